@@ -1,0 +1,1 @@
+"""Clients of a run: the `caviar` command and what agents connect with."""

@@ -1,0 +1,160 @@
+"""Typed objects that carry arrays, and how arrays travel.
+
+A product is two byte strings: a *header* (msgpack map of the typed fields) and a *body* (the
+arrays, one behind the other). In the header an array stands as
+``{"dtype": "<f8", "shape": [3, 2], "offset": 0}``; its elements are in C order, little-endian,
+at ``offset`` bytes into the body. Offsets are multiples of 8, increase in field order, and
+gaps are zero, so that equal values give equal bytes (contract, clause 20).
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import Annotated, Any, ClassVar, TypeAlias, get_args, get_origin, get_type_hints
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from caviar_protocol.errors import PayloadError
+
+BoolArray: TypeAlias = NDArray[np.bool_]
+UInt8Array: TypeAlias = NDArray[np.uint8]
+UInt16Array: TypeAlias = NDArray[np.uint16]
+Int8Array: TypeAlias = NDArray[np.int8]
+Int32Array: TypeAlias = NDArray[np.int32]
+Int64Array: TypeAlias = NDArray[np.int64]
+UInt64Array: TypeAlias = NDArray[np.uint64]
+Float32Array: TypeAlias = NDArray[np.float32]
+Float64Array: TypeAlias = NDArray[np.float64]
+Complex128Array: TypeAlias = NDArray[np.complex128]
+
+WIRE_DTYPES: dict[str, np.dtype[Any]] = {
+    code: np.dtype(code) for code in ("|b1", "|u1", "|i1", "<u2", "<i4", "<i8", "<u8", "<f4", "<f8", "<c16")
+}
+"""Element types that may travel, by the code that stands in a header."""
+
+MAX_DIMENSIONS = 6
+"""An array on the wire has at most this many dimensions."""
+
+
+class ArrayField(msgspec.Struct, frozen=True):
+    """What an array field of a payload promises.
+
+    ``shape`` mixes fixed sizes with names; a name stands for one size throughout a payload
+    object. ``finite`` is checked by the producer (contract, clause 21).
+    """
+
+    dtype: str
+    shape: tuple[int | str, ...]
+    unit: str
+
+
+def array(dtype: str, *shape: int | str, unit: str, doc: str) -> Any:
+    """Describe an array field: ``Annotated[Float64Array, array("<f8", "N", 3, unit="m", doc=…)]``."""
+    if dtype not in WIRE_DTYPES:
+        raise ValueError(f"dtype {dtype!r} cannot travel; one of {', '.join(WIRE_DTYPES)}")
+    return msgspec.Meta(description=doc, extra={"array": ArrayField(dtype, shape, unit), "unit": unit})
+
+
+def quantity(unit: str, doc: str, **constraints: Any) -> Any:
+    """Describe a scalar or tuple field with its unit (``"1"`` for a pure number)."""
+    return msgspec.Meta(description=doc, extra={"unit": unit}, **constraints)
+
+
+Vector3 = Annotated[tuple[float, float, float], quantity("m", "x (east), y (north), z (up)")]
+Quaternion = Annotated[
+    tuple[float, float, float, float],
+    quantity("1", "unit quaternion (w, x, y, z), rotates body axes into world axes"),
+]
+
+
+@cache
+def array_fields(cls: type) -> dict[str, ArrayField]:
+    """The array fields of a payload class, by name, in wire order."""
+    found: dict[str, ArrayField] = {}
+    for name, hint in get_type_hints(cls, include_extras=True).items():
+        for candidate in (hint, *(get_args(hint) if get_origin(hint) is not Annotated else ())):
+            if get_origin(candidate) is Annotated:
+                for meta in get_args(candidate)[1:]:
+                    if isinstance(meta, msgspec.Meta) and meta.extra and "array" in meta.extra:
+                        found[name] = meta.extra["array"]
+    return found
+
+
+class Payload(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Base of every typed object that may hold arrays.
+
+    On construction, here and after decoding, each array is checked against its declared dtype
+    and shape; sizes that share a name must agree. Equality compares arrays element by element.
+    """
+
+    sizes_from: ClassVar[dict[str, str]] = {}
+    """Names of sizes that equal the length of a tuple field: ``{"N": "names"}``."""
+
+    def __post_init__(self) -> None:
+        sizes = {size: len(getattr(self, field)) for size, field in self.sizes_from.items()}
+        for name, spec in array_fields(type(self)).items():
+            value = getattr(self, name)
+            if value is not None:
+                _check_array(type(self).__name__, name, value, spec, sizes)
+
+    def __eq__(self, other: object) -> bool:
+        if type(self) is not type(other):
+            return NotImplemented
+        return all(_equal(getattr(self, f), getattr(other, f)) for f in self.__struct_fields__)
+
+    __hash__ = None  # type: ignore[assignment]  # arrays are not hashable, so neither is their owner
+
+
+def _equal(a: Any, b: Any) -> bool:
+    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
+        return (
+            isinstance(a, np.ndarray)
+            and isinstance(b, np.ndarray)
+            and a.dtype == b.dtype
+            and np.array_equal(a, b)
+        )
+    return bool(a == b)
+
+
+def _check_array(owner: str, name: str, value: Any, spec: ArrayField, sizes: dict[str, int]) -> None:
+    if not isinstance(value, np.ndarray):
+        raise PayloadError(f"{owner}.{name} is {type(value).__name__}, expected a NumPy array")
+    if value.dtype != WIRE_DTYPES[spec.dtype]:
+        raise PayloadError(f"{owner}.{name} has dtype {value.dtype.str}, expected {spec.dtype}")
+    if value.ndim != len(spec.shape):
+        raise PayloadError(
+            f"{owner}.{name} has {value.ndim} dimensions, expected {len(spec.shape)}: {spec.shape}"
+        )
+    for size, expected in zip(value.shape, spec.shape, strict=True):
+        wanted = sizes.setdefault(expected, size) if isinstance(expected, str) else expected
+        if size != wanted:
+            raise PayloadError(
+                f"{owner}.{name} has shape {value.shape}, expected {spec.shape} with {expected} = {wanted}"
+            )
+
+
+def require_finite(payload: Payload, path: str = "") -> None:
+    """Raise `PayloadError` where ``payload`` holds a NaN or an infinity (contract, clause 21)."""
+    path = path or type(payload).__name__
+    for name in payload.__struct_fields__:
+        _require_finite(getattr(payload, name), f"{path}.{name}")
+
+
+def _require_finite(value: Any, path: str) -> None:
+    if isinstance(value, np.ndarray):
+        if value.dtype.kind in "fc" and not np.isfinite(value).all():
+            bad = np.argwhere(~np.isfinite(value))[0].tolist()
+            raise PayloadError(
+                f"{path}{bad} is {value[tuple(bad)]}: non-finite values may not leave a service"
+            )
+    elif isinstance(value, float):
+        if not math.isfinite(value):
+            raise PayloadError(f"{path} is {value}: non-finite values may not leave a service")
+    elif isinstance(value, Payload):
+        require_finite(value, path)
+    elif isinstance(value, tuple):
+        for index, item in enumerate(value):
+            _require_finite(item, f"{path}[{index}]")

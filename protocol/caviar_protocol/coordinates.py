@@ -1,0 +1,116 @@
+"""Rotations and poses in the one convention of CAVIAR.
+
+Right-handed ENU metres, yaw counter-clockwise from +x, quaternions (w, x, y, z) that rotate body
+axes into world axes. Adapters of other conventions convert at their edge.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from caviar_protocol.arrays import Float64Array
+
+Vector = tuple[float, float, float]
+UnitQuaternion = tuple[float, float, float, float]
+
+SPEED_OF_LIGHT = 299_792_458.0
+"""[m/s] in vacuum, exact (SI)."""
+
+
+class Pose(NamedTuple):
+    """Position [m] and orientation of a body in the world."""
+
+    position: Vector
+    orientation: UnitQuaternion
+
+
+def quaternion_from_euler(yaw: float, pitch: float = 0.0, roll: float = 0.0) -> UnitQuaternion:
+    """Unit quaternion of intrinsic z–y′–x″ rotations [rad].
+
+    Yaw turns counter-clockwise seen from above, positive pitch lowers the nose (right-handed
+    about +y), roll is about +x. Equal to Sionna RT's (α, β, γ) orientation.
+    """
+    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
+    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
+    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
+    return (
+        cy * cp * cr + sy * sp * sr,
+        cy * cp * sr - sy * sp * cr,
+        cy * sp * cr + sy * cp * sr,
+        sy * cp * cr - cy * sp * sr,
+    )
+
+
+def euler_from_quaternion(q: Sequence[float]) -> Vector:
+    """(yaw, pitch, roll) [rad] of a unit quaternion; the inverse of `quaternion_from_euler`."""
+    w, x, y, z = q
+    sin_pitch = max(-1.0, min(1.0, 2 * (w * y - z * x)))
+    return (
+        math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+        math.asin(sin_pitch),
+        math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+    )
+
+
+def rotation_matrix(q: Sequence[float]) -> Float64Array:
+    """3×3 matrix R of a unit quaternion: world = R · body."""
+    w, x, y, z = q
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def multiply(p: Sequence[float], q: Sequence[float]) -> UnitQuaternion:
+    """Hamilton product p·q: first q, then p."""
+    pw, px, py, pz = p
+    qw, qx, qy, qz = q
+    return (
+        pw * qw - px * qx - py * qy - pz * qz,
+        pw * qx + px * qw + py * qz - pz * qy,
+        pw * qy - px * qz + py * qw + pz * qx,
+        pw * qz + px * qy - py * qx + pz * qw,
+    )
+
+
+def compose(parent: Pose, mount: Pose) -> Pose:
+    """World pose of something mounted on a parent with the relative pose ``mount``."""
+    x, y, z = rotation_matrix(parent.orientation) @ mount.position
+    px, py, pz = parent.position
+    return Pose(
+        (px + float(x), py + float(y), pz + float(z)),
+        multiply(parent.orientation, mount.orientation),
+    )
+
+
+def direction(zenith: float, azimuth: float) -> Float64Array:
+    """Unit vector [3] of a direction given by zenith from +z and azimuth from +x [rad]."""
+    return np.array(
+        [
+            math.sin(zenith) * math.cos(azimuth),
+            math.sin(zenith) * math.sin(azimuth),
+            math.cos(zenith),
+        ]
+    )
+
+
+def angles(vectors: Float64Array) -> Float64Array:
+    """(zenith, azimuth) [rad] of vectors; Shape ``[..., 3]`` to ``[..., 2]``.
+
+    Uses atan2 of the horizontal part, so that directions near the poles keep their precision.
+    """
+    horizontal = np.hypot(vectors[..., 0], vectors[..., 1])
+    return np.stack(
+        [
+            np.arctan2(horizontal, vectors[..., 2]),
+            np.arctan2(vectors[..., 1], vectors[..., 0]),
+        ],
+        axis=-1,
+    )

@@ -1,0 +1,96 @@
+"""Every error that CAVIAR raises on purpose.
+
+::
+
+    CaviarError
+    ├── ProtocolError          a peer sent something that the protocol does not allow
+    │   ├── DecodeError        bytes that are not the message or payload they claim to be
+    │   ├── LimitError         a size or nesting limit was passed
+    │   └── VersionError       the peers share no major version
+    ├── PayloadError           our own product is malformed (shape, dtype, non-finite)
+    ├── DeclarationError       services do not fit together: cycle, clash, missing source
+    ├── ScenarioError          a scenario file is wrong; names file, key, line, remedy
+    ├── SetupError             this machine lacks something; names the command that mends it
+    ├── AssetError             scenery is missing, or its bytes do not match its digest
+    ├── RecordingError         a recording cannot be read as one
+    └── RunError               a run ended early; names the culprit
+
+`ProtocolError` is the peer's fault and is answered with a message; the others are ours or
+the user's and end a command with a status other than 0.
+"""
+
+from __future__ import annotations
+
+
+class CaviarError(Exception):
+    """Base of all errors raised on purpose; its text is meant for the user."""
+
+
+class ProtocolError(CaviarError):
+    """A peer broke the protocol. ``code`` is the word that SPEC.md lists for the ERROR reply."""
+
+    code = "protocol"
+
+
+class DecodeError(ProtocolError):
+    """Bytes that do not decode to the message or payload they claim to be."""
+
+    code = "malformed"
+
+
+class LimitError(ProtocolError):
+    """A message, payload, name or nesting depth exceeds a limit of the protocol."""
+
+    code = "limit"
+
+
+class VersionError(ProtocolError):
+    """The peer speaks another major version of the protocol."""
+
+    code = "version"
+
+
+class PayloadError(CaviarError):
+    """A product built by this process has a wrong shape, dtype or a non-finite value."""
+
+
+class DeclarationError(CaviarError):
+    """The declarations of the services in a run contradict each other."""
+
+
+class ScenarioError(CaviarError):
+    """A scenario file is wrong.
+
+    Parameters
+    ----------
+    message
+        What is wrong, naming the value, and what to write instead.
+    file
+        Path of the scenario file.
+    key
+        Dotted key, for example ``services.channel.budget_ms``.
+    line
+        1-based line of that key, where known.
+    """
+
+    def __init__(self, message: str, file: str = "", key: str = "", line: int | None = None) -> None:
+        self.file, self.key, self.line = file, key, line
+        place = file + (f":{line}" if line is not None else "")
+        prefix = ": ".join(part for part in (place, key) if part)
+        super().__init__(f"{prefix}: {message}" if prefix else message)
+
+
+class SetupError(CaviarError):
+    """Something this machine needs is not there. The text ends with the command that mends it."""
+
+
+class AssetError(CaviarError):
+    """Scenery is missing or its bytes do not match the digest it was announced with."""
+
+
+class RecordingError(CaviarError):
+    """A file is not a recording of a run, or its content contradicts itself."""
+
+
+class RunError(CaviarError):
+    """A run ended before its last frame. The text names the service, the frame and the phase."""

@@ -1,0 +1,108 @@
+"""The scenario file: what a run consists of.
+
+TOML, validated as a whole before anything starts. A key that is not known here is an error that
+names the file, the line and the key that was probably meant.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
+
+from caviar_protocol.arrays import Vector3, quantity
+from caviar_protocol.messages import Policy, Role
+from caviar_protocol.topics.channel import Carrier
+from caviar_protocol.topics.scene import AntennaArray
+
+
+class _Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Base of all tables of a scenario: unknown keys are refused."""
+
+
+class Timeouts(_Section):
+    """How long the broker waits for what."""
+
+    connect_s: Annotated[float, quantity("s", "for HELLO of every service", gt=0)] = 30.0
+    ready_s: Annotated[float, quantity("s", "for READY, beyond a declared grace", gt=0)] = 120.0
+    reset_s: Annotated[float, quantity("s", "for RESET_DONE", gt=0)] = 60.0
+    stall_s: Annotated[float, quantity("s", "without progress, under wait", gt=0)] = 30.0
+    shutdown_s: Annotated[float, quantity("s", "for BYE; then the process is killed", gt=0)] = 2.0
+    heartbeat_s: Annotated[float, quantity("s", "between heartbeats", gt=0)] = 0.25
+    liveness_s: Annotated[float, quantity("s", "silence after which a remote peer is gone", gt=0)] = 1.5
+
+
+class Run(_Section):
+    """The run as a whole."""
+
+    name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
+    frames: Annotated[int, quantity("frame", "of an episode", ge=1)]
+    sampling_period_ns: Annotated[int, quantity("ns", "T_sam", gt=0)] = 100_000_000
+    episodes: Annotated[int, quantity("1", "episodes", ge=1)] = 1
+    seed: Annotated[int, quantity("1", "seed of everything random", ge=0, lt=2**63)] = 1
+    pace: Literal["fast", "realtime"] = "fast"
+    record: tuple[str, ...] = ()
+    """Topics that are produced because they shall be recorded, though nobody else asks (clause 5)."""
+    frames_in_flight: Annotated[int, quantity("frame", "frames that may overlap at most", ge=1, le=64)] = 4
+
+
+class DeviceSpec(_Section):
+    """A device, or one on each of several objects.
+
+    With ``on`` the device is mounted: on the object of that name, or with ``*`` on up to
+    ``count`` of the matching objects, those that came first; when one leaves, the next gets a
+    device. A mounted device is named ``<object>/<name>``.
+    """
+
+    name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
+    kind: Literal["antenna", "lidar", "camera"]
+    on: str = ""
+    count: Annotated[int, quantity("1", "devices at most, with a pattern", ge=1)] = 1
+    mount: Literal["centre", "roof", "floor"] = "centre"
+    """What ``position_m`` is relative to: a point of the parent's bounding box."""
+    world: str = ""
+    """The world that publishes a device; needed where it cannot be told from ``on``."""
+    position_m: Vector3 = (0.0, 0.0, 0.0)
+    yaw_deg: Annotated[float, quantity("°", "counter-clockwise from +x")] = 0.0
+    pitch_deg: Annotated[float, quantity("°", "positive lowers the nose")] = 0.0
+    roll_deg: Annotated[float, quantity("°", "about +x")] = 0.0
+    # antenna
+    role: Literal["tx", "rx", "both", ""] = ""
+    array: AntennaArray | None = None
+    power_dbm: Annotated[float, quantity("dBm", "transmit power")] = 0.0
+    # lidar
+    beams: Annotated[int, quantity("1", "beams", ge=1, le=1024)] = 64
+    azimuth_steps: Annotated[int, quantity("1", "rays of a beam in a turn", ge=1, le=36000)] = 1800
+    elevation_deg: Annotated[tuple[float, float], quantity("°", "lowest and highest beam")] = (-25.0, 3.0)
+    range_m: Annotated[tuple[float, float], quantity("m", "nearest and farthest hit")] = (0.0, 100.0)
+    # camera
+    size_px: Annotated[tuple[int, int], quantity("px", "width, height")] = (640, 480)
+    field_of_view_deg: Annotated[float, quantity("°", "horizontal", gt=0, lt=180)] = 90.0
+
+
+class ServiceSpec(_Section):
+    """One service of the run."""
+
+    role: Role
+    use: str
+    """Registered implementation of that role."""
+    budget_ms: Annotated[float, quantity("ms", "wall time for a frame; misses are counted", gt=0)]
+    policy: Policy = "wait"
+    max_in_flight: Annotated[
+        int, quantity("1", "grants queued; more than 1 only under wait", ge=1, le=64)
+    ] = 1
+    users: tuple[str, ...] = ()
+    """Agents: the receivers (or actuators) this agent owns, as patterns; empty: a default agent,
+    which serves whoever is left (clause 17)."""
+    settings: dict[str, Any] = {}
+
+
+class Scenario(_Section):
+    """A whole scenario file."""
+
+    run: Run
+    services: dict[str, ServiceSpec]
+    timeouts: Timeouts = Timeouts()
+    carriers: tuple[Carrier, ...] = ()
+    devices: tuple[DeviceSpec, ...] = ()

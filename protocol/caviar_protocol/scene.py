@@ -1,0 +1,93 @@
+"""Scenes of several worlds as one, and where things are in it (contract, clause 3)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from caviar_protocol.arrays import Float64Array
+from caviar_protocol.coordinates import Pose, compose
+from caviar_protocol.errors import PayloadError
+from caviar_protocol.topics.scene import AntennaDevice, Device, Scene
+
+
+def merge_scenes(scenes: Mapping[str, Scene]) -> Scene:
+    """The union of the scenes of all worlds, keyed by source, sorted by name.
+
+    Raises `PayloadError` naming the object and both worlds where a name occurs twice.
+    """
+    if len(scenes) == 1:
+        return next(iter(scenes.values()))
+    owner: dict[str, str] = {}
+    for source, scene in scenes.items():
+        for name in (*scene.names, *(device.name for device in scene.devices)):
+            if name in owner:
+                raise PayloadError(
+                    f"{name!r} comes from both world {owner[name]!r} and world {source!r}; "
+                    "give their objects different prefixes"
+                )
+            owner[name] = source
+    parts = list(scenes.values())
+    names = [name for scene in parts for name in scene.names]
+    order = sorted(range(len(names)), key=names.__getitem__)
+    classes = [item for scene in parts for item in scene.classes]
+    assets = [item for scene in parts for item in scene.assets]
+
+    def joined(field: str) -> Float64Array:
+        stacked: Float64Array = np.concatenate([getattr(scene, field) for scene in parts])
+        return stacked[order]
+
+    return Scene(
+        names=tuple(names[i] for i in order),
+        classes=tuple(classes[i] for i in order),
+        assets=tuple(assets[i] for i in order),
+        position=joined("position"),
+        orientation=joined("orientation"),
+        velocity=joined("velocity"),
+        dimensions=joined("dimensions"),
+        devices=tuple(sorted((d for scene in parts for d in scene.devices), key=lambda device: device.name)),
+    )
+
+
+def object_pose(scene: Scene, index: int) -> Pose:
+    """World pose of an object by index."""
+    x, y, z = scene.position[index].tolist()
+    w, qx, qy, qz = scene.orientation[index].tolist()
+    return Pose((x, y, z), (w, qx, qy, qz))
+
+
+def device_pose(scene: Scene, device: Device) -> Pose:
+    """World pose of a device: its mount pose on top of its parent's pose.
+
+    Raises `PayloadError` where the parent is not in the scene.
+    """
+    mount = Pose(device.position, device.orientation)
+    if not device.parent:
+        return mount
+    return compose(object_pose(scene, _parent_index(scene, device)), mount)
+
+
+def device_velocity(scene: Scene, device: Device) -> Float64Array:
+    """Velocity [m/s] of a device in world axes, Shape ``[3]``; that of its parent."""
+    if not device.parent:
+        return np.zeros(3)
+    velocity: Float64Array = scene.velocity[_parent_index(scene, device)]
+    return velocity
+
+
+def antennas(scene: Scene, role: str) -> list[AntennaDevice]:
+    """Antenna devices that transmit (``"tx"``) or receive (``"rx"``), sorted by name."""
+    return sorted(
+        (d for d in scene.devices if isinstance(d, AntennaDevice) and d.role in (role, "both")),
+        key=lambda device: device.name,
+    )
+
+
+def _parent_index(scene: Scene, device: Device) -> int:
+    try:
+        return scene.names.index(device.parent)
+    except ValueError:
+        raise PayloadError(
+            f"device {device.name!r} is mounted on {device.parent!r}, which is not in the scene"
+        ) from None

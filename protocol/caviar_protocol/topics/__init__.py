@@ -1,0 +1,100 @@
+"""Payloads of the topics: what services tell each other about a frame.
+
+Each topic has one payload class, found in `PAYLOADS`. All coordinates are right-handed ENU
+metres, angles radians, yaw counter-clockwise from +x, stamps whole nanoseconds. Payloads are
+canonical (contract, clause 20): names instead of ids of one process, a stated order, no wall
+time.
+"""
+
+from __future__ import annotations
+
+from caviar_protocol.arrays import Payload
+from caviar_protocol.topics.action import (
+    Action,
+    BeamChoice,
+    UserSchedule,
+    VelocityCommand,
+    WaypointCommand,
+)
+from caviar_protocol.topics.channel import (
+    Carrier,
+    Channel,
+    ChannelMatrix,
+    ChannelOptions,
+    Interaction,
+)
+from caviar_protocol.topics.link import Link
+from caviar_protocol.topics.scene import (
+    AntennaArray,
+    AntennaDevice,
+    CameraDevice,
+    LidarDevice,
+    Scene,
+)
+from caviar_protocol.topics.sensors import (
+    Camera,
+    CameraImage,
+    Depth,
+    DepthImage,
+    Intrinsics,
+    Lidar,
+    LidarScan,
+    OccupancyGrid,
+    Segmentation,
+    SegmentationImage,
+)
+
+PAYLOADS: dict[str, type[Payload]] = {
+    "scene": Scene,
+    "channel": Channel,
+    "lidar": Lidar,
+    "camera": Camera,
+    "depth": Depth,
+    "segmentation": Segmentation,
+    "action": Action,
+    "link": Link,
+}
+"""Payload class of each topic."""
+
+PARTS: dict[str, tuple[str, ...]] = {
+    "scene": (),
+    "channel": ("paths", "h"),
+    "lidar": ("points", "grid"),
+    "camera": (),
+    "depth": (),
+    "segmentation": ("materials",),
+    "action": (),
+    "link": (),
+}
+"""Parts of a payload that are computed only where a consumer asks for them (contract, clause 5)."""
+
+__all__ = [
+    "PARTS",
+    "PAYLOADS",
+    "Action",
+    "AntennaArray",
+    "AntennaDevice",
+    "BeamChoice",
+    "Camera",
+    "CameraDevice",
+    "CameraImage",
+    "Carrier",
+    "Channel",
+    "ChannelMatrix",
+    "ChannelOptions",
+    "Depth",
+    "DepthImage",
+    "Interaction",
+    "Intrinsics",
+    "Lidar",
+    "LidarDevice",
+    "LidarScan",
+    "Link",
+    "OccupancyGrid",
+    "Scene",
+    "Segmentation",
+    "SegmentationImage",
+    "UserSchedule",
+    "VelocityCommand",
+    "WaypointCommand",
+]

@@ -1,0 +1,54 @@
+"""Topic ``action``: what agents decide."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+
+from caviar_protocol.arrays import Payload, Vector3, quantity
+
+
+class BeamChoice(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, tag="beam"):
+    """Use this pair of codebook beams between a transmitter and a receiver.
+
+    The actuator is ``beam:<rx>``.
+    """
+
+    tx: str
+    rx: str
+    tx_beam: Annotated[int, quantity("1", "index into the transmitter's codebook", ge=0)]
+    rx_beam: Annotated[int, quantity("1", "index into the receiver's codebook", ge=0)] = 0
+    carrier: str = ""
+    """Name of the carrier; empty: every carrier."""
+
+
+class WaypointCommand(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, tag="waypoint"):
+    """Fly or drive an object to a point. The actuator is ``motion:<object>``."""
+
+    object: str
+    position: Vector3
+    speed: Annotated[float, quantity("m/s", "at most", gt=0)]
+
+
+class VelocityCommand(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, tag="velocity"):
+    """Give an object a velocity. The actuator is ``motion:<object>``."""
+
+    object: str
+    velocity: Annotated[tuple[float, float, float], quantity("m/s", "in world axes")]
+
+
+class UserSchedule(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, tag="schedule"):
+    """Let a transmitter serve one receiver in this frame. The actuator is ``schedule:<tx>``."""
+
+    tx: str
+    rx: str
+
+
+Command = BeamChoice | WaypointCommand | VelocityCommand | UserSchedule
+
+
+class Action(Payload, frozen=True, kw_only=True, omit_defaults=True):
+    """All commands of one agent in a frame, sorted by actuator, at most one per actuator and carrier."""
+
+    commands: tuple[Command, ...]

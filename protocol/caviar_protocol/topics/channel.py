@@ -1,0 +1,126 @@
+"""Topic ``channel``: how radio waves get from each transmitter to each receiver."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Annotated, ClassVar, Literal
+
+import msgspec
+
+from caviar_protocol.arrays import (
+    BoolArray,
+    Complex128Array,
+    Float64Array,
+    Int32Array,
+    Int64Array,
+    Payload,
+    UInt8Array,
+    UInt64Array,
+    array,
+    quantity,
+)
+
+
+class Interaction(IntEnum):
+    """What a path does at one of its points."""
+
+    NONE = 0
+    REFLECTION = 1
+    DIFFRACTION = 2
+    SCATTERING = 3
+    TRANSMISSION = 4
+
+
+class Carrier(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """One radio carrier."""
+
+    name: str
+    frequency_hz: Annotated[float, quantity("Hz", "centre frequency", gt=0)]
+    bandwidth_hz: Annotated[float, quantity("Hz", "noise and rate bandwidth", gt=0)] = 100e6
+
+
+class ChannelOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What a ray-traced product modelled. Defaults say: nothing but line of sight."""
+
+    los: bool = True
+    reflection: bool = False
+    refraction: bool = False
+    diffraction: bool = False
+    scattering: bool = False
+    max_depth: Annotated[int, quantity("1", "interactions of a path at most", ge=0)] = 0
+    samples: Annotated[int, quantity("1", "rays launched per transmitter", ge=0)] = 0
+
+
+class ChannelMatrix(Payload, frozen=True, kw_only=True, omit_defaults=True):
+    """Narrowband MIMO channel of one carrier and one TX/RX pair, at the carrier frequency."""
+
+    carrier: int
+    """Index into `Channel.carriers`."""
+    tx: int
+    """Index into `Channel.tx`."""
+    rx: int
+    """Index into `Channel.rx`."""
+    h: Annotated[
+        Complex128Array,
+        array("<c16", "Nr", "Nt", unit="1", doc="amplitude gain from TX element n to RX element m"),
+    ]
+
+
+class Channel(Payload, frozen=True, kw_only=True, omit_defaults=True):
+    """Paths, and where asked for MIMO matrices, of all TX/RX pairs in a frame.
+
+    Pair ``p`` is TX ``p // R`` and RX ``p % R`` with R receivers; its paths are
+    ``offsets[p]:offsets[p + 1]``. Within a pair paths are sorted by: number of interactions,
+    interaction types, object names, then delay, departure and arrival angles. Angles are in
+    world axes: zenith from +z, azimuth counter-clockwise from +x. ``a`` contains
+    exp(−j2πfτ): its phase is absolute, and τ is the true propagation delay.
+    """
+
+    sizes_from: ClassVar[dict[str, str]] = {"C": "carriers", "T": "tx", "R": "rx"}
+
+    rung: str
+    """Step of the fidelity ladder: ``free-space``, ``geometric``, ``siso-rt``, ``spherical``, ``mimo-rt``."""
+    options: ChannelOptions = ChannelOptions()
+    expected_error_db: Annotated[
+        float | None, quantity("dB", "expected NMSE of H against the next rung; absent: unknown")
+    ] = None
+    carriers: tuple[Carrier, ...]
+    tx: tuple[str, ...]
+    """Names of the transmitting devices, sorted."""
+    rx: tuple[str, ...]
+    """Names of the receiving devices, sorted."""
+    los: Annotated[BoolArray, array("|b1", "T", "R", unit="1", doc="line of sight is free")]
+    offsets: Annotated[Int64Array, array("<i8", "L1", unit="1", doc="T·R + 1 path offsets")]
+    object_names: tuple[str, ...] = ()
+    """What ``objects`` points into: moving objects and scenery by name."""
+    id: Annotated[
+        UInt64Array, array("<u8", "P", unit="1", doc="stable id: hash of the sort key's discrete part")
+    ]
+    a: Annotated[Complex128Array, array("<c16", "C", "P", unit="1", doc="amplitude gain incl. exp(−j2πfτ)")]
+    tau: Annotated[Float64Array, array("<f8", "P", unit="s", doc="absolute delay")]
+    aod: Annotated[Float64Array, array("<f8", "P", 2, unit="rad", doc="departure (zenith, azimuth)")]
+    aoa: Annotated[
+        Float64Array,
+        array("<f8", "P", 2, unit="rad", doc="direction the wave comes from (zenith, azimuth)"),
+    ]
+    doppler: Annotated[Float64Array, array("<f8", "C", "P", unit="Hz", doc="Doppler shift")]
+    interactions: Annotated[
+        UInt8Array, array("|u1", "P", "D", unit="1", doc="Interaction at each point, TX to RX")
+    ]
+    points: Annotated[
+        Float64Array, array("<f8", "P", "D", 3, unit="m", doc="interaction points; 0 where none")
+    ]
+    objects: Annotated[
+        Int32Array, array("<i4", "P", "D", unit="1", doc="index into object_names; −1 where none")
+    ]
+    h: tuple[ChannelMatrix, ...] = ()
+    """One matrix per carrier and pair, carriers slowest; empty unless part ``h`` is in demand."""
+    dropped: Annotated[int, quantity("1", "paths dropped for non-finite values", ge=0)] = 0
+
+    def pair(self, tx: str, rx: str) -> slice:
+        """Slice of the path axis that belongs to one TX/RX pair; `ValueError` if unknown."""
+        p = self.tx.index(tx) * len(self.rx) + self.rx.index(rx)
+        return slice(int(self.offsets[p]), int(self.offsets[p + 1]))
+
+
+Rung = Literal["free-space", "geometric", "siso-rt", "spherical", "mimo-rt"]

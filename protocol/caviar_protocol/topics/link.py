@@ -1,0 +1,65 @@
+"""Topic ``link``: what the communication system achieved with the chosen beams."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar
+
+from caviar_protocol.arrays import (
+    BoolArray,
+    Float64Array,
+    Int32Array,
+    Payload,
+    array,
+    quantity,
+)
+
+
+class Link(Payload, frozen=True, kw_only=True, omit_defaults=True):
+    """Result per user; a user is one (TX, RX, carrier), sorted by carrier, TX, RX.
+
+    ``y`` is the equivalent channel w* H f of a beam pair (paper, eq. 1) with beams of unit norm
+    and without transmit power. A user without a path has ``has_path`` false and zeros; one that no agent
+    served has beams −1 and |y| 0. Means over users leave out those without a path and state
+    how many they were.
+    """
+
+    sizes_from: ClassVar[dict[str, str]] = {"U": "rx"}
+
+    tx: tuple[str, ...]
+    rx: tuple[str, ...]
+    carrier: tuple[str, ...]
+    has_path: Annotated[BoolArray, array("|b1", "U", unit="1", doc="at least one path reaches the user")]
+    los: Annotated[BoolArray, array("|b1", "U", unit="1", doc="line of sight is free")]
+    tx_beam: Annotated[Int32Array, array("<i4", "U", unit="1", doc="chosen TX beam; −1: none chosen")]
+    rx_beam: Annotated[Int32Array, array("<i4", "U", unit="1", doc="chosen RX beam; −1: none chosen")]
+    abs_y: Annotated[Float64Array, array("<f8", "U", unit="1", doc="|y| of the chosen pair")]
+    top_tx_beam: Annotated[
+        Int32Array, array("<i4", "U", "K", unit="1", doc="TX beams of the best K pairs, best first")
+    ]
+    top_rx_beam: Annotated[
+        Int32Array, array("<i4", "U", "K", unit="1", doc="RX beams of the best K pairs, best first")
+    ]
+    top_abs_y: Annotated[
+        Float64Array, array("<f8", "U", "K", unit="1", doc="|y| of the best K pairs; [:, 0] is eq. 2")
+    ]
+    baseline_abs_y: Annotated[
+        Float64Array,
+        array("<f8", "U", unit="1", doc="|y| of the pair that points along the straight line TX–RX"),
+    ]
+    aod_azimuth: Annotated[
+        Float64Array, array("<f8", "U", unit="rad", doc="azimuth of RX from TX, in the TX device's axes")
+    ]
+    aoa_azimuth: Annotated[
+        Float64Array, array("<f8", "U", unit="rad", doc="azimuth of TX from RX, in the RX device's axes")
+    ]
+    snr: Annotated[Float64Array, array("<f8", "U", unit="1", doc="linear SNR of the chosen pair")]
+    snr_best: Annotated[Float64Array, array("<f8", "U", unit="1", doc="linear SNR of the best pair")]
+    spectral_efficiency: Annotated[Float64Array, array("<f8", "U", unit="bit/s/Hz", doc="log2(1 + SNR)")]
+    bit_rate: Annotated[Float64Array, array("<f8", "U", unit="bit/s", doc="bandwidth · spectral efficiency")]
+    reward: Annotated[
+        Float64Array, array("<f8", "U", unit="1", doc="as the link is configured: |y| by default")
+    ]
+    buffered: (
+        Annotated[Float64Array, array("<f8", "U", unit="bit", doc="waiting in the user's buffer")] | None
+    ) = None
+    no_path: Annotated[int, quantity("1", "users without a path in this frame", ge=0)] = 0

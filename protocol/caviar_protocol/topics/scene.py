@@ -1,0 +1,99 @@
+"""Topic ``scene``: where everything is, and what is mounted on it."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Literal
+
+import msgspec
+
+from caviar_protocol.arrays import Float64Array, Payload, Quaternion, Vector3, array, quantity
+
+
+class AntennaArray(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """A uniform linear (one row or one column) or planar antenna array.
+
+    The elements stand in the y–z plane of the device, boresight +x. Element order is
+    column-major: down a column from +z to −z, columns from −y to +y, as in Sionna RT. So
+    element ``i`` is row ``i % rows`` of column ``i // rows``.
+    """
+
+    rows: Annotated[int, quantity("1", "elements along z", ge=1, le=1024)] = 1
+    columns: Annotated[int, quantity("1", "elements along y", ge=1, le=1024)] = 1
+    vertical_spacing: Annotated[float, quantity("wavelengths", "between rows", gt=0)] = 0.5
+    horizontal_spacing: Annotated[float, quantity("wavelengths", "between columns", gt=0)] = 0.5
+    pattern: Literal["iso", "dipole", "hw_dipole", "tr38901"] = "iso"
+    polarization: Literal["V", "H"] = "V"
+
+    @property
+    def size(self) -> int:
+        """Number of elements."""
+        return self.rows * self.columns
+
+
+class _Device(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What all devices share.
+
+    The pose is relative to the parent's pose (centre of its bounding box, body axes), or to
+    the world where ``parent`` is empty. `caviar_protocol.scene.device_pose` composes the two.
+    """
+
+    name: str
+    parent: str = ""
+    position: Vector3 = (0.0, 0.0, 0.0)
+    orientation: Quaternion = (1.0, 0.0, 0.0, 0.0)
+
+
+class AntennaDevice(_Device, frozen=True, kw_only=True, omit_defaults=True, tag="antenna"):
+    """A radio transmitter, receiver, or both, with one antenna array."""
+
+    role: Literal["tx", "rx", "both"]
+    array: AntennaArray = AntennaArray()
+    power_dbm: Annotated[float, quantity("dBm", "transmit power; unused by a receiver")] = 0.0
+
+
+class LidarDevice(_Device, frozen=True, kw_only=True, omit_defaults=True, tag="lidar"):
+    """A spinning LIDAR. Beams fan over elevation, each turns once around the device's z axis."""
+
+    beams: Annotated[int, quantity("1", "beams (rows)", ge=1, le=1024)] = 64
+    azimuth_steps: Annotated[int, quantity("1", "rays of a beam in a turn", ge=1, le=36000)] = 1800
+    elevation_min: Annotated[float, quantity("rad", "lowest beam")] = -0.4363323129985824
+    elevation_max: Annotated[float, quantity("rad", "highest beam")] = 0.05235987755982989
+    max_range: Annotated[float, quantity("m", "farther hits are dropped", gt=0)] = 100.0
+    min_range: Annotated[float, quantity("m", "nearer hits are dropped", ge=0)] = 0.0
+
+
+class CameraDevice(_Device, frozen=True, kw_only=True, omit_defaults=True, tag="camera"):
+    """A pinhole camera that looks along the device's +x axis, +z up."""
+
+    width: Annotated[int, quantity("px", "image width", ge=1, le=8192)] = 640
+    height: Annotated[int, quantity("px", "image height", ge=1, le=8192)] = 480
+    field_of_view: Annotated[float, quantity("rad", "horizontal field of view", gt=0)] = 1.5707963267948966
+
+
+Device = AntennaDevice | LidarDevice | CameraDevice
+
+
+class Scene(Payload, frozen=True, kw_only=True, omit_defaults=True):
+    """State of the virtual world at one instant, as one world knows it.
+
+    Objects are sorted by name, devices too. A position is the centre of the object's bounding
+    box; the box's axes are the body axes (x forward, y left, z up).
+    """
+
+    sizes_from: ClassVar[dict[str, str]] = {"N": "names"}
+
+    names: tuple[str, ...]
+    """Unique names, each with a prefix that the world declared at READY."""
+    classes: tuple[str, ...]
+    """Class of each object: ``car``, ``truck``, ``bus``, ``uav``, ``pedestrian``, …"""
+    assets: tuple[str, ...]
+    """Name of each object's mesh in the asset manifest (unit box −½…½, scaled by
+    ``dimensions``); empty: the box itself."""
+    position: Annotated[Float64Array, array("<f8", "N", 3, unit="m", doc="bounding-box centre")]
+    orientation: Annotated[Float64Array, array("<f8", "N", 4, unit="1", doc="(w, x, y, z), body into world")]
+    velocity: Annotated[Float64Array, array("<f8", "N", 3, unit="m/s", doc="in world axes")]
+    dimensions: Annotated[
+        Float64Array, array("<f8", "N", 3, unit="m", doc="length (x), width (y), height (z)")
+    ]
+    devices: tuple[Device, ...] = ()
+    """Devices that exist in this frame. A device whose parent left is not listed."""

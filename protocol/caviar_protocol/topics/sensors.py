@@ -1,0 +1,125 @@
+"""Topics ``lidar``, ``camera``, ``depth`` and ``segmentation``: what sensors see."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+
+from caviar_protocol.arrays import (
+    Float32Array,
+    Int8Array,
+    Int32Array,
+    Payload,
+    Quaternion,
+    UInt8Array,
+    Vector3,
+    array,
+    quantity,
+)
+
+
+class OccupancyGrid(Payload, frozen=True, kw_only=True, omit_defaults=True):
+    """The paper's quantised point cloud, in world axes: 0 free, 1 obstacle, −1 TX, −2 RX.
+
+    Cell (i, j, k) is that of a point with index round((v − origin)/cell), clipped.
+    """
+
+    origin: Vector3
+    """Coordinates of index (0, 0, 0)."""
+    cell: Vector3
+    """Edge lengths of a cell."""
+    occupancy: Annotated[Int8Array, array("|i1", "X", "Y", "Z", unit="1", doc="0, 1, −1 or −2")]
+
+
+class LidarScan(Payload, frozen=True, kw_only=True, omit_defaults=True):
+    """One turn of one LIDAR: the rays that hit something, in ray order.
+
+    Ray ``r`` belongs to beam ``r // azimuth_steps`` (lowest elevation first) and azimuth step
+    ``r % azimuth_steps`` (counter-clockwise from the device's +x axis).
+    """
+
+    sensor: str
+    position: Vector3
+    """Pose of the sensor in the world at this frame."""
+    orientation: Quaternion
+    ray: Annotated[Int32Array, array("<i4", "N", unit="1", doc="index of the ray")]
+    points: Annotated[Float32Array, array("<f4", "N", 3, unit="m", doc="hit, sensor axes")]
+    points_world: Annotated[Float32Array, array("<f4", "N", 3, unit="m", doc="hit, world axes")]
+    range: Annotated[Float32Array, array("<f4", "N", unit="m", doc="distance to the hit")]
+    object: Annotated[Int32Array, array("<i4", "N", unit="1", doc="index into object_names")]
+    grid: OccupancyGrid | None = None
+
+
+class Lidar(Payload, frozen=True, kw_only=True, omit_defaults=True):
+    """Scans of all LIDARs of a service, sorted by sensor name."""
+
+    object_names: tuple[str, ...]
+    """What `LidarScan.object` points into: moving objects and scenery by name."""
+    scans: tuple[LidarScan, ...]
+
+
+class Intrinsics(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Pinhole intrinsics: a point (x, y, z) in camera axes (x right, y down, z forward) is at
+    pixel (fx·x/z + cx, fy·y/z + cy), pixel centres at +½."""
+
+    fx: Annotated[float, quantity("px", "focal length, horizontal")]
+    fy: Annotated[float, quantity("px", "focal length, vertical")]
+    cx: Annotated[float, quantity("px", "principal point, horizontal")]
+    cy: Annotated[float, quantity("px", "principal point, vertical")]
+
+
+class _Image(Payload, frozen=True, kw_only=True, omit_defaults=True):
+    """Which sensor, with which optics, from where."""
+
+    sensor: str
+    intrinsics: Intrinsics
+    position: Vector3
+    orientation: Quaternion
+
+
+class CameraImage(_Image, frozen=True, kw_only=True, omit_defaults=True):
+    """One RGB image, top row first, sRGB."""
+
+    rgb: Annotated[UInt8Array, array("|u1", "H", "W", 3, unit="1", doc="red, green, blue")]
+
+
+class Camera(Payload, frozen=True, kw_only=True, omit_defaults=True):
+    """RGB images of all cameras of a service, sorted by sensor name."""
+
+    images: tuple[CameraImage, ...]
+
+
+class DepthImage(_Image, frozen=True, kw_only=True, omit_defaults=True):
+    """One depth image, and the surface normals where computed."""
+
+    depth: Annotated[Float32Array, array("<f4", "H", "W", unit="m", doc="along the optical axis; 0: no hit")]
+    normals: (
+        Annotated[Float32Array, array("<f4", "H", "W", 3, unit="1", doc="unit, world axes; 0: no hit")] | None
+    ) = None
+
+
+class Depth(Payload, frozen=True, kw_only=True, omit_defaults=True):
+    """Depth images of all cameras of a service, sorted by sensor name."""
+
+    images: tuple[DepthImage, ...]
+
+
+class SegmentationImage(_Image, frozen=True, kw_only=True, omit_defaults=True):
+    """One image of object ids, and of material ids where asked for."""
+
+    object: Annotated[Int32Array, array("<i4", "H", "W", unit="1", doc="index into object_names; −1: no hit")]
+    material: (
+        Annotated[Int32Array, array("<i4", "H", "W", unit="1", doc="index into material_names; −1: no hit")]
+        | None
+    ) = None
+
+
+class Segmentation(Payload, frozen=True, kw_only=True, omit_defaults=True):
+    """Segmentation images of all cameras of a service, sorted by sensor name."""
+
+    object_names: tuple[str, ...]
+    material_names: Annotated[
+        tuple[str, ...], quantity("1", "names of materials; empty unless part ``materials``")
+    ] = ()
+    images: tuple[SegmentationImage, ...]

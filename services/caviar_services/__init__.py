@@ -1,0 +1,1 @@
+"""The services of a run: worlds, channel engines, sensors, the link, agents, the recorder."""

@@ -1,0 +1,71 @@
+"""Implementations by role and name.
+
+Strings, loaded late: importing this module imports no implementation, and an implementation
+imports its heavy libraries only when it prepares. Other distributions add theirs through the
+entry-point group ``caviar.services`` (name ``role:name``, value ``module:Class``).
+"""
+
+from __future__ import annotations
+
+import difflib
+from functools import cache
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import Any
+
+from caviar_protocol.errors import DeclarationError
+from caviar_services.service import Service
+
+BUILT_IN: dict[str, str] = {
+    "world:sumo": "caviar_services.world.sumo:SumoWorld",
+    "world:trajectory": "caviar_services.world.trajectory:TrajectoryWorld",
+    "channel:free-space": "caviar_services.channel.free_space:FreeSpaceChannel",
+    "channel:sionna-rt": "caviar_services.channel.sionna_rt:SionnaChannel",
+    "sensors:lidar": "caviar_services.sensors.lidar:LidarSensors",
+    "link:beams": "caviar_services.link.beams:BeamLink",
+    "agent:los-beam": "caviar_services.agent.los_beam:LosBeamAgent",
+    "agent:random": "caviar_services.agent.random:RandomAgent",
+    "agent:oracle": "caviar_services.agent.oracle:OracleAgent",
+    "recorder:mcap": "caviar_services.recorder.mcap:McapRecorder",
+}
+"""``role:name`` to ``module:Class``. To add an implementation: one file, one line here."""
+
+ENTRY_POINT_GROUP = "caviar.services"
+
+
+@cache
+def registered() -> dict[str, str]:
+    """Everything registered, built in and by entry points.
+
+    Raises `DeclarationError` where two distributions register the same ``role:name``.
+    """
+    found = dict(BUILT_IN)
+    for point in entry_points(group=ENTRY_POINT_GROUP):
+        if point.name in found and found[point.name] != point.value:
+            raise DeclarationError(
+                f"{point.name} is registered twice, as {found[point.name]} and as {point.value}; "
+                "uninstall or rename one of them"
+            )
+        found[point.name] = point.value
+    return found
+
+
+def load(role: str, name: str) -> type[Service[Any]]:
+    """The class registered as ``role:name``.
+
+    Raises `DeclarationError` with the known names, nearest first, where there is none.
+    """
+    known = registered()
+    target = known.get(f"{role}:{name}")
+    if target is None:
+        names = sorted(key.split(":", 1)[1] for key in known if key.startswith(f"{role}:"))
+        near = difflib.get_close_matches(name, names, n=1)
+        hint = f"did you mean {near[0]!r}? " if near else ""
+        raise DeclarationError(f"no {role} is named {name!r}; {hint}known: {', '.join(names)}")
+    module_name, _, class_name = target.partition(":")
+    cls = getattr(import_module(module_name), class_name)
+    if not (isinstance(cls, type) and issubclass(cls, Service)):
+        raise DeclarationError(f"{role}:{name} is {target}, which is not a Service")
+    if cls.role != role:
+        raise DeclarationError(f"{role}:{name} is {target}, whose role is {cls.role!r}")
+    return cls

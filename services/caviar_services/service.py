@@ -1,0 +1,222 @@
+"""The contract between a service and the one runner that all services share.
+
+An implementation subclasses `Service` (most subclass the base of their role: `world.base.World`,
+`channel.base.ChannelModel`, …), says what it consumes and produces, and computes. It never
+sees a socket, a deadline or another service: `runner.py` does that part for all of them, and
+the embedded run uses the same objects without sockets.
+
+Life of a service: ``__init__`` → ``scenery`` (worlds) → ``prepare`` → per episode ``reset``,
+``step`` for each frame, ``end_episode`` → ``close``.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import ClassVar, Generic, TypeVar, cast
+
+import msgspec
+import numpy as np
+
+from caviar_protocol.arrays import Payload
+from caviar_protocol.codec import decode_payload
+from caviar_protocol.errors import PayloadError
+from caviar_protocol.messages import GrantInput, Input, Role, Status
+from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.scene import merge_scenes
+from caviar_protocol.seeding import generator
+from caviar_protocol.topics import Carrier, Scene
+
+S = TypeVar("S", bound=msgspec.Struct)
+P = TypeVar("P", bound=Payload)
+
+Progress = Callable[[str, float], None]
+"""``progress(phase, grace_s)``: tell the broker what is being done, and that it advances.
+
+``grace_s`` is how long the phase may stay silent before it counts as stalled; 0 for the
+scenario's ``stall_s``. Declare one before compiling kernels or loading large scenes.
+"""
+
+
+def _silent(phase: str, grace_s: float = 0.0) -> None:
+    """Progress of a service that nobody watches."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunInfo:
+    """What a service knows about the run it is part of."""
+
+    name: str
+    """Name of this service, unique in the run."""
+    run: str = ""
+    seed: int = 0
+    sampling_period_ns: int = 100_000_000
+    frames: int = 1
+    """Frames of an episode, unless an agent ends it earlier."""
+    carriers: tuple[Carrier, ...] = ()
+    devices: tuple[DeviceSpec, ...] = ()
+    """Worlds: the devices that this world publishes. Others: all devices of the scenario."""
+    scenario: Mapping[str, object] = field(default_factory=dict)
+    """The scenario as resolved, for the recorder's metadata."""
+    directory: Path = Path()
+    """Where the recorder writes."""
+    progress: Progress = _silent
+
+
+@dataclass(frozen=True, kw_only=True)
+class Preparation:
+    """What PREPARE tells a service."""
+
+    demand: Mapping[str, frozenset[str]]
+    """Topics of this service that someone consumes, with the parts asked for (clause 5)."""
+    assets: Mapping[str, Path] = field(default_factory=dict)
+    """Files of scenery by name; all are in one local folder, at their names as relative paths."""
+    producers: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """Topic to its sources in this run."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prepared:
+    """What READY tells the broker, beyond the geometry digest, which the runner adds."""
+
+    prefixes: tuple[str, ...] = ()
+    actuators: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+class FrameInput:
+    """One input of a frame: its provenance, and its payload decoded on first use."""
+
+    def __init__(
+        self,
+        provenance: GrantInput,
+        header: bytes | memoryview = b"",
+        body: bytes | memoryview = b"",
+        payload: Payload | None = None,
+    ) -> None:
+        self.provenance = provenance
+        self.header = header
+        self.body = body
+        self._payload = payload
+
+    @property
+    def present(self) -> bool:
+        """Whether there is a payload: fresh, held or late."""
+        return self.provenance.status is not Status.ABSENT
+
+    @property
+    def payload(self) -> Payload:
+        """The payload; its arrays are read-only. `PayloadError` where absent."""
+        if not self.present:
+            entry = self.provenance
+            raise PayloadError(f"{entry.topic} of {entry.source} is absent: {entry.cause}")
+        if self._payload is None:
+            self._payload = decode_payload(self.provenance.topic, self.header, self.body)
+        return self._payload
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frame:
+    """One frame as a service sees it."""
+
+    episode: int
+    number: int
+    t_ns: int
+    """Simulated time since the start of the episode's clock [ns]."""
+    previous: int = -1
+    """The frame this service last completed; −1: none. A world steps the whole gap."""
+    final: bool = False
+    """The agent's extra grant behind the last frame (clause 16)."""
+    inputs: tuple[FrameInput, ...] = ()
+    service: str = ""
+    seed: int = 0
+
+    def of(self, topic: str, cls: type[P]) -> dict[str, P]:
+        """Payloads of a topic by source, those that are present."""
+        return {
+            item.provenance.source: cast(P, item.payload)
+            for item in self.inputs
+            if item.provenance.topic == topic and item.present
+        }
+
+    def only(self, topic: str, cls: type[P]) -> P | None:
+        """Payload of a topic that has one source; None where absent.
+
+        Raises `PayloadError` naming the sources where there are several.
+        """
+        found = self.of(topic, cls)
+        if len(found) > 1:
+            raise PayloadError(
+                f"{self.service} takes {topic} from one source, the run has {', '.join(sorted(found))}"
+            )
+        return next(iter(found.values()), None)
+
+    def scene(self) -> Scene:
+        """The scenes of all worlds as one (contract, clause 3)."""
+        scenes = self.of("scene", Scene)
+        if not scenes:
+            raise PayloadError(f"{self.service} was granted frame {self.number} without a scene")
+        return merge_scenes(scenes)
+
+    def generator(self, stream: str = "") -> np.random.Generator:
+        """Random generator of this service for this frame (contract, clause 19)."""
+        return generator(self.seed, self.episode, f"{self.service}/{stream}", self.number)
+
+    def __iter__(self) -> Iterator[FrameInput]:
+        return iter(self.inputs)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StepResult:
+    """What a service made of a frame."""
+
+    products: Mapping[str, Payload] = field(default_factory=dict)
+    """Payload by topic; a declared output that is missing here is absent."""
+    fidelity: str = ""
+    """Rung or quality of the products, for their provenance."""
+    decisions: Mapping[str, str] = field(default_factory=dict)
+    counts: Mapping[str, int] = field(default_factory=dict)
+    measured: Mapping[str, int] = field(default_factory=dict)
+    """Nanoseconds that named phases took."""
+    end_episode: bool = False
+
+
+class Service(ABC, Generic[S]):
+    """One service of a run.
+
+    Class attributes are the declaration; the broker builds the graph of the run from them.
+    Raise a `CaviarError` whose text names the value and the remedy for what a user can mend.
+    """
+
+    role: ClassVar[Role]
+    inputs: ClassVar[tuple[Input, ...]] = ()
+    outputs: ClassVar[tuple[str, ...]] = ()
+    Settings: ClassVar[type[msgspec.Struct]]
+    """Settings from the scenario: a frozen struct, ``forbid_unknown_fields=True``, units in names."""
+
+    def __init__(self, settings: S, run: RunInfo) -> None:
+        self.settings = settings
+        self.run = run
+
+    def scenery(self) -> Mapping[str, Path | bytes]:
+        """Worlds: the files of scenery this world brings, by asset name (clause 4)."""
+        return {}
+
+    def prepare(self, preparation: Preparation) -> Prepared:
+        """Load, compile, warm up: whatever would otherwise make frame 0 late."""
+        return Prepared()
+
+    def reset(self, episode: int, seed: int, t0_ns: int) -> None:  # noqa: B027  # optional hook
+        """Begin an episode. The same arguments lead to the same episode, bit by bit."""
+
+    @abstractmethod
+    def step(self, frame: Frame) -> StepResult:
+        """Compute this service's part of a frame."""
+
+    def end_episode(self, frames: int) -> None:  # noqa: B027  # optional hook
+        """The episode is over; it had this many frames."""
+
+    def close(self) -> None:  # noqa: B027  # optional hook
+        """Release what is held. Called once, also after an error."""
