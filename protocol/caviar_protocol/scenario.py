@@ -21,7 +21,7 @@ class _Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Base of all tables of a scenario: unknown keys are refused."""
 
 
-class Timeouts(_Section):
+class Timeouts(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How long the broker waits for what."""
 
     connect_s: Annotated[float, quantity("s", "for HELLO of every service", gt=0)] = 30.0
@@ -33,7 +33,7 @@ class Timeouts(_Section):
     liveness_s: Annotated[float, quantity("s", "silence after which a remote peer is gone", gt=0)] = 1.5
 
 
-class Run(_Section):
+class Run(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The run as a whole."""
 
     name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
@@ -47,7 +47,7 @@ class Run(_Section):
     frames_in_flight: Annotated[int, quantity("frame", "frames that may overlap at most", ge=1, le=64)] = 4
 
 
-class DeviceSpec(_Section):
+class DeviceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A device, or one on each of several objects.
 
     With ``on`` the device is mounted: on the object of that name, or with ``*`` on up to
@@ -81,7 +81,7 @@ class DeviceSpec(_Section):
     field_of_view_deg: Annotated[float, quantity("°", "horizontal", gt=0, lt=180)] = 90.0
 
 
-class ServiceSpec(_Section):
+class ServiceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One service of the run."""
 
     role: Role
@@ -98,7 +98,7 @@ class ServiceSpec(_Section):
     settings: dict[str, Any] = {}
 
 
-class Scenario(_Section):
+class Scenario(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A whole scenario file."""
 
     run: Run

@@ -208,15 +208,15 @@ class Service(ABC, Generic[S]):
         """Load, compile, warm up: whatever would otherwise make frame 0 late."""
         return Prepared()
 
-    def reset(self, episode: int, seed: int, t0_ns: int) -> None:  # noqa: B027  # optional hook
+    def reset(self, episode: int, seed: int, t0_ns: int) -> None:  # optional hook
         """Begin an episode. The same arguments lead to the same episode, bit by bit."""
 
     @abstractmethod
     def step(self, frame: Frame) -> StepResult:
         """Compute this service's part of a frame."""
 
-    def end_episode(self, frames: int) -> None:  # noqa: B027  # optional hook
+    def end_episode(self, frames: int) -> None:  # optional hook
         """The episode is over; it had this many frames."""
 
-    def close(self) -> None:  # noqa: B027  # optional hook
+    def close(self) -> None:  # optional hook
         """Release what is held. Called once, also after an error."""
