@@ -1,0 +1,40 @@
+"""Antenna arrays as the channel, the link and the agents all see them.
+
+One phase convention for all of them. The element at ``r`` [wavelengths] sees a plane wave of
+direction k̂ (unit vector from the array *towards* the other end, device axes) with the phase
+``exp(+j2π k̂·r)``: an element nearer to the other end has the shorter path and, with
+exp(−j2πfτ), the larger phase. At both ends the same vector applies, so a single path of
+amplitude a has ``H = a · ar · atᵀ`` (Tse and Viswanath, Fundamentals of Wireless Communication,
+section 7.2, with directions taken from each array outwards).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from caviar_protocol.arrays import Complex128Array, Float64Array
+from caviar_protocol.topics.scene import AntennaArray
+
+
+def element_positions(array: AntennaArray) -> Float64Array:
+    """Element positions [wavelengths] in device axes around the array's centre, Shape ``[N, 3]``.
+
+    Element ``i`` is row ``i % rows`` of column ``i // rows``: rows from +z to −z, columns from
+    −y to +y, boresight +x.
+    """
+    column, row = np.divmod(np.arange(array.size), array.rows)
+    positions = np.zeros((array.size, 3))
+    positions[:, 1] = (column - (array.columns - 1) / 2) * array.horizontal_spacing
+    positions[:, 2] = ((array.rows - 1) / 2 - row) * array.vertical_spacing
+    return positions
+
+
+def steering_vector(array: AntennaArray, directions: Float64Array) -> Complex128Array:
+    """Phases ``exp(+j2π k̂·r)`` of the elements, Shape ``[..., N]``, each of magnitude 1.
+
+    ``directions`` are unit vectors k̂ from the array towards the other end in device axes,
+    Shape ``[..., 3]``. The element pattern is not part of it.
+    """
+    phase = 2 * np.pi * (directions @ element_positions(array).T)
+    vector: Complex128Array = np.exp(1j * phase)
+    return vector
