@@ -1,0 +1,1 @@
+"""Channel models: from a scene to the paths between its antennas."""

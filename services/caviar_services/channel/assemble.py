@@ -1,0 +1,308 @@
+"""From the paths a model found to the canonical `Channel` product (contract, clauses 20 and 21)."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from caviar_protocol.arrays import (
+    BoolArray,
+    Complex128Array,
+    Float64Array,
+    Int32Array,
+    Int64Array,
+    UInt8Array,
+    UInt64Array,
+)
+from caviar_protocol.coordinates import angles, rotation_matrix
+from caviar_protocol.scene import device_pose, device_velocity
+from caviar_protocol.topics import (
+    AntennaArray,
+    AntennaDevice,
+    Carrier,
+    Channel,
+    ChannelMatrix,
+    ChannelOptions,
+    Scene,
+)
+from caviar_services.channel.arrays import channel_matrix, radiated_field, steering
+from caviar_services.channel.geometry import PathGeometry, path_geometry
+
+
+@dataclass(frozen=True, eq=False)
+class Antenna:
+    """An antenna device where it is in this frame, in world axes."""
+
+    name: str
+    array: AntennaArray
+    position: Float64Array
+    """[m], Shape ``[3]``."""
+    rotation: Float64Array
+    """Turns device axes into world axes, Shape ``[3, 3]``."""
+    velocity: Float64Array
+    """[m/s], Shape ``[3]``."""
+
+    @classmethod
+    def of(cls, scene: Scene, device: AntennaDevice) -> Antenna:
+        """The antenna of a device, composed with its parent's pose."""
+        pose = device_pose(scene, device)
+        return cls(
+            device.name,
+            device.array,
+            np.array(pose.position),
+            rotation_matrix(pose.orientation),
+            device_velocity(scene, device),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PathTable:
+    """Paths as a model found them: any order, no antennas applied, no carrier phase.
+
+    P paths of at most D interactions, C carriers.
+    """
+
+    pair: Int64Array
+    """TX index · number of RX + RX index, Shape ``[P]``."""
+    transfer: Complex128Array
+    """Field at RX per field at TX, with spreading λ/(4πd) and without exp(−j2πfτ); Shape ``[C, P, 2, 2]``.
+    Rows (θ̂, φ̂) at the arrival direction, columns (θ̂, φ̂) at the departure direction, world axes."""
+    types: UInt8Array
+    """`Interaction` at each point, Shape ``[P, D]``; 0 behind the last."""
+    objects: Int32Array
+    """Index into ``object_names``, Shape ``[P, D]``; −1 behind the last."""
+    points: Float64Array
+    """Interaction points [m], Shape ``[P, D, 3]``."""
+    object_names: tuple[str, ...]
+    object_velocity: Float64Array
+    """Velocity [m/s] of each named object, Shape ``[len(object_names), 3]``."""
+
+    def take(self, which: Int64Array | BoolArray) -> PathTable:
+        """These paths, in this order."""
+        return PathTable(
+            pair=self.pair[which],
+            transfer=self.transfer[:, which],
+            types=self.types[which],
+            objects=self.objects[which],
+            points=self.points[which],
+            object_names=self.object_names,
+            object_velocity=self.object_velocity,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Product:
+    """What a product says about itself beside its paths."""
+
+    rung: str
+    options: ChannelOptions
+    carriers: tuple[Carrier, ...]
+    with_h: bool
+
+
+def assemble(
+    product: Product,
+    transmitters: Sequence[Antenna],
+    receivers: Sequence[Antenna],
+    table: PathTable,
+    los: BoolArray,
+) -> Channel:
+    """The canonical product: antennas and carrier phase applied, non-finite paths dropped, sorted."""
+    table = _canonical_names(table)
+    with np.errstate(invalid="ignore"):  # what is not finite is dropped and counted below
+        geometry = _geometry(table, transmitters, receivers)
+        a = _amplitudes(product.carriers, table, geometry, transmitters, receivers)
+    finite = _finite(table, geometry, a)
+    dropped = int((~finite).sum())
+    order = np.flatnonzero(finite)[_order(table.take(finite), _select(geometry, finite), a[:, finite])]
+    table, geometry, a = table.take(order), _select(geometry, order), a[:, order]
+
+    pairs = len(transmitters) * len(receivers)
+    offsets = np.searchsorted(table.pair, np.arange(pairs + 1)).astype(np.int64)
+    frequency = np.array([carrier.frequency_hz for carrier in product.carriers])
+    depth = int((table.types != 0).sum(1).max(initial=0))
+    return Channel(
+        rung=product.rung,
+        options=product.options,
+        carriers=product.carriers,
+        tx=tuple(antenna.name for antenna in transmitters),
+        rx=tuple(antenna.name for antenna in receivers),
+        los=los,
+        offsets=offsets,
+        object_names=table.object_names,
+        id=_ids(table),
+        a=a,
+        tau=geometry.tau,
+        aod=angles(geometry.departure),
+        aoa=angles(geometry.arrival),
+        doppler=frequency[:, None] * geometry.doppler_ratio,
+        interactions=table.types[:, :depth],
+        points=table.points[:, :depth],
+        objects=table.objects[:, :depth],
+        h=_matrices(transmitters, receivers, geometry, a, offsets) if product.with_h else (),
+        dropped=dropped,
+    )
+
+
+def _canonical_names(table: PathTable) -> PathTable:
+    """Names that occur, sorted; points and objects behind the last interaction set to their filler."""
+    used = table.types != 0
+    objects = np.where(used, table.objects, -1)
+    occurring = np.unique(objects[used])
+    order = sorted(occurring.tolist(), key=table.object_names.__getitem__)
+    index = np.full(len(table.object_names) + 1, -1, np.int32)
+    index[order] = np.arange(len(order))
+    return PathTable(
+        pair=table.pair,
+        transfer=table.transfer,
+        types=table.types,
+        objects=index[objects],
+        points=np.where(used[..., None], table.points, 0.0),
+        object_names=tuple(table.object_names[i] for i in order),
+        object_velocity=table.object_velocity[order],
+    )
+
+
+def _geometry(
+    table: PathTable, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]
+) -> PathGeometry:
+    def stacked(antennas: Sequence[Antenna], field: str) -> Float64Array:
+        return np.array([getattr(antenna, field) for antenna in antennas]).reshape(-1, 3)
+
+    tx, rx = np.divmod(table.pair, max(len(receivers), 1))
+    standing = np.concatenate([table.object_velocity, np.zeros((1, 3))])
+    return path_geometry(
+        start=stacked(transmitters, "position")[tx],
+        points=table.points,
+        end=stacked(receivers, "position")[rx],
+        count=(table.types != 0).sum(1),
+        start_velocity=stacked(transmitters, "velocity")[tx],
+        point_velocity=standing[table.objects],
+        end_velocity=stacked(receivers, "velocity")[rx],
+    )
+
+
+def _amplitudes(
+    carriers: Sequence[Carrier],
+    table: PathTable,
+    geometry: PathGeometry,
+    transmitters: Sequence[Antenna],
+    receivers: Sequence[Antenna],
+) -> Complex128Array:
+    """a = field_rx · transfer · field_tx · exp(−j2πfτ), Shape ``[C, P]``."""
+    tx, rx = np.divmod(table.pair, max(len(receivers), 1))
+    sent = np.zeros((len(tx), 2))
+    for index, antenna in enumerate(transmitters):
+        mine = tx == index
+        sent[mine] = radiated_field(antenna.array, antenna.rotation, geometry.departure[mine])
+    taken = np.zeros((len(rx), 2))
+    for index, antenna in enumerate(receivers):
+        mine = rx == index
+        taken[mine] = radiated_field(antenna.array, antenna.rotation, geometry.arrival[mine])
+    frequency = np.array([carrier.frequency_hz for carrier in carriers])
+    # The whole turns of f·τ go first: they are millions, and only the rest is a phase.
+    turns = frequency[:, None] * geometry.tau
+    phase = np.exp(-2j * np.pi * (turns - np.round(turns)))
+    a: Complex128Array = np.einsum("pi,cpij,pj->cp", taken, table.transfer, sent) * phase
+    return a
+
+
+def _select(geometry: PathGeometry, which: Int64Array | BoolArray) -> PathGeometry:
+    return PathGeometry(
+        geometry.tau[which], geometry.departure[which], geometry.arrival[which], geometry.doppler_ratio[which]
+    )
+
+
+def _finite(table: PathTable, geometry: PathGeometry, a: Complex128Array) -> BoolArray:
+    finite: BoolArray = (
+        np.isfinite(a).all(0)
+        & np.isfinite(geometry.tau)
+        & np.isfinite(geometry.doppler_ratio)
+        & np.isfinite(geometry.departure).all(-1)
+        & np.isfinite(geometry.arrival).all(-1)
+        & np.isfinite(table.points).all((1, 2))
+    )
+    return finite
+
+
+def _order(table: PathTable, geometry: PathGeometry, a: Complex128Array) -> Int64Array:
+    """Permutation into the order that `Channel` promises.
+
+    Floats are compared exactly, without quantising: a path's values do not depend on the
+    order in which it was found, and a grid would only move the ambiguity to its borders.
+    Amplitude breaks the ties of paths that agree in all else.
+    """
+    depth = table.types.shape[1]
+    aod, aoa = angles(geometry.departure), angles(geometry.arrival)
+    keys: list[np.ndarray[tuple[int, ...], np.dtype[np.generic]]] = [table.pair, (table.types != 0).sum(1)]
+    keys += [table.types[:, d] for d in range(depth)]
+    keys += [table.objects[:, d] for d in range(depth)]
+    keys += [geometry.tau, aod[:, 0], aod[:, 1], aoa[:, 0], aoa[:, 1], a[0].real, a[0].imag]
+    return np.lexsort(keys[::-1]).astype(np.int64)
+
+
+def _ids(table: PathTable) -> UInt64Array:
+    """Stable ids of sorted paths: hash of types, object names and the rank among equals in the pair."""
+    ids = np.zeros(len(table.pair), np.uint64)
+    if not len(ids):
+        return ids
+    depth = table.types.shape[1]
+    discrete = np.concatenate([table.types.astype(np.int32), table.objects], axis=1)
+    kinds, kind = np.unique(discrete, axis=0, return_inverse=True)
+    kind = kind.reshape(-1)
+    base = np.array(
+        [
+            _name_hash(
+                tuple(
+                    (int(t), table.object_names[o])
+                    for t, o in zip(row[:depth], row[depth:], strict=True)
+                    if t
+                )
+            )
+            for row in kinds
+        ],
+        np.uint64,
+    )
+    # Sorted, so paths of one kind and pair stand together: rank = distance to the run's start.
+    starts = np.flatnonzero(np.r_[True, (kind[1:] != kind[:-1]) | (table.pair[1:] != table.pair[:-1])])
+    lengths = np.diff(np.r_[starts, len(ids)])
+    rank = np.arange(len(ids)) - np.repeat(starts, lengths)
+    return _mix(base[kind] + rank.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15))
+
+
+@lru_cache(maxsize=65536)
+def _name_hash(kind: tuple[tuple[int, str], ...]) -> int:
+    text = "\0".join(f"{interaction}\0{name}" for interaction, name in kind)
+    return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little")
+
+
+def _mix(x: UInt64Array) -> UInt64Array:
+    """Finaliser of SplitMix64 (Steele, Lea, Flood 2014): a bijection that spreads every bit."""
+    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return x ^ (x >> np.uint64(31))
+
+
+def _matrices(
+    transmitters: Sequence[Antenna],
+    receivers: Sequence[Antenna],
+    geometry: PathGeometry,
+    a: Complex128Array,
+    offsets: Int64Array,
+) -> tuple[ChannelMatrix, ...]:
+    steered = []
+    for pair in range(len(offsets) - 1):
+        tx, rx = divmod(pair, len(receivers))
+        mine = slice(int(offsets[pair]), int(offsets[pair + 1]))
+        transmit = steering(transmitters[tx].array, transmitters[tx].rotation, geometry.departure[mine])
+        receive = steering(receivers[rx].array, receivers[rx].rotation, geometry.arrival[mine])
+        steered.append((tx, rx, mine, receive, transmit))
+    return tuple(
+        ChannelMatrix(carrier=carrier, tx=tx, rx=rx, h=channel_matrix(a[carrier, mine], receive, transmit))
+        for carrier in range(len(a))
+        for tx, rx, mine, receive, transmit in steered
+    )

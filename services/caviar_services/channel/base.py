@@ -1,0 +1,93 @@
+"""What all channel models share: from a frame to its `Channel` product.
+
+A model finds paths (`ChannelModel.paths`); antennas, carrier phase, order, ids and matrices are
+applied here, in float64, the same way for every rung of the ladder.
+"""
+
+from __future__ import annotations
+
+import time
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar, TypeVar
+
+import msgspec
+
+from caviar_protocol.arrays import BoolArray
+from caviar_protocol.errors import ScenarioError
+from caviar_protocol.messages import Input, Role
+from caviar_protocol.scene import antennas
+from caviar_protocol.topics import ChannelOptions, Scene
+from caviar_services.channel.assemble import Antenna, PathTable, Product, assemble
+from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
+
+S = TypeVar("S", bound=msgspec.Struct)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Found:
+    """What a model found in a frame."""
+
+    table: PathTable
+    los: BoolArray
+    """Whether the line of sight is free, Shape ``[T, R]``."""
+    counts: dict[str, int] = field(default_factory=dict)
+
+
+class ChannelModel(Service[S]):
+    """Base of channel models.
+
+    A model sets ``rung`` and implements `paths`; it loads what it needs in `load` and says in
+    `options` what it models.
+    """
+
+    role: ClassVar[Role] = "channel"
+    inputs: ClassVar[tuple[Input, ...]] = (Input(topic="scene"),)
+    outputs: ClassVar[tuple[str, ...]] = ("channel",)
+    rung: ClassVar[str]
+
+    def __init__(self, settings: S, run: RunInfo) -> None:
+        super().__init__(settings, run)
+        if not run.carriers:
+            raise ScenarioError(
+                "a channel needs at least one carrier; add [[carriers]] with name and frequency_hz",
+                key="carriers",
+            )
+        self._with_h = False
+
+    @property
+    def options(self) -> ChannelOptions:
+        """What the products model."""
+        return ChannelOptions()
+
+    def load(self, preparation: Preparation) -> tuple[str, ...]:
+        """Load scenery, compile, warm up; notes for the user."""
+        return ()
+
+    @abstractmethod
+    def paths(self, scene: Scene, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]) -> Found:
+        """Paths of all TX/RX pairs of a scene, in any order."""
+
+    def prepare(self, preparation: Preparation) -> Prepared:
+        self._with_h = "h" in preparation.demand.get("channel", frozenset())
+        return Prepared(notes=self.load(preparation))
+
+    def step(self, frame: Frame) -> StepResult:
+        scene = frame.scene()
+        transmitters = [Antenna.of(scene, device) for device in antennas(scene, "tx")]
+        receivers = [Antenna.of(scene, device) for device in antennas(scene, "rx")]
+        begin = time.perf_counter_ns()
+        found = self.paths(scene, transmitters, receivers)
+        traced = time.perf_counter_ns()
+        product = Product(
+            rung=self.rung, options=self.options, carriers=self.run.carriers, with_h=self._with_h
+        )
+        channel = assemble(product, transmitters, receivers, found.table, found.los)
+        done = time.perf_counter_ns()
+        return StepResult(
+            products={"channel": channel},
+            fidelity=self.rung,
+            counts={"paths": len(channel.tau), "dropped": channel.dropped, **found.counts},
+            measured={"paths": traced - begin, "assemble": done - traced},
+        )

@@ -1,0 +1,70 @@
+"""Rung ``free-space``: the line of sight by formula, occlusion ignored.
+
+Needs no ray tracer. a = λ/(4πd) · (field of RX · field of TX) · exp(−j2πfτ) with τ = d/c (Friis
+1946, with the polarisation mismatch of the two elements).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import msgspec
+import numpy as np
+
+from caviar_protocol.arrays import Complex128Array, Float64Array
+from caviar_protocol.coordinates import SPEED_OF_LIGHT
+from caviar_protocol.topics import Scene
+from caviar_services.channel.arrays import spherical_basis
+from caviar_services.channel.assemble import Antenna, PathTable
+from caviar_services.channel.base import ChannelModel, Found
+
+
+class FreeSpaceSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The model has nothing to set."""
+
+
+class FreeSpaceChannel(ChannelModel[FreeSpaceSettings]):
+    """One path for each TX/RX pair.
+
+    A pair closer than one wavelength of a carrier, so also a device and itself, is outside the
+    far field that the formula holds in: it has no path and counts as ``too_close``.
+    """
+
+    Settings: ClassVar[type[msgspec.Struct]] = FreeSpaceSettings
+    rung: ClassVar[str] = "free-space"
+
+    def paths(self, scene: Scene, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]) -> Found:
+        start = np.array([antenna.position for antenna in transmitters]).reshape(-1, 1, 3)
+        end = np.array([antenna.position for antenna in receivers]).reshape(1, -1, 3)
+        line = (end - start).reshape(-1, 3)
+        distance = np.sqrt((line**2).sum(-1))
+        wavelength = SPEED_OF_LIGHT / np.array([carrier.frequency_hz for carrier in self.run.carriers])
+        far = np.flatnonzero(distance >= wavelength.max())
+        direction = line[far] / distance[far, None]
+        spreading = wavelength[:, None] / (4 * np.pi * distance[far])
+        table = PathTable(
+            pair=far,
+            transfer=spreading[:, :, None, None] * line_transfer(direction),
+            types=np.zeros((len(far), 0), np.uint8),
+            objects=np.zeros((len(far), 0), np.int32),
+            points=np.zeros((len(far), 0, 3)),
+            object_names=(),
+            object_velocity=np.zeros((0, 3)),
+        )
+        return Found(
+            table=table,
+            los=np.ones((len(transmitters), len(receivers)), bool),
+            counts={"too_close": len(distance) - len(far)},
+        )
+
+
+def line_transfer(direction: Float64Array) -> Complex128Array:
+    """Transfer of a straight line between the spherical bases at its ends, Shape ``[P, 2, 2]``.
+
+    ``direction`` [P, 3] points from TX to RX; the basis at RX is that of the direction back.
+    """
+    sent = np.stack(spherical_basis(direction), axis=-2)
+    taken = np.stack(spherical_basis(-direction), axis=-2)
+    transfer: Complex128Array = np.einsum("pix,pjx->pij", taken, sent).astype(np.complex128)
+    return transfer

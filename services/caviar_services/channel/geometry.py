@@ -1,0 +1,70 @@
+"""Delays, directions and Doppler shifts of paths from their corner points, in float64."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from caviar_protocol.arrays import Float64Array, Int64Array
+from caviar_protocol.coordinates import SPEED_OF_LIGHT
+
+
+@dataclass(frozen=True, eq=False)
+class PathGeometry:
+    """What follows from the corner points of P paths."""
+
+    tau: Float64Array
+    """Absolute delay [s], Shape ``[P]``."""
+    departure: Float64Array
+    """Unit vectors from TX along the first segment, world axes, Shape ``[P, 3]``."""
+    arrival: Float64Array
+    """Unit vectors from RX back along the last segment, world axes, Shape ``[P, 3]``."""
+    doppler_ratio: Float64Array
+    """Doppler shift over carrier frequency, Shape ``[P]``."""
+
+
+def path_geometry(
+    start: Float64Array,
+    points: Float64Array,
+    end: Float64Array,
+    count: Int64Array,
+    start_velocity: Float64Array,
+    point_velocity: Float64Array,
+    end_velocity: Float64Array,
+) -> PathGeometry:
+    """Geometry of paths start → points → end.
+
+    Parameters
+    ----------
+    start, end
+        TX and RX position of each path [m], Shape ``[P, 3]``; likewise their velocities [m/s].
+    points
+        Interaction points [m], Shape ``[P, D, 3]``; entries from ``count`` on are ignored. Likewise
+        ``point_velocity``, the velocity [m/s] of what stands at each point.
+    count
+        Number of interactions of each path, Shape ``[P]``.
+
+    Notes
+    -----
+    Doppler shift to first order in v/c, with unit vector k_i of the segment behind corner i:
+    f_D / f = Σ_i (v_i − v_{i+1})·k_i / c (a source that approaches raises the frequency).
+    """
+    paths, depth = points.shape[:2]
+    corners = np.concatenate([start[:, None], points, end[:, None]], axis=1)
+    velocity = np.concatenate([start_velocity[:, None], point_velocity, end_velocity[:, None]], axis=1)
+    # Unused corners move onto the receiver, so that their segments have length zero.
+    unused = np.arange(depth + 2) > count[:, None]
+    corners = np.where(unused[..., None], end[:, None], corners)
+    velocity = np.where(unused[..., None], end_velocity[:, None], velocity)
+
+    segment = np.diff(corners, axis=1)
+    length = np.sqrt((segment**2).sum(-1))
+    along = segment / np.where(length > 0, length, 1.0)[..., None]
+    rows = np.arange(paths)
+    return PathGeometry(
+        tau=length.sum(-1) / SPEED_OF_LIGHT,
+        departure=along[:, 0],
+        arrival=-along[rows, count],
+        doppler_ratio=-(np.diff(velocity, axis=1) * along).sum((1, 2)) / SPEED_OF_LIGHT,
+    )
