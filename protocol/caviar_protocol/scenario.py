@@ -1,18 +1,20 @@
 """The scenario file: what a run consists of.
 
 TOML, validated as a whole before anything starts. A key that is not known here is an error that
-names the file, the line and the key that was probably meant.
+names the file, the line and the key that was probably meant. This module has the types;
+`scenario_loader` reads files, `scenario_checks` holds the rules between keys.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
 from msgspec import Meta
 
 from caviar_protocol.arrays import Vector3, quantity
 from caviar_protocol.messages import Policy, Role
+from caviar_protocol.tables import Source
 from caviar_protocol.topics.channel import Carrier
 from caviar_protocol.topics.scene import AntennaArray
 
@@ -28,6 +30,9 @@ class Timeouts(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     ready_s: Annotated[float, quantity("s", "for READY, beyond a declared grace", gt=0)] = 120.0
     reset_s: Annotated[float, quantity("s", "for RESET_DONE", gt=0)] = 60.0
     stall_s: Annotated[float, quantity("s", "without progress, under wait", gt=0)] = 30.0
+    rejoin_s: Annotated[
+        float, quantity("s", "for a service that died to come back; 0: the run ends", ge=0)
+    ] = 0.0
     shutdown_s: Annotated[float, quantity("s", "for BYE; then the process is killed", gt=0)] = 2.0
     heartbeat_s: Annotated[float, quantity("s", "between heartbeats", gt=0)] = 0.25
     liveness_s: Annotated[float, quantity("s", "silence after which a remote peer is gone", gt=0)] = 1.5
@@ -40,7 +45,7 @@ class Run(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     frames: Annotated[int, quantity("frame", "of an episode", ge=1)]
     sampling_period_ns: Annotated[int, quantity("ns", "T_sam", gt=0)] = 100_000_000
     episodes: Annotated[int, quantity("1", "episodes", ge=1)] = 1
-    seed: Annotated[int, quantity("1", "seed of everything random", ge=0, lt=2**63)] = 1
+    seed: Annotated[int, quantity("1", "seed of everything random", ge=0, le=2**63 - 1)] = 1
     pace: Literal["fast", "realtime"] = "fast"
     record: tuple[str, ...] = ()
     """Topics that are produced because they shall be recorded, though nobody else asks (clause 5)."""
@@ -84,6 +89,8 @@ class DeviceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True
 class ServiceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One service of the run."""
 
+    unknown_key_hint: ClassVar[str] = "settings of the implementation stand in its table `settings`"
+
     role: Role
     use: str
     """Registered implementation of that role."""
@@ -101,8 +108,12 @@ class ServiceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 class Scenario(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A whole scenario file."""
 
+    not_in_file: ClassVar[tuple[str, ...]] = ("source",)
+
     run: Run
     services: dict[str, ServiceSpec]
     timeouts: Timeouts = Timeouts()
     carriers: tuple[Carrier, ...] = ()
     devices: tuple[DeviceSpec, ...] = ()
+    source: Source = Source()
+    """Where this was read from, so that whatever turns out wrong later can name the line."""

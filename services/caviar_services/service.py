@@ -193,6 +193,8 @@ class Service(ABC, Generic[S]):
     role: ClassVar[Role]
     inputs: ClassVar[tuple[Input, ...]] = ()
     outputs: ClassVar[tuple[str, ...]] = ()
+    uses_scenery: ClassVar[bool] = False
+    """Whether the assets of the run are fetched for this service before `prepare` (clause 4)."""
     Settings: ClassVar[type[msgspec.Struct]]
     """Settings from the scenario: a frozen struct, ``forbid_unknown_fields=True``, units in names."""
 

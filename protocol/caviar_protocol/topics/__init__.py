@@ -57,14 +57,10 @@ PAYLOADS: dict[str, type[Payload]] = {
 """Payload class of each topic."""
 
 PARTS: dict[str, tuple[str, ...]] = {
-    "scene": (),
-    "channel": ("paths", "h"),
-    "lidar": ("points", "grid"),
-    "camera": (),
-    "depth": (),
+    "channel": ("h",),
+    "lidar": ("grid",),
+    "depth": ("normals",),
     "segmentation": ("materials",),
-    "action": (),
-    "link": (),
 }
 """Parts of a payload that are computed only where a consumer asks for them (contract, clause 5)."""
 

@@ -1,0 +1,217 @@
+"""The graph of a run, built from what its services declared (contract, clauses 3 and 5)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+
+from caviar_protocol.errors import DeclarationError
+from caviar_protocol.messages import Demand, Hello, Input
+
+WILDCARD = "*"
+"""Topic of an input that takes every topic (recorders)."""
+
+
+@dataclass(frozen=True)
+class Edge:
+    """One input of a consumer, resolved to a source."""
+
+    topic: str
+    source: str
+    lag: int
+    required: bool
+
+
+@dataclass(frozen=True)
+class Graph:
+    """Who gets what from whom, among the services that are run."""
+
+    order: tuple[str, ...]
+    """Active services, producers before the consumers of their frame."""
+    inputs: Mapping[str, tuple[Edge, ...]]
+    """Edges into each active service, sorted by (topic, source)."""
+    consumers: Mapping[str, tuple[str, ...]]
+    """Active services that take something from a service, at any lag."""
+    outputs: Mapping[str, tuple[str, ...]]
+    """Topics in demand of each active service, sorted."""
+    demand: Mapping[str, tuple[Demand, ...]]
+    """What PREPARE tells each service, active or not."""
+    producers: Mapping[str, tuple[str, ...]]
+    """Sources of each topic, sorted."""
+    retained: frozenset[str]
+    """Active services whose products someone takes with lag 1."""
+    idle: tuple[str, ...]
+    """Services that nobody asks for anything: not run."""
+
+
+def build_graph(hellos: Mapping[str, Hello], record: Iterable[str] = ()) -> Graph:
+    """Graph of the declarations, or `DeclarationError` naming what does not fit.
+
+    ``record`` holds ``topic`` or ``topic.part`` entries that are in demand for the recording.
+    """
+    producers = _producers(hellos)
+    edges = {name: _edges(hello, producers) for name, hello in hellos.items()}
+    order = _topological_order(hellos, edges)
+    wanted = _recorded_parts(record, producers)
+    active = _active(hellos, edges, producers, wanted)
+    recorders = {name for name, hello in hellos.items() if hello.role == "recorder"}
+    inputs = {
+        name: tuple(sorted((e for e in edges[name] if e.source in active), key=_edge_key)) for name in active
+    }
+    consumed = {(e.topic, e.source) for name in active - recorders for e in inputs[name]}
+    outputs = {
+        name: tuple(sorted(t for t in hellos[name].outputs if (t, name) in consumed or t in wanted))
+        for name in active
+    }
+    inputs = {
+        name: tuple(edge for edge in found if edge.topic in outputs[edge.source])
+        for name, found in inputs.items()
+    }
+    return Graph(
+        order=tuple(name for name in order if name in active),
+        inputs=inputs,
+        consumers={
+            name: tuple(sorted(c for c in active if any(e.source == name for e in inputs[c])))
+            for name in active
+        },
+        outputs=outputs,
+        demand={
+            name: tuple(
+                Demand(topic=topic, parts=_parts(topic, hellos, active, wanted))
+                for topic in outputs.get(name, ())
+            )
+            for name in hellos
+        },
+        producers=producers,
+        retained=frozenset(e.source for found in inputs.values() for e in found if e.lag == 1),
+        idle=tuple(sorted(hellos.keys() - active)),
+    )
+
+
+def check_prefixes(prefixes: Mapping[str, Iterable[str]]) -> None:
+    """Raise `DeclarationError` where two worlds could give an object the same name (clause 3)."""
+    claimed = [(prefix, world) for world, found in prefixes.items() for prefix in found]
+    for index, (prefix, world) in enumerate(claimed):
+        for other_prefix, other in claimed[:index]:
+            if other != world and (prefix.startswith(other_prefix) or other_prefix.startswith(prefix)):
+                raise DeclarationError(
+                    f"worlds {other!r} and {world!r} clash: object names may begin with "
+                    f"{other_prefix!r} in the one and {prefix!r} in the other; give one of them "
+                    "another `prefix` in its settings"
+                )
+
+
+def check_actuators(actuators: Mapping[str, Iterable[str]]) -> None:
+    """Raise `DeclarationError` where two agents own the same actuator (clauses 3 and 17)."""
+    claimed = [(pattern, agent) for agent, found in actuators.items() for pattern in found]
+    for index, (pattern, agent) in enumerate(claimed):
+        for other_pattern, other in claimed[:index]:
+            if other != agent and (
+                fnmatchcase(pattern, other_pattern) or fnmatchcase(other_pattern, pattern)
+            ):
+                raise DeclarationError(
+                    f"agents {other!r} and {agent!r} clash: both own {pattern!r} "
+                    f"({other!r} as {other_pattern!r}); give each its own `users`"
+                )
+
+
+def _edge_key(edge: Edge) -> tuple[str, str, int]:
+    return edge.topic, edge.source, edge.lag
+
+
+def _producers(hellos: Mapping[str, Hello]) -> dict[str, tuple[str, ...]]:
+    found: dict[str, list[str]] = {}
+    for name in sorted(hellos):
+        for topic in hellos[name].outputs:
+            found.setdefault(topic, []).append(name)
+    return {topic: tuple(names) for topic, names in found.items()}
+
+
+def _edges(hello: Hello, producers: Mapping[str, tuple[str, ...]]) -> list[Edge]:
+    edges = []
+    for entry in hello.inputs:
+        for topic in producers if entry.topic == WILDCARD else (entry.topic,):
+            sources = producers.get(topic, ())
+            if entry.required and not sources:
+                raise DeclarationError(
+                    f"{hello.role} {hello.name!r} needs topic {topic!r}, which no service of the run "
+                    f"produces; add one that does (topics there are: {', '.join(sorted(producers))})"
+                )
+            edges += [
+                Edge(topic, s, entry.lag, entry.required) for s in sources if s != hello.name or entry.lag
+            ]
+    return edges
+
+
+def _topological_order(hellos: Mapping[str, Hello], edges: Mapping[str, list[Edge]]) -> list[str]:
+    order: list[str] = []
+    trail: list[str] = []
+
+    def visit(name: str) -> None:
+        if name in order:
+            return
+        if name in trail:
+            cycle = [*trail[trail.index(name) :], name]
+            raise DeclarationError(
+                "a cycle within one frame: "
+                + " → ".join(
+                    f"{service} needs" if i < len(cycle) - 1 else service for i, service in enumerate(cycle)
+                )
+                + "; let one of these inputs have lag 1"
+            )
+        trail.append(name)
+        for edge in edges[name]:
+            if edge.lag == 0:
+                visit(edge.source)
+        trail.pop()
+        order.append(name)
+
+    for name in sorted(hellos):
+        visit(name)
+    return order
+
+
+def _recorded_parts(record: Iterable[str], producers: Mapping[str, tuple[str, ...]]) -> dict[str, set[str]]:
+    wanted: dict[str, set[str]] = {}
+    for entry in record:
+        topic, _, part = entry.partition(".")
+        if topic not in producers:
+            raise DeclarationError(
+                f"run.record names {entry!r}, and no service of the run produces {topic!r}"
+            )
+        wanted.setdefault(topic, set()).update({part} - {""})
+    return wanted
+
+
+def _active(
+    hellos: Mapping[str, Hello],
+    edges: Mapping[str, list[Edge]],
+    producers: Mapping[str, tuple[str, ...]],
+    wanted: Mapping[str, set[str]],
+) -> set[str]:
+    active: set[str] = set()
+    recorders = {name for name, hello in hellos.items() if hello.role == "recorder"}
+    todo = [
+        name for name, h in hellos.items() if h.role == "agent" or (not h.outputs and name not in recorders)
+    ]
+    todo += [name for topic in wanted for name in producers[topic]]
+    while todo:
+        name = todo.pop()
+        if name not in active:
+            active.add(name)
+            todo += [edge.source for edge in edges[name]]
+    return active | recorders
+
+
+def _parts(
+    topic: str, hellos: Mapping[str, Hello], active: set[str], wanted: Mapping[str, set[str]]
+) -> tuple[str, ...]:
+    parts = set(wanted.get(topic, ()))
+    for name in active:
+        parts.update(p for e in hellos[name].inputs if _takes(e, topic) for p in e.parts)
+    return tuple(sorted(parts))
+
+
+def _takes(entry: Input, topic: str) -> bool:
+    return entry.topic == topic

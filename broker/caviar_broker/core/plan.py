@@ -1,0 +1,101 @@
+"""What the core is told about a run before it starts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from caviar_protocol.messages import Policy, Role
+from caviar_protocol.scenario import Scenario
+
+SECOND = 1_000_000_000
+"""[ns]"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServicePlan:
+    """One service that the run expects."""
+
+    name: str
+    role: Role
+    budget_ns: int
+    policy: Policy = "wait"
+    max_in_flight: int = 1
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    scenario: Mapping[str, Any] = field(default_factory=dict)
+    """What WELCOME tells it about the scenario."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """How long the core waits for what [ns]; see `caviar_protocol.scenario.Timeouts`."""
+
+    connect: int = 30 * SECOND
+    ready: int = 120 * SECOND
+    reset: int = 60 * SECOND
+    stall: int = 30 * SECOND
+    shutdown: int = 2 * SECOND
+    heartbeat: int = SECOND // 4
+    liveness: int = 3 * SECOND // 2
+    rejoin: int = 0
+    """0: a service that dies ends the run."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunPlan:
+    """A run: its services, its frames, its rules."""
+
+    run: str
+    services: tuple[ServicePlan, ...]
+    frames: int
+    sampling_period_ns: int
+    episodes: int = 1
+    seed: int = 0
+    realtime: bool = False
+    record: tuple[str, ...] = ()
+    """``topic`` or ``topic.part`` that is produced because it shall be recorded (clause 5)."""
+    frames_in_flight: int = 4
+    limits: Limits = Limits()
+    epoch: int = 1
+
+    def t_ns(self, frame: int) -> int:
+        """Simulated time of a frame of any episode [ns]."""
+        return frame * self.sampling_period_ns
+
+
+def plan_run(scenario: Scenario, run: str, told: Mapping[str, Mapping[str, Any]]) -> RunPlan:
+    """Plan of a validated scenario; ``told`` is what WELCOME says to each service by name."""
+    t = scenario.timeouts
+    return RunPlan(
+        run=run,
+        services=tuple(
+            ServicePlan(
+                name=name,
+                role=spec.role,
+                budget_ns=round(spec.budget_ms * 1e6),
+                policy=spec.policy,
+                max_in_flight=spec.max_in_flight,
+                settings=spec.settings,
+                scenario=told.get(name, {}),
+            )
+            for name, spec in scenario.services.items()
+        ),
+        frames=scenario.run.frames,
+        sampling_period_ns=scenario.run.sampling_period_ns,
+        episodes=scenario.run.episodes,
+        seed=scenario.run.seed,
+        realtime=scenario.run.pace == "realtime",
+        record=scenario.run.record,
+        frames_in_flight=scenario.run.frames_in_flight,
+        limits=Limits(
+            connect=round(t.connect_s * SECOND),
+            ready=round(t.ready_s * SECOND),
+            reset=round(t.reset_s * SECOND),
+            stall=round(t.stall_s * SECOND),
+            shutdown=round(t.shutdown_s * SECOND),
+            heartbeat=round(t.heartbeat_s * SECOND),
+            liveness=round(t.liveness_s * SECOND),
+            rejoin=round(t.rejoin_s * SECOND),
+        ),
+    )
