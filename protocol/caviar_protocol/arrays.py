@@ -63,6 +63,11 @@ def quantity(unit: str, doc: str, **constraints: Any) -> Any:
     return msgspec.Meta(description=doc, extra={"unit": unit}, **constraints)
 
 
+def described(doc: str, **constraints: Any) -> Any:
+    """Describe a field that has no unit: a name, a text, a flag."""
+    return msgspec.Meta(description=doc, extra={"unit": ""}, **constraints)
+
+
 Vector3 = Annotated[tuple[float, float, float], quantity("m", "x (east), y (north), z (up)")]
 Quaternion = Annotated[
     tuple[float, float, float, float],
