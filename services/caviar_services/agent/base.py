@@ -1,0 +1,94 @@
+"""What every beam-selecting agent is: whom it serves, and what it hears."""
+
+from __future__ import annotations
+
+import re
+from abc import abstractmethod
+from collections.abc import Iterable, Sequence
+from typing import ClassVar, TypeVar
+
+import msgspec
+
+from caviar_protocol.errors import ScenarioError
+from caviar_protocol.messages import Input, Role
+from caviar_protocol.topics import Action, BeamChoice, Scene
+from caviar_services.link.users import Pair, pairs_of
+from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
+
+BEAM = "beam:"
+"""Prefix of the actuators that steer beams; the receiver's name follows."""
+
+
+class AgentSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Whom an agent serves. A default agent serves everybody whom no other agent owns."""
+
+    users: tuple[str, ...] = ("*",)
+    """Receivers this agent owns, as names with ``*`` for any text (``car.*``); a leading
+    ``beam:`` may stand before each."""
+    except_users: tuple[str, ...] = ()
+    """Receivers among them that other agents own, in the same form."""
+
+
+S = TypeVar("S", bound=AgentSettings)
+
+
+class Agent(Service[S]):
+    """Base of agents that choose a beam pair for each of their users, every frame.
+
+    Subclasses implement `choose`. The final grant of an episode takes no action (contract,
+    clause 16).
+    """
+
+    role: ClassVar[Role] = "agent"
+    inputs: ClassVar[tuple[Input, ...]] = (
+        Input(topic="scene"),
+        Input(topic="link", lag=1, required=False),
+    )
+    outputs: ClassVar[tuple[str, ...]] = ("action",)
+
+    def __init__(self, settings: S, run: RunInfo) -> None:
+        super().__init__(settings, run)
+        self._owned = Patterns(settings.users, f"services.{run.name}.users")
+        self._others = Patterns(settings.except_users, f"services.{run.name}.settings.except_users")
+
+    def prepare(self, preparation: Preparation) -> Prepared:
+        """Declare the actuators. One that leaves users to others owns nothing by name."""
+        if self._others.texts:
+            return Prepared(notes=("serves the users whom no other agent owns",))
+        return Prepared(actuators=tuple(BEAM + text for text in self._owned.texts))
+
+    def step(self, frame: Frame) -> StepResult:
+        """One choice per user, sorted by actuator, then TX, then carrier."""
+        if frame.final:
+            return StepResult()
+        scene = frame.scene()
+        pairs = [pair for pair in pairs_of(scene) if self.serves(pair.rx.name)]
+        choices = sorted(self.choose(frame, scene, pairs), key=lambda c: (c.rx, c.tx, c.carrier))
+        return StepResult(products={"action": Action(commands=tuple(choices))})
+
+    def serves(self, rx: str) -> bool:
+        """Whether this agent serves the receiver of that name."""
+        return self._owned.match(rx) and not self._others.match(rx)
+
+    @abstractmethod
+    def choose(self, frame: Frame, scene: Scene, pairs: Sequence[Pair]) -> Iterable[BeamChoice]:
+        """Beam choices for these pairs, in any order; a pair without one is not served."""
+
+
+class Patterns:
+    """Names in which ``*`` stands for any text, all else for itself."""
+
+    def __init__(self, patterns: Iterable[str], key: str) -> None:
+        self.texts = tuple(pattern.removeprefix(BEAM) for pattern in patterns)
+        for text in self.texts:
+            if text.startswith(("motion:", "schedule:")):
+                raise ScenarioError(
+                    f"{text!r} is no beam: this agent steers beams only; write 'beam:<receiver>'", key=key
+                )
+        self._regular = re.compile(
+            "|".join(".*".join(map(re.escape, text.split("*"))) for text in self.texts) or r"(?!)", re.DOTALL
+        )
+
+    def match(self, name: str) -> bool:
+        """Whether one of the patterns matches the whole name."""
+        return self._regular.fullmatch(name) is not None

@@ -1,0 +1,31 @@
+"""Agent ``los-beam``: the baseline of the paper (section 4).
+
+It chooses the beams that point along the straight line between transmitter and receiver, from
+positions and orientations alone, whether or not that line is free.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from caviar_protocol.topics import BeamChoice, Scene
+from caviar_services.agent.base import Agent, AgentSettings
+from caviar_services.link.codebook import beam_towards
+from caviar_services.link.users import Pair, directions
+from caviar_services.service import Frame
+
+
+class LosBeamAgent(Agent[AgentSettings]):
+    """Points both beams along the straight line."""
+
+    Settings = AgentSettings
+
+    def choose(self, frame: Frame, scene: Scene, pairs: Sequence[Pair]) -> Iterator[BeamChoice]:
+        """The straight-line pair of each user, the same on every carrier."""
+        for pair, at_tx, at_rx in zip(pairs, *directions(scene, pairs), strict=True):
+            yield BeamChoice(
+                tx=pair.tx.name,
+                rx=pair.rx.name,
+                tx_beam=int(beam_towards(pair.tx.array, at_tx)),
+                rx_beam=int(beam_towards(pair.rx.array, at_rx)),
+            )

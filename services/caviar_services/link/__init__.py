@@ -1,0 +1,1 @@
+"""Links: what the communication system achieves with the beams that were chosen."""

@@ -1,0 +1,28 @@
+"""What every link is: channel, scene and actions of a frame in, `Link` out."""
+
+from __future__ import annotations
+
+from typing import ClassVar, TypeVar
+
+import msgspec
+
+from caviar_protocol.messages import Input, Role
+from caviar_services.service import Service
+
+S = TypeVar("S", bound=msgspec.Struct)
+
+
+class LinkModel(Service[S]):
+    """Base of all links.
+
+    A link turns the channels of a frame and the agents' choices into what the users got. It
+    scores every user, served or not, so that agents can be compared with the best possible.
+    """
+
+    role: ClassVar[Role] = "link"
+    inputs: ClassVar[tuple[Input, ...]] = (
+        Input(topic="channel", parts=("h",)),
+        Input(topic="scene"),
+        Input(topic="action", required=False),
+    )
+    outputs: ClassVar[tuple[str, ...]] = ("link",)

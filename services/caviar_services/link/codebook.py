@@ -1,0 +1,92 @@
+"""DFT codebooks: beams, the beam towards a direction, the direction of a beam.
+
+Beam ``k`` of an array is a unit-norm vector c_k in element order. It is matched to waves from
+the direction it points to: a receiver combines with ``w = c_k``, a transmitter precodes with
+``f = conj(c_k)``, so that one index means one direction at both ends. With eq. (1) of the
+paper, ``y = w* H f``, a single path of amplitude a that lies on both grids gives
+``|y| = sqrt(Nr·Nt)·|a|``.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+
+from caviar_protocol.arrays import Complex128Array, Float64Array, Int64Array
+from caviar_protocol.errors import PayloadError
+from caviar_protocol.topics.scene import AntennaArray
+
+
+def dft_codebook(array: AntennaArray) -> Complex128Array:
+    """All beams of an array, Shape ``[N, N]``: beam ``k`` is row ``k``, of norm 1.
+
+    Beam ``k`` combines row beam ``k % rows`` and column beam ``k // rows``, in the order of the
+    elements: the Kronecker product of two DFT matrices with entries
+    ``exp(+j2πkn/N)/sqrt(N)`` (Tse and Viswanath, section 7.3.4).
+    """
+    columns, rows = _dft(array.columns), _dft(array.rows)
+    codebook: Complex128Array = np.einsum("ac,br->abcr", columns, rows).reshape(array.size, array.size)
+    return codebook
+
+
+def _dft(size: int) -> Complex128Array:
+    """Unitary matrix with entry (k, n) = exp(+j2πkn/N)/sqrt(N)."""
+    n = np.arange(size)
+    # k·n is reduced modulo N first, so that the phase of large codebooks keeps full precision.
+    matrix: Complex128Array = np.exp(2j * np.pi * (np.outer(n, n) % size) / size) / math.sqrt(size)
+    return matrix
+
+
+def beam_towards(array: AntennaArray, directions: Float64Array) -> Int64Array:
+    """Beam with the greatest ``|c_k* a(k̂)|`` towards each direction; Shape ``[..., 3]`` to ``[...]``.
+
+    ``directions`` are unit vectors in device axes. The maximum is searched over all beams, so
+    wrapped beams, end-fire directions and spacings other than half a wavelength need no special
+    cases. Of beams with equal gain the lowest index is taken.
+    """
+    column_beam = _best_of_axis(array.columns, array.horizontal_spacing * directions[..., 1])
+    row_beam = _best_of_axis(array.rows, -array.vertical_spacing * directions[..., 2])
+    beams: Int64Array = column_beam * array.rows + row_beam
+    return beams
+
+
+def _best_of_axis(size: int, frequency: Float64Array) -> Int64Array:
+    """DFT beam with the greatest response to ``exp(j2π·frequency·n)``, Shape ``[...]``.
+
+    The response of a planar beam is the product of those of its axes, so each has its own maximum.
+    """
+    response = np.abs(np.fft.fft(np.exp(2j * np.pi * np.multiply.outer(frequency, np.arange(size)))))
+    best: Int64Array = np.argmax(response, axis=-1).astype(np.int64)
+    return best
+
+
+def pointing_directions(array: AntennaArray, beam: int) -> Float64Array:
+    """Directions in which a beam has its full gain ``sqrt(N)``, Shape ``[L, 3]``, unit vectors.
+
+    Only the half space in front of the array (x ≥ 0) is listed; an array is blind to the sign
+    of x. Along an axis with a single element the beam is a fan, of which the centre is given.
+    L > 1 where there are grating lobes (spacing ≥ λ/2), nearest to boresight first; L = 0 for a
+    beam without a real direction (spacing < λ/2). Raises `PayloadError` for an unknown index.
+    """
+    if not 0 <= beam < array.size:
+        raise PayloadError(f"beam {beam} does not exist, the codebook has beams 0 to {array.size - 1}")
+    along_y = _axis_cosines(array.columns, beam // array.rows, array.horizontal_spacing)
+    along_z = [-u for u in _axis_cosines(array.rows, beam % array.rows, array.vertical_spacing)]
+    found = [
+        (math.sqrt(max(0.0, 1 - y * y - z * z)), y, z)
+        for y, z in itertools.product(along_y, along_z)
+        if y * y + z * z <= 1
+    ]
+    found.sort(key=lambda vector: (-vector[0], vector[1], vector[2]))
+    return np.array(found, dtype=np.float64).reshape(-1, 3)
+
+
+def _axis_cosines(size: int, beam: int, spacing: float) -> list[float]:
+    """Direction cosines u within ±1 with ``spacing·u = beam/size`` modulo 1."""
+    if size == 1:
+        return [0.0]
+    lowest = math.ceil(-spacing - beam / size)
+    highest = math.floor(spacing - beam / size)
+    return [(beam / size + turn) / spacing for turn in range(lowest, highest + 1)]

@@ -1,0 +1,47 @@
+"""The sweep over all beam pairs, and the best of them (paper, eq. 1 and 2)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from caviar_protocol.arrays import Complex128Array, Float64Array, Int32Array
+from caviar_protocol.topics.scene import AntennaArray
+
+
+class Pairs(NamedTuple):
+    """Beam pairs, best first, Shape ``[k]`` each."""
+
+    tx_beam: Int32Array
+    rx_beam: Int32Array
+    abs_y: Float64Array
+
+
+def sweep(h: Complex128Array, tx: AntennaArray, rx: AntennaArray) -> Float64Array:
+    """|y| of every pair of DFT beams, Shape ``[..., Nr, Nt]`` to ``[..., Nt, Nr]``.
+
+    y = w* H f (paper, eq. 1) with the beams of `codebook.dft_codebook`. Both conj(w) and f have
+    entries exp(−j2πkn/N)/sqrt(N), so the product over all pairs is a Fourier transform over the
+    columns and rows of both arrays, and no codebook of N² entries has to be formed.
+    """
+    leading = h.shape[:-2]
+    elements = h.reshape(*leading, rx.columns, rx.rows, tx.columns, tx.rows)
+    y = np.fft.fftn(elements, axes=(-4, -3, -2, -1), norm="ortho").reshape(*leading, rx.size, tx.size)
+    magnitude: Float64Array = np.ascontiguousarray(np.abs(y).swapaxes(-1, -2))
+    return magnitude
+
+
+def best_pairs(abs_y: Float64Array, k: int) -> Pairs:
+    """The ``k`` pairs with the greatest |y|, Shape ``[Nt, Nr]``; all of them where there are fewer.
+
+    The first one is eq. (2) of the paper. Of equal ones the lowest pair index
+    ``tx_beam·Nr + rx_beam`` comes first.
+    """
+    flat = abs_y.ravel()
+    k = min(k, flat.size)
+    threshold = np.partition(flat, flat.size - k)[flat.size - k]
+    candidates = np.flatnonzero(flat >= threshold)
+    order = candidates[np.argsort(-flat[candidates], kind="stable")][:k]
+    tx_beam, rx_beam = np.divmod(order, abs_y.shape[1])
+    return Pairs(tx_beam.astype(np.int32), rx_beam.astype(np.int32), flat[order])
