@@ -1,0 +1,1 @@
+"""Worlds: where everything is, frame by frame."""

@@ -1,0 +1,133 @@
+"""What every virtual world does: names, devices, scenery, and the ``scene`` payload.
+
+To add a world, subclass `World`, say in `objects_at` where things are, and register the class.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterable, Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, ClassVar, NamedTuple, TypeVar
+
+import msgspec
+import numpy as np
+
+from caviar_protocol.arrays import Float64Array, quantity
+from caviar_protocol.coordinates import UnitQuaternion, Vector
+from caviar_protocol.errors import PayloadError
+from caviar_protocol.messages import Role
+from caviar_protocol.topics import Scene
+from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
+from caviar_services.world.assets import object_assets, scenery_assets
+from caviar_services.world.devices import Mounts
+
+
+class ObjectState(NamedTuple):
+    """One object at one instant."""
+
+    name: str
+    kind: str
+    """Its class: ``car``, ``truck``, ``bus``, ``uav``, ``pedestrian``, …"""
+    position: Vector
+    """Centre of the bounding box [m]."""
+    orientation: UnitQuaternion
+    velocity: Vector
+    """[m/s], world axes."""
+    dimensions: Vector
+    """Length (x), width (y), height (z) [m]."""
+
+
+class WorldSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings that all worlds share."""
+
+    prefix: Annotated[str | None, quantity("1", "what the names of its objects begin with")] = None
+    """Unset: the world chooses. No two worlds of a run may share a prefix."""
+    scenery: str = ""
+    """Static geometry that this world brings: ``sionna:munich`` (a scene that comes with
+    sionna-rt), ``file:city.xml`` (a Mitsuba XML), or empty: none."""
+
+
+W = TypeVar("W", bound=WorldSettings)
+
+
+class World(Service[W]):
+    """Base of all worlds: turns object states into the frame's `Scene`.
+
+    A subclass implements `begin` and `objects_at`, and says with `prefixes` and
+    `mesh_classes` what it may bring.
+    """
+
+    role: ClassVar[Role] = "world"
+    outputs: ClassVar[tuple[str, ...]] = ("scene",)
+
+    def __init__(self, settings: W, run: RunInfo) -> None:
+        super().__init__(settings, run)
+        self._mounts = Mounts(run.devices)
+        self._t0_ns = 0
+
+    @abstractmethod
+    def prefixes(self) -> tuple[str, ...]:
+        """What the names of this world's objects begin with; whole names where they are known."""
+
+    @abstractmethod
+    def mesh_classes(self) -> tuple[str, ...]:
+        """Classes published with a mesh of their own (`shapes.SHAPES`); the others are boxes."""
+
+    @abstractmethod
+    def begin(self, episode: int, seed: int) -> None:
+        """Go to the state that objects have at the start of an episode."""
+
+    @abstractmethod
+    def objects_at(self, elapsed_ns: int) -> Iterable[ObjectState]:
+        """The objects [ns] after the episode's start, those that came first in front.
+
+        Instants never decrease within an episode; a world steps the whole way to the next one.
+        """
+
+    def scenery(self) -> Mapping[str, Path | bytes]:
+        """The XML, the files it names, and the meshes of the objects that may come."""
+        return {**scenery_assets(self.settings.scenery), **object_assets(self.mesh_classes())}
+
+    def prepare(self, preparation: Preparation) -> Prepared:
+        """Declare the names: prefixes of objects, and fixed devices by their whole name."""
+        scenery = self.settings.scenery or "none"
+        return Prepared(
+            prefixes=tuple(sorted({*self.prefixes(), *self._mounts.fixed_names})),
+            notes=(f"scenery: {scenery}",),
+        )
+
+    def reset(self, episode: int, seed: int, t0_ns: int) -> None:
+        """Begin an episode; the same arguments lead to the same scenes, bit by bit."""
+        self._t0_ns = t0_ns
+        self._mounts.clear()
+        self.begin(episode, seed)
+
+    def step(self, frame: Frame) -> StepResult:
+        """The scene at the frame's instant."""
+        return StepResult(products={"scene": self._scene(list(self.objects_at(frame.t_ns - self._t0_ns)))})
+
+    def _scene(self, states: list[ObjectState]) -> Scene:
+        devices = self._mounts.devices([(state.name, state.dimensions) for state in states])
+        states = sorted(states)
+        names = tuple(state.name for state in states)
+        if len(set(names)) < len(names):
+            twice = next(name for name, following in pairwise(names) if name == following)
+            raise PayloadError(f"world {self.run.name!r} has two objects named {twice!r}")
+        meshes = set(self.mesh_classes())
+        return Scene(
+            names=names,
+            classes=tuple(state.kind for state in states),
+            assets=tuple(f"objects/{s.kind}.ply" if s.kind in meshes else "" for s in states),
+            position=_rows([state.position for state in states], 3),
+            orientation=_rows([state.orientation for state in states], 4),
+            velocity=_rows([state.velocity for state in states], 3),
+            dimensions=_rows([state.dimensions for state in states], 3),
+            devices=devices,
+        )
+
+
+def _rows(rows: Iterable[tuple[float, ...]], width: int) -> Float64Array:
+    # + 0.0: a negative zero and a zero are equal, and so must their bytes be.
+    return np.array(list(rows), dtype="<f8").reshape(-1, width) + 0.0

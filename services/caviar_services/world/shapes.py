@@ -1,0 +1,180 @@
+"""Unit meshes of moving objects: low-poly, closed, bounding box −½…½, x forward, z up.
+
+Simple on purpose: at the distances of a street a ray tracer sees the large faces of a vehicle
+(flanks, roof, windscreen), and every face costs time in every frame.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from caviar_protocol.arrays import Float64Array
+from caviar_services.meshes import Mesh, box
+
+
+def loft(sections: Float64Array) -> Mesh:
+    """Closed surface through convex polygons, Shape ``[S, K, 3]``, with flat ends.
+
+    Seen from the last section towards the first, corners run counter-clockwise; then normals
+    point outwards.
+    """
+    count, corners = sections.shape[:2]
+    faces: list[tuple[int, int, int]] = []
+    for s in range(count - 1):
+        for k in range(corners):
+            a, b = s * corners + k, s * corners + (k + 1) % corners
+            faces += [(a, b, b + corners), (a, b + corners, a + corners)]
+    last = (count - 1) * corners
+    for k in range(1, corners - 1):
+        faces += [(0, k + 1, k), (last, last + k, last + k + 1)]
+    return Mesh(sections.reshape(-1, 3).astype(np.float64), np.array(faces, dtype=np.int32))
+
+
+def joined(parts: Sequence[Mesh]) -> Mesh:
+    """Several closed meshes that do not touch, as one."""
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    return Mesh(
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate(
+            [part.faces + np.int32(start) for part, start in zip(parts, starts, strict=False)], dtype=np.int32
+        ),
+    )
+
+
+def _along_x(stations: Sequence[tuple[float, float, float, float, float]]) -> Mesh:
+    """Body from cross-sections: x, height of the waist, height of the top, half widths there."""
+    return loft(
+        np.array(
+            [
+                [
+                    (x, waist_y, -0.5), (x, waist_y, waist_z), (x, top_y, top_z),
+                    (x, -top_y, top_z), (x, -waist_y, waist_z), (x, -waist_y, -0.5),
+                ]
+                for x, waist_z, top_z, waist_y, top_y in stations
+            ]
+        )
+    )  # fmt: skip
+
+
+def _along_z(
+    levels: Sequence[tuple[float, float, float]], centre: tuple[float, float] = (0.0, 0.0), corners: int = 8
+) -> Mesh:
+    """Body from horizontal polygons: z and the half axes along x and y."""
+    around = [2 * math.pi * k / corners for k in range(corners)]
+    return loft(
+        np.array(
+            [
+                [(centre[0] + rx * math.cos(angle), centre[1] + ry * math.sin(angle), z) for angle in around]
+                for z, rx, ry in levels
+            ]
+        )
+    )
+
+
+def car() -> Mesh:
+    """Bonnet, windscreen, cabin and boot."""
+    return _along_x(
+        [
+            (-0.50, 0.02, 0.10, 0.44, 0.40),
+            (-0.44, 0.06, 0.16, 0.50, 0.42),
+            (-0.36, 0.06, 0.20, 0.50, 0.42),
+            (-0.24, 0.06, 0.48, 0.50, 0.36),
+            (-0.08, 0.06, 0.50, 0.50, 0.36),
+            (0.08, 0.06, 0.46, 0.50, 0.36),
+            (0.24, 0.04, 0.14, 0.50, 0.42),
+            (0.46, -0.02, 0.06, 0.48, 0.40),
+            (0.50, -0.10, 0.00, 0.42, 0.36),
+        ]
+    )
+
+
+def truck() -> Mesh:
+    """A cab with a sloping windscreen, and a box body behind it."""
+    cab = _along_x(
+        [
+            (0.26, 0.28, 0.34, 0.47, 0.44),
+            (0.40, 0.28, 0.34, 0.47, 0.44),
+            (0.48, -0.05, 0.00, 0.47, 0.45),
+            (0.50, -0.15, -0.10, 0.45, 0.42),
+        ]
+    )
+    return joined([cab, box((-0.5, 0.24), (-0.5, 0.5), (-0.5, 0.5))])
+
+
+def bus() -> Mesh:
+    """A long body with bevelled roof edges and a raked front."""
+    return _along_x(
+        [
+            (-0.50, 0.40, 0.49, 0.48, 0.42),
+            (-0.48, 0.42, 0.50, 0.50, 0.43),
+            (0.45, 0.42, 0.50, 0.50, 0.43),
+            (0.50, -0.10, 0.38, 0.48, 0.42),
+        ]
+    )
+
+
+def pedestrian() -> Mesh:
+    """Legs, shoulders and head."""
+    return _along_z(
+        [
+            (-0.50, 0.30, 0.26),
+            (-0.05, 0.36, 0.34),
+            (0.10, 0.40, 0.40),
+            (0.30, 0.50, 0.50),
+            (0.34, 0.22, 0.16),
+            (0.38, 0.40, 0.22),
+            (0.46, 0.36, 0.20),
+            (0.50, 0.16, 0.10),
+        ]
+    )
+
+
+def bicycle() -> Mesh:
+    """A two-wheeler as a slender frame, and its rider leaning forward."""
+    frame = box((-0.5, 0.5), (-0.12, 0.12), (-0.5, -0.16))
+    rider = _along_z(
+        [(-0.14, 0.16, 0.36), (0.20, 0.20, 0.50), (0.30, 0.12, 0.20), (0.50, 0.08, 0.16)], (0.05, 0)
+    )
+    return joined([frame, rider])
+
+
+def uav() -> Mesh:
+    """A quadcopter: body, four arms on the diagonals, four rotors."""
+    parts = [_along_z([(-0.50, 0.16, 0.16), (-0.10, 0.20, 0.20), (0.20, 0.12, 0.12)])]
+    radius, reach = 0.16, 0.34
+    for sx, sy in ((1, 1), (-1, 1), (-1, -1), (1, -1)):
+        parts.append(_along_z([(0.42, radius, radius), (0.50, radius, radius)], (sx * reach, sy * reach)))
+        arm = box((0.22, math.hypot(reach, reach)), (-0.03, 0.03), (0.24, 0.36))
+        c, s = sx * math.sqrt(0.5), sy * math.sqrt(0.5)
+        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        parts.append(Mesh(arm.vertices @ turn.T, arm.faces))
+    return joined(parts)
+
+
+SHAPES: dict[str, Callable[[], Mesh]] = {
+    "bicycle": bicycle,
+    "bus": bus,
+    "car": car,
+    "motorcycle": bicycle,
+    "pedestrian": pedestrian,
+    "truck": truck,
+    "uav": uav,
+}
+"""Object classes that have a mesh."""
+
+
+def ply(mesh: Mesh) -> bytes:
+    """A mesh as binary PLY: float32 vertices, faces as uint8 count and int32 indices."""
+    header = (
+        "ply\nformat binary_little_endian 1.0\n"
+        f"element vertex {len(mesh.vertices)}\n"
+        "property float x\nproperty float y\nproperty float z\n"
+        f"element face {len(mesh.faces)}\n"
+        "property list uchar int vertex_indices\nend_header\n"
+    )
+    rows = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("corners", "<i4", 3)])
+    rows["count"], rows["corners"] = 3, mesh.faces
+    return header.encode() + mesh.vertices.astype("<f4").tobytes() + rows.tobytes()

@@ -1,0 +1,265 @@
+"""World ``trajectory``: objects that follow timed waypoints, a UAV for instance."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import msgspec
+import numpy as np
+
+from caviar_protocol.arrays import Vector3, quantity
+from caviar_protocol.coordinates import Vector, quaternion_from_euler
+from caviar_protocol.errors import ScenarioError
+from caviar_services.service import RunInfo
+from caviar_services.world.base import ObjectState, World, WorldSettings
+from caviar_services.world.curve import MonotoneCurve
+from caviar_services.world.shapes import SHAPES
+
+COLUMNS = ("t_s", "x_m", "y_m", "z_m")
+YAW_COLUMN = "yaw_deg"
+
+_SLOW = 1e-6
+"""Horizontal speed [m/s] below which rounding would choose the course."""
+
+
+class MovingObject(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One object and where it is when."""
+
+    name: Annotated[str, msgspec.Meta(min_length=1, max_length=100)]
+    kind: str = "uav"
+    """Class of the object: ``uav``, ``car``, …; one without a mesh of its own is a box."""
+    dimensions_m: Annotated[Vector3, quantity("m", "length, width, height")] = (0.6, 0.6, 0.25)
+    waypoints: str | tuple[tuple[float, ...], ...]
+    """``file:PATH.csv``, or rows ``[t_s, x_m, y_m, z_m]`` or ``[t_s, x_m, y_m, z_m, yaw_deg]``.
+    The point is the centre of the object; without a yaw it looks along its horizontal course."""
+
+
+class TrajectorySettings(WorldSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of the world ``trajectory``."""
+
+    objects: tuple[MovingObject, ...]
+
+
+class TrajectoryWorld(World[TrajectorySettings]):
+    """Objects that follow timed waypoints; they rest before the first and after the last one."""
+
+    Settings = TrajectorySettings
+
+    def __init__(self, settings: TrajectorySettings, run: RunInfo) -> None:
+        super().__init__(settings, run)
+        self._tracks: dict[str, tuple[MovingObject, Track]] = {}
+        for index, thing in enumerate(settings.objects):
+            key = f"services.{run.name}.settings.objects[{index}]"
+            name = (settings.prefix or "") + thing.name
+            if name in self._tracks:
+                raise ScenarioError(f"a second object is named {name!r}; give it another name", key=key)
+            if min(thing.dimensions_m) <= 0:
+                raise ScenarioError(
+                    f"dimensions_m of {thing.name!r} is {list(thing.dimensions_m)}; write lengths > 0",
+                    key=key,
+                )
+            self._tracks[name] = (thing, Track(read_waypoints(thing.waypoints, f"{key}.waypoints")))
+
+    def prefixes(self) -> tuple[str, ...]:
+        """The setting, or all names, which are known."""
+        return (self.settings.prefix,) if self.settings.prefix else tuple(self._tracks)
+
+    def mesh_classes(self) -> tuple[str, ...]:
+        """The classes of the objects, those that have a mesh."""
+        return tuple({thing.kind for thing, _ in self._tracks.values()} & SHAPES.keys())
+
+    def begin(self, episode: int, seed: int) -> None:
+        """Every episode is the same: nothing here is random."""
+
+    def objects_at(self, elapsed_ns: int) -> Iterable[ObjectState]:
+        """All objects, at all times."""
+        t = elapsed_ns / 1e9
+        for name, (thing, track) in self._tracks.items():
+            yield ObjectState(
+                name=name,
+                kind=thing.kind,
+                position=track.position(t),
+                orientation=quaternion_from_euler(track.yaw(t)),
+                velocity=track.velocity(t),
+                dimensions=thing.dimensions_m,
+            )
+
+
+class Waypoint(NamedTuple):
+    """Where an object is when."""
+
+    t: float
+    """[s]"""
+    position: Vector
+    """[m]"""
+    yaw: float | None = None
+    """[rad]; None: along the course."""
+
+
+class Track:
+    """Position, velocity and yaw over time, from waypoints.
+
+    The velocity is the exact derivative of the position. Without a given yaw the object looks
+    along its horizontal course; while it hovers, climbs or descends on the spot it turns evenly
+    from the course before to the one after.
+    """
+
+    def __init__(self, waypoints: Sequence[Waypoint]) -> None:
+        times = np.array([w.t for w in waypoints])
+        self._curve = MonotoneCurve(times, np.array([w.position for w in waypoints]))
+        yaws = [w.yaw for w in waypoints if w.yaw is not None]
+        self._given = MonotoneCurve(times, np.unwrap(yaws)[:, None]) if yaws else None
+        self._hover = self._hover_yaws()
+
+    def position(self, t: float) -> Vector:
+        """[m] at instant ``t`` [s]."""
+        x, y, z = self._curve(t).tolist()
+        return (x, y, z)
+
+    def velocity(self, t: float) -> Vector:
+        """[m/s] at instant ``t`` [s]."""
+        x, y, z = self._curve(t, 1).tolist()
+        return (x, y, z)
+
+    def yaw(self, t: float) -> float:
+        """[rad] at instant ``t`` [s], counter-clockwise from +x."""
+        if self._given is not None:
+            return float(self._given(t)[0])
+        times = self._curve.times
+        k = self._curve.segment(t)
+        if k < 0:
+            return self._hover[0][0] if t < times[0] else self._hover[-1][1]
+        if self._moves(k):
+            return self._course(t, k)
+        start, end = self._hover[k]
+        s = (t - float(times[k])) / float(times[k + 1] - times[k])
+        return start + (end - start) * s * s * (3 - 2 * s)
+
+    def _moves(self, k: int) -> bool:
+        step = self._curve.points[k + 1] - self._curve.points[k]
+        return bool(step[0] or step[1])
+
+    def _course(self, t: float, k: int) -> float:
+        vx, vy, _ = self._curve(t, 1).tolist()
+        if math.hypot(vx, vy) > _SLOW:
+            return math.atan2(vy, vx)
+        begin, end = self._curve.times[k], self._curve.times[k + 1]
+        return self._limit(k, at_end=bool(t - begin > end - t))
+
+    def _limit(self, k: int, at_end: bool) -> float:
+        """Course with which a segment that moves begins or ends."""
+        curve = self._curve
+        here, there = (k + 1, k) if at_end else (k, k + 1)
+        vx, vy, _ = curve.slopes[here].tolist()
+        if math.hypot(vx, vy) > _SLOW:
+            return math.atan2(vy, vx)
+        # Beside a point of rest the velocity is along ±p″, which there is 6·step − 2·length·slope
+        # with the slope at the segment's other point.
+        length = curve.times[k + 1] - curve.times[k]
+        ax, ay, _ = (3 * (curve.points[k + 1] - curve.points[k]) - length * curve.slopes[there]).tolist()
+        return math.atan2(ay, ax)
+
+    def _hover_yaws(self) -> list[tuple[float, float]]:
+        """Yaw at the beginning and the end of each segment; one entry for a single waypoint."""
+        count = max(len(self._curve.times) - 1, 1)
+        moving = [k for k in range(len(self._curve.times) - 1) if self._moves(k)]
+        if not moving:
+            return [(0.0, 0.0)] * count
+        yaws: list[tuple[float, float]] = []
+        for k in range(count):
+            if k in moving:
+                yaws.append((self._limit(k, at_end=False), self._limit(k, at_end=True)))
+                continue
+            before = [m for m in moving if m < k]
+            after = [m for m in moving if m > k]
+            start = self._limit(before[-1] if before else after[0], at_end=bool(before))
+            end = self._limit(after[0], at_end=False) if after else start
+            turn = math.remainder(end - start, 2 * math.pi)
+            first = (before[-1] if before else -1) + 1
+            yaws.append(self._share(k, first, after[0] if after else count, start, turn))
+        return yaws
+
+    def _share(self, k: int, first: int, last: int, start: float, turn: float) -> tuple[float, float]:
+        """The part of a turn that falls on hovering segment ``k`` of ``first`` to ``last`` − 1."""
+        times = self._curve.times
+        whole = float(times[last] - times[first])
+        return (
+            start + turn * float(times[k] - times[first]) / whole,
+            start + turn * float(times[k + 1] - times[first]) / whole,
+        )
+
+
+def read_waypoints(source: str | Sequence[Sequence[float]], key: str = "") -> list[Waypoint]:
+    """Waypoints of a CSV file or of rows.
+
+    The file has one header line, ``t_s,x_m,y_m,z_m`` or with ``yaw_deg`` behind; lines that
+    begin with ``#`` and empty lines are skipped. Raises `ScenarioError` naming file and line.
+    """
+    if isinstance(source, str):
+        return _from_csv(Path(source), key)
+    rows = [(f"{key}[{index}]", "", None, list(row)) for index, row in enumerate(source)]
+    widths = {len(row) for *_, row in rows}
+    if widths not in ({len(COLUMNS)}, {len(COLUMNS) + 1}):
+        raise ScenarioError(
+            f"needs rows of one length, [{', '.join(COLUMNS)}] or with {YAW_COLUMN} behind", key=key
+        )
+    return _checked(rows)
+
+
+_Row = tuple[str, str, int | None, list[float]]
+"""Key, file, line, values: what an error names."""
+
+
+def _from_csv(path: Path, key: str) -> list[Waypoint]:
+    file = str(path)
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ScenarioError(f"waypoints cannot be read: {error}", file, key) from error
+    rows: list[_Row] = []
+    header: list[str] = []
+    for number, line in enumerate(lines, 1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        cells = [cell.strip() for cell in next(csv.reader([line]))]
+        if not header:
+            header = cells
+            if tuple(header) not in (COLUMNS, (*COLUMNS, YAW_COLUMN)):
+                raise ScenarioError(
+                    f"the first line is {line!r}; write {','.join(COLUMNS)} or add ,{YAW_COLUMN}",
+                    file,
+                    line=number,
+                )
+            continue
+        if len(cells) != len(header):
+            raise ScenarioError(
+                f"has {len(cells)} columns, write {len(header)}: {','.join(header)}", file, line=number
+            )
+        try:
+            rows.append(("", file, number, [float(cell) for cell in cells]))
+        except ValueError as error:
+            raise ScenarioError(f"{line!r} holds something that is no number", file, line=number) from error
+    if not rows:
+        raise ScenarioError(f"holds no waypoint; write {','.join(COLUMNS)}, then one a line", file, key)
+    return _checked(rows)
+
+
+def _checked(rows: Sequence[_Row]) -> list[Waypoint]:
+    waypoints: list[Waypoint] = []
+    for key, file, line, values in rows:
+        if not all(map(math.isfinite, values)):
+            raise ScenarioError(f"{values} is not finite; write numbers", file, key, line)
+        t, x, y, z, *yaw = values
+        if waypoints and t <= waypoints[-1].t:
+            raise ScenarioError(
+                f"t_s = {t} does not come after {waypoints[-1].t}; order the waypoints by time",
+                file,
+                key,
+                line,
+            )
+        waypoints.append(Waypoint(t, (x, y, z), math.radians(yaw[0]) if yaw else None))
+    return waypoints
