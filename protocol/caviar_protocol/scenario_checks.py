@@ -1,0 +1,230 @@
+"""The rules of a scenario that concern several keys at once, and what follows from its keys."""
+
+from __future__ import annotations
+
+import fnmatch
+from collections.abc import Iterable, Mapping
+from pathlib import PurePosixPath
+from typing import Any
+
+import msgspec
+
+from caviar_protocol.errors import ScenarioError
+from caviar_protocol.scenario import DeviceSpec, Scenario, ServiceSpec
+from caviar_protocol.tables import Place, convert_table, suggestion
+from caviar_protocol.topics import PAYLOADS
+
+_STRICT_ROLES = ("world", "recorder")
+_KIND_KEYS = {
+    "antenna": ("role", "array", "power_dbm"),
+    "lidar": ("beams", "azimuth_steps", "elevation_deg", "range_m"),
+    "camera": ("size_px", "field_of_view_deg"),
+}
+
+
+def scenario_error(scenario: Scenario, key: str, message: str) -> ScenarioError:
+    """An error about a key of a scenario, for a check made later than the loader's.
+
+    ``key`` is dotted: ``services.channel.use``, ``devices[0].on``. The line is found from it.
+    """
+    return Place(key, scenario.source).error(message)
+
+
+def settings_place(scenario: Scenario, service: str) -> Place:
+    """Where the settings of a service stand, for `caviar_protocol.tables.convert_settings`."""
+    return Place("services", scenario.source).at(service).at("settings")
+
+
+def check_scenario(scenario: Scenario) -> None:
+    """Raise `ScenarioError` for the first rule that the scenario breaks."""
+    root = Place("", scenario.source)
+    _check_record(scenario, root.at("run").at("record"))
+    _check_timeouts(scenario, root.at("timeouts"))
+    _unique((carrier.name for carrier in scenario.carriers), "carrier", root.at("carriers"))
+    _unique((device.name for device in scenario.devices), "device", root.at("devices"))
+    _check_services(scenario, root.at("services"))
+    for index, device in enumerate(scenario.devices):
+        _check_device(device, root.at("devices").at(index))
+        world_of(scenario, index)
+
+
+def devices_of(scenario: Scenario, world: str) -> tuple[DeviceSpec, ...]:
+    """The devices that a world publishes.
+
+    A device belongs to the world it names, or to the only world of the run, or to the one whose
+    setting ``prefix`` the names of its parent begin with. Raises `ScenarioError` for a device
+    whose world these do not tell.
+    """
+    return tuple(
+        device for index, device in enumerate(scenario.devices) if world_of(scenario, index) == world
+    )
+
+
+def world_of(scenario: Scenario, index: int) -> str:
+    """Name of the world that publishes device ``index``; see `devices_of`."""
+    device = scenario.devices[index]
+    worlds = [name for name, service in scenario.services.items() if service.role == "world"]
+    place = Place("devices", scenario.source).at(index)
+    if device.world:
+        if device.world not in worlds:
+            hint = suggestion(device.world, worlds)
+            raise place.at("world").error(f"no world of this run is named {device.world!r}; {hint}")
+        return device.world
+    if len(worlds) == 1:
+        return worlds[0]
+    literal = device.on.partition("*")[0].partition("?")[0].partition("[")[0]
+    matching = [name for name in worlds if literal and _owns(scenario.services[name], literal)]
+    if len(matching) == 1:
+        return matching[0]
+    where = f"on {device.on!r}" if device.on else "without `on`"
+    raise place.error(
+        f"device {device.name!r} {where} could belong to any of the worlds {', '.join(worlds)}; "
+        f'write world = "{worlds[0]}"'
+    )
+
+
+def with_overrides(scenario: Scenario, frames: int | None = None, seed: int | None = None) -> Scenario:
+    """The scenario with values from the command line in place of its own.
+
+    Raises `ScenarioError` where one is out of range.
+    """
+    given = {"frames": frames, "seed": seed}
+    changes = {name: value for name, value in given.items() if value is not None}
+    if not changes:
+        return scenario
+    run = type(scenario.run)
+    values = msgspec.structs.asdict(scenario.run) | changes
+    return msgspec.structs.replace(scenario, run=convert_table(run, values, Place("run")))
+
+
+def resolved(scenario: Scenario, settings: Mapping[str, msgspec.Struct] | None = None) -> dict[str, Any]:
+    """Everything the scenario says, defaults included, as built-in types.
+
+    ``settings`` are those of services by name after conversion, so that their defaults show too.
+    """
+    plain = _plain(scenario)
+    del plain["source"]
+    for name, value in (settings or {}).items():
+        plain["services"][name]["settings"] = _plain(value)
+    return plain  # type: ignore[no-any-return]  # a struct becomes a dict
+
+
+def owned_by(patterns: Iterable[str], name: str) -> bool:
+    """Whether one of the patterns, with ``*`` and ``?``, matches a name (clause 17)."""
+    return any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)
+
+
+def _plain(value: Any) -> Any:
+    """Built-in types, with every field of a struct; `msgspec.to_builtins` leaves out defaults."""
+    if isinstance(value, msgspec.Struct):
+        tag = value.__struct_config__.tag_field
+        head = {tag: value.__struct_config__.tag} if tag else {}
+        return head | {name: _plain(getattr(value, name)) for name in value.__struct_fields__}
+    if isinstance(value, Mapping):
+        return {str(name): _plain(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return msgspec.to_builtins(value)
+
+
+def _owns(world: ServiceSpec, literal: str) -> bool:
+    prefix = world.settings.get("prefix", "")
+    return isinstance(prefix, str) and prefix != "" and literal.startswith(prefix)
+
+
+def _unique(names: Iterable[str], what: str, place: Place) -> None:
+    first: dict[str, int] = {}
+    for index, name in enumerate(names):
+        here = place.at(index).at("name")
+        if not name:
+            raise here.error(f"a {what} needs a name")
+        if name in first:
+            line = place.source.line(place.at(first[name]).at("name").key)
+            known = f" (the first stands in line {line})" if line else ""
+            raise here.error(f"a second {what} is named {name!r}{known}; give it another name")
+        first[name] = index
+
+
+def _check_record(scenario: Scenario, place: Place) -> None:
+    for index, topic in enumerate(scenario.run.record):
+        if topic not in PAYLOADS:
+            raise place.at(index).error(f"no topic is named {topic!r}; {suggestion(topic, PAYLOADS)}")
+    if scenario.run.record and not any(s.role == "recorder" for s in scenario.services.values()):
+        raise place.error('topics to record need a recorder; add [services.recorder] with role = "recorder"')
+
+
+def _check_timeouts(scenario: Scenario, place: Place) -> None:
+    timeouts = scenario.timeouts
+    if timeouts.heartbeat_s >= timeouts.liveness_s:
+        raise place.error(
+            f"heartbeat_s = {timeouts.heartbeat_s} leaves no heartbeat within liveness_s = "
+            f"{timeouts.liveness_s}; write at most {timeouts.liveness_s / 2}"
+        )
+
+
+def _check_services(scenario: Scenario, place: Place) -> None:
+    by_role: dict[str, list[str]] = {}
+    for name, service in scenario.services.items():
+        by_role.setdefault(service.role, []).append(name)
+        _check_service(name, service, place.at(name))
+    if "world" not in by_role:
+        raise place.error('no service has role = "world", so nothing publishes a scene; add one')
+    recorders = by_role.get("recorder", [])
+    if len(recorders) > 1:
+        raise place.at(recorders[1]).error(
+            f"a second recorder; a run has at most one, which is {recorders[0]!r}. Remove this one"
+        )
+    if by_role.get("channel") and not scenario.carriers:
+        raise place.at(by_role["channel"][0]).error(
+            "a channel needs a carrier; add [[carriers]] with name and frequency_hz"
+        )
+
+
+def _check_service(name: str, service: ServiceSpec, place: Place) -> None:
+    if not name or len(name) > 64 or PurePosixPath(name).name != name or not name.isprintable():
+        raise place.error(f"{name!r} cannot name a service; use at most 64 letters, digits, - and _")
+    if service.role in _STRICT_ROLES and service.policy not in ("wait", "abort"):
+        raise place.at("policy").error(
+            f"a {service.role} cannot {service.policy}: nothing in a run can do without its products "
+            '(clause 9); write "wait" or "abort"'
+        )
+    if service.max_in_flight > 1 and service.policy != "wait":
+        raise place.at("max_in_flight").error(
+            f'is {service.max_in_flight}, but several grants at once need policy = "wait" (clause 7), '
+            f"not {service.policy!r}; write max_in_flight = 1"
+        )
+    if service.users and service.role != "agent":
+        raise place.at("users").error(f"only agents own users, this is a {service.role}; remove the key")
+
+
+def _check_device(device: DeviceSpec, place: Place) -> None:
+    blank = DeviceSpec(name=device.name, kind=device.kind)
+    for kind, keys in _KIND_KEYS.items():
+        for key in keys:
+            here = place.at(key)
+            is_given = here.key in here.source.lines or getattr(device, key) != getattr(blank, key)
+            if kind != device.kind and is_given:
+                others = ", ".join(_KIND_KEYS[device.kind])
+                raise here.error(f"belongs to kind {kind!r}, this is {device.kind!r}, with: {others}")
+    if device.kind == "antenna" and not device.role:
+        raise place.error(f'antenna {device.name!r} lacks its role; write role = "tx", "rx" or "both"')
+    if device.count > 1 and not any(sign in device.on for sign in "*?["):
+        raise place.at("count").error(
+            f'is {device.count}, but {device.on!r} is one object; write a pattern: on = "{device.on}*"'
+        )
+    if device.mount != "centre" and not device.on:
+        raise place.at("mount").error("only a device with `on` has a parent to be mounted at; remove the key")
+    _check_ascending(device.elevation_deg, place.at("elevation_deg"), -90.0, 90.0)
+    _check_ascending(device.range_m, place.at("range_m"), 0.0)
+    for index, size in enumerate(device.size_px):
+        if not 1 <= size <= 8192:
+            raise place.at("size_px").at(index).error(f"is {size}, write 1 to 8192 [px]")
+
+
+def _check_ascending(
+    pair: tuple[float, float], place: Place, least: float, most: float = float("inf")
+) -> None:
+    low, high = pair
+    if not least <= low < high <= most:
+        upper = "" if most == float("inf") else f" and at most {most}"
+        raise place.error(f"is [{low}, {high}], write two ascending numbers, at least {least}{upper}")

@@ -1,0 +1,92 @@
+"""Reading scenario files."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from caviar_protocol.errors import ScenarioError
+from caviar_protocol.scenario import Scenario
+from caviar_protocol.scenario_checks import check_scenario, settings_place
+from caviar_protocol.tables import Place, Source, convert_table
+from caviar_protocol.toml_lines import dotted, key_lines
+
+_FILE = "file:"
+
+
+def load_scenario(path: Path | str) -> Scenario:
+    """Read and check a scenario file.
+
+    Strings that begin with ``file:`` in settings of services are paths relative to the file's
+    folder; they come out as absolute paths.
+
+    Raises `ScenarioError` naming file, line, key, value and what to write instead.
+    """
+    path = Path(path)
+    try:
+        text = path.read_bytes().decode()
+    except OSError as error:
+        raise ScenarioError(f"cannot be read: {error.strerror}{_beside(path)}", str(path)) from error
+    except UnicodeDecodeError as error:
+        line = error.object.count(b"\n", 0, error.start) + 1
+        raise ScenarioError("is not UTF-8 text here; save it as UTF-8", str(path), line=line) from error
+    return parse_scenario(text, str(path), path.parent)
+
+
+def parse_scenario(text: str, file: str = "", folder: Path | None = None) -> Scenario:
+    """Check a scenario given as text; ``folder`` is what its ``file:`` paths are relative to."""
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise _syntax_error(error, text, file) from error
+    lines = {dotted(path): line for path, line in key_lines(text.replace("\r\n", "\n")).items()}
+    source = Source(file=file, lines=lines)
+    scenario = convert_table(Scenario, table, Place("", source))
+    scenario = msgspec.structs.replace(scenario, source=source)
+    check_scenario(scenario)
+    return _with_files(scenario, folder or Path())
+
+
+def _syntax_error(error: tomllib.TOMLDecodeError, text: str, file: str) -> ScenarioError:
+    found = re.fullmatch(r"(.*) \(at (?:line (\d+), column (\d+)|end of document)\)", str(error), re.DOTALL)
+    if found is None:
+        return ScenarioError(f"not TOML: {error}", file)
+    message, line, column = found.groups()
+    if line is None:
+        return ScenarioError(f"not TOML: {message}, at the end of the file", file, line=text.count("\n") + 1)
+    return ScenarioError(f"not TOML: {message}, at column {column}", file, line=int(line))
+
+
+def _beside(path: Path) -> str:
+    """The scenarios that stand where one was looked for."""
+    if not path.parent.is_dir():
+        return ""
+    names = sorted(other.name for other in path.parent.glob("*.toml"))
+    return f"; {path.parent} has {', '.join(names)}" if names and not path.is_file() else ""
+
+
+def _with_files(scenario: Scenario, folder: Path) -> Scenario:
+    services = {
+        name: msgspec.structs.replace(
+            service, settings=_absolute(service.settings, folder, settings_place(scenario, name))
+        )
+        for name, service in scenario.services.items()
+    }
+    return msgspec.structs.replace(scenario, services=services)
+
+
+def _absolute(value: Any, folder: Path, place: Place) -> Any:
+    if isinstance(value, dict):
+        return {name: _absolute(item, folder, place.at(name)) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_absolute(item, folder, place.at(index)) for index, item in enumerate(value)]
+    if not (isinstance(value, str) and value.startswith(_FILE)):
+        return value
+    path = (folder / value.removeprefix(_FILE)).resolve()
+    if not path.exists():
+        raise place.error(f"there is no {path}; {value!r} is relative to the folder of the scenario")
+    return str(path)

@@ -1,0 +1,173 @@
+"""What follows from a scenario: owners of devices, overrides, the resolved form, settings."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+import pytest
+
+from caviar_protocol.arrays import quantity
+from caviar_protocol.errors import ScenarioError
+from caviar_protocol.scenario import DeviceSpec, Run, Scenario, ServiceSpec
+from caviar_protocol.scenario_checks import (
+    check_scenario,
+    devices_of,
+    owned_by,
+    resolved,
+    scenario_error,
+    settings_place,
+    with_overrides,
+)
+from caviar_protocol.scenario_loader import parse_scenario
+from caviar_protocol.tables import Source, convert_settings
+
+
+def world(prefix: str = "") -> ServiceSpec:
+    settings = {"prefix": prefix} if prefix else {}
+    return ServiceSpec(role="world", use="trajectory", budget_ms=1.0, settings=settings)
+
+
+def antenna(name: str, on: str = "", world: str = "") -> DeviceSpec:
+    return DeviceSpec(name=name, kind="antenna", role="rx", on=on, world=world)
+
+
+def scenario(*devices: DeviceSpec, **worlds: ServiceSpec) -> Scenario:
+    return Scenario(run=Run(name="x", frames=3), services=worlds, devices=devices)
+
+
+def test_the_only_world_publishes_every_device() -> None:
+    one = scenario(antenna("bs"), antenna("user", on="car.*"), streets=world())
+    assert [device.name for device in devices_of(one, "streets")] == ["bs", "user"]
+
+
+def test_with_two_worlds_a_device_goes_by_prefix_or_by_name() -> None:
+    two = scenario(
+        antenna("user", on="car.*"),
+        antenna("eye", on="uav"),
+        antenna("bs", world="sky"),
+        streets=world("car."),
+        sky=world("uav"),
+    )
+    assert [device.name for device in devices_of(two, "streets")] == ["user"]
+    assert [device.name for device in devices_of(two, "sky")] == ["eye", "bs"]
+
+
+@pytest.mark.parametrize("device", [antenna("bs"), antenna("user", on="truck.*"), antenna("user", on="*")])
+def test_a_device_of_no_certain_world_is_refused(device: DeviceSpec) -> None:
+    with pytest.raises(ScenarioError, match='write world = "streets"'):
+        check_scenario(scenario(device, streets=world("car."), sky=world("uav")))
+
+
+def test_overrides_replace_and_are_checked() -> None:
+    base = scenario(streets=world())
+    assert with_overrides(base) is base
+    changed = with_overrides(base, frames=9, seed=0)
+    assert (changed.run.frames, changed.run.seed, changed.run.name) == (9, 0, "x")
+    assert base.run.frames == 3
+    with pytest.raises(ScenarioError, match=r"run\.frames: is 0, write a whole number ≥ 1"):
+        with_overrides(base, frames=0)
+    with pytest.raises(ScenarioError, match=r"run\.seed: is -1"):
+        with_overrides(base, seed=-1)
+
+
+TEXT = """\
+[run]
+name = "x"
+frames = 3
+[[carriers]]
+name = "c"
+frequency_hz = 1e9
+[services.streets]
+role = "world"
+use = "sumo"
+budget_ms = 5
+[services.streets.settings]
+lanes = 2
+grid = [1, 2]
+table.samples = 3
+"""
+
+
+def test_the_resolved_form_shows_defaults_and_reads_back() -> None:
+    loaded = parse_scenario(TEXT, "x.toml")
+    plain = resolved(loaded)
+    assert plain["carriers"] == [{"name": "c", "frequency_hz": 1e9, "bandwidth_hz": 100e6}]
+    assert plain["timeouts"]["stall_s"] == 30.0
+    assert plain["services"]["streets"]["settings"] == {"lanes": 2, "grid": [1, 2], "table": {"samples": 3}}
+    assert "source" not in plain
+    assert msgspec.json.decode(msgspec.json.encode(plain)) == plain
+    assert msgspec.convert(plain, Scenario) == msgspec.structs.replace(loaded, source=Source())
+
+
+class Inner(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    samples: Annotated[int, quantity("1", "rays", ge=1)] = 10
+
+
+class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    lanes: Annotated[int, quantity("1", "lanes", ge=1)] = 1
+    grid: tuple[float, float] = (0.0, 0.0)
+    table: Inner | None = None
+    even: int = 0
+
+    def __post_init__(self) -> None:
+        if self.even % 2:
+            raise ValueError(f"even = {self.even} is odd, write an even number")
+
+
+def test_settings_convert_with_and_without_a_place() -> None:
+    loaded = parse_scenario(TEXT, "x.toml")
+    given = loaded.services["streets"].settings
+    expected = Settings(lanes=2, grid=(1.0, 2.0), table=Inner(samples=3))
+    assert convert_settings(Settings, given, settings_place(loaded, "streets")) == expected
+    assert convert_settings(Settings, given) == expected
+    shown = resolved(loaded, {"streets": expected})["services"]["streets"]["settings"]
+    assert shown == {"lanes": 2, "grid": [1.0, 2.0], "table": {"samples": 3}, "even": 0}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        (
+            "lanes = 2",
+            "lane = 2",
+            "x.toml:12: services.streets.settings.lane: unknown key 'lane'; did you mean",
+        ),
+        (
+            "lanes = 2",
+            "lanes = 0",
+            "x.toml:12: services.streets.settings.lanes: is 0, write a whole number ≥ 1",
+        ),
+        ("[1, 2]", '[1, "b"]', "x.toml:13: services.streets.settings.grid[1]: is 'b', write a number"),
+        ("samples = 3", "samples = 0.5", "x.toml:14: services.streets.settings.table.samples: is 0.5"),
+        (
+            "lanes = 2",
+            "even = 3",
+            "x.toml:11: services.streets.settings: even = 3 is odd, write an even number",
+        ),
+    ],
+)
+def test_wrong_settings_are_named_with_their_line(old: str, new: str, says: str) -> None:
+    loaded = parse_scenario(TEXT.replace(old, new), "x.toml")
+    given = loaded.services["streets"].settings
+    with pytest.raises(ScenarioError) as caught:
+        convert_settings(Settings, given, settings_place(loaded, "streets"))
+    assert str(caught.value).startswith(says)
+    with pytest.raises(ScenarioError, match=r"^settings") as without_place:
+        convert_settings(Settings, given)
+    assert without_place.value.line is None
+
+
+def test_a_later_check_can_name_the_line() -> None:
+    loaded = parse_scenario(TEXT, "x.toml")
+    error = scenario_error(loaded, "services.streets.use", "no world is named 'sumo'")
+    assert str(error) == "x.toml:9: services.streets.use: no world is named 'sumo'"
+    absent = scenario_error(loaded, "services.streets.policy[3].x", "…")
+    assert absent.line == 7
+    assert scenario_error(scenario(), "run.frames", "…").line is None
+
+
+def test_users_are_matched_by_pattern() -> None:
+    assert owned_by(["truck", "car.*"], "car.7/antenna")
+    assert not owned_by(["car.?"], "car.17")
+    assert not owned_by([], "car.1")

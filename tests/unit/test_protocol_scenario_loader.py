@@ -1,0 +1,268 @@
+"""What a scenario file may say, and what is answered to what it may not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from caviar_protocol.errors import ScenarioError
+from caviar_protocol.scenario import Scenario
+from caviar_protocol.scenario_loader import load_scenario, parse_scenario
+
+GOOD = """\
+[run]
+name = "crossing"
+frames = 20
+seed = 7
+record = ["scene"]
+
+[timeouts]
+stall_s = 5
+
+[[carriers]]
+name = "mmwave"
+frequency_hz = 28e9
+
+[[devices]]
+name = "bs"
+kind = "antenna"
+role = "tx"
+position_m = [0, 0.5, 10]
+array = { rows = 8, columns = 4 }
+
+[[devices]]
+name = "scanner"
+kind = "lidar"
+on = "car.*"
+count = 2
+mount = "roof"
+beams = 16
+
+[services.traffic]
+role = "world"
+use = "sumo"
+budget_ms = 20
+settings = { prefix = "car.", nested = [{ net = "file:roads.net.xml" }] }
+
+[services.channel]
+role = "channel"
+use = "sionna-rt"
+budget_ms = 150
+policy = "hold"
+[services.channel.settings]
+samples = 1e5
+
+[services.pilot]
+role = "agent"
+use = "los-beam"
+budget_ms = 5
+users = ["car.*"]
+
+[services.recorder]
+role = "recorder"
+use = "mcap"
+budget_ms = 50
+"""
+
+
+def parse(text: str, folder: Path | None = None) -> Scenario:
+    return parse_scenario(text, "crossing.toml", folder)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "roads.net.xml").write_text("<net/>")
+    return tmp_path
+
+
+def failure(text: str, folder: Path) -> ScenarioError:
+    with pytest.raises(ScenarioError) as caught:
+        parse(text, folder)
+    return caught.value
+
+
+def line_of(text: str, fragment: str) -> int:
+    return text[: text.index(fragment)].count("\n") + 1
+
+
+def test_a_good_file_becomes_typed_values_with_defaults(folder: Path) -> None:
+    scenario = parse(GOOD, folder)
+    assert (scenario.run.frames, scenario.run.seed, scenario.run.episodes) == (20, 7, 1)
+    assert scenario.timeouts.stall_s == 5.0
+    bs, scanner = scenario.devices
+    assert bs.array is not None
+    assert bs.array.size == 32
+    assert bs.position_m == (0.0, 0.5, 10.0)
+    assert (scanner.beams, scanner.mount, scanner.count) == (16, "roof", 2)
+    assert scenario.services["channel"].policy == "hold"
+    assert scenario.services["channel"].settings == {"samples": 1e5}
+
+
+def test_file_strings_in_settings_become_absolute_paths(folder: Path) -> None:
+    (folder / "crossing.toml").write_text(GOOD)
+    scenario = load_scenario(folder / "crossing.toml")
+    (nested,) = scenario.services["traffic"].settings["nested"]
+    assert nested == {"net": str((folder / "roads.net.xml").resolve())}
+
+
+def test_a_missing_file_is_named_with_key_and_line(folder: Path) -> None:
+    text = GOOD.replace("roads.net.xml", "lanes.net.xml")
+    error = failure(text, folder)
+    assert error.key == "services.traffic.settings.nested[0].net"
+    assert error.line == line_of(text, "settings = {")
+    assert str(folder.resolve() / "lanes.net.xml") in str(error)
+
+
+# (what stands in the good file, what is written instead, key, a piece of the message)
+UNKNOWN_KEYS = [
+    ("seed = 7", "sede = 7", "run.sede", "did you mean 'seed'?"),
+    ("seed = 7", "wibble = 7", "run.wibble", "known: "),
+    ("[timeouts]", "[timeout]", "timeout", "did you mean 'timeouts'?"),
+    ("stall_s", "stal_s", "timeouts.stal_s", "did you mean 'stall_s'?"),
+    ("frequency_hz", "frequency", "carriers[0].frequency", "did you mean 'frequency_hz'?"),
+    ("columns = 4", "colums = 4", "devices[0].array.colums", "did you mean 'columns'?"),
+    ("beams = 16", "beems = 16", "devices[1].beems", "did you mean 'beams'?"),
+    ("budget_ms = 150", "budget = 150", "services.channel.budget", "did you mean 'budget_ms'?"),
+    (
+        "budget_ms = 5\n",
+        "budget_ms = 5\nbeams_tx = 3\n",
+        "services.pilot.beams_tx",
+        "in its table `settings`",
+    ),
+    ("[timeouts]", "[source]\nfile = 'x'\n[timeouts]", "source", "unknown key 'source'"),
+]
+
+WRONG_VALUES = [
+    ("frames = 20", "frames = 0", "run.frames", "is 0, write a whole number ≥ 1 [frame]"),
+    ("frames = 20", "frames = 1.5", "run.frames", "is 1.5, write a whole number ≥ 1"),
+    ("frames = 20", "frames = true", "run.frames", "is true, write a whole number"),
+    ("frames = 20", 'frames = "20"', "run.frames", "is '20', write a whole number"),
+    (
+        "seed = 7",
+        "seed = 9223372036854775808",
+        "run.seed",
+        "write a whole number ≥ 0 and ≤ 9223372036854775807",
+    ),
+    ('name = "crossing"', 'name = "a b"', "run.name", "a string that matches"),
+    ("stall_s = 5", "stall_s = inf", "timeouts.stall_s", "is inf, write a number > 0 [s]"),
+    ("stall_s = 5", "stall_s = 2024-01-01", "timeouts.stall_s", "write a number > 0 [s]"),
+    ("28e9", "-28e9", "carriers[0].frequency_hz", "write a number > 0 [Hz]"),
+    ("[0, 0.5, 10]", "[0, 0.5]", "devices[0].position_m", "has 2 elements, write 3 [m]"),
+    ("[0, 0.5, 10]", '[0, 0.5, "x"]', "devices[0].position_m[2]", "is 'x', write a number"),
+    ("[[carriers]]", "[carriers]", "carriers", "write an array: [[carriers]]"),
+    ("[0, 0.5, 10]", "10", "devices[0].position_m", "write an array"),
+    ("rows = 8", "rows = 2000", "devices[0].array.rows", "≥ 1 and ≤ 1024"),
+    ("{ rows = 8, columns = 4 }", '"8x4"', "devices[0].array", "write a table"),
+    ('kind = "lidar"', 'kind = "lider"', "devices[1].kind", "did you mean 'lidar'? One of"),
+    ('policy = "hold"', 'policy = "skip"', "services.channel.policy", "known: abort, drop, hold, wait"),
+    ('role = "channel"', 'role = "chanel"', "services.channel.role", "did you mean 'channel'?"),
+    ("budget_ms = 150", "budget_ms = 0", "services.channel.budget_ms", "is 0, write a number > 0 [ms]"),
+]
+
+SECOND_RECORDER = """[services.tape]
+role = "recorder"
+use = "mcap"
+budget_ms = 50
+[services.pilot]"""
+
+BROKEN_RULES = [
+    ('record = ["scene"]', 'record = ["lidar", "scen"]', "run.record[1]", "did you mean 'scene'?"),
+    ('"world"', '"link"', "services", 'no service has role = "world"'),
+    ("[services.pilot]", SECOND_RECORDER, "services.recorder", "at most one, which is 'tape'"),
+    ('policy = "hold"', 'policy = "hold"\nmax_in_flight = 2', "services.channel.max_in_flight", "(clause 7)"),
+    ('use = "sumo"', 'use = "sumo"\npolicy = "drop"', "services.traffic.policy", "a world cannot drop"),
+    ('use = "mcap"', 'use = "mcap"\npolicy = "hold"', "services.recorder.policy", "a recorder cannot hold"),
+    ('use = "mcap"', 'use = "mcap"\nusers = ["*"]', "services.recorder.users", "only agents own users"),
+    (
+        'name = "scanner"',
+        'name = "bs"',
+        "devices[1].name",
+        "a second device is named 'bs' (the first stands in",
+    ),
+    ('on = "car.*"', 'on = "car.1"', "devices[1].count", 'write a pattern: on = "car.1*"'),
+    ('on = "car.*"\ncount = 2\n', "", "devices[1].mount", "a parent to be mounted at"),
+    ('role = "tx"\n', "", "devices[0]", 'write role = "tx", "rx" or "both"'),
+    (
+        'role = "tx"',
+        'role = "tx"\nbeams = 64',
+        "devices[0].beams",
+        "belongs to kind 'lidar', this is 'antenna'",
+    ),
+    ("beams = 16", 'role = "rx"', "devices[1].role", "belongs to kind 'antenna', this is 'lidar'"),
+    ("beams = 16", "range_m = [9, 3]", "devices[1].range_m", "two ascending numbers, at least 0"),
+    ("beams = 16", "elevation_deg = [-95, 3]", "devices[1].elevation_deg", "at least -90.0 and at most 90.0"),
+    ("beams = 16", 'world = "sky"', "devices[1].world", "known: traffic"),
+    ("stall_s = 5", "heartbeat_s = 2", "timeouts", "leaves no heartbeat within liveness_s"),
+    ('[[carriers]]\nname = "mmwave"\nfrequency_hz = 28e9\n', "", "services.channel", "add [[carriers]]"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "key", "says"), [*UNKNOWN_KEYS, *WRONG_VALUES, *BROKEN_RULES])
+def test_what_is_wrong_is_named_with_file_key_and_remedy(
+    folder: Path, old: str, new: str, key: str, says: str
+) -> None:
+    assert old in GOOD
+    error = failure(GOOD.replace(old, new, 1), folder)
+    assert (error.file, error.key) == ("crossing.toml", key)
+    assert says in str(error)
+
+
+@pytest.mark.parametrize(("old", "new", "key", "says"), [*UNKNOWN_KEYS, *WRONG_VALUES])
+def test_what_is_wrong_is_named_with_its_line(folder: Path, old: str, new: str, key: str, says: str) -> None:
+    text = GOOD.replace(old, new, 1)
+    name = key.rpartition(".")[2].partition("[")[0]
+    lines = text.splitlines()
+    error = failure(text, folder)
+    assert error.line is not None
+    assert name in lines[error.line - 1]
+    assert f"crossing.toml:{error.line}: " in str(error)
+    assert error.line in range(line_of(text, new), line_of(text, new) + new.count("\n") + 1)
+
+
+@pytest.mark.parametrize(
+    ("line", "key", "says"),
+    [
+        ("frames = 20\n", "run", "lacks 'frames', write frames = … (a whole number ≥ 1)"),
+        ('kind = "antenna"\n', "devices[0]", "lacks 'kind', write kind = … (one of antenna, camera, lidar)"),
+        ("budget_ms = 150\n", "services.channel", "lacks 'budget_ms'"),
+    ],
+)
+def test_a_missing_key_is_named_with_its_table(folder: Path, line: str, key: str, says: str) -> None:
+    error = failure(GOOD.replace(line, "", 1), folder)
+    assert error.key == key
+    assert error.line is not None
+    assert says in str(error)
+
+
+def test_a_file_without_a_run_table_says_what_it_lacks() -> None:
+    with pytest.raises(ScenarioError, match="the file lacks 'run'"):
+        parse("[services]\n")
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [("[run]\nname 3\n", 2), ("[run]\na = 1\na = 2\n", 3), ("[run]\nx = [1,\n", 3), ("[run\n", 1)],
+)
+def test_broken_toml_is_named_with_its_line(text: str, line: int) -> None:
+    with pytest.raises(ScenarioError, match="not TOML") as caught:
+        parse(text)
+    assert caught.value.line in (line, line - 1, line + 1)
+
+
+def test_a_file_that_is_not_text_is_named_with_its_line(tmp_path: Path) -> None:
+    path = tmp_path / "latin.toml"
+    path.write_bytes(b"[run]\nname = '\xe9'\n")
+    with pytest.raises(ScenarioError, match=r"latin\.toml:2: is not UTF-8"):
+        load_scenario(path)
+
+
+def test_a_missing_scenario_names_those_beside_it(folder: Path) -> None:
+    (folder / "smoke.toml").write_text(GOOD)
+    with pytest.raises(ScenarioError, match=r"smok\.toml: cannot be read: No such file.*has smoke\.toml"):
+        load_scenario(folder / "smok.toml")
+
+
+def test_windows_line_ends_count_as_one(folder: Path) -> None:
+    text = GOOD.replace("seed = 7", "sede = 7")
+    assert failure(text.replace("\n", "\r\n"), folder).line == failure(text, folder).line
