@@ -12,7 +12,7 @@ from caviar_protocol.arrays import Payload, Vector3, quantity
 class BeamChoice(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, tag="beam"):
     """Use this pair of codebook beams between a transmitter and a receiver.
 
-    The actuator is ``beam:<rx>``.
+    `Link` defines the beams by their index. The actuator is ``beam:<rx>``.
     """
 
     tx: str
@@ -49,6 +49,9 @@ Command = BeamChoice | WaypointCommand | VelocityCommand | UserSchedule
 
 
 class Action(Payload, frozen=True, kw_only=True, omit_defaults=True):
-    """All commands of one agent in a frame, sorted by actuator, at most one per actuator and carrier."""
+    """All commands of one agent in a frame, sorted by actuator, TX and carrier.
+
+    At most one per actuator; of beam choices, one per actuator, TX and carrier.
+    """
 
     commands: tuple[Command, ...]

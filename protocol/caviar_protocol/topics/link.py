@@ -15,12 +15,19 @@ from caviar_protocol.arrays import (
 
 
 class Link(Payload, frozen=True, kw_only=True, omit_defaults=True):
-    """Result per user; a user is one (TX, RX, carrier), sorted by carrier, TX, RX.
+    """Result per user; a user is one (TX, RX, carrier): carriers in the order of the channel, then
+    TX, then RX by name. A device that both transmits and receives is no user of itself.
 
     ``y`` is the equivalent channel w* H f of a beam pair (paper, eq. 1) with beams of unit norm
-    and without transmit power. A user without a path has ``has_path`` false and zeros; one that no agent
-    served has beams −1 and |y| 0. Means over users leave out those without a path and state
-    how many they were.
+    and without transmit power. Beam ``k`` of an array with N = rows·columns elements is
+    c_k[i] = exp(+j2π(p·(i % rows)/rows + q·(i // rows)/columns))/sqrt(N) with p = k % rows and
+    q = k // rows; a receiver uses w = c_k, a transmitter f = conj(c_k), so that an index means
+    the same direction at both ends.
+
+    A user without a path has ``has_path`` false and zeros; one that no agent served has beams −1
+    and |y| 0. The lists of best pairs end with beams −1 and |y| 0 where a user has no path or
+    fewer pairs. Of pairs with equal |y| the one of lower TX, then RX beam stands first. Means
+    over users leave out those without a path and state how many they were.
     """
 
     sizes_from: ClassVar[dict[str, str]] = {"U": "rx"}
@@ -57,7 +64,7 @@ class Link(Payload, frozen=True, kw_only=True, omit_defaults=True):
     spectral_efficiency: Annotated[Float64Array, array("<f8", "U", unit="bit/s/Hz", doc="log2(1 + SNR)")]
     bit_rate: Annotated[Float64Array, array("<f8", "U", unit="bit/s", doc="bandwidth · spectral efficiency")]
     reward: Annotated[
-        Float64Array, array("<f8", "U", unit="1", doc="as the link is configured: |y| by default")
+        Float64Array, array("<f8", "U", unit="1", doc="as the link is configured; |y| by default")
     ]
     buffered: (
         Annotated[Float64Array, array("<f8", "U", unit="bit", doc="waiting in the user's buffer")] | None
