@@ -22,10 +22,10 @@ def element_positions(array: AntennaArray) -> Float64Array:
     Element ``i`` is row ``i % rows`` of column ``i // rows``: rows from +z to −z, columns from
     −y to +y, boresight +x.
     """
-    column, row = np.divmod(np.arange(array.size), array.rows)
+    y, z = _grid(array)
     positions = np.zeros((array.size, 3))
-    positions[:, 1] = (column - (array.columns - 1) / 2) * array.horizontal_spacing
-    positions[:, 2] = ((array.rows - 1) / 2 - row) * array.vertical_spacing
+    positions[:, 1] = np.repeat(y, array.rows)
+    positions[:, 2] = np.tile(z, array.columns)
     return positions
 
 
@@ -35,6 +35,22 @@ def steering_vector(array: AntennaArray, directions: Float64Array) -> Complex128
     ``directions`` are unit vectors k̂ from the array towards the other end in device axes,
     Shape ``[..., 3]``. The element pattern is not part of it.
     """
-    phase = 2 * np.pi * (directions @ element_positions(array).T)
-    vector: Complex128Array = np.exp(1j * phase)
+    y, z = _grid(array)
+    # k̂·r separates, so rows + columns exponentials do instead of rows · columns.
+    columns = np.exp(2j * np.pi * directions[..., 1, None] * y)
+    rows = np.exp(2j * np.pi * directions[..., 2, None] * z)
+    vector: Complex128Array = (columns[..., :, None] * rows[..., None, :]).reshape(
+        *directions.shape[:-1], array.size
+    )
     return vector
+
+
+def _grid(array: AntennaArray) -> tuple[Float64Array, Float64Array]:
+    """y of each column and z of each row [wavelengths]."""
+    y: Float64Array = (
+        np.arange(array.columns, dtype=np.float64) - (array.columns - 1) / 2
+    ) * array.horizontal_spacing
+    z: Float64Array = (
+        (array.rows - 1) / 2 - np.arange(array.rows, dtype=np.float64)
+    ) * array.vertical_spacing
+    return y, z

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import re
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
+from fnmatch import fnmatchcase
 from typing import ClassVar, TypeVar
 
 import msgspec
@@ -18,15 +18,18 @@ from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Servi
 BEAM = "beam:"
 """Prefix of the actuators that steer beams; the receiver's name follows."""
 
+_OTHER_ACTUATORS = ("motion:", "schedule:")
+
 
 class AgentSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Whom an agent serves. A default agent serves everybody whom no other agent owns."""
 
     users: tuple[str, ...] = ("*",)
-    """Receivers this agent owns, as names with ``*`` for any text (``car.*``); a leading
-    ``beam:`` may stand before each."""
+    """Receivers this agent owns, as names with ``*`` for any text and ``?`` for any character
+    (``car.*``); ``beam:`` may stand before each."""
     except_users: tuple[str, ...] = ()
-    """Receivers among them that other agents own, in the same form."""
+    """Receivers among them that other agents own, in the same form. Other actuators of those
+    agents (``motion:uav``) may stand among them and take no receiver away."""
 
 
 S = TypeVar("S", bound=AgentSettings)
@@ -48,14 +51,20 @@ class Agent(Service[S]):
 
     def __init__(self, settings: S, run: RunInfo) -> None:
         super().__init__(settings, run)
-        self._owned = Patterns(settings.users, f"services.{run.name}.users")
-        self._others = Patterns(settings.except_users, f"services.{run.name}.settings.except_users")
+        for text in settings.users:
+            if text.startswith(_OTHER_ACTUATORS):
+                raise ScenarioError(
+                    f"{text!r} is no beam, and this agent steers beams only; write 'beam:<receiver>'",
+                    key=f"services.{run.name}.users",
+                )
+        self._owned = _receivers(settings.users)
+        self._others = _receivers(settings.except_users)
 
     def prepare(self, preparation: Preparation) -> Prepared:
         """Declare the actuators. One that leaves users to others owns nothing by name."""
-        if self._others.texts:
+        if self.settings.except_users:
             return Prepared(notes=("serves the users whom no other agent owns",))
-        return Prepared(actuators=tuple(BEAM + text for text in self._owned.texts))
+        return Prepared(actuators=tuple(BEAM + text for text in self._owned))
 
     def step(self, frame: Frame) -> StepResult:
         """One choice per user, sorted by actuator, then TX, then carrier."""
@@ -68,27 +77,17 @@ class Agent(Service[S]):
 
     def serves(self, rx: str) -> bool:
         """Whether this agent serves the receiver of that name."""
-        return self._owned.match(rx) and not self._others.match(rx)
+        return _matches(rx, self._owned) and not _matches(rx, self._others)
 
     @abstractmethod
     def choose(self, frame: Frame, scene: Scene, pairs: Sequence[Pair]) -> Iterable[BeamChoice]:
         """Beam choices for these pairs, in any order; a pair without one is not served."""
 
 
-class Patterns:
-    """Names in which ``*`` stands for any text, all else for itself."""
+def _receivers(patterns: Iterable[str]) -> tuple[str, ...]:
+    """The patterns of receiver names among patterns of receivers and actuators."""
+    return tuple(text.removeprefix(BEAM) for text in patterns if not text.startswith(_OTHER_ACTUATORS))
 
-    def __init__(self, patterns: Iterable[str], key: str) -> None:
-        self.texts = tuple(pattern.removeprefix(BEAM) for pattern in patterns)
-        for text in self.texts:
-            if text.startswith(("motion:", "schedule:")):
-                raise ScenarioError(
-                    f"{text!r} is no beam: this agent steers beams only; write 'beam:<receiver>'", key=key
-                )
-        self._regular = re.compile(
-            "|".join(".*".join(map(re.escape, text.split("*"))) for text in self.texts) or r"(?!)", re.DOTALL
-        )
 
-    def match(self, name: str) -> bool:
-        """Whether one of the patterns matches the whole name."""
-        return self._regular.fullmatch(name) is not None
+def _matches(name: str, patterns: Iterable[str]) -> bool:
+    return any(fnmatchcase(name, pattern) for pattern in patterns)

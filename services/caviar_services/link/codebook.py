@@ -17,6 +17,7 @@ import numpy as np
 from caviar_protocol.arrays import Complex128Array, Float64Array, Int64Array
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.topics.scene import AntennaArray
+from caviar_services.antenna import steering_vector
 
 
 def dft_codebook(array: AntennaArray) -> Complex128Array:
@@ -46,20 +47,12 @@ def beam_towards(array: AntennaArray, directions: Float64Array) -> Int64Array:
     wrapped beams, end-fire directions and spacings other than half a wavelength need no special
     cases. Of beams with equal gain the lowest index is taken.
     """
-    column_beam = _best_of_axis(array.columns, array.horizontal_spacing * directions[..., 1])
-    row_beam = _best_of_axis(array.rows, -array.vertical_spacing * directions[..., 2])
-    beams: Int64Array = column_beam * array.rows + row_beam
+    vectors = steering_vector(array, directions)
+    grid = vectors.reshape(*vectors.shape[:-1], array.columns, array.rows)
+    # Row k of conj(codebook) has entries exp(−j2πkn/N): c_k* a for all k is a Fourier transform.
+    response = np.abs(np.fft.fftn(grid, axes=(-2, -1))).reshape(vectors.shape)
+    beams: Int64Array = np.argmax(response, axis=-1).astype(np.int64)
     return beams
-
-
-def _best_of_axis(size: int, frequency: Float64Array) -> Int64Array:
-    """DFT beam with the greatest response to ``exp(j2π·frequency·n)``, Shape ``[...]``.
-
-    The response of a planar beam is the product of those of its axes, so each has its own maximum.
-    """
-    response = np.abs(np.fft.fft(np.exp(2j * np.pi * np.multiply.outer(frequency, np.arange(size)))))
-    best: Int64Array = np.argmax(response, axis=-1).astype(np.int64)
-    return best
 
 
 def pointing_directions(array: AntennaArray, beam: int) -> Float64Array:
