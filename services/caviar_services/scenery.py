@@ -1,0 +1,242 @@
+"""Scenery as a world announces it: a scene description in XML and the meshes it names.
+
+The description is that of Mitsuba and Sionna RT. Renderers know only the materials of their own
+variant, so it is read here as plain XML: which meshes there are, where they stand, and of which
+material of Recommendation ITU-R P.2040 they are.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from xml.etree import ElementTree
+
+import numpy as np
+
+from caviar_protocol.arrays import Float64Array
+from caviar_protocol.errors import AssetError
+
+
+@dataclass(frozen=True, eq=False)
+class SceneryShape:
+    """One mesh of the scenery."""
+
+    name: str
+    """Id in the description without a leading ``mesh-``; unique."""
+    file: Path
+    """The PLY mesh."""
+    to_world: Float64Array
+    """Homogeneous transform of the mesh's vertices [m], Shape ``[4, 4]``."""
+    material: str
+    """Id of its material in the description; empty where it has none."""
+    itu_material: str
+    """Name of that material in ITU-R P.2040 (``concrete``); empty where it is not one of those."""
+
+
+@dataclass(frozen=True)
+class Scenery:
+    """What a description holds, in its order."""
+
+    file: Path
+    shapes: tuple[SceneryShape, ...]
+
+
+def find_scenery(assets: Mapping[str, Path]) -> Path | None:
+    """The scene description among the assets of a run (``scenery/*.xml``); None where there is none.
+
+    Raises `AssetError` naming them where there are several.
+    """
+    found = sorted(name for name in assets if PurePosixPath(name).match("scenery/*.xml"))
+    if len(found) > 1:
+        raise AssetError(
+            f"the run has {len(found)} scene descriptions, {', '.join(found)}; let one world bring one"
+        )
+    return assets[found[0]] if found else None
+
+
+def read_scenery(file: Path) -> Scenery:
+    """Read a scene description; every mesh it names lies in its folder or below.
+
+    Raises `AssetError` naming the file, the shape and the remedy where the XML is broken, a shape
+    is of another type than ``ply``, a mesh is missing, or a name occurs twice.
+    """
+    root = _parse(file)
+    defaults = {d.get("name", ""): d.get("value", "") for d in root.iter("default")}
+    materials = {b.get("id", ""): _itu_material(b) for b in root.findall("bsdf")}
+    shapes: dict[str, SceneryShape] = {}
+    for element in root.findall("shape"):
+        shape = _shape(file, element, defaults, materials)
+        if shape.name in shapes:
+            raise AssetError(f"{file}: two shapes are named {shape.name!r}; give each an id of its own")
+        shapes[shape.name] = shape
+    return Scenery(file, tuple(shapes.values()))
+
+
+class _Builder(ElementTree.TreeBuilder):
+    """Refuses document types, and with them entities, before any is expanded."""
+
+    def doctype(self, name: str, _public: str | None, _system: str | None) -> None:
+        raise AssetError(f"document type {name!r} is refused; remove the <!DOCTYPE …> declaration")
+
+
+def _parse(file: Path) -> ElementTree.Element:
+    try:
+        data = file.read_bytes()
+    except OSError as error:
+        raise AssetError(f"{file}: cannot be read ({error.strerror}); check the scenery's path") from error
+    parser = ElementTree.XMLParser(target=_Builder())  # noqa: S314 - the builder refuses entities
+    try:
+        parser.feed(data)
+        root: ElementTree.Element = parser.close()
+    except ElementTree.ParseError as error:
+        raise AssetError(f"{file}: broken XML, {error}; export the scene again") from error
+    except AssetError as error:
+        raise AssetError(f"{file}: {error}") from error
+    if root.tag != "scene":
+        raise AssetError(f"{file}: the root element is <{root.tag}>, expected <scene>")
+    return root
+
+
+def _shape(
+    file: Path, element: ElementTree.Element, defaults: Mapping[str, str], materials: Mapping[str, str]
+) -> SceneryShape:
+    given = element.get("id") or element.get("name") or ""
+    where = f"{file}: shape {given!r}"
+    if element.get("type") != "ply":
+        raise AssetError(f"{where} is of type {element.get('type')!r}; export it as a PLY mesh, type='ply'")
+    filename = element.find("string[@name='filename']")
+    if filename is None or not filename.get("value"):
+        raise AssetError(f"{where} names no file; give it <string name='filename' value='meshes/….ply'/>")
+    mesh = _mesh_file(where, file.parent, _resolved(where, filename.get("value", ""), defaults))
+    transform = element.find("transform[@name='to_world']")
+    material, itu = _material_of(where, element, materials)
+    return SceneryShape(
+        name=(given or mesh.stem).removeprefix("mesh-"),
+        file=mesh,
+        to_world=np.eye(4) if transform is None else _to_world(where, transform, defaults),
+        material=material,
+        itu_material=itu,
+    )
+
+
+def _mesh_file(where: str, folder: Path, name: str) -> Path:
+    relative = PurePosixPath(name)
+    if relative.is_absolute() or ".." in relative.parts:
+        raise AssetError(
+            f"{where} names {name!r}; meshes travel with the description, so give a path below its folder"
+        )
+    mesh = folder / relative
+    if not mesh.is_file():
+        raise AssetError(f"{where}: mesh {mesh} is missing; put it there, or remove the shape")
+    return mesh
+
+
+def _material_of(where: str, element: ElementTree.Element, materials: Mapping[str, str]) -> tuple[str, str]:
+    nested = element.find("bsdf")
+    if nested is not None:
+        return nested.get("id", ""), _itu_material(nested)
+    for reference in element.findall("ref"):
+        material = reference.get("id", "")
+        if material in materials:
+            return material, materials[material]
+        if reference.get("name") == "bsdf":
+            raise AssetError(
+                f"{where} refers to material {material!r}, which is not defined; "
+                f"defined are: {', '.join(sorted(materials)) or 'none'}"
+            )
+    return "", ""
+
+
+def _itu_material(bsdf: ElementTree.Element) -> str:
+    """ITU name of a material: told by its type, or by an id like ``mat-itu_concrete.001``."""
+    told = bsdf.find("string[@name='type']")
+    if bsdf.get("type") == "itu-radio-material" and told is not None:
+        return told.get("value", "")
+    name = re.fullmatch(r"(?:mat-)?itu[_-](.+?)(?:\.\d+)?", bsdf.get("id", ""))
+    if name is None:
+        return ""
+    return name.group(1) if told is None else told.get("value", "")
+
+
+def _resolved(where: str, value: str, defaults: Mapping[str, str]) -> str:
+    """``value`` with every ``$name`` replaced by the description's default of that name."""
+
+    def replace(match: re.Match[str]) -> str:
+        if match.group(1) not in defaults:
+            raise AssetError(f"{where} uses ${match.group(1)}, for which there is no <default>; add one")
+        return defaults[match.group(1)]
+
+    return re.sub(r"\$(\w+)", replace, value)
+
+
+def _to_world(where: str, transform: ElementTree.Element, defaults: Mapping[str, str]) -> Float64Array:
+    """Product of a transform's steps; each acts after the ones above it."""
+    matrix: Float64Array = np.eye(4)
+    for step in transform:
+        values = {key: _resolved(where, value, defaults) for key, value in step.attrib.items()}
+        try:
+            matrix = _STEPS[step.tag](values) @ matrix
+        except KeyError as error:
+            raise AssetError(
+                f"{where}: <{step.tag}> in to_world lacks {error} or is not supported; "
+                f"use {', '.join(sorted(_STEPS))}"
+            ) from error
+        except ValueError as error:
+            raise AssetError(f"{where}: <{step.tag}> in to_world has a bad value, {error}") from error
+    if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix[:3, :3])) < 1e-12:
+        raise AssetError(f"{where}: to_world is singular or not finite; give scales other than 0")
+    return matrix
+
+
+def _numbers(text: str, *counts: int) -> list[float]:
+    numbers = [float(word) for word in text.replace(",", " ").split()]
+    if len(numbers) not in counts:
+        raise ValueError(f"{text!r}: {len(numbers)} numbers, expected {' or '.join(map(str, counts))}")
+    return numbers
+
+
+def _vector(values: Mapping[str, str], default: float) -> list[float]:
+    if "value" in values:
+        numbers = _numbers(values["value"], 1, 3)
+        return numbers * 3 if len(numbers) == 1 else numbers
+    return [float(values.get(axis, default)) for axis in "xyz"]
+
+
+def _translate(values: Mapping[str, str]) -> Float64Array:
+    matrix = np.eye(4)
+    matrix[:3, 3] = _vector(values, 0.0)
+    return matrix
+
+
+def _scale(values: Mapping[str, str]) -> Float64Array:
+    return np.diag([*_vector(values, 1.0), 1.0])
+
+
+def _rotate(values: Mapping[str, str]) -> Float64Array:
+    """Rotation about an axis by an angle in degrees (Rodrigues' formula)."""
+    axis = np.array(_vector(values, 0.0))
+    norm = float(np.linalg.norm(axis))
+    if norm == 0:
+        raise ValueError("the axis is zero; give x, y or z")
+    x, y, z = axis / norm
+    angle = math.radians(float(values["angle"]))
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    matrix = np.eye(4)
+    matrix[:3, :3] += math.sin(angle) * cross + (1 - math.cos(angle)) * (cross @ cross)
+    return matrix
+
+
+def _matrix(values: Mapping[str, str]) -> Float64Array:
+    numbers = _numbers(values["value"], 9, 16)
+    size = 3 if len(numbers) == 9 else 4
+    matrix = np.eye(4)
+    matrix[:size, :size] = np.reshape(numbers, (size, size))
+    if matrix[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
+        raise ValueError(f"last row {matrix[3].tolist()}, expected 0 0 0 1")
+    return matrix
+
+
+_STEPS = {"translate": _translate, "scale": _scale, "rotate": _rotate, "matrix": _matrix}

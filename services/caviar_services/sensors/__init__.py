@@ -1,0 +1,1 @@
+"""Sensors: what a device sees of the scene, from the same meshes and poses as the channel."""

@@ -1,0 +1,145 @@
+"""What all sensor services share: the scene for rays, and the settings of its pool of bodies.
+
+A sensor implements `observe`; loading, moving and parking of meshes is done here, the same way
+for every sensor.
+"""
+
+from __future__ import annotations
+
+import time
+from abc import abstractmethod
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any, ClassVar, TypeVar
+
+import msgspec
+import numpy as np
+
+from caviar_protocol.arrays import Payload, quantity
+from caviar_protocol.errors import ScenarioError
+from caviar_protocol.messages import Input, Role
+from caviar_protocol.topics import Scene
+from caviar_protocol.topics.scene import Device
+from caviar_services.llvm import activate_llvm, cuda_devices
+from caviar_services.meshes import Mesh, unit_box
+from caviar_services.scenery import find_scenery, read_scenery
+from caviar_services.sensors.geometry import TracedScene, active_variant, load_scenery, load_unit_mesh
+from caviar_services.service import Frame, Preparation, Prepared, Service, StepResult
+
+
+class SensorSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of every sensor service."""
+
+    bodies_per_asset: Annotated[
+        int, quantity("1", "objects of one mesh that may be in the scene at once", ge=0, le=4096)
+    ] = 64
+    bodies: dict[str, Annotated[int, quantity("1", "the same, for one mesh", ge=0, le=4096)]] = {}
+    """By asset name, ``objects/car.ply``; the empty name is the box."""
+
+
+S = TypeVar("S", bound=SensorSettings)
+
+
+class Sensors(Service[S]):
+    """Base of sensor services.
+
+    An implementation sets ``outputs`` and implements `observe`.
+    """
+
+    role: ClassVar[Role] = "sensors"
+    inputs: ClassVar[tuple[Input, ...]] = (Input(topic="scene"),)
+
+    def prepare(self, preparation: Preparation) -> Prepared:
+        """Load the scenery and the objects' meshes, and compile what `observe` needs.
+
+        Nothing is loaded where nobody asks for an output (contract, clause 5).
+
+        Raises
+        ------
+        AssetError
+            The scene description or a mesh is broken or missing.
+        SetupError
+            There is no library to compile kernels with.
+        """
+        self.demand: dict[str, frozenset[str]] = {
+            topic: parts for topic, parts in preparation.demand.items() if topic in self.outputs
+        }
+        self.traced: TracedScene | None = None
+        if not self.demand:
+            return Prepared(notes=("nobody asks for what these sensors see: not run",))
+        device = "a CUDA device" if cuda_devices() else activate_llvm()
+        self.variant = "cuda_ad_rgb" if device == "a CUDA device" else "llvm_ad_rgb"
+        self.run.progress("loading scenery", 60.0)
+        with active_variant(self.variant) as mi:
+            self.traced = self._load(mi, preparation.assets)
+            self.run.progress("compiling kernels", 60.0)
+            self._warm_up(mi)
+        return Prepared(notes=(f"rays are traced by {device}",))
+
+    def step(self, frame: Frame) -> StepResult:
+        """Move the bodies to the objects of the frame, and observe."""
+        if self.traced is None:
+            return StepResult()
+        scene = frame.scene()
+        started = time.perf_counter_ns()
+        with active_variant(self.variant) as mi:
+            self.traced.update(mi, scene)
+            updated = time.perf_counter_ns()
+            products = self.observe(mi, self.traced, scene)
+        done = time.perf_counter_ns()
+        return StepResult(
+            products=products,
+            fidelity="ray-traced",
+            measured={"scene update": updated - started, "observation": done - updated},
+        )
+
+    def close(self) -> None:
+        """Release the scene."""
+        self.traced = None
+
+    @abstractmethod
+    def observe(self, mi: Any, traced: TracedScene, scene: Scene) -> dict[str, Payload]:
+        """Products by topic of the sensors in ``scene``, to which ``traced`` was brought."""
+
+    @abstractmethod
+    def example_devices(self) -> tuple[Device, ...]:
+        """Devices without a parent that make `observe` compile all it ever needs."""
+
+    def _load(self, mi: Any, assets: Mapping[str, Path]) -> TracedScene:
+        file = find_scenery(assets)
+        names: tuple[str, ...] = ()
+        meshes: list[Mesh] = []
+        if file is not None:
+            scenery = read_scenery(file)
+            names, meshes = tuple(shape.name for shape in scenery.shapes), load_scenery(mi, scenery)
+        bodies = {"": unit_box()}
+        bodies |= {
+            name: load_unit_mesh(mi, path)
+            for name, path in assets.items()
+            if PurePosixPath(name).match("objects/*.ply")
+        }
+        unknown = sorted(self.settings.bodies.keys() - bodies.keys())
+        if unknown:
+            raise ScenarioError(
+                f"the run has no mesh {unknown[0]!r}; meshes of its objects: {', '.join(sorted(bodies)[1:])}",
+                key=f"services.{self.run.name}.settings.bodies",
+            )
+        capacity = dict.fromkeys(bodies, self.settings.bodies_per_asset) | self.settings.bodies
+        return TracedScene(mi, names, meshes, bodies, capacity)
+
+    def _warm_up(self, mi: Any) -> None:
+        """Compile the kernels of an update and an observation, on a scene without objects."""
+        if self.traced is None:
+            return
+        scene = Scene(
+            names=(),
+            classes=(),
+            assets=(),
+            position=np.zeros((0, 3)),
+            orientation=np.zeros((0, 4)),
+            velocity=np.zeros((0, 3)),
+            dimensions=np.zeros((0, 3)),
+            devices=self.example_devices(),
+        )
+        self.traced.update(mi, scene)
+        self.observe(mi, self.traced, scene)

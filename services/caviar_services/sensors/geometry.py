@@ -1,0 +1,262 @@
+"""The scene as a ray tracer holds it: scenery, and bodies that follow the moving objects.
+
+Scenery and bodies are two ray-tracing scenes of one merged mesh each. Tracing both costs less
+than building one again: when a vertex moves, Embree rebuilds everything that shares its scene.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from caviar_protocol.arrays import Float32Array, Float64Array, Int32Array
+from caviar_protocol.coordinates import Vector
+from caviar_protocol.errors import AssetError, PayloadError
+from caviar_protocol.scene import object_pose
+from caviar_protocol.topics import Scene
+from caviar_services.meshes import BodyPool, Mesh, placed
+from caviar_services.scenery import Scenery
+
+NO_HIT = -1
+"""Owner of a ray that hits nothing."""
+
+
+@contextmanager
+def active_variant(variant: str) -> Iterator[Any]:
+    """Mitsuba with ``variant`` set, and the one before set again behind it.
+
+    The variant is one for the whole process, and an embedded run has a channel service in it too.
+    """
+    import mitsuba as mi
+
+    before = mi.variant()
+    if before != variant:
+        mi.set_variant(variant)
+    try:
+        yield mi
+    finally:
+        if before not in (None, variant):
+            mi.set_variant(before)
+
+
+def load_mesh(mi: Any, file: Path) -> Mesh:
+    """Triangles of a PLY file, under the variant that is set.
+
+    Raises `AssetError` naming the file where it is not a mesh.
+    """
+    try:
+        mesh = mi.load_dict({"type": "ply", "filename": str(file), "face_normals": True})
+        vertices = mesh.vertex_positions_buffer().numpy().reshape(-1, 3).astype(np.float64)
+        faces = mesh.faces_buffer().numpy().reshape(-1, 3).astype(np.int32)
+    except RuntimeError as error:
+        reason = str(error).strip().splitlines()[-1]
+        raise AssetError(f"{file}: no PLY mesh ({reason}); export it again, with triangles only") from error
+    if not np.isfinite(vertices).all() or (faces.size and faces.max() >= len(vertices)):
+        raise AssetError(f"{file}: a vertex is not finite or a face names none; export it again")
+    return Mesh(vertices, faces)
+
+
+def load_scenery(mi: Any, scenery: Scenery) -> list[Mesh]:
+    """The scenery's meshes in world coordinates, in its order."""
+    meshes = []
+    for shape in scenery.shapes:
+        mesh = load_mesh(mi, shape.file)
+        rotation, offset = shape.to_world[:3, :3], shape.to_world[:3, 3]
+        meshes.append(Mesh(mesh.vertices @ rotation.T + offset, mesh.faces))
+    return meshes
+
+
+def load_unit_mesh(mi: Any, file: Path) -> Mesh:
+    """The mesh of a moving object.
+
+    Raises `AssetError` where its bounding box is not −½…½ on every axis.
+    """
+    mesh = load_mesh(mi, file)
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    if not (np.allclose(low, -0.5, atol=1e-4) and np.allclose(high, 0.5, atol=1e-4)):
+        raise AssetError(
+            f"{file}: spans {low.round(4).tolist()} to {high.round(4).tolist()}; "
+            "scale and centre it to −0.5…0.5 on every axis"
+        )
+    return mesh
+
+
+def contains(mesh: Mesh, point: Float64Array) -> bool:
+    """Whether ``point`` [3] lies inside a closed mesh, not on its surface.
+
+    Sums the solid angles of all triangles (Van Oosterom and Strackee, "The solid angle of a plane
+    triangle", 1983): 4π inside, 0 outside, and between them on faces and edges.
+    """
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces] - point, 1, 0)
+    la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
+    numerator = np.einsum("ij,ij->i", a, np.cross(b, c))
+    denominator = (
+        la * lb * lc
+        + np.einsum("ij,ij->i", a, b) * lc
+        + np.einsum("ij,ij->i", b, c) * la
+        + np.einsum("ij,ij->i", c, a) * lb
+    )
+    angle = 2 * float(np.arctan2(numerator, denominator).sum())
+    return abs(angle) > 3 * np.pi
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """Where rays end."""
+
+    distance: Float32Array
+    """[m] along each ray, Shape ``[N]``; infinite where nothing is hit."""
+    owner: Int32Array
+    """What is hit, for `TracedScene.name_of`; `NO_HIT` for nothing. Shape ``[N]``."""
+
+
+class _Part:
+    """One merged mesh in a ray-tracing scene of its own."""
+
+    def __init__(self, mi: Any, name: str, vertices: Float64Array, faces: Int32Array) -> None:
+        mesh = mi.Mesh(name, len(vertices), len(faces))
+        parameters = mi.traverse(mesh)
+        parameters["vertex_positions"] = mi.Float(vertices.ravel().astype(np.float32))
+        parameters["faces"] = mi.UInt32(faces.ravel().astype(np.uint32))
+        parameters.update()
+        self.scene = mi.load_dict({"type": "scene", name: mesh})
+        self._key = f"{name}.vertex_positions"
+        self._parameters = mi.traverse(self.scene)
+        self._parameters.keep(self._key)
+
+    def move(self, mi: Any, vertices: Float32Array) -> None:
+        self._parameters[self._key] = mi.Float(vertices.ravel())
+        self._parameters.update()
+
+
+class TracedScene:
+    """Scenery and a pool of bodies, for rays. Build and use it under `active_variant`.
+
+    Parameters
+    ----------
+    names, meshes
+        The scenery's shapes, in world coordinates.
+    bodies
+        Unit mesh of each asset that moving objects may have, by asset name.
+    capacity
+        How many objects of each asset may be in the scene at once.
+    """
+
+    def __init__(
+        self,
+        mi: Any,
+        names: tuple[str, ...],
+        meshes: list[Mesh],
+        bodies: Mapping[str, Mesh],
+        capacity: Mapping[str, int],
+    ) -> None:
+        self._scenery_names = names
+        self._bodies = dict(bodies)
+        self._pool = BodyPool(capacity)
+        self._scenery: _Part | None = None
+        vertices, faces, self._scenery_owner = _merged(meshes)
+        if faces.size:
+            self._scenery = _Part(mi, "scenery", vertices, faces)
+        # Parked bodies are collapsed to a point within the scene, where no ray can hit them.
+        self._parked = vertices.mean(axis=0) if len(vertices) else np.zeros(3)
+        self._start: dict[str, int] = {}
+        pooled: list[Mesh] = []
+        for asset in sorted(self._bodies):
+            self._start[asset] = len(pooled)
+            pooled += [self._bodies[asset]] * capacity[asset]
+        _, faces, owner = _merged(pooled)
+        self._body_owner = owner + np.int32(len(names))
+        self._vertex_start = np.cumsum([0, *(len(mesh.vertices) for mesh in pooled)])
+        self._moving = _Part(mi, "bodies", np.tile(self._parked, (self._vertex_start[-1], 1)), faces)
+        self._owner_names: list[str] = [*names, *[""] * len(pooled)]
+
+    def update(self, mi: Any, scene: Scene) -> None:
+        """Move the bodies to where the scene's objects are.
+
+        Raises `PayloadError` where there are more objects of an asset than bodies, and where an
+        object has the name of a scenery shape.
+        """
+        clash = set(self._scenery_names) & set(scene.names)
+        if clash:
+            raise PayloadError(
+                f"object {min(clash)!r} has the name of a shape of the scenery; give the world's objects "
+                "another prefix"
+            )
+        vertices = np.tile(self._parked, (self._vertex_start[-1], 1))
+        self._owner_names[len(self._scenery_names) :] = [""] * (len(self._vertex_start) - 1)
+        places = self._pool.assign(zip(scene.names, scene.assets, strict=True))
+        for index, name in enumerate(scene.names):
+            asset, slot = places[name]
+            body = self._start[asset] + slot
+            self._owner_names[len(self._scenery_names) + body] = name
+            vertices[self._vertex_start[body] : self._vertex_start[body + 1]] = placed(
+                self._bodies[asset], scene.dimensions[index], object_pose(scene, index)
+            )
+        self._moving.move(mi, vertices.astype(np.float32))
+
+    def trace(self, mi: Any, origin: Float64Array, direction: Float64Array, reach: Float64Array) -> Hits:
+        """First hit of each ray.
+
+        Parameters
+        ----------
+        origin, direction
+            World coordinates [m] and unit vectors, Shape ``[3, N]``.
+        reach
+            [m], Shape ``[N]``; what is farther is not looked for.
+        """
+        import drjit as dr
+
+        # Every value is an array of its own, never a Python number: a number becomes part of the
+        # kernel, and each new one a kernel to compile.
+        columns = [
+            mi.Float(row.astype(np.float32, order="C")) for rows in (origin, direction) for row in rows
+        ]
+        ray = mi.Ray3f(mi.Point3f(*columns[:3]), mi.Vector3f(*columns[3:]))
+        ray.maxt = mi.Float(reach.astype(np.float32))
+        hit = self._moving.scene.ray_intersect_preliminary(ray, coherent=True)
+        distance, face, moving = hit.t, hit.prim_index, mi.Bool(True)
+        if self._scenery is not None:
+            fixed = self._scenery.scene.ray_intersect_preliminary(ray, coherent=True)
+            moving = distance < fixed.t
+            distance = dr.select(moving, distance, fixed.t)
+            face = dr.select(moving, face, fixed.prim_index)
+        dr.eval(distance, face, moving)
+        return self._hits(distance.numpy(), face.numpy(), moving.numpy())
+
+    def _hits(self, distance: Float32Array, face: Any, moving: Any) -> Hits:
+        found = np.isfinite(distance)
+        # A ray that hits nothing has no face; 0 stands in, so that the tables can be read.
+        face = np.where(found, face, 0).astype(np.int64)
+        owner = np.where(
+            moving,
+            self._body_owner[np.where(moving, face, 0)],
+            self._scenery_owner[np.where(moving, 0, face)] if self._scenery is not None else NO_HIT,
+        )
+        owner[~found] = NO_HIT
+        return Hits(distance, owner.astype(np.int32))
+
+    def is_inside(self, asset: str, dimensions: Float64Array, point: Vector) -> bool:
+        """Whether a point in an object's body axes [m] lies inside its mesh, not on its surface."""
+        if not (dimensions > 0).all():
+            return False
+        return contains(self._bodies[asset], np.array(point) / dimensions)
+
+    def name_of(self, owner: int) -> str:
+        """Name of the object or scenery shape behind an owner of `Hits`, in the last update."""
+        return self._owner_names[owner]
+
+
+def _merged(meshes: list[Mesh]) -> tuple[Float64Array, Int32Array, Int32Array]:
+    """One mesh of several: vertices, faces, and the index of the mesh that each face is of."""
+    if not meshes:
+        return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32), np.zeros(0, dtype=np.int32)
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    faces = [mesh.faces + np.int32(start) for mesh, start in zip(meshes, starts, strict=False)]
+    counts = [len(mesh.faces) for mesh in meshes]
+    owner = np.repeat(np.arange(len(meshes), dtype=np.int32), counts)
+    return np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces, dtype=np.int32), owner
