@@ -29,8 +29,9 @@ from caviar_protocol.topics import (
     ChannelOptions,
     Scene,
 )
-from caviar_services.channel.arrays import channel_matrix, radiated_field, steering
+from caviar_services.antenna import steering_vector
 from caviar_services.channel.geometry import PathGeometry, path_geometry
+from caviar_services.channel.patterns import radiated_field
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +70,8 @@ class PathTable:
     pair: Int64Array
     """TX index · number of RX + RX index, Shape ``[P]``."""
     transfer: Complex128Array
-    """Field at RX per field at TX, with spreading λ/(4πd) and without exp(−j2πfτ); Shape ``[C, P, 2, 2]``.
-    Rows (θ̂, φ̂) at the arrival direction, columns (θ̂, φ̂) at the departure direction, world axes."""
+    """Dyad from the field sent to the field received, with spreading λ/(4πd) and without
+    exp(−j2πfτ), in world axes; Shape ``[C, P, 3, 3]``, rows at RX, columns at TX."""
     types: UInt8Array
     """`Interaction` at each point, Shape ``[P, D]``; 0 behind the last."""
     objects: Int32Array
@@ -195,11 +196,11 @@ def _amplitudes(
 ) -> Complex128Array:
     """a = field_rx · transfer · field_tx · exp(−j2πfτ), Shape ``[C, P]``."""
     tx, rx = np.divmod(table.pair, max(len(receivers), 1))
-    sent = np.zeros((len(tx), 2))
+    sent = np.zeros((len(tx), 3))
     for index, antenna in enumerate(transmitters):
         mine = tx == index
         sent[mine] = radiated_field(antenna.array, antenna.rotation, geometry.departure[mine])
-    taken = np.zeros((len(rx), 2))
+    taken = np.zeros((len(rx), 3))
     for index, antenna in enumerate(receivers):
         mine = rx == index
         taken[mine] = radiated_field(antenna.array, antenna.rotation, geometry.arrival[mine])
@@ -294,15 +295,20 @@ def _matrices(
     a: Complex128Array,
     offsets: Int64Array,
 ) -> tuple[ChannelMatrix, ...]:
+    """H[m, n] = Σ_p a[p] · receive[p, m] · transmit[p, n] of every carrier and pair."""
     steered = []
     for pair in range(len(offsets) - 1):
         tx, rx = divmod(pair, len(receivers))
         mine = slice(int(offsets[pair]), int(offsets[pair + 1]))
-        transmit = steering(transmitters[tx].array, transmitters[tx].rotation, geometry.departure[mine])
-        receive = steering(receivers[rx].array, receivers[rx].rotation, geometry.arrival[mine])
+        transmit = _steering(transmitters[tx], geometry.departure[mine])
+        receive = _steering(receivers[rx], geometry.arrival[mine])
         steered.append((tx, rx, mine, receive, transmit))
     return tuple(
-        ChannelMatrix(carrier=carrier, tx=tx, rx=rx, h=channel_matrix(a[carrier, mine], receive, transmit))
+        ChannelMatrix(carrier=carrier, tx=tx, rx=rx, h=(receive * a[carrier, mine, None]).T @ transmit)
         for carrier in range(len(a))
         for tx, rx, mine, receive, transmit in steered
     )
+
+
+def _steering(antenna: Antenna, directions: Float64Array) -> Complex128Array:
+    return steering_vector(antenna.array, directions @ antenna.rotation)

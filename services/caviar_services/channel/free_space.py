@@ -12,10 +12,8 @@ from typing import ClassVar
 import msgspec
 import numpy as np
 
-from caviar_protocol.arrays import Complex128Array, Float64Array
 from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Scene
-from caviar_services.channel.arrays import spherical_basis
 from caviar_services.channel.assemble import Antenna, PathTable
 from caviar_services.channel.base import ChannelModel, Found
 
@@ -41,11 +39,11 @@ class FreeSpaceChannel(ChannelModel[FreeSpaceSettings]):
         distance = np.sqrt((line**2).sum(-1))
         wavelength = SPEED_OF_LIGHT / np.array([carrier.frequency_hz for carrier in self.run.carriers])
         far = np.flatnonzero(distance >= wavelength.max())
-        direction = line[far] / distance[far, None]
         spreading = wavelength[:, None] / (4 * np.pi * distance[far])
         table = PathTable(
             pair=far,
-            transfer=spreading[:, :, None, None] * line_transfer(direction),
+            # Both fields are transverse to the line, so what arrives is what was sent.
+            transfer=spreading[:, :, None, None] * np.eye(3, dtype=np.complex128),
             types=np.zeros((len(far), 0), np.uint8),
             objects=np.zeros((len(far), 0), np.int32),
             points=np.zeros((len(far), 0, 3)),
@@ -57,14 +55,3 @@ class FreeSpaceChannel(ChannelModel[FreeSpaceSettings]):
             los=np.ones((len(transmitters), len(receivers)), bool),
             counts={"too_close": len(distance) - len(far)},
         )
-
-
-def line_transfer(direction: Float64Array) -> Complex128Array:
-    """Transfer of a straight line between the spherical bases at its ends, Shape ``[P, 2, 2]``.
-
-    ``direction`` [P, 3] points from TX to RX; the basis at RX is that of the direction back.
-    """
-    sent = np.stack(spherical_basis(direction), axis=-2)
-    taken = np.stack(spherical_basis(-direction), axis=-2)
-    transfer: Complex128Array = np.einsum("pix,pjx->pij", taken, sent).astype(np.complex128)
-    return transfer

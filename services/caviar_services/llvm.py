@@ -1,0 +1,184 @@
+"""Which LLVM library Dr.Jit compiles with, and on which device it computes.
+
+Without a CUDA device Dr.Jit needs a libLLVM shared library, which pip does not bring. Left alone
+it takes the first it finds; with versions before 16 the process aborts at its first kernel on
+machines with AVX-512. So the library is chosen here, before Dr.Jit is imported.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from caviar_protocol.errors import SetupError
+
+ENVIRONMENT = "DRJIT_LIBLLVM_PATH"
+"""Environment variable that Dr.Jit reads when it is imported."""
+
+OLDEST = 16
+"""First major version that compiles every kernel."""
+
+INSTALL = "sudo apt-get install -y libllvm19"
+"""The command that mends a missing library."""
+
+FOLDERS: tuple[str, ...] = (
+    "/usr/lib/llvm-*/lib",
+    "/usr/lib/*-linux-gnu",
+    "/usr/lib64",
+    "/usr/lib",
+    "/usr/local/lib",
+    "/opt/homebrew/opt/llvm*/lib",
+    "/usr/local/opt/llvm*/lib",
+)
+"""Folders, as patterns, in which a libLLVM is looked for beside the linker's cache."""
+
+_NAME = re.compile(r"libLLVM(?:-(?P<dashed>\d+(?:\.\d+)*))?\.(?:so|dylib)(?:\.(?P<dotted>\d+(?:\.\d+)*))?$")
+_FOLDER = re.compile(r"llvm-(?P<version>\d+)")
+
+
+@dataclass(frozen=True, order=True)
+class LlvmLibrary:
+    """A libLLVM shared library."""
+
+    version: tuple[int, ...]
+    """Major version first; as many parts as its file name tells."""
+    path: Path
+
+    def __str__(self) -> str:
+        return f"LLVM {'.'.join(map(str, self.version))} ({self.path})"
+
+
+def choose_llvm(
+    environment: Mapping[str, str] = os.environ,
+    folders: Sequence[str] = FOLDERS,
+    listed: Iterable[str] | None = None,
+) -> LlvmLibrary:
+    """The library that Dr.Jit shall use: an explicit one first, else the newest that is new enough.
+
+    Parameters
+    ----------
+    environment
+        Where `ENVIRONMENT` may name one explicitly.
+    folders
+        Patterns of folders to look in.
+    listed
+        Further candidates; by default those in the linker's cache.
+
+    Raises
+    ------
+    SetupError
+        The explicit one does not exist or is too old, or there is none; ends with the command that
+        mends it.
+    """
+    explicit = environment.get(ENVIRONMENT, "")
+    if explicit:
+        return _explicit(Path(explicit))
+    candidates = [Path(name) for name in (_linker_cache() if listed is None else listed)]
+    for folder in folders:
+        root = Path(folder).anchor or "."
+        for found in Path(root).glob(folder.removeprefix(root)):
+            candidates += found.glob("libLLVM*")
+    libraries = {_library(path) for path in candidates if path.is_file()} - {None}
+    known = sorted(library for library in libraries if library is not None)
+    usable = [library for library in known if library.version[0] >= OLDEST]
+    if usable:
+        return usable[-1]
+    instead = f"; found only {', '.join(map(str, known))}" if known else ""
+    raise SetupError(
+        f"no libLLVM of version {OLDEST} or newer on this machine{instead}; the ray tracer compiles "
+        f"with it. Install one: {INSTALL}"
+    )
+
+
+def activate_llvm() -> str:
+    """Make Dr.Jit use the chosen library; call before Dr.Jit is imported.
+
+    Returns a line that says which. Raises `SetupError` as `choose_llvm`, and where Dr.Jit was imported
+    before with nothing set, since it may hold another library by then.
+    """
+    library = choose_llvm()
+    if "drjit" in sys.modules and os.environ.get(ENVIRONMENT) != str(library.path):
+        raise SetupError(
+            f"Dr.Jit was imported before {ENVIRONMENT} was set, so it may hold another library; set it "
+            f"before the start: export {ENVIRONMENT}={library.path}"
+        )
+    os.environ[ENVIRONMENT] = str(library.path)
+    return str(library)
+
+
+def choose_variant() -> str:
+    """Mitsuba variant of the channel: CUDA where there is a device that answers, else LLVM."""
+    return "cuda_ad_mono_polarized" if cuda_devices() else "llvm_ad_mono_polarized"
+
+
+def cuda_devices(library: str = "libcuda.so.1") -> int:
+    """Number of CUDA devices that the driver reports; 0 without a driver."""
+    try:
+        driver = ctypes.CDLL(library)
+    except OSError:
+        return 0
+    count = ctypes.c_int(0)
+    if driver.cuInit(0) != 0 or driver.cuDeviceGetCount(ctypes.byref(count)) != 0:
+        return 0
+    return count.value
+
+
+def _explicit(path: Path) -> LlvmLibrary:
+    if not path.is_file():
+        raise SetupError(
+            f"{ENVIRONMENT} is {str(path)!r}, which is not a file; name an existing libLLVM, or unset it "
+            f"and install one: {INSTALL}"
+        )
+    library = _library(path)
+    if library is None:
+        return LlvmLibrary(_asked(path), path)
+    if library.version[0] < OLDEST:
+        raise SetupError(
+            f"{ENVIRONMENT} is {str(path)!r}, LLVM {library.version[0]}, the ray tracer needs {OLDEST} or "
+            f"newer; unset it and install one: {INSTALL}"
+        )
+    return LlvmLibrary(library.version, path)
+
+
+def _library(path: Path) -> LlvmLibrary | None:
+    """The library of a file name that tells its version; None where it does not."""
+    real = path.resolve()
+    match = _NAME.match(real.name)
+    if match is None:
+        return None
+    version = match["dashed"] or match["dotted"]
+    if version is None:
+        folder = _FOLDER.search(str(real.parent))
+        if folder is None:
+            return None
+        version = folder["version"]
+    return LlvmLibrary(tuple(int(part) for part in version.split(".")), real)
+
+
+def _asked(path: Path) -> tuple[int, ...]:
+    """Version that a library of unknown name tells itself; LLVMGetVersion came with LLVM 16."""
+    try:
+        tell = ctypes.CDLL(str(path)).LLVMGetVersion
+    except (OSError, AttributeError) as error:
+        raise SetupError(
+            f"{ENVIRONMENT} is {str(path)!r}, which is not an LLVM {OLDEST} or newer ({error}); unset it and "
+            f"install one: {INSTALL}"
+        ) from error
+    parts = [ctypes.c_uint(0) for _ in range(3)]
+    tell(*(ctypes.byref(part) for part in parts))
+    return tuple(part.value for part in parts)
+
+
+def _linker_cache() -> list[str]:
+    ldconfig = shutil.which("ldconfig", path=os.environ.get("PATH", "") + ":/sbin:/usr/sbin")
+    if ldconfig is None:
+        return []
+    listing = subprocess.run([ldconfig, "-p"], capture_output=True, text=True, timeout=10, check=False)  # noqa: S603 - fixed command
+    return [line.rpartition("=> ")[2].strip() for line in listing.stdout.splitlines() if "libLLVM" in line]
