@@ -13,6 +13,7 @@ from caviar_protocol.messages import (
     Hello,
     Message,
     Ready,
+    Refuse,
     ResetDone,
 )
 
@@ -148,6 +149,14 @@ class Send:
 
 
 @dataclass(frozen=True, slots=True)
+class TurnAway:
+    """Answer the HELLO that is being handled with a refusal."""
+
+    name: str
+    refusal: Refuse
+
+
+@dataclass(frozen=True, slots=True)
 class Journal:
     """Write one task's outcome to the journal, then feed `Journaled` (clause 18)."""
 
@@ -166,7 +175,8 @@ class Notice:
     """Something the user or the log must know: nothing late, dropped or overwritten in silence."""
 
     kind: str
-    """``miss``, ``late``, ``skipped``, ``fault``, ``lost``, ``idle``, ``lag``, ``stale``, ``discarded``, ``note``."""
+    """``miss``, ``late``, ``skipped``, ``fault``, ``lost``, ``idle``, ``lag``, ``stale``,
+    ``discarded`` or ``note``."""
     service: str
     text: str
     episode: int = 0
@@ -212,4 +222,4 @@ class Finished:
     digest: str
 
 
-Action = Send | Journal | Notice | Latency | FrameFinished | EpisodeFinished | Finished
+Action = Send | TurnAway | Journal | Notice | Latency | FrameFinished | EpisodeFinished | Finished

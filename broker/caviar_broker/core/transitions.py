@@ -1,7 +1,7 @@
 """Every state and every transition of the core, in one place.
 
 Three machines: the *run*, each *service* in it, and each *task* (one service's part of one
-frame). What is not in a table is not allowed; `step` raises `IllegalTransition`, which is a fault
+frame). What is not in a table is not allowed; `step` raises `IllegalTransitionError`, which is a fault
 of the core itself, never of a peer: what peers send out of turn is sorted out before.
 """
 
@@ -127,6 +127,7 @@ SERVICE: dict[tuple[ServiceState, ServiceEvent], ServiceState] = {
     (ServiceState.READY, ServiceEvent.RESET): ServiceState.RESETTING,
     (ServiceState.RESETTING, ServiceEvent.RESET_DONE): ServiceState.ACTIVE,
     (ServiceState.ACTIVE, ServiceEvent.EPISODE_END): ServiceState.READY,
+    (ServiceState.EXPECTED, ServiceEvent.LOST): ServiceState.LOST,
     **{(state, ServiceEvent.LOST): ServiceState.LOST for state in _PRESENT},
     **{(state, ServiceEvent.BYE): ServiceState.LEFT for state in _PRESENT},
 }
@@ -157,7 +158,7 @@ DECIDED = frozenset({TaskState.DONE, TaskState.OVERDUE, TaskState.LATE, TaskStat
 """Task states in which consumers know what they get."""
 
 
-class IllegalTransition(AssertionError):
+class IllegalTransitionError(AssertionError):
     """The core tried a transition that is not in its tables."""
 
 
@@ -166,8 +167,8 @@ _E = TypeVar("_E", RunEvent, ServiceEvent, TaskEvent)
 
 
 def step(table: dict[tuple[_S, _E], _S], state: _S, event: _E) -> _S:
-    """The state after ``event``; `IllegalTransition` where the table has none."""
+    """The state after ``event``; `IllegalTransitionError` where the table has none."""
     try:
         return table[state, event]
     except KeyError:
-        raise IllegalTransition(f"{event} in {state}") from None
+        raise IllegalTransitionError(f"{event} in {state}") from None

@@ -1,0 +1,42 @@
+"""Realtime pace: frames are released when their time has come, and slip rather than skip."""
+
+from __future__ import annotations
+
+from caviar_broker.core.plan import RunPlan
+
+
+class Pacer:
+    """Releases the frames of one episode (contract, clause 8).
+
+    Frame 0 is released when somebody first asks for it. A later one is due as long after the one
+    before as simulated time says; when it is asked for later than that, all frames behind it slip by
+    as much. As fast as possible, every frame is released at once.
+    """
+
+    def __init__(self, plan: RunPlan) -> None:
+        self._plan = plan
+        self._released_frame = -1
+        self._released_at = 0
+        self._asked = False
+        self.lag_ns = 0
+        """Sum of all slips [ns]."""
+
+    def release(self, frame: int, now: int) -> int | None:
+        """Ask for a frame: by how much it slips [ns], or None while its time has not come."""
+        if not self._plan.realtime or frame <= self._released_frame:
+            return 0
+        due = now if self._released_frame < 0 else self._due()
+        self._asked = now < due
+        if self._asked:
+            return None
+        self._released_frame, self._released_at = frame, now
+        self.lag_ns += now - due
+        return now - due
+
+    def next_instant(self) -> int | None:
+        """When the frame that was asked for in vain will be due [ns]; None if there is none."""
+        return self._due() if self._asked else None
+
+    def _due(self) -> int:
+        frame = self._released_frame
+        return self._released_at + self._plan.t_ns(frame + 1) - self._plan.t_ns(frame)

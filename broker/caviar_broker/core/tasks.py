@@ -1,0 +1,77 @@
+"""Tasks, and what is decided about their products."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from caviar_broker.core.events import Product
+from caviar_broker.core.transitions import TASK, TaskEvent, TaskState, step
+from caviar_protocol.messages import GrantInput, Status
+
+
+@dataclass(slots=True)
+class Decision:
+    """What consumers of a frame get of one (topic, source)."""
+
+    status: Status
+    product: Product | None
+    cause: str = ""
+
+
+@dataclass(slots=True)
+class Task:
+    """One service's part of one frame."""
+
+    service: str
+    frame: int
+    state: TaskState = TaskState.PENDING
+    eligible_at: int | None = None
+    """When its inputs were decided and its predecessor was through [ns]."""
+    granted_at: int | None = None
+    decisions: dict[str, Decision] = field(default_factory=dict)
+    """By topic, once decided."""
+    journal: int = 0
+    """Number of its journal entry; 0: none yet."""
+
+    def move(self, event: TaskEvent) -> None:
+        """Take a transition of the table."""
+        self.state = step(TASK, self.state, event)
+
+
+def provenance(topic: str, source: str, decision: Decision, frame: int) -> GrantInput:
+    """What a consumer in ``frame`` is told about where its input comes from."""
+    product = decision.product
+    if product is None:
+        return GrantInput(topic=topic, source=source, status=decision.status, cause=decision.cause)
+    return GrantInput(
+        topic=topic,
+        source=source,
+        status=decision.status,
+        frame=product.frame,
+        t_ns=product.t_ns,
+        age=frame - product.frame,
+        fidelity=product.fidelity,
+        digest=product.digest,
+        cause=decision.cause,
+    )
+
+
+def validate_decision(service: str, frame: int, topic: str, decision: Decision) -> None:
+    """Raise AssertionError where a decision contradicts itself (clauses 9 to 12)."""
+    what = f"{topic} of {service} in frame {frame}"
+    match decision.status:
+        case Status.FRESH:
+            assert decision.product is not None, f"{what} is fresh without a product"
+            assert decision.product.frame == frame, f"{what} is not fresh"
+        case Status.HELD:
+            assert decision.product is not None, f"{what} is held without a product"
+            assert decision.product.frame < frame, f"{what} is not an earlier one"
+            assert decision.cause, f"{what} is held without a cause"
+        case _:
+            assert decision.product is None, f"{what} is absent with a product"
+            assert decision.cause, f"{what} is absent without a cause"
+
+
+def milliseconds(ns: int) -> str:
+    """A duration for people."""
+    return f"{ns / 1e6:.1f} ms"
