@@ -95,15 +95,26 @@ class Payload(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     and shape; sizes that share a name must agree. Equality compares arrays element by element.
     """
 
-    sizes_from: ClassVar[dict[str, str]] = {}
-    """Names of sizes that equal the length of a tuple field: ``{"N": "names"}``."""
+    sizes_from: ClassVar[dict[str, tuple[str, ...]]] = {}
+    """Names of sizes, and the tuple fields that have this length: ``{"N": ("names", "classes")}``."""
 
     def __post_init__(self) -> None:
-        sizes = {size: len(getattr(self, field)) for size, field in self.sizes_from.items()}
+        sizes = {size: self._length(fields) for size, fields in self.sizes_from.items()}
         for name, spec in array_fields(type(self)).items():
             value = getattr(self, name)
             if value is not None:
                 _check_array(type(self).__name__, name, value, spec, sizes)
+        self.check()
+
+    def check(self) -> None:  # optional hook
+        """Raise `PayloadError` where fields contradict each other beyond what shapes say."""
+
+    def _length(self, fields: tuple[str, ...]) -> int:
+        lengths = {len(getattr(self, field)) for field in fields}
+        if len(lengths) > 1:
+            stated = ", ".join(f"{field} {len(getattr(self, field))}" for field in fields)
+            raise PayloadError(f"{type(self).__name__} has fields of different length: {stated}")
+        return lengths.pop()
 
     def __eq__(self, other: object) -> bool:
         if type(self) is not type(other):
@@ -141,7 +152,7 @@ def _check_array(owner: str, name: str, value: Any, spec: ArrayField, sizes: dic
             )
 
 
-def require_finite(payload: Payload, path: str = "") -> None:
+def require_finite(payload: msgspec.Struct, path: str = "") -> None:
     """Raise `PayloadError` where ``payload`` holds a NaN or an infinity (contract, clause 21)."""
     path = path or type(payload).__name__
     for name in payload.__struct_fields__:
@@ -158,7 +169,7 @@ def _require_finite(value: Any, path: str) -> None:
     elif isinstance(value, float):
         if not math.isfinite(value):
             raise PayloadError(f"{path} is {value}: non-finite values may not leave a service")
-    elif isinstance(value, Payload):
+    elif isinstance(value, msgspec.Struct):
         require_finite(value, path)
     elif isinstance(value, tuple):
         for index, item in enumerate(value):

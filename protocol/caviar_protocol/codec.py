@@ -1,20 +1,24 @@
 """Bytes to typed objects and back.
 
 Nothing here trusts its input: sizes are checked before anything is decoded, and whatever is
-wrong with the bytes comes out as a `ProtocolError`.
+wrong with the bytes comes out as a `ProtocolError`. All functions may be called from any thread.
 """
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
+from functools import cache
 from typing import Any, TypeVar
 
 import msgspec
-import numpy as np
 
 from caviar_protocol import limits
-from caviar_protocol.arrays import MAX_DIMENSIONS, WIRE_DTYPES, Payload, require_finite
+from caviar_protocol.arrays import Payload
+from caviar_protocol.body import BodyReader, BodyWriter
+from caviar_protocol.canonical import plain
 from caviar_protocol.errors import DecodeError, LimitError, PayloadError, VersionError
+from caviar_protocol.fields import Version
 from caviar_protocol.messages import (
     PROTOCOL_VERSION,
     AssetData,
@@ -30,14 +34,37 @@ from caviar_protocol.topics import PAYLOADS
 
 Buffer = bytes | bytearray | memoryview
 
-_ALIGNMENT = 8
-_encoder = msgspec.msgpack.Encoder()
+
+class _Opening(msgspec.Struct):
+    """What HELLO and WELCOME have in every major version."""
+
+    type: str
+    version: Version
+
+
+_message_encoder = msgspec.msgpack.Encoder(order="deterministic")  # sorts the keys of free maps
+_payload_encoder = msgspec.msgpack.Encoder()
 _message_decoder: msgspec.msgpack.Decoder[Message] = msgspec.msgpack.Decoder(Message)
+_opening_decoder = msgspec.msgpack.Decoder(_Opening)
 
 
 def encode_message(message: Message) -> bytes:
-    """Header part of a message."""
-    return _encoder.encode(message)
+    """Header part of a message.
+
+    Raises `PayloadError` where a field holds what cannot travel, `LimitError` where the header
+    gets too large.
+    """
+    if isinstance(message, Welcome):
+        _check_settings(message, PayloadError)
+    try:
+        header = _message_encoder.encode(message)
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
+        raise PayloadError(f"{message_type(message)} holds a value that cannot travel: {error}") from error
+    if len(header) > limits.MAX_HEADER:
+        raise LimitError(
+            f"{message_type(message)} header has {len(header)} B, at most {limits.MAX_HEADER} may travel"
+        )
+    return header
 
 
 def decode_message(header: Buffer) -> Message:
@@ -47,14 +74,24 @@ def decode_message(header: Buffer) -> Message:
     ------
     LimitError
         The header is larger than `limits.MAX_HEADER` or nested too deeply.
+    VersionError
+        It is a HELLO or WELCOME of another major version, which this one cannot read.
     DecodeError
         The bytes are not a message of this protocol.
     """
-    message = _decode(_message_decoder, header, "message header")
+    try:
+        message = _decode(_message_decoder, header, "message header")
+    except DecodeError:
+        _check_opening(header)
+        raise
     if isinstance(message, Welcome):
-        _check_nesting(message.settings, "WELCOME.settings")
-        _check_nesting(message.scenario, "WELCOME.scenario")
+        _check_settings(message, DecodeError)
     return message
+
+
+def message_type(message: Message) -> str:
+    """The word that stands in the field ``type``: ``"GRANT"``."""
+    return str(type(message).__struct_config__.tag)
 
 
 def part_count(message: Message) -> int:
@@ -71,11 +108,29 @@ def part_count(message: Message) -> int:
 
 
 def check_parts(message: Message, parts: Sequence[Any]) -> None:
-    """Raise `DecodeError` unless ``parts`` (header included) are as many as ``message`` announces."""
+    """Check the parts (header included) that came with ``message``, without decoding them.
+
+    Raises
+    ------
+    DecodeError
+        They are not as many as the message announces, or reach beyond the end of an asset.
+    LimitError
+        One of them is too large.
+    """
     expected = part_count(message)
     if len(parts) != expected:
-        name = type(message).__struct_config__.tag
-        raise DecodeError(f"{name} announces {expected} parts, {len(parts)} came")
+        raise DecodeError(f"{message_type(message)} announces {expected} parts, {len(parts)} came")
+    if isinstance(message, AssetData):
+        _check_chunk(message, len(parts[1]))
+        return
+    for index in range(1, len(parts)):
+        product_header = index % 2 == 1 and isinstance(message, Grant | Done)
+        limit = limits.MAX_HEADER if product_header else limits.MAX_BODY
+        if len(parts[index]) > limit:
+            raise LimitError(
+                f"part {index} of {message_type(message)} has {len(parts[index])} B, "
+                f"at most {limit} are accepted"
+            )
 
 
 def check_version(version: tuple[int, int]) -> None:
@@ -96,28 +151,31 @@ def encode_payload(payload: Payload) -> tuple[bytes, bytes]:
     Equal payloads give equal bytes. Raises `PayloadError` for a non-finite value (clause 21) and
     `LimitError` for a product too large to travel.
     """
-    require_finite(payload)
-    chunks: list[bytes] = []
-    length = 0
-
-    def place(value: Any) -> dict[str, Any]:
-        nonlocal length
-        if not isinstance(value, np.ndarray):
-            raise PayloadError(f"{type(value).__name__} cannot travel in a payload")
-        little = np.ascontiguousarray(value, dtype=value.dtype.newbyteorder("<"))
-        padding = -length % _ALIGNMENT
-        chunks.append(bytes(padding))
-        chunks.append(little.tobytes())
-        offset = length + padding
-        length = offset + little.nbytes
-        return {"dtype": little.dtype.str, "shape": value.shape, "offset": offset}
-
-    header = msgspec.msgpack.Encoder(enc_hook=place).encode(payload)
+    writer = BodyWriter()
+    fields = plain(payload, writer)
+    try:
+        header = _payload_encoder.encode(fields)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise PayloadError(f"{type(payload).__name__} holds a value that cannot travel: {error}") from error
     if len(header) > limits.MAX_HEADER:
         raise LimitError(f"payload header has {len(header)} B, at most {limits.MAX_HEADER} may travel")
-    if length > limits.MAX_BODY:
-        raise LimitError(f"payload body has {length} B, at most {limits.MAX_BODY} may travel")
-    return header, b"".join(chunks)
+    if writer.length > limits.MAX_BODY:
+        raise LimitError(f"payload body has {writer.length} B, at most {limits.MAX_BODY} may travel")
+    return header, writer.body()
+
+
+class _Reading(threading.local):
+    """The body that this thread is decoding: decoders are shared, what they read is not."""
+
+    reader: BodyReader
+
+
+_reading = _Reading()
+
+
+@cache
+def _payload_decoder(cls: type[Payload]) -> msgspec.msgpack.Decoder[Payload]:
+    return msgspec.msgpack.Decoder(cls, dec_hook=lambda _, reference: _reading.reader.take(reference))
 
 
 def decode_payload(topic: str, header: Buffer, body: Buffer) -> Payload:
@@ -136,11 +194,11 @@ def decode_payload(topic: str, header: Buffer, body: Buffer) -> Payload:
     view = memoryview(body).toreadonly().cast("B")
     if len(view) > limits.MAX_BODY:
         raise LimitError(f"payload body has {len(view)} B, at most {limits.MAX_BODY} are accepted")
-
-    def take(_: type, reference: Any) -> Any:
-        return _array_at(reference, view)
-
-    return _decode(msgspec.msgpack.Decoder(cls, dec_hook=take), header, f"{topic} payload")
+    _reading.reader = BodyReader(view)
+    try:
+        return _decode(_payload_decoder(cls), header, f"{topic} payload")
+    finally:
+        del _reading.reader
 
 
 _T = TypeVar("_T")
@@ -153,45 +211,48 @@ def _decode(decoder: msgspec.msgpack.Decoder[_T], header: Buffer, what: str) -> 
         return decoder.decode(header)
     except RecursionError as error:
         raise LimitError(f"{what} nests deeper than {limits.MAX_NESTING} levels") from error
-    except PayloadError as error:
-        raise DecodeError(f"{what}: {error}") from error
-    except (msgspec.MsgspecError, ValueError, OverflowError) as error:
+    except (PayloadError, msgspec.MsgspecError, ValueError, TypeError, OverflowError) as error:
         raise DecodeError(f"{what}: {error}") from error
 
 
-def _array_at(reference: Any, body: memoryview) -> Any:
-    match reference:
-        case {"dtype": str(code), "shape": list(shape), "offset": int(offset)}:
-            pass
-        case _:
-            raise DecodeError("an array reference needs dtype, shape and offset")
-    dtype = WIRE_DTYPES.get(code)
-    if dtype is None:
-        raise DecodeError(f"array dtype {code!r} is not one of {', '.join(WIRE_DTYPES)}")
-    if len(shape) > MAX_DIMENSIONS:
-        raise LimitError(f"array has {len(shape)} dimensions, at most {MAX_DIMENSIONS} are accepted")
-    count = 1
-    for size in shape:
-        if not isinstance(size, int) or isinstance(size, bool) or not 0 <= size <= limits.MAX_BODY:
-            raise DecodeError(f"array shape {shape!r} is not a list of sizes")
-        count *= size
-    if offset < 0 or offset % _ALIGNMENT or offset + count * dtype.itemsize > len(body):
+def _check_opening(header: Buffer) -> None:
+    """Raise `VersionError` where an unreadable header opens a connection in another major version."""
+    try:
+        opening = _opening_decoder.decode(header)
+    except (msgspec.MsgspecError, ValueError, RecursionError):
+        return
+    if opening.type in ("HELLO", "WELCOME"):
+        check_version(opening.version)
+
+
+def _check_chunk(message: AssetData, length: int) -> None:
+    if length > limits.MAX_ASSET_CHUNK:
+        raise LimitError(f"ASSET_DATA carries {length} B, at most {limits.MAX_ASSET_CHUNK} are accepted")
+    if message.offset + length > message.size:
         raise DecodeError(
-            f"array of shape {shape} and dtype {code} at offset {offset} does not fit a body of {len(body)} B"
+            f"ASSET_DATA carries bytes {message.offset} to {message.offset + length} of an asset of "
+            f"{message.size} B"
         )
-    if dtype.kind == "b":
-        raw = np.frombuffer(body, np.uint8, count, offset)
-        if count and raw.max() > 1:
-            raise DecodeError("a |b1 array holds a byte other than 0 and 1")
-    return np.frombuffer(body, dtype, count, offset).reshape(shape)
 
 
-def _check_nesting(value: Any, path: str, depth: int = 2) -> None:
+def _check_settings(message: Welcome, error: type[PayloadError] | type[DecodeError]) -> None:
+    """Settings are plain data that every language has: what JSON has, with integers and floats apart."""
+    for name in ("settings", "scenario"):
+        _check_plain(getattr(message, name), f"WELCOME.{name}", 2, error)
+
+
+def _check_plain(value: Any, path: str, depth: int, error: type[PayloadError] | type[DecodeError]) -> None:
     if depth > limits.MAX_NESTING:
-        raise LimitError(f"{path} nests deeper than {limits.MAX_NESTING} levels")
+        raise LimitError(f"{path:.200} nests deeper than {limits.MAX_NESTING} levels")
     if isinstance(value, dict):
         for key, item in value.items():
-            _check_nesting(item, f"{path}.{key}" if depth < 6 else path, depth + 1)
+            if not isinstance(key, str):
+                raise error(f"{path:.200} has the key {key!r:.40}, keys are strings")
+            _check_plain(item, f"{path:.200}.{key:.40}", depth + 1, error)
     elif isinstance(value, list | tuple):
         for item in value:
-            _check_nesting(item, path, depth + 1)
+            _check_plain(item, path, depth + 1, error)
+    elif not isinstance(value, str | int | float | bool | None):
+        raise error(
+            f"{path:.200} holds {type(value).__name__}, expected text, numbers, flags, lists and tables"
+        )

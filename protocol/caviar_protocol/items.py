@@ -87,7 +87,7 @@ class GrantInput(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     t_ns: Nanoseconds = 0
     """Time of that frame; 0 when absent."""
     age: Age = 0
-    """Frames between its frame and the one it would be of were it on time."""
+    """Frames between its frame and the granted one: 0 or 1 when fresh, as its lag says; more when held."""
     fidelity: Text = ""
     """Rung or quality, as its producer states it."""
     digest: DigestOrNone = ""

@@ -6,6 +6,7 @@ from enum import IntEnum
 from typing import Annotated, ClassVar, Literal
 
 import msgspec
+import numpy as np
 
 from caviar_protocol.arrays import (
     BoolArray,
@@ -19,6 +20,7 @@ from caviar_protocol.arrays import (
     array,
     quantity,
 )
+from caviar_protocol.errors import PayloadError
 
 
 class Interaction(IntEnum):
@@ -54,12 +56,9 @@ class ChannelOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=Tr
 class ChannelMatrix(Payload, frozen=True, kw_only=True, omit_defaults=True):
     """Narrowband MIMO channel of one carrier and one TX/RX pair, at the carrier frequency."""
 
-    carrier: int
-    """Index into `Channel.carriers`."""
-    tx: int
-    """Index into `Channel.tx`."""
-    rx: int
-    """Index into `Channel.rx`."""
+    carrier: Annotated[int, quantity("1", "index into `Channel.carriers`", ge=0)]
+    tx: Annotated[int, quantity("1", "index into `Channel.tx`", ge=0)]
+    rx: Annotated[int, quantity("1", "index into `Channel.rx`", ge=0)]
     h: Annotated[
         Complex128Array,
         array("<c16", "Nr", "Nt", unit="1", doc="amplitude gain from TX element n to RX element m"),
@@ -76,7 +75,7 @@ class Channel(Payload, frozen=True, kw_only=True, omit_defaults=True):
     exp(−j2πfτ): its phase is absolute, and τ is the true propagation delay.
     """
 
-    sizes_from: ClassVar[dict[str, str]] = {"C": "carriers", "T": "tx", "R": "rx"}
+    sizes_from: ClassVar[dict[str, tuple[str, ...]]] = {"C": ("carriers",), "T": ("tx",), "R": ("rx",)}
 
     rung: str
     """Step of the fidelity ladder: ``free-space``, ``geometric``, ``siso-rt``, ``spherical``, ``mimo-rt``."""
@@ -116,6 +115,20 @@ class Channel(Payload, frozen=True, kw_only=True, omit_defaults=True):
     h: tuple[ChannelMatrix, ...] = ()
     """One matrix per carrier and pair, carriers slowest; empty unless part ``h`` is in demand."""
     dropped: Annotated[int, quantity("1", "paths dropped for non-finite values", ge=0)] = 0
+
+    def check(self) -> None:
+        """``offsets`` cuts the path axis into one run for each pair."""
+        offsets, pairs, paths = self.offsets, len(self.tx) * len(self.rx), len(self.tau)
+        if (
+            len(offsets) != pairs + 1
+            or offsets[0] != 0
+            or offsets[-1] != paths
+            or (np.diff(offsets) < 0).any()
+        ):
+            raise PayloadError(
+                f"Channel.offsets {offsets.tolist()!r:.80} does not cut {paths} paths into {pairs} pairs: "
+                f"it needs {pairs + 1} ascending entries from 0 to {paths}"
+            )
 
     def pair(self, tx: str, rx: str) -> slice:
         """Slice of the path axis that belongs to one TX/RX pair; `ValueError` if unknown."""

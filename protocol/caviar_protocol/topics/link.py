@@ -30,7 +30,7 @@ class Link(Payload, frozen=True, kw_only=True, omit_defaults=True):
     over users leave out those without a path and state how many they were.
     """
 
-    sizes_from: ClassVar[dict[str, str]] = {"U": "rx"}
+    sizes_from: ClassVar[dict[str, tuple[str, ...]]] = {"U": ("tx", "rx", "carrier")}
 
     tx: tuple[str, ...]
     rx: tuple[str, ...]

@@ -80,7 +80,7 @@ class Scene(Payload, frozen=True, kw_only=True, omit_defaults=True):
     box; the box's axes are the body axes (x forward, y left, z up).
     """
 
-    sizes_from: ClassVar[dict[str, str]] = {"N": "names"}
+    sizes_from: ClassVar[dict[str, tuple[str, ...]]] = {"N": ("names", "classes", "assets")}
 
     names: tuple[str, ...]
     """Unique names, each with a prefix that the world declared at READY."""
