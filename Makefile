@@ -1,0 +1,36 @@
+# make demo: a co-simulation of a street with traffic, with pictures. make test: every check.
+BIN      := .venv/bin
+STAMP    := .venv/.setup-done
+SCENARIO ?= deploy/scenarios/street-canyon.toml
+FRAMES   ?= 120
+TESTS    ?= tests
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test lint doctor clean
+
+help: ## List these targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+setup: $(STAMP) ## Make .venv and see to the system libraries (again only when pyproject.toml changes)
+
+$(STAMP): pyproject.toml tools/setup.sh
+	@tools/setup.sh
+
+demo: setup ## Run SCENARIO for FRAMES frames, draw its pictures, say where they are
+	@FRAMES=$(FRAMES) tools/demo.sh $(SCENARIO)
+
+lint: setup ## Style, types and the imports that the architecture allows
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy
+	@$(BIN)/lint-imports
+
+test: lint ## Everything that CI checks; TESTS=tests/unit runs a part
+	@$(BIN)/pytest --durations=10 $(TESTS)
+
+doctor: setup ## What this machine has, and what mends what it lacks
+	@$(BIN)/caviar doctor
+
+clean: ## Remove .venv, caches and builds; recorded runs stay
+	@rm -rf .venv build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	@find . -name __pycache__ -not -path './.git/*' -prune -exec rm -rf {} +

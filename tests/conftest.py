@@ -1,0 +1,95 @@
+"""What all tests share: real data, hypothesis settings, and a search for processes left behind."""
+
+from __future__ import annotations
+
+import os
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+
+import hypothesis
+import psutil
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+MARKER = "CAVIAR_TEST_SESSION"
+"""Environment variable by which a process that a test started is known, also after its parent died."""
+
+hypothesis.settings.register_profile("ci", derandomize=True, deadline=None, database=None)
+hypothesis.settings.register_profile("explore", deadline=None, max_examples=5000)
+hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
+
+
+@pytest.fixture(scope="session")
+def repository() -> Path:
+    """Root of the checkout."""
+    return REPOSITORY
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Folder of real inputs beside the checkout; skips where there is none."""
+    folder = REPOSITORY.parent / "shared" / "data"
+    if not folder.is_dir():
+        pytest.skip(f"real inputs are not here: {folder}")
+    return folder
+
+
+class LeftoverProcesses:
+    """Fails a test session whose tests leave processes behind, and names test and process."""
+
+    def __init__(self) -> None:
+        self.session = uuid.uuid4().hex
+        self.owner: dict[int, str] = {}
+        os.environ[MARKER] = self.session
+
+    def alive(self) -> list[psutil.Process]:
+        """Processes that tests of this session started and that still run."""
+        found = []
+        for process in psutil.process_iter():
+            try:
+                if (
+                    process.pid != os.getpid()
+                    and process.environ().get(MARKER) == self.session
+                    and process.status() != psutil.STATUS_ZOMBIE
+                    and not any("resource_tracker" in word for word in process.cmdline())
+                ):
+                    found.append(process)
+            except psutil.Error:
+                continue  # it ended meanwhile, or is another user's
+        return found
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
+        try:
+            return (yield)
+        finally:
+            for process in self.alive():
+                self.owner.setdefault(process.pid, item.nodeid)
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_sessionfinish(self, session: pytest.Session) -> None:
+        _, left = psutil.wait_procs(self.alive(), timeout=2.0)
+        if not left:
+            return
+        reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+        for process in left:
+            first_seen = self.owner.get(process.pid, "an unknown test")
+            line = f"process {process.pid} is left over, first seen after {first_seen}: {_command(process)}"
+            if reporter is not None:
+                reporter.ensure_newline()
+                reporter.write_line(line, red=True)
+            process.kill()
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def _command(process: psutil.Process) -> str:
+    try:
+        return " ".join(process.cmdline())
+    except psutil.Error:
+        return process.name()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Watch for processes that outlive their test."""
+    config.pluginmanager.register(LeftoverProcesses(), "leftover-processes")

@@ -1,0 +1,138 @@
+#!/usr/bin/env bash
+# Make .venv with everything that `make demo` and `make test` need, and see to the system
+# libraries that pip does not bring. Installs Debian packages where it may (as root, or with
+# passwordless sudo); otherwise it names the command and fails.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+
+say() { printf '\033[1m==>\033[0m %s\n' "$*"; }
+die() {
+  printf '\033[1;31merror:\033[0m %s\n' "$*" >&2
+  exit 1
+}
+
+as_root() {
+  if [ "$(id -u)" -eq 0 ]; then "$@"; else sudo -n "$@"; fi
+}
+
+# Install Debian packages, or end with the command that does.
+need_packages() {
+  local why=$1
+  shift
+  local command="sudo apt-get update && sudo apt-get install -y --no-install-recommends $*"
+  command -v apt-get >/dev/null || die "$why. Install what these Debian packages hold: $*"
+  if [ "$(id -u)" -ne 0 ] && ! sudo -n true 2>/dev/null; then
+    die "$why. Install it, then run this again: $command"
+  fi
+  say "$why: installing $*"
+  local log
+  log=$(mktemp)
+  if ! { as_root apt-get update -qq && as_root env DEBIAN_FRONTEND=noninteractive \
+    apt-get install -y -qq --no-install-recommends "$@"; } >"$log" 2>&1; then
+    tail -n 15 "$log" >&2
+    die "apt-get failed (log: $log). Mend it and run this again, or try by hand: $command"
+  fi
+  rm -f "$log"
+}
+
+new_enough() { "$1" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; }
+
+find_python() {
+  local candidate
+  for candidate in "${PYTHON:-}" python3 python3.14 python3.13 python3.12 python3.11; do
+    if [ -n "$candidate" ] && command -v "$candidate" >/dev/null && new_enough "$candidate"; then
+      command -v "$candidate"
+      return
+    fi
+  done
+}
+
+make_venv() {
+  local python
+  python=$(find_python)
+  if [ -z "$python" ]; then
+    need_packages "no Python of version 3.11 or newer was found" python3 python3-venv
+    python=$(find_python)
+    [ -n "$python" ] || die "apt brought no Python ≥ 3.11; install one and run: make setup PYTHON=/path/to/python"
+  fi
+  if ! "$python" -c 'import ensurepip, venv' 2>/dev/null; then
+    need_packages "$python cannot create virtual environments" python3-venv
+    "$python" -c 'import ensurepip, venv' 2>/dev/null ||
+      die "$python has no ensurepip; use another one: make setup PYTHON=/usr/bin/python3"
+  fi
+  say "creating .venv with $("$python" --version)"
+  rm -rf .venv
+  "$python" -m venv .venv
+}
+
+# Names of shared libraries that a file asks for and the system does not have.
+missing_libraries() {
+  ldd "$@" 2>/dev/null | awk '/not found/ { print $1 }' | sort -u
+}
+
+package_of() {
+  case $1 in
+    libX11.so.6) echo libx11-6 ;;
+    libXext.so.6) echo libxext6 ;;
+    libXrender.so.1) echo libxrender1 ;;
+    libXcursor.so.1) echo libxcursor1 ;;
+    libXfixes.so.3) echo libxfixes3 ;;
+    libXft.so.2) echo libxft2 ;;
+    libXrandr.so.2) echo libxrandr2 ;;
+    libGL.so.1) echo libgl1 ;;
+    libGLU.so.1) echo libglu1-mesa ;;
+    libGLX.so.0) echo libglx0 ;;
+    libGLdispatch.so.0) echo libglvnd0 ;;
+    libatomic.so.1) echo libatomic1 ;;
+    libexpat.so.1) echo libexpat1 ;;
+    libgomp.so.1) echo libgomp1 ;;
+    libstdc++.so.6) echo libstdc++6 ;;
+    libz.so.1) echo zlib1g ;;
+    *) return 1 ;;
+  esac
+}
+
+see_to_shared_libraries() {
+  local site library packages=() unknown=()
+  site=$(.venv/bin/python -c 'import sysconfig; print(sysconfig.get_path("platlib"))')
+  for library in $(missing_libraries "$site"/sumo/bin/{sumo,netconvert,netgenerate} \
+    "$site"/libsumo/*.so "$site"/mitsuba/llvm_ad_*.so "$site"/mitsuba/libmitsuba.so "$site"/drjit/*.so); do
+    if package=$(package_of "$library"); then packages+=("$package"); else unknown+=("$library"); fi
+  done
+  if [ ${#packages[@]} -gt 0 ]; then
+    need_packages "shared libraries of the traffic simulator and the ray tracer are missing" "${packages[@]}"
+  fi
+  if [ ${#unknown[@]} -gt 0 ]; then
+    say "note: these shared libraries were not found; 'caviar doctor' shows whether it matters: ${unknown[*]}"
+  fi
+}
+
+# The first that the package lists hold; 19 is the one this project is tested with.
+llvm_package() {
+  local version
+  for version in 19 20 18 17 16; do
+    if apt-cache show "libllvm$version" >/dev/null 2>&1; then
+      echo "libllvm$version"
+      return
+    fi
+  done
+  echo libllvm19
+}
+
+see_to_llvm() {
+  local choose='from caviar_services.llvm import choose_llvm; print(choose_llvm())'
+  if ! .venv/bin/python -c "$choose" >/dev/null 2>&1; then
+    need_packages "the ray tracer compiles with libLLVM ≥ 16, which is missing" "$(llvm_package)"
+  fi
+  say "$(.venv/bin/python -c "$choose")"
+}
+
+if ! { [ -x .venv/bin/python ] && .venv/bin/python -m pip --version && new_enough .venv/bin/python; } >/dev/null 2>&1; then
+  make_venv
+fi
+say "installing the Python packages into .venv (about 1 GB; a few minutes the first time)"
+.venv/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[all,dev]'
+see_to_shared_libraries
+see_to_llvm
+touch .venv/.setup-done
+say "ready: .venv/bin/caviar doctor shows what this machine has"
