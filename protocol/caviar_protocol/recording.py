@@ -1,0 +1,355 @@
+"""Reading what a run recorded.
+
+::
+
+    recording = Recording("runs/street-canyon-1")
+    for frame in recording.frames():
+        scene, link = frame.scene(), frame.only("link", Link)
+
+A recording is a directory with ``recording-0000.mcap``, ``recording-0001.mcap``, … and the
+scenery in ``assets/``. After a crash it is readable up to the last frame whose record was
+written whole; `Recording.complete` then is false.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from bisect import bisect_right
+from collections.abc import Iterator
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import TypeVar, cast
+
+import msgspec
+
+from caviar_protocol.arrays import Payload
+from caviar_protocol.codec import decode_payload
+from caviar_protocol.digest import RunDigest
+from caviar_protocol.errors import ProtocolError, RecordingError
+from caviar_protocol.messages import GrantInput, Status
+from caviar_protocol.recording_layout import (
+    ASSET_FOLDER,
+    FORMAT,
+    FrameEntry,
+    RecordingMetadata,
+    segment_files,
+)
+from caviar_protocol.scene import merge_scenes
+from caviar_protocol.segment import Channel, Chunk, Segment
+from caviar_protocol.topics import Scene
+
+P = TypeVar("P", bound=Payload)
+
+
+class RunDigestReport(msgspec.Struct, frozen=True, kw_only=True):
+    """A run's digest as its recorded bytes give it, and what in them is damaged."""
+
+    digest: str
+    frames: int
+    damage: tuple[str, ...] = ()
+    """Each names file, frame, topic and source; empty: every byte is as it was written."""
+
+
+class RecordedProduct:
+    """One product of a frame; its payload is decoded on first use."""
+
+    def __init__(self, provenance: GrantInput, data: memoryview, place: str) -> None:
+        self.provenance = provenance
+        self._data = data
+        self._place = place
+
+    @property
+    def header(self) -> memoryview:
+        """The wire bytes of the payload's header."""
+        return self._data[8 : 8 + self._header_length]
+
+    @property
+    def body(self) -> memoryview:
+        """The wire bytes of the payload's arrays."""
+        return self._data[8 + self._header_length :]
+
+    @property
+    def _header_length(self) -> int:
+        length = int.from_bytes(self._data[:8], "little")
+        if len(self._data) < 8 or 8 + length > len(self._data):
+            raise RecordingError(f"{self._place}: a header of {length} B does not fit {len(self._data)} B")
+        return length
+
+    @cached_property
+    def payload(self) -> Payload:
+        """The typed payload; its arrays are read-only views into the file."""
+        try:
+            return decode_payload(self.provenance.topic, self.header, self.body)
+        except ProtocolError as error:
+            raise RecordingError(f"{self._place}: {error}") from error
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the recorded bytes (`caviar_protocol.digest.payload_digest`)."""
+        return hashlib.sha256(self._data).hexdigest()
+
+
+class RecordedFrame:
+    """One frame: the provenance of all its products, and the products, read on first use."""
+
+    def __init__(self, recording: Recording, index: int) -> None:
+        self._recording = recording
+        self._index = index
+        self.entry = recording.entry(index)
+        self.episode = self.entry.episode
+        self.number = self.entry.frame
+        self.t_ns = self.entry.t_ns
+
+    @property
+    def inputs(self) -> tuple[GrantInput, ...]:
+        """Provenance of every product, absent ones included."""
+        return self.entry.inputs
+
+    @cached_property
+    def products(self) -> tuple[RecordedProduct, ...]:
+        """What is not absent, in the order of `inputs`.
+
+        Raises `RecordingError` naming the place where the bytes are damaged or missing.
+        """
+        return self._recording.products_of(self._index)
+
+    def of(self, topic: str, cls: type[P]) -> dict[str, P]:
+        """Payloads of a topic by source, fresh and held ones."""
+        return {
+            product.provenance.source: cast(P, product.payload)
+            for product in self.products
+            if product.provenance.topic == topic and product.provenance.status is not Status.LATE
+        }
+
+    def scene(self) -> Scene | None:
+        """The scenes of all worlds as one (contract, clause 3); None where there is none."""
+        scenes = self.of("scene", Scene)
+        return merge_scenes(scenes) if scenes else None
+
+
+class Recording:
+    """A recorded run, or one segment of it.
+
+    Parameters
+    ----------
+    path
+        The run directory, or one ``.mcap`` file of it.
+
+    Raises
+    ------
+    RecordingError
+        It is not a recording, a segment is missing, or the content contradicts itself. A last
+        segment that breaks off is not an error.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._segments = [Segment(file) for file in segment_files(self.path)]
+        for segment in self._segments[:-1]:
+            if not segment.finished:
+                raise RecordingError(
+                    f"{segment.path} breaks off at {len(segment)} B, although later segments follow"
+                )
+        if len(self._segments) > 1 and not self._segments[-1].metadata:
+            self._segments.pop()  # killed while it opened the next segment
+            self.complete = False
+        else:
+            self.complete = self._segments[-1].finished
+        self.metadata = self._read_metadata()
+        self._starts = [0]
+        for segment in self._segments:
+            self._starts.append(self._starts[-1] + len(segment.chunks))
+        self._index = self._build_index()
+
+    def __len__(self) -> int:
+        return self._starts[-1]
+
+    @property
+    def directory(self) -> Path:
+        """The run directory."""
+        return self.path if self.path.is_dir() else self.path.parent
+
+    @property
+    def assets(self) -> dict[str, Path]:
+        """Files of scenery that were recorded, by asset name."""
+        folder = self.directory / ASSET_FOLDER
+        found = {asset.name: folder / asset.name for asset in self.metadata.assets}
+        return {name: file for name, file in found.items() if file.is_file()}
+
+    @property
+    def topics(self) -> dict[str, tuple[str, ...]]:
+        """Topics of which at least one product is stored, with their sources."""
+        found: dict[str, set[str]] = {}
+        for segment in self._segments:
+            for channel in segment.channels.values():
+                if channel.source:
+                    found.setdefault(channel.topic, set()).add(channel.source)
+        return {topic: tuple(sorted(found[topic])) for topic in sorted(found)}
+
+    def frames(self) -> Iterator[RecordedFrame]:
+        """All frames, in the order of (episode, frame)."""
+        return (RecordedFrame(self, index) for index in range(len(self)))
+
+    def frame(self, episode: int, frame: int) -> RecordedFrame:
+        """One frame. Raises `RecordingError` naming what there is where it was not recorded."""
+        index = self._index.get((episode, frame))
+        if index is None:
+            has = f"frames {min(self._index)} to {max(self._index)}" if self._index else "no frame"
+            raise RecordingError(
+                f"{self.path} has no frame {frame} of episode {episode}; it has {has} (episode, frame)"
+            )
+        return RecordedFrame(self, index)
+
+    def product(self, episode: int, frame: int, topic: str, source: str) -> Payload:
+        """The payload of one product, fresh or held. Raises `RecordingError` where absent."""
+        for product in self.frame(episode, frame).products:
+            entry = product.provenance
+            if (entry.topic, entry.source) == (topic, source) and entry.status is not Status.LATE:
+                return product.payload
+        raise RecordingError(f"{self._at(episode, frame)} has no {topic} of {source!r}")
+
+    def of(self, topic: str) -> Iterator[tuple[RecordedFrame, RecordedProduct]]:
+        """Every fresh or held product of a topic, with its frame."""
+        for frame in self.frames():
+            for product in frame.products:
+                if product.provenance.topic == topic and product.provenance.status is not Status.LATE:
+                    yield frame, product
+
+    def run_digest(self) -> RunDigestReport:
+        """The run's digest, recomputed from the payload bytes alone (contract, clause 20).
+
+        It does not stop at damage: a changed payload gives another digest and is named.
+        """
+        chain, damage = RunDigest(), []
+        for index in range(len(self)):
+            entry, (segment, chunk) = self.entry(index), self._place(index)
+            at = f"{self._at(entry.episode, entry.frame)} ({segment.path.name}, offset {chunk.offset})"
+            fresh, faults = _rehash(entry, segment, chunk)
+            if segment.damaged(chunk):
+                faults.append("the CRC-32 of its chunk differs")
+            if index and (gap := _gap(self.entry(index - 1), entry)):
+                faults.append(gap)
+            damage += [f"{at}: {fault}" for fault in faults]
+            chain.add_frame(entry.episode, entry.frame, fresh)
+        for segment in self._segments:
+            if segment.altered and not any(segment.path.name in place for place in damage):
+                damage.append(f"{segment.path}: the CRC-32 of the file differs, outside of the products")
+        return RunDigestReport(digest=chain.hexdigest(), frames=len(self), damage=tuple(damage))
+
+    def entry(self, index: int) -> FrameEntry:
+        """The frame record of the ``index``-th frame of the recording."""
+        number = bisect_right(self._starts, index) - 1
+        return self._segments[number].entries[index - self._starts[number]]
+
+    def products_of(self, index: int) -> tuple[RecordedProduct, ...]:
+        """The products of the ``index``-th frame, held ones fetched from where they stand."""
+        entry, own = self.entry(index), self._messages(index)
+        found = []
+        for item in entry.inputs:
+            if item.status is Status.ABSENT:
+                continue
+            key = (Channel(item.topic, item.source), item.frame)
+            place = f"{self._at(entry.episode, entry.frame)}, {item.topic} of {item.source!r}"
+            data = own.get(key)
+            if data is None and item.status is Status.HELD:
+                data = self._held(entry.episode, *key)
+            if data is None:
+                raise RecordingError(f"{place}: its bytes, of frame {item.frame}, are not in {self.path}")
+            found.append(RecordedProduct(item, data, place))
+        return tuple(found)
+
+    def _held(self, episode: int, channel: Channel, frame: int) -> memoryview | None:
+        for index in (self._index.get((episode, frame)), self._late.get((episode, channel, frame))):
+            if index is not None and (channel, frame) in (stored := self._messages(index)):
+                return stored[channel, frame]
+        return None
+
+    def _messages(self, index: int) -> dict[tuple[Channel, int], memoryview]:
+        segment, chunk = self._place(index)
+        if segment.damaged(chunk):
+            entry = self.entry(index)
+            raise RecordingError(
+                f"{self._at(entry.episode, entry.frame)}: the chunk at offset {chunk.offset} of "
+                f"{segment.path} is damaged, its CRC-32 differs; `caviar inspect --digest` names the product"
+            )
+        return {(m.channel, m.frame): m.data for m in segment.messages(chunk)}
+
+    def _place(self, index: int) -> tuple[Segment, Chunk]:
+        number = bisect_right(self._starts, index) - 1
+        segment = self._segments[number]
+        return segment, segment.chunks[index - self._starts[number]]
+
+    @cached_property
+    def _late(self) -> dict[tuple[int, Channel, int], int]:
+        return {
+            (entry.episode, Channel(item.topic, item.source), item.frame): index
+            for index, entry in enumerate(self.entry(i) for i in range(len(self)))
+            for item in entry.inputs
+            if item.status is Status.LATE
+        }
+
+    def _build_index(self) -> dict[tuple[int, int], int]:
+        order = [(entry.episode, entry.frame) for segment in self._segments for entry in segment.entries]
+        for earlier, later in pairwise(order):
+            if later <= earlier:
+                raise RecordingError(
+                    f"{self.path}: frame {later[1]} of episode {later[0]} follows frame {earlier[1]} of "
+                    f"episode {earlier[0]}: segments of two runs are mixed"
+                )
+        return {key: index for index, key in enumerate(order)}
+
+    def _read_metadata(self) -> RecordingMetadata:
+        found = [_metadata_of(segment) for segment in self._segments]
+        for segment, metadata in zip(self._segments, found, strict=True):
+            if (metadata.run, metadata.seed) != (found[0].run, found[0].seed):
+                raise RecordingError(
+                    f"{segment.path} belongs to run {metadata.run!r} with seed {metadata.seed}, "
+                    f"{self._segments[0].path.name} to run {found[0].run!r} with seed {found[0].seed}"
+                )
+        return found[0]
+
+    def _at(self, episode: int, frame: int) -> str:
+        return f"{self.path}: episode {episode}, frame {frame}"
+
+
+def _rehash(
+    entry: FrameEntry, segment: Segment, chunk: Chunk
+) -> tuple[list[tuple[str, str, str]], list[str]]:
+    """(topic, source, digest) of the fresh products of a frame as stored, and what is wrong there."""
+    stored = {(message.channel, message.frame): message.data for message in segment.messages(chunk)}
+    fresh, faults = [], []
+    for item in entry.inputs:
+        if item.status not in (Status.FRESH, Status.LATE):
+            continue
+        data = stored.get((Channel(item.topic, item.source), item.frame))
+        if data is None:
+            faults.append(f"{item.topic} of {item.source!r}: its bytes are missing")
+            continue
+        digest = hashlib.sha256(data).hexdigest()
+        if digest != item.digest:
+            faults.append(f"{item.topic} of {item.source!r}: its digest is {digest}, was {item.digest}")
+        if item.status is Status.FRESH:
+            fresh.append((item.topic, item.source, digest))
+    return fresh, faults
+
+
+def _gap(earlier: FrameEntry, later: FrameEntry) -> str:
+    if later.episode != earlier.episode or later.frame == earlier.frame + 1:
+        return ""
+    return f"it follows frame {earlier.frame}: what was between is lost"
+
+
+def _metadata_of(segment: Segment) -> RecordingMetadata:
+    if not segment.metadata:
+        raise RecordingError(f"{segment.path} breaks off at {len(segment)} B, before its metadata")
+    try:
+        raw = {key: msgspec.json.decode(text) for key, text in segment.metadata.items()}
+        metadata = msgspec.convert(raw, RecordingMetadata)
+    except msgspec.MsgspecError as error:
+        raise RecordingError(f"{segment.path}: the metadata are damaged: {error}") from error
+    if metadata.format != FORMAT:
+        raise RecordingError(
+            f"{segment.path} has format {metadata.format}, this version reads format {FORMAT}"
+        )
+    return metadata

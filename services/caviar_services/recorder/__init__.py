@@ -1,0 +1,1 @@
+"""Recorders: what writes a run down."""

@@ -1,0 +1,139 @@
+"""Recordings made by hand, through the real recorder: a street with cars, rays, links and a LIDAR."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from caviar_protocol.arrays import Payload
+from caviar_protocol.codec import encode_payload
+from caviar_protocol.coordinates import quaternion_from_euler
+from caviar_protocol.digest import payload_digest
+from caviar_protocol.messages import GrantInput, Status
+from caviar_protocol.topics import AntennaArray, AntennaDevice, LidarDevice, Link, Scene
+from caviar_services.recorder.mcap import McapRecorder, McapSettings
+from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
+
+PERIOD_NS = 100_000_000
+SCENARIO = {"run": {"name": "sample", "frames": 10}, "services": {"link": {"role": "link"}}}
+
+
+def scene(frame: int, cars: int = 3) -> Scene:
+    """Cars that drive east at 10 m/s, a base station over them, a LIDAR and an antenna on the first."""
+    yaw = 0.1
+    names = tuple(f"car.{i}" for i in range(cars))
+    devices = (
+        AntennaDevice(
+            name="bs",
+            role="tx",
+            position=(0.0, 20.0, 15.0),
+            orientation=quaternion_from_euler(-math.pi / 2),
+            array=AntennaArray(columns=16),
+        ),
+        *(AntennaDevice(name=f"{name}/rx", role="rx", parent=name, position=(0, 0, 1.0)) for name in names),
+        LidarDevice(name=f"{names[0]}/top", parent=names[0], position=(0, 0, 1.5), beams=8, azimuth_steps=90),
+    )
+    return Scene(
+        names=names,
+        classes=("car",) * cars,
+        assets=("",) * cars,
+        position=np.array([[-30.0 + 12 * i + frame, 3.5 * (i % 2), 0.75] for i in range(cars)]),
+        orientation=np.tile(np.array(quaternion_from_euler(yaw)), (cars, 1)),
+        velocity=np.tile(np.array([10.0, 1.0, 0.0]), (cars, 1)),
+        dimensions=np.tile(np.array([4.5, 1.8, 1.5]), (cars, 1)),
+        devices=tuple(sorted(devices, key=lambda device: device.name)),
+    )
+
+
+def link(frame: int, users: int = 3, without_path: tuple[int, ...] = ()) -> Link:
+    """Best |y| of 4, the agent reaches half of it, the baseline a quarter."""
+    has_path = np.array([u not in without_path for u in range(users)])
+    best = np.where(has_path, 4.0 + 0.1 * frame, 0.0)
+    return Link(
+        tx=("bs",) * users,
+        rx=tuple(f"car.{u}/rx" for u in range(users)),
+        carrier=("c0",) * users,
+        has_path=has_path,
+        los=has_path & (frame % 5 != 0),
+        tx_beam=np.full(users, 3, np.int32),
+        rx_beam=np.zeros(users, np.int32),
+        abs_y=best / 2,
+        top_tx_beam=np.full((users, 1), 4, np.int32),
+        top_rx_beam=np.zeros((users, 1), np.int32),
+        top_abs_y=best[:, None].copy(),
+        baseline_abs_y=best / 4,
+        aod_azimuth=np.full(users, 0.02 * frame),
+        aoa_azimuth=np.full(users, 0.5 + 0.02 * frame),
+        snr=best**2,
+        snr_best=4 * best**2,
+        spectral_efficiency=np.log2(1 + best**2),
+        bit_rate=1e8 * np.log2(1 + best**2),
+        reward=best / 2,
+        no_path=len(without_path),
+    )
+
+
+def product(
+    topic: str,
+    source: str,
+    payload: Payload,
+    frame: int,
+    status: Status = Status.FRESH,
+    used_in: int | None = None,
+) -> FrameInput:
+    """A product as a recorder is granted it."""
+    header, body = encode_payload(payload)
+    provenance = GrantInput(
+        topic=topic,
+        source=source,
+        status=status,
+        frame=frame,
+        t_ns=frame * PERIOD_NS,
+        age=(frame if used_in is None else used_in) - frame,
+        digest=payload_digest(header, body),
+    )
+    return FrameInput(provenance, memoryview(header), memoryview(body))
+
+
+def absent(topic: str, source: str, cause: str) -> FrameInput:
+    """A product that is not there."""
+    return FrameInput(GrantInput(topic=topic, source=source, status=Status.ABSENT, cause=cause))
+
+
+def frame(number: int, *inputs: FrameInput, episode: int = 0) -> Frame:
+    """A frame as a recorder is granted it; by default with a scene and a link."""
+    inputs = inputs or (
+        product("scene", "world", scene(number), number),
+        product("link", "link", link(number), number),
+    )
+    return Frame(
+        episode=episode, number=number, t_ns=number * PERIOD_NS, inputs=inputs, service="recorder", seed=7
+    )
+
+
+def recorder(folder: Path, assets: dict[str, Path] | None = None, **settings: object) -> McapRecorder:
+    """A prepared recorder that writes to ``folder``."""
+    run = RunInfo(
+        name="recorder",
+        run="sample-1",
+        seed=7,
+        sampling_period_ns=PERIOD_NS,
+        frames=10,
+        scenario=SCENARIO,
+        directory=folder,
+    )
+    made = McapRecorder(McapSettings(**settings), run)
+    made.prepare(Preparation(demand={}, assets=assets or {}))
+    made.reset(0, 7, 0)
+    return made
+
+
+def record(folder: Path, frames: int = 5, **settings: object) -> Path:
+    """A whole recording of ``frames`` frames."""
+    made = recorder(folder, **settings)
+    for number in range(frames):
+        made.step(frame(number))
+    made.close()
+    return folder
