@@ -12,6 +12,7 @@ help: ## List these targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 setup: $(STAMP) ## Make .venv and see to the system libraries (again only when pyproject.toml changes)
+	@:
 
 $(STAMP): pyproject.toml tools/setup.sh
 	@tools/setup.sh

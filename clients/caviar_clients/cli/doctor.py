@@ -1,0 +1,264 @@
+"""``caviar doctor``: what this machine has, and the command that mends what it lacks.
+
+Libraries that could take the process down with them (Dr.Jit with an old LLVM aborts) are tried
+in a process of their own; versions are read from package metadata.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import resource
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+
+import zmq
+from packaging.requirements import Requirement
+from rich.console import Console
+from rich.table import Table
+
+from caviar_protocol.errors import SetupError
+from caviar_services import llvm
+
+DISTRIBUTION = "caviar-sim"
+EXTRAS = ("channel", "sensors", "world", "plot")
+MINIMUM_PYTHON = (3, 11)
+MINIMUM_FREE_GB = 2.0
+MINIMUM_FILES = 1024
+
+SUMO_LIBRARIES = "sudo apt-get install -y libx11-6 libxext6 libxrender1 libgl1 libatomic1 libexpat1"
+
+_KERNEL = """
+import drjit as dr
+from drjit.llvm import Float
+x = dr.arange(Float, 64)
+print(dr.sum(dr.maximum(dr.sin(x), 0.5))[0])
+"""
+"""A kernel with a floating-point maximum, the instruction that LLVM before 16 cannot select."""
+
+_SUMO = "import libsumo; print(libsumo.getVersion()[1])"
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing looked at."""
+
+    name: str
+    ok: bool
+    found: str
+    """What there is, or what is wrong with it."""
+    remedy: str = ""
+    """The command that mends it; empty where it is ok."""
+
+
+@dataclass(frozen=True)
+class _Outcome:
+    """How a command ended."""
+
+    ok: bool
+    text: str
+
+
+def doctor() -> list[Check]:
+    """Look at everything that a shipped scenario needs. Takes a few seconds; imports nothing heavy."""
+    checks = [check_python(), check_base()]
+    checks += [check_extra(extra) for extra in EXTRAS]
+    checks += [check_llvm(), check_gpu(), check_sumo(), check_zmq(), check_loopback()]
+    checks += [check_disk(Path.cwd()), check_kernel_cache(Path.home()), check_open_files()]
+    return checks
+
+
+def exit_status(checks: list[Check]) -> int:
+    """1 where something that a shipped scenario needs is missing, else 0."""
+    return 0 if all(check.ok for check in checks) else 1
+
+
+def render(checks: list[Check], console: Console) -> None:
+    """Print the checks as a table, and below it the commands that mend what is wrong."""
+    table = Table(box=None, pad_edge=False)
+    table.add_column("")
+    table.add_column("what", no_wrap=True)
+    table.add_column("found", overflow="fold")
+    for check in checks:
+        mark = "[green]ok[/]" if check.ok else "[bold red]--[/]"
+        table.add_row(mark, check.name, check.found)
+    console.print(table)
+    wrong = [check for check in checks if not check.ok]
+    for check in wrong:
+        console.print(f"\n[bold red]{check.name}[/]: mend it with")
+        # printed as it is, so that it can be copied even where it is longer than the terminal
+        console.print(f"  {check.remedy}", soft_wrap=True, markup=False, highlight=False)
+    if not wrong:
+        console.print("\nEverything that the shipped scenarios need is here.")
+
+
+def check_python() -> Check:
+    """Version of the interpreter."""
+    version = ".".join(map(str, sys.version_info[:3]))
+    remedy = "sudo apt-get install -y python3.11 python3.11-venv && make clean setup PYTHON=python3.11"
+    return _check("Python", sys.version_info >= MINIMUM_PYTHON, f"{version} ({sys.executable})", remedy)
+
+
+def check_base() -> Check:
+    """The packages that every part needs."""
+    return _check_requirements("base install", "")
+
+
+def check_extra(extra: str) -> Check:
+    """The packages of one extra."""
+    return _check_requirements(f"extra {extra}", extra)
+
+
+def check_llvm() -> Check:
+    """The LLVM that the ray tracer would use, and that it compiles."""
+    try:
+        library = llvm.choose_llvm()
+    except SetupError as error:
+        return Check("LLVM", False, str(error), llvm.INSTALL)
+    if importlib.util.find_spec("drjit") is None:
+        return Check("LLVM", True, f"{library}; not tried, Dr.Jit is not installed")
+    outcome = _run([sys.executable, "-c", _KERNEL], {llvm.ENVIRONMENT: str(library.path)})
+    if outcome.ok:
+        return Check("LLVM", True, f"{library}; compiled a kernel")
+    return Check("LLVM", False, f"{library} cannot compile: {outcome.text}", llvm.INSTALL)
+
+
+def check_gpu() -> Check:
+    """CUDA devices; none is fine."""
+    count = llvm.cuda_devices()
+    return Check("CUDA", True, f"{count} device(s)" if count else "none, the CPU computes")
+
+
+def check_sumo() -> Check:
+    """The traffic simulator: its programs and its library load."""
+    spec = importlib.util.find_spec("sumo")
+    if spec is None or not spec.submodule_search_locations:
+        return Check("SUMO", False, "not installed", _pip_install(_requirements("world")))
+    home = Path(next(iter(spec.submodule_search_locations)))
+    for command in ([str(home / "bin" / "netconvert"), "--version"], [sys.executable, "-c", _SUMO]):
+        outcome = _run(command, {"SUMO_HOME": str(home)})
+        if not outcome.ok:
+            return Check("SUMO", False, f"does not load: {outcome.text}", SUMO_LIBRARIES)
+    return Check("SUMO", True, f"{outcome.text}, SUMO_HOME {home}")
+
+
+def check_zmq() -> Check:
+    """ZeroMQ, with encryption."""
+    found = f"libzmq {zmq.zmq_version()}, pyzmq {zmq.pyzmq_version()}"
+    if zmq.has("curve"):
+        return Check("ZeroMQ", True, f"{found}, with CURVE")
+    remedy = f"{sys.executable} -m pip install --force-reinstall --only-binary :all: pyzmq"
+    return Check("ZeroMQ", False, f"{found}, built without CURVE", remedy)
+
+
+def check_loopback() -> Check:
+    """That services and broker of one machine can talk over TCP."""
+    try:
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            address = server.getsockname()
+            socket.create_connection(address, timeout=2.0).close()
+    except OSError as error:
+        return Check("loopback", False, f"127.0.0.1: {error}", "sudo ip link set lo up")
+    return Check("loopback", True, "127.0.0.1 accepts connections")
+
+
+def check_disk(folder: Path) -> Check:
+    """Room for recordings, which go to ``runs/`` of the folder."""
+    free = shutil.disk_usage(folder).free / 1e9
+    remedy = "caviar run SCENARIO --out DIR, with DIR on a larger disk; or delete old runs"
+    return _check("disk", free >= MINIMUM_FREE_GB, f"{free:.1f} GB free in {folder}", remedy)
+
+
+def check_kernel_cache(home: Path) -> Check:
+    """That compiled kernels can be kept: without, every start compiles for seconds."""
+    cache = home / ".drjit"
+    nearest = cache if cache.exists() else home
+    writable = os.access(nearest, os.W_OK | os.X_OK)
+    remedy = f"sudo chown -R {os.getuid()} {nearest}; or: export HOME=/a/writable/folder"
+    return _check("kernel cache", writable, f"{cache} is {'' if writable else 'not '}writable", remedy)
+
+
+def check_open_files() -> Check:
+    """The limit of open files; every connection of the broker takes some."""
+    soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    unlimited = soft == resource.RLIM_INFINITY
+    found = "unlimited" if unlimited else f"at most {soft}"
+    return _check("open files", unlimited or soft >= MINIMUM_FILES, found, f"ulimit -n {4 * MINIMUM_FILES}")
+
+
+def _check(name: str, ok: bool, found: str, remedy: str) -> Check:
+    return Check(name, ok, found, "" if ok else remedy)
+
+
+def _requirements(extra: str) -> list[Requirement]:
+    """What an extra asks for, or the base install with ``""``; on this platform, itself left out."""
+    try:
+        lines = metadata.requires(DISTRIBUTION) or []
+    except metadata.PackageNotFoundError:
+        return []
+    found = []
+    for line in lines:
+        requirement = Requirement(line)
+        marker = requirement.marker
+        belongs = marker is not None and "extra" in str(marker)
+        wanted = marker is None or marker.evaluate({"extra": extra})
+        if wanted and belongs == bool(extra) and requirement.name != DISTRIBUTION:
+            found.append(requirement)
+    return found
+
+
+def _check_requirements(name: str, extra: str) -> Check:
+    requirements = _requirements(extra)
+    if not requirements and not extra:
+        remedy = f"{sys.executable} -m pip install --editable '.[all]'"
+        return Check(name, False, f"{DISTRIBUTION} is not installed as a package", remedy)
+    unmet, versions = [], []
+    for requirement in requirements:
+        version = _version(requirement.name)
+        if version is None or not requirement.specifier.contains(version, prereleases=True):
+            unmet.append(requirement)
+        versions.append(f"{requirement.name} {version or 'missing'}")
+    return _check(name, not unmet, ", ".join(versions), _pip_install(unmet))
+
+
+def _version(name: str) -> str | None:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _pip_install(requirements: list[Requirement]) -> str:
+    wanted = " ".join(f"'{requirement.name}{requirement.specifier}'" for requirement in requirements)
+    return f"{sys.executable} -m pip install {wanted}"
+
+
+def _run(command: list[str], environment: Mapping[str, str]) -> _Outcome:
+    """First line a command prints, or why it failed."""
+    try:
+        done = subprocess.run(  # noqa: S603 - the commands are those above
+            command,
+            env={**os.environ, **environment},
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+    except OSError as error:
+        return _Outcome(False, str(error))
+    except subprocess.TimeoutExpired:
+        return _Outcome(False, "no end after 120 s")
+    if done.returncode == 0:
+        return _Outcome(True, done.stdout.partition("\n")[0].strip())
+    last = (done.stderr.strip() or done.stdout.strip()).rpartition("\n")[2]
+    how = f"status {done.returncode}"
+    if done.returncode < 0:
+        how = f"killed by {signal.Signals(-done.returncode).name}"
+    return _Outcome(False, f"{how}: {last}" if last else how)

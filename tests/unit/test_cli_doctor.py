@@ -1,0 +1,119 @@
+"""`caviar doctor` says what is there, and names the command for what is not."""
+
+from __future__ import annotations
+
+import io
+import socket
+import sys
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from caviar_clients.cli import doctor
+from caviar_clients.cli.doctor import Check
+from caviar_protocol.errors import SetupError
+from caviar_services import llvm
+
+
+def shown(checks: list[Check], width: int = 80) -> str:
+    console = Console(file=io.StringIO(), width=width)
+    doctor.render(checks, console)
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue()
+
+
+def test_every_check_is_ok_or_names_a_command() -> None:
+    checks = doctor.doctor()
+    assert len({check.name for check in checks}) == len(checks) >= 12
+    for check in checks:
+        assert check.found
+        assert bool(check.remedy) != check.ok, check
+
+
+def test_looking_imports_nothing_heavy() -> None:
+    before = set(sys.modules)
+    doctor.doctor()
+    assert not {name.partition(".")[0] for name in set(sys.modules) - before} & {
+        "drjit",
+        "mitsuba",
+        "sionna",
+        "libsumo",
+        "matplotlib",
+    }
+
+
+def test_the_exit_status_is_1_as_soon_as_one_thing_is_missing() -> None:
+    good, bad = Check("a", True, "1"), Check("b", False, "none", "make b")
+    assert doctor.exit_status([good, good]) == 0
+    assert doctor.exit_status([good, bad]) == 1
+
+
+def test_a_remedy_is_shown_whole_so_that_it_can_be_copied() -> None:
+    remedy = "sudo apt-get install -y " + " ".join(f"package-[{index}]" for index in range(20))
+    text = shown([Check("thing", False, "missing", remedy)], width=60)
+    assert remedy in text.splitlines()[-1]
+    assert "Everything that the shipped scenarios need" not in text
+    assert "Everything that the shipped scenarios need" in shown([Check("thing", True, "1")])
+
+
+def test_a_missing_llvm_comes_with_its_install_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    def none() -> llvm.LlvmLibrary:
+        raise SetupError("no libLLVM of version 16 or newer")
+
+    monkeypatch.setattr(llvm, "choose_llvm", none)
+    check = doctor.check_llvm()
+    assert (check.ok, check.remedy) == (False, llvm.INSTALL)
+    assert "no libLLVM" in check.found
+
+
+@pytest.mark.channel
+def test_an_llvm_that_cannot_compile_is_found_by_compiling(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    pytest.importorskip("drjit")
+    fake = tmp_path / "libLLVM.so.19.1"
+    fake.write_bytes(b"not a library")
+    monkeypatch.setattr(llvm, "choose_llvm", lambda: llvm.LlvmLibrary((19, 1), fake))
+    check = doctor.check_llvm()
+    assert not check.ok
+    assert "cannot compile" in check.found
+    assert check.remedy == llvm.INSTALL
+
+
+def test_a_process_that_aborts_is_named_by_its_signal() -> None:
+    outcome = doctor._run([sys.executable, "-c", "import os; os.abort()"], {})
+    assert not outcome.ok
+    assert "killed by SIGABRT" in outcome.text
+
+
+def test_what_an_extra_lacks_becomes_one_pip_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    versions = {"sionna-rt": "2.2.0", "mitsuba": "3.5.0", "drjit": None}
+    monkeypatch.setattr(doctor, "_version", versions.get)
+    check = doctor.check_extra("channel")
+    assert not check.ok
+    assert "drjit missing" in check.found
+    command, _, packages = check.remedy.partition(" install ")
+    assert command == f"{sys.executable} -m pip"
+    assert {package.partition("<")[0].partition(">")[0] for package in packages.split()} == {
+        "'drjit",
+        "'mitsuba",
+    }
+
+
+def test_a_full_disk_and_a_locked_home_are_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    assert doctor.check_kernel_cache(tmp_path).ok
+    monkeypatch.setattr(doctor.os, "access", lambda path, mode: False)
+    assert "chown" in doctor.check_kernel_cache(tmp_path).remedy
+    monkeypatch.setattr(doctor, "MINIMUM_FREE_GB", 1e9)
+    assert "--out" in doctor.check_disk(tmp_path).remedy
+
+
+def test_a_machine_without_loopback_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*_: object, **__: object) -> socket.socket:
+        raise OSError("Cannot assign requested address")
+
+    assert doctor.check_loopback().ok
+    monkeypatch.setattr(doctor.socket, "create_server", refused)
+    check = doctor.check_loopback()
+    assert (check.ok, check.remedy) == (False, "sudo ip link set lo up")
