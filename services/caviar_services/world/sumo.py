@@ -1,0 +1,231 @@
+"""World ``sumo``: road traffic and people of Eclipse SUMO, in this process."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from typing import Annotated, Any, NamedTuple
+
+import msgspec
+
+from caviar_protocol.arrays import Vector3, quantity
+from caviar_protocol.coordinates import Vector
+from caviar_protocol.errors import RunError, ScenarioError
+from caviar_protocol.seeding import derive_seed
+from caviar_services.service import Preparation, Prepared, RunInfo
+from caviar_services.world.base import ObjectState, World, WorldSettings
+from caviar_services.world.shapes import SHAPES
+from caviar_services.world.sumo_frame import Placement, body_pose, heading, object_class
+from caviar_services.world.sumo_process import Simulation, check_file, load_libsumo
+
+_NS_PER_MS = 1_000_000
+_LONGEST_STEP_MS = 1000
+"""SUMO's car-following models are made for steps up to one second."""
+
+Files = str | tuple[str, ...]
+
+
+class SumoSettings(WorldSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of the world ``sumo``; files are written ``file:PATH``, relative to the scenario."""
+
+    net: str = ""
+    """Road network, ``.net.xml``. One of `net` and `config` is needed."""
+    config: str = ""
+    """Configuration, ``.sumocfg``; the other settings go before what it says."""
+    routes: Files = ()
+    """Vehicle types, routes, flows: ``.rou.xml``."""
+    additional: Files = ()
+    """Additional files: stops, detectors, vehicle types."""
+    step_ms: Annotated[int | None, quantity("ms", "SUMO's step; unset: the sampling period")] = None
+    begin_s: Annotated[
+        float, quantity("s", "SUMO's time at frame 0; it runs up to there first, to fill the roads")
+    ] = 0.0
+    offset_m: Annotated[Vector3, quantity("m", "where the network's origin lies; z: the ground")] = (
+        0.0,
+        0.0,
+        0.0,
+    )
+    yaw_deg: Annotated[float, quantity("°", "the network is turned by, counter-clockwise")] = 0.0
+    classes: dict[str, str] = msgspec.field(default_factory=dict)
+    """Class of an object by the id of its vehicle type, or by vClass: ``{ Lorry = "truck" }``."""
+    meshes: tuple[str, ...] = ("bicycle", "bus", "car", "motorcycle", "pedestrian", "truck")
+    """Classes that have a mesh of their own; objects of others are boxes."""
+    options: tuple[str, ...] = ()
+    """More of SUMO's command line: ``["--lanechange.duration", "2"]``."""
+
+
+class _Kind(NamedTuple):
+    """What does not change while an object is there."""
+
+    kind: str
+    dimensions: Vector
+
+
+class SumoWorld(World[SumoSettings]):
+    """Traffic of a SUMO network.
+
+    Every frame shows the vehicles and persons that are in the network; a person inside a
+    vehicle is not shown, nor a vehicle that SUMO is moving elsewhere (teleporting).
+    """
+
+    Settings = SumoSettings
+
+    def __init__(self, settings: SumoSettings, run: RunInfo) -> None:
+        super().__init__(settings, run)
+        self._step_ms = step_length_ms(run.sampling_period_ns, settings.step_ms)
+        self._prefix = f"{run.name}." if settings.prefix is None else settings.prefix
+        self._placement = Placement(settings.offset_m, math.radians(settings.yaw_deg))
+        self._simulation: Simulation | None = None
+        self._steps = 0
+        self._vehicles: dict[str, _Kind] = {}
+        self._persons: dict[str, _Kind] = {}
+        if not settings.net and not settings.config:
+            raise ScenarioError('needs net = "file:….net.xml" or config = "file:….sumocfg"', key="settings")
+        for name in settings.meshes:
+            if name not in SHAPES:
+                raise ScenarioError(
+                    f"no mesh is there for {name!r}; known: {', '.join(SHAPES)}", key="settings.meshes"
+                )
+
+    def prefixes(self) -> tuple[str, ...]:
+        """The setting, or the world's name and a dot."""
+        return (self._prefix,)
+
+    def mesh_classes(self) -> tuple[str, ...]:
+        """As the settings say."""
+        return self.settings.meshes
+
+    def prepare(self, preparation: Preparation) -> Prepared:
+        """Check the files and load the library; an episode's reset starts SUMO."""
+        for key in ("net", "config", "routes", "additional"):
+            for file in _tuple(getattr(self.settings, key)):
+                check_file(key, file)
+        self._simulation = Simulation(load_libsumo())
+        version = self._simulation.api.getVersion()[1]
+        base = super().prepare(preparation)
+        return Prepared(
+            prefixes=base.prefixes, notes=(*base.notes, f"{version}, steps of {self._step_ms} ms")
+        )
+
+    def begin(self, episode: int, seed: int) -> None:
+        """Start SUMO with the episode's seed, and run it up to ``begin_s``."""
+        self._steps, self._vehicles, self._persons = 0, {}, {}
+        simulation = self._started()
+        self.run.progress("start SUMO", 0.0)
+        simulation.start(self._arguments(derive_seed(seed, episode, self.run.name)))
+        target_ms = self.settings.begin_s * 1e3
+        while round(simulation.api.simulation.getTime() * 1e3) + self._step_ms / 2 < target_ms:
+            self._step(simulation)
+            if self._steps % 1000 == 0:
+                self.run.progress(f"fill the roads: {simulation.api.simulation.getTime():.0f} s", 0.0)
+        self._steps = 0
+
+    def objects_at(self, elapsed_ns: int) -> Iterable[ObjectState]:
+        """Vehicles, then persons, each in the order of their departure."""
+        simulation = self._started()
+        steps, rest = divmod(elapsed_ns, self._step_ms * _NS_PER_MS)
+        if rest:
+            raise RunError(
+                f"world {self.run.name!r} was granted t = {elapsed_ns} ns, no multiple of its step of "
+                f"{self._step_ms} ms; choose step_ms so that it divides all instants"
+            )
+        if steps < self._steps:
+            raise RunError(f"world {self.run.name!r} was granted t = {elapsed_ns} ns after a later instant")
+        while self._steps < steps:
+            self._step(simulation)
+        return [
+            *self._states(simulation.api.vehicle, self._vehicles, simulation.api),
+            *self._states(simulation.api.person, self._persons, simulation.api),
+        ]
+
+    def close(self) -> None:
+        """End SUMO."""
+        if self._simulation is not None:
+            self._simulation.close()
+
+    def _started(self) -> Simulation:
+        if self._simulation is None:
+            self._simulation = Simulation(load_libsumo())
+        return self._simulation
+
+    def _arguments(self, seed: int) -> list[str]:
+        s = self.settings
+        arguments = ["--configuration-file", s.config] if s.config else []
+        for option, files in (
+            ("--net-file", _tuple(s.net)),
+            ("--route-files", _tuple(s.routes)),
+            ("--additional-files", _tuple(s.additional)),
+        ):
+            arguments += [option, ",".join(files)] if files else []
+        quiet = ["--no-step-log", "--duration-log.disable", "--no-warnings"]
+        step = ["--step-length", f"{self._step_ms / 1000:.3f}", "--seed", str(seed)]
+        return [*arguments, *quiet, *step, *s.options]
+
+    def _step(self, simulation: Simulation) -> None:
+        simulation.step()
+        self._steps += 1
+        api = simulation.api
+        for name in api.simulation.getDepartedIDList():
+            self._vehicles[name] = self._kind(api.vehicle, name)
+        for name in api.simulation.getDepartedPersonIDList():
+            self._persons[name] = self._kind(api.person, name)
+
+    def _kind(self, domain: Any, name: str) -> _Kind:
+        kind = object_class(domain.getTypeID(name), domain.getVehicleClass(name), self.settings.classes)
+        return _Kind(kind, (domain.getLength(name), domain.getWidth(name), domain.getHeight(name)))
+
+    def _states(self, domain: Any, known: dict[str, _Kind], api: Any) -> Iterator[ObjectState]:
+        present = set(domain.getIDList())
+        for name in [name for name in known if name not in present]:
+            del known[name]
+        for name, (kind, dimensions) in known.items():
+            bumper = domain.getPosition3D(name)
+            if bumper[0] == api.INVALID_DOUBLE_VALUE:
+                continue
+            if domain is api.person and domain.getVehicle(name):
+                continue
+            towards = heading(domain.getAngle(name), domain.getSlope(name), self._placement)
+            speed = domain.getSpeed(name)
+            pose = body_pose(bumper, towards, dimensions[0], dimensions[2], self._placement)
+            fx, fy, fz = towards.forward
+            yield ObjectState(
+                name=self._prefix + name,
+                kind=kind,
+                position=pose.position,
+                orientation=pose.orientation,
+                velocity=(speed * fx, speed * fy, speed * fz),
+                dimensions=dimensions,
+            )
+
+
+def step_length_ms(sampling_period_ns: int, step_ms: int | None) -> int:
+    """SUMO's step [ms] for a sampling period.
+
+    SUMO steps whole milliseconds. Raises `ScenarioError` unless the sampling period is a whole
+    number of steps.
+    """
+    period_ms, rest = divmod(sampling_period_ns, _NS_PER_MS)
+    if rest:
+        below = max(period_ms, 1) * _NS_PER_MS
+        raise ScenarioError(
+            f"SUMO steps whole milliseconds, and {sampling_period_ns} ns is none; write "
+            f"{below} or {(period_ms + 1) * _NS_PER_MS}",
+            key="run.sampling_period_ns",
+        )
+    step = period_ms if step_ms is None else step_ms
+    if (step_ms is None and period_ms > _LONGEST_STEP_MS) or not 1 <= step <= period_ms or period_ms % step:
+        fitting = max(
+            n for n in range(1, min(period_ms, max(step, 1), _LONGEST_STEP_MS) + 1) if period_ms % n == 0
+        )
+        raise ScenarioError(
+            f"a step of {step} ms does not fit the sampling period of {period_ms} ms; "
+            f"write step_ms = {fitting}",
+            key="settings.step_ms",
+        )
+    return step
+
+
+def _tuple(files: Files) -> tuple[str, ...]:
+    if isinstance(files, str):
+        return (files,) if files else ()
+    return files

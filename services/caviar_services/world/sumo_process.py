@@ -1,0 +1,130 @@
+"""The SUMO simulation in this process: starting, stepping, and saying what is wrong.
+
+libsumo is one simulation per process, prints its errors instead of raising them, and ends the
+process on some broken files; so files are looked at first, and its output is caught.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+from xml.parsers import expat
+
+from caviar_protocol.errors import RunError, ScenarioError, SetupError
+
+_ROOTS = {
+    "net": ("net",),
+    "config": ("configuration", "sumoConfiguration"),
+    "routes": ("routes",),
+    "additional": ("additional", "add", "routes"),
+}
+
+
+def load_libsumo() -> ModuleType:
+    """The library. Raises `SetupError` with the command that installs it."""
+    try:
+        import libsumo
+    except ImportError as error:
+        raise SetupError(
+            f"the world `sumo` needs libsumo ({error}); run: pip install 'caviar-sim[world]'"
+        ) from error
+    return libsumo  # type: ignore[no-any-return]  # an untyped module
+
+
+def check_file(key: str, file: str) -> None:
+    """Raise `ScenarioError` unless ``file`` can be what setting ``key`` names (``net``, ``routes``, …)."""
+    path = Path(file)
+    if not path.is_file():
+        raise ScenarioError(
+            f'there is no file {file}; write "file:PATH", relative to the scenario', key=f"settings.{key}"
+        )
+    if path.suffix == ".gz":
+        return
+    roots: list[str] = []
+    parser = expat.ParserCreate()
+
+    def start(tag: str, _: dict[str, str]) -> None:
+        if not roots:
+            roots.append(tag)
+
+    parser.StartElementHandler = start
+    try:
+        with path.open("rb") as stream:
+            parser.ParseFile(stream)
+    except expat.ExpatError as error:
+        raise ScenarioError(f"not well-formed XML: {error}", file, f"settings.{key}", error.lineno) from error
+    if roots[0] not in _ROOTS[key]:
+        raise ScenarioError(
+            f"holds <{roots[0]}>, {key} takes a file with <{_ROOTS[key][0]}>", file, f"settings.{key}"
+        )
+
+
+class Simulation:
+    """One SUMO simulation at a time."""
+
+    def __init__(self, libsumo: ModuleType) -> None:
+        self.api: Any = libsumo
+        self._running = False
+
+    def start(self, arguments: Sequence[str]) -> None:
+        """Start, from the beginning. Raises `SetupError` with SUMO's own words where it refuses."""
+        self.close()
+        if self.api.isLoaded():
+            raise SetupError(
+                "libsumo already runs a simulation in this process and has room for one; "
+                "run this world as a process of its own: caviar service NAME"
+            )
+        try:
+            with _caught_stderr() as output:
+                self.api.start(["sumo", *arguments])
+        except self.api.TraCIException as error:
+            said = output.getvalue().strip() or str(error)
+            raise SetupError(
+                f"SUMO does not start: {_one_line(said)}; mend the file or setting it names"
+            ) from error
+        finally:
+            self._running = bool(self.api.isLoaded())
+        sys.stderr.write(output.getvalue())
+
+    def step(self) -> None:
+        """One step. Raises `RunError` with SUMO's own words."""
+        try:
+            self.api.simulationStep()
+        except self.api.TraCIException as error:
+            raise RunError(
+                f"SUMO stopped at {self.api.simulation.getTime()} s of its time: {_one_line(str(error))}"
+            ) from error
+
+    def close(self) -> None:
+        """End the simulation, if one runs."""
+        if self._running:
+            self._running = False
+            self.api.close()
+
+
+@contextmanager
+def _caught_stderr() -> Iterator[io.StringIO]:
+    """Catch what C++ code writes to standard error meanwhile."""
+    output = io.StringIO()
+    sys.stderr.flush()
+    with tempfile.TemporaryFile() as file:
+        kept = os.dup(2)
+        os.dup2(file.fileno(), 2)
+        try:
+            yield output
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            file.seek(0)
+            output.write(file.read().decode(errors="replace"))
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())
