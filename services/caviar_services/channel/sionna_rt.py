@@ -1,0 +1,248 @@
+"""Rung ``siso-rt``: Sionna RT traces between reference points, arrays are applied as plane waves."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any, ClassVar
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from caviar_protocol.arrays import Int64Array, quantity
+from caviar_protocol.coordinates import SPEED_OF_LIGHT
+from caviar_protocol.errors import PayloadError, ScenarioError, SetupError
+from caviar_protocol.seeding import derive_seed
+from caviar_protocol.topics import AntennaDevice, ChannelOptions, Scene
+from caviar_services.channel.assemble import Antenna, PathTable
+from caviar_services.channel.base import ChannelModel, Found
+from caviar_services.channel.sionna_materials import MaterialSettings, OutsideRange
+from caviar_services.channel.sionna_scene import SceneSettings, SionnaScene
+from caviar_services.channel.sionna_tracer import LaunchOptions, Traced, Tracer
+from caviar_services.llvm import activate_llvm, choose_variant
+from caviar_services.service import Preparation, RunInfo
+
+Array = NDArray[Any]
+
+_LANES = 20_000_000
+"""Samples · depth · receivers of one launch at most: 40 B each in the solver."""
+
+_COMPILE_GRACE_S = 120.0
+
+
+class SionnaSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What is modelled, and how finely."""
+
+    max_depth: Annotated[int, quantity("1", "interactions of a path at most", ge=0, le=16)] = 3
+    samples: Annotated[int, quantity("1", "rays launched per transmitter", ge=1, le=100_000_000)] = 100_000
+    los: bool = True
+    reflection: bool = True
+    refraction: bool = False
+    diffraction: bool = False
+    scattering: bool = False
+    """Diffuse reflection; needs a scattering_coefficient above 0 in ``materials``."""
+    launch_seed: Annotated[int | None, quantity("1", "of the ray launch; absent: from the run's seed")] = None
+    max_paths: Annotated[
+        int, quantity("1", "candidates per transmitter; more are lost and counted", ge=1)
+    ] = 200_000
+    receivers_at_once: Annotated[
+        int | None, quantity("1", "receivers of one launch; absent: as the scenario has")
+    ] = None
+    bodies: Annotated[int, quantity("1", "moving objects of one mesh at most", ge=0, le=4096)] = 32
+    pool: dict[str, int] = {}
+    """Bodies of single meshes where ``bodies`` does not fit, by file name without ending: ``car = 64``;
+    ``box`` for objects without a mesh."""
+    without_body: tuple[str, ...] = ()
+    """Classes of objects that the waves pass through."""
+    body_material: str = "metal"
+    """ITU-R P.2040 material of moving objects."""
+    materials: dict[str, MaterialSettings] = {}
+    """Changes to materials of the scenery, by name."""
+    outside_itu_range: OutsideRange = "refuse"
+    """What to do where a material is not defined at the carrier frequency."""
+
+
+class SionnaChannel(ChannelModel[SionnaSettings]):
+    """Ray-traced channel of one carrier.
+
+    Each transmitter is traced by itself, with receivers filled up to a fixed number by parked
+    ones: so the kernels do not depend on who is in the scene.
+    """
+
+    Settings: ClassVar[type[msgspec.Struct]] = SionnaSettings
+    rung: ClassVar[str] = "siso-rt"
+
+    def __init__(self, settings: SionnaSettings, run: RunInfo) -> None:
+        super().__init__(settings, run)
+        if len(run.carriers) > 1:
+            raise ScenarioError(
+                f"sionna-rt traces one carrier, the scenario has {len(run.carriers)}: "
+                f"{', '.join(carrier.name for carrier in run.carriers)}; keep one of them",
+                key="carriers",
+            )
+        self._variant = ""
+        self._scene: SionnaScene
+        self._tracer: Tracer
+        self._at_once = 1
+
+    @property
+    def options(self) -> ChannelOptions:
+        s = self.settings
+        return ChannelOptions(
+            los=s.los,
+            reflection=s.reflection,
+            refraction=s.refraction,
+            diffraction=s.diffraction,
+            scattering=s.scattering,
+            max_depth=s.max_depth,
+            samples=s.samples,
+        )
+
+    def load(self, preparation: Preparation) -> tuple[str, ...]:
+        s = self.settings
+        self.run.progress("importing the ray tracer", _COMPILE_GRACE_S)
+        notes = self._start()
+        self.run.progress("loading the scene", _COMPILE_GRACE_S)
+        frequency = self.run.carriers[0].frequency_hz
+        self._scene = SionnaScene(
+            preparation.assets,
+            self._pool_sizes(preparation.assets),
+            SceneSettings(
+                frequency_hz=frequency,
+                body_material=s.body_material,
+                materials=s.materials,
+                outside_itu_range=s.outside_itu_range,
+                weld=s.diffraction,
+            ),
+        )
+        seed = s.launch_seed
+        if seed is None:
+            seed = derive_seed(self.run.seed, 0, f"{self.run.name}/launch")
+        launch = LaunchOptions(
+            max_depth=s.max_depth,
+            samples=s.samples,
+            max_paths=s.max_paths,
+            seed=seed,
+            reflection=s.reflection,
+            refraction=s.refraction,
+            diffraction=s.diffraction,
+            scattering=s.scattering,
+        )
+        self._tracer = Tracer(self._scene.mi_scene, SPEED_OF_LIGHT / frequency, launch)
+        self._at_once = self._receivers_at_once()
+        return (*notes, *self._warm_up())
+
+    def paths(self, scene: Scene, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]) -> Found:
+        import mitsuba as mi
+
+        if mi.variant() != self._variant:
+            mi.set_variant(self._variant)
+        _refuse_buried(scene, self.settings.without_body)
+        names, velocity = self._scene.place(scene, frozenset(self.settings.without_body))
+        parts = [
+            self._launch(t, transmitter, begin, receivers)
+            for t, transmitter in enumerate(transmitters)
+            for begin in range(0, len(receivers), self._at_once)
+        ]
+        depth = self.settings.max_depth
+        table = PathTable(
+            pair=_joined([pair for pair, _ in parts], (0,), np.int64),
+            transfer=_joined([part.transfer for _, part in parts], (0, 3, 3), np.complex128)[None],
+            types=_joined([part.types for _, part in parts], (0, depth), np.uint8),
+            objects=self._scene.object_index(
+                _joined([part.shapes for _, part in parts], (0, depth), np.int64)
+            ),
+            points=_joined([part.points for _, part in parts], (0, depth, 3), np.float64),
+            object_names=names,
+            object_velocity=velocity,
+        )
+        straight = (table.types == 0).all(1)
+        los = np.zeros(len(transmitters) * len(receivers), bool)
+        los[table.pair[straight]] = True
+        if not self.settings.los:
+            table = table.take(~straight)
+        return Found(
+            table=table,
+            los=los.reshape(len(transmitters), len(receivers)),
+            counts={"path_limit_reached": sum(part.limit_reached for _, part in parts)},
+        )
+
+    def _launch(
+        self, t: int, transmitter: Antenna, begin: int, receivers: Sequence[Antenna]
+    ) -> tuple[Int64Array, Traced]:
+        """Paths of one transmitter to some receivers, with the pair that each belongs to."""
+        chosen = receivers[begin : begin + self._at_once]
+        targets = np.tile(self._scene.parking, (self._at_once, 1))
+        targets[: len(chosen)] = [receiver.position for receiver in chosen]
+        traced = self._tracer.trace(transmitter.position, targets)
+        itself = [receiver.name == transmitter.name for receiver in chosen]
+        real = np.zeros(self._at_once, bool)
+        real[: len(chosen)] = np.logical_not(itself)
+        traced = traced.take(real[traced.receiver])
+        return t * len(receivers) + begin + traced.receiver, traced
+
+    def _start(self) -> tuple[str, ...]:
+        """Import the ray tracer with its library and variant; notes that say which."""
+        self._variant = choose_variant()
+        notes: tuple[str, ...] = (f"Mitsuba variant {self._variant}",)
+        if self._variant.startswith("llvm"):
+            notes = (activate_llvm(), *notes)
+        try:
+            import mitsuba as mi
+
+            mi.set_variant(self._variant)
+            import sionna.rt
+        except ImportError as error:
+            raise SetupError(
+                f"sionna-rt cannot be imported ({error}); install it: pip install 'caviar-sim[channel]'"
+            ) from error
+        return (*notes, f"sionna-rt {sionna.rt.__version__}")
+
+    def _pool_sizes(self, assets: Mapping[str, Path]) -> dict[str, int]:
+        """Bodies of each mesh: those among the assets, and the box."""
+        by_stem = {PurePosixPath(name).stem: name for name in assets if name.startswith("objects/")}
+        by_stem["box"] = ""
+        unknown = sorted(self.settings.pool.keys() - by_stem.keys())
+        if unknown:
+            raise ScenarioError(
+                f"there is no object mesh {unknown[0]!r}; the run has: {', '.join(sorted(by_stem))}",
+                key=f"services.{self.run.name}.settings.pool",
+            )
+        return {name: self.settings.pool.get(stem, self.settings.bodies) for stem, name in by_stem.items()}
+
+    def _receivers_at_once(self) -> int:
+        s = self.settings
+        if s.receivers_at_once is not None:
+            return s.receivers_at_once
+        announced = sum(d.count for d in self.run.devices if d.kind == "antenna" and d.role in ("rx", "both"))
+        return max(1, min(announced, _LANES // (s.samples * max(s.max_depth, 1))))
+
+    def _warm_up(self) -> tuple[str, ...]:
+        """Compile every kernel that frames need: move the bodies, and trace what finds paths."""
+        self.run.progress("compiling kernels", _COMPILE_GRACE_S)
+        begin = time.monotonic()
+        middle = (self._scene.low + self._scene.high) / 2
+        above = np.array([middle[0], middle[1], self._scene.high[2] + 10.0])
+        receivers = above + np.arange(1, self._at_once + 1)[:, None] * np.array([1.3, 0.7, -0.1])
+        self._tracer.trace(above, receivers)
+        self._tracer.trace(above + 0.5, receivers + 0.25)
+        self.run.progress("kernels compiled", 0.0)
+        return (f"kernels compiled in {time.monotonic() - begin:.1f} s",)
+
+
+def _joined(arrays: Sequence[Array], empty: tuple[int, ...], dtype: type[np.generic]) -> Array:
+    return np.concatenate([np.zeros(empty, dtype), *arrays])
+
+
+def _refuse_buried(scene: Scene, without_body: Sequence[str]) -> None:
+    """Raise `PayloadError` for an antenna in the very middle of a body, which no wave can reach."""
+    for device in scene.devices:
+        if isinstance(device, AntennaDevice) and device.parent and device.position == (0.0, 0.0, 0.0):
+            cls = scene.classes[scene.names.index(device.parent)]
+            if cls not in without_body:
+                raise PayloadError(
+                    f"antenna {device.name!r} stands in the middle of the body of {device.parent!r}, where "
+                    f"no wave reaches it; mount it on the roof or floor, or list {cls!r} in without_body"
+                )
