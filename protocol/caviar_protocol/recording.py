@@ -60,6 +60,11 @@ class RecordedProduct:
         self._place = place
 
     @property
+    def size(self) -> int:
+        """Stored bytes."""
+        return len(self._data)
+
+    @property
     def header(self) -> memoryview:
         """The wire bytes of the payload's header."""
         return self._data[8 : 8 + self._header_length]
@@ -169,6 +174,11 @@ class Recording:
     def directory(self) -> Path:
         """The run directory."""
         return self.path if self.path.is_dir() else self.path.parent
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The segments that were read."""
+        return tuple(segment.path for segment in self._segments)
 
     @property
     def assets(self) -> dict[str, Path]:

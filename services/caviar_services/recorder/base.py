@@ -52,6 +52,8 @@ def versions() -> dict[str, str]:
     except metadata.PackageNotFoundError:
         return found
     for requirement in requirements:
+        if requirement.endswith(('extra == "dev"', "extra == 'dev'")):
+            continue  # tools of developers take no part in a run
         name = re.split(r"[^A-Za-z0-9._-]", requirement, maxsplit=1)[0]
         try:
             found[name] = metadata.version(name)

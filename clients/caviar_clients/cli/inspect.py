@@ -1,0 +1,243 @@
+"""``caviar inspect``: what a recording holds, and the digest of its run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Annotated, Any, cast
+
+import msgspec
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from caviar_protocol.arrays import quantity
+from caviar_protocol.errors import CaviarError, RecordingError
+from caviar_protocol.messages import Status
+from caviar_protocol.recording import RecordedFrame, Recording
+from caviar_protocol.topics import Link
+
+SHOWN_DAMAGE = 20
+"""Lines about damage that are printed; how many there are more is said."""
+
+
+class SourceSummary(msgspec.Struct, kw_only=True):
+    """What became of one source's products of one topic."""
+
+    topic: str
+    source: str
+    fresh: int = 0
+    held: int = 0
+    absent: int = 0
+    late: int = 0
+    bytes: Annotated[int, quantity("B", "stored")] = 0
+
+
+class LinkSummary(msgspec.Struct, kw_only=True):
+    """Means over frames and users that have a path; |y| of beams of unit norm."""
+
+    mean_abs_y: float | None
+    """None where no user ever had a path."""
+    mean_abs_y_best: float | None
+    mean_abs_y_baseline: float | None
+    no_path_share: float | None
+    """Share of users without a path; None where there was no user."""
+    users: int
+    """Users summed over frames."""
+
+
+class RunSummary(msgspec.Struct, kw_only=True):
+    """A recording at a glance."""
+
+    run: str
+    scenario: str
+    seed: int
+    started: str
+    complete: bool
+    """Whether the recorder closed the recording."""
+    segments: int
+    episodes: int
+    frames: int
+    frames_planned: int
+    simulated_s: Annotated[float, quantity("s", "frames times sampling period")]
+    bytes: Annotated[int, quantity("B", "size of the segments")]
+    sources: list[SourceSummary]
+    link: LinkSummary | None
+    versions: dict[str, str]
+    machine: dict[str, str]
+    notes: tuple[str, ...]
+    damage: list[str]
+
+
+def inspect_command(run: Path, digest: bool = False, as_json: bool = False) -> int:
+    """Print a summary of a recording, or only its digest; the exit status, 1 where it is damaged."""
+    try:
+        recording = Recording(run)
+        return _print_digest(recording) if digest else _print_summary(summarise(recording), as_json)
+    except CaviarError as error:
+        typer.echo(f"error: {error}", err=True)
+        return 1
+
+
+def summarise(recording: Recording) -> RunSummary:
+    """The summary of a recording. Damaged frames are listed and count as if they had no products."""
+    metadata, damage = recording.metadata, []
+    sources: dict[tuple[str, str], SourceSummary] = {}
+    totals, episodes = _LinkTotals(), set()
+    for frame in recording.frames():
+        episodes.add(frame.episode)
+        for entry in frame.inputs:
+            key = (entry.topic, entry.source)
+            source = sources.setdefault(key, SourceSummary(topic=entry.topic, source=entry.source))
+            setattr(source, entry.status.value, getattr(source, entry.status.value) + 1)
+        try:
+            _measure(frame, sources, totals)
+        except RecordingError as error:
+            damage.append(str(error))
+    return RunSummary(
+        run=metadata.run,
+        scenario=metadata.name,
+        seed=metadata.seed,
+        started=metadata.started,
+        complete=recording.complete,
+        segments=len(recording.files),
+        episodes=len(episodes),
+        frames=len(recording),
+        frames_planned=metadata.frames * _episodes_planned(metadata.scenario),
+        simulated_s=len(recording) * metadata.sampling_period_ns / 1e9,
+        bytes=sum(file.stat().st_size for file in recording.files),
+        sources=[sources[key] for key in sorted(sources)],
+        link=totals.summary(),
+        versions=metadata.versions,
+        machine=metadata.machine,
+        notes=metadata.notes,
+        damage=damage,
+    )
+
+
+class _LinkTotals:
+    """Sums of |y| over users that have a path, and how many users had none."""
+
+    def __init__(self) -> None:
+        self.users = self.served = 0
+        self.abs_y = self.best = self.baseline = 0.0
+
+    def add(self, link: Link) -> None:
+        with_path = link.has_path
+        self.users += len(link.rx)
+        self.served += int(with_path.sum())
+        self.abs_y += float(link.abs_y[with_path].sum())
+        self.best += float(link.top_abs_y[with_path, :1].sum())
+        self.baseline += float(link.baseline_abs_y[with_path].sum())
+
+    def summary(self) -> LinkSummary | None:
+        if not self.users:
+            return None
+        means = [
+            total / self.served if self.served else None for total in (self.abs_y, self.best, self.baseline)
+        ]
+        return LinkSummary(
+            mean_abs_y=means[0],
+            mean_abs_y_best=means[1],
+            mean_abs_y_baseline=means[2],
+            no_path_share=1 - self.served / self.users,
+            users=self.users,
+        )
+
+
+def _measure(
+    frame: RecordedFrame, sources: dict[tuple[str, str], SourceSummary], totals: _LinkTotals
+) -> None:
+    for product in frame.products:
+        entry = product.provenance
+        if entry.status in (Status.FRESH, Status.LATE):
+            sources[entry.topic, entry.source].bytes += product.size
+        if entry.topic == "link" and entry.status is Status.FRESH:
+            totals.add(cast(Link, product.payload))
+
+
+def _episodes_planned(scenario: dict[str, Any]) -> int:
+    run = scenario.get("run")
+    episodes = run.get("episodes", 1) if isinstance(run, dict) else 1
+    return episodes if isinstance(episodes, int) else 1
+
+
+def _print_digest(recording: Recording) -> int:
+    report = recording.run_digest()
+    typer.echo(report.digest)
+    if not recording.complete:
+        typer.echo(f"note: the recording breaks off; the digest is that of {report.frames} frames", err=True)
+    return _print_damage(report.damage)
+
+
+def _print_damage(damage: Sequence[str]) -> int:
+    for line in damage[:SHOWN_DAMAGE]:
+        typer.echo(f"damaged: {line}", err=True)
+    if len(damage) > SHOWN_DAMAGE:
+        typer.echo(f"damaged: and {len(damage) - SHOWN_DAMAGE} more", err=True)
+    return 1 if damage else 0
+
+
+def _print_summary(summary: RunSummary, as_json: bool) -> int:
+    if as_json:
+        typer.echo(msgspec.json.format(msgspec.json.encode(summary), indent=2))
+    else:
+        console = Console()
+        console.print(_facts(summary))
+        console.print(_topics(summary.sources))
+    return _print_damage(summary.damage)
+
+
+def _facts(summary: RunSummary) -> Table:
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column(overflow="fold")
+    state = "complete" if summary.complete else "[red]breaks off[/red]: the recorder did not close it"
+    table.add_row("run", escape(f"{summary.run} (scenario {summary.scenario}, seed {summary.seed})"))
+    table.add_row("started", summary.started)
+    table.add_row("recording", f"{state}, {_size(summary.bytes)} in {_count(summary.segments, 'segment')}")
+    table.add_row(
+        "frames",
+        f"{summary.frames} of {summary.frames_planned} planned, {_count(summary.episodes, 'episode')}, "
+        f"{summary.simulated_s:g} s simulated",
+    )
+    link = summary.link
+    if link is not None and link.mean_abs_y is not None:
+        table.add_row(
+            "mean |y|",
+            f"{link.mean_abs_y:.4g}, best {link.mean_abs_y_best:.4g}, straight line "
+            f"{link.mean_abs_y_baseline:.4g} (over users with a path)",
+        )
+    if link is not None:
+        table.add_row("no path", f"{link.no_path_share:.2%} of {_count(link.users, 'user')} over all frames")
+    machine = summary.machine
+    table.add_row("machine", escape(", ".join(f"{key} {value}" for key, value in sorted(machine.items()))))
+    table.add_row("versions", escape(", ".join(f"{k} {v}" for k, v in summary.versions.items())))
+    for note in summary.notes:
+        table.add_row("note", escape(note))
+    return table
+
+
+def _topics(sources: Iterable[SourceSummary]) -> Table:
+    table = Table()
+    for title in ("topic", "source"):
+        table.add_column(title)
+    for title in ("fresh", "held", "absent", "late", "size"):
+        table.add_column(title, justify="right")
+    for source in sources:
+        counts = (source.fresh, source.held, source.absent, source.late)
+        table.add_row(source.topic, escape(source.source), *map(str, counts), _size(source.bytes))
+    return table
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def _size(count: float) -> str:
+    for unit in ("B", "KiB", "MiB"):
+        if count < 1024:
+            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
+        count /= 1024
+    return f"{count:.1f} GiB"
