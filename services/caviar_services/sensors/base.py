@@ -6,6 +6,7 @@ for every sensor.
 
 from __future__ import annotations
 
+import importlib.util
 import time
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -16,7 +17,7 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Payload, quantity
-from caviar_protocol.errors import ScenarioError
+from caviar_protocol.errors import ScenarioError, SetupError
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.topics import Scene
 from caviar_protocol.topics.scene import Device
@@ -49,6 +50,9 @@ class Sensors(Service[S]):
     role: ClassVar[Role] = "sensors"
     inputs: ClassVar[tuple[Input, ...]] = (Input(topic="scene"),)
 
+    traced: TracedScene | None = None
+    """The scene for rays; None where nothing is asked for."""
+
     def prepare(self, preparation: Preparation) -> Prepared:
         """Load the scenery and the objects' meshes, and compile what `observe` needs.
 
@@ -59,14 +63,14 @@ class Sensors(Service[S]):
         AssetError
             The scene description or a mesh is broken or missing.
         SetupError
-            There is no library to compile kernels with.
+            Mitsuba is not installed, or there is no library to compile kernels with.
         """
-        self.demand: dict[str, frozenset[str]] = {
-            topic: parts for topic, parts in preparation.demand.items() if topic in self.outputs
-        }
-        self.traced: TracedScene | None = None
-        if not self.demand:
+        if not preparation.demand.keys() & set(self.outputs):
             return Prepared(notes=("nobody asks for what these sensors see: not run",))
+        if importlib.util.find_spec("mitsuba") is None:
+            raise SetupError(
+                "Mitsuba, which traces the rays, is not installed; run: pip install 'caviar-sim[sensors]'"
+            )
         device = "a CUDA device" if cuda_devices() else activate_llvm()
         self.variant = "cuda_ad_rgb" if device == "a CUDA device" else "llvm_ad_rgb"
         self.run.progress("loading scenery", 60.0)

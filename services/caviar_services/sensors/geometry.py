@@ -87,10 +87,10 @@ def load_unit_mesh(mi: Any, file: Path) -> Mesh:
 
 
 def contains(mesh: Mesh, point: Float64Array) -> bool:
-    """Whether ``point`` [3] lies inside a closed mesh, not on its surface.
+    """Whether ``point`` [3] lies inside a closed mesh; undecided on its surface.
 
     Sums the solid angles of all triangles (Van Oosterom and Strackee, "The solid angle of a plane
-    triangle", 1983): 4π inside, 0 outside, and between them on faces and edges.
+    triangle", 1983): ±4π inside, 0 outside.
     """
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces] - point, 1, 0)
     la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
@@ -102,7 +102,7 @@ def contains(mesh: Mesh, point: Float64Array) -> bool:
         + np.einsum("ij,ij->i", c, a) * lb
     )
     angle = 2 * float(np.arctan2(numerator, denominator).sum())
-    return abs(angle) > 3 * np.pi
+    return abs(angle) > 2 * np.pi
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,9 +129,25 @@ class _Part:
         self._parameters = mi.traverse(self.scene)
         self._parameters.keep(self._key)
 
-    def move(self, mi: Any, vertices: Float32Array) -> None:
-        self._parameters[self._key] = mi.Float(vertices.ravel())
+    def move(self, mi: Any, vertices: Float64Array) -> None:
+        (column,) = _columns(vertices.reshape(1, -1))
+        self._parameters[self._key] = mi.Float(column)
         self._parameters.update()
+
+
+def _columns(rows: Float64Array) -> Float32Array:
+    """Rows as float32, Shape ``[R, N]``, each at a multiple of 64 bytes, with room behind it.
+
+    Dr.Jit computes in NumPy's memory where it can, whole vectors of up to 64 bytes at a time, and
+    compiles a kernel anew for each combination of arrays that happen to be aligned or not.
+    """
+    count, size = rows.shape
+    stride = -(-size // 16) * 16
+    buffer = np.zeros(count * stride + 16, dtype=np.float32)
+    start = (-buffer.ctypes.data % 64) // buffer.itemsize
+    columns = buffer[start : start + count * stride].reshape(count, stride)[:, :size]
+    columns[...] = rows
+    return columns
 
 
 class TracedScene:
@@ -157,7 +173,7 @@ class TracedScene:
     ) -> None:
         self._scenery_names = names
         self._bodies = dict(bodies)
-        self._pool = BodyPool(capacity)
+        self._capacity = dict(capacity)
         self._scenery: _Part | None = None
         vertices, faces, self._scenery_owner = _merged(meshes)
         if faces.size:
@@ -189,7 +205,8 @@ class TracedScene:
             )
         vertices = np.tile(self._parked, (self._vertex_start[-1], 1))
         self._owner_names[len(self._scenery_names) :] = [""] * (len(self._vertex_start) - 1)
-        places = self._pool.assign(zip(scene.names, scene.assets, strict=True))
+        # A new assignment each frame, so that a product depends on its scene alone, whatever came before.
+        places = BodyPool(self._capacity).assign(zip(scene.names, scene.assets, strict=True))
         for index, name in enumerate(scene.names):
             asset, slot = places[name]
             body = self._start[asset] + slot
@@ -197,7 +214,7 @@ class TracedScene:
             vertices[self._vertex_start[body] : self._vertex_start[body + 1]] = placed(
                 self._bodies[asset], scene.dimensions[index], object_pose(scene, index)
             )
-        self._moving.move(mi, vertices.astype(np.float32))
+        self._moving.move(mi, vertices)
 
     def trace(self, mi: Any, origin: Float64Array, direction: Float64Array, reach: Float64Array) -> Hits:
         """First hit of each ray.
@@ -211,13 +228,11 @@ class TracedScene:
         """
         import drjit as dr
 
-        # Every value is an array of its own, never a Python number: a number becomes part of the
-        # kernel, and each new one a kernel to compile.
-        columns = [
-            mi.Float(row.astype(np.float32, order="C")) for rows in (origin, direction) for row in rows
-        ]
-        ray = mi.Ray3f(mi.Point3f(*columns[:3]), mi.Vector3f(*columns[3:]))
-        ray.maxt = mi.Float(reach.astype(np.float32))
+        # Every value is an array, never a Python number: a number becomes part of the kernel, and
+        # each new one makes a kernel to compile.
+        x, y, z, dx, dy, dz, limit = map(mi.Float, _columns(np.vstack([origin, direction, reach])))
+        ray = mi.Ray3f(mi.Point3f(x, y, z), mi.Vector3f(dx, dy, dz))
+        ray.maxt = limit
         hit = self._moving.scene.ray_intersect_preliminary(ray, coherent=True)
         distance, face, moving = hit.t, hit.prim_index, mi.Bool(True)
         if self._scenery is not None:
@@ -241,10 +256,11 @@ class TracedScene:
         return Hits(distance, owner.astype(np.int32))
 
     def is_inside(self, asset: str, dimensions: Float64Array, point: Vector) -> bool:
-        """Whether a point in an object's body axes [m] lies inside its mesh, not on its surface."""
+        """Whether a point in an object's body axes [m] lies in its mesh, deeper than a millimetre."""
         if not (dimensions > 0).all():
             return False
-        return contains(self._bodies[asset], np.array(point) / dimensions)
+        around = np.array(point) + 1e-3 * np.concatenate([np.eye(3), -np.eye(3)])
+        return all(contains(self._bodies[asset], place) for place in around / dimensions)
 
     def name_of(self, owner: int) -> str:
         """Name of the object or scenery shape behind an owner of `Hits`, in the last update."""
