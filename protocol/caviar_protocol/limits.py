@@ -16,3 +16,6 @@ MAX_NESTING = 32
 
 MAX_ASSET_CHUNK = 4 << 20
 """Bytes of the data part of an ASSET_DATA."""
+
+MAX_IN_FLIGHT = 64
+"""Grants that a service may be asked to queue."""

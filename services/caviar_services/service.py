@@ -23,7 +23,7 @@ import numpy as np
 from caviar_protocol.arrays import Payload
 from caviar_protocol.codec import decode_payload
 from caviar_protocol.errors import PayloadError
-from caviar_protocol.messages import GrantInput, Input, Role, Status
+from caviar_protocol.messages import GrantInput, Input, Report, Role, Status
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.scene import merge_scenes
 from caviar_protocol.seeding import generator
@@ -130,6 +130,8 @@ class Frame:
     final: bool = False
     """The agent's extra grant behind the last frame (clause 16)."""
     inputs: tuple[FrameInput, ...] = ()
+    reports: tuple[Report, ...] = ()
+    """Recorders: what the services of this frame reported beside their products."""
     service: str = ""
     seed: int = 0
 

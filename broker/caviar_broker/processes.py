@@ -1,0 +1,64 @@
+"""What the operating system knows of services on this machine (contract, clause 15)."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+
+class LocalProcess:
+    """A process of this kernel and PID namespace, watched through a pidfd.
+
+    The descriptor becomes readable the moment the process dies, whoever its parent is, and never
+    means another process that was given the same number later.
+    """
+
+    def __init__(self, pid: int) -> None:
+        self.pid = pid
+        self.fd = os.pidfd_open(pid)
+
+    def verdict(self) -> str:
+        """How the process ended, as far as can be told."""
+        fields = _stat(self.pid)
+        if fields is not None and fields[0] == "Z":
+            return describe_exit(os.waitstatus_to_exitcode(int(fields[-1])))
+        return "its process is gone"
+
+    @property
+    def stopped(self) -> bool:
+        """Whether it is stopped by a signal (SIGSTOP, SIGTSTP), so that it cannot answer."""
+        fields = _stat(self.pid)
+        return fields is not None and fields[0] == "T"
+
+    def close(self) -> None:
+        """Stop watching."""
+        os.close(self.fd)
+
+
+def watch(pid: int) -> LocalProcess | None:
+    """Watch a process; None where there is no such process or the kernel cannot."""
+    try:
+        return LocalProcess(pid)
+    except OSError:
+        return None
+
+
+def describe_exit(code: int) -> str:
+    """An exit status for people: negative for a signal, as `subprocess` has it."""
+    if code >= 0:
+        return f"it exited with status {code}"
+    try:
+        name = signal.Signals(-code).name
+    except ValueError:
+        name = f"signal {-code}"
+    return f"it was killed by {name}"
+
+
+def _stat(pid: int) -> list[str] | None:
+    """Fields of /proc/PID/stat behind the command name, state first; None where it is gone."""
+    try:
+        text = Path(f"/proc/{pid}/stat").read_text()
+    except OSError:
+        return None
+    return text.rpartition(")")[2].split()

@@ -1,0 +1,204 @@
+"""Starting a run: the broker and every service as processes of their own, and ending them all."""
+
+from __future__ import annotations
+
+import json
+import os
+import selectors
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from caviar_broker.processes import describe_exit
+from caviar_protocol.errors import RunError
+from caviar_protocol.scenario import Scenario
+
+KILL_AFTER_S = 1.0
+"""[s] that a process gets after SIGTERM before SIGKILL, beyond the run's ``shutdown_s``."""
+
+
+@dataclass
+class Child:
+    """One process of the run."""
+
+    name: str
+    process: subprocess.Popen[bytes]
+    log: Path
+    pidfd: int
+
+    def tail(self, lines: int = 5) -> str:
+        """The last lines it printed."""
+        return "\n".join(self.log.read_text(errors="replace").splitlines()[-lines:])
+
+
+@dataclass
+class Launcher:
+    """Runs one scenario as processes of this machine.
+
+    Use as a context manager: however the block is left, no process of the run survives it.
+    ``events()`` yields what the broker reports, until the run is over.
+    """
+
+    scenario: Scenario
+    path: Path
+    directory: Path
+    frames: int | None = None
+    seed: int | None = None
+    bind: str = "tcp://127.0.0.1:0"
+    endpoint: str = ""
+    _children: dict[str, Child] = field(default_factory=dict)
+    _broker: subprocess.Popen[bytes] | None = None
+    _selector: selectors.BaseSelector = field(default_factory=selectors.DefaultSelector)
+    _finished: bool = False
+
+    def __enter__(self) -> Launcher:
+        (self.directory / "logs").mkdir(parents=True, exist_ok=True)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end_all()
+        self._selector.close()
+
+    def events(self) -> Iterator[Mapping[str, Any]]:
+        """Start everything; what the broker tells, then what became of the processes.
+
+        Raises `RunError` where the broker itself cannot start.
+        """
+        self._start_broker()
+        while not self._finished:
+            for key, _ in self._selector.select(timeout=1.0):
+                if isinstance(key.data, Child):
+                    self._child_died(key.data)
+                else:
+                    yield from self._broker_said()
+
+    def stop(self, reason: str) -> None:
+        """Ask for an orderly end."""
+        self._order({"stop": reason})
+
+    def child(self, name: str) -> Child | None:
+        """A service's process."""
+        return self._children.get(name)
+
+    # --- starting ----------------------------------------------------------------------------------
+
+    def _start_broker(self) -> None:
+        command = [sys.executable, "-m", "caviar_broker", str(self.path), "--bind", self.bind]
+        command += ["--directory", str(self.directory), "--control"]
+        if self.frames is not None:
+            command += ["--frames", str(self.frames)]
+        if self.seed is not None:
+            command += ["--seed", str(self.seed)]
+        command += ["--supervised", *self.scenario.services]
+        with (self.directory / "logs" / "broker.log").open("wb") as log:
+            self._broker = subprocess.Popen(  # noqa: S603  # our own module with checked arguments
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, start_new_session=True
+            )
+        if self._broker.stdout is None:
+            raise RunError("the broker has no standard output")
+        os.set_blocking(self._broker.stdout.fileno(), False)
+        self._rest = b""
+        self._selector.register(self._broker.stdout, selectors.EVENT_READ)
+
+    def _start_services(self) -> None:
+        for name, spec in self.scenario.services.items():
+            path = self.directory / "logs" / f"{name}.log"
+            command = [sys.executable, "-m", "caviar_services", name]
+            command += ["--use", f"{spec.role}:{spec.use}", "--broker", self.endpoint]
+            with path.open("wb") as log:
+                process = subprocess.Popen(  # noqa: S603  # our own module with checked arguments
+                    command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True
+                )
+            child = Child(name, process, path, os.pidfd_open(process.pid))
+            self._children[name] = child
+            self._selector.register(child.pidfd, selectors.EVENT_READ, child)
+
+    # --- while it runs -----------------------------------------------------------------------------
+
+    def _broker_said(self) -> Iterator[Mapping[str, Any]]:
+        broker = self._broker
+        if broker is None or broker.stdout is None:
+            return
+        data = os.read(broker.stdout.fileno(), 65536)
+        if not data:
+            self._selector.unregister(broker.stdout)
+            self._finished = True
+            yield self._broker_ended(broker)
+            return
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        for line in lines:
+            event = json.loads(line)
+            if event["event"] == "listening":
+                self.endpoint = event["endpoint"]
+                self._start_services()
+            self._over = self._over or event["event"] == "finished"
+            yield event
+
+    _rest = b""
+    _over = False
+
+    def _broker_ended(self, broker: subprocess.Popen[bytes]) -> Mapping[str, Any]:
+        status = broker.wait()
+        if not self._over:
+            log = (self.directory / "logs" / "broker.log").read_text(errors="replace").strip()
+            last = log.splitlines()[-1] if log else describe_exit(status)
+            raise RunError(last if last.startswith("caviar broker: ") else f"the broker died: {last}")
+        return {"event": "ended", "status": status}
+
+    def _child_died(self, child: Child) -> None:
+        self._selector.unregister(child.pidfd)
+        status = child.process.wait()
+        if not self._over:
+            verdict = describe_exit(status)
+            tail = child.tail(1)
+            self._order({"lost": child.name, "verdict": f"{verdict}, saying: {tail}" if tail else verdict})
+
+    def _order(self, order: Mapping[str, str]) -> None:
+        if self._broker is None or self._broker.stdin is None:
+            return
+        try:
+            self._broker.stdin.write(json.dumps(order).encode() + b"\n")
+            self._broker.stdin.flush()
+        except (BrokenPipeError, ValueError):
+            return  # it is ending already; its output says why
+
+    # --- ending --------------------------------------------------------------------------------------
+
+    def _end_all(self) -> None:
+        processes = [child.process for child in self._children.values()]
+        if self._broker is not None:
+            processes.append(self._broker)
+            if self._broker.stdin is not None:
+                try:
+                    self._broker.stdin.close()
+                except BrokenPipeError:
+                    pass  # the broker is gone already
+        grace = self.scenario.timeouts.shutdown_s if self._over else 0.0
+        _wait(processes, grace)
+        for process in processes:
+            if process.poll() is None:
+                process.send_signal(signal.SIGTERM)
+        _wait(processes, self.scenario.timeouts.shutdown_s + KILL_AFTER_S)
+        for process in processes:
+            if process.poll() is None:
+                process.kill()
+            process.wait()
+        for child in self._children.values():
+            os.close(child.pidfd)
+        if self._broker is not None and self._broker.stdout is not None:
+            self._broker.stdout.close()
+
+
+def _wait(processes: list[subprocess.Popen[bytes]], seconds: float) -> None:
+    """Wait until all have ended, but no longer than that [s]."""
+    until = time.monotonic() + seconds
+    for process in processes:
+        try:
+            process.wait(max(0.0, until - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            continue

@@ -1,0 +1,119 @@
+"""The `caviar` command."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from caviar_protocol.errors import CaviarError
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Co-simulation of machine-learning-based 6G in virtual worlds.",
+)
+_console = Console()
+_errors = Console(stderr=True)
+
+ScenarioFile = Annotated[Path, typer.Argument(help="scenario file (TOML)", show_default=False)]
+RunDirectory = Annotated[Path, typer.Argument(help="directory of a run, or one segment of its recording")]
+Frames = Annotated[int | None, typer.Option(help="frames of an episode, instead of the scenario's")]
+Seed = Annotated[int | None, typer.Option(help="seed, instead of the scenario's")]
+
+
+@app.command()
+def run(
+    scenario: ScenarioFile,
+    frames: Frames = None,
+    seed: Seed = None,
+    json: Annotated[Path | None, typer.Option(help="write the summary to this file too")] = None,
+    out: Annotated[Path, typer.Option(help="directory in which the run's own is made")] = Path("runs"),
+    bind: Annotated[str, typer.Option(help="address of the broker; port 0: any")] = "tcp://127.0.0.1:0",
+) -> None:
+    """Run a scenario: the broker and every service as processes of their own."""
+    from caviar_clients.cli.run import run_scenario
+
+    raise typer.Exit(run_scenario(scenario, out, _console, frames, seed, json, bind))
+
+
+@app.command()
+def broker(
+    scenario: ScenarioFile,
+    bind: Annotated[str, typer.Option(help="address to listen on")] = "tcp://127.0.0.1:5570",
+    frames: Frames = None,
+    seed: Seed = None,
+    out: Annotated[Path, typer.Option(help="directory in which the run's own is made")] = Path("runs"),
+) -> None:
+    """Run only the broker; start the services with `caviar service`, here or on other machines."""
+    from caviar_broker.__main__ import parser, serve
+    from caviar_clients.cli.run import checked_scenario, run_directory
+
+    directory = run_directory(out, checked_scenario(scenario, frames, seed).run.name)
+    arguments = [str(scenario), "--bind", bind, "--directory", str(directory)]
+    for name, value in (("--frames", frames), ("--seed", seed)):
+        arguments += [] if value is None else [name, str(value)]
+    raise typer.Exit(serve(parser().parse_args(arguments)))
+
+
+@app.command()
+def service(
+    name: Annotated[str, typer.Argument(help="name of the service in the scenario")],
+    use: Annotated[str, typer.Option(help="implementation, as ROLE:NAME, for example channel:sionna-rt")],
+    broker: Annotated[str, typer.Option(help="address of the broker")] = "tcp://127.0.0.1:5570",
+) -> None:
+    """Run one service and connect it to a broker."""
+    from caviar_services.__main__ import serve
+
+    raise typer.Exit(serve(name, use, broker))
+
+
+@app.command()
+def doctor() -> None:
+    """Check what this machine has; for what is missing, say the command that mends it."""
+    from caviar_clients.cli import doctor as checks
+
+    found = checks.doctor()
+    checks.render(found, _console)
+    raise typer.Exit(checks.exit_status(found))
+
+
+@app.command()
+def inspect(
+    run: RunDirectory,
+    digest: Annotated[bool, typer.Option("--digest", help="only the digest, from the payloads")] = False,
+    json: Annotated[bool, typer.Option("--json", help="as JSON")] = False,
+) -> None:
+    """Say what a recording holds, or recompute its digest."""
+    from caviar_clients.cli.inspect import inspect_command
+
+    raise typer.Exit(inspect_command(run, digest, json))
+
+
+@app.command()
+def plot(
+    run: RunDirectory,
+    out: Annotated[Path | None, typer.Option(help="where the PNGs go; by default into the run")] = None,
+    frame: Annotated[int | None, typer.Option(help="frame of the map and the LIDAR scan")] = None,
+    user: Annotated[str | None, typer.Option(help="receiver whose |y| is drawn")] = None,
+) -> None:
+    """Draw a run: the map with rays and beam, |y| over time and angle, a LIDAR scan."""
+    from caviar_clients.plots import plot_run
+
+    for picture in plot_run(run, out, frame, user):
+        _console.print(str(picture), highlight=False, soft_wrap=True)
+
+
+def main() -> None:
+    """Entry point: errors meant for the user become one line and status 1."""
+    try:
+        app()
+    except CaviarError as error:
+        _errors.print(f"[red]caviar:[/red] {error}", highlight=False, soft_wrap=True)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        sys.exit(130)

@@ -1,0 +1,171 @@
+"""`caviar run`: a scenario from beginning to end, with progress and a summary."""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+from collections.abc import Mapping
+from datetime import datetime
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from caviar_clients.cli.launch import Launcher
+from caviar_clients.cli.summary import LinkFigures, link_figures, summary_of, summary_table
+from caviar_protocol.errors import DeclarationError
+from caviar_protocol.scenario import Scenario
+from caviar_protocol.scenario_checks import scenario_error, settings_place, with_overrides
+from caviar_protocol.scenario_loader import load_scenario
+from caviar_protocol.tables import convert_settings
+from caviar_services.registry import load
+
+QUIET = frozenset({"stale", "note", "idle", "lag"})
+"""Kinds of notices that are logged, and only counted on the screen."""
+
+
+def checked_scenario(path: Path, frames: int | None = None, seed: int | None = None) -> Scenario:
+    """Load a scenario and check it against the implementations it uses.
+
+    Raises `ScenarioError` naming file, key and line for an implementation or a setting that does
+    not exist.
+    """
+    scenario = with_overrides(load_scenario(path), frames, seed)
+    for name, spec in scenario.services.items():
+        try:
+            implementation = load(spec.role, spec.use)
+        except DeclarationError as error:
+            raise scenario_error(scenario, f"services.{name}.use", str(error)) from error
+        convert_settings(implementation.Settings, spec.settings, settings_place(scenario, name))
+    return scenario
+
+
+def run_directory(root: Path, name: str) -> Path:
+    """A new directory ``root/<name>-<date>-<time>`` for a run, with a number where that is taken."""
+    stem = f"{name}-{datetime.now().astimezone():%Y%m%d-%H%M%S}"
+    for number in range(1, 1000):
+        directory = root / (stem if number == 1 else f"{stem}-{number}")
+        try:
+            directory.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        return directory
+    raise FileExistsError(root / stem)
+
+
+def run_scenario(
+    path: Path,
+    out: Path,
+    console: Console,
+    frames: int | None = None,
+    seed: int | None = None,
+    json_file: Path | None = None,
+    bind: str = "tcp://127.0.0.1:0",
+) -> int:
+    """Run a scenario; the exit status: 0 exactly if it came to its end."""
+    scenario = checked_scenario(path, frames, seed)
+    directory = run_directory(out, scenario.run.name)
+    console.print(f"run {directory}", highlight=False)
+    launcher = Launcher(scenario, path.resolve(), directory, frames, seed, bind)
+    outcome: Mapping[str, Any] = {}
+    interrupted = _Interruption(launcher)
+    with launcher, interrupted, _progress_bar(console) as bar:
+        watcher = _Watcher(bar, console, scenario)
+        for event in launcher.events():
+            watcher.take(event)
+            if event["event"] == "finished":
+                outcome = event
+    figures = link_figures(directory) if outcome["frames"] else LinkFigures()
+    summary = summary_of(outcome, figures, scenario.run.name, directory, scenario.run.seed)
+    _write(directory / "summary.json", summary)
+    if json_file is not None:
+        _write(json_file, summary)
+    if outcome["frames"]:
+        console.print(summary_table(summary))
+    if outcome["error"]:
+        console.print(f"[red]the run ended early:[/red] {outcome['error']}", highlight=False, soft_wrap=True)
+        child = launcher.child(outcome["culprit"])
+        if child is not None:
+            console.print(f"its log: {child.log}", highlight=False, soft_wrap=True)
+    return 130 if interrupted.came else 1 if outcome["error"] else 0
+
+
+class _Interruption:
+    """Ctrl-C as an order to end the run; a second one ends without waiting."""
+
+    def __init__(self, launcher: Launcher) -> None:
+        self._launcher = launcher
+        self.came = False
+
+    def __enter__(self) -> None:
+        self._before = {s: signal.signal(s, self._handle) for s in (signal.SIGINT, signal.SIGTERM)}
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number: int, _: FrameType | None) -> None:
+        if self.came:
+            raise KeyboardInterrupt
+        self.came = True
+        self._launcher.stop(f"stopped by {'Ctrl-C' if number == signal.SIGINT else 'SIGTERM'}")
+
+
+class _Watcher:
+    """Shows what the broker reports."""
+
+    def __init__(self, bar: Progress, console: Console, scenario: Scenario) -> None:
+        self._bar, self._console = bar, console
+        total = scenario.run.frames * scenario.run.episodes
+        self._task = bar.add_task("starting", total=total, rate="", misses="")
+        self._first: tuple[float, int] | None = None
+        self._shown: dict[tuple[str, str], int] = {}
+
+    def take(self, event: Mapping[str, Any]) -> None:
+        """Show one event."""
+        match event["event"]:
+            case "frame":
+                self._frame(event["frames"], event["misses"])
+            case "notice" if event["kind"] not in QUIET:
+                self._notice(event)
+            case "finished":
+                if not event["error"]:
+                    self._bar.update(self._task, completed=event["frames"], description="done")
+
+    def _frame(self, frames: int, misses: int) -> None:
+        now = time.monotonic()
+        self._first = self._first or (now, frames)
+        elapsed, done = now - self._first[0], frames - self._first[1]
+        rate = f"{done / elapsed:.1f} frames/s" if elapsed > 0.5 else ""
+        self._bar.update(
+            self._task, completed=frames, description="running", rate=rate, misses=f"{misses} misses"
+        )
+
+    def _notice(self, event: Mapping[str, Any]) -> None:
+        """Show the first of each kind and service; the rest is in events.jsonl."""
+        key = (event["kind"], event["service"])
+        self._shown[key] = self._shown.get(key, 0) + 1
+        if self._shown[key] == 1:
+            frame = f" in frame {event['frame']}" if event["frame"] >= 0 else ""
+            text = f"{event['kind']}: {event['service']}{frame}: {event['text']}"
+            self._console.print(text, highlight=False, soft_wrap=True, style="yellow", markup=False)
+
+
+def _progress_bar(console: Console) -> Progress:
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[misses]}"),
+        console=console,
+    )
+
+
+def _write(path: Path, summary: Mapping[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(summary, indent=2, ensure_ascii=False) + "\n")

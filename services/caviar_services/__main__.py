@@ -1,0 +1,38 @@
+"""One service as a process: ``python -m caviar_services NAME --use role:implementation --broker URL``."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+
+from caviar_protocol.errors import CaviarError
+from caviar_services.runner import run_service
+
+
+def serve(name: str, use: str, broker: str) -> int:
+    """Run the implementation ``use`` ("role:name") as the service ``name``; the exit status."""
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(message)s")
+    role, separator, implementation = use.partition(":")
+    if not separator:
+        sys.stderr.write(f"caviar service: --use {use!r} is not ROLE:NAME, for example world:sumo\n")
+        return 2
+    try:
+        return run_service(name, role, implementation, broker)
+    except CaviarError as error:
+        sys.stderr.write(f"caviar service {name}: {error}\n")
+        return 1
+
+
+def main() -> int:
+    """Parse the command line and serve; the exit status."""
+    parser = argparse.ArgumentParser(prog="python -m caviar_services", description=__doc__)
+    parser.add_argument("name", help="name of the service in the run")
+    parser.add_argument("--use", required=True, metavar="ROLE:NAME", help="registered implementation")
+    parser.add_argument("--broker", required=True, metavar="URL", help="tcp://host:port of the broker")
+    arguments = parser.parse_args()
+    return serve(arguments.name, arguments.use, arguments.broker)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
