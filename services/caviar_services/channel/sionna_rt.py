@@ -73,6 +73,7 @@ class SionnaChannel(ChannelModel[SionnaSettings]):
 
     Settings: ClassVar[type[msgspec.Struct]] = SionnaSettings
     rung: ClassVar[str] = "siso-rt"
+    uses_scenery: ClassVar[bool] = True
 
     def __init__(self, settings: SionnaSettings, run: RunInfo) -> None:
         super().__init__(settings, run)

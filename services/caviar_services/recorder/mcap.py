@@ -76,6 +76,7 @@ class McapRecorder(Recorder[McapSettings]):
 
     Settings = McapSettings
     outputs: ClassVar[tuple[str, ...]] = ()
+    uses_scenery: ClassVar[bool] = True
 
     def __init__(self, settings: McapSettings, run: RunInfo) -> None:
         super().__init__(settings, run)

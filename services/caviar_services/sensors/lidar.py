@@ -62,6 +62,7 @@ class LidarSensors(Sensors[LidarSettings]):
     """
 
     outputs: ClassVar[tuple[str, ...]] = ("lidar",)
+    uses_scenery: ClassVar[bool] = True
     Settings: ClassVar[type[msgspec.Struct]] = LidarSettings
 
     def prepare(self, preparation: Preparation) -> Prepared:
