@@ -206,10 +206,9 @@ def step_length_ms(sampling_period_ns: int, step_ms: int | None) -> int:
     """
     period_ms, rest = divmod(sampling_period_ns, _NS_PER_MS)
     if rest:
-        below = max(period_ms, 1) * _NS_PER_MS
+        near = " or ".join(str(ms * _NS_PER_MS) for ms in (period_ms, period_ms + 1) if ms)
         raise ScenarioError(
-            f"SUMO steps whole milliseconds, and {sampling_period_ns} ns is none; write "
-            f"{below} or {(period_ms + 1) * _NS_PER_MS}",
+            f"SUMO steps whole milliseconds, and {sampling_period_ns} ns is none; write {near}",
             key="run.sampling_period_ns",
         )
     step = period_ms if step_ms is None else step_ms

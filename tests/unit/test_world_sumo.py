@@ -1,0 +1,399 @@
+"""The world ``sumo`` against SUMO itself: poses, determinism, traffic that comes and goes, errors."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import math
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from world_builders import T_SAM_NS, scene_at, wire_bytes
+
+from caviar_protocol.coordinates import rotation_matrix
+from caviar_protocol.errors import CaviarError, RunError, ScenarioError, SetupError
+from caviar_protocol.topics import Scene
+from caviar_services.service import Frame, Preparation, RunInfo
+from caviar_services.world.sumo import SumoSettings, SumoWorld, step_length_ms
+from caviar_services.world.sumo_process import load_libsumo
+
+pytestmark = [
+    pytest.mark.sumo,
+    pytest.mark.skipif(importlib.util.find_spec("libsumo") is None, reason="needs the world extra"),
+]
+
+Make = Callable[..., SumoWorld]
+
+FRESH_PROCESS = """
+import hashlib, sys
+from caviar_protocol.codec import encode_payload
+from caviar_services.service import Frame, Preparation, RunInfo
+from caviar_services.world.sumo import SumoSettings, SumoWorld
+
+folder, seed = sys.argv[1], int(sys.argv[2])
+world = SumoWorld(
+    SumoSettings(net=folder + "/canyon.net.xml", routes=folder + "/canyon.rou.xml", begin_s=20.0),
+    RunInfo(name="traffic"),
+)
+world.prepare(Preparation(demand={}))
+world.reset(0, seed, 0)
+digest = hashlib.sha256()
+for number in range(60):
+    frame = Frame(episode=0, number=number, t_ns=number * 100_000_000)
+    for part in encode_payload(world.step(frame).products["scene"]):
+        digest.update(part)
+world.close()
+print(digest.hexdigest())
+"""
+
+
+@pytest.fixture
+def make(repository: Path) -> Iterator[Make]:
+    """Worlds in the street of the canyon. Making one closes the one before, and the test's end the
+    last: libsumo holds one simulation."""
+    folder = repository / "deploy" / "scenarios" / "street-canyon"
+    worlds: list[SumoWorld] = []
+
+    def create(name: str = "traffic", sampling_period_ns: int = T_SAM_NS, **changes: object) -> SumoWorld:
+        files = {
+            "net": str(folder / "canyon.net.xml"),
+            "routes": str(folder / "canyon.rou.xml"),
+            "begin_s": 20.0,
+        }
+        settings = SumoSettings(**{**files, **changes})
+        for world in worlds:
+            world.close()
+        worlds.append(SumoWorld(settings, RunInfo(name=name, sampling_period_ns=sampling_period_ns)))
+        worlds[-1].prepare(Preparation(demand={}))
+        return worlds[-1]
+
+    yield create
+    for world in worlds:
+        world.close()
+
+
+def scenes(world: SumoWorld, seed: int, frames: int, episode: int = 0) -> list[Scene]:
+    world.reset(episode, seed, 0)
+    return [scene_at(world, k) for k in range(frames)]
+
+
+# --- poses -----------------------------------------------------------------------------------
+
+NODES = '<nodes><node id="a" x="{x0}" y="{y0}" z="{z0}"/><node id="b" x="{x1}" y="{y1}" z="{z1}"/></nodes>'
+EDGES = '<edges><edge id="ab" from="a" to="b" numLanes="1" speed="20" spreadType="center"/></edges>'
+LORRY = """<routes>
+  <vType id="lorry" vClass="truck" length="9.0" width="2.4" height="3.6" maxSpeed="12" sigma="0"
+         speedDev="0"/>
+  <vehicle id="one" type="lorry" depart="0" departPos="9" departSpeed="12"><route edges="ab"/></vehicle>
+</routes>"""
+
+
+@pytest.fixture
+def ramp(tmp_path: Path) -> tuple[Path, np.ndarray, np.ndarray]:
+    """A straight road at no special angle, uphill, and its two ends."""
+    begin, end = np.array([30.0, -20.0, 5.0]), np.array([-130.0, 220.0, 22.0])
+    names = dict(zip(("x0", "y0", "z0", "x1", "y1", "z1"), (*begin, *end), strict=True))
+    (tmp_path / "r.nod.xml").write_text(NODES.format(**names))
+    (tmp_path / "r.edg.xml").write_text(EDGES)
+    (tmp_path / "r.rou.xml").write_text(LORRY)
+    import sumo
+
+    subprocess.run(
+        [
+            Path(sumo.SUMO_HOME) / "bin" / "netconvert",
+            *("--node-files", "r.nod.xml", "--edge-files", "r.edg.xml", "-o", "r.net.xml"),
+            *("--offset.disable-normalization", "true", "--junctions.endpoint-shape", "true"),
+        ],
+        cwd=tmp_path,
+        check=True,
+        capture_output=True,
+    )
+    return tmp_path, begin, end
+
+
+def test_pose_and_velocity_on_a_slope_by_hand(make: Make, ramp: tuple[Path, np.ndarray, np.ndarray]) -> None:
+    """A lorry at 12 m/s up a ramp: its body lies on the line, nose along it, and moves along it."""
+    folder, begin, end = ramp
+    world = make(net=str(folder / "r.net.xml"), routes=str(folder / "r.rou.xml"), begin_s=1.0)
+    forward = (end - begin) / np.linalg.norm(end - begin)
+    left = np.array([-forward[1], forward[0], 0.0]) / math.hypot(forward[0], forward[1])
+    up = np.cross(forward, left)
+    places = []
+    for scene in scenes(world, 1, 80):
+        assert scene.names == ("traffic.one",)
+        assert scene.classes == ("truck",)
+        assert scene.dimensions[0].tolist() == [9.0, 2.4, 3.6]
+        axes = rotation_matrix(scene.orientation[0].tolist())
+        assert axes == pytest.approx(np.stack([forward, left, up], axis=1), abs=1e-4)
+        bumper = scene.position[0] + 4.5 * forward - 1.8 * up
+        places.append(float((bumper - begin) @ forward))
+        assert np.linalg.norm(bumper - begin - places[-1] * forward) < 0.01
+        assert scene.velocity[0] == pytest.approx(12.0 * forward, abs=1e-3)
+    assert np.diff(places) == pytest.approx(1.2, abs=1e-3)
+
+
+def test_a_placed_network_moves_everything_with_it(make: Make) -> None:
+    """Turned by 30° and shifted: positions, headings and velocities follow as one rigid body."""
+    plain = scenes(make(), 5, 30)[-1]
+    placed = scenes(make(offset_m=(100.0, -50.0, 7.0), yaw_deg=30.0), 5, 30)[-1]
+    c, s = math.cos(math.pi / 6), math.sin(math.pi / 6)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    assert placed.names == plain.names
+    assert placed.position == pytest.approx(plain.position @ turn.T + [100.0, -50.0, 7.0], abs=1e-9)
+    assert placed.velocity == pytest.approx(plain.velocity @ turn.T, abs=1e-9)
+    for p, q in zip(plain.orientation.tolist(), placed.orientation.tolist(), strict=True):
+        assert rotation_matrix(q) == pytest.approx(turn @ rotation_matrix(p), abs=1e-12)
+
+
+def test_velocity_agrees_with_how_positions_change(make: Make) -> None:
+    """On straight road the way of a step is its speed times the step (SUMO moves, then reports)."""
+    before, after = scenes(make(), 3, 41)[-2:]
+    common = [name for name in before.names if name in after.names]
+    checked = 0
+    for name in common:
+        i, j = before.names.index(name), after.names.index(name)
+        way = after.position[j] - before.position[i]
+        straight = np.allclose(before.orientation[i], after.orientation[j], atol=1e-9)
+        if straight and abs(way[1]) < 1e-9:
+            assert way / 0.1 == pytest.approx(after.velocity[j], abs=1e-6)
+            checked += 1
+    assert checked >= 5
+
+
+def test_all_vehicles_stand_on_the_ground_on_their_side_of_the_road(make: Make) -> None:
+    """Right-hand traffic in the street: eastbound south of its middle, westbound north of it."""
+    for scene in scenes(make(offset_m=(0.0, 0.0, -0.03)), 2, 50)[::10]:
+        assert scene.position[:, 2] - scene.dimensions[:, 2] / 2 == pytest.approx(-0.03, abs=1e-9)
+        for name, (x, y, _), (vx, *_) in zip(scene.names, scene.position, scene.velocity, strict=True):
+            if name.startswith(("traffic.bus-east", "traffic.east")) and abs(x) < 14:
+                assert vx > 0
+                assert y < 0.45
+            if name.startswith(("traffic.bus-west", "traffic.west")) and abs(x) < 14:
+                assert vx < 0
+                assert y > 0.45
+
+
+# --- traffic ---------------------------------------------------------------------------------
+
+
+def test_vehicles_come_and_go_and_keep_what_they_are(make: Make) -> None:
+    seen: dict[str, tuple[str, tuple[float, ...]]] = {}
+    present: list[set[str]] = []
+    for scene in scenes(make(), 1, 150):
+        present.append(set(scene.names))
+        for name, kind, size in zip(scene.names, scene.classes, scene.dimensions.tolist(), strict=True):
+            assert seen.setdefault(name, (kind, tuple(size))) == (kind, tuple(size))
+    assert present[-1] - present[0]
+    assert present[0] - present[-1]
+    assert {kind for kind, _ in seen.values()} == {"car", "truck", "bus"}
+    for name in seen:  # nobody flickers: each is there from its first to its last frame
+        frames = [k for k, names in enumerate(present) if name in names]
+        assert frames == list(range(frames[0], frames[-1] + 1))
+
+
+def test_the_road_is_filled_before_frame_0(make: Make) -> None:
+    assert scenes(make(begin_s=0.0), 1, 1)[0].names == ()
+    assert len(scenes(make(begin_s=40.0), 1, 1)[0].names) >= 12
+
+
+def test_the_same_episode_twice_is_equal_bit_by_bit(make: Make) -> None:
+    world = make()
+    first = [wire_bytes(scene) for scene in scenes(world, 4, 40, episode=2)]
+    assert [wire_bytes(scene) for scene in scenes(world, 4, 40, episode=2)] == first
+
+
+def test_seed_episode_and_name_each_change_the_traffic(make: Make) -> None:
+    digests = {
+        hashlib.sha256(b"".join(map(wire_bytes, found))).hexdigest()
+        for found in (
+            scenes(make(prefix="v."), 4, 40),
+            scenes(make(prefix="v."), 5, 40),
+            scenes(make(prefix="v."), 4, 40, episode=1),
+            scenes(make(name="other", prefix="v."), 4, 40),
+        )
+    }
+    assert len(digests) == 4
+
+
+def test_fresh_processes_agree_and_another_seed_differs(repository: Path) -> None:
+    folder = str(repository / "deploy" / "scenarios" / "street-canyon")
+
+    def digest(seed: int) -> str:
+        done = subprocess.run(
+            [sys.executable, "-c", FRESH_PROCESS, folder, str(seed)],
+            check=True,
+            capture_output=True,
+            text=True,
+        )
+        assert done.stderr == ""
+        return done.stdout  # the digest and nothing else: SUMO is silent
+
+    first = digest(1)
+    assert len(first) == 65
+    assert digest(1) == first
+    assert digest(2) != first
+
+
+def test_a_gap_is_stepped_whole(make: Make) -> None:
+    world = make()
+    steady = scenes(world, 6, 31)[-1]
+    world.reset(0, 6, 0)
+    scene_at(world, 0)
+    assert wire_bytes(scene_at(world, 30, previous=0)) == wire_bytes(steady)
+
+
+def test_steps_shorter_than_the_sampling_period(make: Make) -> None:
+    """SUMO in steps of 50 ms under frames of 100 ms: two steps a frame."""
+    world = make(step_ms=50, begin_s=20.0)
+    before, after = scenes(world, 3, 41)[-2:]
+    way = {
+        name: after.position[after.names.index(name)] - before.position[before.names.index(name)]
+        for name in set(before.names) & set(after.names)
+    }
+    speeds = [np.linalg.norm(step) / 0.1 for step in way.values()]
+    assert 2.0 < np.median(speeds) < 14.0
+
+
+def test_going_back_in_time_and_between_steps_is_refused(make: Make) -> None:
+    world = make()
+    scenes(world, 1, 5)
+    with pytest.raises(RunError, match="after a later instant"):
+        scene_at(world, 3)
+    with pytest.raises(RunError, match="multiple of its step of 100 ms"):
+        world.step(Frame(episode=0, number=6, t_ns=6 * T_SAM_NS + 1))
+
+
+# --- settings and errors ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("period_ns", "step_ms", "expected"),
+    [(100_000_000, None, 100), (100_000_000, 20, 20), (1_000_000, None, 1), (5_000_000_000, 500, 500)],
+)
+def test_step_lengths_that_fit(period_ns: int, step_ms: int | None, expected: int) -> None:
+    assert step_length_ms(period_ns, step_ms) == expected
+
+
+@pytest.mark.parametrize(
+    ("period_ns", "step_ms", "message"),
+    [
+        (33_333_333, None, r"whole milliseconds.*write 33000000 or 34000000"),
+        (100_000_000, 30, r"step of 30 ms does not fit .* 100 ms; write step_ms = 25"),
+        (100_000_000, 200, r"write step_ms = 100"),
+        (100_000_000, 0, r"write step_ms = 1"),
+        (2_500_000_000, None, r"write step_ms = 625"),
+        (500, None, r"500 ns is none; write 1000000$"),
+    ],
+)
+def test_step_lengths_that_do_not_fit_are_answered_with_one_that_does(
+    period_ns: int, step_ms: int | None, message: str
+) -> None:
+    with pytest.raises(ScenarioError, match=message):
+        step_length_ms(period_ns, step_ms)
+
+
+def test_names_have_the_prefix_that_is_declared(make: Make) -> None:
+    for changes, prefix in (({"name": "cars"}, "cars."), ({"prefix": "v-"}, "v-")):
+        world = make(**changes)
+        assert world.prefixes() == (prefix,)
+        assert all(name.startswith(prefix) for name in scenes(world, 1, 1)[0].names)
+
+
+def test_what_is_wrong_with_files_is_named(make: Make, tmp_path: Path) -> None:
+    missing = tmp_path / "none.net.xml"
+    with pytest.raises(ScenarioError, match=r"settings\.net: there is no file .*none\.net\.xml"):
+        make(net=str(missing))
+    broken = tmp_path / "broken.net.xml"
+    broken.write_text("<net>\n<edge></net>")  # SUMO itself would end the process
+    with pytest.raises(ScenarioError, match=r"broken\.net\.xml:2: settings\.net: not well-formed XML"):
+        make(net=str(broken))
+    swapped = tmp_path / "swapped.rou.xml"
+    swapped.write_text("<routes/>")
+    with pytest.raises(ScenarioError, match=r"holds <routes>, net takes a file with <net>"):
+        make(net=str(swapped))
+    with pytest.raises(ScenarioError, match=r"needs net"):
+        make(net="")
+    with pytest.raises(ScenarioError, match=r"no mesh is there for 'cart'; known: .*car"):
+        make(meshes=("cart",))
+
+
+def test_what_sumo_refuses_is_said_in_its_words(make: Make) -> None:
+    world = make(options=("--no-such-option",))
+    with pytest.raises(SetupError, match=r"SUMO does not start: .*--no-such-option"):
+        world.reset(0, 1, 0)
+
+
+def test_a_route_over_unknown_roads_ends_the_run_with_sumos_words(make: Make, tmp_path: Path) -> None:
+    routes = tmp_path / "lost.rou.xml"
+    routes.write_text('<routes><vehicle id="lost" depart="0"><route edges="nowhere"/></vehicle></routes>')
+    with pytest.raises(CaviarError, match=r"SUMO .*'nowhere'.*'lost'"):
+        scenes(make(routes=str(routes)), 1, 2)
+
+
+def test_two_simulations_in_one_process_are_refused(make: Make) -> None:
+    first, second = make(), make(name="second")
+    first.reset(0, 1, 0)
+    with pytest.raises(SetupError, match="process of its own"):
+        second.reset(0, 1, 0)
+    first.close()
+    second.reset(0, 1, 0)
+    assert scene_at(second, 0).names
+
+
+def test_libsumo_not_installed_is_answered_with_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "libsumo", None)
+    with pytest.raises(SetupError, match=r"pip install 'caviar-sim\[world\]'"):
+        load_libsumo()
+
+
+# --- real networks ---------------------------------------------------------------------------
+
+
+def test_rosslyn_with_its_vehicle_types(make: Make, shared_data: Path) -> None:
+    """The network of the paper's data sets, whose lorries and buses are known by type id only."""
+    folder = shared_data / "rosslyn" / "sumo"
+    world = make(
+        net=str(folder / "quickstart.net.xml"),
+        routes=str(folder / "quickstart.rou.xml"),
+        classes={"Truck": "truck", "Bus": "bus"},
+        offset_m=(658.82, 358.76, 0.0),
+        begin_s=100.0,
+    )
+    sizes = {"car": [4.645, 1.775, 1.59], "truck": [12.5, 2.5, 4.3], "bus": [9.0, 2.4, 3.2]}
+    found = scenes(world, 1, 100)[-1]
+    assert len(found.names) > 10
+    assert set(found.classes) == {"car", "truck", "bus"}
+    for kind, size in zip(found.classes, found.dimensions.tolist(), strict=True):
+        assert size == pytest.approx(sizes[kind])
+
+
+def test_beijing_with_people_and_drones(make: Make, shared_data: Path) -> None:
+    folder = shared_data / "beijing"
+    world = make(
+        net=str(folder / "longtan.net.xml"),
+        routes=(str(folder / "longtan_pedestrian.rou.xml"), str(folder / "longtan_drone.rou.xml")),
+        classes={"Maverick": "uav"},
+        begin_s=60.0,
+    )
+    found = scenes(world, 1, 30)
+    people = [i for i, kind in enumerate(found[-1].classes) if kind == "pedestrian"]
+    assert len(people) > 5
+    assert found[-1].assets[people[0]] == "objects/pedestrian.ply"
+    assert 0.5 < np.median(np.linalg.norm(found[-1].velocity[people], axis=1)) < 2.0
+    assert "uav" in found[-1].classes
+
+
+def test_a_configuration_file_is_run_and_settings_go_before_it(make: Make, shared_data: Path) -> None:
+    folder = shared_data / "rosslyn" / "sumo"
+    config, heavy = str(folder / "quickstart.sumocfg"), str(folder / "quickstart_heavytraffic.rou.xml")
+
+    def names(routes: str | tuple[str, ...]) -> set[str]:
+        return set(scenes(make(config=config, net="", routes=routes, begin_s=150.0), 1, 1)[0].names)
+
+    as_configured, as_set = names(()), names(heavy)
+    assert as_configured
+    assert len(as_set) > len(as_configured)
