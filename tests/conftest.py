@@ -11,6 +11,8 @@ import hypothesis
 import psutil
 import pytest
 
+pytest.register_assert_rewrite("caviar_services.testing.base", "caviar_services.testing.roles")
+
 REPOSITORY = Path(__file__).resolve().parent.parent
 MARKER = "CAVIAR_TEST_SESSION"
 """Environment variable by which a process that a test started is known, also after its parent died."""

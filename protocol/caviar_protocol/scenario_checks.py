@@ -51,8 +51,8 @@ def check_scenario(scenario: Scenario) -> None:
 def devices_of(scenario: Scenario, world: str) -> tuple[DeviceSpec, ...]:
     """The devices that a world publishes.
 
-    A device belongs to the world it names, or to the only world of the run, or to the one whose
-    setting ``prefix`` the names of its parent begin with. Raises `ScenarioError` for a device
+    A device belongs to the world it names, or to the only world of the run, or to the one with
+    whose ``prefix`` (a setting; else its name and a dot) ``on`` begins. Raises `ScenarioError` for a device
     whose world these do not tell.
     """
     return tuple(
@@ -73,7 +73,7 @@ def world_of(scenario: Scenario, index: int) -> str:
     if len(worlds) == 1:
         return worlds[0]
     literal = device.on.partition("*")[0].partition("?")[0].partition("[")[0]
-    matching = [name for name in worlds if literal and _owns(scenario.services[name], literal)]
+    matching = [name for name in worlds if literal.startswith(_prefix(name, scenario.services[name]))]
     if len(matching) == 1:
         return matching[0]
     where = f"on {device.on!r}" if device.on else "without `on`"
@@ -127,9 +127,9 @@ def _plain(value: Any) -> Any:
     return msgspec.to_builtins(value)
 
 
-def _owns(world: ServiceSpec, literal: str) -> bool:
-    prefix = world.settings.get("prefix", "")
-    return isinstance(prefix, str) and prefix != "" and literal.startswith(prefix)
+def _prefix(name: str, world: ServiceSpec) -> str:
+    """What the names of a world's objects begin with: its setting, else its own name and a dot."""
+    return str(world.settings.get("prefix") or f"{name}.")
 
 
 def _unique(names: Iterable[str], what: str, place: Place) -> None:

@@ -41,6 +41,12 @@ def test_the_only_world_publishes_every_device() -> None:
     assert [device.name for device in devices_of(one, "streets")] == ["bs", "user"]
 
 
+def test_a_world_without_a_prefix_owns_what_begins_with_its_name_and_a_dot() -> None:
+    two = scenario(antenna("user", on="streets.*"), streets=world(), sky=world("uav"))
+    assert [device.name for device in devices_of(two, "streets")] == ["user"]
+    assert devices_of(two, "sky") == ()
+
+
 def test_with_two_worlds_a_device_goes_by_prefix_or_by_name() -> None:
     two = scenario(
         antenna("user", on="car.*"),

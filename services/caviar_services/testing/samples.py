@@ -227,7 +227,11 @@ def _sensed(topic: str, frame: int) -> Payload:
             object=np.array([0, 1], dtype="<i4"),
         )
         return Lidar(object_names=("car.1", "wall"), scans=(scan,))
-    optics: dict[str, Any] = {"sensor": "truck.2/camera", "intrinsics": Intrinsics(fx=16.0, fy=16.0, cx=2.0, cy=1.5), **pose}
+    optics: dict[str, Any] = {
+        "sensor": "truck.2/camera",
+        "intrinsics": Intrinsics(fx=16.0, fy=16.0, cx=2.0, cy=1.5),
+        **pose,
+    }
     pixels = (np.arange(12).reshape(3, 4) + frame) % 5
     match topic:
         case "camera":
@@ -238,4 +242,4 @@ def _sensed(topic: str, frame: int) -> Payload:
             image = SegmentationImage(**optics, object=(pixels % 2).astype("<i4"))
             return Segmentation(object_names=("car.1", "wall"), images=(image,))
         case _:
-            raise ValueError(f"the street has no product of topic {topic!r}; add one to testing_samples.py")
+            raise ValueError(f"the street has no product of topic {topic!r}; add one to testing/samples.py")

@@ -1,0 +1,35 @@
+"""Conformance tests that every implementation of a service passes.
+
+Subclass the class of the role in a test file and name the implementation; pytest runs the tests::
+
+    class TestMyChannel(ChannelConformance):
+        service_class = MyChannel
+        settings = {"samples": 1000}
+
+Implementations in the registry are tested without even that (``tests/conformance``).
+"""
+
+from __future__ import annotations
+
+from caviar_services.testing.base import Played, ServiceConformance
+from caviar_services.testing.roles import (
+    CONFORMANCE,
+    AgentConformance,
+    ChannelConformance,
+    LinkConformance,
+    RecorderConformance,
+    SensorConformance,
+    WorldConformance,
+)
+
+__all__ = [
+    "CONFORMANCE",
+    "AgentConformance",
+    "ChannelConformance",
+    "LinkConformance",
+    "Played",
+    "RecorderConformance",
+    "SensorConformance",
+    "ServiceConformance",
+    "WorldConformance",
+]

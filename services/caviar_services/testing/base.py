@@ -1,0 +1,243 @@
+"""What holds for services of every role."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, get_args
+
+import msgspec
+import pytest
+from msgspec import inspect
+
+from caviar_protocol.codec import decode_payload, encode_payload
+from caviar_protocol.errors import CaviarError, ScenarioError
+from caviar_protocol.messages import Role
+from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.tables import convert_settings
+from caviar_protocol.topics import PARTS, PAYLOADS, Carrier
+from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
+from caviar_services.testing import samples
+
+HEAVY = ("mitsuba", "drjit", "sionna", "torch", "libsumo", "traci", "matplotlib", "scipy")
+"""Libraries that an implementation imports only when it prepares."""
+
+FRAMES = 4
+EPISODE_SEED = 11
+
+Encoded = dict[str, tuple[bytes, bytes]]
+"""Header and body of products by topic."""
+
+
+@dataclass
+class Played:
+    """What a service did in one life: prepared, played episodes, was closed."""
+
+    service: Service[Any]
+    prepared: Prepared
+    assets: Mapping[str, Path]
+    directory: Path
+    episodes: list[list[StepResult]] = field(default_factory=list)
+    frames: list[Frame] = field(default_factory=list)
+    """Grants of the first episode."""
+    granted: list[list[tuple[bytes, bytes]]] = field(default_factory=list)
+    """Bytes of the inputs of each, as they were before the service saw them."""
+
+    def encoded(self, episode: int = 0) -> list[Encoded]:
+        """Bytes of every product, frame by frame."""
+        return [
+            {topic: encode_payload(payload) for topic, payload in result.products.items()}
+            for result in self.episodes[episode]
+        ]
+
+
+class ServiceConformance:
+    """Tests of the contract in `caviar_services.service`; a subclass names ``service_class``."""
+
+    __test__ = False
+
+    service_class: ClassVar[type[Service[Any]]]
+    settings: ClassVar[Mapping[str, Any]] = {}
+    """Settings as in a scenario, ``file:`` paths already absolute."""
+    carriers: ClassVar[tuple[Carrier, ...]] = samples.CARRIERS
+    devices: ClassVar[tuple[DeviceSpec, ...]] = samples.DEVICES
+    demand: ClassVar[Mapping[str, frozenset[str]] | None] = None
+    """Parts asked for, by topic; by default all."""
+    episodes: ClassVar[tuple[int, ...]] = (0, 0)
+    """Episodes of a life; by default the same one twice."""
+
+    def __init_subclass__(cls) -> None:
+        cls.__test__ = hasattr(cls, "service_class")
+
+    # --- a life of the service -------------------------------------------------------------------
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def played(cls, tmp_path_factory: pytest.TempPathFactory) -> Played:
+        """One life of the service."""
+        return cls.play(tmp_path_factory.mktemp("life"))
+
+    @classmethod
+    def build(cls, directory: Path) -> Service[Any]:
+        """The service in a run with the sample street's carriers and devices."""
+        run = RunInfo(
+            name=cls.service_class.role,
+            run="conformance",
+            seed=3,
+            sampling_period_ns=samples.SAMPLING_PERIOD_NS,
+            frames=FRAMES,
+            carriers=cls.carriers,
+            devices=cls.devices,
+            directory=directory / "run",
+        )
+        return cls.service_class(convert_settings(cls.service_class.Settings, cls.settings), run)
+
+    @classmethod
+    def street(cls, service: Service[Any], directory: Path) -> Mapping[str, Path]:
+        """Files of scenery by asset name, as the runner would have fetched them."""
+        return samples.scenery(directory)
+
+    @classmethod
+    def frames_of(cls, service: Service[Any], episode: int) -> list[Frame]:
+        """Grants of an episode. In the last one, whatever is not required is absent."""
+        optional = {i.topic: "left out" for i in service.inputs if not i.required and i.topic != "*"}
+        return [
+            Frame(
+                episode=episode,
+                number=number,
+                t_ns=number * samples.SAMPLING_PERIOD_NS,
+                previous=number - 1,
+                inputs=samples.inputs(service.inputs, number, optional if number == FRAMES - 1 else {}),
+                service=service.run.name,
+                seed=service.run.seed,
+            )
+            for number in range(FRAMES)
+        ]
+
+    @classmethod
+    def play(cls, directory: Path, skip: Sequence[int] = ()) -> Played:
+        """Prepare, play the episodes without the frames in ``skip``, close."""
+        service = cls.build(directory)
+        try:
+            assets = cls.street(service, directory / "assets")
+            demand = cls.demand or {topic: frozenset(PARTS.get(topic, ())) for topic in service.outputs}
+            producers = {topic: (samples.source(topic),) for topic in PAYLOADS}
+            prepared = service.prepare(Preparation(demand=demand, assets=assets, producers=producers))
+            played = Played(service, prepared, assets, service.run.directory)
+            for episode in cls.episodes:
+                service.reset(episode, EPISODE_SEED, 0)
+                frames = [frame for frame in cls.frames_of(service, episode) if frame.number not in skip]
+                granted = [[(bytes(i.header), bytes(i.body)) for i in frame.inputs] for frame in frames]
+                played.episodes.append([service.step(frame) for frame in frames])
+                service.end_episode(len(frames))
+                if not played.frames:
+                    played.frames, played.granted = frames, granted
+        finally:
+            service.close()
+        return played
+
+    # --- what it declares ------------------------------------------------------------------------
+
+    def test_role_inputs_and_outputs_are_those_of_the_protocol(self) -> None:
+        """A topic or part that nobody else knows would never be granted."""
+        cls = self.service_class
+        assert cls.role in get_args(Role)
+        assert set(cls.outputs) <= set(PAYLOADS)
+        assert len(set(cls.outputs)) == len(cls.outputs)
+        for item in cls.inputs:
+            assert item.lag in (0, 1)
+            if item.topic == "*":
+                assert cls.role == "recorder"
+                assert not item.required
+                continue
+            assert item.topic in PAYLOADS
+            assert set(item.parts) <= set(PARTS.get(item.topic, ()))
+            assert item.lag == 1 or item.topic not in cls.outputs, "depends on its own product"
+
+    def test_settings_are_a_frozen_struct_that_names_units(self) -> None:
+        """Numbers cross the boundary of a file there, so each says what it is measured in."""
+        info = inspect.type_info(self.service_class.Settings)
+        assert isinstance(info, inspect.StructType)
+        config = self.service_class.Settings.__struct_config__
+        assert config.frozen
+        assert config.forbid_unknown_fields
+        for entry in info.fields:
+            kinds = entry.type.types if isinstance(entry.type, inspect.UnionType) else (entry.type,)
+            for kind in kinds:
+                assert not isinstance(kind, inspect.IntType | inspect.FloatType), f"{entry.name} has no unit"
+
+    def test_an_unknown_setting_is_refused_by_name(self) -> None:
+        """The message names the key."""
+        with pytest.raises(ScenarioError, match="unknown key 'no_such_setting'"):
+            convert_settings(self.service_class.Settings, {**self.settings, "no_such_setting": 1})
+
+    def test_without_settings_it_starts_or_says_what_it_lacks(self, tmp_path: Path) -> None:
+        """Nobody meets a traceback for a setting not given."""
+        run = RunInfo(name="service", carriers=self.carriers, devices=self.devices, directory=tmp_path)
+        try:
+            self.service_class(convert_settings(self.service_class.Settings, {}), run).close()
+        except CaviarError as error:
+            assert len(str(error)) > 20
+
+    def test_importing_it_imports_nothing_heavy(self) -> None:
+        """So that an agent or a broker does not carry a ray tracer."""
+        module = self.service_class.__module__
+        show = (
+            f"import {module}, sys; print(*({{m.partition('.')[0] for m in sys.modules}} & set({HEAVY!r})))"
+        )
+        done = subprocess.run(  # noqa: S603 - this interpreter, a module of ours
+            [sys.executable, "-c", show], capture_output=True, text=True, timeout=60, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.split() == []
+
+    # --- what it produces ------------------------------------------------------------------------
+
+    def test_products_are_of_declared_topics_and_of_their_class(self, played: Played) -> None:
+        """Every frame whose inputs are there gives every output that is asked for."""
+        for result in played.episodes[0]:
+            assert set(result.products) <= set(self.service_class.outputs)
+            for topic, payload in result.products.items():
+                assert type(payload) is PAYLOADS[topic]
+        assert set(played.episodes[0][0].products) == set(self.demand or self.service_class.outputs)
+
+    def test_products_are_finite_and_survive_the_wire(self, played: Played) -> None:
+        """Encoding refuses what is not finite (clause 21)."""
+        for frame, result in zip(played.encoded(), played.episodes[0], strict=True):
+            for topic, (header, body) in frame.items():
+                assert decode_payload(topic, header, body) == result.products[topic]
+
+    def test_what_it_reports_beside_products_can_travel(self, played: Played) -> None:
+        """Decisions are strings; counts and measured times whole numbers ≥ 0."""
+        for result in played.episodes[0]:
+            assert all(isinstance(value, str) for value in result.decisions.values())
+            numbers = [*result.counts.values(), *result.measured.values()]
+            assert all(type(value) is int and value >= 0 for value in numbers), numbers
+            msgspec.msgpack.encode([result.fidelity, dict(result.counts), dict(result.measured)])
+
+    def test_the_same_seed_gives_the_same_bytes_in_another_life(self, played: Played, tmp_path: Path) -> None:
+        """Clause 20, and clause 19 for whatever is random."""
+        again = self.play(tmp_path)
+        for episode in range(len(self.episodes)):
+            assert again.encoded(episode) == played.encoded(episode)
+
+    def test_a_reset_leaves_nothing_of_the_episode_before(self, played: Played) -> None:
+        """The same episode played twice in one life is the same."""
+        if len(set(self.episodes)) == 1:
+            assert played.encoded(1) == played.encoded(0)
+
+    def test_inputs_are_left_as_they_were(self, played: Played) -> None:
+        """Other services of an embedded run get the same objects."""
+        for frame, granted in zip(played.frames, played.granted, strict=True):
+            for item, (header, body) in zip(frame.inputs, granted, strict=True):
+                assert (bytes(item.header), bytes(item.body)) == (header, body)
+                if item.present:
+                    assert encode_payload(item.payload) == (header, body)
+
+    def test_it_can_be_closed_twice_and_before_it_was_prepared(self, played: Played, tmp_path: Path) -> None:
+        """An error may come at any time."""
+        played.service.close()
+        self.build(tmp_path).close()

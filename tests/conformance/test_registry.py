@@ -1,0 +1,61 @@
+"""Every registered implementation passes the conformance tests of its role.
+
+A new line in the registry is tested by itself. Its settings are those of the first shipped
+scenario that uses it, or none; its role's class says what is asked of it.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+from caviar_protocol.scenario import Scenario
+from caviar_protocol.scenario_checks import devices_of
+from caviar_protocol.scenario_loader import load_scenario
+from caviar_services.registry import BUILT_IN, load
+from caviar_services.testing import CONFORMANCE, ServiceConformance
+
+SCENARIOS = Path(__file__).resolve().parents[2] / "deploy" / "scenarios"
+
+EXTRAS = {"world:sumo": "libsumo", "channel:sionna-rt": "sionna", "sensors:lidar": "mitsuba"}
+"""Package without which an implementation cannot run; a base install skips it."""
+
+OVERRIDES: dict[str, dict[str, object]] = {
+    "channel:sionna-rt": {"samples": 2000, "pool": {}, "bodies": 2},
+    "sensors:lidar": {"grid": {"minimum_m": [-60, -40, 0], "maximum_m": [80, 30, 12], "cells": [28, 14, 6]}},
+}
+"""What the small street of the tests needs in other sizes than the scenario."""
+
+
+def _example(role: str, name: str) -> tuple[Scenario, str] | None:
+    """The first shipped scenario with this implementation, and the service's name there."""
+    for path in sorted(SCENARIOS.glob("*.toml")):
+        scenario = load_scenario(path)
+        for service, spec in scenario.services.items():
+            if (spec.role, spec.use) == (role, name):
+                return scenario, service
+    return None
+
+
+def _tests_of(key: str) -> type[ServiceConformance]:
+    role, _, name = key.partition(":")
+    members: dict[str, object] = {"service_class": load(role, name), "__module__": __name__}
+    example = _example(role, name)
+    if example is not None:
+        scenario, service = example
+        members["settings"] = {**scenario.services[service].settings, **OVERRIDES.get(key, {})}
+        if role == "world":
+            members["devices"] = devices_of(scenario, service)
+    title = "Test" + "".join(word.capitalize() for word in f"{role}-{name}".split("-"))
+    tests = type(title, (CONFORMANCE[role],), members)
+    package = EXTRAS.get(key)
+    if package is not None and importlib.util.find_spec(package) is None:
+        tests = pytest.mark.skip(reason=f"{key} needs {package}")(tests)
+    return tests
+
+
+for _key in BUILT_IN:
+    _tests = _tests_of(_key)
+    globals()[_tests.__name__] = _tests
