@@ -39,7 +39,7 @@ new_enough() { "$1" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev
 
 find_python() {
   local candidate
-  for candidate in "${PYTHON:-}" python3 python3.14 python3.13 python3.12 python3.11; do
+  for candidate in "${PYTHON:-}" python3.11 python3.12 python3.13 python3; do
     if [ -n "$candidate" ] && command -v "$candidate" >/dev/null && new_enough "$candidate"; then
       command -v "$candidate"
       return
@@ -130,7 +130,7 @@ see_to_llvm() {
 if ! { [ -x .venv/bin/python ] && .venv/bin/python -m pip --version && new_enough .venv/bin/python; } >/dev/null 2>&1; then
   make_venv
 fi
-say "installing the Python packages into .venv (about 1 GB; a few minutes the first time)"
+say "installing the Python packages into .venv (1.6 GB; a few minutes the first time)"
 .venv/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[all,dev]'
 see_to_shared_libraries
 see_to_llvm
