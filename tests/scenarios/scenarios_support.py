@@ -1,0 +1,145 @@
+"""Runs of the real command in real processes, and what is left of them."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+SCENARIOS = ROOT / "deploy" / "scenarios"
+HERE = Path(__file__).parent
+MARK = "CAVIAR_TEST_RUN"
+
+
+@dataclass
+class Finished:
+    """A command that has ended."""
+
+    status: int
+    output: str
+    directory: Path
+    leftovers: list[str] = field(default_factory=list)
+
+
+def environment(mark: str, **extra: str) -> dict[str, str]:
+    """This process's environment, marked so that every descendant can be found."""
+    path = os.pathsep.join(filter(None, [str(HERE), os.environ.get("PYTHONPATH", "")]))
+    return os.environ | {MARK: mark, "PYTHONPATH": path, "COLUMNS": "200"} | extra
+
+
+def caviar(*arguments: str | Path, timeout: float = 60.0, **extra: str) -> Finished:
+    """Run ``caviar`` with these arguments, and find out what it left behind."""
+    mark = uuid.uuid4().hex
+    command = [sys.executable, "-m", "caviar_clients", *map(str, arguments)]
+    done = subprocess.run(
+        command,
+        env=environment(mark, **extra),
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        cwd=ROOT,
+        check=False,
+    )
+    return Finished(done.returncode, done.stdout + done.stderr, Path(), marked(mark))
+
+
+def run(scenario: Path, out: Path, *arguments: str | Path, timeout: float = 60.0, **extra: str) -> Finished:
+    """``caviar run`` into an empty folder; the run's own directory is found there."""
+    finished = caviar("run", scenario, "--out", out, *arguments, timeout=timeout, **extra)
+    finished.directory = next(iter(sorted(out.glob("*/"))), Path())
+    return finished
+
+
+@contextmanager
+def running(
+    scenario: Path, out: Path, *arguments: str, **extra: str
+) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """``caviar run`` as a process that can be disturbed, and the mark of its descendants."""
+    mark = uuid.uuid4().hex
+    command = [sys.executable, "-m", "caviar_clients", "run", str(scenario), "--out", str(out), *arguments]
+    process = subprocess.Popen(
+        command,
+        env=environment(mark, **extra),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        cwd=ROOT,
+    )
+    try:
+        yield process, mark
+    finally:
+        process.kill()
+        process.wait()
+        if process.stdout is not None:
+            process.stdout.close()
+        for entry in marked(mark):
+            os.kill(int(entry.split()[0]), signal.SIGKILL)
+
+
+def marked(mark: str) -> list[str]:
+    """Processes alive that carry the mark, each "PID command line"."""
+    found = []
+    for folder in Path("/proc").iterdir():
+        if not folder.name.isdigit() or int(folder.name) == os.getpid():
+            continue
+        try:
+            alive = f"{MARK}={mark}".encode() in (folder / "environ").read_bytes()
+            command = (folder / "cmdline").read_bytes().replace(b"\0", b" ").decode()
+        except OSError:
+            continue
+        if alive:
+            found.append(f"{folder.name} {command}")
+    return found
+
+
+def pid_of(mark: str, word: str) -> int:
+    """Process id of the marked process whose command line contains a word."""
+    return next(int(entry.split()[0]) for entry in marked(mark) if word in entry)
+
+
+def eventually(condition: Callable[[], object], within_s: float, what: str) -> None:
+    """Wait until a condition holds; AssertionError naming it where it does not in time."""
+    until = time.monotonic() + within_s
+    while not condition():
+        if time.monotonic() > until:
+            raise AssertionError(f"not within {within_s} s: {what}")
+        select.select([], [], [], 0.05)  # leave the processor to what is waited for
+
+
+def scenario_file(
+    folder: Path, changes: Sequence[tuple[str, str]] = (), extra: str = "", base: str = "smoke"
+) -> Path:
+    """A shipped scenario with some text replaced and some appended."""
+    text = (SCENARIOS / f"{base}.toml").read_text()
+    for old, new in changes:
+        assert old in text, f"{old!r} is not in {base}.toml"
+        text = text.replace(old, new, 1)
+    path = folder / "scenario.toml"
+    path.write_text(text + "\n" + extra)
+    return path
+
+
+def frames_recorded(directory: Path) -> int:
+    """Frames that can be read from a run's recording."""
+    from caviar_protocol.recording import Recording
+
+    return len(Recording(directory))
+
+
+def recorded_below(out: Path) -> int:
+    """Frames that can be read so far from the only run below a folder; 0 before there is one."""
+    from caviar_protocol.errors import RecordingError
+
+    try:
+        return sum(frames_recorded(directory) for directory in out.glob("*/"))
+    except RecordingError:
+        return 0
