@@ -100,17 +100,29 @@ def choose_llvm(
 def activate_llvm() -> str:
     """Make Dr.Jit use the chosen library; call before Dr.Jit is imported.
 
-    Returns a line that says which. Raises `SetupError` as `choose_llvm`, and where Dr.Jit was imported
-    before with nothing set, since it may hold another library by then.
+    Returns a line that says which. Where Dr.Jit was imported before, it holds a library already: one that
+    is new enough stays, and an older one raises `SetupError`, as does what `choose_llvm` refuses.
     """
-    library = choose_llvm()
-    if "drjit" in sys.modules and os.environ.get(ENVIRONMENT) != str(library.path):
+    held = _held_by_drjit()
+    if held is None:
+        library = choose_llvm()
+        os.environ[ENVIRONMENT] = str(library.path)
+        return str(library)
+    told = ".".join(map(str, held))
+    if not held or held[0] < OLDEST:
         raise SetupError(
-            f"Dr.Jit was imported before {ENVIRONMENT} was set, so it may hold another library; set it "
-            f"before the start: export {ENVIRONMENT}={library.path}"
+            f"Dr.Jit was imported before its library was chosen and holds LLVM {told or 'none'}, the ray "
+            f"tracer needs {OLDEST} or newer; before the start: export {ENVIRONMENT}={choose_llvm().path}"
         )
-    os.environ[ENVIRONMENT] = str(library.path)
-    return str(library)
+    return f"LLVM {told} (held by Dr.Jit since its import)"
+
+
+def _held_by_drjit() -> tuple[int, ...] | None:
+    """Version of the library that Dr.Jit loaded; None where it is not imported or was told which."""
+    drjit = sys.modules.get("drjit")
+    if drjit is None or os.environ.get(ENVIRONMENT):
+        return None
+    return tuple(drjit.detail.llvm_version() or ())
 
 
 def choose_variant() -> str:

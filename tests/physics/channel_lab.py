@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from caviar_protocol.messages import GrantInput, Status
@@ -188,7 +189,7 @@ def sionna(frequency: float, assets: Mapping[str, Path] | None = None, **setting
 
     settings = {"samples": 20_000, "bodies": 2, "receivers_at_once": 8, **settings}
     run = RunInfo(name="channel", seed=1, carriers=carriers(frequency))
-    model = SionnaChannel(SionnaSettings(**settings), run)
+    model = SionnaChannel(msgspec.convert(settings, SionnaSettings), run)
     model.prepare(Preparation(demand={"channel": frozenset({"h"})}, assets=assets or {}))
     return model
 

@@ -164,8 +164,8 @@ def test_a_quarter_roll_is_a_polarisation_null(nothing_there: ChannelModel[Any])
 
 
 def test_reflected_path_of_turned_arrays(over_ground: ChannelModel[Any]) -> None:
-    """H over ground of two randomly turned arrays has, element by element, the phase of the exact direct and
-    image distance, within 0.02 rad over 700 m."""
+    """H over ground of two randomly turned arrays has, element by element, the phase of the exact
+    direct distance and of the exact image distance, within 0.02 rad over 700 m."""
     frequency = 3.5e9
     wavelength = C / frequency
     rng = np.random.default_rng(11)

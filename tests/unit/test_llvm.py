@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from caviar_protocol.errors import SetupError
-from caviar_services.llvm import ENVIRONMENT, INSTALL, choose_llvm, cuda_devices
+from caviar_services.llvm import ENVIRONMENT, INSTALL, activate_llvm, choose_llvm, cuda_devices
 
 
 def touch(folder: Path, *names: str) -> None:
@@ -92,3 +94,33 @@ def test_without_any_library_the_command_is_given(tmp_path: Path) -> None:
 
 def test_no_driver_means_no_cuda_device() -> None:
     assert cuda_devices("libnosuchdriver.so.1") == 0
+
+
+def drjit_holding(version: tuple[int, ...] | None) -> SimpleNamespace:
+    return SimpleNamespace(detail=SimpleNamespace(llvm_version=lambda: version))
+
+
+def test_a_library_that_is_held_already_stays_if_new_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(ENVIRONMENT, raising=False)
+    monkeypatch.setitem(sys.modules, "drjit", drjit_holding((18, 1, 0)))
+    assert "18.1.0" in activate_llvm()
+
+
+def test_a_library_that_is_held_already_and_too_old_is_refused(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Kernels would abort the process; so it is said before any is compiled."""
+    touch(tmp_path, "libLLVM-17.so.1")
+    monkeypatch.delenv(ENVIRONMENT, raising=False)
+    monkeypatch.setitem(sys.modules, "drjit", drjit_holding((15, 0, 7)))
+    good = choose_llvm({}, [], [str(tmp_path / "libLLVM-17.so.1")])
+    monkeypatch.setattr("caviar_services.llvm.choose_llvm", lambda: good)
+    with pytest.raises(SetupError, match=r"LLVM 15\.0\.7.*export DRJIT_LIBLLVM_PATH=.*libLLVM-17"):
+        activate_llvm()
+
+
+def test_activating_tells_the_library_to_drjit(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    touch(tmp_path, "libLLVM-18.so.1")
+    path = str(tmp_path / "libLLVM-18.so.1")
+    monkeypatch.setenv(ENVIRONMENT, path)
+    assert activate_llvm() == f"LLVM 18 ({path})"

@@ -1,0 +1,217 @@
+"""The traced channel of things that move, come and go: Doppler, no traces left, equal products."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from channel_lab import (
+    C,
+    Plate,
+    Thing,
+    antenna,
+    measure,
+    mirrored,
+    scene,
+    sionna,
+    total,
+    write_scenery,
+)
+
+from caviar_protocol.codec import encode_payload
+from caviar_protocol.coordinates import quaternion_from_euler
+from caviar_protocol.digest import payload_digest
+from caviar_protocol.topics import Channel, Interaction, Scene
+from caviar_services.channel.base import ChannelModel
+
+pytestmark = pytest.mark.channel
+
+F = 28e9
+GROUND = Plate("ground", [(-200, -200, 0), (200, -200, 0), (200, 200, 0), (-200, 200, 0)])
+WALL = Plate("wall", [(-90, 14, 0), (80, 20, 0), (80, 20, 25), (-90, 14, 25)], "glass", 0.1)
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory: pytest.TempPathFactory) -> ChannelModel[Any]:
+    assets = write_scenery(tmp_path_factory.mktemp("street"), [GROUND, WALL])
+    return sionna(F, assets, bodies=6, max_depth=2)
+
+
+def digest(channel: Channel) -> str:
+    return payload_digest(*encode_payload(channel))
+
+
+def traffic(cars: int, seed: int = 5, behind_the_wall: bool = False) -> Scene:
+    """A base station and cars in random places, every second with a receiver on its roof."""
+    rng = np.random.default_rng(seed)
+    things = [
+        Thing(
+            f"car.{i}",
+            (rng.uniform(-60, 60), -6 + 4 * (i % 4), 0.85),
+            quaternion=quaternion_from_euler(rng.uniform(-3, 3)),
+            velocity=tuple(rng.uniform(-15, 15, 3) * [1, 1, 0]),
+        )
+        for i in range(cars)
+    ]
+    receivers = [antenna(f"{t.name}/rx", "rx", (0, 0, 1.1), parent=t.name) for t in things[::2]]
+    if behind_the_wall:
+        receivers.append(antenna("hidden", "rx", (5, 30, 2)))
+    return scene([antenna("bs", "tx", (-20, 9, 7.5)), *receivers], things)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_doppler_of_a_moving_reflector(street: ChannelModel[Any], seed: int) -> None:
+    """A vertical metal slab moves, TX and RX stand: the shift of the path by way of it is −f·dL/dt of the
+    image's distance L, within 0.5 Hz of some kilohertz."""
+    rng = np.random.default_rng(seed)
+    yaw = rng.uniform(-0.1, 0.1)
+    forward = np.array([np.cos(yaw), np.sin(yaw), 0.0])
+    centre = np.array([60.0, 3.0, 5.2])
+    velocity = rng.uniform(-20, 20, 3)
+    slab = Thing("slab", centre, (1.0, 30.0, 10.0), quaternion_from_euler(yaw), velocity)
+    tx, rx = np.array([2.0, rng.uniform(-2, 2), 6.0]), np.array([-4.0, rng.uniform(2, 5), 4.5])
+    channel = measure(street, scene([antenna("t", "tx", tx), antenna("r", "rx", rx)], [slab]))
+    names = [[channel.object_names[o] for o in row if o >= 0] for row in channel.objects]
+    path = names.index(["slab"])
+
+    def length(t: float) -> float:
+        face = centre + velocity * t - forward * 0.5
+        return float(np.linalg.norm(rx - mirrored(tx, face, forward)))
+
+    rate = (length(1e-3) - length(-1e-3)) / 2e-3
+    assert channel.tau[path] == pytest.approx(length(0.0) / C, rel=2e-7)
+    assert channel.doppler[0, path] == pytest.approx(-F / C * rate, abs=0.5)
+    direct = names.index([])
+    assert channel.doppler[0, direct] == 0
+
+
+def test_a_reflector_that_approaches_raises_the_frequency(street: ChannelModel[Any]) -> None:
+    """Head on at 10 m/s: +2·f·v/c (both legs), less the slight angle between the ends."""
+    slab = Thing("slab", (60, 0, 5.2), (1, 12, 10), velocity=(-10.0, 0, 0))
+    devices = [antenna("t", "tx", (0, -0.2, 6)), antenna("r", "rx", (0, 0.2, 6))]
+    channel = measure(street, scene(devices, [slab]))
+    path = [row[0] >= 0 and channel.object_names[row[0]] == "slab" and row[1] < 0 for row in channel.objects]
+    assert channel.doppler[0, path] == pytest.approx(2 * F * 10 / C, rel=1e-4)
+
+
+def test_doppler_of_moving_ends_over_a_reflection(street: ChannelModel[Any]) -> None:
+    """Every path of two moving cars: −f·dτ/dt by differences over ±2 ms, matched by path id."""
+    here = traffic(3)
+
+    def at(t: float) -> Channel:
+        moved = Scene(
+            names=here.names,
+            classes=here.classes,
+            assets=here.assets,
+            position=here.position + here.velocity * t,
+            orientation=here.orientation,
+            velocity=here.velocity,
+            dimensions=here.dimensions,
+            devices=here.devices,
+        )
+        return measure(street, moved)
+
+    def keyed(channel: Channel) -> dict[tuple[int, int], int]:
+        pair = np.repeat(np.arange(len(channel.offsets) - 1), np.diff(channel.offsets))
+        return {(int(p), int(i)): row for row, (p, i) in enumerate(zip(pair, channel.id, strict=True))}
+
+    before, now, after = at(-2e-3), at(0.0), at(2e-3)
+    b, a = keyed(before), keyed(after)
+    checked = 0
+    for key, row in keyed(now).items():
+        if key in b and key in a:
+            rate = (after.tau[a[key]] - before.tau[b[key]]) / 4e-3
+            assert now.doppler[0, row] == pytest.approx(-F * rate, abs=60)
+            checked += 1
+    assert checked >= 6
+    assert np.abs(now.doppler).max() > 600
+
+
+def test_what_came_and_went_leaves_no_trace(street: ChannelModel[Any]) -> None:
+    """The product of a frame does not depend on who was there before."""
+    few = digest(measure(street, traffic(2)))
+    measure(street, traffic(6, seed=9))
+    assert digest(measure(street, traffic(2))) == few
+    measure(street, scene([]))
+    assert digest(measure(street, traffic(2))) == few
+
+
+def test_parked_bodies_and_receivers_do_not_matter(tmp_path: Path) -> None:
+    """A service with just the bodies and receivers needed makes the same product, refraction on."""
+    assets = write_scenery(tmp_path, [GROUND, WALL])
+    tight = sionna(F, assets, pool={"box": 3}, receivers_at_once=3, refraction=True, max_depth=3)
+    roomy = sionna(F, assets, pool={"box": 24}, receivers_at_once=16, refraction=True, max_depth=3)
+    frame = traffic(3, behind_the_wall=True)
+    product = measure(tight, frame)
+    assert digest(product) == digest(measure(roomy, frame))
+    assert (product.interactions == Interaction.TRANSMISSION).any()
+
+
+def test_more_receivers_than_one_launch_takes(tmp_path: Path) -> None:
+    """Launches of two receivers each give the paths of one launch of all."""
+    assets = write_scenery(tmp_path, [GROUND, WALL])
+    frame = traffic(6)
+    one = measure(sionna(F, assets, bodies=6, receivers_at_once=3), frame)
+    two = measure(sionna(F, assets, bodies=6, receivers_at_once=2), frame)
+    assert digest(one) == digest(two)
+
+
+def test_a_car_in_between_blocks_the_line_of_sight(street: ChannelModel[Any]) -> None:
+    ends = [antenna("t", "tx", (-30, -3, 1.0)), antenna("r", "rx", (30, -3, 1.0))]
+    free = measure(street, scene(ends))
+    blocked = measure(street, scene(ends, [Thing("car", (3, -3, 0.8))]))
+    assert free.los.all()
+    assert not blocked.los.any()
+    assert (np.abs(total(blocked)) < np.abs(total(free))).all()
+
+
+PROCESS = """
+import sys
+sys.path[:0] = [{here!r}]
+from pathlib import Path
+from channel_lab import measure, sionna, write_scenery
+from test_channel_sionna_motion import F, GROUND, WALL, digest, traffic
+assets = write_scenery(Path({folder!r}), [GROUND, WALL])
+model = sionna(F, assets, bodies=6, **{settings!r})
+print(digest(measure(model, traffic(4))), digest(measure(model, traffic(5, seed=2))))
+"""
+
+ALL_ON = {
+    "refraction": True,
+    "diffraction": True,
+    "scattering": True,
+    "samples": 3000,
+    "materials": {
+        "skin-ground": {"scattering_coefficient": 0.4},
+        "skin-wall": {"scattering_coefficient": 0.3},
+    },
+}
+
+
+@pytest.mark.parametrize("settings", [{}, ALL_ON], ids=["specular", "all-on"])
+def test_two_processes_make_equal_products(tmp_path: Path, settings: dict[str, Any]) -> None:
+    """Bit-equal payloads of separate processes, with diffraction and diffuse scattering too: the solver
+    returns those in another order each time, the product does not."""
+    code = PROCESS.format(here=str(Path(__file__).parent), folder=str(tmp_path), settings=settings)
+    runs = [
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, timeout=200, check=True
+        ).stdout.splitlines()[-1]
+        for _ in range(2)
+    ]
+    assert runs[0] == runs[1]
+    assert len(set(runs[0].split())) == 2
+
+
+def test_diffraction_and_scattering_come_in_canonical_order(tmp_path: Path) -> None:
+    """Repeated runs are equal, and have paths of both kinds."""
+    model = sionna(F, write_scenery(tmp_path, [GROUND, WALL]), **ALL_ON)
+    frame = traffic(2, behind_the_wall=True)
+    products = [measure(model, frame) for _ in range(3)]
+    assert len({digest(product) for product in products}) == 1
+    kinds = set(np.unique(products[0].interactions).tolist())
+    assert {Interaction.DIFFRACTION, Interaction.SCATTERING, Interaction.TRANSMISSION} <= kinds
