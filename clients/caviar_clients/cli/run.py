@@ -85,6 +85,7 @@ def run_scenario(
         _write(json_file, summary)
     if outcome["frames"]:
         console.print(summary_table(summary))
+        console.print(f"digest {summary['digest']}", highlight=False, soft_wrap=True)
     if outcome["error"]:
         console.print(f"[red]the run ended early:[/red] {outcome['error']}", highlight=False, soft_wrap=True)
         child = launcher.child(outcome["culprit"])

@@ -106,4 +106,4 @@ def _caption(summary: Mapping[str, Any]) -> str:
         )
     if summary["no_path_share"]:
         parts.append(f"{summary['no_path_share']:.1%} of users without a path")
-    return "\n".join([*parts, f"digest {summary['digest']}"])
+    return "\n".join(parts)
