@@ -96,7 +96,8 @@ class Tracer:
         from sionna.rt.antenna_pattern import antenna_pattern_registry
         from sionna.rt.path_solvers.field_calculator import FieldCalculator
         from sionna.rt.path_solvers.image_method import ImageMethod
-        from sionna.rt.path_solvers.sb_deterministic import SBDeterministicCandidateGenerator
+
+        from caviar_services.channel.sionna_candidates import CandidateGenerator
 
         self.mi_scene = mi_scene
         self._options = options
@@ -104,7 +105,7 @@ class Tracer:
         # The two orthogonal isotropic fields at both ends give the whole polarisation transfer, to
         # which any element pattern in any orientation is applied afterwards.
         self._patterns = antenna_pattern_registry.get("iso")(polarization="VH").patterns
-        self._candidates = SBDeterministicCandidateGenerator()
+        self._candidates = CandidateGenerator()
         self._images = ImageMethod()
         self._fields = FieldCalculator()
 
