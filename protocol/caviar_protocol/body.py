@@ -6,6 +6,7 @@ the next multiple of 8 bytes; what lies between is zero.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -62,9 +63,9 @@ class BodyReader:
         """
         code, shape, offset = _reference(reference)
         dtype = WIRE_DTYPES[code]
-        count = 1
-        for size in shape:
-            count *= size
+        count = math.prod(shape)
+        if math.prod(max(size, 1) for size in shape) > limits.MAX_BODY:
+            raise DecodeError(f"array shape {shape} is larger than any body")
         end = offset + count * dtype.itemsize
         if end > len(self._body):
             raise DecodeError(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from functools import cache
+from types import NoneType
 from typing import Any, TypeVar
 
 import msgspec
@@ -30,6 +31,7 @@ from caviar_protocol.messages import (
     Status,
     Welcome,
 )
+from caviar_protocol.nesting import check_nesting
 from caviar_protocol.topics import PAYLOADS
 
 Buffer = bytes | bytearray | memoryview
@@ -207,6 +209,7 @@ _T = TypeVar("_T")
 def _decode(decoder: msgspec.msgpack.Decoder[_T], header: Buffer, what: str) -> _T:
     if len(header) > limits.MAX_HEADER:
         raise LimitError(f"{what} has {len(header)} B, at most {limits.MAX_HEADER} are accepted")
+    check_nesting(header, what)
     try:
         return decoder.decode(header)
     except RecursionError as error:
@@ -241,18 +244,23 @@ def _check_settings(message: Welcome, error: type[PayloadError] | type[DecodeErr
         _check_plain(getattr(message, name), f"WELCOME.{name}", 2, error)
 
 
+_PLAIN = (str, int, float, bool, NoneType)
+
+
 def _check_plain(value: Any, path: str, depth: int, error: type[PayloadError] | type[DecodeError]) -> None:
+    if isinstance(value, _PLAIN):
+        return
     if depth > limits.MAX_NESTING:
-        raise LimitError(f"{path:.200} nests deeper than {limits.MAX_NESTING} levels")
+        raise LimitError(f"{path} nests deeper than {limits.MAX_NESTING} levels")
     if isinstance(value, dict):
         for key, item in value.items():
             if not isinstance(key, str):
-                raise error(f"{path:.200} has the key {key!r:.40}, keys are strings")
-            _check_plain(item, f"{path:.200}.{key:.40}", depth + 1, error)
+                raise error(f"{path} has the key {key!r:.40}, keys are strings")
+            if not isinstance(item, _PLAIN):
+                _check_plain(item, f"{path:.200}.{key:.40}", depth + 1, error)
     elif isinstance(value, list | tuple):
         for item in value:
-            _check_plain(item, path, depth + 1, error)
-    elif not isinstance(value, str | int | float | bool | None):
-        raise error(
-            f"{path:.200} holds {type(value).__name__}, expected text, numbers, flags, lists and tables"
-        )
+            if not isinstance(item, _PLAIN):
+                _check_plain(item, path, depth + 1, error)
+    else:
+        raise error(f"{path} holds {type(value).__name__}, expected text, numbers, flags, lists and tables")

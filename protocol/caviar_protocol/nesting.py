@@ -1,0 +1,78 @@
+"""How deep maps and arrays of a header nest, told before anything recurses into them.
+
+The decoder recurses once a level and has a guard of its own, but that guard is made for the stack
+of a main thread. So a header that could nest dangerously is first walked without recursion.
+"""
+
+from __future__ import annotations
+
+from caviar_protocol import limits
+from caviar_protocol.errors import LimitError
+
+HARMLESS = 256
+"""Levels that fit the stack of any thread. A header with no more maps and arrays is not walked."""
+
+_CONTAINERS = bytes([*range(0x80, 0xA0), *range(0xDC, 0xE0)])
+_OTHERS = bytes(byte for byte in range(256) if byte not in _CONTAINERS)
+
+_FIXED = [0] * 256
+"""Bytes of a value by its first byte; 0 where it has a length field, or is a map or an array."""
+for _byte in range(256):
+    if _byte < 0x80 or _byte >= 0xE0 or 0xC0 <= _byte <= 0xC3:
+        _FIXED[_byte] = 1
+    elif 0xA0 <= _byte < 0xC0:
+        _FIXED[_byte] = 1 + (_byte & 0x1F)
+_FIXED[0xCA:0xD4] = [5, 9, 2, 3, 5, 9, 2, 3, 5, 9]  # floats, unsigned and signed integers
+_FIXED[0xD4:0xD9] = [3, 4, 6, 10, 18]  # extensions of fixed size
+
+_LENGTH_FIELD = {
+    0xC4: (1, 0), 0xC5: (2, 0), 0xC6: (4, 0),  # binary
+    0xC7: (1, 1), 0xC8: (2, 1), 0xC9: (4, 1),  # extension, with its type
+    0xD9: (1, 0), 0xDA: (2, 0), 0xDB: (4, 0),  # text
+}  # fmt: skip
+
+
+def check_nesting(header: bytes | bytearray | memoryview, what: str) -> None:
+    """Raise `LimitError` where ``header`` nests so deep that decoding it could exhaust a stack.
+
+    Up to `HARMLESS` maps and arrays in all are let pass unseen; with more, a depth beyond
+    `limits.MAX_NESTING` is refused. Bytes that are not msgpack are left to the decoder.
+    """
+    data = header if isinstance(header, bytes) else bytes(header)
+    if len(data) <= HARMLESS or len(data.translate(None, _OTHERS)) <= HARMLESS:
+        return
+    if _deeper_than(data, limits.MAX_NESTING):
+        raise LimitError(f"{what} nests deeper than {limits.MAX_NESTING} levels")
+
+
+def _deeper_than(data: bytes, limit: int) -> bool:
+    """Walk the values of a header; True at the first that stands in more than ``limit`` containers."""
+    position, end = 0, len(data)
+    due: list[int] = []  # how many values each open container still lacks
+    left = 1
+    while left and position < end:
+        left -= 1
+        byte = data[position]
+        if size := _FIXED[byte]:
+            position += size
+        elif byte in _LENGTH_FIELD:
+            width, extra = _LENGTH_FIELD[byte]
+            position += 1 + width + extra + int.from_bytes(data[position + 1 : position + 1 + width], "big")
+        else:
+            position, children = _open(data, position, byte)
+            due.append(left)
+            left = children
+            if len(due) > limit:
+                return True
+        while not left and due:
+            left = due.pop()
+    return False
+
+
+def _open(data: bytes, position: int, byte: int) -> tuple[int, int]:
+    """Position of the first value in a container, and how many there are (keys count too)."""
+    if byte < 0xA0:
+        return position + 1, (byte & 0x0F) * (1 if byte >= 0x90 else 2)
+    width = 2 if byte in (0xDC, 0xDE) else 4
+    count = int.from_bytes(data[position + 1 : position + 1 + width], "big")
+    return position + 1 + width, count * (1 if byte < 0xDE else 2)
