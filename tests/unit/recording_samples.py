@@ -9,10 +9,21 @@ import numpy as np
 
 from caviar_protocol.arrays import Payload
 from caviar_protocol.codec import encode_payload
-from caviar_protocol.coordinates import quaternion_from_euler
+from caviar_protocol.coordinates import quaternion_from_euler, rotation_matrix
 from caviar_protocol.digest import payload_digest
 from caviar_protocol.messages import GrantInput, Status
-from caviar_protocol.topics import AntennaArray, AntennaDevice, LidarDevice, Link, Scene
+from caviar_protocol.scene import device_pose
+from caviar_protocol.topics import (
+    AntennaArray,
+    AntennaDevice,
+    Carrier,
+    Channel,
+    Lidar,
+    LidarDevice,
+    LidarScan,
+    Link,
+    Scene,
+)
 from caviar_services.recorder.mcap import McapRecorder, McapSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 
@@ -49,7 +60,7 @@ def scene(frame: int, cars: int = 3) -> Scene:
 
 def link(frame: int, users: int = 3, without_path: tuple[int, ...] = ()) -> Link:
     """Best |y| of 4, the agent reaches half of it, the baseline a quarter."""
-    has_path = np.array([u not in without_path for u in range(users)])
+    has_path = np.array([u not in without_path for u in range(users)], dtype=bool)
     best = np.where(has_path, 4.0 + 0.1 * frame, 0.0)
     return Link(
         tx=("bs",) * users,
@@ -73,6 +84,62 @@ def link(frame: int, users: int = 3, without_path: tuple[int, ...] = ()) -> Link
         reward=best / 2,
         no_path=len(without_path),
     )
+
+
+def channel(frame: int, users: int = 3) -> Channel:
+    """To each car a line of sight and a reflection on a wall at y = 30 m; no path to the last car."""
+    where = scene(frame, users)
+    start = np.array([0.0, 20.0, 15.0])
+    ends = where.position[:-1] + np.array([0.0, 0.0, 1.0])
+    mirrored = start * [1, -1, 1] + [0, 60, 0]
+    share = (30.0 - ends[:, 1]) / (mirrored[1] - ends[:, 1])
+    bounce = ends + share[:, None] * (mirrored - ends)
+    reached = users - 1
+    interactions = np.tile(np.array([[0], [1]], np.uint8), (reached, 1))
+    points = np.zeros((2 * reached, 1, 3))
+    points[1::2, 0] = bounce
+    length = np.empty(2 * reached)
+    length[0::2] = np.linalg.norm(ends - start, axis=1)
+    length[1::2] = np.linalg.norm(ends - mirrored, axis=1)
+    return Channel(
+        rung="siso-rt",
+        carriers=(Carrier(name="c0", frequency_hz=28e9),),
+        tx=("bs",),
+        rx=tuple(f"car.{u}/rx" for u in range(users)),
+        los=np.array([[u < reached for u in range(users)]]),
+        offsets=np.array([2 * min(u, reached) for u in range(users + 1)]),
+        object_names=("wall",),
+        id=np.arange(2 * reached, dtype=np.uint64),
+        a=(1e-3 / length)[None].astype(np.complex128),
+        tau=length / 3e8,
+        aod=np.zeros((2 * reached, 2)),
+        aoa=np.zeros((2 * reached, 2)),
+        doppler=np.zeros((1, 2 * reached)),
+        interactions=interactions,
+        points=points,
+        objects=interactions.astype(np.int32) - 1,
+    )
+
+
+def lidar(frame: int) -> Lidar:
+    """The LIDAR of the first car sees a wall 10 m ahead and to the left, and a car behind it."""
+    where = scene(frame)
+    pose = device_pose(where, next(d for d in where.devices if isinstance(d, LidarDevice)))
+    ray = np.arange(8 * 90)[np.arange(8 * 90) % 90 < 60].astype(np.int32)
+    azimuth = (ray % 90) * 2 * np.pi / 90
+    points = 10.0 * np.stack([np.cos(azimuth), np.sin(azimuth), 0.05 * (ray // 90)], axis=-1)
+    world = points @ rotation_matrix(pose.orientation).T + pose.position
+    scan = LidarScan(
+        sensor="car.0/top",
+        position=pose.position,
+        orientation=pose.orientation,
+        ray=ray,
+        points=points.astype(np.float32),
+        points_world=world.astype(np.float32),
+        range=np.full(len(ray), 10.0, np.float32),
+        object=np.where(azimuth > np.pi, 0, 1).astype(np.int32),
+    )
+    return Lidar(object_names=("car.1", "wall"), scans=(scan,))
 
 
 def product(

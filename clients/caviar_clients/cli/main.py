@@ -102,7 +102,7 @@ def plot(
     user: Annotated[str | None, typer.Option(help="receiver whose |y| is drawn")] = None,
 ) -> None:
     """Draw a run: the map with rays and beam, |y| over time and angle, a LIDAR scan."""
-    from caviar_clients.plots import plot_run
+    from caviar_clients.cli.plot import plot_run
 
     for picture in plot_run(run, out, frame, user):
         _console.print(str(picture), highlight=False, soft_wrap=True)

@@ -1,0 +1,292 @@
+"""The world from above: scenery, objects, rays and the beam that was chosen."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from caviar_clients.plots.footprints import Footprints
+from caviar_clients.plots.style import BLACK, GREY, LIGHT_GREY, ORANGE, SKY, VERMILION, figure, legend_below
+from caviar_protocol.arrays import Float64Array
+from caviar_protocol.coordinates import rotation_matrix
+from caviar_protocol.scene import antennas, device_pose
+from caviar_protocol.topics import AntennaArray, AntennaDevice, Channel, Link, Scene
+from caviar_protocol.topics.channel import Interaction
+
+BeamGain = Callable[[AntennaArray, int, Float64Array], Float64Array]
+"""``gain(array, beam, directions)``: amplitude of a codebook beam towards unit vectors in device
+axes, Shape ``[N, 3]`` to ``[N]``, 1 at its greatest."""
+
+_PATHS_OF_A_PAIR = 25
+"""Of a pair so many of the strongest paths are drawn."""
+
+_RANGE_DB = 50.0
+"""Paths weaker than the strongest by more than this have the last colour."""
+
+
+@dataclass(frozen=True, eq=False)
+class MapData:
+    """What stands in a map; whatever is None is left out."""
+
+    scene: Scene
+    channel: Channel | None
+    link: Link | None
+    footprints: Footprints | None
+    beam_gain: BeamGain | None
+    user: tuple[str, str, str] | None
+    """(tx, rx, carrier) whose chosen beam is shown."""
+    title: str
+
+
+def draw_map(data: MapData, file: Path) -> None:
+    """Draw the map of one frame."""
+    beam = _beam(data)
+    view = _view(data, beam)
+    (left, right), (bottom, top) = view
+    # As high as the view needs, beside 1.5 inches for the colour bar, above 1.6 for title and legend.
+    height = float(np.clip((top - bottom) / (right - left) * 8.0 + 1.6, 4.5, 11.0))
+    with figure(file, 9.5, height, layout="compressed") as drawn:
+        axes = drawn.subplots()
+        axes.set_xlim(view[0])
+        axes.set_ylim(view[1])
+        _draw_scenery(axes, data.footprints)
+        _draw_rays(drawn, axes, data)
+        if beam is not None:
+            _draw_beam(axes, beam)
+        _draw_objects(axes, data)
+        _draw_antennas(axes, data)
+        axes.set_aspect("equal")
+        axes.set_xlabel("x, east [m]")
+        axes.set_ylabel("y, north [m]")
+        axes.set_title(data.title)
+        legend_below(drawn, axes)
+
+
+def _view(data: MapData, beam: _Beam | None) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Limits of x and y [m]: objects, devices, ray points and the beam, with a margin; at least 40 m."""
+    points = [data.scene.position[:, :2]]
+    points += [np.array([device_pose(data.scene, device).position[:2]]) for device in data.scene.devices]
+    if data.channel is not None:
+        used = data.channel.interactions != Interaction.NONE
+        points.append(data.channel.points[used][:, :2])
+    if beam is not None:
+        points.append(beam.outline)
+    everything = np.concatenate(points)
+    if not len(everything):
+        everything = np.zeros((1, 2))
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    centre, half = (low + high) / 2, np.maximum((high - low) / 2 * 1.08 + 5.0, 20.0)
+    half = np.maximum(half, half.max() * 0.4)
+    left, bottom = (centre - half).tolist()
+    right, top = (centre + half).tolist()
+    return (left, right), (bottom, top)
+
+
+def _draw_scenery(axes: Any, footprints: Footprints | None) -> None:
+    from matplotlib.collections import LineCollection, PolyCollection
+
+    if footprints is None:
+        return
+    faces: Any = footprints.faces
+    edges: Any = footprints.edges
+    axes.add_collection(
+        PolyCollection(faces, facecolors=LIGHT_GREY, edgecolors=LIGHT_GREY, linewidths=0.4, zorder=1)
+    )
+    axes.add_collection(LineCollection(edges, colors=GREY, linewidths=0.6, zorder=1.1))
+
+
+def _draw_rays(drawn: Any, axes: Any, data: MapData) -> None:
+    """Every path as a line over its interaction points, the strongest on top."""
+    from matplotlib.collections import LineCollection
+
+    lines, gains = _rays(data)
+    if not lines:
+        return
+    order = np.argsort(gains)
+    top = float(gains.max())
+    rays = LineCollection(
+        [lines[i] for i in order],
+        array=gains[order],
+        cmap="viridis",
+        clim=(max(float(gains.min()), top - _RANGE_DB) - 1e-9, top),
+        linewidths=1.1,
+        alpha=0.85,
+        zorder=2,
+    )
+    axes.add_collection(rays)
+    drawn.colorbar(rays, ax=axes, label="Path gain [dB]", shrink=0.75, pad=0.01)
+
+
+def _rays(data: MapData) -> tuple[list[Float64Array], Float64Array]:
+    """Polylines in x and y [m], and path gains of the first carrier [dB]."""
+    channel, lines, gains = data.channel, [], []
+    if channel is None or not len(channel.carriers):
+        return [], np.zeros(0)
+    places = {d.name: np.array(device_pose(data.scene, d).position) for d in data.scene.devices}
+    power = np.abs(channel.a[0]) ** 2
+    for tx in channel.tx:
+        for rx in channel.rx:
+            if tx not in places or rx not in places:
+                continue
+            pair = channel.pair(tx, rx)
+            strongest = np.argsort(-power[pair])[:_PATHS_OF_A_PAIR] + pair.start
+            for path in strongest[power[strongest] > 0]:
+                used = channel.interactions[path] != Interaction.NONE
+                lines.append(np.vstack([places[tx], channel.points[path][used], places[rx]])[:, :2])
+                gains.append(10 * np.log10(power[path]))
+    return lines, np.array(gains)
+
+
+@dataclass(frozen=True, eq=False)
+class _Beam:
+    """The chosen beam's pattern around its array, cut at the elevation of the user."""
+
+    outline: Float64Array
+    """x and y [m], Shape ``[N, 2]``."""
+    label: str
+
+
+def _beam(data: MapData) -> _Beam | None:
+    found = _chosen(data)
+    if found is None or data.beam_gain is None:
+        return None
+    device, beam, rx = found
+    pose = device_pose(data.scene, device)
+    receiver = next((d for d in data.scene.devices if d.name == rx), None)
+    line = np.array([1.0, 0.0, 0.0])
+    if receiver is not None:
+        line = np.array(device_pose(data.scene, receiver).position) - np.array(pose.position)
+    distance = float(np.linalg.norm(line))
+    sine = 0.0 if distance == 0 else float(line[2]) / distance
+    cosine = np.sqrt(max(0.0, 1 - sine**2))
+    azimuth = np.linspace(-np.pi, np.pi, 2881)
+    around = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)
+    world = np.column_stack([cosine * around, np.full_like(azimuth, sine)])
+    gain = data.beam_gain(device.array, beam, world @ rotation_matrix(pose.orientation))
+    radius = max(0.6 * distance, 5.0) * gain / max(float(gain.max()), 1e-9)
+    outline: Float64Array = np.array(pose.position[:2]) + radius[:, None] * around
+    return _Beam(outline, f"beam {beam} of {device.name}, chosen for {rx}")
+
+
+def _draw_beam(axes: Any, beam: _Beam) -> None:
+    axes.fill(*beam.outline.T, facecolor=VERMILION, alpha=0.22, linewidth=0, zorder=3)
+    axes.plot(*beam.outline.T, color=VERMILION, linewidth=1.3, zorder=3.1, label=beam.label)
+
+
+def _chosen(data: MapData) -> tuple[AntennaDevice, int, str] | None:
+    """Transmitter, its chosen beam, and the receiver it was chosen for."""
+    if data.link is None or data.user is None:
+        return None
+    users = list(zip(data.link.tx, data.link.rx, data.link.carrier, strict=True))
+    if data.user not in users:
+        return None
+    beam = int(data.link.tx_beam[users.index(data.user)])
+    device = next((d for d in antennas(data.scene, "tx") if d.name == data.user[0]), None)
+    return None if device is None or beam < 0 else (device, beam, data.user[1])
+
+
+def _draw_objects(axes: Any, data: MapData) -> None:
+    """Bounding boxes from above, a mark at the front, names where there is room."""
+    from matplotlib.collections import PolyCollection
+
+    scene = data.scene
+    if not scene.names:
+        return
+    carriers = {device.parent for device in scene.devices}
+    outline = np.array([[0.5, 0.5], [0.5, -0.5], [-0.5, -0.5], [-0.5, 0.5]])
+    boxes, fronts = [], []
+    for i in range(len(scene.names)):
+        rotation = rotation_matrix(scene.orientation[i].tolist())[:2, :2]
+        centre, size = scene.position[i, :2], scene.dimensions[i, :2]
+        boxes.append(centre + (outline * size) @ rotation.T)
+        fronts.append(centre + (np.array([[0.5, 0.5], [0.5, -0.5], [0.28, 0.0]]) * size) @ rotation.T)
+    colors = [ORANGE if name in carriers else SKY for name in scene.names]
+    axes.add_collection(PolyCollection(boxes, facecolors=colors, edgecolors=BLACK, linewidths=0.7, zorder=4))
+    axes.add_collection(PolyCollection(fronts, facecolors=BLACK, linewidths=0, zorder=4.1))
+    for color, label in ((ORANGE, "object with a device"), (SKY, "other object")):
+        if color in colors:
+            axes.scatter([], [], marker="s", s=60, color=color, edgecolors=BLACK, linewidths=0.7, label=label)
+    _name_objects(axes, scene, np.array(boxes), carriers)
+
+
+def _name_objects(axes: Any, scene: Scene, boxes: Float64Array, carriers: set[str]) -> None:
+    """Names without what all have in common, where there is room; those with a device come first."""
+    from matplotlib.patheffects import withStroke
+
+    halo = [withStroke(linewidth=2.0, foreground="white")]
+    common = _common_prefix(scene.names)
+    # A character of 8 points is about 5 points wide; the axes are about 570 points wide.
+    (left, right), points = axes.get_xlim(), 570.0
+    unit = (right - left) / points
+    taken = [(*box.min(axis=0), *box.max(axis=0)) for box in boxes]
+    for i in sorted(range(len(boxes)), key=lambda i: (scene.names[i] not in carriers, scene.names[i])):
+        text = scene.names[i].removeprefix(common)
+        place = _free_place(boxes[i], 5.0 * len(text) * unit, 9.0 * unit, 2.0 * unit, taken)
+        if place is not None:
+            taken.append(place)
+            axes.text(*place[:2], text, fontsize=8, path_effects=halo, zorder=6, clip_on=True)
+
+
+Rectangle = tuple[float, float, float, float]
+"""Left, bottom, right, top [m]."""
+
+
+def _free_place(
+    box: Float64Array, width: float, height: float, gap: float, taken: Sequence[Rectangle]
+) -> Rectangle | None:
+    """Above, below, right or left of a box, where nothing is taken."""
+    (x0, y0), (x1, y1) = box.min(axis=0).tolist(), box.max(axis=0).tolist()
+    for x, y in (
+        ((x0 + x1 - width) / 2, y1 + gap),
+        ((x0 + x1 - width) / 2, y0 - gap - height),
+        (x1 + gap, (y0 + y1 - height) / 2),
+        (x0 - gap - width, (y0 + y1 - height) / 2),
+    ):
+        place = (x, y, x + width, y + height)
+        if not any(_overlap(place, other) for other in taken):
+            return place
+    return None
+
+
+def _common_prefix(names: Sequence[str]) -> str:
+    """The dotted parts that all names begin with; empty for a single name."""
+    parts = [name.split(".")[:-1] for name in names] if len(names) > 1 else []
+    same = itertools.takewhile(lambda level: len(set(level)) == 1, zip(*parts, strict=False))
+    return "".join(f"{level[0]}." for level in same)
+
+
+def _overlap(a: Rectangle, b: Rectangle) -> bool:
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+
+
+def _draw_antennas(axes: Any, data: MapData) -> None:
+    """Transmitters as triangles with their names, receivers as dots."""
+    from matplotlib.patheffects import withStroke
+
+    halo = [withStroke(linewidth=2.5, foreground="white")]
+    for role, marker, size, label in (("tx", "^", 110, "transmitter"), ("rx", "o", 18, "receiver")):
+        devices = antennas(data.scene, role)
+        if not devices:
+            continue
+        places = np.array([device_pose(data.scene, device).position[:2] for device in devices])
+        axes.scatter(
+            *places.T,
+            marker=marker,
+            s=size,
+            color=BLACK,
+            edgecolors="white",
+            linewidths=0.8,
+            zorder=5,
+            label=label,
+        )
+        for device, place in zip(devices, places, strict=True):
+            if not device.parent:
+                axes.annotate(
+                    device.name, place, xytext=(0, 10), textcoords="offset points", ha="center",
+                    fontsize=10, fontweight="bold", path_effects=halo, zorder=6, annotation_clip=True,
+                )  # fmt: skip

@@ -1,0 +1,64 @@
+"""What all pictures share: size, colours that colour-blind readers tell apart, how they are saved."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+from caviar_protocol.errors import SetupError
+
+# Okabe and Ito, "Color Universal Design", 2008.
+BLACK, GREY, LIGHT_GREY = "#222222", "#8c8c8c", "#dcdcdc"
+ORANGE, SKY, GREEN, BLUE, VERMILION, PURPLE = (
+    "#e69f00", "#56b4e9", "#009e73", "#0072b2", "#d55e00", "#cc79a7",
+)  # fmt: skip
+
+OPTIMUM, AGENT, BASELINE = BLACK, VERMILION, BLUE
+"""Colours of the three curves of |y|, the same in every picture."""
+
+Layout = Literal["constrained", "compressed"]
+"""Of Matplotlib: ``compressed`` for panels of equal aspect."""
+
+_SETTINGS: dict[str, Any] = {
+    "font.size": 11.0,
+    "axes.titlesize": 12.0,
+    "axes.labelsize": 11.0,
+    "legend.fontsize": 10.0,
+    "legend.frameon": True,
+    "legend.framealpha": 0.9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "axes.formatter.limits": (-2, 4),
+    "axes.formatter.use_mathtext": True,
+    "savefig.dpi": 150,
+}
+
+
+@contextmanager
+def figure(file: Path, width: float, height: float, layout: Layout = "constrained") -> Iterator[Any]:
+    """A figure [inches] that is saved as PNG, cut to what is drawn, when the block ends.
+
+    Raises `SetupError` with the command to install Matplotlib where it is missing.
+    """
+    try:
+        from matplotlib import rc_context
+        from matplotlib.figure import Figure
+    except ModuleNotFoundError as error:
+        raise SetupError(
+            f"pictures need {error.name!r}, which is not installed; run: pip install 'caviar-sim[plot]'"
+        ) from error
+    with rc_context(_SETTINGS):
+        drawn = Figure(figsize=(width, height), layout=layout)
+        yield drawn
+        file.parent.mkdir(parents=True, exist_ok=True)
+        drawn.savefig(file, format="png", bbox_inches="tight", pad_inches=0.15)
+
+
+def legend_below(drawn: Any, axes: Any, columns: int = 3) -> None:
+    """The legend of ``axes``, below everything else."""
+    handles, labels = axes.get_legend_handles_labels()
+    if handles:
+        drawn.legend(handles, labels, loc="outside lower center", ncols=columns)

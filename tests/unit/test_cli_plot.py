@@ -1,0 +1,59 @@
+"""`caviar plot`: which pictures a recording gives, and of which frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from recording_samples import channel, frame, lidar, link, product, record, recorder, scene
+
+from caviar_clients.cli.plot import plot_run
+from caviar_protocol.errors import RecordingError
+
+pytest.importorskip("matplotlib")
+
+
+def full(folder: Path, frames: int = 4) -> Path:
+    made = recorder(folder)
+    for n in range(frames):
+        payloads = {"scene": scene(n), "channel": channel(n), "link": link(n), "lidar": lidar(n)}
+        made.step(frame(n, *(product(topic, "s", payload, n) for topic, payload in payloads.items())))
+    made.close()
+    return folder
+
+
+def test_all_pictures_go_into_the_run_directory(tmp_path):
+    files = plot_run(full(tmp_path))
+    assert [file.name for file in files] == [
+        "map.png",
+        "beams-over-time.png",
+        "beams-over-angle.png",
+        "lidar.png",
+    ]
+    assert all(file.parent == tmp_path and file.stat().st_size > 5000 for file in files)
+
+
+def test_what_was_not_recorded_is_not_drawn(tmp_path):
+    files = plot_run(record(tmp_path / "run"), tmp_path / "pictures")
+    assert [file.name for file in files] == ["map.png", "beams-over-time.png", "beams-over-angle.png"]
+    assert all(file.is_file() for file in files)
+
+
+def test_another_frame_gives_another_map(tmp_path):
+    run = record(tmp_path / "run")
+    first = plot_run(run, tmp_path / "a", frame=0)[0].read_bytes()
+    assert plot_run(run, tmp_path / "b", frame=0)[0].read_bytes() == first
+    assert plot_run(run, tmp_path / "c", frame=3)[0].read_bytes() != first
+
+
+def test_a_frame_or_user_that_is_not_there_is_refused(tmp_path):
+    run = full(tmp_path / "run")
+    with pytest.raises(RecordingError, match="no frame 99 of episode 0"):
+        plot_run(run, tmp_path, frame=99)
+    with pytest.raises(RecordingError, match="no user is named 'bike'"):
+        plot_run(run, tmp_path, user="bike")
+
+
+def test_an_empty_recording_has_nothing_to_draw(tmp_path):
+    with pytest.raises(RecordingError, match="holds nothing to draw"):
+        plot_run(record(tmp_path, frames=0))

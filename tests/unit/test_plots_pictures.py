@@ -1,0 +1,178 @@
+"""The map and the LIDAR picture: what is where in them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from recording_samples import channel, lidar, link, scene
+
+from caviar_clients.cli.plot import beam_gain
+from caviar_clients.plots.lidar import draw_scan, range_image
+from caviar_clients.plots.map import MapData, _beam, _common_prefix, _rays, _view, draw_map
+from caviar_protocol.scene import device_pose
+from caviar_protocol.topics import AntennaArray, LidarDevice, LidarScan
+from caviar_services.link.codebook import beam_towards, pointing_directions
+
+pytest.importorskip("matplotlib")
+Image = pytest.importorskip("PIL.Image")
+
+USER = ("bs", "car.1/rx", "c0")
+
+
+def a_map(**changes) -> MapData:
+    given = {
+        "scene": scene(2),
+        "channel": channel(2),
+        "link": link(2),
+        "footprints": None,
+        "beam_gain": beam_gain,
+        "user": USER,
+        "title": "sample",
+    }
+    return MapData(**(given | changes))
+
+
+def test_rays_run_from_transmitter_over_their_points_to_the_receiver():
+    data = a_map()
+    lines, gains = _rays(data)
+    assert len(lines) == 4  # two cars with two paths each, the third has none
+    receiver = next(d for d in data.scene.devices if d.name == "car.1/rx")
+    end = device_pose(data.scene, receiver).position[:2]
+    direct, bounced = (line for line in lines if np.allclose(line[-1], end))
+    assert direct.shape == (2, 2)
+    assert bounced.shape == (3, 2)
+    assert bounced[1, 1] == pytest.approx(30.0)
+    for line in (direct, bounced):
+        np.testing.assert_allclose(line[0], [0.0, 20.0])
+    strongest = 20 * math.log10(1e-3 / np.linalg.norm(np.array(end) - [0, 20]))
+    assert gains.max() == pytest.approx(strongest, abs=2.0)
+
+
+@pytest.mark.parametrize("pattern", ["iso", "tr38901"])
+@pytest.mark.parametrize(("rows", "columns"), [(1, 16), (4, 8)])
+def test_the_gain_of_a_beam_is_greatest_where_the_beam_points(pattern, rows, columns):
+    array = AntennaArray(rows=rows, columns=columns, pattern=pattern)
+    towards = np.array([math.cos(0.3), math.sin(0.3), 0.0])
+    beam = int(beam_towards(array, towards))
+    (pointing, *_) = pointing_directions(array, beam)
+    level = math.hypot(pointing[0], pointing[1])
+    azimuth = np.linspace(-np.pi / 2, np.pi / 2, 1801)
+    around = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.full(1801, pointing[2])], axis=-1)
+    gain = beam_gain(array, beam, around)
+    found = azimuth[np.argmax(gain)]
+    # The element pattern pulls the greatest gain a little towards boresight.
+    assert found == pytest.approx(
+        math.atan2(pointing[1], pointing[0]), abs=0.01 if pattern == "iso" else 0.03
+    )
+
+
+def test_the_lobe_stands_at_the_array_and_points_to_the_user():
+    data = a_map()
+    receiver = next(d for d in data.scene.devices if d.name == "car.1/rx")
+    target = np.array(device_pose(data.scene, receiver).position) - [0.0, 20.0, 15.0]
+    # In the axes of the base station, which is turned by −90°: x' = −y, y' = x.
+    local = np.array([-target[1], target[0], target[2]]) / np.linalg.norm(target)
+    chosen = int(beam_towards(AntennaArray(columns=16), local))
+    links = link(2)
+    links.tx_beam[:] = chosen
+    beam = _beam(a_map(link=links))
+    assert beam is not None
+    assert beam.label == f"beam {chosen} of bs, chosen for car.1/rx"
+    reach = beam.outline - [0.0, 20.0]
+    in_front = reach[reach[:, 1] < 0]
+    tip = in_front[np.argmax(np.linalg.norm(in_front, axis=1))]
+    between = math.atan2(tip[1], tip[0]) - math.atan2(target[1], target[0])
+    assert abs(between) < math.radians(7.2)  # half the spacing of 16 beams, and some
+
+
+@pytest.mark.parametrize(
+    "changes", [{"link": None}, {"user": None}, {"user": ("bs", "gone/rx", "c0")}, {"beam_gain": None}]
+)
+def test_without_a_chosen_beam_there_is_no_lobe(changes):
+    assert _beam(a_map(**changes)) is None
+
+
+def test_the_view_holds_everything_and_is_never_tiny():
+    data = a_map()
+    (left, right), (bottom, top) = _view(data, None)
+    x, y = data.scene.position[:, 0], data.scene.position[:, 1]
+    assert left < x.min()
+    assert x.max() < right
+    assert bottom < y.min()
+    assert top > 30.0  # the wall that reflects
+    single = a_map(scene=scene(0, cars=1), channel=None)
+    (left, right), (bottom, top) = _view(single, None)
+    assert right - left >= 40.0
+    assert top - bottom >= 40.0
+
+
+def test_names_lose_what_all_have_in_common():
+    assert _common_prefix(["vehicle.east.1", "vehicle.east.2"]) == "vehicle.east."
+    assert _common_prefix(["vehicle.east.1", "vehicle.west.1"]) == "vehicle."
+    assert _common_prefix(["car", "uav"]) == ""
+    assert _common_prefix(["world.car"]) == ""
+
+
+def test_the_range_image_has_ahead_in_the_middle_and_left_on_the_left():
+    device = LidarDevice(name="l", beams=2, azimuth_steps=8)
+    # Ray 2 of the upper beam looks 90° to the left, ray 0 of the lower one ahead, ray 6 right.
+    ray = np.array([0, 6, 8 + 2], np.int32)
+    scan = LidarScan(
+        sensor="l",
+        position=(0, 0, 0),
+        orientation=(1, 0, 0, 0),
+        ray=ray,
+        points=np.zeros((3, 3), np.float32),
+        points_world=np.zeros((3, 3), np.float32),
+        range=np.array([1, 2, 3], np.float32),
+        object=np.zeros(3, np.int32),
+    )
+    image = range_image(scan, device)
+    assert image.shape == (2, 8)
+    # Columns: 180, 135, 90, 45, 0, −45, −90, −135 degrees.
+    assert image[0, 4] == 1.0
+    assert image[0, 6] == 2.0
+    assert image[1, 2] == 3.0
+    assert np.isnan(image).sum() == 13
+
+
+def colours(file) -> set[tuple[int, ...]]:
+    with Image.open(file) as picture:
+        assert picture.format == "PNG"
+        pixels = np.asarray(picture.convert("RGB")).astype(np.int64)
+    found = np.unique((pixels[..., 0] << 16) + (pixels[..., 1] << 8) + pixels[..., 2]).tolist()
+    return {(c >> 16, c >> 8 & 255, c & 255) for c in found}
+
+
+@pytest.mark.parametrize(
+    "changes", [{}, {"channel": None}, {"link": None}, {"scene": scene(0, cars=1), "channel": None}]
+)
+def test_the_map_is_drawn_whatever_is_missing(tmp_path, changes):
+    file = tmp_path / "map.png"
+    draw_map(a_map(**changes), file)
+    assert (0xE6, 0x9F, 0x00) in colours(file)  # objects with a device
+
+
+@pytest.mark.parametrize("with_scene", [True, False])
+def test_the_scan_is_drawn_with_and_without_a_scene(tmp_path, with_scene):
+    payload = lidar(1)
+    file = tmp_path / "lidar.png"
+    draw_scan(payload.scans[0], payload, scene(1) if with_scene else None, "sample", file)
+    assert ((0xE6, 0x9F, 0x00) in colours(file)) is with_scene  # hits on a moving object
+
+
+def test_a_scan_without_hits_is_drawn(tmp_path):
+    empty = LidarScan(
+        sensor="car.0/top",
+        position=(0, 0, 1),
+        orientation=(1, 0, 0, 0),
+        ray=np.zeros(0, np.int32),
+        points=np.zeros((0, 3), np.float32),
+        points_world=np.zeros((0, 3), np.float32),
+        range=np.zeros(0, np.float32),
+        object=np.zeros(0, np.int32),
+    )
+    draw_scan(empty, lidar(0), scene(0), "empty", tmp_path / "lidar.png")
+    assert (tmp_path / "lidar.png").stat().st_size > 1000
