@@ -141,14 +141,17 @@ def test_what_came_and_went_leaves_no_trace(street: ChannelModel[Any]) -> None:
 
 
 def test_parked_bodies_and_receivers_do_not_matter(tmp_path: Path) -> None:
-    """A service with just the bodies and receivers needed makes the same product, refraction on."""
+    """A service with just the bodies and receivers needed finds the same paths, refraction on; amplitudes
+    agree within 1e-4, as which of two triangles a ray on their common edge hits may differ."""
     assets = write_scenery(tmp_path, [GROUND, WALL])
     tight = sionna(F, assets, pool={"box": 3}, receivers_at_once=3, refraction=True, max_depth=3)
     roomy = sionna(F, assets, pool={"box": 24}, receivers_at_once=16, refraction=True, max_depth=3)
     frame = traffic(3, behind_the_wall=True)
-    product = measure(tight, frame)
-    assert digest(product) == digest(measure(roomy, frame))
-    assert (product.interactions == Interaction.TRANSMISSION).any()
+    one, other = measure(tight, frame), measure(roomy, frame)
+    assert np.array_equal(one.id, other.id)
+    assert np.array_equal(one.offsets, other.offsets)
+    assert (np.abs(one.a - other.a) < 1e-4 * np.abs(one.a)).all()
+    assert (one.interactions == Interaction.TRANSMISSION).any()
 
 
 def test_more_receivers_than_one_launch_takes(tmp_path: Path) -> None:
@@ -180,7 +183,7 @@ model = sionna(F, assets, bodies=6, **{settings!r})
 print(digest(measure(model, traffic(4))), digest(measure(model, traffic(5, seed=2))))
 """
 
-ALL_ON = {
+ALL_ON: dict[str, Any] = {
     "refraction": True,
     "diffraction": True,
     "scattering": True,
@@ -208,10 +211,15 @@ def test_two_processes_make_equal_products(tmp_path: Path, settings: dict[str, A
 
 
 def test_diffraction_and_scattering_come_in_canonical_order(tmp_path: Path) -> None:
-    """Repeated runs are equal, and have paths of both kinds."""
+    """Repeated runs are equal, and have paths of all kinds."""
     model = sionna(F, write_scenery(tmp_path, [GROUND, WALL]), **ALL_ON)
-    frame = traffic(2, behind_the_wall=True)
-    products = [measure(model, frame) for _ in range(3)]
+    tower = Thing("tower", (12, -6, 5), (8, 8, 10))
+    ends = [
+        antenna("t", "tx", (-10, -4, 4)),
+        antenna("r", "rx", (24, -12, 2)),
+        antenna("s", "rx", (5, 30, 2)),
+    ]
+    products = [measure(model, scene(ends, [tower])) for _ in range(3)]
     assert len({digest(product) for product in products}) == 1
     kinds = set(np.unique(products[0].interactions).tolist())
     assert {Interaction.DIFFRACTION, Interaction.SCATTERING, Interaction.TRANSMISSION} <= kinds

@@ -64,7 +64,10 @@ class CandidateGenerator(SBDeterministicCandidateGenerator):  # type: ignore[mis
         with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
             self._sampler.seed(seed, samples_per_src)
             notes, first_ray = self._shoot_and_bounce_loop(*arguments, counting_mode=True)
-            lanes, finished = _winners(notes, first_ray, samples_per_src, targets)
+            noted: Any = dr.compress(notes != NO_PATH_RECORDED_MARKER)
+            if dr.width(noted) == 0:
+                return
+            lanes, finished = _winners(noted, notes, first_ray, samples_per_src, targets)
             count = min(dr.width(lanes), paths.buffer_size - int(paths.paths_counter[0]))
             if count <= 0:
                 return
@@ -76,12 +79,11 @@ class CandidateGenerator(SBDeterministicCandidateGenerator):  # type: ignore[mis
         paths.advance_paths_counter(dr.opaque(mi.UInt32, count))
 
 
-def _winners(notes: Any, first_ray: Any, samples: int, targets: int) -> tuple[Any, Any]:
-    """Lanes whose find is kept, and whether each ends in a diffuse reflection, so is finished.
+def _winners(lanes: Any, notes: Any, first_ray: Any, samples: int, targets: int) -> tuple[Any, Any]:
+    """Those of the lanes whose find is kept, and whether each ends in a diffuse reflection, so is finished.
 
     Of the rays that found one chain of surfaces, the first keeps it: the one that both hash tables name.
     """
-    lanes: Any = dr.compress(notes != NO_PATH_RECORDED_MARKER)
     note = dr.gather(mi.UInt64, notes, lanes)
     finished = note == NON_SPECULAR_PATH_MARKER
     ray = (lanes // targets) % samples

@@ -153,7 +153,8 @@ class SionnaChannel(ChannelModel[SionnaSettings]):
             transfer=_joined([part.transfer for _, part in parts], (0, 3, 3), np.complex128)[None],
             types=_joined([part.types for _, part in parts], (0, depth), np.uint8),
             objects=self._scene.object_index(
-                _joined([part.shapes for _, part in parts], (0, depth), np.int64)
+                _joined([part.shapes for _, part in parts], (0, depth), np.int64),
+                _joined([part.primitives for _, part in parts], (0, depth), np.int64),
             ),
             points=_joined([part.points for _, part in parts], (0, depth, 3), np.float64),
             object_names=names,

@@ -1,8 +1,13 @@
-"""Scenery and moving bodies in Sionna RT: loaded once, moved in one update a frame."""
+"""Scenery and moving bodies in Sionna RT: loaded once, moved in one update a frame.
+
+Every further shape makes each trace a millisecond longer, whatever its size. So there is one
+shape for each material, and a table that says which triangles belong to what; paths still name the
+single building and vehicle.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,9 +28,11 @@ Body = tuple[str, int]
 PARKING_DEPTH = 2000.0
 """Unused receivers stand this far [m] below the scenery, in a closed metal box of their own."""
 
-_PARKING = "caviar-parking"
 _HALF_BOX = 4.0
 """[m]; more than the part of a shadow ray near its end that is not tested (9e-4 of its length)."""
+
+_PARKING = "caviar-parking"
+_SKIN = "caviar-body"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +47,16 @@ class SceneSettings:
     """Join vertices at one place, so that edges between faces are known (diffraction)."""
 
 
+@dataclass(frozen=True, eq=False)
+class _Shape:
+    """One shape of the ray tracer: pieces of one material."""
+
+    id: str
+    material: Any
+    names: list[str]
+    meshes: list[Mesh]
+
+
 class SionnaScene:
     """A `sionna.rt.Scene` with a pool of bodies for moving objects.
 
@@ -48,20 +65,16 @@ class SionnaScene:
 
     def __init__(self, assets: Mapping[str, Path], pool: Mapping[str, int], settings: SceneSettings) -> None:
         self._scene = _load(find_scenery(assets), settings.weld)
-        scenery = list(self._scene.objects)
-        self.low, self.high = _bounds(self._scene) if scenery else (np.zeros(3), np.zeros(3))
-        self._pool = BodyPool(pool)
+        self._scenery = frozenset(self._scene.objects)
+        self.low, self.high = _bounds(self._scene) if self._scenery else (np.zeros(3), np.zeros(3))
+        self._pool = dict(pool)
         self._meshes = {asset: _unit_mesh(asset, assets) for asset in pool}
         self._bodies: list[Body] = [(asset, slot) for asset in sorted(pool) for slot in range(pool[asset])]
-        self._add_bodies(settings.body_material)
-        set_materials(self._scene, settings.frequency_hz, settings.materials, settings.outside_itu_range)
-        self._names = (*scenery, _PARKING, *(_body_name(body) for body in self._bodies))
-        self._scenery = frozenset(scenery)
-        objects = self._scene.objects
-        ids = np.array([objects[name].object_id for name in self._names], np.int64)
-        self._by_id = np.argsort(ids)
-        self._ids = ids[self._by_id]
         self._standing: frozenset[Body] = frozenset()
+        moving = self._moving_shapes(settings.body_material)
+        self._vertices = np.concatenate([np.zeros((0, 3)), *(mesh.vertices for mesh in moving[-1].meshes)])
+        self._replace_shapes([*_by_material(self._scene), *moving])
+        set_materials(self._scene, settings.frequency_hz, settings.materials, settings.outside_itu_range)
 
     @property
     def mi_scene(self) -> Any:
@@ -87,49 +100,73 @@ class SionnaScene:
         clash = self._scenery & index.keys()
         if clash:
             raise PayloadError(f"object {min(clash)!r} has the name of a piece of scenery; rename one")
-        taken = self._pool.assign((scene.names[i], scene.assets[i]) for i in solid)
+        # A new assignment each frame: the product follows from this frame alone, also after a restart.
+        taken = BodyPool(self._pool).assign((scene.names[i], scene.assets[i]) for i in solid)
         standing = {body: index[name] for name, body in taken.items()}
-        params = self._scene.mi_scene_params
         names, velocity = list(self._names), np.zeros((len(self._names), 3))
         first = len(names) - len(self._bodies)
-        for offset, body in enumerate(self._bodies):
+        begin = len(self._vertices) - sum(len(self._meshes[asset].vertices) for asset, _ in self._bodies)
+        for number, body in enumerate(self._bodies, start=first):
+            mesh = self._meshes[body[0]]
+            rows = slice(begin, begin + len(mesh.vertices))
+            begin = rows.stop
             i = standing.get(body)
             if i is not None:
-                vertices = placed(self._meshes[body[0]], scene.dimensions[i], object_pose(scene, i))
-                params[f"{_body_name(body)}.vertex_positions"] = _floats(vertices)
-                names[first + offset] = scene.names[i]
-                velocity[first + offset] = scene.velocity[i]
+                self._vertices[rows] = placed(mesh, scene.dimensions[i], object_pose(scene, i))
+                names[number], velocity[number] = scene.names[i], scene.velocity[i]
             elif body in self._standing:
-                params[f"{_body_name(body)}.vertex_positions"] = _floats(self._shrunk(body))
+                self._vertices[rows] = self._middle
         if standing or self._standing:
+            params = self._scene.mi_scene_params
+            params[f"{_SKIN}.vertex_positions"] = _floats(self._vertices)
             params.update()
         self._standing = frozenset(standing)
         return tuple(names), velocity
 
-    def object_index(self, shapes: Int64Array) -> Int32Array:
-        """Index into the names of `place` of each process-local shape id; −1 for no shape."""
+    def object_index(self, shapes: Int64Array, primitives: Int64Array) -> Int32Array:
+        """Index into the names of `place` of triangles of process-local shapes; −1 for no shape."""
         where = np.minimum(np.searchsorted(self._ids, shapes), len(self._ids) - 1)
-        found = self._ids[where] == shapes
-        return np.where(found, self._by_id[where], -1).astype(np.int32)
+        piece = np.searchsorted(self._first_triangles, self._offsets[where] + primitives, side="right") - 1
+        return np.where(self._ids[where] == shapes, piece, -1).astype(np.int32)
 
-    def _shrunk(self, body: Body) -> Float64Array:
-        centre = (self.low + self.high) / 2
-        return np.broadcast_to(centre, self._meshes[body[0]].vertices.shape)
+    @property
+    def _middle(self) -> Float64Array:
+        return (self.low + self.high) / 2
 
-    def _add_bodies(self, material: str) -> None:
-        from sionna.rt import ITURadioMaterial, RadioMaterial, SceneObject
+    def _moving_shapes(self, itu_type: str) -> list[_Shape]:
+        """The box around the parked receivers, and last the moving bodies; one shape where both are metal."""
+        from sionna.rt import ITURadioMaterial, RadioMaterial
 
-        metal = RadioMaterial("caviar-parking-wall", conductivity=1e7)
         x, y, z = self.parking
         h = _HALF_BOX
-        parking = box((x - h, x + h), (y - h, y + h), (z - h, z + h))
-        added = [SceneObject(mi_mesh=_mi_mesh(_PARKING, parking, parking.vertices), radio_material=metal)]
-        if self._bodies:
-            skin = ITURadioMaterial("caviar-body", material, 0.1)
-            for body in self._bodies:
-                mesh = _mi_mesh(_body_name(body), self._meshes[body[0]], self._shrunk(body))
-                added.append(SceneObject(mi_mesh=mesh, radio_material=skin))
-        self._scene.edit(add=added)
+        walls = box((x - h, x + h), (y - h, y + h), (z - h, z + h))
+        names = [f"{_SKIN}-{asset or 'box'}-{slot}" for asset, slot in self._bodies]
+        bodies = [
+            Mesh(np.tile(self._middle, (len(mesh.vertices), 1)), mesh.faces)
+            for mesh in (self._meshes[asset] for asset, _ in self._bodies)
+        ]
+        if bodies:
+            skin = ITURadioMaterial(f"{_SKIN}-skin", itu_type, 0.1)
+            if itu_type == "metal":
+                return [_Shape(_SKIN, skin, [_PARKING, *names], [walls, *bodies])]
+        closed = _Shape(_PARKING, RadioMaterial(f"{_PARKING}-walls", conductivity=1e7), [_PARKING], [walls])
+        return [closed, _Shape(_SKIN, skin, names, bodies)] if bodies else [closed]
+
+    def _replace_shapes(self, shapes: Sequence[_Shape]) -> None:
+        """Put these shapes in place of what was loaded, and number their triangles."""
+        from sionna.rt import SceneObject
+
+        added = [SceneObject(mi_mesh=_mi_mesh(shape), radio_material=shape.material) for shape in shapes]
+        self._scene.edit(add=added, remove=list(self._scene.objects))
+        counts = [[len(mesh.faces) for mesh in shape.meshes] for shape in shapes]
+        totals = np.array([sum(count) for count in counts], np.int64)
+        ids = np.array([item.object_id for item in added], np.int64)
+        order = np.argsort(ids)
+        self._ids = ids[order]
+        self._offsets = (np.cumsum(totals) - totals)[order]
+        faces = np.concatenate([np.array(count, np.int64) for count in counts])
+        self._first_triangles = np.cumsum(faces) - faces
+        self._names = tuple(name for shape in shapes for name in shape.names)
 
 
 def _load(description: Path | None, weld: bool) -> Any:
@@ -138,7 +175,6 @@ def _load(description: Path | None, weld: bool) -> Any:
     if description is not None:
         read_scenery(description)  # says what is wrong with a file before the renderer does
     try:
-        # Merged shapes would lose the names that paths refer to.
         return load_scene(
             None if description is None else str(description),
             merge_shapes=False,
@@ -149,12 +185,19 @@ def _load(description: Path | None, weld: bool) -> Any:
 
 
 def _bounds(scene: Any) -> tuple[Float64Array, Float64Array]:
-    box = scene.mi_scene.bbox()
-    return np.array(box.min, np.float64).reshape(3), np.array(box.max, np.float64).reshape(3)
+    bounds = scene.mi_scene.bbox()
+    return np.array(bounds.min, np.float64).reshape(3), np.array(bounds.max, np.float64).reshape(3)
 
 
-def _body_name(body: Body) -> str:
-    return f"caviar-body-{body[0] or 'box'}-{body[1]}".replace(".", "_")
+def _by_material(scene: Any) -> list[_Shape]:
+    """What was loaded, joined to one shape a material."""
+    groups: dict[str, _Shape] = {}
+    for name, item in scene.objects.items():
+        material = item.radio_material
+        group = groups.setdefault(material.name, _Shape(f"caviar-scenery-{material.name}", material, [], []))
+        group.names.append(name)
+        group.meshes.append(_mesh_of(item.mi_mesh))
+    return list(groups.values())
 
 
 def _unit_mesh(asset: str, assets: Mapping[str, Path]) -> Mesh:
@@ -167,9 +210,14 @@ def _unit_mesh(asset: str, assets: Mapping[str, Path]) -> Mesh:
         known = ", ".join(sorted(name for name in assets if name.startswith("objects/"))) or "none"
         raise AssetError(f"there is no mesh {asset!r} among the assets; object meshes: {known}")
     try:
-        shape = mi.load_dict({"type": "ply", "filename": str(path), "face_normals": True})
+        return _mesh_of(mi.load_dict({"type": "ply", "filename": str(path), "face_normals": True}))
     except RuntimeError as error:
         raise AssetError(f"mesh {asset!r} ({path}) cannot be read: {error}") from error
+
+
+def _mesh_of(shape: Any) -> Mesh:
+    import mitsuba as mi
+
     params = mi.traverse(shape)
     return Mesh(
         np.array(params["vertex_positions"], np.float64).reshape(-1, 3),
@@ -177,16 +225,19 @@ def _unit_mesh(asset: str, assets: Mapping[str, Path]) -> Mesh:
     )
 
 
-def _mi_mesh(name: str, mesh: Mesh, vertices: Float64Array) -> Any:
+def _mi_mesh(shape: _Shape) -> Any:
     import mitsuba as mi
 
+    counts = np.array([len(mesh.vertices) for mesh in shape.meshes])
+    before = np.cumsum(counts) - counts
+    faces = np.concatenate([mesh.faces + begin for mesh, begin in zip(shape.meshes, before, strict=True)])
     properties = mi.Properties()
-    properties.set_id(name)
+    properties.set_id(shape.id)
     properties["face_normals"] = True
-    made = mi.Mesh(name, len(mesh.vertices), len(mesh.faces), props=properties)
+    made = mi.Mesh(shape.id, int(counts.sum()), len(faces), props=properties)
     params = mi.traverse(made)
-    params["vertex_positions"] = _floats(vertices)
-    params["faces"] = mi.UInt(np.ascontiguousarray(mesh.faces, np.uint32).ravel())
+    params["vertex_positions"] = _floats(np.concatenate([mesh.vertices for mesh in shape.meshes]))
+    params["faces"] = mi.UInt(np.ascontiguousarray(faces, np.uint32).ravel())
     params.update()
     return made
 

@@ -17,7 +17,6 @@ from caviar_protocol.arrays import (
     BoolArray,
     Complex128Array,
     Float64Array,
-    Int32Array,
     Int64Array,
     UInt8Array,
 )
@@ -63,7 +62,7 @@ class Traced:
     """`Interaction` of each point, Shape ``[P, D]``."""
     shapes: Int64Array
     """Process-local id of the shape at each point, Shape ``[P, D]``."""
-    primitives: Int32Array
+    primitives: Int64Array
     """Triangle of that shape, Shape ``[P, D]``."""
     points: Float64Array
     """Interaction points [m], Shape ``[P, D, 3]``."""
@@ -179,7 +178,7 @@ def _read(
             transfer=np.zeros((0, 3, 3), np.complex128),
             types=np.zeros((0, max_depth), np.uint8),
             shapes=np.zeros((0, max_depth), np.int64),
-            primitives=np.zeros((0, max_depth), np.int32),
+            primitives=np.zeros((0, max_depth), np.int64),
             points=np.zeros((0, max_depth, 3)),
             limit_reached=limit_reached,
         )
@@ -198,7 +197,7 @@ def _read(
         transfer=_dyad(jones, transmitter, receivers[receiver], points, types),
         types=types,
         shapes=buffer.shapes.numpy()[:, :max_depth].astype(np.int64),
-        primitives=buffer.primitives.numpy()[:, :max_depth].astype(np.int32),
+        primitives=buffer.primitives.numpy()[:, :max_depth].astype(np.int64),
         points=points,
         limit_reached=limit_reached,
     )
