@@ -109,11 +109,11 @@ class Welcome(_Message, frozen=True, kw_only=True, tag="WELCOME"):
 
 
 class Refuse(_Message, frozen=True, kw_only=True, tag="REFUSE"):
-    """Broker to service, at HELLO or READY: you cannot take part. The service exits with a status
-    other than 0."""
+    """Broker to service, answers HELLO: you cannot take part. The service exits with a status other
+    than 0."""
 
     code: Word
-    """``version``, ``name-taken``, ``unknown-name``, ``declaration``, ``clash``, ``geometry``, ``late``."""
+    """``version``, ``name-taken``, ``unknown-name``, ``declaration``, ``late``."""
     message: Text
     """What is wrong, naming both sides of a contradiction, and what to change."""
 
@@ -211,7 +211,7 @@ class Grant(_Message, frozen=True, kw_only=True, tag="GRANT"):
     t_ns: Nanoseconds
     """Time of the frame."""
     budget_ns: Duration = 0
-    """From the receipt of the GRANT to the deadline; 0: none."""
+    """The service's budget for a frame; what follows when it is up says its policy (clause 9); 0: none."""
     inputs: Annotated[tuple[GrantInput, ...], few] = ()
     """Every declared input and each of its sources, those that are absent too."""
     final: bool = False

@@ -16,7 +16,9 @@ class BeamChoice(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, 
     """
 
     tx: str
+    """Transmitting device."""
     rx: str
+    """Receiving device."""
     tx_beam: Annotated[int, quantity("1", "index into the transmitter's codebook", ge=0)]
     rx_beam: Annotated[int, quantity("1", "index into the receiver's codebook", ge=0)] = 0
     carrier: str = ""
@@ -27,7 +29,9 @@ class WaypointCommand(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=T
     """Fly or drive an object to a point. The actuator is ``motion:<object>``."""
 
     object: str
+    """Object to be moved."""
     position: Vector3
+    """Where to."""
     speed: Annotated[float, quantity("m/s", "at most", gt=0)]
 
 
@@ -35,6 +39,7 @@ class VelocityCommand(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=T
     """Give an object a velocity. The actuator is ``motion:<object>``."""
 
     object: str
+    """Object to be moved."""
     velocity: Annotated[tuple[float, float, float], quantity("m/s", "in world axes")]
 
 
@@ -42,7 +47,9 @@ class UserSchedule(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
     """Let a transmitter serve one receiver in this frame. The actuator is ``schedule:<tx>``."""
 
     tx: str
+    """Transmitting device."""
     rx: str
+    """Device that it serves."""
 
 
 Command = BeamChoice | WaypointCommand | VelocityCommand | UserSchedule
@@ -55,3 +62,4 @@ class Action(Payload, frozen=True, kw_only=True, omit_defaults=True):
     """
 
     commands: tuple[Command, ...]
+    """Told apart by their ``type``."""

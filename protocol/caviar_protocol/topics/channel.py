@@ -37,6 +37,7 @@ class Carrier(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """One radio carrier."""
 
     name: str
+    """Unique in the run."""
     frequency_hz: Annotated[float, quantity("Hz", "centre frequency", gt=0)]
     bandwidth_hz: Annotated[float, quantity("Hz", "noise and rate bandwidth", gt=0)] = 100e6
 
@@ -45,10 +46,15 @@ class ChannelOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=Tr
     """What a ray-traced product modelled. Defaults say: nothing but line of sight."""
 
     los: bool = True
+    """The direct path."""
     reflection: bool = False
+    """Specular reflection."""
     refraction: bool = False
+    """Passing through objects."""
     diffraction: bool = False
+    """Bending around edges."""
     scattering: bool = False
+    """Diffuse reflection."""
     max_depth: Annotated[int, quantity("1", "interactions of a path at most", ge=0)] = 0
     samples: Annotated[int, quantity("1", "rays launched per transmitter", ge=0)] = 0
 
@@ -80,10 +86,12 @@ class Channel(Payload, frozen=True, kw_only=True, omit_defaults=True):
     rung: str
     """Step of the fidelity ladder: ``free-space``, ``geometric``, ``siso-rt``, ``spherical``, ``mimo-rt``."""
     options: ChannelOptions = ChannelOptions()
+    """What was modelled."""
     expected_error_db: Annotated[
         float | None, quantity("dB", "expected NMSE of H against the next rung; absent: unknown")
     ] = None
     carriers: tuple[Carrier, ...]
+    """The carriers that axis C counts."""
     tx: tuple[str, ...]
     """Names of the transmitting devices, sorted."""
     rx: tuple[str, ...]

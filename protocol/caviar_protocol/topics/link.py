@@ -33,8 +33,11 @@ class Link(Payload, frozen=True, kw_only=True, omit_defaults=True):
     sizes_from: ClassVar[dict[str, tuple[str, ...]]] = {"U": ("tx", "rx", "carrier")}
 
     tx: tuple[str, ...]
+    """Transmitting device of each user."""
     rx: tuple[str, ...]
+    """Receiving device of each user."""
     carrier: tuple[str, ...]
+    """Name of each user's carrier."""
     has_path: Annotated[BoolArray, array("|b1", "U", unit="1", doc="at least one path reaches the user")]
     los: Annotated[BoolArray, array("|b1", "U", unit="1", doc="line of sight is free")]
     tx_beam: Annotated[Int32Array, array("<i4", "U", unit="1", doc="chosen TX beam; −1: none chosen")]

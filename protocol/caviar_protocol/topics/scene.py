@@ -22,7 +22,9 @@ class AntennaArray(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
     vertical_spacing: Annotated[float, quantity("wavelengths", "between rows", gt=0)] = 0.5
     horizontal_spacing: Annotated[float, quantity("wavelengths", "between columns", gt=0)] = 0.5
     pattern: Literal["iso", "dipole", "hw_dipole", "tr38901"] = "iso"
+    """Of each element: isotropic, short dipole, half-wave dipole, 3GPP TR 38.901."""
     polarization: Literal["V", "H"] = "V"
+    """Of each element: vertical (along the device's z) or horizontal (along its y)."""
 
     @property
     def size(self) -> int:
@@ -38,16 +40,22 @@ class _Device(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """
 
     name: str
+    """Unique among objects and devices: ``<object>/<name>`` where it is mounted."""
     parent: str = ""
+    """Object that it is mounted on; empty: fixed in the world."""
     position: Vector3 = (0.0, 0.0, 0.0)
+    """Relative to the parent: x forward, y left, z up."""
     orientation: Quaternion = (1.0, 0.0, 0.0, 0.0)
+    """Relative to the parent: rotates the device's axes into the parent's."""
 
 
 class AntennaDevice(_Device, frozen=True, kw_only=True, omit_defaults=True, tag="antenna"):
     """A radio transmitter, receiver, or both, with one antenna array."""
 
     role: Literal["tx", "rx", "both"]
+    """Transmits, receives, or both."""
     array: AntennaArray = AntennaArray()
+    """Its elements."""
     power_dbm: Annotated[float, quantity("dBm", "transmit power; unused by a receiver")] = 0.0
 
 

@@ -40,15 +40,18 @@ class LidarScan(Payload, frozen=True, kw_only=True, omit_defaults=True):
     """
 
     sensor: str
+    """Name of the device."""
     position: Vector3
     """Pose of the sensor in the world at this frame."""
     orientation: Quaternion
+    """Rotates the sensor's axes into world axes."""
     ray: Annotated[Int32Array, array("<i4", "N", unit="1", doc="index of the ray")]
     points: Annotated[Float32Array, array("<f4", "N", 3, unit="m", doc="hit, sensor axes")]
     points_world: Annotated[Float32Array, array("<f4", "N", 3, unit="m", doc="hit, world axes")]
     range: Annotated[Float32Array, array("<f4", "N", unit="m", doc="distance to the hit")]
     object: Annotated[Int32Array, array("<i4", "N", unit="1", doc="index into object_names")]
     grid: OccupancyGrid | None = None
+    """Where part ``grid`` is in demand."""
 
 
 class Lidar(Payload, frozen=True, kw_only=True, omit_defaults=True):
@@ -57,6 +60,7 @@ class Lidar(Payload, frozen=True, kw_only=True, omit_defaults=True):
     object_names: tuple[str, ...]
     """What `LidarScan.object` points into: moving objects and scenery by name."""
     scans: tuple[LidarScan, ...]
+    """One a sensor."""
 
 
 class Intrinsics(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -73,9 +77,13 @@ class _Image(Payload, frozen=True, kw_only=True, omit_defaults=True):
     """Which sensor, with which optics, from where."""
 
     sensor: str
+    """Name of the device."""
     intrinsics: Intrinsics
+    """How its camera projects."""
     position: Vector3
+    """Pose of the sensor in the world at this frame."""
     orientation: Quaternion
+    """Rotates the device's axes (it looks along +x, +z up) into world axes."""
 
 
 class CameraImage(_Image, frozen=True, kw_only=True, omit_defaults=True):
@@ -88,6 +96,7 @@ class Camera(Payload, frozen=True, kw_only=True, omit_defaults=True):
     """RGB images of all cameras of a service, sorted by sensor name."""
 
     images: tuple[CameraImage, ...]
+    """One a camera."""
 
 
 class DepthImage(_Image, frozen=True, kw_only=True, omit_defaults=True):
@@ -103,6 +112,7 @@ class Depth(Payload, frozen=True, kw_only=True, omit_defaults=True):
     """Depth images of all cameras of a service, sorted by sensor name."""
 
     images: tuple[DepthImage, ...]
+    """One a camera."""
 
 
 class SegmentationImage(_Image, frozen=True, kw_only=True, omit_defaults=True):
@@ -119,7 +129,9 @@ class Segmentation(Payload, frozen=True, kw_only=True, omit_defaults=True):
     """Segmentation images of all cameras of a service, sorted by sensor name."""
 
     object_names: tuple[str, ...]
+    """What `SegmentationImage.object` points into: moving objects and scenery by name."""
     material_names: Annotated[
         tuple[str, ...], quantity("1", "names of materials; empty unless part ``materials``")
     ] = ()
     images: tuple[SegmentationImage, ...]
+    """One a camera."""
