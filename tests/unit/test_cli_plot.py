@@ -46,6 +46,12 @@ def test_another_frame_gives_another_map(tmp_path):
     assert plot_run(run, tmp_path / "c", frame=3)[0].read_bytes() != first
 
 
+def test_by_default_the_map_shows_the_middle_of_the_frames_with_line_of_sight(tmp_path):
+    run = record(tmp_path / "run", frames=6)  # the sample is NLOS in frames 0 and 5
+    chosen = plot_run(run, tmp_path / "a")[0].read_bytes()
+    assert plot_run(run, tmp_path / "b", frame=3)[0].read_bytes() == chosen
+
+
 def test_a_frame_or_user_that_is_not_there_is_refused(tmp_path):
     run = full(tmp_path / "run")
     with pytest.raises(RecordingError, match="no frame 99 of episode 0"):

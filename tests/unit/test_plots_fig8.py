@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 from recording_samples import absent, frame, link, product, record, recorder
 
-from caviar_clients.plots.fig8 import choose_user, draw_over_angle, draw_over_time, series
+from caviar_clients.plots.fig8 import (
+    _shade,
+    _without_jumps,
+    choose_user,
+    draw_over_angle,
+    draw_over_time,
+    series,
+)
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.recording import Recording
 
@@ -91,10 +98,14 @@ def test_the_pictures_are_drawn_whatever_is_missing(tmp_path, users):
             assert len(np.unique(np.asarray(picture.convert("L")))) > 20
 
 
+def test_an_angle_that_passes_180_degrees_leaves_a_gap():
+    time, degrees = _without_jumps(np.arange(4.0), np.array([170.0, 179.0, -178.0, -170.0]))
+    np.testing.assert_array_equal(time, [0, 1, 2, 2, 3])
+    np.testing.assert_array_equal(degrees, [170, 179, np.nan, -178, -170])
+
+
 def test_nlos_frames_are_shaded(tmp_path):
     data = series(with_links(tmp_path / "run", [3] * 11), USER)  # NLOS in frames 0, 5, 10
-    from caviar_clients.plots.fig8 import _shade
-
     spans: list[tuple[float, float, str | None]] = []
 
     class Axes:

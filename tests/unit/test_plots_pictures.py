@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import numpy as np
 import pytest
 from recording_samples import channel, lidar, link, scene
@@ -106,6 +107,14 @@ def test_the_view_holds_everything_and_is_never_tiny():
     (left, right), (bottom, top) = _view(single, None)
     assert right - left >= 40.0
     assert top - bottom >= 40.0
+
+
+def test_a_ray_that_strays_far_does_not_shrink_the_picture():
+    far = channel(2)
+    points = far.points.copy()
+    points[1, 0] = [900.0, 30.0, 0.0]
+    (left, right), _ = _view(a_map(channel=msgspec.structs.replace(far, points=points)), None)
+    assert right - left < 100.0
 
 
 def test_names_lose_what_all_have_in_common():

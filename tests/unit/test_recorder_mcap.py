@@ -168,12 +168,8 @@ def test_log_time_grows_over_episodes_that_each_start_at_zero(tmp_path):
 
 def test_segments_rotate_by_size_and_by_frames(tmp_path):
     record(tmp_path / "frames", frames=7, segment_frames=3)
-    assert sorted(p.name for p in (tmp_path / "frames").iterdir()) == [
-        "assets",
-        *(f"recording-{i:04d}.mcap" for i in range(3)),
-    ] or sorted(p.name for p in (tmp_path / "frames").iterdir()) == [
-        f"recording-{i:04d}.mcap" for i in range(3)
-    ]
+    files = sorted(p.name for p in (tmp_path / "frames").glob("*.mcap"))
+    assert files == [f"recording-{i:04d}.mcap" for i in range(3)]
     record(tmp_path / "size", frames=20, segment_mib=0.01)
     sizes = [p.stat().st_size for p in (tmp_path / "size").glob("*.mcap")]
     assert len(sizes) > 3
@@ -253,7 +249,10 @@ def test_a_write_that_fails_ends_the_run_with_path_and_errno_and_leaves_a_readab
     assert "recording-0000.mcap: File too large (errno 27)" in first
     assert again.removeprefix("again ") == first.split(" ", 1)[1]
     recording = Recording(tmp_path)
-    assert len(recording) == int(first.split()[0]) > 0
+    acknowledged = int(first.split()[0])
+    assert acknowledged > 0
+    # The write may have broken off behind the frame, in its index.
+    assert len(recording) in (acknowledged, acknowledged + 1)
     assert not recording.complete
 
 

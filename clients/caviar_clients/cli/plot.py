@@ -116,15 +116,15 @@ def _scenery(recording: Recording) -> Footprints | None:
 def _frame(
     recording: Recording, number: int | None, topic: str, user: tuple[str, str, str] | None
 ) -> RecordedFrame:
-    """The frame asked for, or the middle one of those with the topic, with the user where possible."""
+    """The frame asked for, or the middle one of those with the topic in which the user sees most."""
     if number is not None:
         return recording.frame(0, number)
     candidates = list(recording.frames())
     for wanted in ("scene", topic):
         with_topic = [frame for frame in candidates if _has(frame, wanted)]
         candidates = with_topic or candidates
-    with_user = [frame for frame in candidates if user is not None and _serves(frame, user)]
-    candidates = with_user or candidates
+    ranks = [_worth(frame, user) for frame in candidates]
+    candidates = [frame for frame, rank in zip(candidates, ranks, strict=True) if rank == max(ranks)]
     return candidates[len(candidates) // 2]
 
 
@@ -132,10 +132,14 @@ def _has(frame: RecordedFrame, topic: str) -> bool:
     return any(entry.topic == topic and entry.status in ("fresh", "held") for entry in frame.inputs)
 
 
-def _serves(frame: RecordedFrame, user: tuple[str, str, str]) -> bool:
-    return any(
-        user in zip(link.tx, link.rx, link.carrier, strict=True) for link in frame.of("link", Link).values()
-    )
+def _worth(frame: RecordedFrame, user: tuple[str, str, str] | None) -> int:
+    """3: the user has a line of sight, 2: a path, 1: is there, 0: is not."""
+    for link in frame.of("link", Link).values() if user is not None else ():
+        users = list(zip(link.tx, link.rx, link.carrier, strict=True))
+        if user in users:
+            index = users.index(user)
+            return 1 + int(link.has_path[index]) + int(link.has_path[index] and link.los[index])
+    return 0
 
 
 def _agent(recording: Recording) -> str:

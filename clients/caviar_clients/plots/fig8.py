@@ -100,14 +100,19 @@ def draw_over_time(data: UserSeries, agent: str, file: Path) -> None:
     with figure(file, 9.0, 6.0) as drawn:
         top, bottom = drawn.subplots(2, 1, sharex=True, height_ratios=(3, 2))
         for label, values, style in _curves(data, agent):
-            top.plot(data.time, values, label=f"{label}, mean {_mean(data, values):.3g}", **style)
+            top.plot(
+                data.time,
+                np.where(data.has_path, values, np.nan),
+                label=f"{label}, mean {_mean(data, values):.3g}",
+                **style,
+            )
         for axes in (top, bottom):
             _shade(axes, data)
             axes.grid(color=LIGHT_GREY, linewidth=0.6)
         top.set_ylabel("|y|")
         top.set_ylim(bottom=0)
         top.set_title(f"Beam selection for {data.rx}, served by {data.tx} ({data.carrier})")
-        bottom.plot(data.time, np.degrees(_unwrapped(data.theta)), color=GREY, linewidth=1.6)
+        bottom.plot(*_without_jumps(data.time, np.degrees(_wrapped(data.theta))), color=GREY, linewidth=1.6)
         bottom.set_ylabel("AoA θ [°]")
         bottom.set_xlabel("Time [s]")
         bottom.margins(x=0)
@@ -118,7 +123,7 @@ def draw_over_angle(data: UserSeries, agent: str, file: Path) -> None:
     """|y| over the angle of arrival, a point a frame; hollow where the line of sight is blocked."""
     with figure(file, 9.0, 5.0) as drawn:
         axes = drawn.subplots()
-        theta = np.degrees(_unwrapped(data.theta))
+        theta = np.degrees(_wrapped(data.theta))
         for label, values, style in _curves(data, agent):
             color = style["color"]
             for mask, face in ((data.has_path & data.los, color), (data.has_path & ~data.los, "none")):
@@ -170,14 +175,16 @@ def _mean(data: UserSeries, values: Float64Array) -> float:
     return float(with_path.mean()) if len(with_path) else 0.0
 
 
-def _unwrapped(theta: Float64Array) -> Float64Array:
-    """Angles without jumps by a turn, NaN kept, the median within ±π."""
-    result: Float64Array = theta.copy()
-    known = ~np.isnan(theta)
-    result[known] = np.unwrap(theta[known])
-    if known.any():
-        result -= 2 * np.pi * np.round(np.median(result[known]) / (2 * np.pi))
+def _wrapped(theta: Float64Array) -> Float64Array:
+    """Angles within ±π."""
+    result: Float64Array = np.arctan2(np.sin(theta), np.cos(theta))
     return result
+
+
+def _without_jumps(time: Float64Array, degrees: Float64Array) -> tuple[Float64Array, Float64Array]:
+    """The same with a gap where an angle passes ±180°, so that no line crosses the picture."""
+    jumps = np.flatnonzero(np.abs(np.diff(degrees)) > 180) + 1
+    return np.insert(time, jumps, time[jumps]), np.insert(degrees, jumps, np.nan)
 
 
 def _row(link: Link | None, user: tuple[str, str, str]) -> tuple[float, ...]:

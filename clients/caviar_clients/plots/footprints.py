@@ -12,7 +12,7 @@ import numpy as np
 from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_protocol.errors import AssetError
 
-_STEEP = 0.3
+_STEEP = 0.1
 """A face is a wall where the vertical part of its unit normal is smaller."""
 
 _GROUND_WALLS = 0.02
@@ -109,10 +109,7 @@ def read_ply(file: Path) -> tuple[Float64Array, Int64Array]:
         head, mark, rest = data.partition(b"end_header")
         if not head.startswith(b"ply") or not mark:
             raise AssetError(f"{file} is not a PLY mesh; its first bytes are {data[:8]!r}")
-        vertices, faces = _parse(_header(head.decode("ascii")), rest[rest.index(b"\n") + 1 :])
-        if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
-            raise ValueError(f"faces refer to vertices {faces.min()} to {faces.max()} of {len(vertices)}")
-        return vertices, faces  # noqa: TRY300 - one try for all that a broken file can raise
+        return _checked(*_parse(_header(head.decode("ascii")), rest[rest.index(b"\n") + 1 :]))
     except OSError as error:
         raise AssetError(f"{file} cannot be read: {error.strerror}") from error
     except (ValueError, KeyError, IndexError, StopIteration) as error:
@@ -157,6 +154,12 @@ def _parse(header: _Header, data: bytes) -> tuple[Float64Array, Int64Array]:
     table = np.frombuffer(data, record, count)
     vertices = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=-1)
     return vertices, _binary_faces(header, data[count * record.itemsize :], faces)
+
+
+def _checked(vertices: Float64Array, faces: Int64Array) -> tuple[Float64Array, Int64Array]:
+    if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
+        raise ValueError(f"faces refer to vertices {faces.min()} to {faces.max()} of {len(vertices)}")
+    return vertices, faces
 
 
 def _binary_faces(header: _Header, data: bytes, count: int) -> Int64Array:

@@ -68,20 +68,21 @@ def draw_map(data: MapData, file: Path) -> None:
 
 
 def _view(data: MapData, beam: _Beam | None) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Limits of x and y [m]: objects, devices, ray points and the beam, with a margin; at least 40 m."""
-    points = [data.scene.position[:, :2]]
-    points += [np.array([device_pose(data.scene, device).position[:2]]) for device in data.scene.devices]
+    """Limits of x and y [m]: objects, devices and the beam, ray points unless far off; at least 40 m."""
+    devices = [device_pose(data.scene, device).position[:2] for device in data.scene.devices]
+    core = np.concatenate([data.scene.position[:, :2], np.array(devices).reshape(-1, 2)])
+    if beam is not None:
+        core = np.concatenate([core, beam.outline])
+    if not len(core):
+        core = np.zeros((1, 2))
+    low, high = core.min(axis=0), core.max(axis=0)
     if data.channel is not None:
         used = data.channel.interactions != Interaction.NONE
-        points.append(data.channel.points[used][:, :2])
-    if beam is not None:
-        points.append(beam.outline)
-    everything = np.concatenate(points)
-    if not len(everything):
-        everything = np.zeros((1, 2))
-    low, high = everything.min(axis=0), everything.max(axis=0)
+        reach = 0.25 * float((high - low).max())
+        points = np.clip(data.channel.points[used][:, :2], low - reach, high + reach)
+        low, high = np.min([low, *points], axis=0), np.max([high, *points], axis=0)
     centre, half = (low + high) / 2, np.maximum((high - low) / 2 * 1.08 + 5.0, 20.0)
-    half = np.maximum(half, half.max() * 0.4)
+    half = np.maximum(half, half.max() * np.array([0.9, 0.4]))  # neither a tower nor a strip
     left, bottom = (centre - half).tolist()
     right, top = (centre + half).tolist()
     return (left, right), (bottom, top)
@@ -208,6 +209,12 @@ def _draw_objects(axes: Any, data: MapData) -> None:
     colors = [ORANGE if name in carriers else SKY for name in scene.names]
     axes.add_collection(PolyCollection(boxes, facecolors=colors, edgecolors=BLACK, linewidths=0.7, zorder=4))
     axes.add_collection(PolyCollection(fronts, facecolors=BLACK, linewidths=0, zorder=4.1))
+    (left, right), smallest = axes.get_xlim(), scene.dimensions[:, :2].max(axis=1)
+    tiny = np.flatnonzero(smallest < 0.012 * (right - left))
+    axes.scatter(
+        *scene.position[tiny, :2].T, marker="s", s=42, c=[colors[i] for i in tiny], edgecolors=BLACK,
+        linewidths=0.7, zorder=3.9,
+    )  # fmt: skip
     for color, label in ((ORANGE, "object with a device"), (SKY, "other object")):
         if color in colors:
             axes.scatter([], [], marker="s", s=60, color=color, edgecolors=BLACK, linewidths=0.7, label=label)
