@@ -18,7 +18,12 @@ from caviar_protocol.arrays import Float64Array, Int32Array, Int64Array
 from caviar_protocol.errors import AssetError, PayloadError
 from caviar_protocol.scene import object_pose
 from caviar_protocol.topics import Scene
-from caviar_services.channel.sionna_materials import MaterialSettings, OutsideRange, set_materials
+from caviar_services.channel.sionna_materials import (
+    MaterialSettings,
+    OutsideRange,
+    itu_constants,
+    set_materials,
+)
 from caviar_services.meshes import BodyPool, Mesh, box, placed, unit_box
 from caviar_services.scenery import find_scenery, read_scenery
 
@@ -64,6 +69,9 @@ class SionnaScene:
     """
 
     def __init__(self, assets: Mapping[str, Path], pool: Mapping[str, int], settings: SceneSettings) -> None:
+        skin = itu_constants(
+            "body_material", settings.body_material, settings.frequency_hz, settings.outside_itu_range
+        )
         self._scene = _load(find_scenery(assets), settings.weld)
         self._scenery = frozenset(self._scene.objects)
         self.low, self.high = _bounds(self._scene) if self._scenery else (np.zeros(3), np.zeros(3))
@@ -71,7 +79,7 @@ class SionnaScene:
         self._meshes = {asset: _unit_mesh(asset, assets) for asset in pool}
         self._bodies: list[Body] = [(asset, slot) for asset in sorted(pool) for slot in range(pool[asset])]
         self._standing: frozenset[Body] = frozenset()
-        moving = self._moving_shapes(settings.body_material)
+        moving = self._moving_shapes(skin, settings.body_material == "metal")
         self._vertices = np.concatenate([np.zeros((0, 3)), *(mesh.vertices for mesh in moving[-1].meshes)])
         self._replace_shapes([*_by_material(self._scene), *moving])
         set_materials(self._scene, settings.frequency_hz, settings.materials, settings.outside_itu_range)
@@ -133,9 +141,9 @@ class SionnaScene:
     def _middle(self) -> Float64Array:
         return (self.low + self.high) / 2
 
-    def _moving_shapes(self, itu_type: str) -> list[_Shape]:
+    def _moving_shapes(self, constants: tuple[float, float], metal: bool) -> list[_Shape]:
         """The box around the parked receivers, and last the moving bodies; one shape where both are metal."""
-        from sionna.rt import ITURadioMaterial, RadioMaterial
+        from sionna.rt import RadioMaterial
 
         x, y, z = self.parking
         h = _HALF_BOX
@@ -146,8 +154,8 @@ class SionnaScene:
             for mesh in (self._meshes[asset] for asset, _ in self._bodies)
         ]
         if bodies:
-            skin = ITURadioMaterial(f"{_SKIN}-skin", itu_type, 0.1)
-            if itu_type == "metal":
+            skin = RadioMaterial(f"{_SKIN}-skin", 0.1, *constants)
+            if metal:
                 return [_Shape(_SKIN, skin, [_PARKING, *names], [walls, *bodies])]
         closed = _Shape(_PARKING, RadioMaterial(f"{_PARKING}-walls", conductivity=1e7), [_PARKING], [walls])
         return [closed, _Shape(_SKIN, skin, names, bodies)] if bodies else [closed]

@@ -1,0 +1,227 @@
+"""The ray-traced service: settings, what it refuses and how it says so."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from caviar_protocol.errors import AssetError, PayloadError, ScenarioError
+from caviar_protocol.messages import GrantInput, Status
+from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.topics import AntennaDevice, Carrier, Channel, Scene
+from caviar_services.channel.sionna_rt import SionnaChannel, SionnaSettings
+from caviar_services.registry import load
+from caviar_services.service import Frame, FrameInput, Preparation, RunInfo, StepResult
+
+RX = DeviceSpec(name="rx", kind="antenna", role="rx", on="car.*", count=3)
+PLY = """ply
+format ascii 1.0
+element vertex 3
+property float x
+property float y
+property float z
+element face 1
+property list uchar int vertex_index
+end_header
+-50 -50 0
+50 -50 0
+0 50 0
+3 0 1 2
+"""
+
+
+def scenery(folder: Path, itu_type: str, mesh: str = "floor.ply") -> dict[str, Path]:
+    (folder / "floor.ply").write_text(PLY)
+    (folder / "scene.xml").write_text(
+        f'<scene version="2.1.0"><bsdf type="itu-radio-material" id="skin"><string name="type" '
+        f'value="{itu_type}"/></bsdf><shape type="ply" id="mesh-floor"><string name="filename" '
+        f'value="{mesh}"/><ref id="skin" name="bsdf"/></shape></scene>'
+    )
+    return {"scenery/scene.xml": folder / "scene.xml", "scenery/floor.ply": folder / "floor.ply"}
+
+
+def model(frequency: float = 28e9, **settings: Any) -> SionnaChannel:
+    settings = {"samples": 500, "max_depth": 1, "bodies": 2, **settings}
+    run = RunInfo(name="channel", carriers=(Carrier(name="c", frequency_hz=frequency),), devices=(RX,))
+    return SionnaChannel(msgspec.convert(settings, SionnaSettings), run)
+
+
+def prepared(assets: dict[str, Path] | None = None, **settings: Any) -> SionnaChannel:
+    made = model(**settings)
+    made.prepare(Preparation(demand={"channel": frozenset()}, assets=assets or {}))
+    return made
+
+
+def step(
+    channel: SionnaChannel, names: tuple[str, ...], *devices: AntennaDevice, asset: str = ""
+) -> StepResult:
+    count = len(names)
+    scene = Scene(
+        names=names,
+        classes=("car",) * count,
+        assets=(asset,) * count,
+        position=np.arange(3 * count, dtype=float).reshape(count, 3) * 10,
+        orientation=np.tile([1.0, 0, 0, 0], (count, 1)),
+        velocity=np.zeros((count, 3)),
+        dimensions=np.tile([4.0, 2.0, 1.5], (count, 1)),
+        devices=devices,
+    )
+    source = FrameInput(GrantInput(topic="scene", source="w", status=Status.FRESH), payload=scene)
+    return channel.step(Frame(episode=0, number=0, t_ns=0, inputs=(source,)))
+
+
+def test_it_is_registered_and_says_its_rung() -> None:
+    assert load("channel", "sionna-rt") is SionnaChannel
+    assert model(diffraction=True, samples=77).options.diffraction
+    assert model(samples=77).options.samples == 77
+    assert SionnaChannel.rung == "siso-rt"
+
+
+def test_an_unknown_setting_is_refused_by_name() -> None:
+    with pytest.raises(msgspec.ValidationError, match="max_dept"):
+        model(max_dept=3)
+
+
+def test_two_carriers_are_refused_by_name() -> None:
+    run = RunInfo(
+        name="channel", carriers=(Carrier(name="a", frequency_hz=1e9), Carrier(name="b", frequency_hz=2e9))
+    )
+    with pytest.raises(ScenarioError, match="2: a, b"):
+        SionnaChannel(SionnaSettings(), run)
+
+
+@pytest.mark.channel
+class TestPreparing:
+    """What is wrong with a scenario or its scenery comes out in `prepare`, as one message."""
+
+    def test_the_notes_name_library_and_variant(self) -> None:
+        notes = model().prepare(Preparation(demand={})).notes
+        assert any("LLVM" in note or "cuda" in note for note in notes)
+        assert any("variant" in note for note in notes)
+
+    def test_progress_announces_compilation(self) -> None:
+        told: list[tuple[str, float]] = []
+        carriers = (Carrier(name="c", frequency_hz=1e9),)
+        run = RunInfo(name="c", carriers=carriers, progress=lambda *phase: told.append(phase))
+        SionnaChannel(SionnaSettings(samples=100, bodies=0), run).prepare(Preparation(demand={}))
+        assert next(grace for phase, grace in told if phase == "compiling kernels") >= 30
+
+    def test_a_material_outside_its_range_is_named_with_the_remedies(self, tmp_path: Path) -> None:
+        with pytest.raises(ScenarioError) as caught:
+            prepared(scenery(tmp_path, "brick"), frequency=60e9)
+        for part in ("'skin'", "ITU brick", "1–40 GHz", "60 GHz", "settings.materials.skin", "nearest"):
+            assert part in str(caught.value)
+
+    @pytest.mark.parametrize(
+        "settings",
+        [
+            {"outside_itu_range": "nearest"},
+            {"materials": {"skin": {"relative_permittivity": 4.0, "conductivity_s_per_m": 0.1}}},
+        ],
+    )
+    def test_each_remedy_works(self, tmp_path: Path, settings: dict[str, Any]) -> None:
+        prepared(scenery(tmp_path, "brick"), frequency=60e9, **settings)
+
+    def test_the_end_of_a_range_belongs_to_it(self, tmp_path: Path) -> None:
+        """Marble is defined up to 60 GHz, which float32 rounds up."""
+        prepared(scenery(tmp_path, "marble"), frequency=60e9)
+
+    def test_an_unknown_material_in_the_settings_is_named(self, tmp_path: Path) -> None:
+        with pytest.raises(ScenarioError, match=r"no material 'skim'.*skin"):
+            prepared(scenery(tmp_path, "brick"), materials={"skim": {"thickness_m": 0.2}})
+
+    def test_a_bad_value_of_a_material_is_named(self, tmp_path: Path) -> None:
+        with pytest.raises(ScenarioError, match=r"'skin'.*settings\.materials\.skin"):
+            prepared(scenery(tmp_path, "brick"), materials={"skin": {"scattering_coefficient": 2.0}})
+
+    def test_an_unknown_body_material_is_named(self) -> None:
+        with pytest.raises(ScenarioError, match=r"'aluminium'.*metal"):
+            prepared(body_material="aluminium")
+
+    def test_a_missing_mesh_is_named(self, tmp_path: Path) -> None:
+        with pytest.raises(AssetError, match=r"absent\.ply"):
+            prepared(scenery(tmp_path, "brick", mesh="absent.ply"))
+
+    def test_a_broken_mesh_is_named(self, tmp_path: Path) -> None:
+        assets = scenery(tmp_path, "brick")
+        (tmp_path / "floor.ply").write_text("no mesh")
+        with pytest.raises(AssetError, match=r"floor\.ply"):
+            prepared(assets)
+
+    def test_a_pool_for_a_mesh_that_is_not_there_is_named(self) -> None:
+        with pytest.raises(ScenarioError, match=r"pool: there is no object mesh 'lorry'.*box"):
+            prepared(pool={"lorry": 3})
+
+
+@pytest.fixture(scope="module")
+def channel() -> SionnaChannel:
+    return prepared()
+
+
+@pytest.mark.channel
+class TestFrames:
+    """What a frame may and may not hold."""
+
+    def test_more_objects_than_bodies_name_the_setting(self, channel: SionnaChannel) -> None:
+        with pytest.raises(PayloadError, match="pool size"):
+            step(channel, ("a", "b", "c"))
+
+    def test_an_asset_that_is_not_there_is_named(self, channel: SionnaChannel) -> None:
+        with pytest.raises(PayloadError, match=r"objects/tank\.ply"):
+            step(channel, ("a",), asset="objects/tank.ply")
+
+    def test_an_object_named_like_scenery_is_refused(self, tmp_path: Path) -> None:
+        with pytest.raises(PayloadError, match="'floor'"):
+            step(prepared(scenery(tmp_path, "brick")), ("floor",))
+
+    def test_an_antenna_in_the_middle_of_a_body_is_refused(self, channel: SionnaChannel) -> None:
+        with pytest.raises(PayloadError, match=r"'a/rx'.*roof.*without_body"):
+            step(channel, ("a",), AntennaDevice(name="a/rx", role="rx", parent="a"))
+
+    def test_waves_pass_through_what_has_no_body(self) -> None:
+        """The same antenna, once its class is listed."""
+        ends = (
+            AntennaDevice(name="a/rx", role="rx", parent="a"),
+            AntennaDevice(name="t", role="tx", position=(9.0, 9, 9)),
+        )
+        channel = step(prepared(without_body=["car"]), ("a",), *ends).products["channel"]
+        assert isinstance(channel, Channel)
+        assert channel.los.all()
+
+    @pytest.mark.parametrize("role", ["tx", "rx"])
+    def test_a_frame_without_an_end_is_empty(self, channel: SionnaChannel, role: str) -> None:
+        device = AntennaDevice(name="d", role=role, position=(0.0, 0, 5))  # type: ignore[arg-type]
+        result = step(channel, ("a",), device)
+        assert result.counts["paths"] == 0
+
+    def test_a_device_of_both_roles_does_not_hear_itself(self, tmp_path: Path) -> None:
+        """Not even its echo from the ground below."""
+        device = AntennaDevice(name="d", role="both", position=(0.0, 0, 5))
+        other = AntennaDevice(name="e", role="rx", position=(2.0, 3, 7))
+        channel = step(prepared(scenery(tmp_path, "brick")), (), device, other).products["channel"]
+        assert isinstance(channel, Channel)
+        assert channel.rx == ("d", "e")
+        assert channel.offsets.tolist() == [0, 0, 2]
+
+    def test_without_line_of_sight_paths_the_flag_stays(self) -> None:
+        ends = (
+            AntennaDevice(name="r", role="rx", position=(30.0, 0, 5)),
+            AntennaDevice(name="t", role="tx", position=(0.0, 0, 5)),
+        )
+        channel = step(prepared(los=False), (), *ends).products["channel"]
+        assert isinstance(channel, Channel)
+        assert channel.los.all()
+        assert len(channel.tau) == 0
+
+    def test_candidates_beyond_the_limit_are_counted(self, tmp_path: Path) -> None:
+        ends = (
+            AntennaDevice(name="r", role="rx", position=(10.0, 0, 5)),
+            AntennaDevice(name="s", role="rx", position=(-7.0, 0, 5)),
+            AntennaDevice(name="t", role="tx", position=(0.0, 0, 5)),
+        )
+        result = step(prepared(scenery(tmp_path, "brick"), max_paths=2), (), *ends)
+        assert result.counts["path_limit_reached"] == 1
