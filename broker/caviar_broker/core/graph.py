@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 
 from caviar_protocol.errors import DeclarationError
-from caviar_protocol.messages import Demand, Hello, Input
+from caviar_protocol.messages import Demand, Hello
 
 WILDCARD = "*"
 """Topic of an input that takes every topic (recorders)."""
@@ -78,7 +77,7 @@ def build_graph(hellos: Mapping[str, Hello], record: Iterable[str] = ()) -> Grap
         outputs=outputs,
         demand={
             name: tuple(
-                Demand(topic=topic, parts=_parts(topic, hellos, active, wanted))
+                Demand(topic=topic, parts=_parts(topic, hellos, active - recorders, wanted))
                 for topic in outputs.get(name, ())
             )
             for name in hellos
@@ -107,13 +106,32 @@ def check_actuators(actuators: Mapping[str, Iterable[str]]) -> None:
     claimed = [(pattern, agent) for agent, found in actuators.items() for pattern in found]
     for index, (pattern, agent) in enumerate(claimed):
         for other_pattern, other in claimed[:index]:
-            if other != agent and (
-                fnmatchcase(pattern, other_pattern) or fnmatchcase(other_pattern, pattern)
-            ):
+            if other != agent and _overlap(pattern, other_pattern):
                 raise DeclarationError(
-                    f"agents {other!r} and {agent!r} clash: both own {pattern!r} "
-                    f"({other!r} as {other_pattern!r}); give each its own `users`"
+                    f"agents {other!r} and {agent!r} clash: an actuator may match {other_pattern!r} of the "
+                    f"one and {pattern!r} of the other; give each its own `users`"
                 )
+
+
+def _overlap(a: str, b: str) -> bool:
+    """Whether some name matches both patterns, in which ``*`` is any text and ``?`` any character."""
+    reachable = {(0, 0)}
+    todo = [(0, 0)]
+    while todo:
+        i, j = todo.pop()
+        if i == len(a) and j == len(b):
+            return True
+        head_a, head_b = a[i : i + 1], b[j : j + 1]
+        steps = set()
+        if head_a == "*":
+            steps |= {(i + 1, j)} | ({(i, j + 1)} if head_b else set())
+        if head_b == "*":
+            steps |= {(i, j + 1)} | ({(i + 1, j)} if head_a else set())
+        if head_a and head_b and (head_a == head_b or "?" in (head_a, head_b)):
+            steps.add((i + 1, j + 1))
+        todo += steps - reachable
+        reachable |= steps
+    return False
 
 
 def _edge_key(edge: Edge) -> tuple[str, str, int]:
@@ -129,8 +147,13 @@ def _producers(hellos: Mapping[str, Hello]) -> dict[str, tuple[str, ...]]:
 
 
 def _edges(hello: Hello, producers: Mapping[str, tuple[str, ...]]) -> list[Edge]:
-    edges = []
+    found: dict[tuple[str, str, int], Edge] = {}
     for entry in hello.inputs:
+        if entry.topic == WILDCARD and hello.role != "recorder":
+            raise DeclarationError(
+                f"{hello.role} {hello.name!r} takes every topic ({WILDCARD!r}), which only a recorder may; "
+                "name the topics it needs"
+            )
         for topic in producers if entry.topic == WILDCARD else (entry.topic,):
             sources = producers.get(topic, ())
             if entry.required and not sources:
@@ -138,38 +161,39 @@ def _edges(hello: Hello, producers: Mapping[str, tuple[str, ...]]) -> list[Edge]
                     f"{hello.role} {hello.name!r} needs topic {topic!r}, which no service of the run "
                     f"produces; add one that does (topics there are: {', '.join(sorted(producers))})"
                 )
-            edges += [
-                Edge(topic, s, entry.lag, entry.required) for s in sources if s != hello.name or entry.lag
-            ]
-    return edges
+            for source in sources:
+                key = (topic, source, entry.lag)
+                required = entry.required or (key in found and found[key].required)
+                found[key] = Edge(topic, source, entry.lag, required)
+    return list(found.values())
 
 
 def _topological_order(hellos: Mapping[str, Hello], edges: Mapping[str, list[Edge]]) -> list[str]:
     order: list[str] = []
-    trail: list[str] = []
+    trail: list[Edge] = []
 
     def visit(name: str) -> None:
         if name in order:
             return
-        if name in trail:
-            cycle = [*trail[trail.index(name) :], name]
-            raise DeclarationError(
-                "a cycle within one frame: "
-                + " → ".join(
-                    f"{service} needs" if i < len(cycle) - 1 else service for i, service in enumerate(cycle)
-                )
-                + "; let one of these inputs have lag 1"
-            )
-        trail.append(name)
         for edge in edges[name]:
             if edge.lag == 0:
+                trail.append(edge)
+                sources = [e.source for e in trail[:-1]]
+                if edge.source == name or edge.source in sources:
+                    start = sources.index(edge.source) + 1 if edge.source in sources else len(trail) - 1
+                    raise DeclarationError(_cycle(edge.source, trail[start:]))
                 visit(edge.source)
-        trail.pop()
+                trail.pop()
         order.append(name)
 
     for name in sorted(hellos):
         visit(name)
     return order
+
+
+def _cycle(first: str, edges: Iterable[Edge]) -> str:
+    steps = f"{first!r}" + "".join(f" needs {e.topic!r} of {e.source!r}, which" for e in edges)
+    return f"a cycle within one frame: {steps.removesuffix(', which')}; let one of these inputs have lag 1"
 
 
 def _recorded_parts(record: Iterable[str], producers: Mapping[str, tuple[str, ...]]) -> dict[str, set[str]]:
@@ -205,13 +229,9 @@ def _active(
 
 
 def _parts(
-    topic: str, hellos: Mapping[str, Hello], active: set[str], wanted: Mapping[str, set[str]]
+    topic: str, hellos: Mapping[str, Hello], consumers: set[str], wanted: Mapping[str, set[str]]
 ) -> tuple[str, ...]:
     parts = set(wanted.get(topic, ()))
-    for name in active:
-        parts.update(p for e in hellos[name].inputs if _takes(e, topic) for p in e.parts)
+    for name in consumers:
+        parts.update(part for entry in hellos[name].inputs if entry.topic == topic for part in entry.parts)
     return tuple(sorted(parts))
-
-
-def _takes(entry: Input, topic: str) -> bool:
-    return entry.topic == topic

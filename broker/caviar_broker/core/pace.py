@@ -9,15 +9,17 @@ class Pacer:
     """Releases the frames of one episode (contract, clause 8).
 
     Frame 0 is released when somebody first asks for it. A later one is due as long after the one
-    before as simulated time says; when it is asked for later than that, all frames behind it slip by
-    as much. As fast as possible, every frame is released at once.
+    before as simulated time says; when nobody is ready for it by then, all frames behind it slip by as
+    much. A timer that fires late delays its own frame, not those behind it. As fast as possible,
+    every frame is released at once.
     """
 
     def __init__(self, plan: RunPlan) -> None:
         self._plan = plan
         self._released_frame = -1
-        self._released_at = 0
-        self._asked = False
+        self._reference = 0
+        """When the frame released last should have been, slips included [ns]."""
+        self._awaited = False
         self.lag_ns = 0
         """Sum of all slips [ns]."""
 
@@ -26,17 +28,18 @@ class Pacer:
         if not self._plan.realtime or frame <= self._released_frame:
             return 0
         due = now if self._released_frame < 0 else self._due()
-        self._asked = now < due
-        if self._asked:
+        if now < due:
+            self._awaited = True
             return None
-        self._released_frame, self._released_at = frame, now
-        self.lag_ns += now - due
-        return now - due
+        slip = 0 if self._awaited else now - due
+        self._released_frame, self._reference, self._awaited = frame, due + slip, False
+        self.lag_ns += slip
+        return slip
 
     def next_instant(self) -> int | None:
         """When the frame that was asked for in vain will be due [ns]; None if there is none."""
-        return self._due() if self._asked else None
+        return self._due() if self._awaited else None
 
     def _due(self) -> int:
         frame = self._released_frame
-        return self._released_at + self._plan.t_ns(frame + 1) - self._plan.t_ns(frame)
+        return self._reference + self._plan.t_ns(frame + 1) - self._plan.t_ns(frame)

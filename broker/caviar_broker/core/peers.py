@@ -4,10 +4,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from caviar_protocol.messages import Asset, Hello, Ready
+
 from caviar_broker.core.plan import ServicePlan
 from caviar_broker.core.tasks import Task
 from caviar_broker.core.transitions import PRESENT, SERVICE, ServiceEvent, ServiceState, step
-from caviar_protocol.messages import Asset, Hello, Ready
+
+_DOING = {
+    ServiceState.EXPECTED: "being awaited",
+    ServiceState.JOINED: "waiting for the others",
+    ServiceState.PREPARING: "preparing",
+    ServiceState.READY: "waiting for the others",
+    ServiceState.RESETTING: "resetting",
+    ServiceState.ACTIVE: "idle in an episode",
+    ServiceState.LOST: "lost",
+    ServiceState.LEFT: "gone",
+}
 
 
 @dataclass(slots=True)
@@ -16,8 +28,11 @@ class Peer:
 
     plan: ServicePlan
     state: ServiceState = ServiceState.EXPECTED
+    since: int = 0
+    """When its state began [ns]."""
     hello: Hello | None = None
     ready: Ready | None = None
+    """Its last READY; kept when it is lost."""
     assets: tuple[Asset, ...] = ()
     attempt: int = 0
     heard_at: int | None = None
@@ -27,8 +42,10 @@ class Peer:
     progress: int = 0
     phase: str = ""
     grace_ns: int = 0
-    lost_at: int | None = None
     verdict: str = ""
+    """How its loss is known."""
+    losses: int = 0
+    """How often it was lost since it last answered a grant."""
 
     @property
     def name(self) -> str:
@@ -36,13 +53,27 @@ class Peer:
         return self.plan.name
 
     @property
+    def role(self) -> str:
+        """Role in the run."""
+        return self.plan.role
+
+    @property
     def present(self) -> bool:
         """Whether messages can reach it."""
         return self.state in PRESENT
 
-    def move(self, event: ServiceEvent) -> None:
+    def __str__(self) -> str:
+        return f"{self.plan.role} {self.plan.name!r}"
+
+    def move(self, event: ServiceEvent, now: int) -> None:
         """Take a transition of the table."""
-        self.state = step(SERVICE, self.state, event)
+        self.state, self.since = step(SERVICE, self.state, event), now
+
+    def join(self, hello: Hello, now: int) -> None:
+        """A new incarnation: what was heard of the one before does not count for it."""
+        self.move(ServiceEvent.HELLO, now)
+        self.hello, self.attempt = hello, self.attempt + 1
+        self.heard_at, self.progress, self.phase, self.grace_ns = None, 0, "", 0
 
     def heartbeat(self, progress: int, phase: str, grace_ns: int, now: int) -> None:
         """A heartbeat came."""
@@ -52,27 +83,34 @@ class Peer:
         self.progress, self.phase, self.grace_ns = progress, phase, grace_ns
 
     def silent_until(self, since: int, limit: int) -> int:
-        """When a silence that began at ``since`` or at its last progress becomes a stall [ns]."""
+        """When a silence that began at ``since`` or at its last progress becomes a stall [ns].
+
+        A phase that declared a longer grace, such as compilation, has that (clause 14).
+        """
         return max(since, self.advanced_at) + max(limit, self.grace_ns)
+
+    @property
+    def doing(self) -> str:
+        """What its state means, for people."""
+        return _DOING[self.state]
 
     def last_words(self, now: int) -> str:
         """What its heartbeats told last."""
         if self.heard_at is None:
             return "no heartbeat ever came"
-        doing = f", which told of {self.phase!r} (progress {self.progress})" if self.phase else ""
-        return f"last heartbeat {_seconds(now - self.heard_at)} ago{doing}"
+        phase = f"phase {self.phase!r}" if self.phase else "no phase told"
+        return f"last heartbeat {_seconds(now - self.heard_at)} ago: {phase}, progress {self.progress}"
 
-    def blame_task(self, task: Task, problem: str, now: int) -> str:
-        """Clause 14: service, frame, phase, elapsed and budget, last heartbeat and progress."""
-        elapsed = now - (task.granted_at if task.granted_at is not None else now)
+    def blame_task(self, task: Task, problem: str, now: int, waiting: str = "") -> str:
+        """Clause 14: service, frame, who lacks what, elapsed and budget, last heartbeat, phase, progress."""
         return (
-            f"{self.plan.role} {self.name!r} {problem} in frame {task.frame}, granted "
-            f"{_seconds(elapsed)} ago with a budget of {_seconds(self.plan.budget_ns)}; {self.last_words(now)}"
-        )
+            f"{self} {problem} in frame {task.frame}: {_seconds(now - task.started_at)} since its grant, "
+            f"budget {_seconds(self.plan.budget_ns)}; {self.last_words(now)}"
+        ) + (f"; {waiting}" if waiting else "")
 
     def blame(self, problem: str, now: int) -> str:
         """The same outside a frame."""
-        return f"{self.plan.role} {self.name!r} {problem}; {self.last_words(now)}"
+        return f"{self} {problem} for {_seconds(now - self.since)}; {self.last_words(now)}"
 
 
 def _seconds(ns: int) -> str:

@@ -58,6 +58,8 @@ class RunPlan:
     frames_in_flight: int = 4
     limits: Limits = Limits()
     epoch: int = 1
+    imposed: Mapping[tuple[str, int, int], Mapping[str, str]] = field(default_factory=dict)
+    """Decisions imposed in a replay, by (service, episode, frame) (clause 6)."""
 
     def t_ns(self, frame: int) -> int:
         """Simulated time of a frame of any episode [ns]."""

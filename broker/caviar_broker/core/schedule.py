@@ -1,338 +1,343 @@
-"""The frames of one episode: who may be granted what, and what becomes of every product.
+"""The frames of one episode: who may be granted what, when, and what happens at a deadline.
 
 `EpisodeSchedule` implements clauses 6 to 13 and 16 of the contract for a fixed graph. It knows
-nothing of joining, dying or messages; `clock.FrameClock` does that around it.
+nothing of joining, dying or messages; `episodes.Episodes` does that around it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 
-from caviar_broker.core.events import (
-    Action,
-    FrameFinished,
-    Journal,
-    Latency,
-    Notice,
-    Product,
-)
+from caviar_protocol.digest import RunDigest
+from caviar_protocol.messages import GrantInput, Report, Status
+
+from caviar_broker.core.decisions import DecisionBook
+from caviar_broker.core.events import Action, Latency, Notice, Product
 from caviar_broker.core.graph import Edge, Graph
+from caviar_broker.core.ledger import Ledger
 from caviar_broker.core.pace import Pacer
 from caviar_broker.core.plan import RunPlan, ServicePlan
-from caviar_broker.core.tasks import Decision, Task, milliseconds, provenance, validate_decision
-from caviar_broker.core.transitions import DECIDED, OUTSTANDING, TaskEvent, TaskState
-from caviar_protocol.digest import RunDigest
-from caviar_protocol.messages import GrantInput, Status
-
-
-@dataclass(frozen=True, slots=True)
-class GrantOrder:
-    """A grant that the schedule wants sent."""
-
-    service: str
-    frame: int
-    previous: int
-    final: bool
-    inputs: tuple[GrantInput, ...]
-    products: tuple[Product, ...]
+from caviar_broker.core.tasks import Decision, GrantOrder, Task, milliseconds, provenance
+from caviar_broker.core.transitions import OUTSTANDING, TaskEvent, TaskState
 
 
 class EpisodeSchedule:
     """Schedule of one episode.
 
+    What it wants done collects in `actions`, `grants`, `cut`, `overruns` and `aborted`, for the
+    caller to carry out.
+
     Parameters
     ----------
     graph, plan
         The run.
+    capacity
+        Grants that each service can have outstanding (clause 7).
     episode
         Number of the episode.
-    digest
-        The run's chain; finished frames are added to it.
-    first_journal
-        Number of the first journal entry.
+    digest, ledger
+        The run's digest and journal.
     """
 
     def __init__(
-        self, graph: Graph, plan: RunPlan, episode: int, digest: RunDigest, first_journal: int
+        self,
+        graph: Graph,
+        plan: RunPlan,
+        capacity: Mapping[str, int],
+        episode: int,
+        digest: RunDigest,
+        ledger: Ledger,
     ) -> None:
-        self.graph = graph
-        self.plan = plan
-        self.episode = episode
-        self.frames = plan.frames
-        """Frames of the episode; becomes less when an agent ends it early."""
-        self.finished_frames = 0
-        self.journaled = first_journal - 1
+        self.graph, self.plan, self.episode = graph, plan, episode
+        self.actions: list[Action] = []
         self.grants: list[GrantOrder] = []
         self.cut: list[Task] = []
         """Granted tasks that an early end made useless; to be cancelled."""
+        self.overruns: list[tuple[Task, str]] = []
+        """Granted tasks whose budget is up, and what is done about it; to be blamed (clause 14)."""
         self.aborted: Task | None = None
         """A task of a service with policy abort that missed its deadline."""
-        self.actions: list[Action] = []
-        self._digest = digest
-        self._next_journal = first_journal
         self._plans: Mapping[str, ServicePlan] = {p.name: p for p in plan.services}
-        self._agents = frozenset(n for n in graph.order if self._plans[n].role == "agent")
-        self._recorders = frozenset(n for n in graph.order if self._plans[n].role == "recorder")
-        self._tasks: dict[tuple[str, int], Task] = {}
-        self._next: dict[str, int] = dict.fromkeys(graph.order, 0)
-        """First frame of each service that is not decided yet."""
-        self._completed: dict[str, int] = dict.fromkeys(graph.order, -1)
+        self._agents = tuple(n for n in graph.order if self._plans[n].role == "agent")
+        self._recorders = tuple(n for n in graph.order if self._plans[n].role == "recorder")
+        self._others = tuple(n for n in graph.order if n not in self._recorders)
+        self._capacity, self._ledger = capacity, ledger
+        self._first_entry = ledger.last
+        self._pacer = Pacer(plan)
+        self._book = DecisionBook(graph, plan, episode, digest, ledger, self.actions)
+        self._book.lag_ns = lambda: self._pacer.lag_ns
+        self._completed = dict.fromkeys(graph.order, -1)
         self._outstanding: dict[str, list[Task]] = {name: [] for name in graph.order}
-        self._newest: dict[tuple[str, str], Product] = {}
-        """Newest product by (service, topic), late ones included (clauses 9 and 12)."""
         self._late: list[Product] = []
         """Late products that the recorder has not been told of (clause 11)."""
-        self._pacer = Pacer(plan)
-        self._dirty: set[str] = set(graph.order)
+        self._dirty = set(graph.order)
+        """Services for which something may have changed."""
+        self._waiting_for_journal: set[str] = set()
+        self._waiting_for_pace: set[str] = set()
+        self._waiting_for_frames: set[str] = set()
         self._paused: set[str] = set()
 
-    # --- what happens ------------------------------------------------------------------------
+    # --- what happens ------------------------------------------------------------------------------
 
     def done(
-        self, service: str, frame: int, products: Iterable[Product], now: int, *, end: bool = False
+        self,
+        service: str,
+        frame: int,
+        products: Iterable[Product],
+        now: int,
+        report: Report | None = None,
+        *,
+        end: bool = False,
     ) -> None:
-        """DONE for an outstanding task. Products are of declared topics (checked by the caller)."""
-        task = self._answered(service, frame)
-        by_topic = {p.topic: p for p in products if p.topic in self.graph.outputs[service]}
-        if task.state is TaskState.ABANDONED:
-            task.move(TaskEvent.ANSWER)
+        """DONE for the oldest outstanding task. Products are of declared topics (checked by the caller)."""
+        task = self._answered(service, frame, now)
+        state, by_topic = task.state, {p.topic: p for p in products if p.topic in self.graph.outputs[service]}
+        task.move(TaskEvent.ANSWER)
+        if state is TaskState.ABANDONED:
+            self._book.release(task)
             self._notice("discarded", task, "answered behind the end of the episode; not used")
             return
-        late = task.state is TaskState.OVERDUE
-        for topic, product in by_topic.items():
-            key = (service, topic)
-            if key not in self._newest or self._newest[key].frame < product.frame:
-                self._newest[key] = product
-        task.move(TaskEvent.ANSWER)
-        if late:
-            elapsed = now - (task.granted_at or now)
-            self._late += by_topic.values() if self._recorders else ()
-            self._notice("late", task, f"answered after {milliseconds(elapsed)}; its frame had gone on")
-        else:
-            self._measure(task, now)
-            self._decide(task, self._fresh(task, by_topic), "done")
         self._completed[service] = max(self._completed[service], frame)
+        self._measure(task, now)
+        if state is TaskState.OVERDUE:
+            self._came_late(task, by_topic, now)
+        else:
+            task.report = report
+            self._book.fresh(task, by_topic, now)
+            self._decided(task)
+        if frame >= self._book.frames and by_topic:
+            self._notice("discarded", task, f"answered its final grant with {', '.join(sorted(by_topic))}")
         if end and service in self._agents:
             self._end_after(frame)
-        self._dirty.add(service)
 
     def fault(self, service: str, frame: int, text: str, now: int) -> None:
-        """FAULT for an outstanding task of a service with policy hold or drop."""
-        task = self._answered(service, frame)
-        abandoned, overdue = task.state is TaskState.ABANDONED, task.state is TaskState.OVERDUE
+        """FAULT for the oldest outstanding task, of a service the run can do without in this frame."""
+        task = self._answered(service, frame, now)
+        state = task.state
         task.move(TaskEvent.FAULT)
         self._notice("fault", task, text)
-        self._dirty.add(service)
-        if not abandoned and not overdue:
-            self._measure(task, now)
-            self._decide(task, self._substitute(task, f"{service} failed in frame {frame}: {text}"), "fault")
+        if state is TaskState.ABANDONED:
+            self._book.release(task)
+            return
+        self._measure(task, now)
+        if state is TaskState.OVERDUE:
+            self._book.release(task)
+        else:
+            self._book.substitute(task, f"{service} failed in frame {frame}: {text}", "fault", now)
+            self._decided(task)
 
-    def journal_written(self, number: int) -> None:
-        """Entries up to ``number`` are safe; what waited for them may be granted."""
-        if number > self.journaled:
-            self.journaled = number
-            self._dirty.update(self.graph.order)
+    def journal_written(self) -> None:
+        """More entries of the ledger are safe; what waited for them may be granted."""
+        self._wake(self._waiting_for_journal)
 
     def pause(self, service: str) -> None:
         """The service is gone: its outstanding grants stay owed, no new ones are made."""
         self._paused.add(service)
 
-    def resume(self, service: str) -> list[GrantOrder]:
+    def resume(self, service: str, now: int) -> list[GrantOrder]:
         """The service is back: the grants it owes, to be sent again (clause 18).
 
         It starts from its reset, so ``previous`` is −1 and a world steps the whole gap.
         """
         self._paused.discard(service)
         self._dirty.add(service)
-        owed = self._outstanding[service]
-        previous = [-1, *(task.frame for task in owed)]
-        return [self._order(task, before) for task, before in zip(owed, previous, strict=False)]
+        self._completed[service] = previous = -1
+        again = []
+        for task in self._outstanding[service]:
+            task.started_at = now
+            if task.order is not None:
+                task.order = replace(task.order, previous=previous)
+                again.append(task.order)
+            previous = task.frame
+        return again
 
     def advance(self, now: int) -> None:
         """Grant and skip whatever can be, until nothing changes."""
         while self._dirty:
-            name = min(self._dirty)
-            self._dirty.discard(name)
-            self._advance_service(name, now)
+            for name in self.graph.order:
+                if name in self._dirty:
+                    self._dirty.discard(name)
+                    self._advance_service(name, now)
 
     def expire(self, now: int) -> None:
         """Act on deadlines that have passed (clause 9)."""
-        for deadline, task in self._deadlines():
-            if deadline > now:
-                continue
-            granted = task.state is TaskState.GRANTED
-            plan = self._plans[task.service]
-            if plan.policy == "abort":
-                self.aborted = self.aborted or task
-                continue
-            cause = f"{task.service} missed frame {task.frame} ({plan.policy}, budget {milliseconds(plan.budget_ns)})"
-            if not granted:
-                owed = self._outstanding[task.service]
-                cause += f", still busy with frame {owed[0].frame}" if owed else ", not connected"
-            self._measure(task, now)
-            task.move(TaskEvent.DEADLINE)
-            self._notice("miss" if granted else "skipped", task, cause)
-            self._decide(task, self._substitute(task, cause), "overdue" if granted else "skipped")
-            self._dirty.add(task.service)
+        for name in self.graph.order:
+            due = self._due(name)
+            if due is not None and due[0] <= now:
+                self._expired(due[1], now)
         instant = self._pacer.next_instant()
         if instant is not None and instant <= now:
-            self._dirty.update(self.graph.order)
-        self.advance(now)
+            self._wake(self._waiting_for_pace)
 
     def next_deadline(self) -> int | None:
         """The earliest instant at which `expire` has something to do [ns]."""
-        instants = [deadline for deadline, _ in self._deadlines()]
-        pace = self._pacer.next_instant()
-        if pace is not None:
-            instants.append(pace)
-        return min(instants, default=None)
+        instant = self._pacer.next_instant()
+        for name in self.graph.order:
+            due = self._due(name)
+            if due is not None and (instant is None or due[0] < instant):
+                instant = due[0]
+        return instant
 
-    # --- what can be asked ---------------------------------------------------------------------
+    def close(self, now: int) -> None:
+        """The episode is over, or the run ends within it: tell what was left unanswered or unused."""
+        for product in self._late:
+            text = f"{product.topic} came after the recorder's last grant; not recorded"
+            self._notice("discarded", Task(product.source, product.frame), text)
+        for owed in self._outstanding.values():
+            for task in owed:
+                if task.overran:
+                    self._measure(task, now)
+                    self._notice("late", task, "was never answered")
+
+    # --- what can be asked -------------------------------------------------------------------------
+
+    @property
+    def frames(self) -> int:
+        """Frames of the episode; becomes less when an agent ends it early."""
+        return self._book.frames
 
     @property
     def finished(self) -> bool:
-        """Every frame is decided, final grants are answered, nothing is outstanding."""
-        return (
-            self.finished_frames >= self.frames
-            and all(self._next[a] > self.frames for a in self._agents)
-            and not any(self._outstanding.values())
+        """Whether every frame is decided, final grants are answered, and nobody is waited for."""
+        return self._over and not any(
+            self._outstanding[name] for name in self.graph.order if self._binds(name)
         )
 
     @property
-    def lag_ns(self) -> int:
-        """How far real time has slipped [ns] (clause 8)."""
-        return self._pacer.lag_ns
+    def _over(self) -> bool:
+        book = self._book
+        return book.finished_frames >= book.frames and all(book.next[a] > book.frames for a in self._agents)
+
+    def _binds(self, service: str) -> bool:
+        """Whether the end of the episode waits for what a service still owes.
+
+        Behind the last episode there is no RESET that it had to be ready for, so whom the run can do
+        without is not waited for.
+        """
+        last = self.episode + 1 >= self.plan.episodes
+        return not last or self._plans[service].policy in ("wait", "abort")
 
     def outstanding(self, service: str) -> list[Task]:
         """Tasks of a service for which DONE or FAULT is due, oldest first."""
         return self._outstanding[service]
 
-    def must_answer(self, task: Task) -> bool:
-        """Whether the run cannot go on without this outstanding task, so that a stall is fatal."""
-        waits = self._plans[task.service].policy == "wait"
-        return (waits and task.state is TaskState.GRANTED) or self.finished_frames >= self.frames
+    def awaited(self, service: str) -> Task | None:
+        """The outstanding task of a service without which the run cannot go on: no progress is fatal."""
+        owed = self._outstanding[service]
+        if not owed:
+            return None
+        waits = self._plans[service].policy == "wait" and owed[0].state is TaskState.GRANTED
+        return owed[0] if waits or (self._over and self._binds(service)) else None
+
+    def waiting_for(self, service: str) -> str:
+        """Who lacks which input of a service now, for its blame; empty if nobody does."""
+        found = []
+        for name in self.graph.consumers.get(service, ()):
+            frame = self._book.next[name]
+            for edge in self.graph.inputs[name]:
+                if edge.source == service and frame <= self.frames and not self._book.decided(edge, frame):
+                    found.append(f"{name} waits for {edge.topic} of frame {frame - edge.lag}")
+        return ", ".join(found)
 
     def validate(self) -> None:
         """Cross-field invariants; raises AssertionError naming the one that is broken."""
+        self._book.validate()
         for name, owed in self._outstanding.items():
-            plan = self._plans[name]
-            capacity = plan.max_in_flight if plan.policy == "wait" else 1
+            capacity = self._capacity[name]
             assert len(owed) <= capacity, f"{name} has {len(owed)} grants, at most {capacity} (clause 7)"
             assert all(t.state in OUTSTANDING for t in owed), f"{name} owes an answered task"
+            assert all(t.order is not None for t in owed), f"{name} owes what it was not granted"
             assert [t.frame for t in owed] == sorted({t.frame for t in owed}), f"{name} grants out of order"
-        for (name, frame), task in self._tasks.items():
-            assert (task.state in OUTSTANDING) == (task in self._outstanding[name]), f"{task} miscounted"
-            decided = task.state in DECIDED
-            assert decided == (frame < self._next[name]) or task.state in (
-                TaskState.ABANDONED,
-                TaskState.CANCELLED,
-            ), f"{task} decided out of order"
-            for topic, decision in task.decisions.items():
-                validate_decision(name, frame, topic, decision)
-            if task.state in OUTSTANDING and task.state is not TaskState.ABANDONED and frame < self.frames:
-                for edge in self.graph.inputs[name]:
-                    assert self._decision_ready(edge, frame), f"{task} granted before {edge} (clause 7)"
-        assert self.finished_frames <= self.frames
-        assert all(n >= min(self.finished_frames, self.frames) for n in self._next.values())
-        window = self.plan.frames_in_flight + 2
-        assert len(self._tasks) <= len(self.graph.order) * window, "tasks are not released"
-        assert all(n <= self.finished_frames + self.plan.frames_in_flight + 1 for n in self._next.values())
+        for task in self._book.tasks():
+            owed = self._outstanding[task.service]
+            assert (task.state in OUTSTANDING) == (task in owed), f"{task} miscounted"
+            if task.state in (TaskState.GRANTED, TaskState.OVERDUE):
+                for edge in self._taken(task):
+                    assert self._book.decided(edge, task.frame), f"{task} granted before {edge} (clause 7)"
 
-    # --- granting ------------------------------------------------------------------------------
+    # --- granting ----------------------------------------------------------------------------------
 
     def _advance_service(self, name: str, now: int) -> None:
         while True:
             task = self._candidate(name)
-            if task is None or task.state is not TaskState.PENDING:
+            if task is None or not all(self._book.decided(e, task.frame) for e in self._taken(task)):
                 return
-            if not self._inputs_decided(task) or not self._safe(task) or not self._released(task, now):
+            if not self._safe(task):
+                self._waiting_for_journal.add(name)
                 return
-            if task.eligible_at is None:
+            queued = task.frame > self._book.next[name]
+            has_room = len(self._outstanding[name]) < self._capacity[name]
+            if queued and not has_room:
+                return
+            if not self._released(task, now):
+                self._waiting_for_pace.add(name)
+                return
+            cause = self._missing(task)
+            if queued and cause is not None:
+                return  # it is skipped when its turn has come
+            if task.eligible_at is None and not queued:
                 task.eligible_at = now
-            missing = self._missing(task)
-            if missing is not None:
+            if cause is not None:
                 task.move(TaskEvent.SKIP)
-                self._notice("skipped", task, missing)
-                absent = {t: Decision(Status.ABSENT, None, missing) for t in self._due_topics(task)}
-                self._decide(task, absent, "skipped")
-                continue
-            if name in self._paused or not self._has_room(name):
+                self._notice("skipped", task, cause)
+                self._book.consequence(task, cause, now)
+                self._decided(task)
+            elif has_room and name not in self._paused:
+                self._grant(task, now)
+            else:
                 return
-            task.move(TaskEvent.GRANT)
-            task.granted_at = now
-            in_flight = (t.frame for t in self._outstanding[name] if t.state is TaskState.GRANTED)
-            previous = max(in_flight, default=self._completed[name])
-            self._outstanding[name].append(task)
-            self.grants.append(self._order(task, previous))
 
     def _candidate(self, name: str) -> Task | None:
-        """The next task of a service that is not granted: behind those in flight."""
-        frame = self._next[name] + sum(t.state is TaskState.GRANTED for t in self._outstanding[name])
-        last = self.frames if name in self._agents else self.frames - 1
-        if frame > last or frame >= self.finished_frames + self.plan.frames_in_flight + (
-            frame == self.frames
-        ):
+        """The next task of a service that is not granted, behind those in flight; None: not its turn."""
+        book = self._book
+        frame = book.next[name] + sum(t.state is TaskState.GRANTED for t in self._outstanding[name])
+        if frame >= book.frames and (name not in self._agents or frame > book.frames):
             return None
-        return self._tasks.setdefault((name, frame), Task(name, frame))
+        if frame >= book.finished_frames + self.plan.frames_in_flight + (frame == book.frames):
+            self._waiting_for_frames.add(name)
+            return None
+        # No agent runs ahead of one that may end the episode, and no recorder of what may be cut then.
+        if name in self._agents and any(book.next[agent] < frame for agent in self._agents):
+            return None
+        if name in self._recorders and any(book.next[other] <= frame for other in self._others):
+            return None
+        return book.task(name, frame)
 
-    def _has_room(self, name: str) -> bool:
-        plan = self._plans[name]
-        capacity = plan.max_in_flight if plan.policy == "wait" else 1
-        return len(self._outstanding[name]) < capacity
-
-    def _inputs_decided(self, task: Task) -> bool:
-        return all(self._decision_ready(edge, task.frame) for edge in self._taken(task))
-
-    def _taken(self, task: Task) -> tuple[Edge, ...]:
+    def _taken(self, task: Task) -> Iterable[Edge]:
         """Edges that count in this frame: behind the last frame only those with lag 1 (clause 16)."""
         edges = self.graph.inputs[task.service]
-        return edges if task.frame < self.frames else tuple(e for e in edges if e.lag == 1)
-
-    def _decision_ready(self, edge: Edge, frame: int) -> bool:
-        return frame - edge.lag < self._next[edge.source] or frame < edge.lag
+        return edges if task.frame < self._book.frames else [e for e in edges if e.lag == 1]
 
     def _safe(self, task: Task) -> bool:
-        """Clause 18: what this grant relies on from the frame before is in the journal."""
-        relied = [e.source for e in self._taken(task) if e.lag == 1] + [task.service]
-        earlier = (self._tasks.get((name, task.frame - 1)) for name in relied)
-        return all(t is None or t.journal <= self.journaled for t in earlier)
+        """Clause 18: what this grant relies on from before its frame is in the journal.
+
+        That is the service's own last decision, lag 1 inputs and held products; what was decided in
+        this very frame would be decided again. Entries become safe in order, so nothing is missing
+        between them.
+        """
+        book, written, frame = self._book, self._ledger.written, task.frame
+        if written < self._first_entry or book.entry(task.service, frame - 1) > written:
+            return False
+        for edge in self._taken(task):
+            if edge.lag and book.entry(edge.source, frame - edge.lag) > written:
+                return False
+            if book.decision(edge, frame).journal > written:
+                return False
+        return True
 
     def _missing(self, task: Task) -> str | None:
-        """Cause of the first required input that is absent (clause 10); the first frame has no earlier one."""
+        """Cause of the first required input that is absent (clause 10); frame 0 has no earlier one."""
         for edge in self._taken(task):
             if edge.required and task.frame >= edge.lag:
-                decision = self._decision(edge, task.frame)
+                decision = self._book.decision(edge, task.frame)
                 if decision.product is None:
                     return decision.cause
         return None
 
-    def _decision(self, edge: Edge, frame: int) -> Decision:
-        if frame < edge.lag:
-            return Decision(Status.ABSENT, None, "there is no earlier frame")
-        return self._tasks[edge.source, frame - edge.lag].decisions[edge.topic]
-
-    def _order(self, task: Task, previous: int) -> GrantOrder:
-        inputs: list[GrantInput] = []
-        products: list[Product] = []
-        for edge in self._taken(task):
-            decision = self._decision(edge, task.frame)
-            inputs.append(provenance(edge.topic, edge.source, decision, task.frame))
-            if decision.product is not None:
-                products.append(decision.product)
-        if task.service in self._recorders:
-            for product in self._late:
-                late = Decision(Status.LATE, product)
-                inputs.append(provenance(product.topic, product.source, late, task.frame))
-                products.append(product)
-            self._late = []
-        return GrantOrder(
-            task.service, task.frame, previous, task.frame == self.frames, tuple(inputs), tuple(products)
-        )
-
     def _released(self, task: Task, now: int) -> bool:
         """Whether real time has come to this frame (clause 8)."""
-        if task.frame >= self.frames:
+        if task.frame >= self._book.frames:
             return True
         slip = self._pacer.release(task.frame, now)
         if slip is None:
@@ -342,120 +347,128 @@ class EpisodeSchedule:
             self._notice("lag", task, f"{milliseconds(slip)} behind real time, {behind} since the start")
         return True
 
-    # --- deciding ----------------------------------------------------------------------------------
+    def _grant(self, task: Task, now: int) -> None:
+        owed = self._outstanding[task.service]
+        previous = owed[-1].frame if owed else self._completed[task.service]
+        task.move(TaskEvent.GRANT)
+        task.started_at = now
+        task.order = self._order(task, previous)
+        owed.append(task)
+        self.grants.append(task.order)
 
-    def _answered(self, service: str, frame: int) -> Task:
+    def _order(self, task: Task, previous: int) -> GrantOrder:
+        inputs: list[GrantInput] = []
+        products: list[Product] = []
+        for edge in self._taken(task):
+            decision = self._book.decision(edge, task.frame)
+            inputs.append(provenance(edge.topic, edge.source, decision, task.frame))
+            if decision.product is not None:
+                products.append(decision.product)
+        reports: list[Report] = []
+        if task.service in self._recorders:
+            for product in [p for p in self._late if p.frame <= task.frame]:
+                self._late.remove(product)
+                late = Decision(Status.LATE, product)
+                inputs.append(provenance(product.topic, product.source, late, task.frame))
+                products.append(product)
+            of_frame = (self._book.find(name, task.frame) for name in self._others)
+            reports = sorted((t.report for t in of_frame if t and t.report), key=lambda r: r.source)
+        final = task.frame == self._book.frames
+        return GrantOrder(
+            task.service, task.frame, previous, final, tuple(inputs), tuple(products), tuple(reports)
+        )
+
+    # --- answers and deadlines -----------------------------------------------------------------------
+
+    def _answered(self, service: str, frame: int, now: int) -> Task:
         owed = self._outstanding[service]
-        task = next(t for t in owed if t.frame == frame)
-        owed.remove(task)
+        task = owed.pop(0)
+        assert task.frame == frame, f"{service} answered {frame}, it owes {task.frame}"
+        if owed:
+            owed[0].started_at = now  # it was queued until now
+        task.order = None
+        self._dirty.add(service)
         return task
 
-    def _fresh(self, task: Task, products: Mapping[str, Product]) -> dict[str, Decision]:
-        return {
-            topic: Decision(Status.FRESH, products[topic])
-            if topic in products
-            else Decision(Status.ABSENT, None, f"{task.service} produced no {topic} in frame {task.frame}")
-            for topic in self._due_topics(task)
-        }
+    def _decided(self, task: Task) -> None:
+        name = task.service
+        self._dirty.add(name)
+        self._dirty.update(self.graph.consumers[name])
+        self._dirty.update(self._recorders)
+        if name in self._agents:
+            self._dirty.update(self._agents)
+        self._wake(self._waiting_for_frames)
 
-    def _due_topics(self, task: Task) -> tuple[str, ...]:
-        """Topics that consumers expect of a task; none of a final one."""
-        return self.graph.outputs[task.service] if task.frame < self.frames else ()
+    def _wake(self, services: set[str]) -> None:
+        self._dirty |= services
+        services.clear()
 
-    def _substitute(self, task: Task, cause: str) -> dict[str, Decision]:
-        """What consumers get instead (clause 9): the newest earlier product under hold, else nothing."""
-        hold = self._plans[task.service].policy == "hold"
-        found = {}
-        for topic in self._due_topics(task):
-            held = self._newest.get((task.service, topic)) if hold else None
-            status = Status.ABSENT if held is None else Status.HELD
-            found[topic] = Decision(status, held, cause)
-        return found
-
-    def _decide(self, task: Task, decisions: dict[str, Decision], outcome: str) -> None:
-        task.decisions = decisions
-        task.journal = self._next_journal
-        self._next_journal += 1
-        keep = task.service in self.graph.retained or self._plans[task.service].policy == "hold"
-        self.actions.append(
-            Journal(
-                number=task.journal,
-                episode=self.episode,
-                frame=task.frame,
-                service=task.service,
-                outcome=outcome,
-                decisions=tuple(
-                    provenance(topic, task.service, decision, task.frame)
-                    for topic, decision in decisions.items()
-                ),
-                products=tuple(
-                    d.product for d in decisions.values() if keep and d.status is Status.FRESH and d.product
-                ),
-            )
-        )
-        self._next[task.service] = task.frame + 1
-        self._dirty.add(task.service)
-        self._dirty.update(self.graph.consumers[task.service])
-        self._finish_frames()
-
-    def _finish_frames(self) -> None:
-        while self.finished_frames < self.frames and all(
-            n > self.finished_frames for n in self._next.values()
-        ):
-            frame = self.finished_frames
-            self._digest.add_frame(
-                self.episode,
-                frame,
-                (
-                    (topic, name, decision.product.digest)
-                    for name in self.graph.order
-                    for topic, decision in self._tasks[name, frame].decisions.items()
-                    if decision.status is Status.FRESH and decision.product is not None
-                ),
-            )
-            self.actions.append(FrameFinished(self.episode, frame, self.plan.t_ns(frame), self._pacer.lag_ns))
-            self.finished_frames += 1
-            self._dirty.update(self.graph.order)
-            for name in self.graph.order:  # lag 1 still needs this frame, nothing needs the one before
-                old = self._tasks.get((name, frame - 1))
-                if old is not None and old.state not in OUTSTANDING:
-                    del self._tasks[name, frame - 1]
+    def _came_late(self, task: Task, products: Mapping[str, Product], now: int) -> None:
+        elapsed = milliseconds(now - task.started_at)
+        self._notice("late", task, f"answered after {elapsed}; its frame had gone on")
+        if products:
+            self._book.late(task, products, now)
+        if self._recorders:
+            self._late += products.values()
+        self._book.release(task)
 
     def _end_after(self, frame: int) -> None:
-        """The episode ends with ``frame`` (clause 16): what lies behind it is cut."""
-        self.frames = min(self.frames, frame + 1)
-        for (name, number), task in list(self._tasks.items()):
-            if number < self.frames or (number == self.frames and name in self._agents):
-                continue
-            if task.state in (TaskState.GRANTED, TaskState.OVERDUE):
+        """An agent ends the episode with ``frame`` (clause 16): what lies behind it is cut.
+
+        An agent that is late cannot undo what others did meanwhile: the episode then ends with the
+        last frame that any agent was granted.
+        """
+        in_flight = (t.frame for agent in self._agents for t in self._outstanding[agent])
+        reached = max((self._book.next[agent] - 1 for agent in self._agents), default=frame)
+        for task in self._book.end_after(max(frame, reached, *in_flight)):
+            if task.state in OUTSTANDING:
                 task.move(TaskEvent.CUT)
                 self.cut.append(task)
-            elif task.state is not TaskState.ABANDONED:
-                del self._tasks[name, number]
-        for name in self._next:
-            self._next[name] = min(self._next[name], self.frames + (name in self._agents))
-        self._finish_frames()
+        self._dirty.update(self.graph.order)
 
-    # --- bookkeeping -----------------------------------------------------------------------------
+    def _due(self, name: str) -> tuple[int, Task] | None:
+        """When the budget of what a service has to do next is up."""
+        task = self._book.find(name, self._book.next[name])
+        if task is None:
+            return None
+        budget = self._plans[name].budget_ns
+        if task.state is TaskState.GRANTED:
+            return None if task.overran else (task.started_at + budget, task)
+        if task.state is TaskState.PENDING and task.eligible_at is not None:
+            waits = self._plans[name].policy == "wait"
+            return None if waits else (task.eligible_at + budget, task)
+        return None
 
-    def _deadlines(self) -> list[tuple[int, Task]]:
-        """(deadline, task) of everything that does not wait."""
-        found = []
-        for name in self.graph.order:
-            plan = self._plans[name]
-            if plan.policy == "wait":
-                continue
-            task = self._tasks.get((name, self._next[name]))
-            if task is None or task.eligible_at is None:
-                continue
-            if task.state in (TaskState.PENDING, TaskState.GRANTED):
-                found.append((task.eligible_at + plan.budget_ns, task))
-        return found
+    def _expired(self, task: Task, now: int) -> None:
+        plan, granted = self._plans[task.service], task.state is TaskState.GRANTED
+        budget = milliseconds(plan.budget_ns)
+        task.overran = granted
+        if plan.policy == "abort":
+            self.aborted = self.aborted or task
+        elif plan.policy == "wait":
+            self.overruns.append((task, "the frame waits"))
+        elif granted:
+            cause = f"{task.service} missed frame {task.frame} ({plan.policy}, budget {budget})"
+            task.move(TaskEvent.DEADLINE)
+            self.overruns.append((task, f"the frame goes on ({plan.policy})"))
+            self._book.substitute(task, cause, "overdue", now)
+            self._decided(task)
+        else:
+            owed = self._outstanding[task.service]
+            why = f"still busy with frame {owed[0].frame}" if owed else "not connected"
+            cause = f"{task.service} missed frame {task.frame} ({plan.policy}, budget {budget}), {why}"
+            elapsed = now - (task.eligible_at or now)
+            self.actions.append(Latency(task.service, self.episode, task.frame, elapsed, missed=True))
+            task.move(TaskEvent.DEADLINE)
+            self._notice("skipped", task, cause)
+            self._book.substitute(task, cause, "skipped", now)
+            self._decided(task)
 
     def _measure(self, task: Task, now: int) -> None:
-        start = task.granted_at if task.granted_at is not None else task.eligible_at
-        elapsed = now - (now if start is None else start)
-        missed = elapsed > self._plans[task.service].budget_ns or task.granted_at is None
+        elapsed = now - task.started_at
+        missed = task.overran or elapsed > self._plans[task.service].budget_ns
+        if missed and not task.overran:
+            self.overruns.append((task, "answered before the frame went on"))
         self.actions.append(Latency(task.service, self.episode, task.frame, elapsed, missed))
 
     def _notice(self, kind: str, task: Task, text: str) -> None:

@@ -1,24 +1,40 @@
-"""Tasks, and what is decided about their products."""
+"""Tasks, what is decided about their products, and the grants made from decisions."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from caviar_protocol.messages import GrantInput, Report, Status
+
 from caviar_broker.core.events import Product
 from caviar_broker.core.transitions import TASK, TaskEvent, TaskState, step
-from caviar_protocol.messages import GrantInput, Status
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Decision:
     """What consumers of a frame get of one (topic, source)."""
 
     status: Status
     product: Product | None
     cause: str = ""
+    journal: int = 0
+    """Journal entry that holds a held product; 0: the one of this decision."""
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
+class GrantOrder:
+    """A grant that the schedule wants sent."""
+
+    service: str
+    frame: int
+    previous: int
+    final: bool
+    inputs: tuple[GrantInput, ...]
+    products: tuple[Product, ...]
+    reports: tuple[Report, ...]
+
+
+@dataclass(slots=True, eq=False)
 class Task:
     """One service's part of one frame."""
 
@@ -27,11 +43,17 @@ class Task:
     state: TaskState = TaskState.PENDING
     eligible_at: int | None = None
     """When its inputs were decided and its predecessor was through [ns]."""
-    granted_at: int | None = None
+    started_at: int = 0
+    """When it was granted or, where grants queue, when the one before it was answered [ns]."""
+    overran: bool = False
+    """Whether its budget is up."""
+    order: GrantOrder | None = None
+    """As granted, until it is answered: a service that rejoins gets it again."""
     decisions: dict[str, Decision] = field(default_factory=dict)
     """By topic, once decided."""
     journal: int = 0
-    """Number of its journal entry; 0: none yet."""
+    """Number of the journal entry of its decisions; 0: not decided."""
+    report: Report | None = None
 
     def move(self, event: TaskEvent) -> None:
         """Take a transition of the table."""
@@ -67,6 +89,7 @@ def validate_decision(service: str, frame: int, topic: str, decision: Decision) 
             assert decision.product is not None, f"{what} is held without a product"
             assert decision.product.frame < frame, f"{what} is not an earlier one"
             assert decision.cause, f"{what} is held without a cause"
+            assert decision.journal, f"{what} is held from no journal entry"
         case _:
             assert decision.product is None, f"{what} is absent with a product"
             assert decision.cause, f"{what} is absent without a cause"

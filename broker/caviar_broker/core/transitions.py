@@ -81,11 +81,11 @@ class TaskState(Enum):
     FAILED = auto()
     """Answered with FAULT."""
     SKIPPED = auto()
-    """Never granted: a required input is absent (clause 10), or the service was late for too long."""
+    """Never granted: a required input is absent (clause 10), or the service was busy for too long."""
     ABANDONED = auto()
     """Granted, but the episode ended before this frame; the answer is still due and not used."""
-    CANCELLED = auto()
-    """Lies behind the end of the episode and nothing is outstanding."""
+    DISCARDED = auto()
+    """Answered behind the end of the episode."""
 
 
 class TaskEvent(Enum):
@@ -127,6 +127,7 @@ SERVICE: dict[tuple[ServiceState, ServiceEvent], ServiceState] = {
     (ServiceState.READY, ServiceEvent.RESET): ServiceState.RESETTING,
     (ServiceState.RESETTING, ServiceEvent.RESET_DONE): ServiceState.ACTIVE,
     (ServiceState.ACTIVE, ServiceEvent.EPISODE_END): ServiceState.READY,
+    (ServiceState.RESETTING, ServiceEvent.EPISODE_END): ServiceState.READY,
     (ServiceState.EXPECTED, ServiceEvent.LOST): ServiceState.LOST,
     **{(state, ServiceEvent.LOST): ServiceState.LOST for state in _PRESENT},
     **{(state, ServiceEvent.BYE): ServiceState.LEFT for state in _PRESENT},
@@ -136,7 +137,6 @@ TASK: dict[tuple[TaskState, TaskEvent], TaskState] = {
     (TaskState.PENDING, TaskEvent.GRANT): TaskState.GRANTED,
     (TaskState.PENDING, TaskEvent.SKIP): TaskState.SKIPPED,
     (TaskState.PENDING, TaskEvent.DEADLINE): TaskState.SKIPPED,
-    (TaskState.PENDING, TaskEvent.CUT): TaskState.CANCELLED,
     (TaskState.GRANTED, TaskEvent.ANSWER): TaskState.DONE,
     (TaskState.GRANTED, TaskEvent.DEADLINE): TaskState.OVERDUE,
     (TaskState.GRANTED, TaskEvent.FAULT): TaskState.FAILED,
@@ -144,8 +144,8 @@ TASK: dict[tuple[TaskState, TaskEvent], TaskState] = {
     (TaskState.OVERDUE, TaskEvent.ANSWER): TaskState.LATE,
     (TaskState.OVERDUE, TaskEvent.FAULT): TaskState.FAILED,
     (TaskState.OVERDUE, TaskEvent.CUT): TaskState.ABANDONED,
-    (TaskState.ABANDONED, TaskEvent.ANSWER): TaskState.CANCELLED,
-    (TaskState.ABANDONED, TaskEvent.FAULT): TaskState.CANCELLED,
+    (TaskState.ABANDONED, TaskEvent.ANSWER): TaskState.DISCARDED,
+    (TaskState.ABANDONED, TaskEvent.FAULT): TaskState.DISCARDED,
 }
 
 PRESENT = frozenset(_PRESENT)

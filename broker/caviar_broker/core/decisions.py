@@ -1,0 +1,227 @@
+"""What becomes of every product of an episode: decided once, in order, and entered in the journal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+
+from caviar_protocol.digest import RunDigest
+from caviar_protocol.messages import Status
+
+from caviar_broker.core.events import Action, FrameFinished, Journal, Product
+from caviar_broker.core.graph import Edge, Graph
+from caviar_broker.core.ledger import Ledger
+from caviar_broker.core.plan import RunPlan
+from caviar_broker.core.tasks import Decision, Task, provenance, validate_decision
+from caviar_broker.core.transitions import DECIDED, OUTSTANDING, TaskState
+
+_FIRST = Decision(Status.ABSENT, None, "there is no earlier frame")
+
+
+class DecisionBook:
+    """Decisions of one episode, by service and frame (contract, clauses 9 to 12, 18 and 20).
+
+    A service decides its frames one after the other. A frame is finished once every service has
+    decided it; the fresh products of finished frames make the digest of the run.
+
+    Parameters
+    ----------
+    graph, plan
+        The run.
+    episode
+        Number of the episode.
+    digest
+        The run's chain; finished frames are added to it.
+    ledger
+        The run's journal.
+    actions
+        Where journal entries and finished frames are put.
+    """
+
+    def __init__(
+        self,
+        graph: Graph,
+        plan: RunPlan,
+        episode: int,
+        digest: RunDigest,
+        ledger: Ledger,
+        actions: list[Action],
+    ) -> None:
+        self.frames = plan.frames
+        """Frames of the episode; becomes less when an agent ends it early."""
+        self.finished_frames = 0
+        self.next = dict.fromkeys(graph.order, 0)
+        """First frame of each service that is not decided yet."""
+        self.lag_ns: Callable[[], int] = lambda: 0
+        """How far real time has slipped, for the report on a frame."""
+        self._graph, self._plan, self._episode = graph, plan, episode
+        self._digest, self._ledger, self._actions = digest, ledger, actions
+        self._holding = frozenset(p.name for p in plan.services if p.policy == "hold")
+        self._kept = self._holding | graph.retained
+        self._tasks: dict[str, dict[int, Task]] = {name: {} for name in graph.order}
+        self._newest: dict[tuple[str, str], tuple[Product, int]] = {}
+        """Newest product and its journal entry by (service, topic), late ones included (clause 12)."""
+
+    # --- tasks -----------------------------------------------------------------------------------
+
+    def task(self, service: str, frame: int) -> Task:
+        """The task of a service in a frame; a new one where there is none."""
+        tasks = self._tasks[service]
+        found = tasks.get(frame)
+        if found is None:
+            found = tasks[frame] = Task(service, frame)
+        return found
+
+    def find(self, service: str, frame: int) -> Task | None:
+        """The task of a service in a frame, if there is one."""
+        return self._tasks[service].get(frame)
+
+    def release(self, task: Task) -> None:
+        """Forget a task that was answered when its frame had been over already."""
+        if not self.finished_frames - 1 <= task.frame < self.frames:
+            del self._tasks[task.service][task.frame]
+
+    def tasks(self) -> Iterable[Task]:
+        """All tasks that are not forgotten."""
+        return (task for tasks in self._tasks.values() for task in tasks.values())
+
+    # --- what consumers get ------------------------------------------------------------------------
+
+    def decided(self, edge: Edge, frame: int) -> bool:
+        """Whether it is known what a consumer gets over an edge in a frame."""
+        return frame - edge.lag < self.next[edge.source] or frame < edge.lag
+
+    def decision(self, edge: Edge, frame: int) -> Decision:
+        """What a consumer gets over an edge in a frame."""
+        if frame < edge.lag:
+            return _FIRST
+        return self._tasks[edge.source][frame - edge.lag].decisions[edge.topic]
+
+    def entry(self, service: str, frame: int) -> int:
+        """Journal entry of a service's decisions about a frame; 0 where there is none."""
+        task = self._tasks[service].get(frame)
+        return 0 if task is None else task.journal
+
+    # --- deciding ----------------------------------------------------------------------------------
+
+    def fresh(self, task: Task, products: Mapping[str, Product], now: int) -> None:
+        """The task was answered in time; a declared product that is missing is absent."""
+        cause = f"{task.service} produced no {{}} in frame {task.frame}"
+        decisions = {
+            topic: Decision(Status.FRESH, products[topic])
+            if topic in products
+            else Decision(Status.ABSENT, None, cause.format(topic))
+            for topic in self._due_topics(task)
+        }
+        self._decide(task, decisions, "done", now)
+        if task.service in self._holding:
+            self._renew(products.values(), task.journal)
+
+    def substitute(self, task: Task, cause: str, outcome: str, now: int) -> None:
+        """Clause 9: under hold consumers get the newest earlier product; else, or without one, nothing."""
+        decisions = {}
+        for topic in self._due_topics(task):
+            held = self._newest.get((task.service, topic))
+            if held is None:
+                decisions[topic] = Decision(Status.ABSENT, None, cause)
+            else:
+                decisions[topic] = Decision(Status.HELD, held[0], cause, held[1])
+        self._decide(task, decisions, outcome, now)
+
+    def consequence(self, task: Task, cause: str, now: int) -> None:
+        """Clause 10: a required input is absent, so its products are; the blame stays at the origin."""
+        absent = {topic: Decision(Status.ABSENT, None, cause) for topic in self._due_topics(task)}
+        self._decide(task, absent, "skipped", now)
+
+    def late(self, task: Task, products: Mapping[str, Product], now: int) -> None:
+        """Clause 11: products whose frame went on without them; later frames may hold them."""
+        number = self._ledger.enter(now)
+        decisions = {topic: Decision(Status.LATE, product) for topic, product in products.items()}
+        self._journal(task, decisions, "late", number)
+        if task.service in self._holding:
+            self._renew(products.values(), number)
+
+    def end_after(self, frame: int) -> list[Task]:
+        """The episode ends with ``frame`` (clause 16); the tasks behind it, forgotten unless outstanding."""
+        self.frames = min(self.frames, frame + 1)
+        cut = [task for task in self.tasks() if task.frame >= self.frames]
+        for task in cut:
+            if task.state not in OUTSTANDING:
+                del self._tasks[task.service][task.frame]
+        for name in self.next:
+            self.next[name] = min(self.next[name], self.frames)
+        return cut
+
+    def _due_topics(self, task: Task) -> tuple[str, ...]:
+        """Topics that consumers expect of a task; none of a final one."""
+        return self._graph.outputs[task.service] if task.frame < self.frames else ()
+
+    def _renew(self, products: Iterable[Product], number: int) -> None:
+        for product in products:
+            key = (product.source, product.topic)
+            known = self._newest.get(key)
+            if known is None or known[0].frame < product.frame:  # clause 12
+                self._newest[key] = product, number
+
+    def _decide(self, task: Task, decisions: dict[str, Decision], outcome: str, now: int) -> None:
+        task.decisions = decisions
+        task.journal = self._ledger.enter(now)
+        self._journal(task, decisions, outcome, task.journal)
+        self.next[task.service] = task.frame + 1
+        self._finish_frames()
+
+    def _journal(self, task: Task, decisions: Mapping[str, Decision], outcome: str, number: int) -> None:
+        """Products of earlier frames stand in entries of their own; others only if they may be used later."""
+        products: tuple[Product, ...] = ()
+        if task.service in self._kept:
+            products = tuple(d.product for d in decisions.values() if d.product and not d.journal)
+        self._actions.append(
+            Journal(
+                number=number,
+                episode=self._episode,
+                frame=task.frame,
+                service=task.service,
+                outcome=outcome,
+                decisions=tuple(
+                    provenance(topic, task.service, decision, task.frame)
+                    for topic, decision in decisions.items()
+                ),
+                products=products,
+            )
+        )
+
+    def _finish_frames(self) -> None:
+        while self.finished_frames < min(self.frames, min(self.next.values())):
+            frame = self.finished_frames
+            decided = [self._tasks[name][frame] for name in self._graph.order]
+            fresh = (
+                (topic, task.service, decision.product.digest)
+                for task in decided
+                for topic, decision in task.decisions.items()
+                if decision.status is Status.FRESH and decision.product is not None
+            )
+            self._digest.add_frame(self._episode, frame, fresh)
+            t_ns = self._plan.t_ns(frame)
+            self._actions.append(FrameFinished(self._episode, frame, t_ns, self.lag_ns()))
+            self.finished_frames += 1
+            for tasks in self._tasks.values():  # lag 1 still needs this frame, nothing needs the one before
+                old = tasks.get(frame - 1)
+                if old is not None and old.state not in OUTSTANDING:
+                    del tasks[frame - 1]
+
+    # --- invariants ----------------------------------------------------------------------------------
+
+    def validate(self) -> None:
+        """Cross-field invariants; raises AssertionError naming the one that is broken."""
+        for task in self.tasks():
+            decided = task.state in DECIDED
+            beyond = task.state in (TaskState.ABANDONED, TaskState.DISCARDED)
+            assert beyond or decided == (task.frame < self.next[task.service]), f"{task} decided out of order"
+            assert decided == bool(task.journal) or beyond, f"{task} is not in the journal"
+            for topic, decision in task.decisions.items():
+                validate_decision(task.service, task.frame, topic, decision)
+        assert self.finished_frames <= self.frames
+        assert all(n >= self.finished_frames for n in self.next.values()), "finished, but not decided"
+        window = self.finished_frames + self._plan.frames_in_flight + 1
+        assert all(n <= window for n in self.next.values()), "too many frames overlap"
+        kept = sum(1 for task in self.tasks() if task.state not in OUTSTANDING)
+        assert kept <= len(self.next) * (self._plan.frames_in_flight + 3), "tasks are not released"

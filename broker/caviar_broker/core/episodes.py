@@ -1,0 +1,219 @@
+"""The episodes of a run: RESET, grants and their answers, EPISODE_END."""
+
+from __future__ import annotations
+
+from caviar_protocol.messages import Cancel, Done, EpisodeEnd, Fault, Grant, Report, Reset
+
+from caviar_broker.core import events as ev
+from caviar_broker.core.peers import Peer
+from caviar_broker.core.run import Run
+from caviar_broker.core.schedule import EpisodeSchedule
+from caviar_broker.core.tasks import GrantOrder
+from caviar_broker.core.transitions import RunEvent, RunState, ServiceEvent, ServiceState, TaskState
+
+
+class Episodes:
+    """Drives the schedule of one episode after the other (clauses 1, 6, 16 and 18)."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self.schedule: EpisodeSchedule | None = None
+        """Of the episode that is under way; None between episodes."""
+
+    # --- from one episode to the next ----------------------------------------------------------------
+
+    def begin(self, now: int) -> None:
+        """RESET for everybody who is ready; who is not, gets it when it is."""
+        for peer in self._members():
+            if peer.state is ServiceState.READY:
+                self.reset(peer, now)
+
+    def reset(self, peer: Peer, now: int) -> None:
+        """RESET for one service, if it takes part in episodes at all."""
+        run = self._run
+        if run.takes_part(peer) and not run.over:
+            peer.move(ServiceEvent.RESET, now)
+            message = Reset(
+                epoch=run.plan.epoch,
+                attempt=peer.attempt,
+                episode=run.episode,
+                seed=run.plan.seed,
+                t0_ns=run.plan.t_ns(0),
+            )
+            run.send(peer, message)
+
+    def reset_done(self, event: ev.ResetDoneReceived, now: int) -> None:
+        """RESET_DONE: the episode starts once all are there; one that rejoins gets what it owes."""
+        run, peer, message = self._run, self._run.peers[event.service], event.message
+        if not run.current(peer, message.epoch, message.attempt, "RESET_DONE"):
+            return
+        if peer.state is not ServiceState.RESETTING or message.episode != run.episode:
+            run.unexpected(peer, "RESET_DONE", f"after RESET of episode {run.episode}")
+            return
+        peer.move(ServiceEvent.RESET_DONE, now)
+        if self.schedule is not None:
+            for order in self.schedule.resume(peer.name, now):
+                self._grant(order)
+        elif all(p.state is ServiceState.ACTIVE for p in self._members()):
+            run.enter(RunEvent.ALL_RESET, now)
+            assert run.graph is not None
+            capacity = {p.name: _capacity(p) for p in self._members()}
+            self.schedule = EpisodeSchedule(
+                run.graph, run.plan, capacity, run.episode, run.digest, run.ledger
+            )
+
+    def _over(self, schedule: EpisodeSchedule, now: int) -> None:
+        run = self._run
+        self.close(now)
+        run.actions.append(ev.EpisodeFinished(run.episode, schedule.frames))
+        for peer in self._members():
+            if peer.state in (ServiceState.ACTIVE, ServiceState.RESETTING):
+                peer.move(ServiceEvent.EPISODE_END, now)
+                end = EpisodeEnd(
+                    epoch=run.plan.epoch, attempt=peer.attempt, episode=run.episode, frames=schedule.frames
+                )
+                run.send(peer, end)
+        if run.episode + 1 < run.plan.episodes:
+            run.episode += 1
+            run.enter(RunEvent.NEXT_EPISODE, now)
+            self.begin(now)
+        else:
+            run.stop("the run is complete", now)
+
+    def close(self, now: int) -> None:
+        """The episode is over, or the run ended within it."""
+        if self.schedule is not None:
+            self.schedule.close(now)
+            self._run.actions += self.schedule.actions
+            self.schedule = None
+
+    def _members(self) -> list[Peer]:
+        assert self._run.graph is not None
+        return [self._run.peers[name] for name in self._run.graph.order]
+
+    # --- answers -------------------------------------------------------------------------------------
+
+    def done(self, event: ev.DoneReceived, now: int) -> None:
+        """DONE: its products are decided, or it is stale."""
+        run, peer, message = self._run, self._run.peers[event.service], event.message
+        schedule = self._owing(peer, message, "DONE")
+        if schedule is None:
+            return
+        topics = [header.topic for header in message.products]
+        declared = peer.hello.outputs if peer.hello else ()
+        strange = [t for t in topics if t not in declared or topics.count(t) > 1]
+        if strange:
+            problem = "twice" if strange[0] in declared else "which it did not declare"
+            run.fail(f"{peer} answered frame {message.frame} with {strange[0]!r}, {problem}", peer.name, now)
+            return
+        peer.advanced_at, peer.losses = now, 0
+        t_ns = run.plan.t_ns(message.frame)
+        products = [
+            ev.Product(h.topic, peer.name, message.frame, t_ns, h.digest, h.fidelity, payload)
+            for h, payload in zip(message.products, event.payloads, strict=True)
+        ]
+        report = Report(
+            source=peer.name,
+            decisions=message.decisions,
+            counts=message.counts,
+            measured=message.measured,
+        )
+        told = report if message.decisions or message.counts or message.measured else None
+        schedule.done(peer.name, message.frame, products, now, told, end=message.end_episode)
+
+    def fault(self, event: ev.FaultReceived, now: int) -> None:
+        """FAULT: fatal, unless it is in a frame that the run can do without."""
+        run, peer, message = self._run, self._run.peers[event.service], event.message
+        text = f"{message.phase}: {message.message}"
+        if message.frame < 0:
+            if not run.current(peer, message.epoch, message.attempt, "FAULT"):
+                return
+            if run.takes_part(peer):
+                run.fail(f"{peer} failed in {text}", peer.name, now)
+            else:
+                run.notice("fault", peer.name, text)
+            return
+        schedule = self._owing(peer, message, "FAULT")
+        if schedule is None:
+            return
+        peer.advanced_at = now
+        needed = schedule.outstanding(peer.name)[0].state is not TaskState.ABANDONED
+        if needed and peer.plan.policy in ("wait", "abort"):
+            run.fail(f"{peer} failed in frame {message.frame}, {text}", peer.name, now)
+        else:
+            schedule.fault(peer.name, message.frame, text, now)
+
+    def _owing(self, peer: Peer, answer: Done | Fault, kind: str) -> EpisodeSchedule | None:
+        """The schedule, if this answers the oldest outstanding grant (clause 1)."""
+        run, schedule = self._run, self.schedule
+        owed = schedule.outstanding(peer.name) if schedule and run.takes_part(peer) else []
+        outstanding = owed[0].frame if owed else -1
+        if not run.current(peer, answer.epoch, answer.attempt, kind, outstanding):
+            return None
+        asked = (run.episode, outstanding) if owed and peer.state is ServiceState.ACTIVE else None
+        if (answer.episode, answer.frame) == asked:
+            return schedule
+        run.stale(peer, kind, f"{kind} for episode {answer.episode} frame {answer.frame}", outstanding)
+        return None
+
+    # --- what the schedule wants -----------------------------------------------------------------------
+
+    def journaled(self, event: ev.Journaled, now: int) -> None:
+        """Decisions are safe; what waited for that may be granted."""
+        if self._run.ledger.confirm(event.number, now) and self.schedule is not None:
+            self.schedule.journal_written()
+
+    def pump(self, now: int) -> None:
+        """Let the schedule act, and carry out what it wants."""
+        run, schedule = self._run, self.schedule
+        if schedule is None or run.state is not RunState.RUNNING:
+            return
+        schedule.advance(now)
+        for task, remedy in schedule.overruns:
+            peer = run.peers[task.service]
+            waiting = schedule.waiting_for(task.service)
+            text = peer.blame_task(task, "overran its budget", now, waiting)
+            run.notice("miss", task.service, f"{text}; {remedy}", task.frame)
+        run.actions += schedule.actions
+        for order in schedule.grants:
+            self._grant(order)
+        for task in schedule.cut:
+            peer = run.peers[task.service]
+            if peer.present:
+                ids = {"epoch": run.plan.epoch, "attempt": peer.attempt, "episode": run.episode}
+                run.send(peer, Cancel(**ids, frame=task.frame))
+        schedule.overruns.clear()
+        schedule.actions.clear()
+        schedule.grants.clear()
+        schedule.cut.clear()
+        if schedule.aborted is not None:
+            peer = run.peers[schedule.aborted.service]
+            waiting = schedule.waiting_for(peer.name)
+            text = peer.blame_task(schedule.aborted, "overran its budget (policy abort)", now, waiting)
+            run.fail(text, peer.name, now)
+        elif schedule.finished:
+            self._over(schedule, now)
+
+    def _grant(self, order: GrantOrder) -> None:
+        run, peer = self._run, self._run.peers[order.service]
+        grant = Grant(
+            epoch=run.plan.epoch,
+            attempt=peer.attempt,
+            episode=run.episode,
+            frame=order.frame,
+            previous_frame=order.previous,
+            t_ns=run.plan.t_ns(order.frame),
+            budget_ns=peer.plan.budget_ns,
+            inputs=order.inputs,
+            final=order.final,
+            decisions=dict(run.plan.imposed.get((order.service, run.episode, order.frame), {})),
+            reports=order.reports,
+        )
+        run.send(peer, grant, order.products)
+
+
+def _capacity(peer: Peer) -> int:
+    """Grants that a service may have outstanding: one, or under wait as planned and as it says it can."""
+    if peer.plan.policy != "wait" or peer.hello is None:
+        return 1
+    return min(peer.plan.max_in_flight, peer.hello.max_in_flight)

@@ -1,0 +1,146 @@
+"""Who is there, who is silent, who is gone: progress, loss, and deadlines (clauses 14 and 15)."""
+
+from __future__ import annotations
+
+from caviar_broker.core import events as ev
+from caviar_broker.core.episodes import Episodes
+from caviar_broker.core.peers import Peer
+from caviar_broker.core.run import Run
+from caviar_broker.core.transitions import RunState, ServiceEvent, ServiceState
+
+MAX_LOSSES = 3
+"""A service that was lost so often without an answer in between is not waited for again."""
+
+
+class Liveness:
+    """Notices of life and death, and what becomes of silence."""
+
+    def __init__(self, run: Run, episodes: Episodes) -> None:
+        self._run = run
+        self._episodes = episodes
+
+    # --- life and death ------------------------------------------------------------------------------
+
+    def progressed(self, event: ev.Progressed, now: int) -> None:
+        """A heartbeat."""
+        self._run.peers[event.service].heartbeat(event.progress, event.phase, event.grace_ns, now)
+
+    def violated(self, event: ev.Violated, now: int) -> None:
+        """A service broke the protocol beyond repair."""
+        self._run.fail(f"{self._run.peers[event.service]} {event.text}", event.service, now)
+
+    def bye(self, event: ev.ByeReceived, now: int) -> None:
+        """A service leaves: as it was told to, or on its own account."""
+        peer = self._run.peers[event.service]
+        if peer.present and self._run.over:
+            peer.move(ServiceEvent.BYE, now)
+        elif peer.present:
+            self.lost(ev.Lost(event.service, f"it left: {event.reason or 'no reason given'}"), now)
+
+    def lost(self, event: ev.Lost, now: int) -> None:
+        """A service died; the run ends, unless it can do without it or wait for its return."""
+        run, peer = self._run, self._run.peers[event.service]
+        if peer.state in (ServiceState.LOST, ServiceState.LEFT):
+            return
+        schedule = self._episodes.schedule if run.takes_part(peer) else None
+        owed = schedule.outstanding(peer.name) if schedule else []
+        text = f"{peer} died while {peer.doing}: {event.verdict}; {peer.last_words(now)}"
+        if owed and schedule:
+            died = f"died ({event.verdict})"
+            text = peer.blame_task(owed[0], died, now, schedule.waiting_for(peer.name))
+        peer.verdict = event.verdict
+        peer.losses += 1
+        peer.move(ServiceEvent.LOST, now)
+        if run.over:
+            return
+        run.notice("lost", peer.name, text, owed[0].frame if owed else -1)
+        if not run.takes_part(peer):
+            return
+        if not self._may_return(peer):
+            run.fail(text, peer.name, now)
+        elif schedule:
+            schedule.pause(peer.name)
+
+    def _may_return(self, peer: Peer) -> bool:
+        """Whether the loss of a service is survived for a while: it was ready once, and got somewhere."""
+        return self._run.plan.limits.rejoin > 0 and peer.ready is not None and peer.losses < MAX_LOSSES
+
+    # --- deadlines -----------------------------------------------------------------------------------
+
+    def next_deadline(self) -> int | None:
+        """When somebody's silence will be too long [ns]; None: nobody has to say anything."""
+        run = self._run
+        if run.state is RunState.FINISHED:
+            return None
+        if run.state is RunState.STOPPING:
+            return run.since + run.plan.limits.shutdown
+        waiting = run.ledger.waiting_since
+        earliest = None if waiting is None else waiting + run.plan.limits.stall
+        for peer in run.peers.values():
+            due = self._due(peer)
+            if due is not None and (earliest is None or due < earliest):
+                earliest = due
+        return earliest
+
+    def expire(self, now: int) -> None:
+        """Act on silence that has been too long: the run ends with blame."""
+        run = self._run
+        if run.state is RunState.STOPPING:
+            if run.since + run.plan.limits.shutdown <= now:
+                self._give_up_waiting(now)
+            return
+        if run.over:
+            return
+        silent = [(due, p) for p in run.peers.values() if (due := self._due(p)) is not None and due <= now]
+        if silent:
+            _, culprit = min(silent, key=lambda pair: pair[0])
+            run.fail(self._blame(culprit, now), culprit.name, now)
+        elif (since := run.ledger.waiting_since) is not None and since + run.plan.limits.stall <= now:
+            waited = run.plan.limits.stall / 1e9
+            run.fail(f"the journal was not written for {waited:g} s; the disk may be full or gone", "", now)
+
+    def _due(self, peer: Peer) -> int | None:
+        """When a service has to have shown life or progress [ns]."""
+        limits = self._run.plan.limits
+        if not self._run.takes_part(peer):
+            return None
+        match peer.state:
+            case ServiceState.EXPECTED:
+                return self._run.since + limits.connect
+            case ServiceState.PREPARING:
+                return peer.silent_until(peer.since, limits.ready)
+            case ServiceState.RESETTING:
+                return peer.silent_until(peer.since, limits.reset)
+            case ServiceState.LOST:
+                return peer.since + limits.rejoin
+            case ServiceState.ACTIVE:
+                schedule = self._episodes.schedule
+                task = schedule.awaited(peer.name) if schedule else None
+                return peer.silent_until(task.started_at, limits.stall) if task else None
+            case _:
+                return None  # it waits for others
+
+    def _blame(self, peer: Peer, now: int) -> str:
+        limits, schedule = self._run.plan.limits, self._episodes.schedule
+        task = schedule.awaited(peer.name) if schedule and peer.state is ServiceState.ACTIVE else None
+        if schedule and task:
+            waiting = schedule.waiting_for(peer.name)
+            return peer.blame_task(task, "makes no progress (timeouts.stall_s)", now, waiting)
+        match peer.state:
+            case ServiceState.EXPECTED:
+                missing = [p for p in self._run.peers.values() if p.state is ServiceState.EXPECTED]
+                names = ", ".join(str(p) for p in missing)
+                return f"{names} did not connect within {limits.connect / 1e9:g} s (timeouts.connect_s)"
+            case ServiceState.LOST:
+                waited = f"{limits.rejoin / 1e9:g} s (timeouts.rejoin_s)"
+                return f"{peer} died and did not come back within {waited}: {peer.verdict}"
+            case _:
+                key = "ready_s" if peer.state is ServiceState.PREPARING else "reset_s"
+                return peer.blame(f"makes no progress (timeouts.{key}) while {peer.doing}", now)
+
+    def _give_up_waiting(self, now: int) -> None:
+        for peer in self._run.peers.values():
+            if peer.present:
+                text = f"{peer} did not say BYE in time (timeouts.shutdown_s); {peer.last_words(now)}"
+                self._run.notice("lost", peer.name, text)
+                peer.move(ServiceEvent.LOST, now)

@@ -1,0 +1,104 @@
+"""What the parts of the frame clock share: the peers, the state of the run, and what shall be done."""
+
+from __future__ import annotations
+
+from caviar_protocol.digest import RunDigest
+from caviar_protocol.messages import Error, Message, Shutdown, Stale
+
+from caviar_broker.core.events import Action, Finished, Notice, Product, Send
+from caviar_broker.core.graph import Graph
+from caviar_broker.core.ledger import Ledger
+from caviar_broker.core.peers import Peer
+from caviar_broker.core.plan import RunPlan
+from caviar_broker.core.transitions import RUN, RunEvent, RunState, step
+
+
+class Run:
+    """One run: its present state, its services, and the actions that wait to be carried out."""
+
+    def __init__(self, plan: RunPlan, now: int) -> None:
+        self.plan = plan
+        self.state = RunState.JOINING
+        self.since = now
+        """When the present state began [ns]."""
+        self.peers = {service.name: Peer(service, since=now) for service in plan.services}
+        self.graph: Graph | None = None
+        """Known once all services have joined."""
+        self.episode = 0
+        self.digest = RunDigest()
+        self.ledger = Ledger()
+        self.error = ""
+        self.culprit = ""
+        self.actions: list[Action] = []
+
+    @property
+    def over(self) -> bool:
+        """Whether the run has ended, if perhaps not everybody has left."""
+        return self.state is RunState.STOPPING or self.state is RunState.FINISHED
+
+    def takes_part(self, peer: Peer) -> bool:
+        """Whether the run needs a service: all until the graph is known, then those in it (clause 5)."""
+        return self.graph is None or peer.name in self.graph.inputs
+
+    # --- transitions of the run --------------------------------------------------------------------
+
+    def enter(self, event: RunEvent, now: int) -> None:
+        """Take a transition of the table."""
+        self.state, self.since = step(RUN, self.state, event), now
+
+    def fail(self, error: str, culprit: str, now: int) -> None:
+        """End the run with blame; the first blame counts."""
+        if not self.over:
+            self.error, self.culprit = error, culprit
+            self.stop(error, now)
+
+    def stop(self, reason: str, now: int) -> None:
+        """End the run: everybody shall leave."""
+        self.enter(RunEvent.STOP, now)
+        for peer in self.peers.values():
+            if peer.present:
+                self.send(peer, Shutdown(reason=reason, grace_ns=self.plan.limits.shutdown))
+
+    def finish_if_alone(self, now: int) -> None:
+        """The run is finished once everybody has left."""
+        if self.state is RunState.STOPPING and not any(peer.present for peer in self.peers.values()):
+            self.enter(RunEvent.ALL_GONE, now)
+            self.actions.append(Finished(self.error, self.culprit, self.digest.hexdigest()))
+
+    # --- what goes out -------------------------------------------------------------------------------
+
+    def send(self, peer: Peer, message: Message, products: tuple[Product, ...] = ()) -> None:
+        """Have a message sent."""
+        self.actions.append(Send(peer.name, message, products))
+
+    def notice(self, kind: str, service: str, text: str, frame: int = -1) -> None:
+        """Have something told to the user."""
+        self.actions.append(Notice(kind, service, text, self.episode, frame))
+
+    # --- what came out of turn -----------------------------------------------------------------------
+
+    def current(self, peer: Peer, epoch: int, attempt: int, kind: str, outstanding: int = -1) -> bool:
+        """Clause 1: whether a message is of this broker's and this service's present incarnation."""
+        if peer.present and (epoch, attempt) == (self.plan.epoch, peer.attempt):
+            return True
+        self.stale(peer, kind, f"{kind} of epoch {epoch}, attempt {attempt}", outstanding)
+        return False
+
+    def stale(self, peer: Peer, kind: str, what: str, outstanding: int = -1) -> None:
+        """Answer a message that matches nothing outstanding (clause 1)."""
+        self.notice("stale", peer.name, f"{what} matches nothing that is outstanding; not used")
+        if peer.present:
+            answer = Stale(
+                of=kind,
+                epoch=self.plan.epoch,
+                attempt=peer.attempt,
+                episode=self.episode,
+                frame=outstanding,
+            )
+            self.send(peer, answer)
+
+    def unexpected(self, peer: Peer, kind: str, when: str) -> None:
+        """Answer a message that came out of turn."""
+        self.notice("stale", peer.name, f"{kind} came out of turn: it is expected {when}; not used")
+        if peer.present:
+            self.send(peer, Error(code="unexpected", of=kind, message=f"{kind} is expected {when}"))
