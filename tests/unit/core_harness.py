@@ -15,13 +15,13 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from caviar_protocol import messages as m
 from core_history import History
 
 from caviar_broker.core import events as ev
 from caviar_broker.core.clock import FrameClock
 from caviar_broker.core.plan import Limits, RunPlan, ServicePlan
 from caviar_broker.core.transitions import RunState
+from caviar_protocol import messages as m
 
 MS = 1_000_000
 SECOND = 1000 * MS

@@ -9,11 +9,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from caviar_protocol import messages as m
-from caviar_protocol.digest import RunDigest
-
 from caviar_broker.core import events as ev
 from caviar_broker.core.plan import RunPlan
+from caviar_protocol import messages as m
+from caviar_protocol.digest import RunDigest
 
 if TYPE_CHECKING:
     from core_harness import Sim

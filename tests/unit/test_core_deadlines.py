@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from caviar_protocol import messages as m
-from caviar_protocol.messages import Status
 from core_harness import MS, SECOND, Sim, Simulation, agent, link, loop, recorder, sensors, world
 
 from caviar_broker.core import events as ev
 from caviar_broker.core.plan import Limits
+from caviar_protocol import messages as m
+from caviar_protocol.messages import Status
 
 
 def slow_at(*frames: int, takes: int | None = 70 * MS) -> Any:

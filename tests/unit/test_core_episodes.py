@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import pytest
-from caviar_protocol import messages as m
-from caviar_protocol.messages import Status
 from core_harness import MS, SECOND, Simulation, agent, channel, link, loop, recorder, sensors, world
 
 from caviar_broker.core import events as ev
 from caviar_broker.core.plan import Limits
 from caviar_broker.core.transitions import RunState
+from caviar_protocol import messages as m
+from caviar_protocol.messages import Status
 
 
 def ends(*at: tuple[int, int]) -> dict[str, frozenset[tuple[int, int]]]:

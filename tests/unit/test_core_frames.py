@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from caviar_protocol import messages as m
-from caviar_protocol.digest import RunDigest
-from caviar_protocol.messages import Status
 from core_harness import MS, SECOND, Simulation, agent, channel, link, loop, recorder, sensors, world
 
 from caviar_broker.core import events as ev
 from caviar_broker.core.plan import Limits
 from caviar_broker.core.transitions import RunState
+from caviar_protocol import messages as m
+from caviar_protocol.digest import RunDigest
+from caviar_protocol.messages import Status
 
 
 def running(run: Simulation) -> bool:

@@ -7,12 +7,12 @@ from itertools import product
 from typing import Any
 
 import pytest
-from caviar_protocol.errors import DeclarationError
-from caviar_protocol.messages import PROTOCOL_VERSION, Demand, Hello, Input
 from hypothesis import given
 from hypothesis import strategies as st
 
 from caviar_broker.core.graph import build_graph, check_actuators, check_prefixes
+from caviar_protocol.errors import DeclarationError
+from caviar_protocol.messages import PROTOCOL_VERSION, Demand, Hello, Input
 
 
 def hello(name: str, role: Any, takes: str = "", gives: str = "", **kw: Any) -> Hello:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import pytest
-from caviar_protocol import messages as m
-from caviar_protocol.digest import geometry_digest
 from core_harness import MS, SECOND, Sim, Simulation, agent, channel, link, loop, recorder, sensors, world
 
 from caviar_broker.core import events as ev
 from caviar_broker.core.plan import Limits
 from caviar_broker.core.transitions import RunState
+from caviar_protocol import messages as m
+from caviar_protocol.digest import geometry_digest
 
 
 def refusals(run: Simulation) -> list[m.Refuse]:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from caviar_protocol import messages as m
 from core_harness import MS, SECOND, Simulation, agent, loop, recorder, sensors, world
 
 from caviar_broker.core import events as ev
 from caviar_broker.core.liveness import MAX_LOSSES
 from caviar_broker.core.plan import Limits
 from caviar_broker.core.transitions import RunState
+from caviar_protocol import messages as m
 
 REJOIN = Limits(rejoin=10 * SECOND)
 

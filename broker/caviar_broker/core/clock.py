@@ -16,8 +16,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from caviar_protocol.digest import RunDigest
-
 from caviar_broker.core import events as ev
 from caviar_broker.core.episodes import Episodes
 from caviar_broker.core.graph import Graph
@@ -27,6 +25,7 @@ from caviar_broker.core.peers import Peer
 from caviar_broker.core.plan import RunPlan
 from caviar_broker.core.run import Run
 from caviar_broker.core.transitions import RunState, ServiceState
+from caviar_protocol.digest import RunDigest
 
 
 class FrameClock:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 
-from caviar_protocol.digest import RunDigest
-from caviar_protocol.messages import Status
-
 from caviar_broker.core.events import Action, FrameFinished, Journal, Product
 from caviar_broker.core.graph import Edge, Graph
 from caviar_broker.core.ledger import Ledger
 from caviar_broker.core.plan import RunPlan
 from caviar_broker.core.tasks import Decision, Task, provenance, validate_decision
 from caviar_broker.core.transitions import DECIDED, OUTSTANDING, TaskState
+from caviar_protocol.digest import RunDigest
+from caviar_protocol.messages import Status
 
 _FIRST = Decision(Status.ABSENT, None, "there is no earlier frame")
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from caviar_protocol.messages import Cancel, Done, EpisodeEnd, Fault, Grant, Report, Reset
-
 from caviar_broker.core import events as ev
 from caviar_broker.core.peers import Peer
 from caviar_broker.core.run import Run
 from caviar_broker.core.schedule import EpisodeSchedule
 from caviar_broker.core.tasks import GrantOrder
 from caviar_broker.core.transitions import RunEvent, RunState, ServiceEvent, ServiceState, TaskState
+from caviar_protocol.messages import Cancel, Done, EpisodeEnd, Fault, Grant, Report, Reset
 
 
 class Episodes:

@@ -4,6 +4,12 @@ from __future__ import annotations
 
 import difflib
 
+from caviar_broker.core import events as ev
+from caviar_broker.core.episodes import Episodes
+from caviar_broker.core.graph import build_graph, check_actuators, check_prefixes
+from caviar_broker.core.peers import Peer
+from caviar_broker.core.run import Run
+from caviar_broker.core.transitions import RunEvent, RunState, ServiceEvent, ServiceState
 from caviar_protocol.codec import check_version
 from caviar_protocol.digest import geometry_digest
 from caviar_protocol.errors import DeclarationError, VersionError
@@ -17,13 +23,6 @@ from caviar_protocol.messages import (
     Refuse,
     Welcome,
 )
-
-from caviar_broker.core import events as ev
-from caviar_broker.core.episodes import Episodes
-from caviar_broker.core.graph import build_graph, check_actuators, check_prefixes
-from caviar_broker.core.peers import Peer
-from caviar_broker.core.run import Run
-from caviar_broker.core.transitions import RunEvent, RunState, ServiceEvent, ServiceState
 
 
 class Joining:

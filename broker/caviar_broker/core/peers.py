@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from caviar_protocol.messages import Asset, Hello, Ready
-
 from caviar_broker.core.plan import ServicePlan
 from caviar_broker.core.tasks import Task
 from caviar_broker.core.transitions import PRESENT, SERVICE, ServiceEvent, ServiceState, step
+from caviar_protocol.messages import Asset, Hello, Ready
 
 _DOING = {
     ServiceState.EXPECTED: "being awaited",

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from caviar_protocol.digest import RunDigest
-from caviar_protocol.messages import Error, Message, Shutdown, Stale
-
 from caviar_broker.core.events import Action, Finished, Notice, Product, Send
 from caviar_broker.core.graph import Graph
 from caviar_broker.core.ledger import Ledger
 from caviar_broker.core.peers import Peer
 from caviar_broker.core.plan import RunPlan
 from caviar_broker.core.transitions import RUN, RunEvent, RunState, step
+from caviar_protocol.digest import RunDigest
+from caviar_protocol.messages import Error, Message, Shutdown, Stale
 
 
 class Run:

@@ -9,9 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
-from caviar_protocol.digest import RunDigest
-from caviar_protocol.messages import GrantInput, Report, Status
-
 from caviar_broker.core.decisions import DecisionBook
 from caviar_broker.core.events import Action, Latency, Notice, Product
 from caviar_broker.core.graph import Edge, Graph
@@ -20,6 +17,8 @@ from caviar_broker.core.pace import Pacer
 from caviar_broker.core.plan import RunPlan, ServicePlan
 from caviar_broker.core.tasks import Decision, GrantOrder, Task, milliseconds, provenance
 from caviar_broker.core.transitions import OUTSTANDING, TaskEvent, TaskState
+from caviar_protocol.digest import RunDigest
+from caviar_protocol.messages import GrantInput, Report, Status
 
 
 class EpisodeSchedule:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from caviar_protocol.messages import GrantInput, Report, Status
-
 from caviar_broker.core.events import Product
 from caviar_broker.core.transitions import TASK, TaskEvent, TaskState, step
+from caviar_protocol.messages import GrantInput, Report, Status
 
 
 @dataclass(frozen=True, slots=True)
