@@ -250,18 +250,22 @@ class BrokerServer:
         self._reply(route, m.HeartbeatAck(sequence=0))
 
     def _asset_offer(self, service: str, message: m.AssetOffer, _: Sequence[zmq.Frame]) -> None:
-        requests = self._scenery.offered(service, message.assets)
+        try:
+            requests = self._scenery.offered(service, message.assets)
+        except AssetError as error:
+            self.feed(ev.Violated(service, f"offered wrong scenery: {error}"))
+            return
         self.feed(ev.AssetsOffered(service, message.assets))
         for request in requests:
             self._reply(self._routes[service], request)
 
     def _asset_data(self, service: str, message: m.AssetData, parts: Sequence[zmq.Frame]) -> None:
         try:
-            request = self._scenery.taken(service, message, parts[0].buffer)
+            requests = self._scenery.taken(service, message, parts[0].buffer)
         except AssetError as error:
             self.feed(ev.Violated(service, f"sent wrong scenery: {error}"))
             return
-        if request is not None:
+        for request in requests:
             self._reply(self._routes[service], request)
         if self._scenery.complete(service) and service in self._deferred:
             self.feed(ev.ReadyReceived(service, self._deferred.pop(service)))

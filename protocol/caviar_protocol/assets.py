@@ -9,10 +9,16 @@ import tempfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+import msgspec
+
 from caviar_protocol.digest import geometry_digest
-from caviar_protocol.errors import AssetError
-from caviar_protocol.limits import MAX_ASSET_CHUNK
+from caviar_protocol.errors import AssetError, SetupError
+from caviar_protocol.fields import AssetName
+from caviar_protocol.limits import MAX_ASSET_CHUNK, MAX_BODY
 from caviar_protocol.messages import Asset
+
+MAX_ASSET = MAX_BODY
+"""[B] A file of scenery is at most this large: it is put together in memory."""
 
 
 def default_folder() -> Path:
@@ -22,40 +28,61 @@ def default_folder() -> Path:
 
 class AssetStore:
     """Content-addressed files below ``folder``. Safe for several processes at once: a file appears
-    under its digest only when it is complete and verified."""
+    under its digest only when it is complete and verified.
+
+    What a process finds in the store it believes only after it has looked at size and digest itself,
+    once: disks fill up and machines crash while a cache is written.
+
+    Raises `SetupError` where the folder cannot be made.
+    """
 
     def __init__(self, folder: Path | None = None) -> None:
         self.folder = folder or default_folder()
         self._files = self.folder / "assets"
-        self._files.mkdir(parents=True, exist_ok=True)
+        self._verified: set[str] = set()
+        try:
+            self._files.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise SetupError(
+                f"cannot keep scenery in {self._files}: {error.strerror}; "
+                "name a folder that can be written: export XDG_CACHE_HOME=/path"
+            ) from error
 
-    def has(self, digest: str) -> bool:
-        """Whether the whole file is here."""
-        return self.path(digest).is_file()
+    def holds(self, asset: Asset) -> bool:
+        """Whether the whole file is here, with the size and content that its description tells."""
+        return self._intact(asset.digest, asset.size)
 
     def path(self, digest: str) -> Path:
         """Where the file with this digest is, or would be."""
         return self._files / digest
 
     def add(self, name: str, content: Path | bytes) -> Asset:
-        """Take in a file and describe it. `AssetError` naming it where it cannot be read."""
+        """Take in a file and describe it.
+
+        Raises `AssetError` where it cannot be read or stored, is too large, or ``name`` could lead
+        out of a folder.
+        """
+        _check_name(name)
         try:
             data = content if isinstance(content, bytes) else content.read_bytes()
         except OSError as error:
             raise AssetError(f"asset {name!r}: cannot read {content!r}: {error.strerror}") from error
-        digest = hashlib.sha256(data).hexdigest()
-        if not self.has(digest):
-            self._place(digest, data)
-        return Asset(name=name, digest=digest, size=len(data))
+        asset = Asset(name=name, digest=hashlib.sha256(data).hexdigest(), size=len(data))
+        _check_size(asset)
+        if not self.holds(asset):
+            self._place(asset, data)
+        return asset
 
     def read(self, digest: str, offset: int) -> tuple[bytes, int]:
         """Up to a chunk of a file from ``offset``, and the file's size [B].
 
-        Raises `AssetError` where there is no such file.
+        Raises `AssetError` where there is no such file, or it ends before ``offset``.
         """
         try:
             with self.path(digest).open("rb") as file:
                 size = os.fstat(file.fileno()).st_size
+                if offset > size:
+                    raise AssetError(f"asset {digest} has {size} B, there is nothing at {offset}")
                 file.seek(offset)
                 return file.read(MAX_ASSET_CHUNK), size
         except OSError as error:
@@ -64,45 +91,69 @@ class AssetStore:
     def folder_of(self, assets: Iterable[Asset]) -> Mapping[str, Path]:
         """Local files of a manifest, all in one folder at their names as relative paths.
 
-        The folder is kept under the manifest's digest, so that it is laid out once. Raises
-        `AssetError` where a file of it is not in the store.
+        The folder is kept under the manifest's digest; what is in it already and intact is not laid
+        out again. Raises `AssetError` where a file of the manifest is not in the store.
         """
         manifest = list(assets)
         folder = self.folder / "geometry" / (geometry_digest(manifest) or "none")
-        if not folder.is_dir():
-            staged = Path(tempfile.mkdtemp(dir=self.folder, prefix="staged-"))
+        for asset in manifest:
+            _check_name(asset.name)
+            if not self.holds(asset):
+                raise AssetError(f"asset {asset.name!r} ({asset.digest[:12]}…) was never fetched")
             try:
-                for asset in manifest:
-                    self._lay_out(asset, staged / asset.name)
-                folder.parent.mkdir(exist_ok=True)
-                staged.rename(folder)
+                self._lay_out(asset, folder / asset.name)
             except OSError as error:
-                if not folder.is_dir():  # another process may have been first
-                    raise AssetError(f"cannot lay out scenery in {folder}: {error.strerror}") from error
-            finally:
-                shutil.rmtree(staged, ignore_errors=True)
+                raise AssetError(f"cannot lay out {asset.name!r} in {folder}: {error.strerror}") from error
         return {asset.name: folder / asset.name for asset in manifest}
+
+    def _intact(self, digest: str, size: int) -> bool:
+        path = self.path(digest)
+        try:
+            if path.stat().st_size != size:
+                return False
+            if digest not in self._verified:
+                if _file_digest(path) != digest:
+                    return False
+                self._verified.add(digest)
+        except OSError:
+            return False
+        return True
 
     def _lay_out(self, asset: Asset, target: Path) -> None:
         source = self.path(asset.digest)
-        if not source.is_file():
-            raise AssetError(f"asset {asset.name!r} ({asset.digest[:12]}…) was never fetched")
+        if target.is_file() and (target.samefile(source) or _file_digest(target) == asset.digest):
+            return
         target.parent.mkdir(parents=True, exist_ok=True)
+        staged = Path(tempfile.mkdtemp(dir=target.parent, prefix=".staged-")) / "file"
         try:
-            os.link(source, target)
-        except OSError:  # no hard links on this file system
-            shutil.copyfile(source, target)
+            try:
+                os.link(source, staged)
+            except OSError:  # no hard links on this file system
+                shutil.copyfile(source, staged)
+            staged.replace(target)
+        finally:
+            shutil.rmtree(staged.parent)
 
-    def _place(self, digest: str, data: bytes) -> None:
-        with tempfile.NamedTemporaryFile(dir=self._files, prefix="part-", delete=False) as file:
-            file.write(data)
-        Path(file.name).replace(self.path(digest))
+    def _place(self, asset: Asset, data: bytes) -> None:
+        try:
+            with tempfile.NamedTemporaryFile(dir=self._files, prefix="part-", delete=False) as file:
+                file.write(data)
+            Path(file.name).replace(self.path(asset.digest))
+        except OSError as error:
+            raise AssetError(
+                f"cannot keep asset {asset.name!r} in {self._files}: {error.strerror}"
+            ) from error
+        self._verified.add(asset.digest)
 
 
 class Incoming:
-    """One file on its way, chunk by chunk."""
+    """One file on its way, chunk by chunk.
+
+    Raises `AssetError` where more is announced than a file may have.
+    """
 
     def __init__(self, store: AssetStore, asset: Asset) -> None:
+        _check_size(asset)
         self.asset = asset
         self._store = store
         self._data = bytearray()
@@ -118,16 +169,37 @@ class Incoming:
         Raises `AssetError` where the chunk is not the next one, or the content has another digest
         than announced.
         """
-        name = self.asset.name
-        if offset != self.offset or size != self.asset.size or (size and not len(chunk)):
+        name, announced = self.asset.name, self.asset
+        fits = offset == self.offset and size == announced.size and offset + len(chunk) <= size
+        if not fits or (size and not len(chunk)):
             raise AssetError(
                 f"asset {name!r}: got {len(chunk)} B at {offset} of {size} B, expected them at "
-                f"{self.offset} of {self.asset.size} B"
+                f"{self.offset} of {announced.size} B"
             )
         self._data += chunk
         if self.offset < size:
             return False
-        added = self._store.add(name, bytes(self._data))
-        if added.digest != self.asset.digest:
-            raise AssetError(f"asset {name!r} has digest {added.digest}, announced was {self.asset.digest}")
+        digest = hashlib.sha256(self._data).hexdigest()
+        if digest != announced.digest:
+            raise AssetError(f"asset {name!r} has digest {digest}, announced was {announced.digest}")
+        self._store.add(name, bytes(self._data))
         return True
+
+
+def _check_name(name: str) -> None:
+    try:
+        msgspec.convert(name, AssetName)
+    except msgspec.ValidationError as error:
+        raise AssetError(
+            f"asset name {name!r} is not a relative path with forward slashes and without '.' and '..'"
+        ) from error
+
+
+def _check_size(asset: Asset) -> None:
+    if asset.size > MAX_ASSET:
+        raise AssetError(f"asset {asset.name!r} has {asset.size} B, a file may have {MAX_ASSET} B")
+
+
+def _file_digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

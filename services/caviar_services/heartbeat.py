@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
-import select
-import signal
 import threading
 import time
+from collections.abc import Callable
 
 import zmq
 
@@ -17,30 +17,32 @@ from caviar_protocol.messages import Attach, Heartbeat, HeartbeatAck, Welcome
 
 _log = logging.getLogger("caviar.heartbeat")
 
-TERMINATION_GRACE_S = 1.5
-"""[s] from SIGTERM until the process is ended from this thread, for a service that is busy in
-compiled code and cannot see the signal."""
-
 
 class HeartbeatThread(threading.Thread):
     """Tells the broker that this process lives, and watches that the broker does.
 
-    The same thread watches for SIGTERM through ``set_wakeup_fd``: a Python signal handler does not
-    run while the main thread is inside a compiled call.
+    ``gone`` is called in this thread when the broker has been silent for longer than the run's
+    liveness, at least two heartbeats are unanswered, and then no more.
     """
 
     def __init__(
-        self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str, name: str, welcome: Welcome
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        endpoint: str,
+        name: str,
+        welcome: Welcome,
+        gone: Callable[[], None],
     ) -> None:
         super().__init__(name="heartbeat", daemon=True)
-        self._context, self._endpoint = context, endpoint
+        self._context, self._endpoint, self._gone = context, endpoint, gone
         self._attach = Attach(epoch=welcome.epoch, attempt=welcome.attempt, name=name)
         self._interval = welcome.heartbeat_ns / 1e9
         self._liveness = welcome.liveness_ns / 1e9
         self._lock = threading.Lock()
         self._progress, self._phase, self._grace_ns = 0, "", 0
-        self._halt = threading.Event()
-        self._silent_since: float | None = None
+        self._halt = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self.broker_silence: float | None = None
+        """For how long the broker has been silent [s], once that is too long; None while it lives."""
 
     def progress(self, phase: str, grace_s: float = 0.0) -> None:
         """Say what the service is doing, and that it advances."""
@@ -48,32 +50,44 @@ class HeartbeatThread(threading.Thread):
             self._progress += 1
             self._phase, self._grace_ns = phase, round(grace_s * 1e9)
 
-    @property
-    def broker_silence(self) -> float | None:
-        """For how long the broker has been silent [s], once that is too long; None while it lives."""
-        since = self._silent_since
-        return None if since is None else time.monotonic() - since
-
     def stop(self) -> None:
         """End the thread and wait for it."""
-        self._halt.set()
-        self.join(timeout=2 * self._interval + 1.0)
+        os.eventfd_write(self._halt, 1)
+        self.join(timeout=1.0)
 
     def run(self) -> None:
-        """Send heartbeats until told to stop."""
+        """Send heartbeats until told to stop, or until the broker is silent for too long."""
         with self._context.socket(zmq.DEALER) as socket:
             socket.linger = 0
             socket.connect(self._endpoint)
-            socket.send(encode_message(self._attach))
-            heard, sequence = time.monotonic(), 0
-            while not self._halt.is_set():
-                if socket.poll(round(self._interval * 1000)):
-                    heard = self._drain(socket, heard)
-                    if self._halt.wait(self._interval / 2):
-                        break
-                self._silent_since = heard if time.monotonic() - heard > self._liveness else None
-                socket.send(self._heartbeat(sequence))
+            socket.send(encode_message(self._attach), zmq.NOBLOCK)
+            self._beat(socket)
+        if self.broker_silence is not None:
+            self._gone()
+
+    def _beat(self, socket: zmq.Socket[bytes]) -> None:
+        poller = zmq.Poller()
+        poller.register(socket, zmq.POLLIN)
+        poller.register(self._halt, zmq.POLLIN)
+        due, sequence, answered, silence = time.monotonic(), 0, 0, 0.0
+        while True:
+            began = time.monotonic()
+            if began >= due:
+                socket.send(self._heartbeat(sequence), zmq.NOBLOCK)
                 sequence += 1
+                due = began + self._interval
+            ready = dict(poller.poll(math.ceil((due - began) * 1000)))
+            if self._halt in ready:
+                return
+            if socket in ready and self._heard(socket):
+                answered, silence = sequence, 0.0
+                continue
+            # Only time in which this thread really listened counts as silence: while somebody else
+            # holds the interpreter's lock, answers wait in the socket.
+            silence += min(time.monotonic() - began, self._interval)
+            if silence > self._liveness and sequence - answered >= 2:
+                self.broker_silence = silence
+                return
 
     def _heartbeat(self, sequence: int) -> bytes:
         with self._lock:
@@ -84,43 +98,18 @@ class HeartbeatThread(threading.Thread):
             )
 
     @staticmethod
-    def _drain(socket: zmq.Socket[bytes], heard: float) -> float:
-        while socket.poll(0):
+    def _heard(socket: zmq.Socket[bytes]) -> bool:
+        """Take all that has come: whether an answer was among it."""
+        heard = False
+        while True:
             try:
-                if isinstance(decode_message(socket.recv(zmq.NOBLOCK)), HeartbeatAck):
-                    heard = time.monotonic()
+                message = decode_message(socket.recv(zmq.NOBLOCK))
+            except zmq.Again:
+                return heard
             except ProtocolError as error:
                 _log.warning("the broker sent what is no message: %s", error)
-        return heard
-
-
-class Termination:
-    """SIGTERM and SIGINT as a flag, and as a certain end.
-
-    A flag alone would not end a process that is inside a long compiled call, so a thread waits for
-    the signal too and ends the process `TERMINATION_GRACE_S` later.
-    """
-
-    def __init__(self) -> None:
-        self.requested = False
-        self._read, self._write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
-        signal.signal(signal.SIGTERM, self._handle)
-        signal.signal(signal.SIGINT, self._handle)
-        signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
-        self._done = threading.Event()
-        threading.Thread(target=self._watch, name="termination", daemon=True).start()
-
-    def _handle(self, *_: object) -> None:
-        self.requested = True
-
-    def _watch(self) -> None:
-        while not self._done.is_set():
-            select.select([self._read], [], [])
-            if {signal.SIGTERM, signal.SIGINT} & set(os.read(self._read, 64)):
-                if not self._done.wait(TERMINATION_GRACE_S):
-                    os._exit(128 + signal.SIGTERM)
-                return
-
-    def finished(self) -> None:
-        """The process ends by itself; do not force it."""
-        self._done.set()
+                continue
+            if isinstance(message, HeartbeatAck):
+                heard = True
+            else:
+                _log.warning("the broker says on the heartbeat connection: %s", message)

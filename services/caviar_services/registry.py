@@ -2,7 +2,8 @@
 
 Strings, loaded late: importing this module imports no implementation, and an implementation
 imports its heavy libraries only when it prepares. Other distributions add theirs through the
-entry-point group ``caviar.services`` (name ``role:name``, value ``module:Class``).
+entry-point group ``caviar.services`` (name ``role:name``, value ``module:Class``). What is not
+registered at all can be named by its place, ``module:Class``, as long as Python finds the module.
 """
 
 from __future__ import annotations
@@ -51,10 +52,25 @@ def registered() -> dict[str, str]:
 
 
 def load(role: str, name: str) -> type[Service[Any]]:
-    """The class registered as ``role:name``.
+    """The class registered as ``role:name``, or at the place ``module:Class`` that ``name`` gives.
 
-    Raises `DeclarationError` with the known names, nearest first, where there is none.
+    Raises `DeclarationError` with the known names, nearest first, where there is none, or saying
+    what is wrong with the class.
     """
+    target = name if ":" in name else _registered_target(role, name)
+    module_name, _, class_name = target.partition(":")
+    try:
+        cls = getattr(import_module(module_name), class_name)
+    except (ImportError, AttributeError) as error:
+        raise DeclarationError(f"{role} {name!r} cannot be loaded from {target}: {error}") from error
+    if not (isinstance(cls, type) and issubclass(cls, Service)):
+        raise DeclarationError(f"{role} {name!r} is {target}, which is not a Service")
+    if cls.role != role:
+        raise DeclarationError(f"{role} {name!r} is {target}, whose role is {cls.role!r}")
+    return cls
+
+
+def _registered_target(role: str, name: str) -> str:
     known = registered()
     target = known.get(f"{role}:{name}")
     if target is None:
@@ -62,10 +78,4 @@ def load(role: str, name: str) -> type[Service[Any]]:
         near = difflib.get_close_matches(name, names, n=1)
         hint = f"did you mean {near[0]!r}? " if near else ""
         raise DeclarationError(f"no {role} is named {name!r}; {hint}known: {', '.join(names)}")
-    module_name, _, class_name = target.partition(":")
-    cls = getattr(import_module(module_name), class_name)
-    if not (isinstance(cls, type) and issubclass(cls, Service)):
-        raise DeclarationError(f"{role}:{name} is {target}, which is not a Service")
-    if cls.role != role:
-        raise DeclarationError(f"{role}:{name} is {target}, whose role is {cls.role!r}")
-    return cls
+    return target

@@ -7,11 +7,8 @@ as long as the run does is bounded by the broker's heartbeats.
 
 from __future__ import annotations
 
-import logging
 import os
 import time
-import traceback
-from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,27 +19,21 @@ import zmq
 from caviar_protocol import limits
 from caviar_protocol import messages as m
 from caviar_protocol.assets import AssetStore, Incoming
-from caviar_protocol.codec import check_parts, check_version, decode_message, encode_message, encode_payload
+from caviar_protocol.codec import check_version, encode_message, encode_payload, message_type
 from caviar_protocol.digest import geometry_digest, payload_digest
-from caviar_protocol.errors import CaviarError, ProtocolError, RunError
+from caviar_protocol.errors import AssetError, PayloadError, ProtocolError, RunError
 from caviar_protocol.host import host_identity
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.tables import convert_settings
-from caviar_protocol.topics import Carrier
-from caviar_services.heartbeat import HeartbeatThread, Termination
+from caviar_protocol.topics import PAYLOADS, Carrier
+from caviar_services.answers import Answers, Guard
+from caviar_services.connection import Connection, RunOver, Terminated, describe
 from caviar_services.registry import load
 from caviar_services.service import Frame, FrameInput, Preparation, Prepared, RunInfo, Service, StepResult
-
-_log = logging.getLogger("caviar.service")
+from caviar_services.termination import TERMINATED, Termination
 
 CONNECT_TIMEOUT_S = 30.0
-"""[s] until the broker has to answer HELLO."""
-POLL_MS = 50
-"""[ms] between looks at the termination flag and the broker's heartbeat while waiting."""
-
-
-class Terminated(Exception):  # noqa: N818  # an order, not an error
-    """SIGTERM came."""
+"""[s] until the broker has to answer HELLO, or a request for scenery."""
 
 
 class Runner:
@@ -56,60 +47,75 @@ class Runner:
         Registered implementation.
     endpoint
         ZeroMQ address of the broker.
+    connect_timeout_s
+        Until the broker has to answer HELLO, or a request for scenery [s].
     """
 
-    def __init__(self, name: str, role: str, use: str, endpoint: str) -> None:
-        self.name, self.use, self.endpoint = name, use, endpoint
+    def __init__(
+        self, name: str, role: str, use: str, endpoint: str, connect_timeout_s: float = CONNECT_TIMEOUT_S
+    ) -> None:
+        self.name, self.use = name, use
         self.cls = load(role, use)
+        self._timeout_s = connect_timeout_s
         self._store = AssetStore()
         self._termination = Termination()
-        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._socket = self._context.socket(zmq.DEALER)
-        self._heartbeat: HeartbeatThread | None = None
+        self._broker = Connection(name, endpoint, self._termination)
         self._service: Service[Any] | None = None
-        self._welcome: m.Welcome | None = None
-        self._answers: OrderedDict[tuple[int, int], list[Any]] = OrderedDict()
-        self._prepared = False
+        self._identity: dict[str, Any] = {}
+        """``epoch`` and ``attempt``, which stand in every message (clause 1)."""
+        self._episode = -1
+        """Episode that was reset to; −1: none."""
+        self._answers = Answers()
         self._handlers: Mapping[type, Callable[[Any, Sequence[zmq.Frame]], None]] = {
             m.Prepare: self._prepare,
             m.AssetGet: self._serve_asset,
             m.Reset: self._reset,
             m.Grant: self._grant,
             m.EpisodeEnd: self._episode_end,
-            m.Cancel: self._ignore,
-            m.Stale: self._complaint,
-            m.Error: self._complaint,
         }
 
     def run(self) -> int:
-        """Serve until SHUTDOWN; the exit status: 0 after it, 143 after SIGTERM."""
-        self._socket.linger = 500
-        self._socket.setsockopt(zmq.MAXMSGSIZE, limits.MAX_BODY)
-        self._socket.connect(self.endpoint)
+        """Serve until SHUTDOWN; the exit status: 0 after it, 143 after SIGTERM.
+
+        Raises `RunError` where there is no broker, it refuses this service, or it is gone.
+        """
         try:
             self._join()
             while True:
-                message, parts = self._receive()
-                if isinstance(message, m.Shutdown):
-                    self._bye(message.reason)
-                    return 0
-                handler = self._handlers.get(type(message))
-                if handler is None:
-                    kind = str(type(message).__struct_config__.tag)
-                    self._send(m.Error(code="unexpected", of=kind, message=f"{kind} is not for a service"))
-                else:
-                    handler(message, parts)
+                self._handle(*self._broker.receive())
+        except RunOver as order:
+            if self._service is None and not self._identity:
+                raise RunError(f"the run ended before {self.name!r} was in it: {order}") from order
+            self._bye(str(order))
+            return 0
         except Terminated:
             self._bye("SIGTERM")
-            return 143
+            return TERMINATED
         finally:
             self._close()
+
+    def _handle(self, message: m.Message, parts: Sequence[zmq.Frame]) -> None:
+        if isinstance(message, m.Cancel | m.Stale | m.Error):
+            return  # advisory: a step that has begun is finished; complaints are logged already
+        handler = self._handlers.get(type(message))
+        if handler is None:
+            self._unexpected(message, "it is not for a service that is in the run")
+            return
+        epoch, attempt = self._identity["epoch"], self._identity["attempt"]
+        if (getattr(message, "epoch", epoch), getattr(message, "attempt", attempt)) != (epoch, attempt):
+            self._unexpected(message, f"this is attempt {attempt} in epoch {epoch}")
+            return
+        handler(message, parts)
+
+    def _unexpected(self, message: m.Message, why: str) -> None:
+        kind = message_type(message)
+        self._broker.send(m.Error(code="unexpected", of=kind, message=f"{kind} is not used: {why}"))
 
     # --- joining -----------------------------------------------------------------------------------
 
     def _join(self) -> None:
-        cls = self.cls
-        self._send(
+        cls, broker = self.cls, self._broker
+        broker.send(
             m.Hello(
                 version=m.PROTOCOL_VERSION,
                 name=self.name,
@@ -118,23 +124,21 @@ class Runner:
                 outputs=cls.outputs,
                 capabilities=m.CAPABILITIES,
                 implementation=self.use,
+                max_in_flight=limits.MAX_IN_FLIGHT,
                 host=host_identity(),
                 pid=os.getpid(),
             )
         )
-        message, _ = self._receive(CONNECT_TIMEOUT_S)
+        message, _ = broker.receive(self._timeout_s)
         if isinstance(message, m.Refuse):
             raise RunError(
-                f"the broker at {self.endpoint} refused {self.name!r} ({message.code}): {message.message}"
+                f"the broker at {broker.endpoint} refused {self.name!r} ({message.code}): {message.message}"
             )
-        if isinstance(message, m.Shutdown):
-            raise RunError(f"the run ended before {self.name!r} was in it: {message.reason}")
         if not isinstance(message, m.Welcome):
-            raise ProtocolError(f"the broker answered HELLO with {type(message).__name__}, not WELCOME")
+            raise ProtocolError(f"the broker answered HELLO with {describe(message)}, not with WELCOME")
         check_version(message.version)
-        self._welcome = message
-        self._heartbeat = HeartbeatThread(self._context, self.endpoint, self.name, message)
-        self._heartbeat.start()
+        self._identity = {"epoch": message.epoch, "attempt": message.attempt}
+        broker.beat(message)
         with self._reporting("settings"):
             settings = convert_settings(cls.Settings, message.settings)
             self._service = cls(settings, self._run_info(message))
@@ -151,7 +155,7 @@ class Runner:
             devices=msgspec.convert(told.get("devices", ()), tuple[DeviceSpec, ...]),
             scenario=told.get("resolved", {}),
             directory=Path(str(told.get("directory", "."))),
-            progress=self._progress,
+            progress=self._broker.progress,
         )
 
     # --- preparing ---------------------------------------------------------------------------------
@@ -163,7 +167,7 @@ class Runner:
             if message.demand or service.role in ("agent", "recorder") or not service.outputs:
                 offered = [self._store.add(n, c) for n, c in sorted(service.scenery().items())]
                 if offered:
-                    self._send(m.AssetOffer(**self._identity, assets=tuple(offered)))
+                    self._broker.send(m.AssetOffer(**self._identity, assets=tuple(offered)))
                 assets = self._fetch(message.assets) if service.uses_scenery else offered
                 geometry = geometry_digest(assets)
                 prepared = service.prepare(
@@ -173,7 +177,7 @@ class Runner:
                         producers=message.producers,
                     )
                 )
-            self._send(
+            self._broker.send(
                 m.Ready(
                     **self._identity,
                     geometry=geometry,
@@ -185,51 +189,78 @@ class Runner:
 
     def _fetch(self, assets: Sequence[m.Asset]) -> list[m.Asset]:
         """Get through the broker what this machine does not hold yet (clause 4)."""
-        missing = [asset for asset in assets if not self._store.has(asset.digest)]
+        missing = [asset for asset in assets if not self._store.holds(asset)]
         for number, asset in enumerate(missing, 1):
-            self._progress(f"fetching scenery, file {number} of {len(missing)}")
+            self._broker.progress(f"fetching scenery, file {number} of {len(missing)}")
             incoming = Incoming(self._store, asset)
             complete = False
             while not complete:
-                self._send(m.AssetGet(digest=asset.digest, offset=incoming.offset))
-                answer, parts = self._receive(CONNECT_TIMEOUT_S)
-                if not isinstance(answer, m.AssetData) or answer.digest != asset.digest:
-                    raise ProtocolError(f"asked for asset {asset.name!r}, got {answer}")
-                complete = incoming.take(answer.offset, answer.size, parts[0].buffer)
+                self._broker.send(m.AssetGet(digest=asset.digest, offset=incoming.offset))
+                answer, chunk = self._asset_data(asset)
+                complete = incoming.take(answer.offset, answer.size, chunk)
         return list(assets)
+
+    def _asset_data(self, asset: m.Asset) -> tuple[m.AssetData, memoryview]:
+        until = time.monotonic() + self._timeout_s
+        while time.monotonic() < until:
+            answer, parts = self._broker.receive(self._timeout_s)
+            if isinstance(answer, m.AssetData) and answer.digest == asset.digest:
+                return answer, parts[0].buffer
+            if isinstance(answer, m.Error) and answer.subject == asset.digest:
+                raise AssetError(f"the broker cannot deliver asset {asset.name!r}: {answer.message}")
+            if not isinstance(answer, m.AssetGet | m.Cancel | m.Error):
+                raise ProtocolError(f"asked for asset {asset.name!r}, got {describe(answer)}")
+            self._handle(answer, parts)
+        raise AssetError(f"the broker did not deliver asset {asset.name!r} within {self._timeout_s:g} s")
 
     def _serve_asset(self, message: m.AssetGet, _: Sequence[zmq.Frame]) -> None:
         try:
             chunk, size = self._store.read(message.digest, message.offset)
-        except CaviarError as error:
-            self._send(
+        except AssetError as error:
+            self._broker.send(
                 m.Error(code="unknown-asset", of="ASSET_GET", subject=message.digest, message=str(error))
             )
         else:
-            self._send(m.AssetData(digest=message.digest, offset=message.offset, size=size), chunk)
+            self._broker.send(m.AssetData(digest=message.digest, offset=message.offset, size=size), chunk)
 
     # --- frames ------------------------------------------------------------------------------------
 
     def _reset(self, message: m.Reset, _: Sequence[zmq.Frame]) -> None:
         with self._reporting("reset", message.episode):
-            self._progress(f"reset to episode {message.episode}")
+            self._broker.progress(f"reset to episode {message.episode}")
             self._answers.clear()
             self._running.reset(message.episode, message.seed, message.t0_ns)
-            self._send(m.ResetDone(**self._identity, episode=message.episode))
+            self._episode = message.episode
+            self._broker.send(m.ResetDone(**self._identity, episode=message.episode))
 
     def _grant(self, grant: m.Grant, parts: Sequence[zmq.Frame]) -> None:
-        key = (grant.episode, grant.frame)
-        if key not in self._answers:
-            with self._reporting("step", grant.episode, grant.frame):
-                self._progress(f"frame {grant.frame}")
-                frame = self._frame(grant, parts)
-                started = time.monotonic_ns()
-                result = self._running.step(frame)
-                self._answers[key] = self._answer(grant, result, started)
-                if len(self._answers) > 2 * limits.MAX_IN_FLIGHT:
-                    self._answers.popitem(last=False)
-        if key in self._answers:
-            self._socket.send_multipart(self._answers[key], copy=False)
+        if grant.episode != self._episode:
+            self._unexpected(grant, f"there was no RESET to episode {grant.episode}")
+            return
+        if self._answers.is_new(grant.frame):
+            self._broker.progress(f"frame {grant.frame}")
+            self._answers.put(grant.frame, self._answer(grant, parts))
+        answer = self._answers.get(grant.frame)
+        if answer is None:
+            self._unexpected(grant, f"frame {grant.frame} was answered long ago")
+        else:
+            self._broker.send_parts(answer)
+
+    def _answer(self, grant: m.Grant, parts: Sequence[zmq.Frame]) -> list[Any]:
+        """DONE with its products, or FAULT, as it travels."""
+        answer: list[Any] = []
+
+        def failed(fault: m.Fault) -> None:
+            answer.append(encode_message(fault))
+
+        with Guard(self._identity, failed, "step", grant.episode, grant.frame) as guard:
+            frame = self._frame(grant, parts)
+            started = time.monotonic_ns()
+            result = self._running.step(frame)
+            stepped = time.monotonic_ns()
+            guard.phase = "encode"
+            answer += self._encode(grant, result, started, stepped)
+        return answer
 
     def _frame(self, grant: m.Grant, parts: Sequence[zmq.Frame]) -> Frame:
         inputs, taken = [], 0
@@ -251,14 +282,16 @@ class Runner:
             seed=self._running.run.seed,
         )
 
-    def _answer(self, grant: m.Grant, result: StepResult, started: int) -> list[Any]:
-        headers, body_parts = [], list[Any]()
-        stepped = time.monotonic_ns()
+    def _encode(self, grant: m.Grant, result: StepResult, started: int, stepped: int) -> list[Any]:
+        headers, parts = [], list[Any]()
         for topic in sorted(result.products):
-            header, body = encode_payload(result.products[topic])
+            payload = result.products[topic]
+            if type(payload) is not PAYLOADS.get(topic):
+                raise PayloadError(f"{self.use} made a {type(payload).__name__} for the topic {topic!r}")
+            header, body = encode_payload(payload)
             digest = payload_digest(header, body)
             headers.append(m.ProductHeader(topic=topic, digest=digest, fidelity=result.fidelity))
-            body_parts += [header, body]
+            parts += [header, body]
         done = m.Done(
             **self._identity,
             episode=grant.episode,
@@ -269,52 +302,13 @@ class Runner:
             counts=dict(result.counts),
             end_episode=result.end_episode,
         )
-        return [encode_message(done), *body_parts]
+        return [encode_message(done), *parts]
 
     def _episode_end(self, message: m.EpisodeEnd, _: Sequence[zmq.Frame]) -> None:
         with self._reporting("end of episode", message.episode):
             self._running.end_episode(message.frames)
 
-    # --- the connection ------------------------------------------------------------------------------
-
-    def _receive(self, timeout_s: float | None = None) -> tuple[m.Message, Sequence[zmq.Frame]]:
-        """Next message and its further parts.
-
-        Raises `Terminated` after SIGTERM, `RunError` when the broker is silent for longer than its
-        liveness, or after ``timeout_s``.
-        """
-        give_up = None if timeout_s is None else time.monotonic() + timeout_s
-        while True:
-            if self._termination.requested:
-                raise Terminated
-            if self._socket.poll(POLL_MS):
-                parts = self._socket.recv_multipart(copy=False)
-                try:
-                    message = decode_message(parts[0].buffer)
-                    check_parts(message, parts)
-                except ProtocolError as error:
-                    self._send(m.Error(code=error.code, message=str(error)))
-                    continue
-                return message, parts[1:]
-            silence = self._heartbeat.broker_silence if self._heartbeat else None
-            if silence is not None:
-                raise RunError(
-                    f"the broker at {self.endpoint} has been silent for {silence:.1f} s; {self.name!r} gives up"
-                )
-            if give_up is not None and time.monotonic() > give_up:
-                raise RunError(
-                    f"no answer from a broker at {self.endpoint} within {timeout_s:g} s; "
-                    "is `caviar broker` running there?"
-                )
-
-    def _send(self, message: m.Message, *parts: bytes) -> None:
-        self._socket.send_multipart([encode_message(message), *parts])
-
-    @property
-    def _identity(self) -> dict[str, Any]:
-        if self._welcome is None:
-            raise ProtocolError("the broker sent an order before WELCOME")
-        return {"epoch": self._welcome.epoch, "attempt": self._welcome.attempt}
+    # --- what both need ------------------------------------------------------------------------------
 
     @property
     def _running(self) -> Service[Any]:
@@ -322,66 +316,20 @@ class Runner:
             raise RunError(f"{self.name!r} could not be set up")
         return self._service
 
-    def _progress(self, phase: str, grace_s: float = 0.0) -> None:
-        if self._heartbeat is not None:
-            self._heartbeat.progress(phase, grace_s)
-
-    def _reporting(self, phase: str, episode: int = 0, frame: int = -1) -> _Reporting:
-        return _Reporting(self, phase, episode, frame)
-
-    def report_fault(self, phase: str, episode: int, frame: int, error: Exception) -> None:
-        """Turn an exception of the service into a FAULT."""
-        known = isinstance(error, CaviarError)
-        text = str(error) if known else f"{type(error).__name__}: {error}"
-        detail = "" if known else "".join(traceback.format_exception(error))
-        _log.error(detail or text)
-        self._send(
-            m.Fault(
-                **self._identity,
-                episode=episode,
-                frame=frame,
-                phase=phase,
-                message=text[:2000],
-                detail=detail[-20000:],
-            )
-        )
+    def _reporting(self, phase: str, episode: int = 0) -> Guard:
+        return Guard(self._identity, self._broker.send, phase, episode)
 
     def _bye(self, reason: str) -> None:
-        if self._welcome is not None:
-            self._send(m.Bye(**self._identity, reason=reason))
+        if self._identity:
+            self._broker.send(m.Bye(**self._identity, reason=reason))
 
     def _close(self) -> None:
         try:
             if self._service is not None:
                 self._service.close()
         finally:
-            if self._heartbeat is not None:
-                self._heartbeat.stop()
-            self._socket.close()
-            self._context.term()
+            self._broker.close()
             self._termination.finished()
-
-    def _ignore(self, message: m.Message, _: Sequence[zmq.Frame]) -> None:
-        """CANCEL is advisory: a step that has begun is finished."""
-
-    def _complaint(self, message: m.Message, _: Sequence[zmq.Frame]) -> None:
-        _log.warning("the broker says: %s", message)
-
-
-class _Reporting:
-    """Turns an exception of the service, inside a ``with``, into a FAULT message."""
-
-    def __init__(self, runner: Runner, phase: str, episode: int, frame: int) -> None:
-        self._runner, self._phase, self._episode, self._frame = runner, phase, episode, frame
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, _: object, error: BaseException | None, __: object) -> bool:
-        if not isinstance(error, Exception) or isinstance(error, Terminated):
-            return False
-        self._runner.report_fault(self._phase, self._episode, self._frame, error)
-        return True
 
 
 def run_service(name: str, role: str, use: str, endpoint: str) -> int:

@@ -1,0 +1,60 @@
+"""How a service process is told to end, and made to."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import sys
+import threading
+
+TERMINATION_GRACE_S = 1.5
+"""[s] from SIGTERM until the process is ended by force, so that it is gone within 2 s."""
+
+TERMINATED = 128 + signal.SIGTERM
+"""Exit status of a service that was told to end by a signal."""
+
+
+class Termination:
+    """SIGTERM and SIGINT as a flag, and as a certain end.
+
+    A Python signal handler does not run while the main thread is inside a compiled call, so a
+    thread of its own hears of the signal through ``set_wakeup_fd``, and ends the process when the
+    main thread has not done so in time. Against a call that holds the interpreter's lock not even
+    that helps: then the process ends as soon as the lock is free, or is killed by whoever started it.
+    """
+
+    def __init__(self) -> None:
+        self.requested = False
+        self._ended = threading.Event()
+        self._read, write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        signal.set_wakeup_fd(write, warn_on_full_buffer=False)
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._handle)
+        threading.Thread(target=self._watch, name="termination", daemon=True).start()
+
+    def enforce(self, grace_s: float, status: int, last_words: str) -> None:
+        """See to it that the process ends with ``status`` unless it does so itself within ``grace_s``."""
+
+        def end() -> None:
+            if not self._ended.wait(grace_s):
+                sys.stderr.write(f"{last_words}\n")
+                os._exit(status)
+
+        threading.Thread(target=end, name="end", daemon=True).start()
+
+    def finished(self) -> None:
+        """Everything is closed; the process ends by itself."""
+        self._ended.set()
+
+    def _handle(self, *_: object) -> None:
+        self.requested = True
+
+    def _watch(self) -> None:
+        while True:
+            select.select([self._read], [], [])
+            if {signal.SIGTERM, signal.SIGINT} & set(os.read(self._read, 64)):
+                self.requested = True
+                words = "ended by SIGTERM in the middle of a call that does not return"
+                self.enforce(TERMINATION_GRACE_S, TERMINATED, words)
+                return
