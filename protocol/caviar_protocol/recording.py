@@ -27,7 +27,7 @@ from caviar_protocol.arrays import Payload
 from caviar_protocol.codec import decode_payload
 from caviar_protocol.digest import RunDigest
 from caviar_protocol.errors import ProtocolError, RecordingError
-from caviar_protocol.messages import GrantInput, Status
+from caviar_protocol.messages import GrantInput, Report, Status
 from caviar_protocol.recording_layout import (
     ASSET_FOLDER,
     FORMAT,
@@ -110,6 +110,11 @@ class RecordedFrame:
     def inputs(self) -> tuple[GrantInput, ...]:
         """Provenance of every product, absent ones included."""
         return self.entry.inputs
+
+    @property
+    def reports(self) -> tuple[Report, ...]:
+        """What services reported beside their products: decisions, counts, wall times."""
+        return self.entry.reports
 
     @cached_property
     def products(self) -> tuple[RecordedProduct, ...]:

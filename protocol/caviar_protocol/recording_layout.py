@@ -9,7 +9,7 @@ import msgspec
 
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import RecordingError
-from caviar_protocol.messages import Asset, GrantInput
+from caviar_protocol.messages import Asset, GrantInput, Report
 
 FORMAT = 1
 """Version of the layout of a recording; a reader refuses any other."""
@@ -73,6 +73,9 @@ class FrameEntry(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     inputs: tuple[GrantInput, ...] = ()
     """Provenance of every product, sorted by (topic, source, frame). Fresh and late products
     stand in the frame's chunk, a held one in the chunk of the frame it was computed for."""
+    reports: tuple[Report, ...] = ()
+    """What services reported beside their products: decisions that a replay imposes, counts of what
+    was dropped, and wall times, which no digest covers."""
 
 
 def segment_files(path: Path) -> list[Path]:

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from caviar_clients.cli.launch import Launcher
-from caviar_clients.cli.summary import LinkFigures, link_figures, summary_of, summary_table
+from caviar_clients.cli.summary import link_figures, summary_of, summary_table
 from caviar_protocol.errors import DeclarationError
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario_checks import scenario_error, settings_place, with_overrides
@@ -78,7 +78,7 @@ def run_scenario(
             watcher.take(event)
             if event["event"] == "finished":
                 outcome = event
-    figures = link_figures(directory) if outcome["frames"] else LinkFigures()
+    figures = link_figures(directory) if outcome["frames"] else None
     summary = summary_of(outcome, figures, scenario.run.name, directory, scenario.run.seed)
     _write(directory / "summary.json", summary)
     if json_file is not None:

@@ -6,61 +6,23 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import msgspec
-import numpy as np
 from rich.table import Table
 
+from caviar_clients.cli.inspect import LinkSummary, summarise
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.recording import Recording
-from caviar_protocol.topics import Link
 
 
-class LinkFigures(msgspec.Struct, frozen=True, kw_only=True):
-    """Means over users and frames of the link products of a recording.
-
-    Users without a path are left out of the means; `no_path_share` states how many they were.
-    """
-
-    mean_abs_y: float | None = None
-    """|y| of the pairs that the agents chose [1]."""
-    mean_abs_y_best: float | None = None
-    """|y| of the best pairs (eq. 2) [1]."""
-    mean_abs_y_baseline: float | None = None
-    """|y| of the pairs that point along the straight line [1]."""
-    no_path_share: float | None = None
-    """Users without a path, of all users in all frames [1]."""
-
-
-def link_figures(directory: Path) -> LinkFigures:
-    """Figures of the link products in a run's recording; empty where it has none."""
-    chosen, best, baseline, users, without = 0.0, 0.0, 0.0, 0, 0
+def link_figures(directory: Path) -> LinkSummary | None:
+    """Means over the link products of a run's recording; None where it has none."""
     try:
-        recording = Recording(directory)
+        return summarise(Recording(directory)).link
     except RecordingError:
-        return LinkFigures()
-    for _, product in recording.of("link"):
-        link = product.payload
-        if not isinstance(link, Link) or not link.rx:
-            continue
-        reached = link.has_path
-        users += len(link.rx)
-        without += int(np.count_nonzero(~reached))
-        chosen += float(link.abs_y[reached].sum())
-        best += float(link.top_abs_y[reached, 0].sum())
-        baseline += float(link.baseline_abs_y[reached].sum())
-    if not users:
-        return LinkFigures()
-    served = users - without
-    return LinkFigures(
-        mean_abs_y=chosen / served if served else None,
-        mean_abs_y_best=best / served if served else None,
-        mean_abs_y_baseline=baseline / served if served else None,
-        no_path_share=without / users,
-    )
+        return None
 
 
 def summary_of(
-    outcome: Mapping[str, Any], figures: LinkFigures, scenario: str, directory: Path, seed: int
+    outcome: Mapping[str, Any], figures: LinkSummary | None, scenario: str, directory: Path, seed: int
 ) -> dict[str, Any]:
     """Everything `--json` writes."""
     return {
@@ -74,7 +36,10 @@ def summary_of(
         "warm_up_frames": outcome["warm_up_frames"],
         "services": outcome["services"],
         "digest": outcome["digest"],
-        **msgspec.structs.asdict(figures),
+        "mean_abs_y": figures.mean_abs_y if figures else None,
+        "mean_abs_y_best": figures.mean_abs_y_best if figures else None,
+        "mean_abs_y_baseline": figures.mean_abs_y_baseline if figures else None,
+        "no_path_share": figures.no_path_share if figures else None,
     }
 
 

@@ -143,6 +143,7 @@ class McapRecorder(Recorder[McapSettings]):
             t_ns=frame.t_ns,
             seed=frame.seed,
             inputs=tuple(_with_digest(item) for item in inputs),
+            reports=frame.reports,
         )
         try:
             segment.write(entry, [item for item in inputs if self._to_store(item)], self._base_ns)
