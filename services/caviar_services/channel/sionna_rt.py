@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from caviar_protocol.arrays import Int64Array, quantity
+from caviar_protocol.arrays import Float64Array, Int64Array, quantity
 from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.errors import PayloadError, ScenarioError, SetupError
 from caviar_protocol.seeding import derive_seed
@@ -21,6 +21,7 @@ from caviar_services.channel.base import ChannelModel, Found
 from caviar_services.channel.sionna_materials import MaterialSettings, OutsideRange
 from caviar_services.channel.sionna_scene import SceneSettings, SionnaScene
 from caviar_services.channel.sionna_tracer import LaunchOptions, Traced, Tracer
+from caviar_services.channel.specular import refined_points
 from caviar_services.llvm import activate_llvm, choose_variant
 from caviar_services.service import Preparation, RunInfo
 
@@ -147,19 +148,7 @@ class SionnaChannel(ChannelModel[SionnaSettings]):
             for t, transmitter in enumerate(transmitters)
             for begin in range(0, len(receivers), self._at_once)
         ]
-        depth = self.settings.max_depth
-        table = PathTable(
-            pair=_joined([pair for pair, _ in parts], (0,), np.int64),
-            transfer=_joined([part.transfer for _, part in parts], (0, 3, 3), np.complex128)[None],
-            types=_joined([part.types for _, part in parts], (0, depth), np.uint8),
-            objects=self._scene.object_index(
-                _joined([part.shapes for _, part in parts], (0, depth), np.int64),
-                _joined([part.primitives for _, part in parts], (0, depth), np.int64),
-            ),
-            points=_joined([part.points for _, part in parts], (0, depth, 3), np.float64),
-            object_names=names,
-            object_velocity=velocity,
-        )
+        table = self._table(parts, names, velocity, transmitters, receivers)
         straight = (table.types == 0).all(1)
         los = np.zeros(len(transmitters) * len(receivers), bool)
         los[table.pair[straight]] = True
@@ -169,6 +158,38 @@ class SionnaChannel(ChannelModel[SionnaSettings]):
             table=table,
             los=los.reshape(len(transmitters), len(receivers)),
             counts={"path_limit_reached": sum(part.limit_reached for _, part in parts)},
+        )
+
+    def _table(
+        self,
+        parts: Sequence[tuple[Int64Array, Traced]],
+        names: tuple[str, ...],
+        velocity: Float64Array,
+        transmitters: Sequence[Antenna],
+        receivers: Sequence[Antenna],
+    ) -> PathTable:
+        """What all launches found, with names, and specular points in float64."""
+        depth = self.settings.max_depth
+        pair = _joined([pair for pair, _ in parts], (0,), np.int64)
+        types = _joined([part.types for _, part in parts], (0, depth), np.uint8)
+        shapes = _joined([part.shapes for _, part in parts], (0, depth), np.int64)
+        primitives = _joined([part.primitives for _, part in parts], (0, depth), np.int64)
+        tx, rx = np.divmod(pair, max(len(receivers), 1))
+        points = refined_points(
+            np.array([antenna.position for antenna in transmitters]).reshape(-1, 3)[tx],
+            _joined([part.points for _, part in parts], (0, depth, 3), np.float64),
+            np.array([antenna.position for antenna in receivers]).reshape(-1, 3)[rx],
+            types,
+            self._scene.planes(shapes, primitives),
+        )
+        return PathTable(
+            pair=pair,
+            transfer=_joined([part.transfer for _, part in parts], (0, 3, 3), np.complex128)[None],
+            types=types,
+            objects=self._scene.object_index(shapes, primitives),
+            points=points,
+            object_names=names,
+            object_velocity=velocity,
         )
 
     def _launch(

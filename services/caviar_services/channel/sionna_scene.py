@@ -80,8 +80,9 @@ class SionnaScene:
         self._bodies: list[Body] = [(asset, slot) for asset in sorted(pool) for slot in range(pool[asset])]
         self._standing: frozenset[Body] = frozenset()
         moving = self._moving_shapes(skin, settings.body_material == "metal")
-        self._vertices = np.concatenate([np.zeros((0, 3)), *(mesh.vertices for mesh in moving[-1].meshes)])
+        moved = sum(len(mesh.vertices) for mesh in moving[-1].meshes)
         self._replace_shapes([*_by_material(self._scene), *moving])
+        self._vertices = self._corners[len(self._corners) - moved :]
         set_materials(self._scene, settings.frequency_hz, settings.materials, settings.outside_itu_range)
 
     @property
@@ -131,11 +132,23 @@ class SionnaScene:
         self._standing = frozenset(standing)
         return tuple(names), velocity
 
+    def planes(self, shapes: Int64Array, primitives: Int64Array) -> tuple[Float64Array, Float64Array]:
+        """A corner [m] and the normal (of any length) of triangles, each of Shape ``[..., 3]``, in float64.
+
+        Anything for no shape.
+        """
+        triangle = np.clip(self._offsets[self._where(shapes)] + primitives, 0, len(self._faces) - 1)
+        a, b, c = np.moveaxis(self._corners[self._faces[triangle]], -2, 0)
+        return a, np.cross(b - a, c - a)
+
     def object_index(self, shapes: Int64Array, primitives: Int64Array) -> Int32Array:
         """Index into the names of `place` of triangles of process-local shapes; −1 for no shape."""
-        where = np.minimum(np.searchsorted(self._ids, shapes), len(self._ids) - 1)
+        where = self._where(shapes)
         piece = np.searchsorted(self._first_triangles, self._offsets[where] + primitives, side="right") - 1
         return np.where(self._ids[where] == shapes, piece, -1).astype(np.int32)
+
+    def _where(self, shapes: Int64Array) -> Int64Array:
+        return np.minimum(np.searchsorted(self._ids, shapes), len(self._ids) - 1)
 
     @property
     def _middle(self) -> Float64Array:
@@ -174,6 +187,11 @@ class SionnaScene:
         self._offsets = (np.cumsum(totals) - totals)[order]
         faces = np.concatenate([np.array(count, np.int64) for count in counts])
         self._first_triangles = np.cumsum(faces) - faces
+        meshes = [mesh for shape in shapes for mesh in shape.meshes]
+        corners = np.array([len(mesh.vertices) for mesh in meshes])
+        before = np.cumsum(corners) - corners
+        self._corners = np.concatenate([mesh.vertices for mesh in meshes])
+        self._faces = np.concatenate([mesh.faces + b for mesh, b in zip(meshes, before, strict=True)])
         self._names = tuple(name for shape in shapes for name in shape.names)
 
 
