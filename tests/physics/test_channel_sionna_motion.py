@@ -163,6 +163,22 @@ def test_more_receivers_than_one_launch_takes(tmp_path: Path) -> None:
     assert digest(one) == digest(two)
 
 
+def test_no_frame_compiles_a_kernel(tmp_path: Path) -> None:
+    """Neither moving, coming and going, nor numbers of objects, receivers and paths: all was compiled while
+    preparing. Kernels of single frames would also be a leak of memory."""
+    model = sionna(F, write_scenery(tmp_path, [GROUND, WALL]), bodies=6)
+    import drjit as dr
+
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        for seed, cars in enumerate((1, 6, 0, 3, 5, 2, 4, 6)):
+            measure(model, traffic(cars, seed))
+        history = dr.kernel_history([dr.KernelType.JIT])
+        dr.kernel_history_clear()
+    assert len(history) > 40
+    assert not [entry["operation_count"] for entry in history if not entry["cache_hit"]]
+
+
 def test_a_car_in_between_blocks_the_line_of_sight(street: ChannelModel[Any]) -> None:
     ends = [antenna("t", "tx", (-30, -3, 1.0)), antenna("r", "rx", (30, -3, 1.0))]
     free = measure(street, scene(ends))
