@@ -60,7 +60,10 @@ Digest = Annotated[
 DigestOrNone = Annotated[
     str,
     quantity(
-        "1", "SHA-256, 64 lower-case hexadecimal digits, or empty", max_length=64, pattern="^([0-9a-f]{64})?$"
+        "1",
+        "SHA-256, 64 lower-case hexadecimal digits, or empty",
+        max_length=64,
+        pattern=r"^([0-9a-f]{64})?$(?!\n)",
     ),
 ]
 
