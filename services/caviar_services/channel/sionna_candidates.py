@@ -2,80 +2,66 @@
 
 Sionna RT's deterministic generator shoots twice: a first pass notes which (depth, ray, receiver) found
 something, a second stores it, in an order decided in between. That decision runs over every lane of
-depth · rays · receivers, of which one in some thousands holds anything. Here the lanes that do are
-picked out first: the same candidates in the same order for less than a tenth of the work.
-
-Imported by the tracer only, after a Mitsuba variant has been set.
+depth · rays · receivers, of which few hold anything. Here the lanes that do are picked out first:
+the same candidates in the same order for a fraction of the work.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-import drjit as dr
-import mitsuba as mi
-from sionna.rt.path_solvers.sb_deterministic import (
-    NO_PATH_RECORDED_MARKER,
-    NON_SPECULAR_PATH_MARKER,
-    UINT32_MAX,
-    SBDeterministicCandidateGenerator,
-    extract_hashes_from_u64,
-)
+
+def candidate_generator() -> Any:
+    """A `SBDeterministicCandidateGenerator` for a single source, with that stage replaced."""
+    from sionna.rt.path_solvers.sb_deterministic import SBDeterministicCandidateGenerator
+
+    generator = SBDeterministicCandidateGenerator()
+    generator._shoot_and_bounce = _Shooting(generator)
+    return generator
 
 
-class CandidateGenerator(SBDeterministicCandidateGenerator):  # type: ignore[misc]  # untyped base
-    """`SBDeterministicCandidateGenerator` for a single source."""
+class _Shooting:
+    """The shooting stage of a candidate generator; called as its ``_shoot_and_bounce``."""
 
-    def _shoot_and_bounce(
+    def __init__(self, generator: Any) -> None:
+        self._loop = generator._shoot_and_bounce_loop
+        self._sampler = generator._sampler
+
+    def __call__(
         self,
         mi_scene: Any,
         src_positions: Any,
         tgt_positions: Any,
         paths: Any,
-        samples_per_src: int,
-        max_num_paths_per_src: int,
+        samples: int,
+        max_paths: int,
         max_depth: int,
-        paths_counter_per_source: Any,
-        specular_reflection: bool,
-        diffuse_reflection: bool,
-        refraction: bool,
-        diffraction: bool,
-        edge_diffraction: bool,
-        seed: int,
-        src_boxes: Any = None,
+        paths_counter: Any,
+        *flags_seed_and_boxes: Any,
     ) -> None:
-        arguments = (
-            mi_scene,
-            src_positions,
-            tgt_positions,
-            samples_per_src,
-            max_num_paths_per_src,
-            max_depth,
-            paths,
-            paths_counter_per_source,
-            specular_reflection,
-            diffuse_reflection,
-            refraction,
-            diffraction,
-            edge_diffraction,
-            self._sampler,
-        )
+        import drjit as dr
+        import mitsuba as mi
+        from sionna.rt.path_solvers.sb_deterministic import NO_PATH_RECORDED_MARKER
+
+        *flags, seed, _boxes = flags_seed_and_boxes
+        arguments = (mi_scene, src_positions, tgt_positions, samples, max_paths, max_depth, paths)
+        arguments = (*arguments, paths_counter, *flags, self._sampler)
         targets = dr.width(tgt_positions)
         with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
-            self._sampler.seed(seed, samples_per_src)
-            notes, first_ray = self._shoot_and_bounce_loop(*arguments, counting_mode=True)
+            self._sampler.seed(seed, samples)
+            notes, first_ray = self._loop(*arguments, counting_mode=True)
             noted: Any = dr.compress(notes != NO_PATH_RECORDED_MARKER)
             if dr.width(noted) == 0:
                 return
-            lanes, finished = _winners(noted, notes, first_ray, samples_per_src, targets)
+            lanes, finished = _winners(noted, notes, first_ray, samples, targets)
             count = min(dr.width(lanes), paths.buffer_size - int(paths.paths_counter[0]))
             if count <= 0:
                 return
             place, shooting = _places(
-                lanes, finished, count, paths.paths_counter, dr.width(notes), samples_per_src, targets
+                lanes, finished, count, paths.paths_counter, dr.width(notes), samples, targets
             )
-            self._sampler.seed(seed, samples_per_src)
-            self._shoot_and_bounce_loop(*arguments, output_offset=place, thread_has_output=shooting)
+            self._sampler.seed(seed, samples)  # the second pass repeats the first
+            self._loop(*arguments, output_offset=place, thread_has_output=shooting)
         paths.advance_paths_counter(dr.opaque(mi.UInt32, count))
 
 
@@ -84,6 +70,10 @@ def _winners(lanes: Any, notes: Any, first_ray: Any, samples: int, targets: int)
 
     Of the rays that found one chain of surfaces, the first keeps it: the one that both hash tables name.
     """
+    import drjit as dr
+    import mitsuba as mi
+    from sionna.rt.path_solvers.sb_deterministic import NON_SPECULAR_PATH_MARKER, extract_hashes_from_u64
+
     note = dr.gather(mi.UInt64, notes, lanes)
     finished = note == NON_SPECULAR_PATH_MARKER
     ray = (lanes // targets) % samples
@@ -104,6 +94,10 @@ def _places(
 
     The topmost bit of a place says that the find is finished, as the loop expects.
     """
+    import drjit as dr
+    import mitsuba as mi
+    from sionna.rt.path_solvers.sb_deterministic import UINT32_MAX
+
     number = dr.arange(mi.UInt32, dr.width(lanes))
     fits = number < dr.opaque(mi.UInt32, count)
     place = dr.full(mi.UInt32, UINT32_MAX, width)

@@ -22,6 +22,7 @@ from caviar_protocol.arrays import (
 )
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.patterns import spherical_basis
+from caviar_services.channel.sionna_candidates import candidate_generator
 
 _POLE = 1.2e-5
 """Below this horizontal part of a direction Sionna RT sets its azimuth to 0 (100 float32 epsilons)."""
@@ -96,15 +97,13 @@ class Tracer:
         from sionna.rt.path_solvers.field_calculator import FieldCalculator
         from sionna.rt.path_solvers.image_method import ImageMethod
 
-        from caviar_services.channel.sionna_candidates import CandidateGenerator
-
         self.mi_scene = mi_scene
         self._options = options
         self._wavelength = dr.opaque(mi.Float, wavelength)
         # The two orthogonal isotropic fields at both ends give the whole polarisation transfer, to
         # which any element pattern in any orientation is applied afterwards.
         self._patterns = antenna_pattern_registry.get("iso")(polarization="VH").patterns
-        self._candidates = CandidateGenerator()
+        self._candidates = candidate_generator()
         self._images = ImageMethod()
         self._fields = FieldCalculator()
 
