@@ -112,6 +112,13 @@ def test_clause_16_no_agent_runs_ahead_of_another_that_may_end_the_episode() -> 
         assert run.time_of("a", frame) >= run.time_of("b", frame - 1) + 80 * MS
 
 
+def test_clause_16_ending_the_episode_with_the_final_grant_changes_nothing() -> None:
+    both = [agent("a", latency=9 * MS), agent("b", **ends((0, 2), (0, 3)))]
+    run = Simulation([world(), channel(), *both, link()], frames=6).join().run()
+    assert run.seen(ev.EpisodeFinished)[0].frames == 3
+    assert [g.frame for g in run.grants("a")] == [0, 1, 2, 3]
+
+
 def test_clause_16_two_agents_may_end_the_episode_in_one_frame() -> None:
     both = [agent("a", **ends((0, 2))), agent("b", latency=9 * MS, **ends((0, 2)))]
     run = Simulation([world(), channel(), *both, link()], frames=6).join().run()

@@ -141,7 +141,9 @@ class DecisionBook:
 
     def end_after(self, frame: int) -> list[Task]:
         """The episode ends with ``frame`` (clause 16); the tasks behind it, forgotten unless outstanding."""
-        self.frames = min(self.frames, frame + 1)
+        if frame + 1 >= self.frames:
+            return []
+        self.frames = frame + 1
         cut = [task for task in self.tasks() if task.frame >= self.frames]
         for task in cut:
             if task.state not in OUTSTANDING:
