@@ -238,6 +238,18 @@ def test_clause_8_a_timer_that_fires_late_delays_its_own_frame_only() -> None:
     assert run.seen(ev.FrameFinished)[-1].lag_ns == 0
 
 
+def test_clause_8_a_frame_that_one_service_finds_due_is_released_for_all() -> None:
+    # The answer of one source is handled after the frame's instant, but before its deadline fires.
+    two = [world(budget=SECOND), world("uav", budget=SECOND, latency=lambda e, k: None if k == 0 else MS)]
+    run = Simulation([*two, agent(budget=SECOND)], realtime=True).join().run(granted("uav", 0))
+    run.run_to(run.now + 99 * MS)
+    run.now += 2 * MS
+    run.answer("uav", run.grants("uav")[0])
+    run.run_to(run.now)
+    assert run.time_of("world", 1) == run.time_of("uav", 1) == run.now
+    assert run.run().outcome.error == ""
+
+
 # --- clause 18: journal before grant -----------------------------------------------------------------------
 
 

@@ -341,6 +341,7 @@ class EpisodeSchedule:
         slip = self._pacer.release(task.frame, now)
         if slip is None:
             return False
+        self._wake(self._waiting_for_pace)  # whoever asks first releases the frame for all
         if slip > self.plan.sampling_period_ns // 10:
             behind = milliseconds(self._pacer.lag_ns)
             self._notice("lag", task, f"{milliseconds(slip)} behind real time, {behind} since the start")
