@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import msgpack  # type: ignore[import-untyped]
 import msgspec
 
 from caviar_broker.core.events import Journal
-from caviar_protocol.errors import RunError
+from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.messages import GrantInput
 
 
 class JournalEntry(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """One line of the journal: what became of one service's part of one frame."""
+    """One entry of the journal: what became of one service's part of one frame."""
 
     number: int
     epoch: int
@@ -37,6 +39,7 @@ class JournalFile:
     def __init__(self, path: Path, epoch: int) -> None:
         self.path, self._epoch = path, epoch
         self._encoder = msgspec.msgpack.Encoder()
+        self._buffer = bytearray()
         try:
             self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
         except OSError as error:
@@ -44,23 +47,25 @@ class JournalFile:
 
     def write(self, entry: Journal) -> None:
         """Append one entry. `RunError` naming the file where the system refuses it."""
-        data = self._encoder.encode(
-            JournalEntry(
-                number=entry.number,
-                epoch=self._epoch,
-                episode=entry.episode,
-                frame=entry.frame,
-                service=entry.service,
-                outcome=entry.outcome,
-                decisions=entry.decisions,
-                products=tuple((p.topic, _bytes(p.payload[0]), _bytes(p.payload[1])) for p in entry.products),
-            )
+        products: tuple[tuple[str, Any, Any], ...] = tuple(
+            (p.topic, p.payload[0].buffer, p.payload[1].buffer) for p in entry.products
         )
+        record = JournalEntry(
+            number=entry.number,
+            epoch=self._epoch,
+            episode=entry.episode,
+            frame=entry.frame,
+            service=entry.service,
+            outcome=entry.outcome,
+            decisions=entry.decisions,
+            products=products,
+        )
+        self._encoder.encode_into(record, self._buffer)
         try:
-            written = os.write(self._fd, data)
+            written = os.write(self._fd, self._buffer)
         except OSError as error:
             raise RunError(f"cannot write the journal {self.path}: {error.strerror}") from error
-        if written != len(data):
+        if written != len(self._buffer):
             raise RunError(f"cannot write the journal {self.path}: no space left")
 
     def close(self) -> None:
@@ -68,5 +73,23 @@ class JournalFile:
         os.close(self._fd)
 
 
-def _bytes(part: Any) -> bytes:
-    return bytes(part.buffer)
+def read_journal(path: Path) -> Iterator[JournalEntry]:
+    """The entries of a journal, in the order in which they were written.
+
+    An entry that is cut off at the end, as a crash in the middle of writing leaves it, ends the
+    sequence. Raises `RecordingError` naming the place of what is no entry.
+    """
+    try:
+        file = path.open("rb")
+    except OSError as error:
+        raise RecordingError(f"cannot read the journal {path}: {error.strerror}") from error
+    with file:
+        unpacker = msgpack.Unpacker(file, max_buffer_size=0)
+        while True:
+            place = unpacker.tell()
+            try:
+                yield msgspec.convert(unpacker.unpack(), JournalEntry)
+            except msgpack.OutOfData:
+                return
+            except (ValueError, msgpack.UnpackException) as error:
+                raise RecordingError(f"{path}: no entry of a journal at byte {place}: {error}") from error

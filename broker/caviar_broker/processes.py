@@ -37,9 +37,16 @@ class LocalProcess:
 
 
 def watch(pid: int) -> LocalProcess | None:
-    """Watch a process; None where there is no such process or the kernel cannot."""
+    """Watch a process; None where the system does not let us.
+
+    Raises `ProcessLookupError` where there is no such process.
+    """
     try:
         return LocalProcess(pid)
+    except ProcessLookupError:
+        raise
+    except OverflowError:
+        raise ProcessLookupError(pid) from None
     except OSError:
         return None
 

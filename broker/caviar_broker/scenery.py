@@ -2,6 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import zmq
+
+from caviar_broker.core import events as ev
+from caviar_broker.core.clock import FrameClock
+from caviar_broker.core.transitions import ServiceState
 from caviar_protocol import messages as m
 from caviar_protocol.assets import AssetStore, Incoming
 from caviar_protocol.errors import AssetError
@@ -42,10 +51,6 @@ class SceneryExchange:
             return self._more(world)
         return [m.AssetGet(digest=message.digest, offset=incoming.offset)]
 
-    def complete(self, world: str) -> bool:
-        """Whether nothing is owed by this world."""
-        return not self._coming.get(world)
-
     def owed(self, world: str) -> tuple[m.Asset, ...]:
         """The files that a world still has to deliver, those asked for first."""
         coming = [incoming.asset for incoming in self._coming.get(world, {}).values()]
@@ -65,7 +70,87 @@ class SceneryExchange:
         waiting, coming = self._waiting[world], self._coming[world]
         asked = []
         while waiting and len(coming) < FILES_AT_ONCE:
-            digest, asset = waiting.popitem()
-            coming[digest] = Incoming(self._store, asset)
+            digest = next(iter(waiting))
+            coming[digest] = Incoming(self._store, waiting.pop(digest))
             asked.append(m.AssetGet(digest=digest))
         return asked
+
+
+class Reply(Protocol):
+    """Sends a message to a service."""
+
+    def __call__(self, service: str, message: m.Message, *parts: bytes) -> None:
+        """Never waits."""
+
+
+@dataclass
+class SceneryDesk:
+    """Handles the messages of services about scenery, and holds back a READY until it is here."""
+
+    exchange: SceneryExchange
+    clock: FrameClock
+    feed: Callable[[ev.Event], None]
+    reply: Reply
+    note: Callable[[str, str], None]
+    _deferred: dict[str, m.Ready] = field(default_factory=dict)
+
+    def offer(self, service: str, message: m.AssetOffer, _: Sequence[zmq.Frame]) -> None:
+        """ASSET_OFFER: ask for what is not here yet."""
+        peer = self.clock.peer(service)
+        if peer is None or (message.epoch, message.attempt) != (self.clock.plan.epoch, peer.attempt):
+            self.note(service, "offered scenery for another epoch or attempt; not used")
+            return
+        self.feed(ev.AssetsOffered(service, message.assets))  # says what is wrong with it, if anything
+        if peer.role == "world" and peer.state is ServiceState.PREPARING:
+            try:
+                self._ask(service, self.exchange.offered(service, message.assets))
+            except AssetError as error:
+                self.feed(ev.Violated(service, f"offers wrong scenery: {error}"))
+
+    def data(self, service: str, message: m.AssetData, parts: Sequence[zmq.Frame]) -> None:
+        """ASSET_DATA: take it, and ask for the next."""
+        try:
+            self._ask(service, self.exchange.taken(service, message, parts[0].buffer))
+        except AssetError as error:
+            self.feed(ev.Violated(service, f"sent wrong scenery: {error}"))
+            return
+        if service in self._deferred and not self.exchange.owed(service):
+            self.feed(ev.ReadyReceived(service, self._deferred.pop(service)))
+
+    def get(self, service: str, message: m.AssetGet, _: Sequence[zmq.Frame]) -> None:
+        """ASSET_GET: send the next chunk."""
+        try:
+            answer, chunk = self.exchange.read(message)
+        except AssetError as error:
+            text = str(error)
+            refusal = m.Error(code="unknown-asset", of="ASSET_GET", subject=message.digest, message=text)
+            self.reply(service, refusal)
+        else:
+            self.reply(service, answer, chunk)
+
+    def ready(self, service: str, message: m.Ready, _: Sequence[zmq.Frame]) -> None:
+        """READY: it counts once all scenery of the service is here."""
+        owed = self.exchange.owed(service)
+        if not owed:
+            self.feed(ev.ReadyReceived(service, message))
+            return
+        self._deferred[service] = message
+        self.note(service, f"is ready, but {len(owed)} files of its scenery are due, {owed[0].name!r} first")
+
+    def undeliverable(self, service: str, error: m.Error) -> bool:
+        """Whether an ERROR says that a world does not have what it offered; then the run ends."""
+        for asset in self.exchange.owed(service):
+            if asset.digest == error.subject:
+                text = f"offered {asset.name!r} and cannot deliver it: {error.message}"
+                self.feed(ev.Violated(service, text))
+                return True
+        return False
+
+    def forget(self, service: str) -> None:
+        """An incarnation of a service is gone."""
+        self._deferred.pop(service, None)
+        self.exchange.forget(service)
+
+    def _ask(self, service: str, requests: Sequence[m.AssetGet]) -> None:
+        for request in requests:
+            self.reply(service, request)

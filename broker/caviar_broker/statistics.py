@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from array import array
+from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -62,6 +64,18 @@ class Statistics:
             return 0.0
         elapsed = self._finished_at[-1] - self._finished_at[first]
         return (self.frames - 1 - first) / (elapsed / 1e9) if elapsed else 0.0
+
+    def save(self, path: Path) -> None:
+        """Write every figure as a NumPy archive: ``finished_ns`` by frame, ``latency_ns/NAME`` by grant.
+
+        A disk that is full costs the record, not the run's result.
+        """
+        figures: dict[str, Any] = {"finished_ns": np.asarray(self._finished_at, np.int64)}
+        figures |= {f"latency_ns/{n}": np.asarray(v, np.int64) for n, v in self._latencies.items()}
+        try:
+            np.savez_compressed(path, **figures)
+        except OSError:
+            path.unlink(missing_ok=True)
 
     def services(self) -> dict[str, ServiceStatistics]:
         """Summary by service; a service that was never granted a frame has none."""

@@ -22,6 +22,12 @@ KILL_AFTER_S = 1.0
 """[s] that a process gets after SIGTERM before SIGKILL, beyond the run's ``shutdown_s``."""
 
 
+BROKER_S = 10.0
+"""[s] that the broker gets to end after its last service, beyond the run's ``shutdown_s``."""
+TAIL = 1 << 16
+"""[B] of a log that are looked at for its last line."""
+
+
 @dataclass
 class Child:
     """One process of the run."""
@@ -31,9 +37,12 @@ class Child:
     log: Path
     pidfd: int
 
-    def tail(self, lines: int = 5) -> str:
-        """The last lines it printed."""
-        return "\n".join(self.log.read_text(errors="replace").splitlines()[-lines:])
+    def last_line(self) -> str:
+        """The last line it printed; empty if it printed nothing."""
+        with self.log.open("rb") as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL))
+            lines = file.read().decode(errors="replace").strip().splitlines()
+        return lines[-1] if lines else ""
 
 
 @dataclass
@@ -54,7 +63,13 @@ class Launcher:
     _children: dict[str, Child] = field(default_factory=dict)
     _broker: subprocess.Popen[bytes] | None = None
     _selector: selectors.BaseSelector = field(default_factory=selectors.DefaultSelector)
+    _rest: bytes = b""
+    _over: bool = False
+    """Whether the broker told how the run ended."""
     _finished: bool = False
+    """Whether the broker's output has ended."""
+    _give_up_at: float | None = None
+    """When a broker that all services have left must have ended [s]; None while one is left."""
 
     def __enter__(self) -> Launcher:
         (self.directory / "logs").mkdir(parents=True, exist_ok=True)
@@ -76,6 +91,8 @@ class Launcher:
                     self._child_died(key.data)
                 else:
                     yield from self._broker_said()
+            if self._give_up_at is not None and time.monotonic() > self._give_up_at:
+                raise RunError("the broker does not answer: all services have ended, and it does not")
 
     def stop(self, reason: str) -> None:
         """Ask for an orderly end."""
@@ -97,12 +114,16 @@ class Launcher:
         command += ["--supervised", *self.scenario.services]
         with (self.directory / "logs" / "broker.log").open("wb") as log:
             self._broker = subprocess.Popen(  # noqa: S603  # our own module with checked arguments
-                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, start_new_session=True
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                bufsize=0,  # orders are given from signal handlers too, where a buffer would not be safe
+                start_new_session=True,
             )
-        if self._broker.stdout is None:
-            raise RunError("the broker has no standard output")
-        os.set_blocking(self._broker.stdout.fileno(), False)
-        self._rest = b""
+        if self._broker.stdin is None or self._broker.stdout is None:
+            raise RunError("the broker has no standard input or output")
+        os.set_blocking(self._broker.stdin.fileno(), False)
         self._selector.register(self._broker.stdout, selectors.EVENT_READ)
 
     def _start_services(self) -> None:
@@ -139,11 +160,11 @@ class Launcher:
             self._over = self._over or event["event"] == "finished"
             yield event
 
-    _rest = b""
-    _over = False
-
     def _broker_ended(self, broker: subprocess.Popen[bytes]) -> Mapping[str, Any]:
-        status = broker.wait()
+        _wait([broker], self.scenario.timeouts.shutdown_s + BROKER_S)
+        status = broker.poll()
+        if status is None:
+            raise RunError("the broker closed its output and does not end")
         if not self._over:
             log = (self.directory / "logs" / "broker.log").read_text(errors="replace").strip()
             last = log.splitlines()[-1] if log else describe_exit(status)
@@ -153,9 +174,11 @@ class Launcher:
     def _child_died(self, child: Child) -> None:
         self._selector.unregister(child.pidfd)
         status = child.process.wait()
+        if all(other.process.poll() is not None for other in self._children.values()):
+            self._give_up_at = time.monotonic() + self.scenario.timeouts.shutdown_s + BROKER_S
         if not self._over:
             verdict = describe_exit(status)
-            tail = child.tail(1)
+            tail = child.last_line()
             self._order({"lost": child.name, "verdict": f"{verdict}, saying: {tail}" if tail else verdict})
 
     def _order(self, order: Mapping[str, str]) -> None:
@@ -163,7 +186,6 @@ class Launcher:
             return
         try:
             self._broker.stdin.write(json.dumps(order).encode() + b"\n")
-            self._broker.stdin.flush()
         except (BrokenPipeError, ValueError):
             return  # it is ending already; its output says why
 
@@ -174,10 +196,7 @@ class Launcher:
         if self._broker is not None:
             processes.append(self._broker)
             if self._broker.stdin is not None:
-                try:
-                    self._broker.stdin.close()
-                except BrokenPipeError:
-                    pass  # the broker is gone already
+                self._broker.stdin.close()
         grace = self.scenario.timeouts.shutdown_s if self._over else 0.0
         _wait(processes, grace)
         for process in processes:

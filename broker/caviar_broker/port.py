@@ -1,0 +1,77 @@
+"""The one ROUTER port of a broker: parts in, parts out, and never a wait."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import zmq
+
+from caviar_protocol import limits
+from caviar_protocol.errors import RunError
+
+LINGER_MS = 500
+"""[ms] that closing waits until the last messages are on their way."""
+
+
+class Port:
+    """A bound ROUTER socket.
+
+    Parameters
+    ----------
+    endpoint
+        Address to bind, ``tcp://127.0.0.1:0`` for any free port.
+    liveness_ns
+        A peer that is stopped or unreachable loses its connection before this is over, and the next
+        `send` to it says so. libzmq's own thread answers for a peer that is merely busy, so a slow
+        service is never taken for a dead one (contract, clause 15).
+
+    Raises `RunError` naming the remedy where the address cannot be bound.
+    """
+
+    def __init__(self, endpoint: str, liveness_ns: int) -> None:
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self.socket = self._context.socket(zmq.ROUTER)
+        liveness_ms = liveness_ns // 1_000_000
+        self.socket.setsockopt(zmq.ROUTER_MANDATORY, 1)
+        self.socket.setsockopt(zmq.HEARTBEAT_IVL, max(1, liveness_ms // 3))
+        self.socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, max(1, liveness_ms // 2))
+        self.socket.setsockopt(zmq.MAXMSGSIZE, limits.MAX_BODY)
+        self.socket.linger = LINGER_MS
+        try:
+            self.socket.bind(endpoint)
+        except zmq.ZMQError as error:
+            self.close()
+            raise RunError(
+                f"cannot listen on {endpoint}: {error.strerror}; end what uses that port, or choose another "
+                "with --bind tcp://127.0.0.1:PORT (0: any free one)"
+            ) from error
+        self.endpoint = self.socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        """Where services connect to."""
+
+    def receive(self) -> list[zmq.Frame] | None:
+        """The next message, its routing id first; None where there is none now."""
+        try:
+            return self.socket.recv_multipart(zmq.NOBLOCK, copy=False)
+        except zmq.Again:
+            return None
+
+    def send(self, parts: Sequence[Any]) -> str:
+        """Send a message whose first part is a routing id; why it did not go, or an empty text.
+
+        Parts that were received go out as they came, without a copy.
+        """
+        try:
+            self.socket.send_multipart(parts, zmq.NOBLOCK, copy=False)
+        except zmq.ZMQError as error:
+            if error.errno == zmq.EHOSTUNREACH:
+                return "its connection is gone"
+            if error.errno == zmq.EAGAIN:
+                return "it takes no messages"
+            raise
+        return ""
+
+    def close(self) -> None:
+        """Send what is queued, as far as `LINGER_MS` allow, and close."""
+        self.socket.close()
+        self._context.term()

@@ -1,0 +1,135 @@
+"""Which services live: the operating system is asked about local ones, connections about remote ones."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from caviar_broker.core.clock import FrameClock
+from caviar_broker.processes import LocalProcess, watch
+
+CHECK_NS = 50_000_000
+"""[ns] between looks at whether a local process is stopped; its death shows at once."""
+SUPERVISOR_NS = 1_000_000_000
+"""[ns] that a launcher has to report the death of its child, with exit status and last words."""
+
+
+@dataclass
+class _Watched:
+    """What the watchdog knows of one incarnation of a service."""
+
+    since: int
+    process: LocalProcess | None = None
+    pulse: bytes | None = None
+    """Routing id of its heartbeat connection."""
+    heard_at: int = 0
+    died_at: int | None = None
+    """When the process of a supervised service died [ns]."""
+    warned: bool = False
+
+
+@dataclass
+class Watchdog:
+    """Tells of services that are gone (contract, clause 15).
+
+    Parameters
+    ----------
+    clock
+        Who is present in the run.
+    heartbeat_ns, liveness_ns
+        Of the run [ns].
+    probe
+        Sends a harmless message to a heartbeat connection; why that did not go, or an empty text.
+    lost
+        Is told service and verdict.
+    warn
+        Is told service and text.
+    """
+
+    clock: FrameClock
+    heartbeat_ns: int
+    liveness_ns: int
+    probe: Callable[[bytes], str]
+    lost: Callable[[str, str], None]
+    warn: Callable[[str, str], None]
+    supervised: set[str] = field(default_factory=set)
+    """Services whose death a launcher reports, who knows their exit status and last words."""
+    _watched: dict[str, _Watched] = field(default_factory=dict)
+
+    def welcome(self, service: str, pid: int | None) -> int | None:
+        """A new incarnation of a service; ``pid`` on this machine, None if it is elsewhere.
+
+        Returns a descriptor that is readable once its process is dead, if it can be watched.
+        """
+        watched = self._watched[service] = _Watched(since=time.monotonic_ns())
+        if pid is None:
+            return None
+        try:
+            watched.process = watch(pid)
+        except ProcessLookupError:
+            self.lost(service, f"there is no process {pid}, which it says it is")
+        return watched.process.fd if watched.process else None
+
+    def forget(self, service: str) -> int | None:
+        """An incarnation is of no interest any more; the descriptor that `welcome` returned, now closed."""
+        watched = self._watched.pop(service, None)
+        if watched is None or watched.process is None:
+            return None
+        watched.process.close()
+        return watched.process.fd
+
+    def attach(self, service: str, pulse: bytes) -> bytes | None:
+        """A service has a heartbeat connection; returns the one that it had before."""
+        watched = self._watched[service]
+        before, watched.pulse = watched.pulse, pulse
+        self.heard(service)
+        return before
+
+    def heard(self, service: str) -> None:
+        """A heartbeat came."""
+        watched = self._watched.get(service)
+        if watched is not None:
+            watched.heard_at = time.monotonic_ns()
+
+    def died(self, service: str) -> None:
+        """The descriptor of a local process says that it is dead."""
+        watched = self._watched[service]
+        watched.died_at = time.monotonic_ns()
+        if service not in self.supervised and watched.process is not None:
+            self.lost(service, watched.process.verdict())
+
+    def check(self, now: int) -> None:
+        """Look for local processes that are stopped, and probe remote ones."""
+        for service, watched in list(self._watched.items()):
+            peer = self.clock.peer(service)
+            if peer is None or not peer.present:
+                continue
+            if watched.process is not None:
+                self._check_local(service, watched, watched.process, now)
+            else:
+                self._check_remote(service, watched, now)
+
+    def close(self) -> None:
+        """Stop watching."""
+        for service in tuple(self._watched):
+            self.forget(service)
+
+    def _check_local(self, service: str, watched: _Watched, process: LocalProcess, now: int) -> None:
+        if watched.died_at is not None:
+            if now - watched.died_at > SUPERVISOR_NS:
+                self.lost(service, process.verdict())
+        elif process.stopped:
+            self.lost(service, f"its process {process.pid} is stopped (SIGSTOP or SIGTSTP)")
+
+    def _check_remote(self, service: str, watched: _Watched, now: int) -> None:
+        if watched.pulse is None:
+            if not watched.warned and now - watched.since > self.liveness_ns:
+                watched.warned = True
+                self.warn(
+                    service, "has no heartbeat connection: its death shows only when it is due to answer"
+                )
+        elif now - watched.heard_at > 2 * self.heartbeat_ns:
+            reason = self.probe(watched.pulse)
+            if reason:
+                self.lost(service, f"it is unreachable or stopped: {reason}")
