@@ -250,6 +250,14 @@ def test_clause_8_a_frame_that_one_service_finds_due_is_released_for_all() -> No
     assert run.run().outcome.error == ""
 
 
+def test_clause_8_nobody_waits_for_a_frame_that_an_early_end_cut() -> None:
+    services = loop(agent={"ends": frozenset({(0, 0)})}, link={"latency": 300 * MS, "budget": SECOND})
+    run = Simulation(services, realtime=True).join().run(lambda run: bool(run.seen(ev.Latency, "agent")))
+    run.run_to(run.now + 290 * MS)  # `step` asserts that no deadline stays
+    assert run.run().outcome.error == ""
+    assert [g.frame for g in run.grants("world")] == [0]
+
+
 # --- clause 18: journal before grant -----------------------------------------------------------------------
 
 

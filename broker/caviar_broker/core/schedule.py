@@ -165,13 +165,13 @@ class EpisodeSchedule:
             due = self._due(name)
             if due is not None and due[0] <= now:
                 self._expired(due[1], now)
-        instant = self._pacer.next_instant()
+        instant = self._next_release()
         if instant is not None and instant <= now:
             self._wake(self._waiting_for_pace)
 
     def next_deadline(self) -> int | None:
         """The earliest instant at which `expire` has something to do [ns]."""
-        instant = self._pacer.next_instant()
+        instant = self._next_release()
         for name in self.graph.order:
             due = self._due(name)
             if due is not None and (instant is None or due[0] < instant):
@@ -347,6 +347,10 @@ class EpisodeSchedule:
             self._notice("lag", task, f"{milliseconds(slip)} behind real time, {behind} since the start")
         return True
 
+    def _next_release(self) -> int | None:
+        """When the frame that somebody waits for will be due; None if nobody does."""
+        return self._pacer.next_instant() if self._waiting_for_pace else None
+
     def _grant(self, task: Task, now: int) -> None:
         owed = self._outstanding[task.service]
         previous = owed[-1].frame if owed else self._completed[task.service]
@@ -424,6 +428,8 @@ class EpisodeSchedule:
             if task.state in OUTSTANDING:
                 task.move(TaskEvent.CUT)
                 self.cut.append(task)
+        for waiting in (self._waiting_for_journal, self._waiting_for_pace, self._waiting_for_frames):
+            waiting.clear()
         self._dirty.update(self.graph.order)
 
     def _due(self, name: str) -> tuple[int, Task] | None:
