@@ -211,14 +211,17 @@ def test_the_grid_marks_what_the_scan_hit_and_the_antennas(yard: dict[str, Path]
     assert np.array_equal(scan.grid.occupancy, wanted)
 
 
-def test_where_only_the_grid_is_asked_for_no_points_travel(yard: dict[str, Path]) -> None:
+def test_the_grid_comes_beside_the_points_and_only_where_it_is_asked_for(yard: dict[str, Path]) -> None:
     grid = GridSettings(minimum_m=(-30, -30, 0), maximum_m=(30, 30, 6), cells=(30, 30, 6))
-    service = prepared(yard, LidarSettings(bodies_per_asset=4, grid=grid), frozenset({"grid"}))
-    lidar = observed(service, scene_of({"a": a_car(9, 2)}, LEVEL))
-    assert lidar.object_names == ()
-    assert lidar.scans[0].range.shape == (0,)
-    assert lidar.scans[0].grid is not None
-    assert lidar.scans[0].grid.occupancy.any()
+    settings = LidarSettings(bodies_per_asset=4, grid=grid)
+    scene = scene_of({"a": a_car(9, 2)}, LEVEL)
+    (asked,) = observed(prepared(yard, settings, frozenset({"grid"})), scene).scans
+    (plain,) = observed(prepared(yard, settings, frozenset()), scene).scans
+    assert asked.grid is not None
+    assert asked.grid.occupancy.any()
+    assert plain.grid is None
+    assert len(plain.range) > 0
+    assert np.array_equal(asked.points, plain.points)
 
 
 def traffic(frame: int) -> dict[str, Body]:

@@ -25,7 +25,7 @@ class LidarSettings(SensorSettings, frozen=True, kw_only=True, forbid_unknown_fi
     """Settings of the LIDAR service."""
 
     grid: GridSettings | None = None
-    """The quantised grid that each scan carries, too; none without."""
+    """The quantised grid that each scan carries where somebody asks for it (``lidar.grid``)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class LidarSensors(Sensors[LidarSettings]):
     Every object of the scene is solid for them, their own carrier too. A hit nearer than a
     device's ``min_range`` hides what is behind it and is not reported.
 
-    Where only part ``grid`` is asked for, scans carry the grid and no points.
+    Scans carry the grid where part ``grid`` is asked for (clause 5).
     """
 
     outputs: ClassVar[tuple[str, ...]] = ("lidar",)
@@ -74,7 +74,7 @@ class LidarSensors(Sensors[LidarSettings]):
                 "grid = { minimum_m = […], maximum_m = […], cells = […] }",
                 key=f"services.{self.run.name}.settings.grid",
             )
-        self._with_points = parts != {"grid"}
+        self._with_grid = "grid" in parts
         return super().prepare(preparation)
 
     def example_devices(self) -> tuple[Device, ...]:
@@ -90,7 +90,7 @@ class LidarSensors(Sensors[LidarSettings]):
         returns = _traced(mi, traced, bundles) if bundles else []
         names, index = _object_names(traced, returns)
         scans = tuple(self._scan(scene, item, index) for item in returns)
-        return {"lidar": Lidar(object_names=names if self._with_points else (), scans=scans)}
+        return {"lidar": Lidar(object_names=names, scans=scans)}
 
     def _scan(self, scene: Scene, returns: _Returns, index: Int32Array) -> LidarScan:
         rays, hit = returns.rays, returns.hit
@@ -99,19 +99,18 @@ class LidarSensors(Sensors[LidarSettings]):
         # Relative to the sensor in float64, so that only the sum is rounded to float32.
         world = (_scaled(rays.world, hit, distance) + np.array(rays.pose.position)).astype(np.float32)
         grid = None
-        if self.settings.grid is not None:
+        if self._with_grid and self.settings.grid is not None:
             tx, rx = antenna_positions(scene, rays.device, self.settings.grid)
             grid = occupancy(world, returns.distance, tx, rx, self.settings.grid)
-        kept = slice(None) if self._with_points else slice(0)
         return LidarScan(
             sensor=rays.device.name,
             position=rays.pose.position,
             orientation=rays.pose.orientation,
-            ray=np.flatnonzero(hit).astype(np.int32)[kept],
-            points=points.astype(np.float32)[kept],
-            points_world=world[kept],
-            range=returns.distance[kept],
-            object=index[returns.owner][kept],
+            ray=np.flatnonzero(hit).astype(np.int32),
+            points=points.astype(np.float32),
+            points_world=world,
+            range=returns.distance,
+            object=index[returns.owner],
             grid=grid,
         )
 
