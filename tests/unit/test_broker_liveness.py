@@ -1,0 +1,184 @@
+"""How soon the broker knows that a service is gone, and what it does not take for death (clause 15)."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from broker_harness import MS, Client, Serving, plan, serving
+
+from caviar_broker.processes import describe_exit, watch
+from caviar_protocol import messages as m
+
+PEER = Path(__file__).with_name("broker_peer.py")
+LOCAL_S, REMOTE_S = 0.1, 1.5
+MARGIN_S = 0.4
+"""[s] for a machine that is busy with other things."""
+
+
+@contextmanager
+def peer(broker: Serving, place: str, how: str) -> Iterator[subprocess.Popen[str]]:
+    """A world in a process of its own, beside raw sensors, up to the world's first grant."""
+    command = [sys.executable, str(PEER), broker.endpoint, place, how]
+    with (
+        subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process,
+        Client(broker.endpoint, "sensors") as sensors,
+    ):
+        try:
+            assert process.stdout is not None
+            sensors.join()
+            sensors.ready()
+            sensors.reset()
+            assert process.stdout.readline() == "granted\n"
+            yield process
+        finally:
+            process.kill()
+
+
+@pytest.mark.parametrize(
+    ("number", "words"),
+    [(signal.SIGKILL, ()), (signal.SIGSTOP, ("is stopped (SIGSTOP or SIGTSTP)",))],
+)
+def test_a_local_process_that_dies_or_stops_is_known_within_100_ms(
+    tmp_path: Path, number: signal.Signals, words: tuple[str, ...]
+) -> None:
+    with serving(plan("world", "sensors"), tmp_path) as broker, peer(broker, "local", "wait") as process:
+        started = time.monotonic()
+        os.kill(process.pid, number)
+        while not any(notice.kind == "lost" for notice in broker.witness.notices):
+            assert time.monotonic() - started < LOCAL_S + MARGIN_S
+            os.sched_yield()
+        elapsed = time.monotonic() - started
+        print(f"{number.name} of a local process was known after {elapsed * 1e3:.1f} ms")
+        outcome = broker.outcome()
+    assert outcome.culprit == "world"
+    for word in ("world 'world'", "frame 0", "budget 50 ms", "last heartbeat", "phase 'playing'", *words):
+        assert word in outcome.error
+
+
+def test_the_death_of_a_local_process_tells_its_exit_status(tmp_path: Path) -> None:
+    with serving(plan("world", "sensors"), tmp_path) as broker, peer(broker, "local", "7"):
+        assert "it exited with status 7" in broker.outcome().error
+
+
+def test_a_supervised_death_is_told_by_the_launcher_or_else_by_the_broker(tmp_path: Path) -> None:
+    """The launcher knows the exit status and last words; but it may itself be stopped."""
+    with serving(plan("world", "sensors"), tmp_path) as broker:
+        broker.server._watchdog.supervised.add("world")
+        with peer(broker, "local", "wait") as process:
+            started = time.monotonic()
+            process.kill()
+            assert "killed by SIGKILL" in broker.outcome().error
+            assert time.monotonic() - started > 0.9
+
+
+def test_a_remote_process_that_is_stopped_is_known_within_its_liveness(tmp_path: Path) -> None:
+    with serving(plan("world", "sensors"), tmp_path) as broker, peer(broker, "remote", "wait") as process:
+        started = time.monotonic()
+        os.kill(process.pid, signal.SIGSTOP)
+        outcome = broker.outcome(within_s=5.0)
+        elapsed = time.monotonic() - started - 0.3  # shutdown_s, for a world that says no BYE
+        print(f"SIGSTOP of a remote process was known after {elapsed:.2f} s")
+    assert outcome.culprit == "world"
+    assert "unreachable or stopped" in outcome.error
+    assert "phase 'playing'" in outcome.error
+    assert elapsed < REMOTE_S + MARGIN_S
+
+
+def test_a_remote_process_that_is_killed_is_known_within_its_liveness(tmp_path: Path) -> None:
+    with serving(plan("world", "sensors"), tmp_path) as broker, peer(broker, "remote", "wait") as process:
+        started = time.monotonic()
+        process.kill()
+        outcome = broker.outcome(within_s=5.0)
+        assert "unreachable or stopped" in outcome.error
+        assert time.monotonic() - started < REMOTE_S + MARGIN_S
+
+
+def test_a_remote_service_that_holds_the_interpreter_is_busy_and_not_dead(tmp_path: Path) -> None:
+    """No heartbeat comes for 2 s; libzmq answers for the process (clause 15)."""
+    with (
+        serving(plan("world", "sensors"), tmp_path) as broker,
+        peer(broker, "remote", "hold the interpreter"),
+    ):
+        started = time.monotonic()
+        while not broker.server.statistics.services():
+            assert broker.server.outcome is None, broker.server.outcome
+            assert time.monotonic() - started < 10.0
+            os.sched_yield()
+        assert time.monotonic() - started > 1.9
+        assert not [n for n in broker.witness.notices if n.kind == "lost"]
+
+
+def test_a_service_that_makes_no_progress_is_blamed_with_all_that_is_known(tmp_path: Path) -> None:
+    run = plan("world", "sensors", limits={"stall": 600 * MS})
+    with serving(run, tmp_path) as broker, peer(broker, "remote", "wait"):
+        error = broker.outcome(within_s=5.0).error
+    for word in ("world 'world'", "makes no progress", "stall_s", "frame 0", "budget 50 ms"):
+        assert word in error
+    assert "last heartbeat" in error
+    assert "phase 'playing', progress 0" in error
+
+
+def test_a_remote_service_without_heartbeats_is_noted(tmp_path: Path) -> None:
+    run = plan("world", "sensors", limits={"liveness": 200 * MS})
+    with serving(run, tmp_path) as broker, Client(broker.endpoint, "world") as world:
+        world.join()
+        started = time.monotonic()
+        while "has no heartbeat connection" not in broker.witness.texts("world"):
+            assert time.monotonic() - started < 5.0
+            os.sched_yield()
+
+
+def test_a_service_that_never_connects_is_named(tmp_path: Path) -> None:
+    run = plan("world", "sensors", limits={"connect": 200 * MS})
+    with serving(run, tmp_path) as broker, Client(broker.endpoint, "world") as world:
+        world.join()
+        assert "sensors 'sensors' did not connect within 0.2 s" in broker.outcome().error
+        world.expect(m.Shutdown)
+
+
+def test_exit_statuses_are_words() -> None:
+    assert describe_exit(3) == "it exited with status 3"
+    assert describe_exit(-signal.SIGKILL) == "it was killed by SIGKILL"
+    assert describe_exit(-200) == "it was killed by signal 200"
+
+
+def test_a_process_that_is_not_there_is_told_apart_from_one_that_cannot_be_watched() -> None:
+    with subprocess.Popen([sys.executable, "-c", ""]) as process:
+        process.wait()
+    for pid in (process.pid, 2**62):
+        with pytest.raises(ProcessLookupError):
+            watch(pid)
+
+
+def test_a_process_that_rejoins_is_watched_in_place_of_the_one_before(tmp_path: Path) -> None:
+    """The old descriptor is closed while the loop goes on, and the new process is the one that counts."""
+    run = plan("world", "sensors", limits={"rejoin": 5000 * MS}, frames=2)
+    with serving(run, tmp_path) as broker:
+        with peer(broker, "local", "wait") as first:
+            os.kill(first.pid, signal.SIGSTOP)
+            started = time.monotonic()
+            while not any(notice.kind == "lost" for notice in broker.witness.notices):
+                assert time.monotonic() - started < 5.0
+                os.sched_yield()
+            command = [sys.executable, str(PEER), broker.endpoint, "local", "wait"]
+            with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as second:
+                assert second.stdout is not None
+                assert second.stdout.readline() == "granted\n"
+                first.kill()
+                first.wait()
+                known = broker.server.clock.peer("world")
+                assert known is not None
+                assert (known.attempt, known.present) == (2, True)
+                second.kill()
+                started = time.monotonic()
+                while sum(notice.kind == "lost" for notice in broker.witness.notices) < 2:
+                    assert time.monotonic() - started < 5.0
+                    os.sched_yield()
