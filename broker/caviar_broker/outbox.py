@@ -96,6 +96,10 @@ class Outbox:
         while self._pending and not self.gone and (left := until - time.monotonic()) > 0:
             self._poll.poll(left * 1000)
             self.flush()
+        self.close()
+
+    def close(self) -> None:
+        """Close the log; the descriptor is its owner's."""
         self._log.close()
 
     def _encode(self, line: Line) -> bytes:

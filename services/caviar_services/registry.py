@@ -61,12 +61,15 @@ def load(role: str, name: str) -> type[Service[Any]]:
     module_name, _, class_name = target.partition(":")
     try:
         cls = getattr(import_module(module_name), class_name)
-    except (ImportError, AttributeError) as error:
-        raise DeclarationError(f"{role} {name!r} cannot be loaded from {target}: {error}") from error
+    except Exception as error:  # whatever a module that is not ours does when it is imported
+        known = isinstance(error, ImportError | AttributeError)
+        text = str(error) if known else f"{type(error).__name__}: {error}"
+        raise DeclarationError(f"{role} {name!r} cannot be loaded from {target}: {text}") from error
     if not (isinstance(cls, type) and issubclass(cls, Service)):
         raise DeclarationError(f"{role} {name!r} is {target}, which is not a Service")
-    if cls.role != role:
-        raise DeclarationError(f"{role} {name!r} is {target}, whose role is {cls.role!r}")
+    declared = getattr(cls, "role", None)
+    if declared != role:
+        raise DeclarationError(f"{role} {name!r} is {target}, whose role is {declared!r}")
     return cls
 
 

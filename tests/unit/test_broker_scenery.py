@@ -1,4 +1,4 @@
-"""Scenery through the broker: worlds deliver it, services fetch it, and what is wrong has a name (clause 4)."""
+"""Scenery through the broker: delivered by worlds, fetched by services, and blamed where wrong (clause 4)."""
 
 from __future__ import annotations
 
