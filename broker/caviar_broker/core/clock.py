@@ -45,6 +45,8 @@ class FrameClock:
         self._episodes = Episodes(self._run)
         self._joining = Joining(self._run, self._episodes)
         self._liveness = Liveness(self._run, self._episodes)
+        self._deadline: int | None = None
+        self._deadline_is_known = False
         self._handlers: dict[type, Callable[[Any, int], None]] = {
             ev.Joined: self._joining.joined,
             ev.AssetsOffered: self._joining.assets_offered,
@@ -78,12 +80,13 @@ class FrameClock:
 
     def next_deadline(self) -> int | None:
         """When `expire` has to be called at the latest [ns]; None if nothing is awaited."""
-        earliest = self._liveness.next_deadline()
-        if self._episodes.schedule is not None:
-            due = self._episodes.schedule.next_deadline()
-            if earliest is None or (due is not None and due < earliest):
-                return due
-        return earliest
+        if not self._deadline_is_known:
+            schedule = self._episodes.schedule
+            of_frames = schedule.next_deadline() if schedule is not None else None
+            instants = (self._liveness.next_deadline(), of_frames)
+            self._deadline = min((instant for instant in instants if instant is not None), default=None)
+            self._deadline_is_known = True
+        return self._deadline
 
     def actions(self) -> list[ev.Action]:
         """What the shell has to do, in order; each is handed out once."""
@@ -92,6 +95,7 @@ class FrameClock:
 
     def _settle(self, now: int) -> None:
         """What follows from any event: the schedule acts, and a run that is over gets done."""
+        self._deadline_is_known = False
         self._episodes.pump(now)
         if self._run.over:
             self._episodes.close(now)

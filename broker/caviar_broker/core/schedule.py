@@ -11,12 +11,14 @@ from dataclasses import replace
 
 from caviar_broker.core.decisions import DecisionBook
 from caviar_broker.core.events import Action, Latency, Notice, Product
-from caviar_broker.core.graph import Edge, Graph
+from caviar_broker.core.graph import Graph
+from caviar_broker.core.inputs import Inputs
 from caviar_broker.core.ledger import Ledger
 from caviar_broker.core.pace import Pacer
 from caviar_broker.core.plan import RunPlan, ServicePlan
 from caviar_broker.core.tasks import Decision, GrantOrder, Task, milliseconds, provenance
 from caviar_broker.core.transitions import OUTSTANDING, TaskEvent, TaskState
+from caviar_broker.core.turns import Turns
 from caviar_protocol.digest import RunDigest
 from caviar_protocol.messages import GrantInput, Report, Status
 
@@ -58,23 +60,17 @@ class EpisodeSchedule:
         self.aborted: Task | None = None
         """A task of a service with policy abort that missed its deadline."""
         self._plans: Mapping[str, ServicePlan] = {p.name: p for p in plan.services}
-        self._agents = tuple(n for n in graph.order if self._plans[n].role == "agent")
-        self._recorders = tuple(n for n in graph.order if self._plans[n].role == "recorder")
-        self._others = tuple(n for n in graph.order if n not in self._recorders)
         self._capacity, self._ledger = capacity, ledger
         self._first_entry = ledger.last
         self._pacer = Pacer(plan)
         self._book = DecisionBook(graph, plan, episode, digest, ledger, self.actions)
         self._book.lag_ns = lambda: self._pacer.lag_ns
+        self._inputs = Inputs(graph, self._book)
+        self._turns = Turns(graph, plan, self._book)
         self._completed = dict.fromkeys(graph.order, -1)
         self._outstanding: dict[str, list[Task]] = {name: [] for name in graph.order}
         self._late: list[Product] = []
         """Late products that the recorder has not been told of (clause 11)."""
-        self._dirty = set(graph.order)
-        """Services for which something may have changed."""
-        self._waiting_for_journal: set[str] = set()
-        self._waiting_for_pace: set[str] = set()
-        self._waiting_for_frames: set[str] = set()
         self._paused: set[str] = set()
 
     # --- what happens ------------------------------------------------------------------------------
@@ -104,10 +100,10 @@ class EpisodeSchedule:
         else:
             task.report = report
             self._book.fresh(task, by_topic, now)
-            self._decided(task)
+            self._turns.decided(task.service)
         if frame >= self._book.frames and by_topic:
             self._notice("discarded", task, f"answered its final grant with {', '.join(sorted(by_topic))}")
-        if end and service in self._agents:
+        if end and service in self._turns.agents:
             self._end_after(frame)
 
     def fault(self, service: str, frame: int, text: str, now: int) -> None:
@@ -124,11 +120,11 @@ class EpisodeSchedule:
             self._book.release(task)
         else:
             self._book.substitute(task, f"{service} failed in frame {frame}: {text}", "fault", now)
-            self._decided(task)
+            self._turns.decided(task.service)
 
     def journal_written(self) -> None:
         """More entries of the ledger are safe; what waited for them may be granted."""
-        self._wake(self._waiting_for_journal)
+        self._turns.wake(self._turns.waiting_for_journal)
 
     def pause(self, service: str) -> None:
         """The service is gone: its outstanding grants stay owed, no new ones are made."""
@@ -140,7 +136,7 @@ class EpisodeSchedule:
         It starts from its reset, so ``previous`` is −1 and a world steps the whole gap.
         """
         self._paused.discard(service)
-        self._dirty.add(service)
+        self._turns.concerned.add(service)
         self._completed[service] = previous = -1
         again = []
         for task in self._outstanding[service]:
@@ -153,10 +149,11 @@ class EpisodeSchedule:
 
     def advance(self, now: int) -> None:
         """Grant and skip whatever can be, until nothing changes."""
-        while self._dirty:
+        concerned = self._turns.concerned
+        while concerned:
             for name in self.graph.order:
-                if name in self._dirty:
-                    self._dirty.discard(name)
+                if name in concerned:
+                    concerned.discard(name)
                     self._advance_service(name, now)
 
     def expire(self, now: int) -> None:
@@ -167,7 +164,7 @@ class EpisodeSchedule:
                 self._expired(due[1], now)
         instant = self._next_release()
         if instant is not None and instant <= now:
-            self._wake(self._waiting_for_pace)
+            self._turns.wake(self._turns.waiting_for_pace)
 
     def next_deadline(self) -> int | None:
         """The earliest instant at which `expire` has something to do [ns]."""
@@ -199,14 +196,12 @@ class EpisodeSchedule:
     @property
     def finished(self) -> bool:
         """Whether every frame is decided, final grants are answered, and nobody is waited for."""
-        return self._over and not any(
-            self._outstanding[name] for name in self.graph.order if self._binds(name)
-        )
+        return self._over and not any(owed and self._binds(name) for name, owed in self._outstanding.items())
 
     @property
     def _over(self) -> bool:
-        book = self._book
-        return book.finished_frames >= book.frames and all(book.next[a] > book.frames for a in self._agents)
+        book, agents = self._book, self._turns.agents
+        return book.finished_frames >= book.frames and all(book.next[a] > book.frames for a in agents)
 
     def _binds(self, service: str) -> bool:
         """Whether the end of the episode waits for what a service still owes.
@@ -231,13 +226,7 @@ class EpisodeSchedule:
 
     def waiting_for(self, service: str) -> str:
         """Who lacks which input of a service now, for its blame; empty if nobody does."""
-        found = []
-        for name in self.graph.consumers.get(service, ()):
-            frame = self._book.next[name]
-            for edge in self.graph.inputs[name]:
-                if edge.source == service and frame <= self.frames and not self._book.decided(edge, frame):
-                    found.append(f"{name} waits for {edge.topic} of frame {frame - edge.lag}")
-        return ", ".join(found)
+        return self._inputs.lacking(service)
 
     def validate(self) -> None:
         """Cross-field invariants; raises AssertionError naming the one that is broken."""
@@ -252,87 +241,40 @@ class EpisodeSchedule:
             owed = self._outstanding[task.service]
             assert (task.state in OUTSTANDING) == (task in owed), f"{task} miscounted"
             if task.state in (TaskState.GRANTED, TaskState.OVERDUE):
-                for edge in self._taken(task):
+                for edge in self._inputs.taken(task):
                     assert self._book.decided(edge, task.frame), f"{task} granted before {edge} (clause 7)"
 
     # --- granting ----------------------------------------------------------------------------------
 
     def _advance_service(self, name: str, now: int) -> None:
         while True:
-            task = self._candidate(name)
-            if task is None or not all(self._book.decided(e, task.frame) for e in self._taken(task)):
+            in_flight = sum(t.state is TaskState.GRANTED for t in self._outstanding[name])
+            task = self._turns.candidate(name, in_flight)
+            if task is None or not self._inputs.decided(task):
                 return
-            if not self._safe(task):
-                self._waiting_for_journal.add(name)
+            if self._ledger.written < max(self._first_entry, self._inputs.latest_entry(task)):
+                self._turns.waiting_for_journal.add(name)
                 return
-            queued = task.frame > self._book.next[name]
             has_room = len(self._outstanding[name]) < self._capacity[name]
-            if queued and not has_room:
+            if in_flight and not has_room:
                 return
             if not self._released(task, now):
-                self._waiting_for_pace.add(name)
+                self._turns.waiting_for_pace.add(name)
                 return
-            cause = self._missing(task)
-            if queued and cause is not None:
+            cause = self._inputs.missing(task)
+            if in_flight and cause is not None:
                 return  # it is skipped when its turn has come
-            if task.eligible_at is None and not queued:
+            if task.eligible_at is None and not in_flight:
                 task.eligible_at = now
             if cause is not None:
                 task.move(TaskEvent.SKIP)
                 self._notice("skipped", task, cause)
                 self._book.consequence(task, cause, now)
-                self._decided(task)
+                self._turns.decided(task.service)
             elif has_room and name not in self._paused:
                 self._grant(task, now)
             else:
                 return
-
-    def _candidate(self, name: str) -> Task | None:
-        """The next task of a service that is not granted, behind those in flight; None: not its turn."""
-        book = self._book
-        frame = book.next[name] + sum(t.state is TaskState.GRANTED for t in self._outstanding[name])
-        if frame >= book.frames and (name not in self._agents or frame > book.frames):
-            return None
-        if frame >= book.finished_frames + self.plan.frames_in_flight + (frame == book.frames):
-            self._waiting_for_frames.add(name)
-            return None
-        # No agent runs ahead of one that may end the episode, and no recorder of what may be cut then.
-        if name in self._agents and any(book.next[agent] < frame for agent in self._agents):
-            return None
-        if name in self._recorders and any(book.next[other] <= frame for other in self._others):
-            return None
-        return book.task(name, frame)
-
-    def _taken(self, task: Task) -> Iterable[Edge]:
-        """Edges that count in this frame: behind the last frame only those with lag 1 (clause 16)."""
-        edges = self.graph.inputs[task.service]
-        return edges if task.frame < self._book.frames else [e for e in edges if e.lag == 1]
-
-    def _safe(self, task: Task) -> bool:
-        """Clause 18: what this grant relies on from before its frame is in the journal.
-
-        That is the service's own last decision, lag 1 inputs and held products; what was decided in
-        this very frame would be decided again. Entries become safe in order, so nothing is missing
-        between them.
-        """
-        book, written, frame = self._book, self._ledger.written, task.frame
-        if written < self._first_entry or book.entry(task.service, frame - 1) > written:
-            return False
-        for edge in self._taken(task):
-            if edge.lag and book.entry(edge.source, frame - edge.lag) > written:
-                return False
-            if book.decision(edge, frame).journal > written:
-                return False
-        return True
-
-    def _missing(self, task: Task) -> str | None:
-        """Cause of the first required input that is absent (clause 10); frame 0 has no earlier one."""
-        for edge in self._taken(task):
-            if edge.required and task.frame >= edge.lag:
-                decision = self._book.decision(edge, task.frame)
-                if decision.product is None:
-                    return decision.cause
-        return None
 
     def _released(self, task: Task, now: int) -> bool:
         """Whether real time has come to this frame (clause 8)."""
@@ -341,7 +283,7 @@ class EpisodeSchedule:
         slip = self._pacer.release(task.frame, now)
         if slip is None:
             return False
-        self._wake(self._waiting_for_pace)  # whoever asks first releases the frame for all
+        self._turns.wake(self._turns.waiting_for_pace)  # whoever asks first releases the frame for all
         if slip > self.plan.sampling_period_ns // 10:
             behind = milliseconds(self._pacer.lag_ns)
             self._notice("lag", task, f"{milliseconds(slip)} behind real time, {behind} since the start")
@@ -349,7 +291,7 @@ class EpisodeSchedule:
 
     def _next_release(self) -> int | None:
         """When the frame that somebody waits for will be due; None if nobody does."""
-        return self._pacer.next_instant() if self._waiting_for_pace else None
+        return self._pacer.next_instant() if self._turns.waiting_for_pace else None
 
     def _grant(self, task: Task, now: int) -> None:
         owed = self._outstanding[task.service]
@@ -361,21 +303,14 @@ class EpisodeSchedule:
         self.grants.append(task.order)
 
     def _order(self, task: Task, previous: int) -> GrantOrder:
-        inputs: list[GrantInput] = []
-        products: list[Product] = []
-        for edge in self._taken(task):
-            decision = self._book.decision(edge, task.frame)
-            inputs.append(provenance(edge.topic, edge.source, decision, task.frame))
-            if decision.product is not None:
-                products.append(decision.product)
+        inputs, products = self._inputs.provide(task)
         reports: list[Report] = []
-        if task.service in self._recorders:
-            for product in [p for p in self._late if p.frame <= task.frame]:
-                self._late.remove(product)
-                late = Decision(Status.LATE, product)
-                inputs.append(provenance(product.topic, product.source, late, task.frame))
-                products.append(product)
-            of_frame = (self._book.find(name, task.frame) for name in self._others)
+        if task.service in self._turns.recorders:
+            told = [product for product in self._late if product.frame <= task.frame]
+            self._late = [product for product in self._late if product.frame > task.frame]
+            inputs += [_late_input(product, task.frame) for product in told]
+            products += told
+            of_frame = (self._book.find(name, task.frame) for name in self._turns.others)
             reports = sorted((t.report for t in of_frame if t and t.report), key=lambda r: r.source)
         final = task.frame == self._book.frames
         return GrantOrder(
@@ -391,28 +326,15 @@ class EpisodeSchedule:
         if owed:
             owed[0].started_at = now  # it was queued until now
         task.order = None
-        self._dirty.add(service)
+        self._turns.concerned.add(service)
         return task
-
-    def _decided(self, task: Task) -> None:
-        name = task.service
-        self._dirty.add(name)
-        self._dirty.update(self.graph.consumers[name])
-        self._dirty.update(self._recorders)
-        if name in self._agents:
-            self._dirty.update(self._agents)
-        self._wake(self._waiting_for_frames)
-
-    def _wake(self, services: set[str]) -> None:
-        self._dirty |= services
-        services.clear()
 
     def _came_late(self, task: Task, products: Mapping[str, Product], now: int) -> None:
         elapsed = milliseconds(now - task.started_at)
         self._notice("late", task, f"answered after {elapsed}; its frame had gone on")
         if products:
             self._book.late(task, products, now)
-        if self._recorders:
+        if self._turns.recorders:
             self._late += products.values()
         self._book.release(task)
 
@@ -422,15 +344,13 @@ class EpisodeSchedule:
         An agent that is late cannot undo what others did meanwhile: the episode then ends with the
         last frame that any agent was granted.
         """
-        in_flight = (t.frame for agent in self._agents for t in self._outstanding[agent])
-        reached = max((self._book.next[agent] - 1 for agent in self._agents), default=frame)
+        in_flight = (t.frame for agent in self._turns.agents for t in self._outstanding[agent])
+        reached = max((self._book.next[agent] - 1 for agent in self._turns.agents), default=frame)
         for task in self._book.end_after(max(frame, reached, *in_flight)):
             if task.state in OUTSTANDING:
                 task.move(TaskEvent.CUT)
                 self.cut.append(task)
-        for waiting in (self._waiting_for_journal, self._waiting_for_pace, self._waiting_for_frames):
-            waiting.clear()
-        self._dirty.update(self.graph.order)
+        self._turns.wake_all()
 
     def _due(self, name: str) -> tuple[int, Task] | None:
         """When the budget of what a service has to do next is up."""
@@ -458,7 +378,7 @@ class EpisodeSchedule:
             task.move(TaskEvent.DEADLINE)
             self.overruns.append((task, f"the frame goes on ({plan.policy})"))
             self._book.substitute(task, cause, "overdue", now)
-            self._decided(task)
+            self._turns.decided(task.service)
         else:
             owed = self._outstanding[task.service]
             why = f"still busy with frame {owed[0].frame}" if owed else "not connected"
@@ -468,7 +388,7 @@ class EpisodeSchedule:
             task.move(TaskEvent.DEADLINE)
             self._notice("skipped", task, cause)
             self._book.substitute(task, cause, "skipped", now)
-            self._decided(task)
+            self._turns.decided(task.service)
 
     def _measure(self, task: Task, now: int) -> None:
         elapsed = now - task.started_at
@@ -479,3 +399,7 @@ class EpisodeSchedule:
 
     def _notice(self, kind: str, task: Task, text: str) -> None:
         self.actions.append(Notice(kind, task.service, text, self.episode, task.frame))
+
+
+def _late_input(product: Product, frame: int) -> GrantInput:
+    return provenance(product.topic, product.source, Decision(Status.LATE, product), frame)

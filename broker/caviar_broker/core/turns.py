@@ -1,0 +1,66 @@
+"""Whose turn it is: which frame a service may have next, and who has to be looked at again."""
+
+from __future__ import annotations
+
+from caviar_broker.core.decisions import DecisionBook
+from caviar_broker.core.graph import Graph
+from caviar_broker.core.plan import RunPlan
+from caviar_broker.core.tasks import Task
+
+
+class Turns:
+    """Turns of the services of one episode (clauses 7 and 16).
+
+    After something happened only services that may be concerned are looked at again; who waits for
+    the journal, for real time or for frames to be finished is remembered until that comes.
+    """
+
+    def __init__(self, graph: Graph, plan: RunPlan, book: DecisionBook) -> None:
+        roles = {service.name: service.role for service in plan.services}
+        self.agents = tuple(name for name in graph.order if roles[name] == "agent")
+        self.recorders = tuple(name for name in graph.order if roles[name] == "recorder")
+        self.others = tuple(name for name in graph.order if name not in self.recorders)
+        self.concerned = set(graph.order)
+        """Services for which something may have changed."""
+        self.waiting_for_journal: set[str] = set()
+        self.waiting_for_pace: set[str] = set()
+        self._waiting_for_frames: set[str] = set()
+        self._graph, self._plan, self._book = graph, plan, book
+
+    def candidate(self, name: str, in_flight: int) -> Task | None:
+        """The next task of a service behind those in flight; None: it has to wait for others, or is through.
+
+        No agent runs ahead of one that may end the episode, and no recorder of what may be cut then.
+        """
+        book = self._book
+        frame = book.next[name] + in_flight
+        if frame >= book.frames and (name not in self.agents or frame > book.frames):
+            return None
+        if frame >= book.finished_frames + self._plan.frames_in_flight + (frame == book.frames):
+            self._waiting_for_frames.add(name)
+            return None
+        if name in self.agents and any(book.next[agent] < frame for agent in self.agents):
+            return None
+        if name in self.recorders and any(book.next[other] <= frame for other in self.others):
+            return None
+        return book.task(name, frame)
+
+    def decided(self, name: str) -> None:
+        """A service's task was decided: whom may that concern?"""
+        self.concerned.add(name)
+        self.concerned.update(self._graph.consumers[name])
+        self.concerned.update(self.recorders)
+        if name in self.agents:
+            self.concerned.update(self.agents)
+        self.wake(self._waiting_for_frames)
+
+    def wake(self, waiting: set[str]) -> None:
+        """What these services waited for has come."""
+        self.concerned |= waiting
+        waiting.clear()
+
+    def wake_all(self) -> None:
+        """Everything may have changed."""
+        for waiting in (self.waiting_for_journal, self.waiting_for_pace, self._waiting_for_frames):
+            waiting.clear()
+        self.concerned.update(self._graph.order)
