@@ -14,11 +14,11 @@ help: ## List these targets
 setup: $(STAMP) ## Make .venv and see to the system libraries (again only when pyproject.toml changes)
 	@:
 
-$(STAMP): pyproject.toml tools/setup.sh
-	@tools/setup.sh
+$(STAMP): pyproject.toml deploy/setup.sh
+	@deploy/setup.sh
 
 demo: setup ## Run SCENARIO for FRAMES frames, draw its pictures, say where they are
-	@FRAMES=$(FRAMES) tools/demo.sh $(SCENARIO)
+	@FRAMES=$(FRAMES) deploy/demo.sh $(SCENARIO)
 
 lint: setup ## Style, types and the imports that the architecture allows
 	@$(BIN)/ruff check .

@@ -84,8 +84,9 @@ def run_scenario(
     if json_file is not None:
         _write(json_file, summary)
     if outcome["frames"]:
-        console.print(summary_table(summary))
-        console.print(f"digest {summary['digest']}", highlight=False, soft_wrap=True)
+        _show(console, summary)
+        with (directory / "summary.txt").open("w") as file:
+            _show(Console(file=file, width=100), summary)
     if outcome["error"]:
         console.print(f"[red]the run ended early:[/red] {outcome['error']}", highlight=False, soft_wrap=True)
         child = launcher.child(outcome["culprit"])
@@ -165,6 +166,11 @@ def _progress_bar(console: Console) -> Progress:
         TextColumn("{task.fields[misses]}"),
         console=console,
     )
+
+
+def _show(console: Console, summary: Mapping[str, Any]) -> None:
+    console.print(summary_table(summary))
+    console.print(f"digest {summary['digest']}", highlight=False, soft_wrap=True)
 
 
 def _write(path: Path, summary: Mapping[str, Any]) -> None:

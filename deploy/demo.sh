@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Run one scenario and draw its pictures: tools/demo.sh [SCENARIO]. FRAMES sets the length.
+# Run one scenario and draw its pictures: deploy/demo.sh [SCENARIO]. FRAMES sets the length.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 .venv/bin/caviar run "${1:-deploy/scenarios/street-canyon.toml}" --frames "${FRAMES:-120}"
