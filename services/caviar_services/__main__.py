@@ -7,10 +7,10 @@ import logging
 import sys
 
 from caviar_protocol.errors import CaviarError
-from caviar_services.runner import run_service
+from caviar_services.runner import CONNECT_TIMEOUT_S, run_service
 
 
-def serve(name: str, use: str, broker: str) -> int:
+def serve(name: str, use: str, broker: str, connect_timeout_s: float = CONNECT_TIMEOUT_S) -> int:
     """Run the implementation ``use`` ("role:name") as the service ``name``; the exit status."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(message)s")
     role, separator, implementation = use.partition(":")
@@ -18,7 +18,7 @@ def serve(name: str, use: str, broker: str) -> int:
         sys.stderr.write(f"caviar service: --use {use!r} is not ROLE:NAME, for example world:sumo\n")
         return 2
     try:
-        return run_service(name, role, implementation, broker)
+        return run_service(name, role, implementation, broker, connect_timeout_s)
     except CaviarError as error:
         sys.stderr.write(f"caviar service {name}: {error}\n")
         return 1
@@ -30,8 +30,15 @@ def main() -> int:
     parser.add_argument("name", help="name of the service in the run")
     parser.add_argument("--use", required=True, metavar="ROLE:NAME", help="registered implementation")
     parser.add_argument("--broker", required=True, metavar="URL", help="tcp://host:port of the broker")
+    parser.add_argument(
+        "--connect-timeout",
+        type=float,
+        default=CONNECT_TIMEOUT_S,
+        metavar="S",
+        help="how long to wait for the broker; it may start later than its services",
+    )
     arguments = parser.parse_args()
-    return serve(arguments.name, arguments.use, arguments.broker)
+    return serve(arguments.name, arguments.use, arguments.broker, arguments.connect_timeout)
 
 
 if __name__ == "__main__":

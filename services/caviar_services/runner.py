@@ -287,7 +287,7 @@ class Runner:
         for topic in sorted(result.products):
             payload = result.products[topic]
             if type(payload) is not PAYLOADS.get(topic):
-                raise PayloadError(f"{self.use} made a {type(payload).__name__} for the topic {topic!r}")
+                raise PayloadError(f"{self.use} made a payload {type(payload).__name__} for the topic {topic!r}")
             header, body = encode_payload(payload)
             digest = payload_digest(header, body)
             headers.append(m.ProductHeader(topic=topic, digest=digest, fidelity=result.fidelity))
@@ -332,6 +332,6 @@ class Runner:
             self._termination.finished()
 
 
-def run_service(name: str, role: str, use: str, endpoint: str) -> int:
+def run_service(name: str, role: str, use: str, endpoint: str, connect_timeout_s: float) -> int:
     """Run a registered implementation as the service ``name``; the exit status."""
-    return Runner(name, role, use, endpoint).run()
+    return Runner(name, role, use, endpoint, connect_timeout_s).run()
