@@ -189,11 +189,11 @@ class Simulation:
                 case ev.Send():
                     self._deliver(action.service, action.message)
                 case ev.Journal(number=number):
-                    self.after(self.journal_after, lambda number=number: self._journaled(number))
+                    self.after(self.journal_after, lambda number=number: self.journaled(number))
                 case _:
                     pass
 
-    def _journaled(self, number: int) -> None:
+    def journaled(self, number: int) -> None:
         if self.history is not None:
             self.history.journaled = max(self.history.journaled, number)
         self.feed(ev.Journaled(number))

@@ -256,6 +256,12 @@ def test_the_deadline_of_a_frame_runs_though_the_only_source_is_late() -> None:
     assert [f.frame for f in run.seen(ev.FrameFinished)] == [0, 1, 2, 3, 4]
 
 
+def test_nothing_is_kept_of_what_came_late() -> None:
+    tardy = {"policy": "hold", "latency": lambda e, k: 45 * MS if k % 5 == 2 else MS}
+    run = lidar_run(frames=60, **tardy)  # `validate` asserts that tasks are released
+    assert len(run.notices("late")) == 12
+
+
 def test_an_agent_that_is_late_does_not_stop_the_run() -> None:
     services = loop(agent={"policy": "hold", "budget": 10 * MS, "latency": slow_at(1, 5, takes=35 * MS)})
     run = Simulation(services, frames=8).join().run()

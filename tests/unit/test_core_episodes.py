@@ -140,6 +140,18 @@ def test_clause_16_an_agent_that_is_late_ends_the_episode_where_the_agents_have_
     assert run.outcome.error == ""
 
 
+def test_clause_16_a_late_end_gives_the_others_their_final_grant_though_a_scene_is_under_way() -> None:
+    late = agent(
+        "late", policy="drop", budget=10 * MS, latency=lambda e, k: 45 * MS if k == 1 else MS, **ends((0, 1))
+    )
+    slow_world = world(latency=lambda e, k: 300 * MS if k == 3 else MS)
+    run = Simulation([slow_world, late, agent("other")], frames=50).join().run()
+    frames = run.seen(ev.EpisodeFinished)[0].frames
+    assert frames == 3
+    assert run.time_of("other", 3) == run.time_of("late", 1) + 45 * MS
+    assert run.grants("other")[-1].final
+
+
 def test_somebody_who_is_no_agent_cannot_end_the_episode() -> None:
     run = Simulation(loop(world=ends((0, 1)))).join().run()
     assert run.seen(ev.EpisodeFinished)[0].frames == 5

@@ -8,6 +8,7 @@ import pytest
 from core_harness import MS, SECOND, Simulation, agent, channel, link, loop, recorder, sensors, world
 
 from caviar_broker.core import events as ev
+from caviar_broker.core.ledger import Ledger
 from caviar_broker.core.plan import Limits
 from caviar_broker.core.transitions import RunState
 from caviar_protocol import messages as m
@@ -245,7 +246,7 @@ def test_clause_8_a_frame_that_one_service_finds_due_is_released_for_all() -> No
     run.run_to(run.now + 99 * MS)
     run.now += 2 * MS
     run.answer("uav", run.grants("uav")[0])
-    run.run_to(run.now)
+    run.journaled(run.seen(ev.Journal)[-1].number)
     assert run.time_of("world", 1) == run.time_of("uav", 1) == run.now
     assert run.run().outcome.error == ""
 
@@ -280,6 +281,17 @@ def test_clause_18_a_new_episode_waits_for_the_journal_of_the_one_before() -> No
     run = Simulation(loop(), journal_after=500 * MS, episodes=2, frames=1).join().run()
     last = max(t for t, a in run.log if isinstance(a, ev.Journal) and a.episode == 0)
     assert run.time_of("world", 0, episode=1) == last + 500 * MS
+
+
+def test_the_ledger_tells_since_when_nothing_was_confirmed() -> None:
+    ledger = Ledger()
+    assert [ledger.enter(10), ledger.enter(20)] == [1, 2]
+    assert ledger.waiting_since == 10
+    assert ledger.confirm(1, 30)
+    assert ledger.waiting_since == 30, "something was confirmed, something is still waiting"
+    assert not ledger.confirm(1, 40)
+    assert ledger.confirm(2, 50)
+    assert (ledger.written, ledger.waiting_since) == (2, None)
 
 
 def test_a_journal_that_is_not_written_ends_the_run() -> None:

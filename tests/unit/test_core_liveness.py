@@ -173,6 +173,24 @@ def test_a_service_that_dies_again_and_again_is_given_up() -> None:
     assert run.run().outcome.culprit == "channel"
 
 
+def test_a_service_that_gets_somewhere_may_die_more_often() -> None:
+    run = Simulation(loop(channel={"latency": 20 * MS}), frames=9, limits=REJOIN).join()
+    for frame in range(1, 2 * MAX_LOSSES):
+        run.run(granted("channel", frame))
+        run.kill("channel")
+        run.hello("channel")
+    assert run.run().outcome.error == ""
+
+
+def test_after_a_return_the_time_counts_from_the_grant_that_was_sent_again() -> None:
+    run = Simulation(loop(channel={"latency": 20 * MS}), limits=REJOIN).join().run(granted("channel", 1))
+    run.kill("channel")
+    run.after(SECOND, lambda: run.hello("channel"))
+    run.run()
+    (latency,) = [x for x in run.seen(ev.Latency, "channel") if x.frame == 1]
+    assert (latency.elapsed_ns, latency.missed) == (20 * MS, True), "the frame did miss its budget"
+
+
 def test_a_service_that_never_was_ready_is_not_waited_for() -> None:
     run = Simulation(loop(channel={"ready_after": None}), limits=REJOIN).join()
     run.run(lambda run: bool(run.seen(m.Prepare, "channel")))

@@ -123,7 +123,7 @@ class Puppets(Simulation):
     def write(self, count: int) -> None:
         """The journal gets so many entries further."""
         numbers, self.unwritten = self.unwritten[:count], self.unwritten[count:]
-        self._journaled(numbers[-1])
+        self.journaled(numbers[-1])
 
     def die(self, name: str) -> None:
         self.inbox[name].clear()

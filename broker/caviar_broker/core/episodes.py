@@ -105,7 +105,7 @@ class Episodes:
             problem = "twice" if strange[0] in declared else "which it did not declare"
             run.fail(f"{peer} answered frame {message.frame} with {strange[0]!r}, {problem}", peer.name, now)
             return
-        peer.advanced_at, peer.losses = now, 0
+        peer.losses = 0
         t_ns = run.plan.t_ns(message.frame)
         products = [
             ev.Product(h.topic, peer.name, message.frame, t_ns, h.digest, h.fidelity, payload)
@@ -135,7 +135,6 @@ class Episodes:
         schedule = self._owing(peer, message, "FAULT")
         if schedule is None:
             return
-        peer.advanced_at = now
         needed = schedule.outstanding(peer.name)[0].state is not TaskState.ABANDONED
         if needed and peer.plan.policy in ("wait", "abort"):
             run.fail(f"{peer} failed in frame {message.frame}, {text}", peer.name, now)

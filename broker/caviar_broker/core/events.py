@@ -165,6 +165,7 @@ class Journal:
     frame: int
     service: str
     outcome: str
+    """``done``, ``fault``, ``overdue``, ``skipped``, or, for products that came later, ``late``."""
     decisions: tuple[GrantInput, ...]
     products: tuple[Product, ...]
     """Those that a later frame may consume."""
@@ -185,7 +186,8 @@ class Notice:
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """A grant was answered (or its deadline passed): the figure behind p50 and p99."""
+    """The figure behind p50 and p99: one for each grant once it is answered, late or not, or will never
+    be; and one for each frame that a service could not be granted before its deadline."""
 
     service: str
     episode: int

@@ -37,7 +37,7 @@ class Peer:
     heard_at: int | None = None
     """When the last heartbeat came [ns]."""
     advanced_at: int = 0
-    """When it last showed progress: a message of its own, or a heartbeat that counted on [ns]."""
+    """When it last showed progress: an offer of scenery, or a heartbeat that counted on [ns]."""
     progress: int = 0
     phase: str = ""
     grace_ns: int = 0

@@ -264,7 +264,7 @@ class EpisodeSchedule:
             cause = self._inputs.missing(task)
             if in_flight and cause is not None:
                 return  # it is skipped when its turn has come
-            if task.eligible_at is None and not in_flight:
+            if task.eligible_at is None:
                 task.eligible_at = now
             if cause is not None:
                 task.move(TaskEvent.SKIP)

@@ -41,7 +41,7 @@ class Task:
     frame: int
     state: TaskState = TaskState.PENDING
     eligible_at: int | None = None
-    """When its inputs were decided and its predecessor was through [ns]."""
+    """When it could first have been granted, or skipped, had its service been there and not late [ns]."""
     started_at: int = 0
     """When it was granted or, where grants queue, when the one before it was answered [ns]."""
     overran: bool = False
