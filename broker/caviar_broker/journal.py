@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -45,12 +45,24 @@ class JournalFile:
         except OSError as error:
             raise RunError(f"cannot write the journal {path}: {error.strerror}") from error
 
-    def write(self, entry: Journal) -> None:
-        """Append one entry. `RunError` naming the file where the system refuses it."""
+    def write(self, entries: Iterable[Journal]) -> None:
+        """Append entries. `RunError` naming the file where the system refuses them."""
+        data = self._buffer
+        data.clear()
+        for entry in entries:
+            self._encoder.encode_into(self._record(entry), data, -1)
+        try:
+            written = os.write(self._fd, data)
+        except OSError as error:
+            raise RunError(f"cannot write the journal {self.path}: {error.strerror}") from error
+        if written != len(data):
+            raise RunError(f"cannot write the journal {self.path}: no space left")
+
+    def _record(self, entry: Journal) -> JournalEntry:
         products: tuple[tuple[str, Any, Any], ...] = tuple(
             (p.topic, p.payload[0].buffer, p.payload[1].buffer) for p in entry.products
         )
-        record = JournalEntry(
+        return JournalEntry(
             number=entry.number,
             epoch=self._epoch,
             episode=entry.episode,
@@ -60,13 +72,6 @@ class JournalFile:
             decisions=entry.decisions,
             products=products,
         )
-        self._encoder.encode_into(record, self._buffer)
-        try:
-            written = os.write(self._fd, self._buffer)
-        except OSError as error:
-            raise RunError(f"cannot write the journal {self.path}: {error.strerror}") from error
-        if written != len(self._buffer):
-            raise RunError(f"cannot write the journal {self.path}: no space left")
 
     def close(self) -> None:
         """Close the file."""

@@ -97,6 +97,8 @@ class BrokerServer:
         self._fds: dict[int, Callable[[], None]] = {}
         self._host = host_identity()
         self._replying = b""
+        self._entries: list[ev.Journal] = []
+        """Decisions that are not in the journal yet."""
         self._next_check = 0
         self._port = Port(endpoint, plan.limits.liveness)
         self.endpoint = self._port.endpoint
@@ -107,7 +109,7 @@ class BrokerServer:
             clock=self.clock,
             heartbeat_ns=plan.limits.heartbeat,
             liveness_ns=plan.limits.liveness,
-            probe=lambda route: self._port.send([route, encode_message(m.HeartbeatAck(sequence=0))]),
+            probe=lambda route: self._port.send(route, encode_message(m.HeartbeatAck(sequence=0))),
             lost=lambda service, verdict: self.feed(ev.Lost(service, verdict)),
             warn=self.note,
             supervised=set(supervised),
@@ -122,6 +124,16 @@ class BrokerServer:
             m.AssetOffer: self._scenery.offer,
             m.AssetGet: self._scenery.get,
             m.AssetData: self._scenery.data,
+        }
+        self._performers: dict[type, Callable[[Any], None]] = {
+            ev.Send: self._send,
+            ev.Journal: lambda action: self._entries.append(action),
+            ev.Latency: self._latency,
+            ev.Notice: self._observer.notice,
+            ev.FrameFinished: self._frame_finished,
+            ev.EpisodeFinished: self._episode_finished,
+            ev.TurnAway: self._turn_away,
+            ev.Finished: self._finished,
         }
 
     # --- the loop ------------------------------------------------------------------------------------
@@ -153,37 +165,38 @@ class BrokerServer:
         return self.outcome
 
     def _turn(self) -> None:
-        deadline = self.clock.next_deadline()
-        wake = self._next_check if deadline is None else min(deadline, self._next_check)
-        wait_ns = max(0, wake - time.monotonic_ns())
-        for source, _ in self._poller.poll(-(-wait_ns // 1_000_000)):
-            if source is self._port.socket:
-                self._receive_all()
-            elif source in self._fds:
-                self._fds[source]()
         now = time.monotonic_ns()
-        if now >= self._next_check:
-            self._next_check = now + CHECK_NS
-            self._watchdog.check(now)
         deadline = self.clock.next_deadline()
         if deadline is not None and deadline <= now:
             self.clock.expire(now)
             self._perform()
+            self._write_journal()
+            return
+        if now >= self._next_check:
+            self._next_check = now + CHECK_NS
+            self._watchdog.check(now)
+        wake = self._next_check if deadline is None else min(deadline, self._next_check)
+        for source, _ in self._poller.poll(-(-(wake - now) // 1_000_000)):
+            if source is self._port.socket:
+                self._receive_all()
+            elif source in self._fds:
+                self._fds[source]()
+        self._write_journal()
 
     def _receive_all(self) -> None:
         for _ in range(MESSAGES_A_TURN):
-            parts = self._port.receive()
-            if parts is None:
+            received = self._port.receive()
+            if received is not None:
+                self._handle(*received)
+            if not self._port.readable:
                 return
-            self._handle(parts)
 
     # --- what comes ----------------------------------------------------------------------------------
 
-    def _handle(self, parts: list[zmq.Frame]) -> None:
-        route = parts[0].bytes
+    def _handle(self, route: bytes, parts: list[zmq.Frame]) -> None:
         try:
-            message = decode_message(parts[1].buffer if len(parts) > 1 else b"")
-            check_parts(message, parts[1:])
+            message = decode_message(parts[0].buffer)
+            check_parts(message, parts)
         except ProtocolError as error:
             self._refuse_bytes(route, error)
             return
@@ -193,7 +206,7 @@ class BrokerServer:
         elif connection.heartbeat:
             self._from_pulse(route, connection.service, message)
         elif (handler := self._handlers.get(type(message))) is not None:
-            handler(connection.service, message, parts[2:])
+            handler(connection.service, message, parts[1:])
         else:
             self._unexpected(route, message, "the ordered connection of a service that is in the run")
 
@@ -311,45 +324,51 @@ class BrokerServer:
     def _perform(self) -> None:
         """Carry out the clock's actions, until there are no more."""
         while actions := self.clock.actions():
+            # Whoever is granted something works while this process does the rest.
+            actions.sort(key=_is_no_send)
             for action in actions:
-                match action:
-                    case ev.Send():
-                        self._send(action)
-                    case ev.Journal():
-                        self._write(action)
-                    case ev.Latency():
-                        self.statistics.latency(action.service, action.elapsed_ns, action.missed)
-                    case ev.FrameFinished():
-                        self.statistics.frame(time.monotonic_ns())
-                        self._observer.frame(action, self.statistics)
-                    case ev.Notice():
-                        self._observer.notice(action)
-                    case ev.TurnAway():
-                        self._reply(self._replying, action.refusal)
-                    case ev.Finished():
-                        self.outcome = action
+                self._performers[type(action)](action)
 
-    def _write(self, entry: ev.Journal) -> None:
-        """Clause 18: nothing that relies on an entry is granted before the system has it."""
-        try:
-            self._journal.write(entry)
-        except RunError as error:
-            self.clock.receive(ev.StopRequested(str(error)), time.monotonic_ns())
-        else:
-            self.clock.receive(ev.Journaled(entry.number), time.monotonic_ns())
+    def _write_journal(self) -> None:
+        """Clause 18: nothing that relies on an entry is granted before the system has it.
+
+        Once a turn, so that services that answer together cost one write.
+        """
+        while self._entries:
+            entries, self._entries = self._entries, []
+            event: ev.Event = ev.Journaled(entries[-1].number)
+            try:
+                self._journal.write(entries)
+            except RunError as error:
+                event = ev.StopRequested(str(error))
+            self.feed(event)
+
+    def _latency(self, action: ev.Latency) -> None:
+        self.statistics.latency(action.service, action.elapsed_ns, action.missed)
+
+    def _frame_finished(self, action: ev.FrameFinished) -> None:
+        self.statistics.frame(time.monotonic_ns())
+        self._observer.frame(action, self.statistics)
+
+    def _episode_finished(self, action: ev.EpisodeFinished) -> None:
+        """Its frames are told one by one."""
+
+    def _turn_away(self, action: ev.TurnAway) -> None:
+        self._reply(self._replying, action.refusal)
+
+    def _finished(self, action: ev.Finished) -> None:
+        self.outcome = action
 
     def _send(self, action: ev.Send) -> None:
-        parts: list[Any] = [self._routes[action.service], encode_message(action.message)]
-        for product in action.products:
-            parts += product.payload
-        reason = self._port.send(parts)
+        parts = [part for product in action.products for part in product.payload]
+        reason = self._port.send(self._routes[action.service], encode_message(action.message), parts)
         if reason and self.clock.state is not RunState.FINISHED:
             verdict = f"it is unreachable: {reason}"
             self.clock.receive(ev.Lost(action.service, verdict), time.monotonic_ns())
 
     def _reply(self, route: bytes, message: m.Message, *parts: bytes) -> None:
         """Answer a routing id; a peer that is gone meanwhile needs no answer."""
-        reason = self._port.send([route, encode_message(message), *parts])
+        reason = self._port.send(route, encode_message(message), parts)
         if reason:
             connection = self._connections.get(route)
             service = connection.service if connection else ""
@@ -363,3 +382,7 @@ class BrokerServer:
         text = self._grumbles.tell(kind, text, time.monotonic_ns())
         if text:
             self.note(service, text)
+
+
+def _is_no_send(action: ev.Action) -> bool:
+    return type(action) is not ev.Send

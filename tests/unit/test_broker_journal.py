@@ -24,7 +24,7 @@ def entry(number: int, body: bytes = b"") -> Journal:
 def path(tmp_path: Path) -> Path:
     journal = JournalFile(tmp_path / "journal.msgpack", epoch=3)
     for number in range(1, 51):
-        journal.write(entry(number, b"x" * 1000 * (number % 3)))
+        journal.write([entry(number, b"x" * 1000 * (number % 3))])
     journal.close()
     return tmp_path / "journal.msgpack"
 
@@ -40,7 +40,7 @@ def test_entries_come_back_in_order_with_decisions_and_products(path: Path) -> N
 
 def test_a_later_broker_appends(path: Path) -> None:
     journal = JournalFile(path, epoch=4)
-    journal.write(entry(51))
+    journal.write([entry(51)])
     journal.close()
     assert [(e.number, e.epoch) for e in read_journal(path)][-2:] == [(50, 3), (51, 4)]
 
@@ -69,7 +69,7 @@ def test_an_entry_is_with_the_system_when_write_returns(tmp_path: Path) -> None:
     """Read while the file is open and before anything is flushed or closed."""
     journal = JournalFile(tmp_path / "journal.msgpack", epoch=1)
     for number in range(1, 4):
-        journal.write(entry(number))
+        journal.write([entry(number)])
         assert [e.number for e in read_journal(journal.path)] == list(range(1, number + 1))
     journal.close()
 
@@ -77,7 +77,7 @@ def test_an_entry_is_with_the_system_when_write_returns(tmp_path: Path) -> None:
 def test_a_full_disk_is_an_error_that_names_the_file() -> None:
     journal = JournalFile(Path("/dev/full"), epoch=1)
     with pytest.raises(RunError, match="cannot write the journal /dev/full: No space left"):
-        journal.write(entry(1))
+        journal.write([entry(1)])
     journal.close()
 
 

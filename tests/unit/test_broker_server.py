@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -328,9 +329,10 @@ class Diary(JournalFile):
         super().__init__(path, 1)
         self.events: list[tuple[str, str, int]] = []
 
-    def write(self, entry: Journal) -> None:
-        super().write(entry)
-        self.events.append(("written", entry.service, entry.frame))
+    def write(self, entries: Iterable[Journal]) -> None:
+        written = list(entries)
+        super().write(written)
+        self.events += [("written", entry.service, entry.frame) for entry in written]
 
 
 def test_no_grant_overtakes_the_journal_entries_that_it_relies_on(tmp_path: Path) -> None:
@@ -344,11 +346,11 @@ def test_no_grant_overtakes_the_journal_entries_that_it_relies_on(tmp_path: Path
     with serving(plan(*PAIR, frames=20), tmp_path, diary) as broker:
         events, send = diaries[0].events, broker.server._port.send
 
-        def recorded(parts: Any) -> str:
-            message = decode_message(parts[1])
+        def recorded(route: bytes, header: bytes, parts: Any = ()) -> str:
+            message = decode_message(header)
             if isinstance(message, m.Grant):
                 events.append(("granted", "", message.frame))
-            return send(parts)
+            return send(route, header, parts)
 
         broker.server._port.send = recorded  # type: ignore[method-assign]
         feedback = (m.Input(topic="lidar", lag=1, required=False),)
@@ -379,10 +381,11 @@ def test_no_grant_overtakes_the_journal_entries_that_it_relies_on(tmp_path: Path
 
 def test_a_journal_that_cannot_be_written_ends_the_run_in_order(tmp_path: Path) -> None:
     class Full(JournalFile):
-        def write(self, entry: Journal) -> None:
-            if entry.frame == 1:
+        def write(self, entries: Iterable[Journal]) -> None:
+            written = list(entries)
+            if any(entry.frame == 1 for entry in written):
                 raise RunError("cannot write the journal: no space left")
-            super().write(entry)
+            super().write(written)
 
     with (
         serving(plan(*PAIR), tmp_path, lambda path: Full(path, 1)) as broker,
