@@ -125,9 +125,9 @@ def check_parts(message: Message, parts: Sequence[Any]) -> None:
     if isinstance(message, AssetData):
         _check_chunk(message, len(parts[1]))
         return
-    for index in range(1, len(parts)):
-        product_header = index % 2 == 1 and isinstance(message, Grant | Done)
-        limit = limits.MAX_HEADER if product_header else limits.MAX_BODY
+    has_products = isinstance(message, (Grant, Done))
+    for index in range(1, expected):
+        limit = limits.MAX_HEADER if has_products and index % 2 else limits.MAX_BODY
         if len(parts[index]) > limit:
             raise LimitError(
                 f"part {index} of {message_type(message)} has {len(parts[index])} B, "
