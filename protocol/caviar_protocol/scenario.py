@@ -48,7 +48,8 @@ class Run(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     seed: Annotated[int, quantity("1", "seed of everything random", ge=0, le=2**63 - 1)] = 1
     pace: Literal["fast", "realtime"] = "fast"
     record: tuple[str, ...] = ()
-    """Topics that are produced because they shall be recorded, though nobody else asks (clause 5)."""
+    """Topics that are produced because they shall be recorded, though nobody else asks (clause 5):
+    ``lidar``, or with a part of it ``lidar.grid``."""
     frames_in_flight: Annotated[int, quantity("frame", "frames that may overlap at most", ge=1, le=64)] = 4
 
 

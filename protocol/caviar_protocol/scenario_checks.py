@@ -12,7 +12,7 @@ import msgspec
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.scenario import DeviceSpec, Scenario, ServiceSpec
 from caviar_protocol.tables import Place, convert_table, suggestion
-from caviar_protocol.topics import PAYLOADS
+from caviar_protocol.topics import PARTS, PAYLOADS
 
 _STRICT_ROLES = ("world", "recorder")
 _KIND_KEYS = {
@@ -146,9 +146,13 @@ def _unique(names: Iterable[str], what: str, place: Place) -> None:
 
 
 def _check_record(scenario: Scenario, place: Place) -> None:
-    for index, topic in enumerate(scenario.run.record):
+    for index, entry in enumerate(scenario.run.record):
+        topic, dot, part = entry.partition(".")
         if topic not in PAYLOADS:
             raise place.at(index).error(f"no topic is named {topic!r}; {suggestion(topic, PAYLOADS)}")
+        if dot and part not in PARTS.get(topic, ()):
+            known = suggestion(part, PARTS.get(topic, ())) if topic in PARTS else f'write "{topic}"'
+            raise place.at(index).error(f"topic {topic!r} has no part {part!r}; {known}")
     if scenario.run.record and not any(s.role == "recorder" for s in scenario.services.values()):
         raise place.error('topics to record need a recorder; add [services.recorder] with role = "recorder"')
 

@@ -86,6 +86,11 @@ def line_of(text: str, fragment: str) -> int:
     return text[: text.index(fragment)].count("\n") + 1
 
 
+def test_a_part_of_a_topic_can_be_recorded() -> None:
+    text = GOOD.replace('record = ["scene"]', 'record = ["scene", "channel.h"]')
+    assert parse_scenario(text).run.record == ("scene", "channel.h")
+
+
 def test_a_good_file_becomes_typed_values_with_defaults(folder: Path) -> None:
     scenario = parse(GOOD, folder)
     assert (scenario.run.frames, scenario.run.seed, scenario.run.episodes) == (20, 7, 1)
@@ -168,6 +173,8 @@ budget_ms = 50
 
 BROKEN_RULES = [
     ('record = ["scene"]', 'record = ["lidar", "scen"]', "run.record[1]", "did you mean 'scene'?"),
+    ('record = ["scene"]', 'record = ["lidar.gird"]', "run.record[0]", "did you mean 'grid'?"),
+    ('record = ["scene"]', 'record = ["scene.h"]', "run.record[0]", "has no part 'h'"),
     ('"world"', '"link"', "services", 'no service has role = "world"'),
     ("[services.pilot]", SECOND_RECORDER, "services.recorder", "at most one, which is 'tape'"),
     ('policy = "hold"', 'policy = "hold"\nmax_in_flight = 2', "services.channel.max_in_flight", "(clause 7)"),
