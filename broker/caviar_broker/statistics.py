@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from array import array
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,11 @@ class Statistics:
     def frames(self) -> int:
         """Frames finished, over all episodes."""
         return len(self._finished_at)
+
+    @property
+    def finished_ns(self) -> Sequence[int]:
+        """When each frame was finished [ns], on the clock of `frame`."""
+        return self._finished_at
 
     @property
     def misses(self) -> int:
