@@ -86,9 +86,9 @@ def line_of(text: str, fragment: str) -> int:
     return text[: text.index(fragment)].count("\n") + 1
 
 
-def test_a_part_of_a_topic_can_be_recorded() -> None:
+def test_a_part_of_a_topic_can_be_recorded(folder: Path) -> None:
     text = GOOD.replace('record = ["scene"]', 'record = ["scene", "channel.h"]')
-    assert parse_scenario(text).run.record == ("scene", "channel.h")
+    assert parse(text, folder).run.record == ("scene", "channel.h")
 
 
 def test_a_good_file_becomes_typed_values_with_defaults(folder: Path) -> None:
