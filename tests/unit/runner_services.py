@@ -200,3 +200,11 @@ if "SlowStart" in " ".join(sys.argv):
 
 class SlowStart(Sensors):
     """Tells when it is loaded, so before it connects."""
+
+
+class HoldsForever(_Stuck):
+    """In a compiled call that holds the interpreter and never returns: only SIGKILL ends it."""
+
+    def never_return(self) -> None:
+        while True:
+            ctypes.PyDLL(None).sleep(60)

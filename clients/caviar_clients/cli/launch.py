@@ -82,9 +82,10 @@ class Launcher:
     def events(self) -> Iterator[Mapping[str, Any]]:
         """Start everything; what the broker tells, then what became of the processes.
 
-        Raises `RunError` where the broker itself cannot start.
+        Called again, it goes on where it was left. Raises `RunError` where the broker itself cannot start.
         """
-        self._start_broker()
+        if self._broker is None:
+            self._start_broker()
         while not self._finished:
             for key, _ in self._selector.select(timeout=1.0):
                 if isinstance(key.data, Child):
@@ -168,7 +169,8 @@ class Launcher:
         if not self._over:
             log = (self.directory / "logs" / "broker.log").read_text(errors="replace").strip()
             last = log.splitlines()[-1] if log else describe_exit(status)
-            raise RunError(last if last.startswith("caviar broker: ") else f"the broker died: {last}")
+            told = last.startswith("caviar broker: ")
+            raise RunError(last.removeprefix("caviar broker: ") if told else f"the broker died: {last}")
         return {"event": "ended", "status": status}
 
     def _child_died(self, child: Child) -> None:

@@ -1,0 +1,172 @@
+"""The launcher: what it starts it ends, whatever happens in between."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from caviar_clients.cli import launch
+from caviar_clients.cli.launch import TAIL, Child, Launcher
+from caviar_protocol.errors import RunError
+from caviar_protocol.scenario_loader import load_scenario
+
+ROOT = Path(__file__).parents[2]
+SMOKE = ROOT / "deploy" / "scenarios" / "smoke.toml"
+
+
+def launcher(tmp_path: Path, frames: int = 10, extra: str = "", **values: Any) -> Launcher:
+    """Of the smoke scenario with something added."""
+    path = tmp_path / "scenario.toml"
+    text = SMOKE.read_text()
+    assert 'record = ["scene",' in text
+    if "sensors" in extra:
+        text = text.replace('record = ["scene",', 'record = ["lidar", "scene",')
+    path.write_text(text + extra)
+    return Launcher(load_scenario(path), path, tmp_path / "run", frames=frames, **values)
+
+
+def alive(started: Launcher) -> list[str]:
+    """Names of the processes that it started and that still run."""
+    found = [name for name, child in started._children.items() if child.process.poll() is None]
+    broker = started._broker
+    return [*found, "broker"] if broker is not None and broker.poll() is None else found
+
+
+def wait_for(started: Launcher, kind: str) -> list[Mapping[str, Any]]:
+    """Events up to the first of a kind."""
+    seen = []
+    for event in started.events():
+        seen.append(event)
+        if event["event"] == kind:
+            return seen
+    raise AssertionError(f"no {kind} among {seen}")
+
+
+def test_a_run_tells_where_it_listens_and_how_it_ended(tmp_path: Path) -> None:
+    with launcher(tmp_path) as started:
+        events = list(started.events())
+        started.stop("too late")  # and harmless
+    assert [event["event"] for event in events if event["event"] not in ("frame", "notice")] == [
+        "listening",
+        "finished",
+        "ended",
+    ]
+    assert events[-2]["frames"] == 10
+    assert events[-2]["error"] == ""
+    assert events[-1]["status"] == 0
+    assert alive(started) == []
+    assert sorted(path.stem for path in (tmp_path / "run" / "logs").iterdir()) == sorted(
+        ["agent", "broker", "channel", "link", "recorder", "world"]
+    )
+
+
+def test_a_block_that_is_left_in_the_middle_leaves_no_process(tmp_path: Path) -> None:
+    def interrupted() -> None:
+        with launcher(tmp_path, frames=1_000_000) as started:
+            kept.append(started)
+            wait_for(started, "frame")
+            raise KeyboardInterrupt
+
+    kept: list[Launcher] = []
+    began = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert alive(kept[0]) == []
+    assert time.monotonic() - began < 15.0
+
+
+def test_an_order_to_stop_ends_the_run_with_that_reason(tmp_path: Path) -> None:
+    with launcher(tmp_path, frames=1_000_000) as started:
+        wait_for(started, "frame")
+        started.stop("enough of it")
+        finished = next(event for event in started.events() if event["event"] == "finished")
+    assert finished["error"] == "enough of it"
+    assert alive(started) == []
+
+
+def test_a_broker_that_cannot_start_says_why(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        bind = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
+        with (
+            launcher(tmp_path, bind=bind) as started,
+            pytest.raises(RunError, match="Address already in use"),
+        ):
+            list(started.events())
+    assert alive(started) == []
+
+
+def test_a_broker_that_hangs_is_given_up_once_its_services_have_left_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(launch, "BROKER_S", 0.3)
+    with launcher(tmp_path, frames=1_000_000, extra="[timeouts]\nshutdown_s = 0.5\n") as started:
+        wait_for(started, "frame")
+        assert started._broker is not None
+        os.kill(started._broker.pid, signal.SIGSTOP)
+        with pytest.raises(RunError, match="the broker does not answer"):
+            list(started.events())
+    assert alive(started) == []
+
+
+STUBBORN = """
+[services.sick]
+role = "sensors"
+use = "runner_services:HoldsForever"
+budget_ms = 50
+
+[timeouts]
+shutdown_s = 0.5
+"""
+
+
+def test_a_service_that_nothing_else_ends_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It holds the interpreter's lock, so that no signal handler and no thread of it runs."""
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    with launcher(tmp_path, extra=STUBBORN) as started:
+        stuck = tmp_path / "run" / "logs" / "sick.log"
+        wait_for(started, "listening")
+        until = time.monotonic() + 20.0
+        while "stuck" not in stuck.read_text():
+            assert time.monotonic() < until
+            os.sched_yield()
+        began = time.monotonic()
+    assert time.monotonic() - began < 0.5 + launch.KILL_AFTER_S + 2.0
+    assert alive(started) == []
+    assert started._children["sick"].process.returncode == -signal.SIGKILL
+
+
+def test_the_last_line_of_a_long_log_is_found_at_its_end(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    child = Child("world", None, log, -1)  # type: ignore[arg-type]
+    log.write_bytes(b"")
+    assert child.last_line() == ""
+    log.write_bytes(b"x" * (3 * TAIL) + b"\nsegmentation \xff fault\n\n")
+    assert child.last_line() == "segmentation � fault"
+
+
+def test_what_the_broker_says_in_pieces_is_put_together(tmp_path: Path) -> None:
+    """Lines are split wherever a read ends."""
+    with launcher(tmp_path) as started:
+        read, write = os.pipe()
+
+        class Broker:
+            stdout = os.fdopen(read, "rb", buffering=0)
+
+        started._broker = Broker()  # type: ignore[assignment]
+        line = json.dumps({"event": "notice", "text": "é" * 100}, ensure_ascii=False).encode() + b"\n"
+        events = []
+        for piece in (line[:3], line[3:40], line[40:] + line):
+            os.write(write, piece)
+            events += list(started._broker_said())
+        assert [event["text"] for event in events] == ["é" * 100] * 2
+        Broker.stdout.close()
+        os.close(write)
+        started._broker = None
