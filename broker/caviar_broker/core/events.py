@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
+
+import msgspec
 
 from caviar_protocol.messages import (
     Asset,
@@ -18,8 +19,7 @@ from caviar_protocol.messages import (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Product:
+class Product(msgspec.Struct, frozen=True):
     """One source's value of one topic for one frame. The core never looks into ``payload``."""
 
     topic: str
@@ -34,39 +34,34 @@ class Product:
 # --- events ----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class Joined:
+class Joined(msgspec.Struct, frozen=True):
     """HELLO of a service came."""
 
     hello: Hello
 
 
-@dataclass(frozen=True, slots=True)
-class AssetsOffered:
+class AssetsOffered(msgspec.Struct, frozen=True):
     """A world announced its scenery, and the asset store holds all of it."""
 
     service: str
     assets: tuple[Asset, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class ReadyReceived:
+class ReadyReceived(msgspec.Struct, frozen=True):
     """READY came."""
 
     service: str
     message: Ready
 
 
-@dataclass(frozen=True, slots=True)
-class ResetDoneReceived:
+class ResetDoneReceived(msgspec.Struct, frozen=True):
     """RESET_DONE came."""
 
     service: str
     message: ResetDone
 
 
-@dataclass(frozen=True, slots=True)
-class DoneReceived:
+class DoneReceived(msgspec.Struct, frozen=True):
     """DONE came; ``payloads`` are opaque, one for each of its products."""
 
     service: str
@@ -74,24 +69,21 @@ class DoneReceived:
     payloads: tuple[Any, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class FaultReceived:
+class FaultReceived(msgspec.Struct, frozen=True):
     """FAULT came."""
 
     service: str
     message: Fault
 
 
-@dataclass(frozen=True, slots=True)
-class Violated:
+class Violated(msgspec.Struct, frozen=True):
     """A service sent what it may not, in a way it cannot be told to mend."""
 
     service: str
     text: str
 
 
-@dataclass(frozen=True, slots=True)
-class Progressed:
+class Progressed(msgspec.Struct, frozen=True):
     """A heartbeat came."""
 
     service: str
@@ -100,31 +92,27 @@ class Progressed:
     grace_ns: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Lost:
+class Lost(msgspec.Struct, frozen=True):
     """A service died or became unreachable; ``verdict`` says how that is known."""
 
     service: str
     verdict: str
 
 
-@dataclass(frozen=True, slots=True)
-class ByeReceived:
+class ByeReceived(msgspec.Struct, frozen=True):
     """BYE came."""
 
     service: str
     reason: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Journaled:
+class Journaled(msgspec.Struct, frozen=True):
     """All journal entries up to and including this number are with the operating system."""
 
     number: int
 
 
-@dataclass(frozen=True, slots=True)
-class StopRequested:
+class StopRequested(msgspec.Struct, frozen=True):
     """The user, or the machine, wants the run to end."""
 
     reason: str
@@ -139,8 +127,7 @@ Event = (
 # --- actions ---------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class Send:
+class Send(msgspec.Struct, frozen=True):
     """Send a message to a service; ``products`` follow it, two parts each."""
 
     service: str
@@ -148,16 +135,14 @@ class Send:
     products: tuple[Product, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class TurnAway:
+class TurnAway(msgspec.Struct, frozen=True):
     """Answer the HELLO that is being handled with a refusal."""
 
     name: str
     refusal: Refuse
 
 
-@dataclass(frozen=True, slots=True)
-class Journal:
+class Journal(msgspec.Struct, frozen=True):
     """Write one task's outcome to the journal, then feed `Journaled` (clause 18)."""
 
     number: int
@@ -171,8 +156,7 @@ class Journal:
     """Those that a later frame may consume."""
 
 
-@dataclass(frozen=True, slots=True)
-class Notice:
+class Notice(msgspec.Struct, frozen=True):
     """Something the user or the log must know: nothing late, dropped or overwritten in silence."""
 
     kind: str
@@ -184,8 +168,7 @@ class Notice:
     frame: int = -1
 
 
-@dataclass(frozen=True, slots=True)
-class Latency:
+class Latency(msgspec.Struct, frozen=True):
     """The figure behind p50 and p99: one for each grant once it is answered, late or not, or will never
     be; and one for each frame that a service could not be granted before its deadline."""
 
@@ -196,8 +179,7 @@ class Latency:
     missed: bool
 
 
-@dataclass(frozen=True, slots=True)
-class FrameFinished:
+class FrameFinished(msgspec.Struct, frozen=True):
     """Every service is through with a frame."""
 
     episode: int
@@ -207,16 +189,14 @@ class FrameFinished:
     """How far real time has slipped so far, under realtime pace (clause 8)."""
 
 
-@dataclass(frozen=True, slots=True)
-class EpisodeFinished:
+class EpisodeFinished(msgspec.Struct, frozen=True):
     """An episode is over and had this many frames."""
 
     episode: int
     frames: int
 
 
-@dataclass(frozen=True, slots=True)
-class Finished:
+class Finished(msgspec.Struct, frozen=True):
     """The run is over. ``error`` is empty where all went well, else the one line that blames."""
 
     error: str

@@ -7,7 +7,8 @@ nothing of joining, dying or messages; `episodes.Episodes` does that around it.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
+
+from msgspec.structs import replace
 
 from caviar_broker.core.decisions import DecisionBook
 from caviar_broker.core.events import Action, Latency, Notice, Product

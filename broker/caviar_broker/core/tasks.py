@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import msgspec
+
 from caviar_broker.core.events import Product
 from caviar_broker.core.transitions import TASK, TaskEvent, TaskState, step
 from caviar_protocol.messages import GrantInput, Report, Status
 
 
-@dataclass(frozen=True, slots=True)
-class Decision:
+class Decision(msgspec.Struct, frozen=True):
     """What consumers of a frame get of one (topic, source)."""
 
     status: Status
@@ -20,8 +21,7 @@ class Decision:
     """Journal entry that holds a held product; 0: the one of this decision."""
 
 
-@dataclass(frozen=True, slots=True)
-class GrantOrder:
+class GrantOrder(msgspec.Struct, frozen=True):
     """A grant that the schedule wants sent."""
 
     service: str
