@@ -362,7 +362,9 @@ class BrokerServer:
     def _send(self, action: ev.Send) -> None:
         parts = [part for product in action.products for part in product.payload]
         reason = self._port.send(self._routes[action.service], encode_message(action.message), parts)
-        if reason and self.clock.state is not RunState.FINISHED:
+        if not reason or self.clock.state is RunState.FINISHED:
+            return
+        if not self._watchdog.cut_off(action.service):
             verdict = f"it is unreachable: {reason}"
             self.clock.receive(ev.Lost(action.service, verdict), time.monotonic_ns())
 

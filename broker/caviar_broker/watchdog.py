@@ -26,6 +26,8 @@ class _Watched:
     heard_at: int = 0
     died_at: int | None = None
     """When the process of a supervised service died [ns]."""
+    cut_off_at: int | None = None
+    """When a message to a local process first found no connection [ns]."""
     warned: bool = False
 
 
@@ -99,6 +101,15 @@ class Watchdog:
         if service not in self.supervised and watched.process is not None:
             self.lost(service, watched.process.verdict())
 
+    def cut_off(self, service: str) -> bool:
+        """A message found no connection. Whether the verdict is left to the operating system, which
+        tells a moment later how a local process ended."""
+        watched = self._watched.get(service)
+        if watched is None or watched.process is None:
+            return False
+        watched.cut_off_at = watched.cut_off_at or time.monotonic_ns()
+        return True
+
     def check(self, now: int) -> None:
         """Look for local processes that are stopped, and probe remote ones."""
         for service, watched in list(self._watched.items()):
@@ -121,6 +132,8 @@ class Watchdog:
                 self.lost(service, process.verdict())
         elif process.stopped:
             self.lost(service, f"its process {process.pid} is stopped (SIGSTOP or SIGTSTP)")
+        elif watched.cut_off_at is not None and now - watched.cut_off_at > SUPERVISOR_NS:
+            self.lost(service, f"its process {process.pid} lives, but its connection is gone")
 
     def _check_remote(self, service: str, watched: _Watched, now: int) -> None:
         if watched.pulse is None:
