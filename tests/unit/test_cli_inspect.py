@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import pytest
 from recording_samples import absent, frame, link, product, record, recorder, scene
@@ -102,12 +101,3 @@ def test_an_empty_run_is_summarised_without_means(tmp_path, capsys):
     record(tmp_path, frames=0)
     assert inspect_command(tmp_path) == 0
     assert "0 of 10 planned" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("digest", [True, False])
-def test_what_is_no_recording_ends_with_one_line_and_status_1(tmp_path: Path, capsys, digest):
-    assert inspect_command(tmp_path / "nothing", digest=digest) == 1
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err.startswith("error: ")
-    assert err.count("\n") == 1

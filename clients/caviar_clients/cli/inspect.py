@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from caviar_protocol.arrays import quantity
-from caviar_protocol.errors import CaviarError, RecordingError
+from caviar_protocol.errors import RecordingError
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import RecordedFrame, Recording
 from caviar_protocol.topics import Link
@@ -71,13 +71,12 @@ class RunSummary(msgspec.Struct, kw_only=True):
 
 
 def inspect_command(run: Path, digest: bool = False, as_json: bool = False) -> int:
-    """Print a summary of a recording, or only its digest; the exit status, 1 where it is damaged."""
-    try:
-        recording = Recording(run)
-        return _print_digest(recording) if digest else _print_summary(summarise(recording), as_json)
-    except CaviarError as error:
-        typer.echo(f"error: {error}", err=True)
-        return 1
+    """Print a summary of a recording, or only its digest; the exit status, 1 where it is damaged.
+
+    Raises `RecordingError` where it is no recording.
+    """
+    recording = Recording(run)
+    return _print_digest(recording) if digest else _print_summary(summarise(recording), as_json)
 
 
 def summarise(recording: Recording) -> RunSummary:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.text import Text
 
 from caviar_protocol.errors import CaviarError
 
@@ -53,7 +55,11 @@ def broker(
     from caviar_broker.__main__ import parser, serve
     from caviar_clients.cli.run import checked_scenario, run_directory
 
-    directory = run_directory(out, checked_scenario(scenario, frames, seed).run.name)
+    checked = checked_scenario(scenario, frames, seed)
+    directory = run_directory(out, checked.run.name)
+    typer.echo(f"run {directory}; start its services with --broker and this broker's address:")
+    for name, spec in checked.services.items():
+        typer.echo("  " + shlex.join(["caviar", "service", name, "--use", f"{spec.role}:{spec.use}"]))
     arguments = [str(scenario), "--bind", bind, "--directory", str(directory)]
     for name, value in (("--frames", frames), ("--seed", seed)):
         arguments += [] if value is None else [name, str(value)]
@@ -65,11 +71,14 @@ def service(
     name: Annotated[str, typer.Argument(help="name of the service in the scenario")],
     use: Annotated[str, typer.Option(help="implementation, as ROLE:NAME, for example channel:sionna-rt")],
     broker: Annotated[str, typer.Option(help="address of the broker")] = "tcp://127.0.0.1:5570",
+    connect_timeout: Annotated[
+        float, typer.Option(min=0.0, help="seconds to wait for the broker, which may start later")
+    ] = 30.0,
 ) -> None:
     """Run one service and connect it to a broker."""
     from caviar_services.__main__ import serve
 
-    raise typer.Exit(serve(name, use, broker))
+    raise typer.Exit(serve(name, use, broker, connect_timeout))
 
 
 @app.command()
@@ -105,7 +114,7 @@ def plot(
     from caviar_clients.cli.plot import plot_run
 
     for picture in plot_run(run, out, frame, user):
-        _console.print(str(picture), highlight=False, soft_wrap=True)
+        typer.echo(picture)
 
 
 def main() -> None:
@@ -113,7 +122,7 @@ def main() -> None:
     try:
         app()
     except CaviarError as error:
-        _errors.print(f"[red]caviar:[/red] {error}", highlight=False, soft_wrap=True)
+        _errors.print(Text.assemble(("caviar:", "red"), f" {error}"), soft_wrap=True)
         sys.exit(1)
     except KeyboardInterrupt:
         sys.exit(130)

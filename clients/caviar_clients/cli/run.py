@@ -13,10 +13,11 @@ from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.text import Text
 
 from caviar_clients.cli.launch import Launcher
 from caviar_clients.cli.summary import link_figures, summary_of, summary_table
-from caviar_protocol.errors import DeclarationError
+from caviar_protocol.errors import DeclarationError, RunError
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario_checks import scenario_error, settings_place, with_overrides
 from caviar_protocol.scenario_loader import load_scenario
@@ -44,7 +45,10 @@ def checked_scenario(path: Path, frames: int | None = None, seed: int | None = N
 
 
 def run_directory(root: Path, name: str) -> Path:
-    """A new directory ``root/<name>-<date>-<time>`` for a run, with a number where that is taken."""
+    """A new directory ``root/<name>-<date>-<time>`` for a run, with a number where that is taken.
+
+    Raises `RunError` where none can be made.
+    """
     stem = f"{name}-{datetime.now().astimezone():%Y%m%d-%H%M%S}"
     for number in range(1, 1000):
         directory = root / (stem if number == 1 else f"{stem}-{number}")
@@ -52,8 +56,12 @@ def run_directory(root: Path, name: str) -> Path:
             directory.mkdir(parents=True)
         except FileExistsError:
             continue
+        except OSError as error:
+            raise RunError(
+                f"cannot make the run's directory {directory}: {error.strerror}; choose another with --out"
+            ) from error
         return directory
-    raise FileExistsError(root / stem)
+    raise RunError(f"{root} has a thousand runs named {stem}; choose another directory with --out")
 
 
 def run_scenario(
@@ -67,8 +75,10 @@ def run_scenario(
 ) -> int:
     """Run a scenario; the exit status: 0 exactly if it came to its end."""
     scenario = checked_scenario(path, frames, seed)
+    if json_file is not None:
+        _write(json_file, "")  # before the run, since after it an unwritable file would cost the figures
     directory = run_directory(out, scenario.run.name)
-    console.print(f"run {directory}", highlight=False)
+    console.print(Text(f"run {directory}"), soft_wrap=True)
     launcher = Launcher(scenario, path.resolve(), directory, frames, seed, bind)
     outcome: Mapping[str, Any] = {}
     interrupted = _Interruption(launcher)
@@ -80,18 +90,20 @@ def run_scenario(
                 outcome = event
     figures = link_figures(directory) if outcome["frames"] else None
     summary = summary_of(outcome, figures, scenario.run.name, directory, scenario.run.seed)
-    _write(directory / "summary.json", summary)
+    text = json.dumps(summary, indent=2, ensure_ascii=False) + "\n"
+    _write(directory / "summary.json", text)
     if json_file is not None:
-        _write(json_file, summary)
+        _write(json_file, text)
     if outcome["frames"]:
         _show(console, summary)
         with (directory / "summary.txt").open("w") as file:
             _show(Console(file=file, width=100), summary)
     if outcome["error"]:
-        console.print(f"[red]the run ended early:[/red] {outcome['error']}", highlight=False, soft_wrap=True)
+        told = Text.assemble(("the run ended early:", "red"), f" {outcome['error']}")
+        console.print(told, soft_wrap=True)
         child = launcher.child(outcome["culprit"])
         if child is not None:
-            console.print(f"its log: {child.log}", highlight=False, soft_wrap=True)
+            console.print(Text(f"its log: {child.log}"), soft_wrap=True)
     return 130 if interrupted.came else 1 if outcome["error"] else 0
 
 
@@ -134,8 +146,7 @@ class _Watcher:
             case "notice" if event["kind"] not in QUIET:
                 self._notice(event)
             case "finished":
-                if not event["error"]:
-                    self._bar.update(self._task, completed=event["frames"], description="done")
+                self._finished(event)
 
     def _frame(self, frames: int, misses: int) -> None:
         now = time.monotonic()
@@ -145,6 +156,13 @@ class _Watcher:
         self._bar.update(
             self._task, completed=frames, description="running", rate=rate, misses=f"{misses} misses"
         )
+
+    def _finished(self, event: Mapping[str, Any]) -> None:
+        """Show the final figures, which the last ``frame`` event need not have had."""
+        misses = sum(service["misses"] for service in event["services"].values())
+        self._bar.update(self._task, completed=event["frames"], misses=f"{misses} misses")
+        if not event["error"]:
+            self._bar.update(self._task, description="done")
 
     def _notice(self, event: Mapping[str, Any]) -> None:
         """Show the first of each kind and service; the rest is in events.jsonl."""
@@ -173,6 +191,9 @@ def _show(console: Console, summary: Mapping[str, Any]) -> None:
     console.print(f"digest {summary['digest']}", highlight=False, soft_wrap=True)
 
 
-def _write(path: Path, summary: Mapping[str, Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(summary, indent=2, ensure_ascii=False) + "\n")
+def _write(path: Path, text: str) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    except OSError as error:
+        raise RunError(f"cannot write {path}: {error.strerror}; choose another file") from error

@@ -6,7 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from caviar_clients.cli.inspect import LinkSummary, summarise
 from caviar_protocol.errors import RecordingError
@@ -45,12 +47,12 @@ def summary_of(
 
 def summary_table(summary: Mapping[str, Any]) -> Table:
     """p50 and p99 by service, misses, and |y| against the best."""
-    table = Table(title=f"{summary['scenario']}: {summary['run']}", title_justify="left")
+    table = Table(title=Text(f"{summary['scenario']}: {summary['run']}"), title_justify="left")
     for column in ("service", "p50 ms", "p99 ms", "budget ms", "misses"):
         table.add_column(column, justify="left" if column == "service" else "right")
     for name, figures in summary["services"].items():
         table.add_row(
-            name,
+            escape(name),
             f"{figures['p50_ms']:.2f}",
             f"{figures['p99_ms']:.2f}",
             f"{figures['budget_ms']:g}",
@@ -66,8 +68,8 @@ def _caption(summary: Mapping[str, Any]) -> str:
     if summary["mean_abs_y"] is not None:
         share = summary["mean_abs_y"] / summary["mean_abs_y_best"] if summary["mean_abs_y_best"] else 0.0
         parts.append(
-            f"mean |y| {summary['mean_abs_y']:.3g} of {summary['mean_abs_y_best']:.3g} at best ({share:.1%}), "
-            f"straight line {summary['mean_abs_y_baseline']:.3g}"
+            f"mean |y| {summary['mean_abs_y']:.3g} of {summary['mean_abs_y_best']:.3g} at best "
+            f"({share:.1%}), straight line {summary['mean_abs_y_baseline']:.3g}"
         )
     if summary["no_path_share"]:
         parts.append(f"{summary['no_path_share']:.1%} of users without a path")

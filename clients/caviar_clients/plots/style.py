@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
-from caviar_protocol.errors import SetupError
+from caviar_protocol.errors import RunError, SetupError
 
 # Okabe and Ito, "Color Universal Design", 2008.
 BLACK, GREY, LIGHT_GREY = "#222222", "#8c8c8c", "#dcdcdc"
@@ -41,7 +41,8 @@ _SETTINGS: dict[str, Any] = {
 def figure(file: Path, width: float, height: float, layout: Layout = "constrained") -> Iterator[Any]:
     """A figure [inches] that is saved as PNG, cut to what is drawn, when the block ends.
 
-    Raises `SetupError` with the command to install Matplotlib where it is missing.
+    Raises `SetupError` with the command to install Matplotlib where it is missing, `RunError`
+    where the file cannot be written.
     """
     try:
         from matplotlib import rc_context
@@ -53,8 +54,11 @@ def figure(file: Path, width: float, height: float, layout: Layout = "constraine
     with rc_context(_SETTINGS):
         drawn = Figure(figsize=(width, height), layout=layout)
         yield drawn
-        file.parent.mkdir(parents=True, exist_ok=True)
-        drawn.savefig(file, format="png", bbox_inches="tight", pad_inches=0.15)
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            drawn.savefig(file, format="png", bbox_inches="tight", pad_inches=0.15)
+        except OSError as error:
+            raise RunError(f"cannot write {file}: {error.strerror}; choose another folder") from error
 
 
 def legend_below(drawn: Any, axes: Any, columns: int = 3) -> None:

@@ -1,0 +1,68 @@
+"""The `caviar` command: what is wrong with its arguments is one line on standard error."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+from caviar_clients.cli import main as command
+
+SMOKE = Path(__file__).parents[2] / "deploy" / "scenarios" / "smoke.toml"
+
+
+def complaint(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: str | Path
+) -> str:
+    """The one line that ``caviar`` answers to these arguments; its status is 1."""
+    monkeypatch.setattr(sys, "argv", ["caviar", *map(str, arguments)])
+    with pytest.raises(SystemExit) as ended:
+        command.main()
+    assert ended.value.code == 1
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    return err
+
+
+def scenario(folder: Path, old: str, new: str) -> Path:
+    path = folder / "scenario.toml"
+    text = SMOKE.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+    return path
+
+
+@pytest.mark.parametrize("text", ["[/red]", "[bold]", "[[carriers]]"])
+def test_brackets_of_a_message_are_shown_as_they_are(monkeypatch, capsys, tmp_path, text):
+    """Rich would take them for markup: swallow them, or fail."""
+    path = scenario(tmp_path, 'use = "beams"', f'use = "{text}"')
+    assert f"no link is named '{text}'" in complaint(monkeypatch, capsys, "run", path)
+
+
+def test_a_remedy_that_is_a_table_is_shown(monkeypatch, capsys, tmp_path):
+    path = tmp_path / "scenario.toml"
+    path.write_text(re.sub(r"\[\[carriers\]\][^\[]*", "", SMOKE.read_text()))
+    assert "add [[carriers]] with" in complaint(monkeypatch, capsys, "run", path)
+
+
+@pytest.mark.parametrize("digest", [["--digest"], []])
+def test_what_is_no_recording_is_named(monkeypatch, capsys, tmp_path, digest):
+    err = complaint(monkeypatch, capsys, "inspect", tmp_path / "nothing", *digest)
+    assert f"caviar: {tmp_path / 'nothing'} does not exist" in err
+
+
+def test_a_directory_that_cannot_be_made_is_named_with_the_option(monkeypatch, capsys, tmp_path):
+    file = tmp_path / "file"
+    file.write_text("")
+    err = complaint(monkeypatch, capsys, "run", SMOKE, "--out", file)
+    assert f"{file}/smoke-" in err
+    assert "Not a directory; choose another with --out" in err
+
+
+def test_a_summary_that_cannot_be_written_ends_the_command_before_the_run(monkeypatch, capsys, tmp_path):
+    err = complaint(monkeypatch, capsys, "run", SMOKE, "--out", tmp_path / "runs", "--json", tmp_path)
+    assert f"cannot write {tmp_path}: Is a directory" in err
+    assert not (tmp_path / "runs").exists()
