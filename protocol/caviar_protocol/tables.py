@@ -15,6 +15,8 @@ from caviar_protocol.errors import ScenarioError
 
 T = TypeVar("T", bound=msgspec.Struct)
 
+_ARRAYS = (inspect.VarTupleType, inspect.ListType, inspect.TupleType)
+
 
 class Source(msgspec.Struct, frozen=True, kw_only=True):
     """The file a scenario was read from, and where its keys stand. Empty: built in Python."""
@@ -136,13 +138,15 @@ def _check_struct(value: object, expected: inspect.StructType, place: Place) -> 
     for name, field in fields.items():
         if field.required and name not in table:
             what = place.key or "the file"
-            raise place.error(f"{what} lacks {name!r}, write {name} = …{_meaning(field)}")
+            raise place.error(f"{what} lacks {name!r}, write {_example(field, place.at(name))}")
 
 
 def _check_union(value: object, choices: tuple[inspect.Type, ...], place: Place) -> None:
     structs = [choice for choice in choices if isinstance(choice, inspect.StructType)]
     if not isinstance(value, dict) or not structs:
         plain = [choice for choice in choices if not isinstance(choice, inspect.NoneType)]
+        if isinstance(value, list):
+            plain = [choice for choice in plain if isinstance(choice, _ARRAYS)] or plain
         if len(plain) == 1:
             _check(value, plain[0], place)
         return  # what remains is left to msgspec, which knows every type
@@ -218,15 +222,23 @@ def _in(unit: str) -> str:
     return f" [{unit}]" if unit and unit != "1" else ""
 
 
-def _meaning(field: inspect.Field) -> str:
+def _example(field: inspect.Field, place: Place) -> str:
+    """What to write for a key that is missing."""
     kind = field.type
     while isinstance(kind, inspect.Metadata):
         kind = kind.type
-    if isinstance(kind, inspect.LiteralType):
-        return f" (one of {', '.join(map(str, kind.values))})"
-    if isinstance(kind, inspect.StructType | inspect.DictType):
-        return ""
-    return f" ({_describe(kind)})"
+    match kind:
+        case inspect.StructType():
+            return f"[{place.key}]"
+        case inspect.DictType():
+            return f"[{place.key}.NAME]"
+        case inspect.VarTupleType(item_type=inspect.StructType()):
+            return f"[[{place.key}]]"
+        case inspect.LiteralType(values=choices):
+            return f"{field.encode_name} = … (one of {', '.join(map(str, choices))})"
+        case inspect.BoolType() | inspect.StrType() | inspect.IntType() | inspect.FloatType():
+            return f"{field.encode_name} = … ({_describe(kind)})"
+    return f"{field.encode_name} = …"
 
 
 def show(value: object) -> str:
