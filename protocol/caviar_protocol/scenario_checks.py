@@ -46,6 +46,7 @@ def check_scenario(scenario: Scenario) -> None:
     for index, device in enumerate(scenario.devices):
         _check_device(device, root.at("devices").at(index))
         world_of(scenario, index)
+    _check_antennas(scenario, root.at("devices"))
 
 
 def devices_of(scenario: Scenario, world: str) -> tuple[DeviceSpec, ...]:
@@ -223,6 +224,16 @@ def _check_device(device: DeviceSpec, place: Place) -> None:
     for index, size in enumerate(device.size_px):
         if not 1 <= size <= 8192:
             raise place.at("size_px").at(index).error(f"is {size}, write 1 to 8192 [px]")
+
+
+def _check_antennas(scenario: Scenario, place: Place) -> None:
+    """A channel has paths only between a transmitter and a receiver."""
+    roles = {device.role for device in scenario.devices if device.kind == "antenna"}
+    has_channel = any(service.role == "channel" for service in scenario.services.values())
+    if not has_channel or not roles or "both" in roles or roles >= {"tx", "rx"}:
+        return
+    lacking = ({"tx", "rx"} - roles).pop()
+    raise place.error(f'no antenna has role = "{lacking}", so the channel has no path; add one')
 
 
 def _check_ascending(

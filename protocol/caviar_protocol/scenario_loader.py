@@ -65,8 +65,10 @@ def _beside(path: Path) -> str:
     """The scenarios that stand where one was looked for."""
     if not path.parent.is_dir():
         return ""
+    if path.is_dir():
+        path /= "SCENARIO.toml"
     names = sorted(other.name for other in path.parent.glob("*.toml"))
-    return f"; {path.parent} has {', '.join(names)}" if names and not path.is_file() else ""
+    return f"; {path.parent.resolve()} has {', '.join(names)}" if names and not path.is_file() else ""
 
 
 def _with_files(scenario: Scenario, folder: Path) -> Scenario:

@@ -27,7 +27,7 @@ frequency_hz = 28e9
 [[devices]]
 name = "bs"
 kind = "antenna"
-role = "tx"
+role = "both"
 position_m = [0, 0.5, 10]
 array = { rows = 8, columns = 4 }
 
@@ -189,10 +189,10 @@ BROKEN_RULES = [
     ),
     ('on = "car.*"', 'on = "car.1"', "devices[1].count", 'write a pattern: on = "car.1*"'),
     ('on = "car.*"\ncount = 2\n', "", "devices[1].mount", "a parent to be mounted at"),
-    ('role = "tx"\n', "", "devices[0]", 'write role = "tx", "rx" or "both"'),
+    ('role = "both"\n', "", "devices[0]", 'write role = "tx", "rx" or "both"'),
     (
-        'role = "tx"',
-        'role = "tx"\nbeams = 64',
+        'role = "both"',
+        'role = "both"\nbeams = 64',
         "devices[0].beams",
         "belongs to kind 'lidar', this is 'antenna'",
     ),
@@ -243,7 +243,7 @@ def test_a_missing_key_is_named_with_its_table(folder: Path, line: str, key: str
 
 
 def test_a_file_without_a_run_table_says_what_it_lacks() -> None:
-    with pytest.raises(ScenarioError, match="the file lacks 'run'"):
+    with pytest.raises(ScenarioError, match=r"the file lacks 'run', write \[run\]"):
         parse("[services]\n")
 
 
@@ -268,6 +268,19 @@ def test_a_missing_scenario_names_those_beside_it(folder: Path) -> None:
     (folder / "smoke.toml").write_text(GOOD)
     with pytest.raises(ScenarioError, match=r"smok\.toml: cannot be read: No such file.*has smoke\.toml"):
         load_scenario(folder / "smok.toml")
+
+
+def test_a_folder_in_place_of_a_scenario_names_those_in_it(folder: Path) -> None:
+    (folder / "smoke.toml").write_text(GOOD)
+    with pytest.raises(ScenarioError, match=r"cannot be read: Is a directory.*has smoke\.toml"):
+        load_scenario(folder)
+
+
+@pytest.mark.parametrize(("role", "lacking"), [("tx", "rx"), ("rx", "tx")])
+def test_a_channel_with_antennas_of_one_role_alone_is_refused(folder: Path, role: str, lacking: str) -> None:
+    error = failure(GOOD.replace('role = "both"', f'role = "{role}"'), folder)
+    assert (error.key, error.line) == ("devices", line_of(GOOD, "[[devices]]"))
+    assert f'no antenna has role = "{lacking}"' in str(error)
 
 
 def test_windows_line_ends_count_as_one(folder: Path) -> None:
