@@ -81,6 +81,17 @@ def test_names_of_fixed_devices_are_declared_with_the_prefixes() -> None:
     assert world.prepare(Preparation(demand={})).prefixes == ("bs", "car.")
 
 
+@pytest.mark.parametrize("on", ["cra.1", "cra.*", "*.a", "ca?.*", "car.*"])
+def test_a_device_on_what_can_never_come_is_refused(on: str) -> None:
+    """The names of the world's objects begin with ``car.``; patterns that may match them pass."""
+    world = ScriptedWorld([[]], [antenna(on=on)])
+    if not on.startswith("cra"):
+        assert world.prepare(Preparation(demand={})).prefixes == ("car.",)
+        return
+    with pytest.raises(ScenarioError, match=r"'rx' stands on 'cra\..*begin with car\."):
+        world.prepare(Preparation(demand={}))
+
+
 def test_first_come_keep_their_devices_and_the_next_takes_over() -> None:
     """Two receivers for four cars: whoever came first has one; who leaves frees it for the next."""
     a, b, c, d = (state(f"car.{name}") for name in "abcd")

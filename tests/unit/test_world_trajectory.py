@@ -14,6 +14,7 @@ from world_builders import scene_at, wire_bytes
 
 from caviar_protocol.coordinates import euler_from_quaternion
 from caviar_protocol.errors import ScenarioError
+from caviar_protocol.tables import convert_settings
 from caviar_services.service import Preparation, RunInfo
 from caviar_services.world.trajectory import (
     MovingObject,
@@ -261,9 +262,23 @@ def test_whole_names_are_declared_without_a_prefix() -> None:
     assert world(UAV).prepare(Preparation(demand={})).prefixes == ("uav",)
 
 
-def test_two_objects_of_one_name_or_without_size_are_refused() -> None:
+def test_two_objects_of_one_name_are_refused() -> None:
     with pytest.raises(ScenarioError, match=r"objects\[1\].*second object is named 'uav'"):
         world(UAV, UAV)
-    flat = MovingObject(name="uav", dimensions_m=(1.0, 0.0, 1.0), waypoints=((0.0, 0.0, 0.0, 0.0),))
-    with pytest.raises(ScenarioError, match=r"dimensions_m of 'uav'.*write lengths > 0"):
-        world(flat)
+
+
+def test_an_object_without_size_is_refused() -> None:
+    flat = {"name": "uav", "dimensions_m": [1.0, 0.0, 1.0], "waypoints": [[0.0, 0.0, 0.0, 0.0]]}
+    with pytest.raises(ScenarioError, match=r"objects\[0\].dimensions_m\[1\]: is 0.0, write a number > 0"):
+        convert_settings(TrajectorySettings, {"objects": [flat]})
+
+
+def test_a_waypoint_that_is_no_number_is_named_with_row_and_column() -> None:
+    uav = {"name": "uav", "waypoints": [[0.0, 0.0, 0.0, 0.0], [1.0, "two", 0.0, 0.0]]}
+    with pytest.raises(ScenarioError, match=r"waypoints\[1\]\[1\]: is 'two', write a number"):
+        convert_settings(TrajectorySettings, {"objects": [uav]})
+
+
+def test_a_file_without_its_prefix_is_refused_with_the_remedy() -> None:
+    with pytest.raises(ScenarioError, match=r'write "file:flight.csv"'):
+        world(MovingObject(name="uav", waypoints="flight.csv"))

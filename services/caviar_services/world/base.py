@@ -5,6 +5,7 @@ To add a world, subclass `World`, say in `objects_at` where things are, and regi
 
 from __future__ import annotations
 
+import re
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from itertools import pairwise
@@ -16,7 +17,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array, quantity
 from caviar_protocol.coordinates import UnitQuaternion, Vector
-from caviar_protocol.errors import PayloadError
+from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.messages import Role
 from caviar_protocol.topics import Scene
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
@@ -92,11 +93,28 @@ class World(Service[W]):
 
     def prepare(self, preparation: Preparation) -> Prepared:
         """Declare the names: prefixes of objects, and fixed devices by their whole name."""
+        self._check_parents()
         scenery = self.settings.scenery or "none"
         return Prepared(
             prefixes=tuple(sorted({*self.prefixes(), *self._mounts.fixed_names})),
             notes=(f"scenery: {scenery}",),
         )
+
+    def _check_parents(self) -> None:
+        """Refuse a device on an object that can never come."""
+        prefixes = self.prefixes()
+        for spec in self.run.devices:
+            literal = re.split(r"[*?[]", spec.on)[0]
+            is_pattern = literal != spec.on
+            if spec.on and not any(
+                literal.startswith(prefix) or (is_pattern and prefix.startswith(literal))
+                for prefix in prefixes
+            ):
+                raise ScenarioError(
+                    f"device {spec.name!r} stands on {spec.on!r}, which no object of world "
+                    f"{self.run.name!r} can be: their names begin with {', '.join(prefixes)}",
+                    key="devices",
+                )
 
     def reset(self, episode: int, seed: int, t0_ns: int) -> None:
         """Begin an episode; the same arguments lead to the same scenes, bit by bit."""

@@ -11,7 +11,7 @@ from typing import Annotated, NamedTuple
 import msgspec
 import numpy as np
 
-from caviar_protocol.arrays import Vector3, quantity
+from caviar_protocol.arrays import quantity
 from caviar_protocol.coordinates import Vector, quaternion_from_euler
 from caviar_protocol.errors import ScenarioError
 from caviar_services.service import RunInfo
@@ -26,13 +26,17 @@ _SLOW = 1e-6
 """Horizontal speed [m/s] below which rounding would choose the course."""
 
 
+Length = Annotated[float, quantity("m", "side of a bounding box", gt=0)]
+
+
 class MovingObject(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One object and where it is when."""
 
     name: Annotated[str, msgspec.Meta(min_length=1, max_length=100)]
     kind: str = "uav"
     """Class of the object: ``uav``, ``car``, …; one without a mesh of its own is a box."""
-    dimensions_m: Annotated[Vector3, quantity("m", "length, width, height")] = (0.6, 0.6, 0.25)
+    dimensions_m: tuple[Length, Length, Length] = (0.6, 0.6, 0.25)
+    """Length, width, height."""
     waypoints: str | tuple[tuple[float, ...], ...]
     """``file:PATH.csv``, or rows ``[t_s, x_m, y_m, z_m]`` or ``[t_s, x_m, y_m, z_m, yaw_deg]``.
     The point is the centre of the object; without a yaw it looks along its horizontal course."""
@@ -57,11 +61,6 @@ class TrajectoryWorld(World[TrajectorySettings]):
             name = (settings.prefix or "") + thing.name
             if name in self._tracks:
                 raise ScenarioError(f"a second object is named {name!r}; give it another name", key=key)
-            if min(thing.dimensions_m) <= 0:
-                raise ScenarioError(
-                    f"dimensions_m of {thing.name!r} is {list(thing.dimensions_m)}; write lengths > 0",
-                    key=key,
-                )
             self._tracks[name] = (thing, Track(read_waypoints(thing.waypoints, f"{key}.waypoints")))
 
     def prefixes(self) -> tuple[str, ...]:
@@ -216,10 +215,13 @@ _Row = tuple[str, str, int | None, list[float]]
 
 def _from_csv(path: Path, key: str) -> list[Waypoint]:
     file = str(path)
+    if not path.is_absolute():
+        raise ScenarioError(f'{file!r} is relative to nothing; write "file:{file}"', key=key)
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise ScenarioError(f"waypoints cannot be read: {error}", file, key) from error
+        why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise ScenarioError(f"waypoints cannot be read: {why}; name a CSV file", file, key) from error
     rows: list[_Row] = []
     header: list[str] = []
     for number, line in enumerate(lines, 1):
