@@ -75,6 +75,9 @@ def load(role: str, name: str) -> type[Service[Any]]:
 
 def _registered_target(role: str, name: str) -> str:
     known = registered()
+    roles = sorted({key.split(":", 1)[0] for key in known})
+    if role not in roles:
+        raise DeclarationError(f"no service has the role {role!r}; one of {', '.join(roles)}")
     target = known.get(f"{role}:{name}")
     if target is None:
         names = sorted(key.split(":", 1)[1] for key in known if key.startswith(f"{role}:"))

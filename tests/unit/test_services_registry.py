@@ -37,6 +37,11 @@ def test_a_built_in_implementation_is_found_by_role_and_name() -> None:
     assert load("channel", "free-space") is FreeSpaceChannel
 
 
+def test_an_unknown_role_is_answered_with_the_roles() -> None:
+    with pytest.raises(DeclarationError, match="no service has the role 'wurld'; one of agent, channel, "):
+        load("wurld", "sumo")
+
+
 def test_an_implementation_is_found_by_its_place() -> None:
     assert load("channel", "caviar_services.channel.free_space:FreeSpaceChannel") is FreeSpaceChannel
 
