@@ -48,6 +48,13 @@ def test_a_remedy_that_is_a_table_is_shown(monkeypatch, capsys, tmp_path):
     assert "add [[carriers]] with" in complaint(monkeypatch, capsys, "run", path)
 
 
+def test_a_topic_to_record_that_nothing_produces_is_named_with_its_line(monkeypatch, capsys, tmp_path):
+    path = scenario(tmp_path, '"scene", "channel"', '"scene", "lidar"')
+    line = 1 + SMOKE.read_text().partition("record = ")[0].count("\n")
+    err = complaint(monkeypatch, capsys, "run", path)
+    assert f"{path}:{line}: run.record[1]: no service of the run produces 'lidar'; remove it" in err
+
+
 @pytest.mark.parametrize("digest", [["--digest"], []])
 def test_what_is_no_recording_is_named(monkeypatch, capsys, tmp_path, digest):
     err = complaint(monkeypatch, capsys, "inspect", tmp_path / "nothing", *digest)

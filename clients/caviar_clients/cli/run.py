@@ -32,15 +32,25 @@ def checked_scenario(path: Path, frames: int | None = None, seed: int | None = N
     """Load a scenario and check it against the implementations it uses.
 
     Raises `ScenarioError` naming file, key and line for an implementation or a setting that does
-    not exist.
+    not exist, and for a topic to record that no implementation produces.
     """
     scenario = with_overrides(load_scenario(path), frames, seed)
+    produced: set[str] = set()
     for name, spec in scenario.services.items():
         try:
             implementation = load(spec.role, spec.use)
         except DeclarationError as error:
             raise scenario_error(scenario, f"services.{name}.use", str(error)) from error
         convert_settings(implementation.Settings, spec.settings, settings_place(scenario, name))
+        produced.update(implementation.outputs)
+    for index, entry in enumerate(scenario.run.record):
+        topic = entry.partition(".")[0]
+        if topic not in produced:
+            raise scenario_error(
+                scenario,
+                f"run.record[{index}]",
+                f"no service of the run produces {topic!r}; remove it, or add a service that does",
+            )
     return scenario
 
 
