@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar
 
 import msgspec
 import numpy as np
@@ -142,6 +142,3 @@ class Channel(Payload, frozen=True, kw_only=True, omit_defaults=True):
         """Slice of the path axis that belongs to one TX/RX pair; `ValueError` if unknown."""
         p = self.tx.index(tx) * len(self.rx) + self.rx.index(rx)
         return slice(int(self.offsets[p]), int(self.offsets[p + 1]))
-
-
-Rung = Literal["free-space", "geometric", "siso-rt", "spherical", "mimo-rt"]
