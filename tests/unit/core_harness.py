@@ -43,6 +43,8 @@ class Sim:
     inputs: tuple[m.Input, ...] = ()
     outputs: tuple[str, ...] = ()
     policy: m.Policy = "wait"
+    use: str = ""
+    """Implementation that the scenario names."""
     budget: int = 100 * MS
     max_in_flight: int = 1
     hello: Mapping[str, Any] = field(default_factory=dict)
@@ -68,6 +70,7 @@ class Sim:
         return ServicePlan(
             name=self.name,
             role=self.role,
+            use=self.use,
             budget_ns=self.budget,
             policy=self.policy,
             max_in_flight=self.max_in_flight,

@@ -326,6 +326,15 @@ def test_clause_20_under_wait_the_digest_does_not_depend_on_timing() -> None:
     assert quick.outcome.digest == slow.outcome.digest == recomputed(slow)
 
 
+@pytest.mark.parametrize("writing", [1, 3, 40])
+def test_clause_20_what_the_recorder_writes_behind_an_early_end_counts(writing: int) -> None:
+    """The agent fails in frame 3, while the recorder is still busy with a frame before that."""
+    services = loop(agent={"faults": {(0, 3): "lost its mind"}}, recorder={"latency": writing * MS})
+    run = Simulation(services).join().run()
+    assert "lost its mind" in run.outcome.error
+    assert run.outcome.digest == recomputed(run)
+
+
 def test_clause_20_another_product_gives_another_digest() -> None:
     run = Simulation(loop(world={"omits": frozenset({(0, 4)})})).join().run()
     assert run.outcome.digest != Simulation(loop()).join().run().outcome.digest

@@ -83,6 +83,20 @@ def test_a_service_of_another_role_than_the_scenario_says_is_refused_and_ends_th
     assert "sensors" in run.outcome.error
 
 
+def test_another_implementation_than_the_scenario_says_is_refused_and_ends_the_run() -> None:
+    """Its metadata would call the recording what it is not."""
+    rays = {"use": "free-space", "hello": {"implementation": "sionna-rt"}}
+    run = Simulation(loop(channel=rays)).join().run()
+    assert refusals(run)[0].code == "declaration"
+    assert run.outcome.culprit == "channel"
+    assert "'sionna-rt'" in run.outcome.error
+    assert "'free-space'" in run.outcome.error
+
+
+def test_a_client_that_names_no_implementation_is_accepted() -> None:
+    assert Simulation(loop(channel={"use": "free-space"})).join().run().outcome.error == ""
+
+
 def test_hello_after_the_end_is_refused() -> None:
     run = Simulation(loop()).join().run()
     run.feed(ev.Joined(m.Hello(version=m.PROTOCOL_VERSION, name="world", role="world")))

@@ -107,8 +107,10 @@ class FrameClock:
             case ev.Joined() | ev.Lost() | ev.ByeReceived() | ev.Progressed():
                 self._handlers[type(event)](event, now)
             case ev.DoneReceived(service=name, message=message):
+                if self._episodes.recorded(event, now):
+                    return
                 text = f"answered frame {message.frame} after the end of the run; not used"
-                self._run.notice("discarded", name, text, message.frame)
+                self._run.notice("note", name, text, message.frame)
             case ev.FaultReceived(service=name, message=message):
                 self._run.notice("fault", name, f"{message.phase}: {message.message}", message.frame)
             case _:

@@ -18,6 +18,8 @@ class Episodes:
         self._run = run
         self.schedule: EpisodeSchedule | None = None
         """Of the episode that is under way; None between episodes."""
+        self._ended: EpisodeSchedule | None = None
+        """Of the episode that was under way before."""
 
     # --- from one episode to the next ----------------------------------------------------------------
 
@@ -83,8 +85,24 @@ class Episodes:
         """The episode is over, or the run ended within it."""
         if self.schedule is not None:
             self.schedule.close(now)
-            self._run.actions += self.schedule.actions
-            self.schedule = None
+            self._tell(self.schedule)
+            self._ended, self.schedule = self.schedule, None
+
+    def recorded(self, event: ev.DoneReceived, now: int) -> bool:
+        """A recorder's DONE behind the end of the run: what it wrote counts, so that the digest of the
+        run is that of the recording. Whether it was such a one."""
+        run, peer, message, ended = self._run, self._run.peers[event.service], event.message, self._ended
+        owed = ended.outstanding(peer.name) if ended and peer.plan.role == "recorder" else []
+        asked = (run.plan.epoch, peer.attempt, run.episode, owed[0].frame if owed else -1)
+        if ended is None or (message.epoch, message.attempt, message.episode, message.frame) != asked:
+            return False
+        ended.done(peer.name, message.frame, (), now)
+        self._tell(ended)
+        return True
+
+    def _tell(self, schedule: EpisodeSchedule) -> None:
+        self._run.actions += schedule.actions
+        schedule.actions.clear()
 
     def _members(self) -> list[Peer]:
         assert self._run.graph is not None
@@ -172,7 +190,7 @@ class Episodes:
             waiting = schedule.waiting_for(task.service)
             text = peer.blame_task(task, "overran its budget", now, waiting)
             run.notice("miss", task.service, f"{text}; {remedy}", task.frame)
-        run.actions += schedule.actions
+        self._tell(schedule)
         for order in schedule.grants:
             self._grant(order)
         for task in schedule.cut:
@@ -181,7 +199,6 @@ class Episodes:
                 ids = {"epoch": run.plan.epoch, "attempt": peer.attempt, "episode": run.episode}
                 run.send(peer, Cancel(**ids, frame=task.frame))
         schedule.overruns.clear()
-        schedule.actions.clear()
         schedule.grants.clear()
         schedule.cut.clear()
         if schedule.aborted is not None:

@@ -196,7 +196,12 @@ class Joining:
 def _contradiction(peer: Peer, hello: Hello) -> str:
     """How a HELLO contradicts the scenario or what the service said before; empty if it does not."""
     if hello.role != peer.role:
-        return f"{hello.name!r} is the run's {peer.role}, this one says it is a {hello.role}"
+        return f"{hello.name!r} is the run's {peer.role}, this one says that its role is {hello.role}"
+    if peer.plan.use and hello.implementation and hello.implementation != peer.plan.use:
+        return (
+            f"{hello.name!r} is {hello.implementation!r}, the scenario says use = {peer.plan.use!r}; "
+            "start that one, or change the scenario, which is recorded with the run"
+        )
     before = peer.hello
     if before is not None and (hello.inputs, hello.outputs) != (before.inputs, before.outputs):
         return f"{hello.name!r} came back with other inputs or outputs than it had before"

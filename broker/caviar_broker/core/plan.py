@@ -20,6 +20,8 @@ class ServicePlan:
     name: str
     role: Role
     budget_ns: int
+    use: str = ""
+    """Implementation that the scenario names; empty: any."""
     policy: Policy = "wait"
     max_in_flight: int = 1
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -75,6 +77,7 @@ def plan_run(scenario: Scenario, run: str, told: Mapping[str, Mapping[str, Any]]
             ServicePlan(
                 name=name,
                 role=spec.role,
+                use=spec.use,
                 budget_ns=round(spec.budget_ms * 1e6),
                 policy=spec.policy,
                 max_in_flight=spec.max_in_flight,
