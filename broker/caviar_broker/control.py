@@ -67,12 +67,12 @@ class Reporter:
 
     def _see_to_the_rest(self) -> None:
         if self._outbox.waiting and self._server is not None:
-            self._server.watch_fd(self._fd, self._writable, zmq.POLLOUT)
+            self._server.loop.watch(self._fd, self._writable, zmq.POLLOUT)
 
     def _writable(self) -> None:
         self._outbox.flush()
         if self._server is not None and not self._outbox.waiting:
-            self._server.unwatch_fd(self._fd)
+            self._server.loop.unwatch(self._fd)
 
 
 def _json(line: Line) -> str:
@@ -95,12 +95,12 @@ class Control:
 
     def __init__(self, server: BrokerServer, fd: int = 0) -> None:
         self._server, self._fd, self._rest = server, fd, b""
-        server.watch_fd(fd, self._read)
+        server.loop.watch(fd, self._read)
 
     def _read(self) -> None:
         data = os.read(self._fd, MAX_ORDER)
         if not data:
-            self._server.unwatch_fd(self._fd)
+            self._server.loop.unwatch(self._fd)
             self._server.feed(ev.StopRequested("the launcher of the run ended"))
             return
         *lines, self._rest = (self._rest + data).split(b"\n")
@@ -133,4 +133,4 @@ def stop_on_signals(server: BrokerServer) -> None:
         for number in os.read(read, 64):
             server.feed(ev.StopRequested(f"stopped by {signal.Signals(number).name}"))
 
-    server.watch_fd(read, stop)
+    server.loop.watch(read, stop)

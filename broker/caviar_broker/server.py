@@ -20,6 +20,7 @@ from caviar_broker.core.plan import RunPlan
 from caviar_broker.core.transitions import RunState
 from caviar_broker.grumbles import Grumbles
 from caviar_broker.journal import JournalFile
+from caviar_broker.loop import Loop
 from caviar_broker.port import Port
 from caviar_broker.scenery import SceneryDesk, SceneryExchange
 from caviar_broker.statistics import Statistics
@@ -30,8 +31,10 @@ from caviar_protocol.codec import check_parts, decode_message, encode_message, m
 from caviar_protocol.errors import ProtocolError, RunError, VersionError
 from caviar_protocol.host import host_identity
 
+LOOK_NS = 1_000_000
+"""[ns] until deadlines are looked at again, however busy the port is."""
 MESSAGES_A_TURN = 64
-"""Messages taken before deadlines are looked at again, however busy the port is."""
+"""Messages taken before the clock is looked at again."""
 
 
 class Observer(Protocol):
@@ -94,17 +97,17 @@ class BrokerServer:
         )
         self._connections: dict[bytes, _Connection] = {}
         self._routes: dict[str, bytes] = {}
-        self._fds: dict[int, Callable[[], None]] = {}
         self._host = host_identity()
         self._replying = b""
         self._entries: list[ev.Journal] = []
         """Decisions that are not in the journal yet."""
-        self._next_check = 0
+        self._next_check = self._look_at = 0
         self._port = Port(endpoint, plan.limits.liveness)
         self.endpoint = self._port.endpoint
         """Where services connect to."""
-        self._poller = zmq.Poller()
-        self._poller.register(self._port.socket, zmq.POLLIN)
+        self.loop = Loop()
+        """Others may have descriptors watched by it."""
+        self.loop.watch(self._port.socket, self._receive_all)
         self._watchdog = Watchdog(
             clock=self.clock,
             heartbeat_ns=plan.limits.heartbeat,
@@ -138,17 +141,6 @@ class BrokerServer:
 
     # --- the loop ------------------------------------------------------------------------------------
 
-    def watch_fd(self, fd: int, callback: Callable[[], None], events: int = zmq.POLLIN) -> None:
-        """Call back when a file descriptor is readable, or as ``events`` say."""
-        if self._fds.get(fd) != callback:
-            self._fds[fd] = callback
-            self._poller.register(fd, events)
-
-    def unwatch_fd(self, fd: int) -> None:
-        """Undo `watch_fd`; nothing where it was not watched."""
-        if self._fds.pop(fd, None) is not None:
-            self._poller.unregister(fd)
-
     def feed(self, event: ev.Event) -> None:
         """Give the clock an event from outside, and do what it wants."""
         self.clock.receive(event, time.monotonic_ns())
@@ -165,23 +157,33 @@ class BrokerServer:
         return self.outcome
 
     def _turn(self) -> None:
+        """Serve whoever is there; with nobody there, or after `LOOK_NS` at the latest, see to deadlines.
+
+        Finding the next deadline is work for the time in which nobody waits for this process.
+        """
+        ready = self.loop.poll()
         now = time.monotonic_ns()
-        deadline = self.clock.next_deadline()
-        if deadline is not None and deadline <= now:
-            self.clock.expire(now)
-            self._perform()
-            self._write_journal()
-            return
+        if not ready or now >= self._look_at:
+            wake = self._see_to_deadlines(now)
+            ready = ready or self.loop.poll(wake - now)
+        self.loop.call(ready)
+        self._write_journal()
+
+    def _see_to_deadlines(self, now: int) -> int:
+        """Act on whatever is due; the instant of the next thing that will be [ns]."""
+        self._look_at = now + LOOK_NS
         if now >= self._next_check:
             self._next_check = now + CHECK_NS
             self._watchdog.check(now)
-        wake = self._next_check if deadline is None else min(deadline, self._next_check)
-        for source, _ in self._poller.poll(-(-(wake - now) // 1_000_000)):
-            if source is self._port.socket:
-                self._receive_all()
-            elif source in self._fds:
-                self._fds[source]()
-        self._write_journal()
+            self._write_journal()
+        deadline = self.clock.next_deadline()
+        if deadline is None:
+            return self._next_check
+        if deadline <= now:
+            self.clock.expire(now)
+            self._perform()
+            return now
+        return min(deadline, self._next_check)
 
     def _receive_all(self) -> None:
         for _ in range(MESSAGES_A_TURN):
@@ -253,17 +255,12 @@ class BrokerServer:
     def _hello(self, route: bytes, hello: m.Hello) -> None:
         before = self.clock.peer(hello.name)
         attempt = before.attempt if before else 0
-        earlier = self._routes.get(hello.name)
-        self._routes[hello.name] = self._replying = route  # WELCOME or REFUSE goes there
+        self._replying = route
         self.clock.receive(ev.Joined(hello), time.monotonic_ns())
         peer = self.clock.peer(hello.name)
         if peer is not None and peer.attempt > attempt:
             self._admit(route, hello)
-        elif earlier is not None:  # turned away: the one who has the name keeps it
-            self._routes[hello.name] = earlier
-        else:
-            del self._routes[hello.name]
-        self._perform()
+        self._perform()  # WELCOME goes to whom was admitted; one turned away changes nothing
 
     def _admit(self, route: bytes, hello: m.Hello) -> None:
         """A new incarnation is in the run: nothing counts any more that comes from the one before."""
@@ -271,17 +268,18 @@ class BrokerServer:
         self._scenery.forget(name)
         earlier = self._watchdog.forget(name)
         if earlier is not None:
-            self.unwatch_fd(earlier)
+            self.loop.unwatch(earlier)
         for old in [r for r, c in self._connections.items() if c.service == name]:
             del self._connections[old]
+        self._routes[name] = route
         self._connections[route] = _Connection(name, heartbeat=False)
         local = hello.pid and hello.host and hello.host == self._host
         fd = self._watchdog.welcome(name, hello.pid if local else None)
         if fd is not None:
-            self.watch_fd(fd, lambda: self._died(name, fd))
+            self.loop.watch(fd, lambda: self._died(name, fd))
 
     def _died(self, service: str, fd: int) -> None:
-        self.unwatch_fd(fd)
+        self.loop.unwatch(fd)
         self._watchdog.died(service)
 
     def _attach(self, route: bytes, attach: m.Attach) -> None:

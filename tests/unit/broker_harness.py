@@ -117,13 +117,13 @@ def _order_to_stop(server: BrokerServer) -> Callable[[], None]:
     read, write = os.pipe()
 
     def stop() -> None:
-        server.unwatch_fd(read)
+        server.loop.unwatch(read)
         server.feed(ev.StopRequested("the test is over"))
 
     def order() -> None:
         os.write(write, b"x")
 
-    server.watch_fd(read, stop)
+    server.loop.watch(read, stop)
     return order
 
 
