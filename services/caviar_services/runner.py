@@ -97,6 +97,8 @@ class Runner:
     def _handle(self, message: m.Message, parts: Sequence[zmq.Frame]) -> None:
         if isinstance(message, m.Cancel | m.Stale | m.Error):
             return  # advisory: a step that has begun is finished; complaints are logged already
+        if isinstance(message, m.Refuse):
+            raise self._refused(message)
         handler = self._handlers.get(type(message))
         if handler is None:
             self._unexpected(message, "it is not for a service that is in the run")
@@ -131,9 +133,7 @@ class Runner:
         )
         message, _ = broker.receive(self._timeout_s)
         if isinstance(message, m.Refuse):
-            raise RunError(
-                f"the broker at {broker.endpoint} refused {self.name!r} ({message.code}): {message.message}"
-            )
+            raise self._refused(message)
         if not isinstance(message, m.Welcome):
             raise ProtocolError(f"the broker answered HELLO with {describe(message)}, not with WELCOME")
         check_version(message.version)
@@ -142,6 +142,10 @@ class Runner:
         with self._reporting("settings"):
             settings = convert_settings(cls.Settings, message.settings)
             self._service = cls(settings, self._run_info(message))
+
+    def _refused(self, message: m.Refuse) -> RunError:
+        endpoint = self._broker.endpoint
+        return RunError(f"the broker at {endpoint} refused {self.name!r} ({message.code}): {message.message}")
 
     def _run_info(self, welcome: m.Welcome) -> RunInfo:
         told = welcome.scenario
@@ -287,7 +291,9 @@ class Runner:
         for topic in sorted(result.products):
             payload = result.products[topic]
             if type(payload) is not PAYLOADS.get(topic):
-                raise PayloadError(f"{self.use} made a payload {type(payload).__name__} for the topic {topic!r}")
+                raise PayloadError(
+                    f"{self.use} made a payload {type(payload).__name__} for the topic {topic!r}"
+                )
             header, body = encode_payload(payload)
             digest = payload_digest(header, body)
             headers.append(m.ProductHeader(topic=topic, digest=digest, fidelity=result.fidelity))

@@ -151,7 +151,8 @@ class Frame:
         found = self.of(topic, cls)
         if len(found) > 1:
             raise PayloadError(
-                f"{self.service} takes {topic} from one source, the run has {', '.join(sorted(found))}"
+                f"{self.service} takes {topic} from one source, the run has {', '.join(sorted(found))}; "
+                "remove all but one of them from the scenario"
             )
         return next(iter(found.values()), None)
 

@@ -119,7 +119,7 @@ def test_a_service_that_is_stopped_is_noticed_at_once(tmp_path: Path) -> None:
         assert marked(mark) == []
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_ctrl_c_ends_everything_cleanly(tmp_path: Path, number: signal.Signals) -> None:
     with running(scenario_file(tmp_path), tmp_path, "--frames", "100000") as (process, mark):
         eventually(lambda: recorded_below(tmp_path) > 3, 20, "a few frames are recorded")

@@ -125,7 +125,8 @@ class _Interruption:
         self.came = False
 
     def __enter__(self) -> None:
-        self._before = {s: signal.signal(s, self._handle) for s in (signal.SIGINT, signal.SIGTERM)}
+        orders = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+        self._before = {order: signal.signal(order, self._handle) for order in orders}
 
     def __exit__(self, *_: object) -> None:
         for number, handler in self._before.items():
@@ -135,7 +136,8 @@ class _Interruption:
         if self.came:
             raise KeyboardInterrupt
         self.came = True
-        self._launcher.stop(f"stopped by {'Ctrl-C' if number == signal.SIGINT else 'SIGTERM'}")
+        name = "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
+        self._launcher.stop(f"stopped by {name}")
 
 
 class _Watcher:
