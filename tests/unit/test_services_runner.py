@@ -413,6 +413,16 @@ def test_a_refusal_ends_it_with_the_reason(broker: Broker) -> None:
     assert "Traceback" not in said
 
 
+def test_a_refusal_at_ready_ends_it_with_the_reason(broker: Broker) -> None:
+    """As where its actuators clash with those of another agent."""
+    with service(broker.endpoint) as process:
+        broker.welcome()
+        broker.prepare()
+        broker.send(m.Refuse(code="clash", message="agents 'a' and 'b' own the same"))
+        said = ends(process, 1)
+    assert "(clash): agents 'a' and 'b' own the same" in said
+
+
 def test_a_broker_of_another_major_version_is_left_naming_both(broker: Broker) -> None:
     with service(broker.endpoint) as process:
         broker.expect(m.Hello)
