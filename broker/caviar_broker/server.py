@@ -161,12 +161,12 @@ class BrokerServer:
 
         Finding the next deadline is work for the time in which nobody waits for this process.
         """
-        ready = self.loop.poll()
-        now = time.monotonic_ns()
-        if not ready or now >= self._look_at:
+        busy, now = self._port.readable, time.monotonic_ns()
+        if busy and now < self._look_at:
+            self._receive_all()
+        else:
             wake = self._see_to_deadlines(now)
-            ready = ready or self.loop.poll(wake - now)
-        self.loop.call(ready)
+            self.loop.call(self.loop.poll(0 if busy else wake - now))
         self._write_journal()
 
     def _see_to_deadlines(self, now: int) -> int:
