@@ -4,11 +4,20 @@ Sionna RT's deterministic generator shoots twice: a first pass notes which (dept
 something, a second stores it, in an order decided in between. That decision runs over every lane of
 depth · rays · receivers, of which few hold anything. Here the lanes that do are picked out first:
 the same candidates in the same order for a fraction of the work.
+
+Neighbouring lanes of a kernel walk the ray tracer's tree together. Sionna RT launches its rays in the order
+of the Fibonacci lattice, where neighbours point into quite different directions; here the same rays
+are launched along a space-filling curve, which halved the time of the kernel in the street canyon.
 """
 
 from __future__ import annotations
 
+from types import FunctionType, MethodType
 from typing import Any
+
+import numpy as np
+
+from caviar_protocol.arrays import Float64Array, Int64Array
 
 
 def candidate_generator() -> Any:
@@ -24,7 +33,11 @@ class _Shooting:
     """The shooting stage of a candidate generator; called as its ``_shoot_and_bounce``."""
 
     def __init__(self, generator: Any) -> None:
-        self._loop = generator._shoot_and_bounce_loop
+        loop = generator._shoot_and_bounce_loop.__func__
+        names = {**loop.__globals__, "fibonacci_lattice": _Lattice(loop.__globals__["fibonacci_lattice"])}
+        along_curve = FunctionType(loop.__code__, names, loop.__name__, loop.__defaults__, loop.__closure__)
+        along_curve.__kwdefaults__ = loop.__kwdefaults__
+        self._loop = MethodType(along_curve, generator)
         self._sampler = generator._sampler
 
     def __call__(
@@ -106,3 +119,36 @@ def _places(
     dr.scatter(shooting, True, (lanes // targets) % samples, fits)
     dr.eval(place, shooting)
     return place, shooting
+
+
+class _Lattice:
+    """A lattice on the unit square whose points are ordered along a space-filling curve."""
+
+    def __init__(self, lattice: Any) -> None:
+        self._lattice = lattice
+        self._ordered: dict[int, Any] = {}
+
+    def __call__(self, count: int) -> Any:
+        import drjit as dr
+        import mitsuba as mi
+
+        if count not in self._ordered:
+            points = self._lattice(count)
+            order = morton_order(np.array(points.x, np.float64), np.array(points.y, np.float64))
+            # Gathered, not made from NumPy: where NumPy's memory happens to lie would be part of the kernel.
+            ordered = dr.gather(mi.Point2f, points, mi.UInt32(order.astype(np.uint32)))
+            dr.eval(ordered)
+            self._ordered[count] = ordered
+        return self._ordered[count]
+
+
+def morton_order(x: Float64Array, y: Float64Array) -> Int64Array:
+    """Indices that sort points of the unit square along the Morton curve (G. M. Morton, "A Computer Oriented
+    Geodetic Data Base", IBM, 1966), Shape ``[N]``; the bits of both coordinates alternate in the key."""
+    bits = 16
+    cells = [np.clip(axis * (1 << bits), 0, (1 << bits) - 1).astype(np.uint64) for axis in (x, y)]
+    key = np.zeros(len(x), np.uint64)
+    for bit in range(bits):
+        for shift, cell in enumerate(cells):
+            key |= ((cell >> np.uint64(bit)) & np.uint64(1)) << np.uint64(2 * bit + shift)
+    return np.argsort(key, kind="stable")
