@@ -87,7 +87,9 @@ def _words(line: Line) -> str:
         case "listening":
             return f"listening on {line['endpoint']}"
         case _:
-            return f"run digest {line['digest']}, {line['frames']} frames"
+            return (
+                f"{line['frames']} frames, digest {line['digest']}" if line["frames"] else "no frame was run"
+            )
 
 
 class Control:

@@ -46,8 +46,9 @@ class Port:
             self.socket.bind(endpoint)
         except zmq.ZMQError as error:
             self.close()
+            remedy = "end what uses that port, or choose" if error.errno == zmq.EADDRINUSE else "choose"
             raise RunError(
-                f"cannot listen on {endpoint}: {error.strerror}; end what uses that port, or choose another "
+                f"cannot listen on {endpoint}: {error.strerror}; {remedy} another "
                 "with --bind tcp://127.0.0.1:PORT (0: any free one)"
             ) from error
         self.endpoint = self.socket.getsockopt_string(zmq.LAST_ENDPOINT)

@@ -135,7 +135,7 @@ def test_a_person_reads_words_and_no_progress(tmp_path: Path, pipe: tuple[int, i
         "listening on tcp://127.0.0.1:5570",
         "miss: link frame 7: too slow",
         "note: link: uses the CPU",
-        "run digest abc, 3 frames",
+        "3 frames, digest abc",
     ]
 
 

@@ -66,6 +66,8 @@ class Launcher:
     _rest: bytes = b""
     _over: bool = False
     """Whether the broker told how the run ended."""
+    _frames: int = 0
+    """Frames that the run had, once it is over."""
     _finished: bool = False
     """Whether the broker's output has ended."""
     _give_up_at: float | None = None
@@ -158,7 +160,8 @@ class Launcher:
             if event["event"] == "listening":
                 self.endpoint = event["endpoint"]
                 self._start_services()
-            self._over = self._over or event["event"] == "finished"
+            if event["event"] == "finished":
+                self._over, self._frames = True, event["frames"]
             yield event
 
     def _broker_ended(self, broker: subprocess.Popen[bytes]) -> Mapping[str, Any]:
@@ -199,7 +202,8 @@ class Launcher:
             processes.append(self._broker)
             if self._broker.stdin is not None:
                 self._broker.stdin.close()
-        grace = self.scenario.timeouts.shutdown_s if self._over else 0.0
+        # Before the first frame some services may not have connected, so that no SHUTDOWN reached them.
+        grace = self.scenario.timeouts.shutdown_s if self._frames else 0.0
         _wait(processes, grace)
         for process in processes:
             if process.poll() is None:

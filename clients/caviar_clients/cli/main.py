@@ -24,8 +24,8 @@ _errors = Console(stderr=True)
 
 ScenarioFile = Annotated[Path, typer.Argument(help="scenario file (TOML)", show_default=False)]
 RunDirectory = Annotated[Path, typer.Argument(help="directory of a run, or one segment of its recording")]
-Frames = Annotated[int | None, typer.Option(help="frames of an episode, instead of the scenario's")]
-Seed = Annotated[int | None, typer.Option(help="seed, instead of the scenario's")]
+Frames = Annotated[int | None, typer.Option(min=1, help="frames of an episode, instead of the scenario's")]
+Seed = Annotated[int | None, typer.Option(min=0, max=2**63 - 1, help="seed, instead of the scenario's")]
 
 
 @app.command()
