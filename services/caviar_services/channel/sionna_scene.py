@@ -24,6 +24,7 @@ from caviar_services.channel.sionna_materials import (
     itu_constants,
     set_materials,
 )
+from caviar_services.columns import aligned_columns
 from caviar_services.meshes import BodyPool, Mesh, box, placed, unit_box
 from caviar_services.scenery import find_scenery, read_scenery
 
@@ -271,4 +272,5 @@ def _mi_mesh(shape: _Shape) -> Any:
 def _floats(vertices: Float64Array) -> Any:
     import mitsuba as mi
 
-    return mi.Float(np.ascontiguousarray(vertices, np.float32).ravel())
+    (column,) = aligned_columns(vertices.reshape(1, -1))
+    return mi.Float(column)

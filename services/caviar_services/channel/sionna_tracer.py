@@ -23,6 +23,7 @@ from caviar_protocol.arrays import (
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.patterns import spherical_basis
 from caviar_services.channel.sionna_candidates import candidate_generator
+from caviar_services.columns import aligned_columns
 
 _POLE = 1.2e-5
 """Below this horizontal part of a direction Sionna RT sets its azimuth to 0 (100 float32 epsilons)."""
@@ -161,8 +162,7 @@ class Tracer:
 def _points(positions: Float64Array) -> Any:
     import mitsuba as mi
 
-    x, y, z = np.ascontiguousarray(positions.T, np.float32)
-    return mi.Point3f(mi.Float(x), mi.Float(y), mi.Float(z))
+    return mi.Point3f(*map(mi.Float, aligned_columns(positions.T)))
 
 
 def _read(

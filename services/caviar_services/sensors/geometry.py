@@ -19,6 +19,7 @@ from caviar_protocol.coordinates import Vector
 from caviar_protocol.errors import AssetError, PayloadError
 from caviar_protocol.scene import object_pose
 from caviar_protocol.topics import Scene
+from caviar_services.columns import aligned_columns
 from caviar_services.meshes import BodyPool, Mesh, placed
 from caviar_services.scenery import Scenery
 
@@ -130,24 +131,9 @@ class _Part:
         self._parameters.keep(self._key)
 
     def move(self, mi: Any, vertices: Float64Array) -> None:
-        (column,) = _columns(vertices.reshape(1, -1))
+        (column,) = aligned_columns(vertices.reshape(1, -1))
         self._parameters[self._key] = mi.Float(column)
         self._parameters.update()
-
-
-def _columns(rows: Float64Array) -> Float32Array:
-    """Rows as float32, Shape ``[R, N]``, each at a multiple of 64 bytes, with room behind it.
-
-    Dr.Jit computes in NumPy's memory where it can, whole vectors of up to 64 bytes at a time, and
-    compiles a kernel anew for each combination of arrays that happen to be aligned or not.
-    """
-    count, size = rows.shape
-    stride = -(-size // 16) * 16
-    buffer = np.zeros(count * stride + 16, dtype=np.float32)
-    start = (-buffer.ctypes.data % 64) // buffer.itemsize
-    columns = buffer[start : start + count * stride].reshape(count, stride)[:, :size]
-    columns[...] = rows
-    return columns
 
 
 class TracedScene:
@@ -230,7 +216,7 @@ class TracedScene:
 
         # Every value is an array, never a Python number: a number becomes part of the kernel, and
         # each new one makes a kernel to compile.
-        x, y, z, dx, dy, dz, limit = map(mi.Float, _columns(np.vstack([origin, direction, reach])))
+        x, y, z, dx, dy, dz, limit = map(mi.Float, aligned_columns(np.vstack([origin, direction, reach])))
         ray = mi.Ray3f(mi.Point3f(x, y, z), mi.Vector3f(dx, dy, dz))
         ray.maxt = limit
         hit = self._moving.scene.ray_intersect_preliminary(ray, coherent=True)

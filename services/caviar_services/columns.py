@@ -1,0 +1,22 @@
+"""Arrays as Dr.Jit's LLVM kernels want them in memory."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from caviar_protocol.arrays import Float32Array, Float64Array
+
+
+def aligned_columns(rows: Float64Array) -> Float32Array:
+    """Rows as float32, Shape ``[R, N]``, each at a multiple of 64 bytes, with room behind it.
+
+    Dr.Jit computes in NumPy's memory where it can, whole vectors of up to 64 bytes at a time, and
+    compiles a kernel anew for each combination of arrays that happen to be aligned or not.
+    """
+    count, size = rows.shape
+    stride = -(-size // 16) * 16
+    buffer = np.zeros(count * stride + 16, dtype=np.float32)
+    start = (-buffer.ctypes.data % 64) // buffer.itemsize
+    columns = buffer[start : start + count * stride].reshape(count, stride)[:, :size]
+    columns[...] = rows
+    return columns
