@@ -21,6 +21,7 @@ from caviar_broker.core.plan import plan_run
 from caviar_broker.journal import JournalFile
 from caviar_broker.server import BrokerServer
 from caviar_protocol.errors import CaviarError, RunError
+from caviar_protocol.host import steady_memory
 from caviar_protocol.scenario_checks import with_overrides
 from caviar_protocol.scenario_loader import load_scenario
 
@@ -35,6 +36,7 @@ def tune_collector() -> None:
 
 def serve(arguments: argparse.Namespace) -> int:
     """Run the broker; the exit status: 0 exactly if the run came to its end."""
+    steady_memory()
     scenario = load_scenario(arguments.scenario)
     scenario = with_ownership(with_overrides(scenario, arguments.frames, arguments.seed))
     directory = _made(arguments.directory)
