@@ -7,13 +7,11 @@ import logging
 import sys
 
 from caviar_protocol.errors import CaviarError
-from caviar_protocol.host import steady_memory
 from caviar_services.runner import CONNECT_TIMEOUT_S, run_service
 
 
 def serve(name: str, use: str, broker: str, connect_timeout_s: float = CONNECT_TIMEOUT_S) -> int:
     """Run the implementation ``use`` ("role:name") as the service ``name``; the exit status."""
-    steady_memory()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(message)s")
     role, separator, implementation = use.partition(":")
     if not separator:

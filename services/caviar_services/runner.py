@@ -7,6 +7,7 @@ as long as the run does is bounded by the broker's heartbeats.
 
 from __future__ import annotations
 
+import gc
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -22,7 +23,7 @@ from caviar_protocol.assets import AssetStore, Incoming
 from caviar_protocol.codec import check_version, encode_message, encode_payload, message_type
 from caviar_protocol.digest import geometry_digest, payload_digest
 from caviar_protocol.errors import AssetError, PayloadError, ProtocolError, RunError
-from caviar_protocol.host import host_identity
+from caviar_protocol.host import host_identity, trim_memory
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.tables import convert_settings
 from caviar_protocol.topics import PAYLOADS, Carrier
@@ -31,6 +32,10 @@ from caviar_services.connection import Connection, RunOver, Terminated, describe
 from caviar_services.registry import load
 from caviar_services.service import Frame, FrameInput, Preparation, Prepared, RunInfo, Service, StepResult
 from caviar_services.termination import TERMINATED, Termination
+
+TRIM_EVERY = 10
+"""Frames after which free memory is given back to the system. Megabytes come and go in each frame in ever
+other sizes, and what they leave behind would creep up for hours; in each frame it would cost page faults."""
 
 CONNECT_TIMEOUT_S = 30.0
 """[s] until the broker has to answer HELLO, or a request for scenery."""
@@ -181,6 +186,9 @@ class Runner:
                         producers=message.producers,
                     )
                 )
+            # What was loaded stays: collections look only at what frames leave behind, all of it, soon.
+            gc.collect()
+            gc.freeze()
             self._broker.send(
                 m.Ready(
                     **self._identity,
@@ -249,6 +257,10 @@ class Runner:
             self._unexpected(grant, f"frame {grant.frame} was answered long ago")
         else:
             self._broker.send_parts(answer)
+        if grant.frame % TRIM_EVERY == TRIM_EVERY - 1:
+            with self._reporting("release", grant.episode, grant.frame):
+                self._running.release_memory()
+                trim_memory()
 
     def _answer(self, grant: m.Grant, parts: Sequence[zmq.Frame]) -> list[Any]:
         """DONE with its products, or FAULT, as it travels."""
@@ -322,8 +334,8 @@ class Runner:
             raise RunError(f"{self.name!r} could not be set up")
         return self._service
 
-    def _reporting(self, phase: str, episode: int = 0) -> Guard:
-        return Guard(self._identity, self._broker.send, phase, episode)
+    def _reporting(self, phase: str, episode: int = 0, frame: int = -1) -> Guard:
+        return Guard(self._identity, self._broker.send, phase, episode, frame)
 
     def _bye(self, reason: str) -> None:
         if self._identity:

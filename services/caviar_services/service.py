@@ -220,6 +220,9 @@ class Service(ABC, Generic[S]):
     def step(self, frame: Frame) -> StepResult:
         """Compute this service's part of a frame."""
 
+    def release_memory(self) -> None:  # optional hook
+        """Give back buffers that are kept for reuse. Called now and then between frames."""
+
     def end_episode(self, frames: int) -> None:  # optional hook
         """The episode is over; it had this many frames."""
 

@@ -91,31 +91,20 @@ def test_a_service_that_never_answers_is_blamed_after_the_stall_time(tmp_path: P
     assert_readable(finished, 5)
 
 
-def test_a_service_killed_from_outside_is_named_with_the_signal(tmp_path: Path) -> None:
-    with running(faulty(tmp_path, "Raises", "frame = 1000000"), tmp_path, "--frames", "100000") as (
-        process,
-        mark,
-    ):
+@pytest.mark.parametrize(
+    ("number", "words"), [(signal.SIGKILL, "SIGKILL"), (signal.SIGSTOP, "is stopped (SIGSTOP")]
+)
+def test_a_service_killed_or_stopped_from_outside_is_named_with_the_signal(
+    tmp_path: Path, number: signal.Signals, words: str
+) -> None:
+    scenario = faulty(tmp_path, "Raises", "frame = 1000000")
+    with running(scenario, tmp_path, "--frames", "100000") as (process, mark):
         eventually(lambda: recorded_below(tmp_path) > 3, 20, "a few frames are recorded")
-        os.kill(pid_of(mark, "caviar_services channel"), signal.SIGKILL)
+        os.kill(pid_of(mark, "caviar_services channel"), number)
         output, _ = process.communicate(timeout=20)
         assert process.returncode == 1
         assert "channel 'channel' died" in output
-        assert "SIGKILL" in output
-        assert marked(mark) == []
-
-
-def test_a_service_that_is_stopped_is_noticed_at_once(tmp_path: Path) -> None:
-    with running(faulty(tmp_path, "Raises", "frame = 1000000"), tmp_path, "--frames", "100000") as (
-        process,
-        mark,
-    ):
-        eventually(lambda: recorded_below(tmp_path) > 3, 20, "a few frames are recorded")
-        os.kill(pid_of(mark, "caviar_services channel"), signal.SIGSTOP)
-        output, _ = process.communicate(timeout=20)
-        assert process.returncode == 1
-        assert "channel 'channel' died" in output
-        assert "is stopped (SIGSTOP" in output
+        assert words in output
         assert marked(mark) == []
 
 

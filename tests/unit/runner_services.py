@@ -184,6 +184,14 @@ class Environment(Sensors):
         raise OSError(f"no GPU in {Path.cwd()}")
 
 
+class Keeps(Sensors):
+    """Tells when it is asked to give back memory, and fails to."""
+
+    def release_memory(self) -> None:
+        say(f"released after {self.steps}")
+        raise MemoryError("nothing to give")
+
+
 class Reader(Sensors):
     """Looks into its input."""
 

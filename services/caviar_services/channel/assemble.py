@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
@@ -275,7 +274,6 @@ def _ids(table: PathTable) -> UInt64Array:
     return _mix(base[kind] + rank.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15))
 
 
-@lru_cache(maxsize=65536)
 def _name_hash(kind: tuple[tuple[int, str], ...]) -> int:
     text = "\0".join(f"{interaction}\0{name}" for interaction, name in kind)
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little")

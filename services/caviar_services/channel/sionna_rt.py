@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from caviar_protocol.arrays import Float64Array, Int64Array, quantity
 from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.errors import PayloadError, ScenarioError, SetupError
-from caviar_protocol.host import trim_memory
 from caviar_protocol.seeding import derive_seed
 from caviar_protocol.topics import AntennaDevice, ChannelOptions, Scene
 from caviar_services.channel.assemble import Antenna, PathTable
@@ -24,7 +23,7 @@ from caviar_services.channel.sionna_scene import SceneSettings, SionnaScene
 from caviar_services.channel.sionna_tracer import LaunchOptions, Traced, Tracer
 from caviar_services.channel.specular import refined_points
 from caviar_services.llvm import activate_llvm, choose_variant
-from caviar_services.service import Frame, Preparation, RunInfo, StepResult
+from caviar_services.service import Preparation, RunInfo
 
 Array = NDArray[Any]
 
@@ -66,11 +65,6 @@ class SionnaSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     """What to do where a material is not defined at the carrier frequency."""
 
 
-_FLUSH_EVERY = 50
-"""Frames after which Dr.Jit gives back the buffers that it keeps for reuse: their sizes vary from frame to
-frame, and it keeps one for each that it has seen."""
-
-
 class SionnaChannel(ChannelModel[SionnaSettings]):
     """Ray-traced channel of one carrier.
 
@@ -94,7 +88,6 @@ class SionnaChannel(ChannelModel[SionnaSettings]):
         self._scene: SionnaScene
         self._tracer: Tracer
         self._at_once = 1
-        self._steps = 0
 
     @property
     def options(self) -> ChannelOptions:
@@ -143,16 +136,11 @@ class SionnaChannel(ChannelModel[SionnaSettings]):
         self._at_once = self._receivers_at_once()
         return (*notes, *self._warm_up())
 
-    def step(self, frame: Frame) -> StepResult:
-        """See `ChannelModel.step`."""
+    def release_memory(self) -> None:
+        """Dr.Jit keeps freed buffers, some of each size that it has seen; sizes vary with the paths."""
         import drjit as dr
 
-        result = super().step(frame)
-        self._steps += 1
-        if self._steps % _FLUSH_EVERY == 0:
-            dr.flush_malloc_cache()
-            trim_memory()
-        return result
+        dr.flush_malloc_cache()
 
     def paths(self, scene: Scene, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]) -> Found:
         import mitsuba as mi

@@ -1,0 +1,77 @@
+"""What goes wrong inside a service reaches the broker as a FAULT that says where."""
+
+from __future__ import annotations
+
+import pytest
+from runner_harness import IDS, Broker, ends, played_broker, service
+
+from caviar_protocol import messages as m
+
+__all__ = ["played_broker"]
+
+
+FAULTS = {
+    "prepare": ("prepare", "ZeroDivisionError: nothing to divide in prepare"),
+    "reset": ("reset", "ZeroDivisionError: nothing to divide in reset"),
+    "step": ("step", "ZeroDivisionError: nothing to divide in step"),
+    "told by name": ("step", "town.toml:7: devices.0: the mast is 3 m too low"),
+    "non-finite": ("encode", "scans[0].points[0, 0] is nan"),
+    "wrong type": ("encode", "a payload Action for the topic 'lidar'"),
+}
+
+
+@pytest.mark.parametrize(("wrong", "phase", "words"), [(w, *f) for w, f in FAULTS.items()], ids=FAULTS)
+def test_a_failure_becomes_a_fault_with_phase_and_text(
+    broker: Broker, wrong: str, phase: str, words: str
+) -> None:
+    with service(broker.endpoint) as process:
+        broker.welcome(settings={"wrong": wrong})
+        broker.prepare()
+        if wrong != "prepare":
+            broker.expect(m.Ready)
+            broker.send(m.Reset(**IDS, episode=0, seed=9, t0_ns=0))
+        if wrong not in ("prepare", "reset"):
+            broker.expect(m.ResetDone)
+            broker.grant(3)
+        fault = broker.expect(m.Fault)
+        assert fault.phase == phase
+        assert words in fault.message
+        assert fault.frame == (3 if phase in ("step", "encode") else -1)
+        assert ("Traceback" in fault.detail) == ("ZeroDivision" in words)
+        broker.shutdown()
+        ends(process, 0)
+
+
+def test_a_setting_that_does_not_exist_is_a_fault(broker: Broker) -> None:
+    with service(broker.endpoint):
+        broker.welcome(settings={"wrogn": "x"})
+        fault = broker.expect(m.Fault)
+        assert fault.phase == "settings"
+        assert "wrogn" in fault.message
+
+
+def test_a_service_that_cannot_be_made_is_a_fault_and_leaves_when_told(broker: Broker) -> None:
+    with service(broker.endpoint, "sensors:Environment") as process:
+        broker.welcome()
+        assert "OSError: no GPU in" in broker.expect(m.Fault).message
+        broker.shutdown()
+        ends(process, 0)
+
+
+def test_an_input_that_cannot_be_decoded_is_a_fault(broker: Broker) -> None:
+    with service(broker.endpoint, "link:Reader") as process:
+        broker.start()
+        entry = m.GrantInput(topic="scene", source="world", status=m.Status.FRESH, frame=0, digest="0" * 64)
+        broker.send(m.Grant(**IDS, episode=0, frame=0, t_ns=0, inputs=(entry,)), b"\xff", b"")
+        fault = broker.expect(m.Fault)
+        assert fault.phase == "step"
+        assert "scene payload" in fault.message
+        broker.shutdown()
+        ends(process, 0)
+
+
+def test_a_process_that_ends_itself_ends_with_that_status(broker: Broker) -> None:
+    with service(broker.endpoint, "sensors:Leaves") as process:
+        broker.start()
+        broker.grant(0)
+        assert "the simulator has quit" in ends(process, 1)

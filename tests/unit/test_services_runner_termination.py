@@ -1,0 +1,64 @@
+"""SIGTERM ends a service within 2 s, whatever it is at."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from runner_harness import Broker, ends, hears, played_broker, service
+
+from caviar_protocol import messages as m
+
+__all__ = ["played_broker"]
+
+
+def terminated(process: subprocess.Popen[str], number: int = signal.SIGTERM) -> str:
+    """What it says until it has ended, within 2 s."""
+    started = time.monotonic()
+    process.send_signal(number)
+    said = ends(process, 143, within_s=5.0)
+    elapsed = time.monotonic() - started
+    sys.stdout.write(f"ended {elapsed:.2f} s after the signal\n")
+    assert elapsed < 2.0
+    return said
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_between_frames_ends_it_with_bye(broker: Broker, number: signal.Signals) -> None:
+    with service(broker.endpoint) as process:
+        broker.start()
+        process.send_signal(number)
+        assert broker.expect(m.Bye).reason == "SIGTERM"
+        assert "closed" in ends(process, 143, within_s=2.0)
+
+
+def test_sigterm_while_it_waits_for_a_broker_ends_it(broker: Broker) -> None:
+    with service(broker.endpoint) as process:
+        broker.expect(m.Hello)  # and no WELCOME
+        terminated(process)
+
+
+@pytest.mark.parametrize("name", ["WaitsForever", "SleepsInC", "ComputesInC", "HoldsTheInterpreter"])
+def test_sigterm_ends_a_service_that_is_stuck_in_a_frame(broker: Broker, name: str) -> None:
+    with service(broker.endpoint, f"sensors:{name}") as process:
+        broker.start()
+        broker.grant(0)
+        hears(process, "stuck")
+        terminated(process)
+
+
+def test_sigterm_ends_a_service_that_is_stuck_in_prepare(broker: Broker) -> None:
+    with service(broker.endpoint, "sensors:SleepsInC") as process:
+        broker.welcome(settings={"wrong": "prepare"})
+        broker.prepare()
+        hears(process, "stuck")
+        assert "in the middle of a call that does not return" in terminated(process)
+
+
+def test_sigterm_ends_a_service_that_hangs_when_it_closes(broker: Broker) -> None:
+    with service(broker.endpoint, "sensors:IgnoresClosing") as process:
+        broker.start()
+        terminated(process)
