@@ -21,7 +21,6 @@ from caviar_protocol.errors import PayloadError
 
 BoolArray: TypeAlias = NDArray[np.bool_]
 UInt8Array: TypeAlias = NDArray[np.uint8]
-UInt16Array: TypeAlias = NDArray[np.uint16]
 Int8Array: TypeAlias = NDArray[np.int8]
 Int32Array: TypeAlias = NDArray[np.int32]
 Int64Array: TypeAlias = NDArray[np.int64]

@@ -11,9 +11,7 @@ from caviar_protocol.errors import RunError, SetupError
 
 # Okabe and Ito, "Color Universal Design", 2008.
 BLACK, GREY, LIGHT_GREY = "#222222", "#8c8c8c", "#dcdcdc"
-ORANGE, SKY, GREEN, BLUE, VERMILION, PURPLE = (
-    "#e69f00", "#56b4e9", "#009e73", "#0072b2", "#d55e00", "#cc79a7",
-)  # fmt: skip
+ORANGE, SKY, BLUE, VERMILION = "#e69f00", "#56b4e9", "#0072b2", "#d55e00"
 
 OPTIMUM, AGENT, BASELINE = BLACK, VERMILION, BLUE
 """Colours of the three curves of |y|, the same in every picture."""
