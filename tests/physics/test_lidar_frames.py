@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import os
 import subprocess
@@ -16,8 +17,10 @@ from caviar_protocol.arrays import Float32Array
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.coordinates import quaternion_from_euler
 from caviar_protocol.errors import AssetError, PayloadError
+from caviar_protocol.host import trim_memory
 from caviar_protocol.topics import AntennaDevice, Lidar, LidarDevice
 from caviar_services.meshes import box
+from caviar_services.runner import TRIM_EVERY
 from caviar_services.sensors.grid import GridSettings
 from caviar_services.sensors.lidar import LidarSensors, LidarSettings
 from caviar_services.world.shapes import car, ply
@@ -290,14 +293,20 @@ def in_a_fresh_process(call: str, yard: dict[str, Path], *arguments: int) -> str
 
 
 def memory_slope(yard: dict[str, Path], frames: int) -> float:
-    """Growth of resident memory [B a frame] over the last 80 % of as many frames."""
+    """Growth of resident memory [B a frame] over the last 80 % of as many frames, run as the runner does."""
     service = prepared(yard)
+    gc.collect()
+    gc.freeze()
     resident = []
     for frame in range(frames):
         observed(service, scene_of(traffic(frame), turning(frame)), frame)
+        if frame % TRIM_EVERY == 0:
+            service.release_memory()
+            trim_memory()
         resident.append(int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE"))
-    begin = frames // 5
-    return float(np.polyfit(np.arange(begin, frames), resident[begin:], 1)[0])
+    levels = np.median(np.reshape(resident, (-1, TRIM_EVERY)), axis=1)
+    late = levels[len(levels) // 5 :]
+    return float(np.polyfit(np.arange(len(late)) * TRIM_EVERY, late, 1)[0])
 
 
 def test_memory_stays_flat_over_a_thousand_frames(yard: dict[str, Path]) -> None:
