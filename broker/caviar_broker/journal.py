@@ -60,7 +60,7 @@ class JournalFile:
 
     def _record(self, entry: Journal) -> JournalEntry:
         products: tuple[tuple[str, Any, Any], ...] = tuple(
-            (p.topic, p.payload[0].buffer, p.payload[1].buffer) for p in entry.products
+            (p.topic, memoryview(p.payload[0]), memoryview(p.payload[1])) for p in entry.products
         )
         return JournalEntry(
             number=entry.number,

@@ -11,26 +11,29 @@ import gc
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-import msgspec
 import zmq
 
-from caviar_protocol import limits
 from caviar_protocol import messages as m
 from caviar_protocol.assets import AssetStore, Incoming
-from caviar_protocol.codec import check_version, encode_message, encode_payload, message_type
-from caviar_protocol.digest import geometry_digest, payload_digest
-from caviar_protocol.errors import AssetError, PayloadError, ProtocolError, RunError
+from caviar_protocol.codec import check_version, encode_message, message_type
+from caviar_protocol.errors import AssetError, ProtocolError, RunError
 from caviar_protocol.host import host_identity, trim_memory
-from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.tables import convert_settings
-from caviar_protocol.topics import PAYLOADS, Carrier
 from caviar_services.answers import Answers, Guard
 from caviar_services.connection import Connection, RunOver, Terminated, describe
+from caviar_services.exchange import (
+    done_of,
+    frame_of,
+    hello_of,
+    is_needed,
+    preparation_of,
+    ready_of,
+    run_info,
+)
 from caviar_services.registry import load
-from caviar_services.service import Frame, FrameInput, Preparation, Prepared, RunInfo, Service, StepResult
+from caviar_services.service import Prepared, Service
 from caviar_services.termination import TERMINATED, Termination
 
 TRIM_EVERY = 10
@@ -121,21 +124,8 @@ class Runner:
     # --- joining -----------------------------------------------------------------------------------
 
     def _join(self) -> None:
-        cls, broker = self.cls, self._broker
-        broker.send(
-            m.Hello(
-                version=m.PROTOCOL_VERSION,
-                name=self.name,
-                role=cls.role,
-                inputs=cls.inputs,
-                outputs=cls.outputs,
-                capabilities=m.CAPABILITIES,
-                implementation=self.use,
-                max_in_flight=limits.MAX_IN_FLIGHT,
-                host=host_identity(),
-                pid=os.getpid(),
-            )
-        )
+        broker = self._broker
+        broker.send(hello_of(self.name, self.use, self.cls, host_identity(), os.getpid()))
         message, _ = broker.receive(self._timeout_s)
         if isinstance(message, m.Refuse):
             raise self._refused(message)
@@ -145,59 +135,32 @@ class Runner:
         self._identity = {"epoch": message.epoch, "attempt": message.attempt}
         broker.beat(message)
         with self._reporting("settings"):
-            settings = convert_settings(cls.Settings, message.settings)
-            self._service = cls(settings, self._run_info(message))
+            settings = convert_settings(self.cls.Settings, message.settings)
+            self._service = self.cls(settings, run_info(self.name, message, broker.progress))
 
     def _refused(self, message: m.Refuse) -> RunError:
         endpoint = self._broker.endpoint
         return RunError(f"the broker at {endpoint} refused {self.name!r} ({message.code}): {message.message}")
-
-    def _run_info(self, welcome: m.Welcome) -> RunInfo:
-        told = welcome.scenario
-        return RunInfo(
-            name=self.name,
-            run=welcome.run,
-            seed=welcome.seed,
-            sampling_period_ns=int(told.get("sampling_period_ns", 1)),
-            frames=int(told.get("frames", 1)),
-            carriers=msgspec.convert(told.get("carriers", ()), tuple[Carrier, ...]),
-            devices=msgspec.convert(told.get("devices", ()), tuple[DeviceSpec, ...]),
-            scenario=told.get("resolved", {}),
-            directory=Path(str(told.get("directory", "."))),
-            progress=self._broker.progress,
-        )
 
     # --- preparing ---------------------------------------------------------------------------------
 
     def _prepare(self, message: m.Prepare, _: Sequence[zmq.Frame]) -> None:
         service = self._running
         with self._reporting("prepare"):
-            prepared, geometry = Prepared(), ""
-            if message.demand or service.role in ("agent", "recorder") or not service.outputs:
-                offered = [self._store.add(n, c) for n, c in sorted(service.scenery().items())]
-                if offered:
-                    self._broker.send(m.AssetOffer(**self._identity, assets=tuple(offered)))
-                assets = self._fetch(message.assets) if service.uses_scenery else offered
-                geometry = geometry_digest(assets)
-                prepared = service.prepare(
-                    Preparation(
-                        demand={d.topic: frozenset(d.parts) for d in message.demand},
-                        assets=self._store.folder_of(assets) if assets else {},
-                        producers=message.producers,
-                    )
-                )
+            prepared: Prepared | None = None
+            assets: list[m.Asset] = []
+            if is_needed(service, message):
+                assets = [self._store.add(n, c) for n, c in sorted(service.scenery().items())]
+                if assets:
+                    self._broker.send(m.AssetOffer(**self._identity, assets=tuple(assets)))
+                if service.uses_scenery:
+                    assets = self._fetch(message.assets)
+                files = self._store.folder_of(assets) if assets else {}
+                prepared = service.prepare(preparation_of(message, files))
             # What was loaded stays: collections look only at what frames leave behind, all of it, soon.
             gc.collect()
             gc.freeze()
-            self._broker.send(
-                m.Ready(
-                    **self._identity,
-                    geometry=geometry,
-                    prefixes=prepared.prefixes,
-                    actuators=prepared.actuators,
-                    notes=prepared.notes,
-                )
-            )
+            self._broker.send(ready_of(self._identity, prepared, assets))
 
     def _fetch(self, assets: Sequence[m.Asset]) -> list[m.Asset]:
         """Get through the broker what this machine does not hold yet (clause 4)."""
@@ -270,57 +233,14 @@ class Runner:
             answer.append(encode_message(fault))
 
         with Guard(self._identity, failed, "step", grant.episode, grant.frame) as guard:
-            frame = self._frame(grant, parts)
+            frame = frame_of(self._running, grant, [part.buffer for part in parts])
             started = time.monotonic_ns()
             result = self._running.step(frame)
             stepped = time.monotonic_ns()
             guard.phase = "encode"
-            answer += self._encode(grant, result, started, stepped)
+            done, products = done_of(self._identity, self.use, grant, result, stepped - started)
+            answer += [encode_message(done), *products]
         return answer
-
-    def _frame(self, grant: m.Grant, parts: Sequence[zmq.Frame]) -> Frame:
-        inputs, taken = [], 0
-        for entry in grant.inputs:
-            if entry.status is m.Status.ABSENT:
-                inputs.append(FrameInput(entry))
-            else:
-                inputs.append(FrameInput(entry, parts[taken].buffer, parts[taken + 1].buffer))
-                taken += 2
-        return Frame(
-            episode=grant.episode,
-            number=grant.frame,
-            t_ns=grant.t_ns,
-            previous=grant.previous_frame,
-            final=grant.final,
-            inputs=tuple(inputs),
-            reports=grant.reports,
-            service=self.name,
-            seed=self._running.run.seed,
-        )
-
-    def _encode(self, grant: m.Grant, result: StepResult, started: int, stepped: int) -> list[Any]:
-        headers, parts = [], list[Any]()
-        for topic in sorted(result.products):
-            payload = result.products[topic]
-            if type(payload) is not PAYLOADS.get(topic):
-                raise PayloadError(
-                    f"{self.use} made a payload {type(payload).__name__} for the topic {topic!r}"
-                )
-            header, body = encode_payload(payload)
-            digest = payload_digest(header, body)
-            headers.append(m.ProductHeader(topic=topic, digest=digest, fidelity=result.fidelity))
-            parts += [header, body]
-        done = m.Done(
-            **self._identity,
-            episode=grant.episode,
-            frame=grant.frame,
-            products=tuple(headers),
-            decisions=dict(result.decisions),
-            measured={**result.measured, "step": stepped - started, "encode": time.monotonic_ns() - stepped},
-            counts=dict(result.counts),
-            end_episode=result.end_episode,
-        )
-        return [encode_message(done), *parts]
 
     def _episode_end(self, message: m.EpisodeEnd, _: Sequence[zmq.Frame]) -> None:
         with self._reporting("end of episode", message.episode):

@@ -101,9 +101,10 @@ class Launcher:
         """Ask for an orderly end."""
         self._order({"stop": reason})
 
-    def child(self, name: str) -> Child | None:
-        """A service's process."""
-        return self._children.get(name)
+    def log_of(self, service: str) -> Path | None:
+        """Where a service's process printed; None for a service that has none."""
+        child = self._children.get(service)
+        return child.log if child else None
 
     # --- starting ----------------------------------------------------------------------------------
 

@@ -36,11 +36,14 @@ def run(
     json: Annotated[Path | None, typer.Option(help="write the summary to this file too")] = None,
     out: Annotated[Path, typer.Option(help="directory in which the run's own is made")] = Path("runs"),
     bind: Annotated[str, typer.Option(help="address of the broker; port 0: any")] = "tcp://127.0.0.1:0",
+    embedded: Annotated[
+        bool, typer.Option("--embedded", help="all in this process, without sockets")
+    ] = False,
 ) -> None:
-    """Run a scenario: the broker and every service as processes of their own."""
+    """Run a scenario: the broker and every service as processes of their own, or all in this one."""
     from caviar_clients.cli.run import run_scenario
 
-    raise typer.Exit(run_scenario(scenario, out, _console, frames, seed, json, bind))
+    raise typer.Exit(run_scenario(scenario, out, _console, frames, seed, json, bind, embedded))
 
 
 @app.command()

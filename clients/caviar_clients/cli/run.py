@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
+from caviar_clients.cli.inside import EmbeddedLauncher
 from caviar_clients.cli.launch import Launcher
 from caviar_clients.cli.summary import link_figures, summary_of, summary_table
 from caviar_protocol.errors import DeclarationError, RunError
@@ -82,6 +83,7 @@ def run_scenario(
     seed: int | None = None,
     json_file: Path | None = None,
     bind: str = "tcp://127.0.0.1:0",
+    embedded: bool = False,
 ) -> int:
     """Run a scenario; the exit status: 0 exactly if it came to its end."""
     scenario = checked_scenario(path, frames, seed)
@@ -89,7 +91,11 @@ def run_scenario(
         _write(json_file, "")  # before the run, since after it an unwritable file would cost the figures
     directory = run_directory(out, scenario.run.name)
     console.print(Text(f"run {directory}"), soft_wrap=True)
-    launcher = Launcher(scenario, path.resolve(), directory, frames, seed, bind)
+    launcher: Launcher | EmbeddedLauncher
+    if embedded:
+        launcher = EmbeddedLauncher(scenario, directory)
+    else:
+        launcher = Launcher(scenario, path.resolve(), directory, frames, seed, bind)
     outcome: Mapping[str, Any] = {}
     interrupted = _Interruption(launcher)
     with launcher, interrupted, _progress_bar(console) as bar:
@@ -111,16 +117,16 @@ def run_scenario(
     if outcome["error"]:
         told = Text.assemble(("the run ended early:", "red"), f" {outcome['error']}")
         console.print(told, soft_wrap=True)
-        child = launcher.child(outcome["culprit"])
-        if child is not None:
-            console.print(Text(f"its log: {child.log}"), soft_wrap=True)
+        log = launcher.log_of(outcome["culprit"])
+        if log is not None:
+            console.print(Text(f"its log: {log}"), soft_wrap=True)
     return 130 if interrupted.came else 1 if outcome["error"] else 0
 
 
 class _Interruption:
     """Ctrl-C as an order to end the run; a second one ends without waiting."""
 
-    def __init__(self, launcher: Launcher) -> None:
+    def __init__(self, launcher: Launcher | EmbeddedLauncher) -> None:
         self._launcher = launcher
         self.came = False
 

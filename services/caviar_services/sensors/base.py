@@ -21,7 +21,7 @@ from caviar_protocol.errors import ScenarioError, SetupError
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.topics import Scene
 from caviar_protocol.topics.scene import Device
-from caviar_services.llvm import activate_llvm, cuda_devices
+from caviar_services.llvm import activate_llvm, choose_variant, cuda_devices
 from caviar_services.meshes import Mesh, unit_box
 from caviar_services.scenery import find_scenery, read_scenery
 from caviar_services.sensors.geometry import TracedScene, active_variant, load_scenery, load_unit_mesh
@@ -72,7 +72,9 @@ class Sensors(Service[S]):
                 "Mitsuba, which traces the rays, is not installed; run: pip install 'caviar-sim[sensors]'"
             )
         device = "a CUDA device" if cuda_devices() else activate_llvm()
-        self.variant = "cuda_ad_rgb" if device == "a CUDA device" else "llvm_ad_rgb"
+        # The channel's variant: rays and triangles are the same in all, and an embedded run with both
+        # would change it twice a frame, which costs Sionna RT half of the frame.
+        self.variant = choose_variant()
         self.run.progress("loading scenery", 60.0)
         with active_variant(self.variant) as mi:
             self.traced = self._load(mi, preparation.assets)

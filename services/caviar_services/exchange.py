@@ -1,0 +1,139 @@
+"""Between the messages of the protocol and a `Service`, without I/O: for the runner and the embedded run."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from caviar_protocol import limits
+from caviar_protocol import messages as m
+from caviar_protocol.codec import encode_payload
+from caviar_protocol.digest import geometry_digest, payload_digest
+from caviar_protocol.errors import PayloadError
+from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.topics import PAYLOADS, Carrier
+from caviar_services.service import (
+    Frame,
+    FrameInput,
+    Preparation,
+    Prepared,
+    Progress,
+    RunInfo,
+    Service,
+    StepResult,
+)
+
+
+def hello_of(name: str, use: str, cls: type[Service[Any]], host: str = "", pid: int = 0) -> m.Hello:
+    """What a service says of itself."""
+    return m.Hello(
+        version=m.PROTOCOL_VERSION,
+        name=name,
+        role=cls.role,
+        inputs=cls.inputs,
+        outputs=cls.outputs,
+        capabilities=m.CAPABILITIES,
+        implementation=use,
+        max_in_flight=limits.MAX_IN_FLIGHT,
+        host=host,
+        pid=pid,
+    )
+
+
+def run_info(name: str, welcome: m.Welcome, progress: Progress) -> RunInfo:
+    """What WELCOME tells about the run."""
+    told = welcome.scenario
+    return RunInfo(
+        name=name,
+        run=welcome.run,
+        seed=welcome.seed,
+        sampling_period_ns=int(told.get("sampling_period_ns", 1)),
+        frames=int(told.get("frames", 1)),
+        carriers=msgspec.convert(told.get("carriers", ()), tuple[Carrier, ...]),
+        devices=msgspec.convert(told.get("devices", ()), tuple[DeviceSpec, ...]),
+        scenario=told.get("resolved", {}),
+        directory=Path(str(told.get("directory", "."))),
+        progress=progress,
+    )
+
+
+def is_needed(service: Service[Any], order: m.Prepare) -> bool:
+    """Whether anybody wants what the service makes, or it is there for its own sake."""
+    return bool(order.demand) or service.role in ("agent", "recorder") or not service.outputs
+
+
+def preparation_of(order: m.Prepare, assets: Mapping[str, Path]) -> Preparation:
+    """What PREPARE orders, with the files of scenery where they lie."""
+    return Preparation(
+        demand={d.topic: frozenset(d.parts) for d in order.demand}, assets=assets, producers=order.producers
+    )
+
+
+def ready_of(identity: dict[str, int], prepared: Prepared | None, assets: Sequence[m.Asset]) -> m.Ready:
+    """READY of a service that loaded these assets; ``prepared`` is None where nobody needs it."""
+    if prepared is None:
+        return m.Ready(epoch=identity["epoch"], attempt=identity["attempt"])
+    return m.Ready(
+        **identity,
+        geometry=geometry_digest(assets),
+        prefixes=prepared.prefixes,
+        actuators=prepared.actuators,
+        notes=prepared.notes,
+    )
+
+
+def frame_of(service: Service[Any], grant: m.Grant, parts: Sequence[Any]) -> Frame:
+    """The frame that GRANT grants; ``parts`` are header and body of each input that is present."""
+    inputs, taken = [], 0
+    for entry in grant.inputs:
+        if entry.status is m.Status.ABSENT:
+            inputs.append(FrameInput(entry))
+        else:
+            inputs.append(FrameInput(entry, parts[taken], parts[taken + 1]))
+            taken += 2
+    return Frame(
+        episode=grant.episode,
+        number=grant.frame,
+        t_ns=grant.t_ns,
+        previous=grant.previous_frame,
+        final=grant.final,
+        inputs=tuple(inputs),
+        reports=grant.reports,
+        service=service.run.name,
+        seed=service.run.seed,
+    )
+
+
+def done_of(
+    identity: dict[str, int], use: str, grant: m.Grant, result: StepResult, step_ns: int
+) -> tuple[m.Done, list[Any]]:
+    """DONE, and header and body of each product behind it; ``step_ns`` is what the step took.
+
+    Raises `PayloadError` for a product that is not its topic's.
+    """
+    started = time.monotonic_ns()
+    headers, parts = [], list[Any]()
+    for topic in sorted(result.products):
+        payload = result.products[topic]
+        if type(payload) is not PAYLOADS.get(topic):
+            raise PayloadError(f"{use} made a payload {type(payload).__name__} for the topic {topic!r}")
+        header, body = encode_payload(payload)
+        headers.append(
+            m.ProductHeader(topic=topic, digest=payload_digest(header, body), fidelity=result.fidelity)
+        )
+        parts += [header, body]
+    done = m.Done(
+        **identity,
+        episode=grant.episode,
+        frame=grant.frame,
+        products=tuple(headers),
+        decisions=dict(result.decisions),
+        measured={**result.measured, "step": step_ns, "encode": time.monotonic_ns() - started},
+        counts=dict(result.counts),
+        end_episode=result.end_episode,
+    )
+    return done, parts

@@ -1,0 +1,88 @@
+"""A run in one process is the run of many: the same digest, the same blame, the same recording."""
+
+from __future__ import annotations
+
+import json
+import signal
+from pathlib import Path
+
+import pytest
+from scenarios_support import (
+    SCENARIOS,
+    Finished,
+    caviar,
+    eventually,
+    marked,
+    recorded_below,
+    run,
+    running,
+    scenario_file,
+)
+
+SICK = """
+[services.sick]
+role = "sensors"
+use = "faulty:Raises"
+budget_ms = 50
+"""
+
+
+def digest_of(finished: Finished) -> str:
+    """The digest of the summary, which the recording has too."""
+    assert finished.status == 0, finished.output
+    summary: dict[str, str] = json.loads((finished.directory / "summary.json").read_text())
+    assert caviar("inspect", "--digest", finished.directory).output.split() == [summary["digest"]]
+    return summary["digest"]
+
+
+def test_smoke_has_the_digest_of_the_distributed_run(tmp_path: Path) -> None:
+    scenario = scenario_file(tmp_path)
+    distributed = digest_of(run(scenario, tmp_path / "many"))
+    assert digest_of(run(scenario, tmp_path / "one", "--embedded")) == distributed
+    assert digest_of(run(scenario, tmp_path / "short", "--embedded", "--frames", "99")) != distributed
+
+
+@pytest.mark.channel
+@pytest.mark.sumo
+def test_street_canyon_has_the_digest_of_the_distributed_run(tmp_path: Path) -> None:
+    """Ray tracer, LIDAR and traffic simulator side by side in one process, for a few frames."""
+    for library in ("libsumo", "mitsuba", "sionna.rt"):
+        pytest.importorskip(library, reason="needs the extras")
+    arguments = (SCENARIOS / "street-canyon.toml", tmp_path / "one", "--frames", "12")
+    embedded = digest_of(run(*arguments, "--embedded", timeout=120))
+    assert digest_of(run(arguments[0], tmp_path / "many", "--frames", "12", timeout=120)) == embedded
+
+
+def test_realtime_pace_does_not_wait(tmp_path: Path) -> None:
+    """A hundred frames of an hour each."""
+    hours = ("sampling_period_ns = 100_000_000 ", "sampling_period_ns = 3_600_000_000_000 ")
+    plain = digest_of(run(scenario_file(tmp_path, [hours]), tmp_path / "plain", "--embedded"))
+    paced = scenario_file(tmp_path, [hours, ("frames = 100\n", 'frames = 100\npace = "realtime"\n')])
+    assert digest_of(run(paced, tmp_path / "paced", "--embedded")) == plain
+
+
+def test_a_service_that_raises_is_blamed_and_the_recording_readable(tmp_path: Path) -> None:
+    changes = [
+        ('"action", "link"]', '"action", "link", "lidar"]'),
+        ("frames = 100\n", "frames = 100\nframes_in_flight = 1\n"),
+    ]
+    finished = run(scenario_file(tmp_path, changes, SICK), tmp_path / "out", "--embedded")
+    assert finished.status == 1
+    assert "sensors 'sick'" in finished.output
+    assert "frame 5" in finished.output
+    assert "ZeroDivisionError: the sensor's focal length is 0" in finished.output
+    summary = json.loads((finished.directory / "summary.json").read_text())
+    assert summary["frames"] == 5
+    digest = caviar("inspect", "--digest", finished.directory)
+    assert (digest.status, digest.output.split()) == (0, [summary["digest"]])
+
+
+def test_ctrl_c_ends_it_cleanly(tmp_path: Path) -> None:
+    arguments = ("--frames", "100000", "--embedded")
+    with running(scenario_file(tmp_path), tmp_path / "out", *arguments) as (process, mark):
+        eventually(lambda: recorded_below(tmp_path / "out") > 3, 20, "a few frames are recorded")
+        process.send_signal(signal.SIGINT)
+        output, _ = process.communicate(timeout=20)
+        assert process.returncode == 130
+        assert "stopped by Ctrl-C" in output
+        assert marked(mark) == []
