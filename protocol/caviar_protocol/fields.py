@@ -47,6 +47,7 @@ FrameIndex = Annotated[int, quantity("1", "frame of the episode, from 0", ge=0, 
 FrameOrNone = Annotated[int, quantity("1", "frame of the episode; −1: none", ge=-1, le=MAX_INTEGER)]
 Age = Annotated[int, quantity("frame", "age", ge=0, le=MAX_INTEGER)]
 Seed = Annotated[int, quantity("1", "seed of everything random", ge=0, le=MAX_INTEGER)]
+SeedOrNone = Annotated[int, quantity("1", "seed; −1: none", ge=-1, le=MAX_INTEGER)]
 Nanoseconds = Annotated[int, quantity("ns", "simulated time, whole", ge=-MAX_INTEGER, le=MAX_INTEGER)]
 Duration = Annotated[int, quantity("ns", "wall time, whole", ge=0, le=MAX_INTEGER)]
 Period = Annotated[int, quantity("ns", "wall time, whole, at least 1", ge=1, le=MAX_INTEGER)]

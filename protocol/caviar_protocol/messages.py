@@ -29,6 +29,7 @@ from caviar_protocol.fields import (
     NewName,
     Period,
     Seed,
+    SeedOrNone,
     Size,
     Text,
     Version,
@@ -45,7 +46,7 @@ from caviar_protocol.items import Report as Report
 from caviar_protocol.items import Role as Role
 from caviar_protocol.items import Status as Status
 
-PROTOCOL_VERSION = (1, 0)
+PROTOCOL_VERSION = (1, 1)
 """Major and minor version of the protocol that this package speaks."""
 
 CAPABILITIES: tuple[str, ...] = ("assets", "episodes", "parts")
@@ -174,6 +175,8 @@ class Ready(_Message, frozen=True, kw_only=True, tag="READY"):
     """Agents: the actuators they own, as patterns with ``*``: ``beam:car.*``, ``motion:uav``."""
     notes: tuple[Text, ...] = ()
     """What a user should know: the library chosen, the GPU used."""
+    seed: SeedOrNone = -1
+    """Agents: seed of the first episode, instead of the run's."""
 
 
 # --- episodes and frames -------------------------------------------------------------------
@@ -189,6 +192,8 @@ class Reset(_Message, frozen=True, kw_only=True, tag="RESET"):
     """Of the run, or what an agent reset to."""
     t0_ns: Nanoseconds
     """Time of frame 0."""
+    seed_episode: EpisodeIndex = 0
+    """Episodes since the first one with this seed: random numbers derive from both (clause 19)."""
 
 
 class ResetDone(_Message, frozen=True, kw_only=True, tag="RESET_DONE"):
@@ -239,6 +244,8 @@ class Done(_Message, frozen=True, kw_only=True, tag="DONE"):
     """What was dropped or skipped, by name (clause 21): ``non-finite-paths``."""
     end_episode: bool = False
     """An agent ends the episode with this frame (clause 16)."""
+    seed: SeedOrNone = -1
+    """Agents, with ``end_episode`` or for the final grant: seed of the next episode."""
 
 
 class Fault(_Message, frozen=True, kw_only=True, tag="FAULT"):

@@ -11,6 +11,7 @@ import msgspec
 
 from caviar_protocol import limits
 from caviar_protocol import messages as m
+from caviar_protocol.arrays import Payload
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.digest import geometry_digest, payload_digest
 from caviar_protocol.errors import PayloadError
@@ -83,11 +84,28 @@ def ready_of(identity: dict[str, int], prepared: Prepared | None, assets: Sequen
         prefixes=prepared.prefixes,
         actuators=prepared.actuators,
         notes=prepared.notes,
+        seed=prepared.seed,
     )
 
 
-def frame_of(service: Service[Any], grant: m.Grant, parts: Sequence[Any]) -> Frame:
-    """The frame that GRANT grants; ``parts`` are header and body of each input that is present."""
+def frame_of(service: Service[Any], reset: m.Reset, grant: m.Grant, inputs: tuple[FrameInput, ...]) -> Frame:
+    """The frame that GRANT grants, in the episode that RESET began."""
+    return Frame(
+        episode=grant.episode,
+        number=grant.frame,
+        t_ns=grant.t_ns,
+        previous=grant.previous_frame,
+        final=grant.final,
+        inputs=inputs,
+        reports=grant.reports,
+        service=service.run.name,
+        seed=reset.seed,
+        seed_episode=reset.seed_episode,
+    )
+
+
+def inputs_of(grant: m.Grant, parts: Sequence[Any]) -> tuple[FrameInput, ...]:
+    """Inputs of a grant; ``parts`` are header and body of each one that is present."""
     inputs, taken = [], 0
     for entry in grant.inputs:
         if entry.status is m.Status.ABSENT:
@@ -95,17 +113,7 @@ def frame_of(service: Service[Any], grant: m.Grant, parts: Sequence[Any]) -> Fra
         else:
             inputs.append(FrameInput(entry, parts[taken], parts[taken + 1]))
             taken += 2
-    return Frame(
-        episode=grant.episode,
-        number=grant.frame,
-        t_ns=grant.t_ns,
-        previous=grant.previous_frame,
-        final=grant.final,
-        inputs=tuple(inputs),
-        reports=grant.reports,
-        service=service.run.name,
-        seed=service.run.seed,
-    )
+    return tuple(inputs)
 
 
 def done_of(
@@ -117,23 +125,54 @@ def done_of(
     """
     started = time.monotonic_ns()
     headers, parts = [], list[Any]()
-    for topic in sorted(result.products):
-        payload = result.products[topic]
-        if type(payload) is not PAYLOADS.get(topic):
-            raise PayloadError(f"{use} made a payload {type(payload).__name__} for the topic {topic!r}")
+    for topic, payload in _products(use, result):
         header, body = encode_payload(payload)
         headers.append(
             m.ProductHeader(topic=topic, digest=payload_digest(header, body), fidelity=result.fidelity)
         )
         parts += [header, body]
-    done = m.Done(
+    measured = {**result.measured, "step": step_ns, "encode": time.monotonic_ns() - started}
+    return _done(identity, grant, result, tuple(headers), measured), parts
+
+
+def plain_done_of(
+    identity: dict[str, int], use: str, grant: m.Grant, result: StepResult
+) -> tuple[m.Done, tuple[Payload, ...]]:
+    """DONE without digests, and the products as they are, for a consumer in this process.
+
+    Raises `PayloadError` for a product that is not its topic's.
+    """
+    products = _products(use, result)
+    headers = tuple(
+        m.ProductHeader(topic=topic, digest="", fidelity=result.fidelity) for topic, _ in products
+    )
+    done = _done(identity, grant, result, headers, result.measured)
+    return done, tuple(payload for _, payload in products)
+
+
+def _products(use: str, result: StepResult) -> list[tuple[str, Payload]]:
+    products = sorted(result.products.items())
+    for topic, payload in products:
+        if type(payload) is not PAYLOADS.get(topic):
+            raise PayloadError(f"{use} made a payload {type(payload).__name__} for the topic {topic!r}")
+    return products
+
+
+def _done(
+    identity: dict[str, int],
+    grant: m.Grant,
+    result: StepResult,
+    headers: tuple[m.ProductHeader, ...],
+    measured: Mapping[str, int],
+) -> m.Done:
+    return m.Done(
         **identity,
         episode=grant.episode,
         frame=grant.frame,
-        products=tuple(headers),
+        products=headers,
         decisions=dict(result.decisions),
-        measured={**result.measured, "step": step_ns, "encode": time.monotonic_ns() - started},
+        measured=dict(measured),
         counts=dict(result.counts),
         end_episode=result.end_episode,
+        seed=result.seed,
     )
-    return done, parts

@@ -27,6 +27,7 @@ from caviar_services.exchange import (
     done_of,
     frame_of,
     hello_of,
+    inputs_of,
     is_needed,
     preparation_of,
     ready_of,
@@ -71,8 +72,7 @@ class Runner:
         self._service: Service[Any] | None = None
         self._identity: dict[str, Any] = {}
         """``epoch`` and ``attempt``, which stand in every message (clause 1)."""
-        self._episode = -1
-        """Episode that was reset to; −1: none."""
+        self._reset_to: m.Reset | None = None
         self._answers = Answers()
         self._handlers: Mapping[type, Callable[[Any, Sequence[zmq.Frame]], None]] = {
             m.Prepare: self._prepare,
@@ -204,17 +204,18 @@ class Runner:
         with self._reporting("reset", message.episode):
             self._broker.progress(f"reset to episode {message.episode}")
             self._answers.clear()
-            self._running.reset(message.episode, message.seed, message.t0_ns)
-            self._episode = message.episode
+            self._running.reset(message.seed_episode, message.seed, message.t0_ns)
+            self._reset_to = message
             self._broker.send(m.ResetDone(**self._identity, episode=message.episode))
 
     def _grant(self, grant: m.Grant, parts: Sequence[zmq.Frame]) -> None:
-        if grant.episode != self._episode:
+        reset = self._reset_to
+        if reset is None or grant.episode != reset.episode:
             self._unexpected(grant, f"there was no RESET to episode {grant.episode}")
             return
         if self._answers.is_new(grant.frame):
             self._broker.progress(f"frame {grant.frame}")
-            self._answers.put(grant.frame, self._answer(grant, parts))
+            self._answers.put(grant.frame, self._answer(reset, grant, parts))
         answer = self._answers.get(grant.frame)
         if answer is None:
             self._unexpected(grant, f"frame {grant.frame} was answered long ago")
@@ -225,7 +226,7 @@ class Runner:
                 self._running.release_memory()
                 trim_memory()
 
-    def _answer(self, grant: m.Grant, parts: Sequence[zmq.Frame]) -> list[Any]:
+    def _answer(self, reset: m.Reset, grant: m.Grant, parts: Sequence[zmq.Frame]) -> list[Any]:
         """DONE with its products, or FAULT, as it travels."""
         answer: list[Any] = []
 
@@ -233,7 +234,8 @@ class Runner:
             answer.append(encode_message(fault))
 
         with Guard(self._identity, failed, "step", grant.episode, grant.frame) as guard:
-            frame = frame_of(self._running, grant, [part.buffer for part in parts])
+            inputs = inputs_of(grant, [part.buffer for part in parts])
+            frame = frame_of(self._running, reset, grant, inputs)
             started = time.monotonic_ns()
             result = self._running.step(frame)
             stepped = time.monotonic_ns()

@@ -84,6 +84,8 @@ class Prepared:
     prefixes: tuple[str, ...] = ()
     actuators: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    seed: int = -1
+    """Agents: of the first episode; −1: the run's."""
 
 
 class FrameInput:
@@ -134,6 +136,9 @@ class Frame:
     """Recorders: what the services of this frame reported beside their products."""
     service: str = ""
     seed: int = 0
+    """Of the episode: the run's, or what an agent chose."""
+    seed_episode: int = 0
+    """Episodes since the first one with this seed."""
 
     def of(self, topic: str, cls: type[P]) -> dict[str, P]:
         """Payloads of a topic by source, those that are present."""
@@ -165,7 +170,7 @@ class Frame:
 
     def generator(self, stream: str = "") -> np.random.Generator:
         """Random generator of this service for this frame (contract, clause 19)."""
-        return generator(self.seed, self.episode, f"{self.service}/{stream}", self.number)
+        return generator(self.seed, self.seed_episode, f"{self.service}/{stream}", self.number)
 
     def __iter__(self) -> Iterator[FrameInput]:
         return iter(self.inputs)
@@ -184,6 +189,9 @@ class StepResult:
     measured: Mapping[str, int] = field(default_factory=dict)
     """Nanoseconds that named phases took."""
     end_episode: bool = False
+    """Agents: this frame is the last of the episode."""
+    seed: int = -1
+    """Agents, with ``end_episode`` or for the final grant: of the next episode; −1: none chosen."""
 
 
 class Service(ABC, Generic[S]):
@@ -214,7 +222,11 @@ class Service(ABC, Generic[S]):
         return Prepared()
 
     def reset(self, episode: int, seed: int, t0_ns: int) -> None:  # optional hook
-        """Begin an episode. The same arguments lead to the same episode, bit by bit."""
+        """Begin an episode. The same arguments lead to the same episode, bit by bit.
+
+        ``episode`` counts from the first one with this ``seed``: as agents choose seeds, it need not be
+        the `Frame.episode` of the frames that follow.
+        """
 
     @abstractmethod
     def step(self, frame: Frame) -> StepResult:

@@ -219,3 +219,45 @@ def test_messages_while_the_run_stops_do_no_harm() -> None:
     assert "too late" in run.notices("fault", "world")[0].text
     run.feed(ev.ByeReceived("world"))
     assert run.run().outcome.error == "Ctrl-C"
+
+
+def seeds_of(run: Simulation) -> list[tuple[int, int, int]]:
+    """(episode, seed, episodes since that seed was set), as the world was told."""
+    return [(r.episode, r.seed, r.seed_episode) for r in run.seen(m.Reset, "world")]
+
+
+def says(seeds: dict[tuple[int, int], int]) -> dict[str, object]:
+    return {"report": lambda episode, frame: {"seed": seeds.get((episode, frame), -1)}}
+
+
+def test_clause_16_unless_an_agent_chooses_a_seed_all_episodes_have_the_run_s() -> None:
+    run = Simulation(loop(), episodes=3, frames=1, seed=5).join().run()
+    assert seeds_of(run) == [(0, 5, 0), (1, 5, 1), (2, 5, 2)]
+
+
+def test_clause_16_an_agent_chooses_seeds_as_it_ends_episodes() -> None:
+    chosen = says({(0, 1): 70, (2, 4): 71, (4, 4): 70}) | ends((0, 1))
+    run = Simulation(loop(agent=chosen), episodes=6, frames=4, seed=5).join().run()
+    assert seeds_of(run) == [(0, 5, 0), (1, 70, 0), (2, 70, 1), (3, 71, 0), (4, 71, 1), (5, 70, 0)]
+    assert run.outcome.error == ""
+
+
+def test_clause_16_an_agent_chooses_the_seed_of_the_first_episode() -> None:
+    run = Simulation(loop(agent={"ready": {"seed": 70}}), episodes=2, frames=1, seed=5).join().run()
+    assert seeds_of(run) == [(0, 70, 0), (1, 70, 1)]
+
+
+def test_clause_16_agents_that_choose_different_seeds_end_the_run_with_both_named() -> None:
+    peers = [*loop(agent=says({(0, 2): 70})), agent("other", outputs=("action",), **says({(0, 2): 71}))]
+    run = Simulation(peers, episodes=2, frames=2).join().run()
+    assert "'agent'" in run.outcome.error
+    assert "'other'" in run.outcome.error
+    assert "70" in run.outcome.error
+    assert "71" in run.outcome.error
+
+
+@pytest.mark.parametrize("name", ["agent", "world"])
+def test_clause_16_a_seed_chosen_out_of_turn_is_told_and_not_used(name: str) -> None:
+    run = Simulation(loop(**{name: says({(0, 1): 70})}), episodes=2, frames=3, seed=5).join().run()
+    assert seeds_of(run) == [(0, 5, 0), (1, 5, 1)]
+    assert "70" in run.notices("discarded", name)[0].text

@@ -18,7 +18,7 @@ __all__ = ["played_broker"]
 def test_a_service_joins_prepares_steps_and_leaves(broker: Broker) -> None:
     with service(broker.endpoint) as process:
         hello = broker.welcome()
-        assert (hello.version, hello.name, hello.role) == ((1, 0), "sick", "sensors")
+        assert (hello.version, hello.name, hello.role) == (m.PROTOCOL_VERSION, "sick", "sensors")
         assert (hello.inputs, hello.outputs) == ((m.Input(topic="scene"),), ("lidar",))
         assert hello.pid == process.pid
         assert hello.host

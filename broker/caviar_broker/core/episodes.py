@@ -25,6 +25,7 @@ class Episodes:
 
     def begin(self, now: int) -> None:
         """RESET for everybody who is ready; who is not, gets it when it is."""
+        self._run.next_seed()
         for peer in self._members():
             if peer.state is ServiceState.READY:
                 self.reset(peer, now)
@@ -38,8 +39,9 @@ class Episodes:
                 epoch=run.plan.epoch,
                 attempt=peer.attempt,
                 episode=run.episode,
-                seed=run.plan.seed,
+                seed=run.seed,
                 t0_ns=run.plan.t_ns(0),
+                seed_episode=run.seed_episode,
             )
             run.send(peer, message)
 
@@ -136,7 +138,19 @@ class Episodes:
             measured=message.measured,
         )
         told = report if message.decisions or message.counts or message.measured else None
+        if message.seed >= 0:
+            self._seed_chosen(peer, message, schedule, now)
         schedule.done(peer.name, message.frame, products, now, told, end=message.end_episode)
+
+    def _seed_chosen(self, peer: Peer, message: Done, schedule: EpisodeSchedule, now: int) -> None:
+        ends = message.end_episode or message.frame >= schedule.frames
+        if ends and peer.role == "agent":
+            self._run.wish(message.seed, peer, now)
+        else:
+            text = (
+                f"chose the seed {message.seed}, which only an agent may where it ends an episode; not used"
+            )
+            self._run.notice("discarded", peer.name, text, message.frame)
 
     def fault(self, event: ev.FaultReceived, now: int) -> None:
         """FAULT: fatal, unless it is in a frame that the run can do without."""

@@ -161,6 +161,8 @@ class Joining:
         if not self._accepted(peer, message, now):
             return
         peer.ready = message
+        if message.seed >= 0 and run.state is RunState.PREPARING:
+            run.wish(message.seed, peer, now)
         self._prepare_whoever_can(now)
         if run.state is not RunState.PREPARING:
             self._episodes.reset(peer, now)

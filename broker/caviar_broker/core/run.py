@@ -24,6 +24,12 @@ class Run:
         self.graph: Graph | None = None
         """Known once all services have joined."""
         self.episode = 0
+        self.seed = plan.seed
+        """Of the present episode."""
+        self.seed_episode = 0
+        """Episodes since the first one with this seed."""
+        self._wished: tuple[int, Peer] | None = None
+        """Seed of the next episode, and the agent that chose it."""
         self.digest = RunDigest()
         self.ledger = Ledger()
         self.error = ""
@@ -38,6 +44,24 @@ class Run:
     def takes_part(self, peer: Peer) -> bool:
         """Whether the run needs a service: all until the graph is known, then those in it (clause 5)."""
         return self.graph is None or peer.name in self.graph.inputs
+
+    # --- seeds (clause 16) -------------------------------------------------------------------------
+
+    def wish(self, seed: int, peer: Peer, now: int) -> None:
+        """An agent chooses the seed of the next episode."""
+        if self._wished is not None and self._wished[0] != seed:
+            other = self._wished[1]
+            self.fail(
+                f"{other} and {peer} choose different seeds, {self._wished[0]} and {seed}", peer.name, now
+            )
+        self._wished = seed, peer
+
+    def next_seed(self) -> None:
+        """An episode begins: with the seed that was chosen, or the one before."""
+        if self._wished is not None:
+            self.seed, self.seed_episode, self._wished = self._wished[0], 0, None
+        elif self.episode:
+            self.seed_episode += 1
 
     # --- transitions of the run --------------------------------------------------------------------
 

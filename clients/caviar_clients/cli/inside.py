@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 
 from caviar_broker.core import events as ev
-from caviar_clients.embedded import EmbeddedRun
+from caviar_clients.embedded.run import EmbeddedRun
 from caviar_protocol.errors import RunError
 from caviar_protocol.scenario import Scenario
 

@@ -85,7 +85,7 @@ class McapRecorder(Recorder[McapSettings]):
         self._segments = 0
         self._failure: RunError | None = None
         self._base_ns: int | None = 0
-        self._last_ns = 0
+        self._last_ns: int | None = None
         self._stored: dict[tuple[str, str], int] = {}
 
     def prepare(self, preparation: Preparation) -> Prepared:
@@ -121,7 +121,7 @@ class McapRecorder(Recorder[McapSettings]):
     def reset(self, episode: int, seed: int, t0_ns: int) -> None:
         """Begin an episode: its run time starts one sampling period after the last frame."""
         self._stored.clear()
-        if episode > 0:
+        if self._last_ns is not None:
             self._base_ns = None
 
     def step(self, frame: Frame) -> StepResult:
@@ -134,7 +134,7 @@ class McapRecorder(Recorder[McapSettings]):
             raise self._failure
         segment = self._segment or self._open_segment()
         if self._base_ns is None:
-            self._base_ns = self._last_ns + self.run.sampling_period_ns - frame.t_ns
+            self._base_ns = (self._last_ns or 0) + self.run.sampling_period_ns - frame.t_ns
         self._last_ns = self._base_ns + frame.t_ns
         inputs = sorted(map(_encoded, frame.inputs), key=_canonical)
         entry = FrameEntry(

@@ -112,7 +112,8 @@ class ServiceConformance:
                 previous=number - 1,
                 inputs=samples.inputs(service.inputs, number, optional if number == FRAMES - 1 else {}),
                 service=service.run.name,
-                seed=service.run.seed,
+                seed=EPISODE_SEED,
+                seed_episode=episode,
             )
             for number in range(FRAMES)
         ]

@@ -1,0 +1,178 @@
+"""A run in one process, without sockets: the same frame clock, the same services, the same digest.
+
+Time stands still here: whoever is granted a frame is waited for, and nothing is ever late. Under
+``pace = "realtime"`` the clock jumps to its next deadline once nobody has anything to do.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Generator, Mapping
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from msgspec.structs import replace as replace_field
+
+from caviar_broker.briefing import briefings, with_ownership
+from caviar_broker.core import events as ev
+from caviar_broker.core.clock import FrameClock
+from caviar_broker.core.plan import plan_run
+from caviar_broker.journal import JournalFile
+from caviar_broker.statistics import Statistics
+from caviar_clients.embedded.place import Place, Seat
+from caviar_protocol import messages as m
+from caviar_protocol.assets import AssetStore
+from caviar_protocol.errors import RunError
+from caviar_protocol.scenario import Scenario
+from caviar_services.registry import load
+from caviar_services.service import Service
+
+
+class EmbeddedRun:
+    """One run of a scenario in this process.
+
+    Parameters
+    ----------
+    scenario
+        Checked, as `caviar_protocol.scenario_loader.load_scenario` returns it.
+    directory
+        Where the recorder and the journal write. None: nothing is written, recorders are left out, and
+        products go from service to service as they are, so that the outcome has no digest.
+    on_notice, on_frame
+        Told what the user should know, and of each finished frame.
+    seats
+        By name, services that decide outside of the run (`Seat`), with the class that declares them.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        directory: Path | None,
+        on_notice: Callable[[ev.Notice], None] = lambda notice: None,
+        on_frame: Callable[[ev.FrameFinished], None] = lambda frame: None,
+        seats: Mapping[str, type[Service[Any]]] | None = None,
+    ) -> None:
+        if directory is None:
+            scenario = _without_recorders(scenario)
+        scenario = with_ownership(scenario)
+        folder = (directory or Path()).resolve()
+        plan = plan_run(scenario, folder.name, briefings(scenario, folder))
+        # Whoever runs ahead gains nothing in one process, and works in vain where an agent ends the episode.
+        plan = replace(plan, frames_in_flight=1)
+        self.statistics = Statistics({s.name: s.budget_ns for s in plan.services})
+        self._now = 0
+        self._clock = FrameClock(plan, self._now)
+        self._journal = JournalFile(folder / "journal.msgpack", plan.epoch) if directory else None
+        self._on_notice, self._on_frame = on_notice, on_frame
+        self.outcome: ev.Finished | None = None
+        """How it ended; None until then."""
+        self._stop_reason = ""
+        self._orders: deque[ev.Send] = deque()
+        store, seats = AssetStore(), seats or {}
+        self.seats = {
+            name: Seat(
+                name, scenario.services[name].use, cls, store, self._feed, digests=directory is not None
+            )
+            for name, cls in seats.items()
+        }
+        """Services that decide outside of the run."""
+        self._places: dict[str, Place] = {
+            name: self.seats.get(name)
+            or Place(
+                name, spec.use, load(spec.role, spec.use), store, self._feed, digests=directory is not None
+            )
+            for name, spec in scenario.services.items()
+        }
+
+    def run(self) -> ev.Finished:
+        """Run to the end."""
+        for _ in self.steps():
+            pass
+        if self.outcome is None:
+            raise RunError("the run ended without an outcome")
+        return self.outcome
+
+    def steps(self) -> Generator[None, None, None]:
+        """Run to the end, and come back behind whatever a service did.
+
+        Do not go on while a seat has a frame that is not answered. However the loop is left, every service
+        is closed.
+        """
+        with ExitStack() as stack:
+            if self._journal is not None:
+                stack.callback(self._journal.close)
+            for place in self._places.values():
+                stack.callback(place.close)
+            for place in self._places.values():
+                self._feed(ev.Joined(place.hello()))
+            while self.outcome is None:
+                if self._stop_reason:
+                    reason, self._stop_reason = self._stop_reason, ""
+                    self._feed(ev.StopRequested(reason))
+                elif self._orders:
+                    self._obey(self._orders.popleft())
+                else:
+                    self._skip_time()
+                yield
+
+    def stop(self, reason: str) -> None:
+        """End the run behind what is being done. May be called from a signal handler."""
+        self._stop_reason = reason
+
+    def _obey(self, order: ev.Send) -> None:
+        began = time.monotonic_ns()
+        self._places[order.service].obey(order)
+        if isinstance(order.message, m.Grant):
+            self.statistics.latency(order.service, time.monotonic_ns() - began, missed=False)
+
+    def _skip_time(self) -> None:
+        """Nobody has anything to do: to the next deadline."""
+        deadline = self._clock.next_deadline()
+        if deadline is None:
+            raise RunError("nobody has anything to do, and the run is not over")
+        self._now = max(self._now, deadline)
+        self._clock.expire(self._now)
+        self._perform()
+
+    def _feed(self, event: ev.Event) -> None:
+        self._clock.receive(event, self._now)
+        self._perform()
+
+    def _perform(self) -> None:
+        while actions := self._clock.actions():
+            written = 0
+            for action in actions:
+                kind = type(action)
+                if kind is ev.Send:
+                    self._orders.append(action)  # type: ignore[arg-type]  # its type was looked at
+                elif kind is ev.Journal:
+                    written = action.number  # type: ignore[union-attr]
+                elif kind is not ev.Latency:
+                    self._tell(action)
+            if written:
+                if self._journal is not None:
+                    self._journal.write(action for action in actions if isinstance(action, ev.Journal))
+                self._clock.receive(ev.Journaled(written), self._now)
+
+    def _tell(self, action: ev.Action) -> None:
+        match action:
+            case ev.FrameFinished():
+                self.statistics.frame(time.monotonic_ns())
+                self._on_frame(action)
+            case ev.Notice():
+                self._on_notice(action)
+            case ev.Finished():
+                self.outcome = action if self._journal is not None else replace_field(action, digest="")
+            case ev.TurnAway():
+                raise RunError(f"{action.name!r} is refused: {action.refusal.message}")
+            case _:
+                pass
+
+
+def _without_recorders(scenario: Scenario) -> Scenario:
+    services = {name: spec for name, spec in scenario.services.items() if spec.role != "recorder"}
+    run = replace_field(scenario.run, record=())
+    return replace_field(scenario, services=services, run=run)
