@@ -98,11 +98,19 @@ class Payload(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Names of sizes, and the tuple fields that have this length: ``{"N": ("names", "classes")}``."""
 
     def __post_init__(self) -> None:
+        cls = type(self)
         sizes = {size: self._length(fields) for size, fields in self.sizes_from.items()}
-        for name, spec in array_fields(type(self)).items():
+        for name, dtype, shape, spec in _expected(cls):
             value = getattr(self, name)
-            if value is not None:
-                _check_array(type(self).__name__, name, value, spec, sizes)
+            if value is None:
+                continue
+            # Paths cross here a thousand times a second: what is right is seen with few steps.
+            if type(value) is not np.ndarray or value.dtype is not dtype or value.ndim != len(shape):
+                _check_array(cls.__name__, name, value, spec, sizes)
+                continue
+            for size, expected in zip(value.shape, shape, strict=True):
+                if size != (expected if type(expected) is int else sizes.setdefault(expected, size)):
+                    _check_array(cls.__name__, name, value, spec, sizes)
         self.check()
 
     def check(self) -> None:  # optional hook
@@ -121,6 +129,13 @@ class Payload(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
         return all(_equal(getattr(self, f), getattr(other, f)) for f in self.__struct_fields__)
 
     __hash__ = None  # type: ignore[assignment]  # arrays are not hashable, so neither is their owner
+
+
+@cache
+def _expected(cls: type) -> tuple[tuple[str, np.dtype[Any], tuple[Any, ...], ArrayField], ...]:
+    """Name, dtype, shape and description of each array field."""
+    fields = array_fields(cls).items()
+    return tuple((name, WIRE_DTYPES[spec.dtype], spec.shape, spec) for name, spec in fields)
 
 
 def _equal(a: Any, b: Any) -> bool:

@@ -68,6 +68,23 @@ def rotation_matrix(q: Sequence[float]) -> Float64Array:
     )
 
 
+def rotated(q: Sequence[float], v: Sequence[float]) -> Vector:
+    """World components of a vector given in body axes: R·v, for one vector without an array."""
+    w, x, y, z = q
+    a, b, c = v
+    return (
+        (1 - 2 * (y * y + z * z)) * a + 2 * (x * y - w * z) * b + 2 * (x * z + w * y) * c,
+        2 * (x * y + w * z) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z - w * x) * c,
+        2 * (x * z - w * y) * a + 2 * (y * z + w * x) * b + (1 - 2 * (x * x + y * y)) * c,
+    )
+
+
+def unrotated(q: Sequence[float], v: Sequence[float]) -> Vector:
+    """Body components of a vector given in world axes: the inverse of `rotated`."""
+    w, x, y, z = q
+    return rotated((w, -x, -y, -z), v)
+
+
 def multiply(p: Sequence[float], q: Sequence[float]) -> UnitQuaternion:
     """Hamilton product p·q: first q, then p."""
     pw, px, py, pz = p
@@ -82,12 +99,9 @@ def multiply(p: Sequence[float], q: Sequence[float]) -> UnitQuaternion:
 
 def compose(parent: Pose, mount: Pose) -> Pose:
     """World pose of something mounted on a parent with the relative pose ``mount``."""
-    x, y, z = rotation_matrix(parent.orientation) @ mount.position
+    x, y, z = rotated(parent.orientation, mount.position)
     px, py, pz = parent.position
-    return Pose(
-        (px + float(x), py + float(y), pz + float(z)),
-        multiply(parent.orientation, mount.orientation),
-    )
+    return Pose((px + x, py + y, pz + z), multiply(parent.orientation, mount.orientation))
 
 
 def direction(zenith: float, azimuth: float) -> Float64Array:

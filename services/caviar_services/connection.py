@@ -32,7 +32,8 @@ SILENCE_GRACE_S = 1.0
 
 
 class Terminated(BaseException):
-    """SIGTERM came. An order, like KeyboardInterrupt, that no handler of errors shall swallow."""
+    """SIGTERM came, or what the text says. An order, like KeyboardInterrupt, that no handler of errors
+    shall swallow."""
 
 
 class RunOver(BaseException):

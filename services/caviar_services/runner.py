@@ -35,7 +35,7 @@ from caviar_services.exchange import (
 )
 from caviar_services.registry import load
 from caviar_services.service import Prepared, Service
-from caviar_services.termination import TERMINATED, Termination
+from caviar_services.termination import TERMINATED, SignalTermination, Termination
 
 TRIM_EVERY = 10
 """Frames after which free memory is given back to the system. Megabytes come and go in each frame in ever
@@ -52,22 +52,31 @@ class Runner:
     ----------
     name
         Name of the service in the run.
-    role, use
-        Registered implementation.
+    cls, use
+        Implementation, and what it is called.
     endpoint
         ZeroMQ address of the broker.
     connect_timeout_s
         Until the broker has to answer HELLO, or a request for scenery [s].
+    termination
+        How this runner is told to end; none: not by signals.
     """
 
     def __init__(
-        self, name: str, role: str, use: str, endpoint: str, connect_timeout_s: float = CONNECT_TIMEOUT_S
+        self,
+        name: str,
+        cls: type[Service[Any]],
+        use: str,
+        endpoint: str,
+        connect_timeout_s: float = CONNECT_TIMEOUT_S,
+        termination: Termination | None = None,
     ) -> None:
-        self.name, self.use = name, use
-        self.cls = load(role, use)
+        self.name, self.use, self.cls = name, use, cls
+        self.ended = ""
+        """Why the broker ended the run, once it did."""
         self._timeout_s = connect_timeout_s
         self._store = AssetStore()
-        self._termination = Termination()
+        self._termination = termination or Termination()
         self._broker = Connection(name, endpoint, self._termination)
         self._service: Service[Any] | None = None
         self._identity: dict[str, Any] = {}
@@ -94,10 +103,11 @@ class Runner:
         except RunOver as order:
             if self._service is None and not self._identity:
                 raise RunError(f"the run ended before {self.name!r} was in it: {order}") from order
-            self._bye(str(order))
+            self.ended = str(order)
+            self._bye(self.ended)
             return 0
-        except Terminated:
-            self._bye("SIGTERM")
+        except Terminated as order:
+            self._bye(str(order) or "SIGTERM")
             return TERMINATED
         finally:
             self._close()
@@ -274,4 +284,4 @@ class Runner:
 
 def run_service(name: str, role: str, use: str, endpoint: str, connect_timeout_s: float) -> int:
     """Run a registered implementation as the service ``name``; the exit status."""
-    return Runner(name, role, use, endpoint, connect_timeout_s).run()
+    return Runner(name, load(role, use), use, endpoint, connect_timeout_s, SignalTermination()).run()

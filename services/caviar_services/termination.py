@@ -16,22 +16,11 @@ TERMINATED = 128 + signal.SIGTERM
 
 
 class Termination:
-    """SIGTERM and SIGINT as a flag, and as a certain end.
-
-    A Python signal handler does not run while the main thread is inside a compiled call, so a
-    thread of its own hears of the signal through ``set_wakeup_fd``, and ends the process when the
-    main thread has not done so in time. Against a call that holds the interpreter's lock not even
-    that helps: then the process ends as soon as the lock is free, or is killed by whoever started it.
-    """
+    """The order to end, as a flag, and as a certain end of the process."""
 
     def __init__(self) -> None:
         self.requested = False
         self._ended = threading.Event()
-        self._read, write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
-        signal.set_wakeup_fd(write, warn_on_full_buffer=False)
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, self._handle)
-        threading.Thread(target=self._watch, name="termination", daemon=True).start()
 
     def enforce(self, grace_s: float, status: int, last_words: str) -> None:
         """See to it that the process ends with ``status`` unless it does so itself within ``grace_s``."""
@@ -46,6 +35,24 @@ class Termination:
     def finished(self) -> None:
         """Everything is closed; the process ends by itself."""
         self._ended.set()
+
+
+class SignalTermination(Termination):
+    """SIGTERM and SIGINT as such an order.
+
+    A Python signal handler does not run while the main thread is inside a compiled call, so a
+    thread of its own hears of the signal through ``set_wakeup_fd``, and ends the process when the
+    main thread has not done so in time. Against a call that holds the interpreter's lock not even
+    that helps: then the process ends as soon as the lock is free, or is killed by whoever started it.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._read, write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        signal.set_wakeup_fd(write, warn_on_full_buffer=False)
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._handle)
+        threading.Thread(target=self._watch, name="termination", daemon=True).start()
 
     def _handle(self, *_: object) -> None:
         self.requested = True

@@ -244,11 +244,11 @@ def speak(name: str, endpoint: str, size: int) -> None:
 
 def serve(name: str, endpoint: str, size: int) -> None:
     """Client of the broker: a service in the runner."""
-    from caviar_services.runner import Runner
+    from caviar_services.runner import CONNECT_TIMEOUT_S, run_service
 
     hub = name == "hub"
     place = "bench_broker:Hub" if hub else "bench_broker:Leaf"
-    Runner(name, "world" if hub else "sensors", place, endpoint).run()
+    run_service(name, "world" if hub else "sensors", place, endpoint, CONNECT_TIMEOUT_S)
 
 
 class Settings(msgspec.Struct, frozen=True):

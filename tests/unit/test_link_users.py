@@ -10,8 +10,9 @@ from link_builders import CARRIER, antenna, channel_of, random_h, scene_of
 
 from caviar_protocol.coordinates import angles
 from caviar_protocol.errors import PayloadError
+from caviar_protocol.pairs import directions, pairs_of
 from caviar_protocol.topics import Carrier
-from caviar_services.link.users import channels_of, directions, pairs_of, sweep_users, users_of
+from caviar_services.link.users import channels_of, sweep_users, users_of
 
 BS = antenna("bs", "tx", (1, 4))
 CAR = antenna("car/rx", "rx", (1, 2), (10.0, 0.0, 0.0))

@@ -173,6 +173,8 @@ class DecisionBook:
 
     def _journal(self, task: Task, decisions: Mapping[str, Decision], outcome: str, number: int) -> None:
         """Products of earlier frames stand in entries of their own; others only if they may be used later."""
+        if self._plan.ephemeral:
+            return
         products: tuple[Product, ...] = ()
         if task.service in self._kept:
             products = tuple(d.product for d in decisions.values() if d.product and not d.journal)
@@ -194,14 +196,8 @@ class DecisionBook:
     def _finish_frames(self) -> None:
         while self.finished_frames < min(self.frames, min(self.next.values())):
             frame = self.finished_frames
-            decided = [self._tasks[name][frame] for name in self._graph.order]
-            fresh = (
-                (topic, task.service, decision.product.digest)
-                for task in decided
-                for topic, decision in task.decisions.items()
-                if decision.status is Status.FRESH and decision.product is not None
-            )
-            self._digest.add_frame(self._episode, frame, fresh)
+            if not self._plan.ephemeral:
+                self._digest.add_frame(self._episode, frame, self._fresh(frame))
             t_ns = self._plan.t_ns(frame)
             self._actions.append(FrameFinished(self._episode, frame, t_ns, self.lag_ns()))
             self.finished_frames += 1
@@ -209,6 +205,16 @@ class DecisionBook:
                 old = tasks.get(frame - 1)
                 if old is not None and old.state not in OUTSTANDING:
                     del tasks[frame - 1]
+
+    def _fresh(self, frame: int) -> Iterable[tuple[str, str, str]]:
+        """(topic, source, digest) of the fresh products of a frame that everybody has decided."""
+        decided = [self._tasks[name][frame] for name in self._graph.order]
+        return (
+            (topic, task.service, decision.product.digest)
+            for task in decided
+            for topic, decision in task.decisions.items()
+            if decision.status is Status.FRESH and decision.product is not None
+        )
 
     # --- invariants ----------------------------------------------------------------------------------
 

@@ -9,7 +9,9 @@ class Ledger:
     Entries become safe in order, so one number says which are: all up to and including `written`.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, kept: bool = True) -> None:
+        self._kept = kept
+        """Whether there is a journal; without one every entry is as safe as it will be."""
         self.last = 0
         """Number of the last entry; 0: none yet."""
         self.written = 0
@@ -20,7 +22,9 @@ class Ledger:
     def enter(self, now: int) -> int:
         """Number of a new entry."""
         self.last += 1
-        if self.waiting_since is None:
+        if not self._kept:
+            self.written = self.last
+        elif self.waiting_since is None:
             self.waiting_since = now
         return self.last
 

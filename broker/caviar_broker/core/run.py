@@ -31,7 +31,7 @@ class Run:
         self._wished: tuple[int, Peer] | None = None
         """Seed of the next episode, and the agent that chose it."""
         self.digest = RunDigest()
-        self.ledger = Ledger()
+        self.ledger = Ledger(kept=not plan.ephemeral)
         self.error = ""
         self.culprit = ""
         self.actions: list[Action] = []
@@ -86,7 +86,8 @@ class Run:
         """The run is finished once everybody has left."""
         if self.state is RunState.STOPPING and not any(peer.present for peer in self.peers.values()):
             self.enter(RunEvent.ALL_GONE, now)
-            self.actions.append(Finished(self.error, self.culprit, self.digest.hexdigest()))
+            digest = "" if self.plan.ephemeral else self.digest.hexdigest()
+            self.actions.append(Finished(self.error, self.culprit, digest))
 
     # --- what goes out -------------------------------------------------------------------------------
 

@@ -61,7 +61,7 @@ class EmbeddedRun:
         folder = (directory or Path()).resolve()
         plan = plan_run(scenario, folder.name, briefings(scenario, folder))
         # Whoever runs ahead gains nothing in one process, and works in vain where an agent ends the episode.
-        plan = replace(plan, frames_in_flight=1)
+        plan = replace(plan, frames_in_flight=1, ephemeral=directory is None)
         self.statistics = Statistics({s.name: s.budget_ns for s in plan.services})
         self._now = 0
         self._clock = FrameClock(plan, self._now)
@@ -143,19 +143,18 @@ class EmbeddedRun:
 
     def _perform(self) -> None:
         while actions := self._clock.actions():
-            written = 0
+            entries: list[ev.Journal] = []
             for action in actions:
                 kind = type(action)
                 if kind is ev.Send:
                     self._orders.append(action)  # type: ignore[arg-type]  # its type was looked at
                 elif kind is ev.Journal:
-                    written = action.number  # type: ignore[union-attr]
+                    entries.append(action)  # type: ignore[arg-type]
                 elif kind is not ev.Latency:
                     self._tell(action)
-            if written:
-                if self._journal is not None:
-                    self._journal.write(action for action in actions if isinstance(action, ev.Journal))
-                self._clock.receive(ev.Journaled(written), self._now)
+            if entries and self._journal is not None:
+                self._journal.write(entries)
+                self._clock.receive(ev.Journaled(entries[-1].number), self._now)
 
     def _tell(self, action: ev.Action) -> None:
         match action:
@@ -165,7 +164,7 @@ class EmbeddedRun:
             case ev.Notice():
                 self._on_notice(action)
             case ev.Finished():
-                self.outcome = action if self._journal is not None else replace_field(action, digest="")
+                self.outcome = action
             case ev.TurnAway():
                 raise RunError(f"{action.name!r} is refused: {action.refusal.message}")
             case _:

@@ -11,8 +11,8 @@ import msgspec
 
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.messages import Input, Role
+from caviar_protocol.pairs import Pair, pairs_of
 from caviar_protocol.topics import Action, BeamChoice, Scene
-from caviar_services.link.users import Pair, pairs_of
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
 
 BEAM = "beam:"

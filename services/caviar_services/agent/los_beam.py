@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from caviar_protocol.pairs import Pair, directions
 from caviar_protocol.topics import BeamChoice, Scene
 from caviar_services.agent.base import Agent, AgentSettings
 from caviar_services.link.codebook import beam_towards
-from caviar_services.link.users import Pair, directions
 from caviar_services.service import Frame
 
 
@@ -22,10 +22,11 @@ class LosBeamAgent(Agent[AgentSettings]):
 
     def choose(self, frame: Frame, scene: Scene, pairs: Sequence[Pair]) -> Iterator[BeamChoice]:
         """The straight-line pair of each user, the same on every carrier."""
-        for pair, at_tx, at_rx in zip(pairs, *directions(scene, pairs), strict=True):
+        at_tx, at_rx = (vectors.tolist() for vectors in directions(scene, pairs))
+        for pair, towards_rx, towards_tx in zip(pairs, at_tx, at_rx, strict=True):
             yield BeamChoice(
                 tx=pair.tx.name,
                 rx=pair.rx.name,
-                tx_beam=int(beam_towards(pair.tx.array, at_tx)),
-                rx_beam=int(beam_towards(pair.rx.array, at_rx)),
+                tx_beam=beam_towards(pair.tx.array, towards_rx),
+                rx_beam=beam_towards(pair.rx.array, towards_tx),
             )

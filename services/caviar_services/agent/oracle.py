@@ -7,10 +7,11 @@ from typing import ClassVar
 
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.messages import Input
+from caviar_protocol.pairs import Pair
 from caviar_protocol.topics import BeamChoice, Channel, Scene
 from caviar_services.agent.base import Agent, AgentSettings
 from caviar_services.link.sweep import best_pairs
-from caviar_services.link.users import Pair, User, channels_of, sweep_users
+from caviar_services.link.users import User, channels_of, sweep_users
 from caviar_services.service import Frame
 
 

@@ -14,15 +14,16 @@ from typing import Annotated, Literal
 import msgspec
 import numpy as np
 
-from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, quantity
-from caviar_protocol.coordinates import angles
+from caviar_protocol.arrays import Float64Array, Int32Array, quantity
 from caviar_protocol.errors import PayloadError
+from caviar_protocol.pairs import directions
 from caviar_protocol.topics import Carrier, Channel, Link, Scene
+from caviar_protocol.topics.scene import Device
 from caviar_services.link.base import LinkModel
 from caviar_services.link.choices import Choices, choices_of
 from caviar_services.link.codebook import beam_towards
 from caviar_services.link.sweep import best_pairs
-from caviar_services.link.users import User, UserChannels, channels_of, directions, sweep_users, users_of
+from caviar_services.link.users import User, UserChannels, channels_of, sweep_users, users_of
 from caviar_services.service import Frame, StepResult
 
 BOLTZMANN = 1.380649e-23
@@ -53,6 +54,7 @@ class BeamLink(LinkModel[BeamLinkSettings]):
     """Scores the agents' beam pairs against the best pair and the straight-line pair."""
 
     Settings = BeamLinkSettings
+    _budget: _Budget | None = None
 
     def step(self, frame: Frame) -> StepResult:
         """Link of a frame. Raises `PayloadError` naming the agent or user at fault."""
@@ -60,43 +62,48 @@ class BeamLink(LinkModel[BeamLinkSettings]):
         if channel is None:
             raise PayloadError(f"{self.run.name} was granted frame {frame.number} without a channel")
         scene = frame.scene()
-        users = users_of(scene, channel.carriers)
+        budget = self._budget
+        if budget is None or (budget.devices, budget.carriers) != (scene.devices, channel.carriers):
+            budget = self._budget = _Budget.of(scene, channel.carriers, self.settings)
+        users = budget.users
         choices = choices_of(frame, users)
         channels = channels_of(channel, users)
         scores = _score(scene, users, choices, channels, self.settings.top_k)
+        without_path = int(np.count_nonzero(~channels.has_path))
+        without_channel = int(np.count_nonzero(~channels.known))
         counts = {
-            "users-without-path": int(np.sum(channels.known & ~channels.has_path)),
-            "users-without-channel": int(np.sum(~channels.known)),
+            "users-without-path": without_path - without_channel,  # what is unknown has no path either
+            "users-without-channel": without_channel,
             "commands-for-absent-users": choices.outdated,
         }
         return StepResult(
-            products={"link": self._link(users, choices, channels, scores)},
+            products={"link": self._link(budget, choices, channels, scores, without_path)},
             fidelity=channel.rung,
             counts={name: count for name, count in counts.items() if count},
         )
 
-    def _link(self, users: Sequence[User], choices: Choices, channels: UserChannels, scores: _Scores) -> Link:
+    def _link(
+        self, budget: _Budget, choices: Choices, channels: UserChannels, scores: _Scores, without_path: int
+    ) -> Link:
         settings = self.settings
-        bandwidth = np.array([user.carrier.bandwidth_hz for user in users], dtype=np.float64)
-        noise = np.array(
-            [noise_power(user.carrier, settings.noise_figure_db, settings.temperature_k) for user in users]
-        )
-        power_over_noise = np.array([transmit_power(user) for user in users]) / noise
         best = scores.top_abs_y.max(axis=1, initial=0.0)
-        snr = power_over_noise * scores.abs_y**2
+        snr = budget.power_over_noise * scores.abs_y**2
         efficiency = np.log2(1 + snr)
         if settings.max_spectral_efficiency is not None:
             efficiency = np.minimum(efficiency, settings.max_spectral_efficiency)
-        rewards: dict[RewardKind, Float64Array] = {
-            "abs_y": scores.abs_y,
-            "normalised": np.divide(scores.abs_y, best, out=np.zeros(len(users)), where=best > 0),
-            "snr": snr,
-            "spectral_efficiency": efficiency,
-        }
+        match settings.reward:
+            case "abs_y":
+                reward = scores.abs_y
+            case "normalised":
+                reward = np.divide(scores.abs_y, best, out=np.zeros(len(best)), where=best > 0)
+            case "snr":
+                reward = snr
+            case "spectral_efficiency":
+                reward = efficiency
         return Link(
-            tx=tuple(user.tx.name for user in users),
-            rx=tuple(user.rx.name for user in users),
-            carrier=tuple(user.carrier.name for user in users),
+            tx=budget.tx,
+            rx=budget.rx,
+            carrier=budget.carrier,
             has_path=channels.has_path,
             los=channels.los,
             tx_beam=choices.tx_beam,
@@ -109,11 +116,41 @@ class BeamLink(LinkModel[BeamLinkSettings]):
             aod_azimuth=scores.aod_azimuth,
             aoa_azimuth=scores.aoa_azimuth,
             snr=snr,
-            snr_best=power_over_noise * best**2,
+            snr_best=budget.power_over_noise * best**2,
             spectral_efficiency=efficiency,
-            bit_rate=bandwidth * efficiency,
-            reward=rewards[settings.reward],
-            no_path=int(np.sum(~channels.has_path)),
+            bit_rate=budget.bandwidth * efficiency,
+            reward=reward,
+            no_path=without_path,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Budget:
+    """What stays the same while the same devices are there; Shape ``[U]`` each."""
+
+    devices: tuple[Device, ...]
+    carriers: tuple[Carrier, ...]
+    users: list[User]
+    tx: tuple[str, ...]
+    rx: tuple[str, ...]
+    carrier: tuple[str, ...]
+    bandwidth: Float64Array
+    power_over_noise: Float64Array
+
+    @classmethod
+    def of(cls, scene: Scene, carriers: tuple[Carrier, ...], settings: BeamLinkSettings) -> _Budget:
+        users = users_of(scene, carriers)
+        figure, temperature = settings.noise_figure_db, settings.temperature_k
+        noise = np.array([noise_power(user.carrier, figure, temperature) for user in users])
+        return cls(
+            devices=scene.devices,
+            carriers=carriers,
+            users=users,
+            tx=tuple(user.tx.name for user in users),
+            rx=tuple(user.rx.name for user in users),
+            carrier=tuple(user.carrier.name for user in users),
+            bandwidth=np.array([user.carrier.bandwidth_hz for user in users], dtype=np.float64),
+            power_over_noise=np.array([transmit_power(user) for user in users]) / noise,
         )
 
 
@@ -150,6 +187,7 @@ def _score(
 ) -> _Scores:
     """Sweep all pairs of all users and read off the chosen, the best and the baseline pairs."""
     at_tx, at_rx = directions(scene, users)
+    towards_rx, towards_tx = at_tx.tolist(), at_rx.tolist()
     k = min(top_k, max((user.tx.array.size * user.rx.array.size for user in users), default=0))
     scores = _Scores(
         abs_y=np.zeros(len(users)),
@@ -157,10 +195,10 @@ def _score(
         top_rx_beam=np.full((len(users), k), -1, dtype=np.int32),
         top_abs_y=np.zeros((len(users), k)),
         baseline_abs_y=np.zeros(len(users)),
-        aod_azimuth=angles(at_tx)[:, 1],
-        aoa_azimuth=angles(at_rx)[:, 1],
+        aod_azimuth=np.arctan2(at_tx[:, 1], at_tx[:, 0]),
+        aoa_azimuth=np.arctan2(at_rx[:, 1], at_rx[:, 0]),
     )
-    served: BoolArray = choices.tx_beam >= 0
+    served = choices.tx_beam.tolist()
     for u, abs_y in enumerate(sweep_users(users, channels.h)):
         if abs_y is None:
             continue
@@ -169,8 +207,9 @@ def _score(
         scores.top_tx_beam[u, :listed] = best.tx_beam
         scores.top_rx_beam[u, :listed] = best.rx_beam
         scores.top_abs_y[u, :listed] = best.abs_y
-        if served[u]:
+        if served[u] >= 0:
             scores.abs_y[u] = abs_y[choices.tx_beam[u], choices.rx_beam[u]]
-        baseline = (beam_towards(users[u].tx.array, at_tx[u]), beam_towards(users[u].rx.array, at_rx[u]))
+        user = users[u]
+        baseline = beam_towards(user.tx.array, towards_rx[u]), beam_towards(user.rx.array, towards_tx[u])
         scores.baseline_abs_y[u] = abs_y[baseline]
     return scores

@@ -99,11 +99,11 @@ class _Book:
         self.scheduled[command.tx] = (agent, command.rx)
 
     def result(self) -> Choices:
-        tx_beam, rx_beam = (np.full(len(self.users), -1, dtype=np.int32) for _ in range(2))
+        tx_beam, rx_beam = ([-1] * len(self.users) for _ in range(2))
         for index, (_, command) in self.chosen.items():
             if self.scheduled.get(command.tx, ("", command.rx))[1] == command.rx:
                 tx_beam[index], rx_beam[index] = command.tx_beam, command.rx_beam
-        return Choices(tx_beam, rx_beam, self.outdated)
+        return Choices(np.array(tx_beam, np.int32), np.array(rx_beam, np.int32), self.outdated)
 
     def _first_wins(
         self, index: int, previous: tuple[str, BeamChoice], agent: str, command: BeamChoice

@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
-from caviar_protocol.arrays import Complex128Array, Float64Array, Int64Array
+from caviar_protocol.arrays import Complex128Array, Float64Array
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.topics.scene import AntennaArray
-from caviar_services.antenna import steering_vector
 
 
 def dft_codebook(array: AntennaArray) -> Complex128Array:
@@ -40,19 +40,28 @@ def _dft(size: int) -> Complex128Array:
     return matrix
 
 
-def beam_towards(array: AntennaArray, directions: Float64Array) -> Int64Array:
-    """Beam with the greatest ``|c_k* a(k̂)|`` towards each direction; Shape ``[..., 3]`` to ``[...]``.
+def beam_towards(array: AntennaArray, direction: Sequence[float]) -> int:
+    """Beam with the greatest ``|c_k* a(k̂)|`` towards a direction, a unit vector in device axes.
 
-    ``directions`` are unit vectors in device axes. The maximum is searched over all beams, so
-    wrapped beams, end-fire directions and spacings other than half a wavelength need no special
-    cases. Of beams with equal gain the lowest index is taken.
+    Along one axis of N elements with a spacing of d wavelengths, and u the direction's cosine,
+    ``|c_k* a| = |sin(πNv)| / (sqrt(N)·|sin πv|)`` with ``v = d·u − k/N`` (Tse and Viswanath, section
+    7.3.4). The numerator is the same for all k, so the best k is the one nearest to N·d·u, modulo N:
+    wrapped beams, end-fire directions and grating lobes need no special cases. Of two beams with equal
+    gain the one of lower index is taken.
     """
-    vectors = steering_vector(array, directions)
-    grid = vectors.reshape(*vectors.shape[:-1], array.columns, array.rows)
-    # Row k of conj(codebook) has entries exp(−j2πkn/N): c_k* a for all k is a Fourier transform.
-    response = np.abs(np.fft.fftn(grid, axes=(-2, -1))).reshape(vectors.shape)
-    beams: Int64Array = np.argmax(response, axis=-1).astype(np.int64)
-    return beams
+    _, y, z = direction
+    column = _nearest(array.columns, array.horizontal_spacing * y)
+    row = _nearest(array.rows, -array.vertical_spacing * z)  # rows count from +z to −z
+    return column * array.rows + row
+
+
+def _nearest(size: int, turns: float) -> int:
+    """The k of 0 … size − 1 with the least ``|turns − k/size|`` modulo 1."""
+    exact = size * turns
+    below = math.ceil(exact - 0.5)
+    is_tie = exact - below == 0.5
+    beam = below % size
+    return 0 if is_tie and beam == size - 1 else beam
 
 
 def pointing_directions(array: AntennaArray, beam: int) -> Float64Array:

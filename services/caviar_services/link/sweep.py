@@ -9,6 +9,9 @@ import numpy as np
 from caviar_protocol.arrays import Complex128Array, Float64Array, Int32Array
 from caviar_protocol.topics.scene import AntennaArray
 
+SORTED_WHOLE = 256
+"""Pairs up to which sorting all of them is faster than looking for the best first."""
+
 
 class Pairs(NamedTuple):
     """Beam pairs, best first, Shape ``[k]`` each."""
@@ -27,7 +30,11 @@ def sweep(h: Complex128Array, tx: AntennaArray, rx: AntennaArray) -> Float64Arra
     """
     leading = h.shape[:-2]
     elements = h.reshape(*leading, rx.columns, rx.rows, tx.columns, tx.rows)
-    y = np.fft.fftn(elements, axes=(-4, -3, -2, -1), norm="ortho").reshape(*leading, rx.size, tx.size)
+    y = elements
+    for axis in (-4, -3, -2, -1):
+        if elements.shape[axis] > 1:
+            y = np.fft.fft(y, axis=axis, norm="ortho")
+    y = y.reshape(*leading, rx.size, tx.size)
     magnitude: Float64Array = np.ascontiguousarray(np.abs(y).swapaxes(-1, -2))
     return magnitude
 
@@ -40,8 +47,11 @@ def best_pairs(abs_y: Float64Array, k: int) -> Pairs:
     """
     flat = abs_y.ravel()
     k = min(k, flat.size)
-    threshold = np.partition(flat, flat.size - k)[flat.size - k]
-    candidates = np.flatnonzero(flat >= threshold)
-    order = candidates[np.argsort(-flat[candidates], kind="stable")][:k]
+    if flat.size <= SORTED_WHOLE:
+        order = np.argsort(-flat, kind="stable")[:k]
+    else:
+        threshold = np.partition(flat, flat.size - k)[flat.size - k]
+        candidates = np.flatnonzero(flat >= threshold)
+        order = candidates[np.argsort(-flat[candidates], kind="stable")][:k]
     tx_beam, rx_beam = np.divmod(order, abs_y.shape[1])
     return Pairs(tx_beam.astype(np.int32), rx_beam.astype(np.int32), flat[order])

@@ -1,8 +1,4 @@
-"""Users of a frame, where they are seen from each other, and their channels.
-
-A *pair* is a transmitting and a receiving device of the scene, a *user* such a pair on one
-carrier. A device that both transmits and receives is no user of itself.
-"""
+"""Users of a frame and their channels; a *user* is a pair of devices on one carrier."""
 
 from __future__ import annotations
 
@@ -13,19 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array
-from caviar_protocol.coordinates import Pose, rotation_matrix
 from caviar_protocol.errors import PayloadError
-from caviar_protocol.scene import antennas, device_pose
-from caviar_protocol.topics import AntennaDevice, Carrier, Channel, Scene
+from caviar_protocol.pairs import Pair, pairs_of
+from caviar_protocol.topics import Carrier, Channel, Scene
 from caviar_services.link.sweep import sweep
-
-
-@dataclass(frozen=True)
-class Pair:
-    """A transmitter and a receiver."""
-
-    tx: AntennaDevice
-    rx: AntennaDevice
 
 
 @dataclass(frozen=True)
@@ -35,41 +22,10 @@ class User(Pair):
     carrier: Carrier
 
 
-def pairs_of(scene: Scene) -> list[Pair]:
-    """All pairs of the scene, sorted by TX, then RX."""
-    receivers = antennas(scene, "rx")
-    return [Pair(tx, rx) for tx in antennas(scene, "tx") for rx in receivers if rx.name != tx.name]
-
-
 def users_of(scene: Scene, carriers: Sequence[Carrier]) -> list[User]:
     """All users: carriers in the given order, then TX, then RX by name."""
     pairs = pairs_of(scene)
     return [User(pair.tx, pair.rx, carrier) for carrier in carriers for pair in pairs]
-
-
-def directions(scene: Scene, pairs: Sequence[Pair]) -> tuple[Float64Array, Float64Array]:
-    """Direction of RX from TX in the TX device's axes, and of TX from RX in the RX device's axes.
-
-    Unit vectors, Shape ``[U, 3]`` each. Two devices at one point see each other at boresight.
-    """
-    devices = {device.name: device for pair in pairs for device in (pair.tx, pair.rx)}
-    poses = {name: device_pose(scene, device) for name, device in devices.items()}
-    rotations = {name: rotation_matrix(pose.orientation) for name, pose in poses.items()}
-    at_tx, at_rx = np.empty((len(pairs), 3)), np.empty((len(pairs), 3))
-    for index, pair in enumerate(pairs):
-        towards_rx = _unit_vector(poses[pair.tx.name], poses[pair.rx.name])
-        if towards_rx is None:
-            at_tx[index] = at_rx[index] = (1.0, 0.0, 0.0)
-        else:
-            at_tx[index] = towards_rx @ rotations[pair.tx.name]
-            at_rx[index] = -towards_rx @ rotations[pair.rx.name]
-    return at_tx, at_rx
-
-
-def _unit_vector(origin: Pose, target: Pose) -> Float64Array | None:
-    difference: Float64Array = np.subtract(target.position, origin.position)
-    length = float(np.linalg.norm(difference))
-    return difference / length if length > 0 else None
 
 
 @dataclass(frozen=True)
@@ -136,7 +92,7 @@ def sweep_users(users: Sequence[User], h: Sequence[Complex128Array | None]) -> l
         if matrix is not None:
             groups[user.tx.array, user.rx.array].append((index, matrix))
     for (tx, rx), members in groups.items():
-        batch = sweep(np.stack([matrix for _, matrix in members]), tx, rx)
+        batch = sweep(np.array([matrix for _, matrix in members]), tx, rx)
         for (index, _), abs_y in zip(members, batch, strict=True):
             swept[index] = abs_y
     return swept

@@ -1,0 +1,11 @@
+"""Environments of gymnasium: importing this registers them.
+
+import gymnasium
+import caviar_clients.envs
+
+env = gymnasium.make("caviar/BeamSelection-v0", scenario="deploy/scenarios/geometric.toml")
+"""
+
+import gymnasium
+
+gymnasium.register("caviar/BeamSelection-v0", "caviar_clients.envs.beam_selection:BeamSelectionEnv")

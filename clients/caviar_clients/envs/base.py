@@ -1,0 +1,167 @@
+"""What the environments share: a scenario, a session, what is observed and what is rewarded."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from caviar_clients.envs.observations import Moment, Part, part
+from caviar_clients.envs.rewards import KINDS, Reward, RewardKind
+from caviar_clients.envs.users import Users
+from caviar_clients.sessions.base import Frame, Session
+from caviar_clients.sessions.opening import agent_of, open_session, opened
+from caviar_protocol.errors import RunError, ScenarioError
+from caviar_protocol.messages import Input
+from caviar_protocol.topics import Action, Link
+from caviar_protocol.topics.action import Command
+
+A = TypeVar("A")
+Observation = dict[str, np.ndarray[Any, np.dtype[Any]]]
+
+
+class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
+    """A run of CAVIAR as a gymnasium environment (contract, clause 16).
+
+    ``step(a_k)`` reports the decision of frame k, waits for the grant of frame k + 1, or the final one,
+    and returns its observation with the reward of link(k). An episode ends by truncation behind its
+    last frame; the last observation has the scene of the last frame and its link.
+
+    Parameters
+    ----------
+    scenario
+        Scenario file.
+    broker
+        ZeroMQ address of a broker that runs the scenario, with the agent's ``use = "remote"``; None: the
+        run takes place in this process.
+    agent
+        Name of the agent whose place is taken; None: the remote one, or the only one.
+    users
+        Receivers served, as names with ``*`` and ``?``.
+    observe
+        Names of the parts of the observation: `caviar_clients.envs.observations.PARTS`.
+    reward
+        What the reward is: `caviar_clients.envs.rewards.Reward`.
+    directory
+        Where an embedded run records; None: it does not, which is faster.
+    render_mode
+        ``rgb_array``: a map of the scene.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012  # as gymnasium has it
+
+    def __init__(
+        self,
+        scenario: str | Path,
+        broker: str | None = None,
+        agent: str | None = None,
+        users: str | Sequence[str] = "*",
+        observe: Sequence[str] = ("aoa",),
+        reward: RewardKind = "abs_y",
+        directory: str | Path | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        if reward not in KINDS:
+            raise ScenarioError(f"no reward is called {reward!r}; there are: {', '.join(KINDS)}")
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ScenarioError(f"render_mode is {render_mode!r}; write 'rgb_array' or None")
+        if not observe:
+            raise ScenarioError("observe names no part; write observe=('aoa',)")
+        self.scenario = opened(Path(scenario), agent)
+        self.agent = agent_of(self.scenario, agent)
+        self.render_mode = render_mode
+        self.users = Users(self.scenario, (users,) if isinstance(users, str) else users)
+        self._parts: dict[str, Part] = {name: part(self.scenario, self.users, name) for name in observe}
+        self._blank = {name: np.zeros(p.space.shape, p.space.dtype) for name, p in self._parts.items()}
+        self.observation_space: spaces.Dict[Any] = spaces.Dict(  # type: ignore[assignment]  # of arrays
+            {name: p.space for name, p in self._parts.items()}
+        )
+        self._reward = Reward(reward)
+        self._broker = broker
+        self._directory = None if directory is None else Path(directory)
+        self._session: Session | None = None
+        self._moment: Moment | None = None
+
+    # --- gymnasium -------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode. The same ``seed`` leads to the same episode, here and at a broker."""
+        super().reset(seed=seed)
+        if options:
+            raise ScenarioError(f"options are not used, got {sorted(options)}; set them in the scenario")
+        if self._session is None:
+            self._session = open_session(
+                self.scenario, self.agent, self._inputs(), self._broker, self._directory
+            )
+        self._moment = self._at(self._session.reset(seed))
+        return self._observation(self._moment), self._info(self._moment)
+
+    def step(self, action: A) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Decide for the present frame."""
+        before = self._moment
+        if self._session is None or before is None or before.frame.final:
+            raise RunError("the episode is over, or none has begun; call reset()")
+        commands = tuple(self._commands(action, before))
+        self._moment = now = self._at(self._session.step({"action": Action(commands=commands)}))
+        if now.link is None:
+            raise RunError(f"agent {self.agent!r} got no link of frame {before.frame.number}; is there one?")
+        served = {(pair.tx.name, pair.rx.name) for _, pair in before.users}
+        reward = self._reward.of(now.link, served)
+        return self._observation(now), reward, self._terminated(now), now.frame.final, self._info(now)
+
+    def close(self) -> None:
+        """End the run, or leave it."""
+        session, self._session, self._moment = self._session, None, None
+        if session is not None:
+            session.close()
+
+    def render(self) -> Any:
+        """A map of the scene as an RGB image, Shape ``[H, W, 3]``."""
+        if self.render_mode is None:
+            return None
+        raise NotImplementedError
+
+    # --- what a kind of environment says -------------------------------------------------------------
+
+    @abstractmethod
+    def _commands(self, action: A, moment: Moment) -> Sequence[Command]:
+        """What the agent's decision means."""
+
+    def _terminated(self, moment: Moment) -> bool:
+        """Whether the goal is reached, or cannot be any more."""
+        return False
+
+    # --- what is known ---------------------------------------------------------------------------------
+
+    def _inputs(self) -> tuple[Input, ...]:
+        further = {i.topic: i for p in self._parts.values() for i in p.inputs}
+        return (Input(topic="scene"), Input(topic="link", lag=1, required=False), *further.values())
+
+    def _at(self, frame: Frame) -> Moment:
+        link = frame.only("link", Link)
+        if frame.final and self._moment is not None:
+            return Moment(frame, self._moment.scene, link, self._moment.users)
+        scene = frame.scene()
+        return Moment(frame, scene, link, self.users.present(scene))
+
+    def _observation(self, moment: Moment) -> Observation:
+        found = {}
+        for name, p in self._parts.items():
+            value = p.read(moment)
+            found[name] = self._blank[name].copy() if value is None else value
+        return found
+
+    def _info(self, moment: Moment) -> dict[str, Any]:
+        link = moment.link
+        known: dict[str, Any] = {"frame": moment.frame.number, "t_ns": moment.frame.t_ns}
+        if link is not None:
+            known["abs_y"], known["best_abs_y"] = link.abs_y, link.top_abs_y[:, 0]
+            known["baseline_abs_y"], known["los"] = link.baseline_abs_y, link.los
+        return known

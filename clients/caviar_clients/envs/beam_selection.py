@@ -1,0 +1,40 @@
+"""``caviar/BeamSelection-v0``: choose a beam pair for each user, every frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from caviar_clients.envs.base import SessionEnv
+from caviar_clients.envs.observations import Moment
+from caviar_protocol.topics import BeamChoice
+from caviar_protocol.topics.action import Command
+
+
+class BeamSelectionEnv(SessionEnv[np.int64 | NDArray[np.int64]]):
+    """Beam selection (the paper, section 4).
+
+    The action is the index ``tx_beam·Nr + rx_beam`` of a pair of the two DFT codebooks: ``Discrete`` for one
+    place, ``MultiDiscrete`` with one entry for each place otherwise. Parameters as `SessionEnv`.
+    """
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        sizes = [place.beam_pairs for place in self.users.places]
+        self.action_space = spaces.Discrete(sizes[0]) if len(sizes) == 1 else spaces.MultiDiscrete(sizes)
+
+    def _commands(self, action: np.int64 | NDArray[np.int64], moment: Moment) -> Sequence[Command]:
+        chosen = [int(action)] if len(self.users) == 1 else np.asarray(action).tolist()
+        commands = []
+        for place, pair in moment.users:
+            tx_beam, rx_beam = divmod(chosen[place], pair.rx.array.size)
+            commands.append(BeamChoice(tx=pair.tx.name, rx=pair.rx.name, tx_beam=tx_beam, rx_beam=rx_beam))
+        return sorted(commands, key=_order)
+
+
+def _order(choice: BeamChoice) -> tuple[str, str]:
+    return choice.rx, choice.tx

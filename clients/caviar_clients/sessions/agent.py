@@ -1,0 +1,61 @@
+"""The agent of a session, as the run sees it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import ClassVar
+
+import msgspec
+
+from caviar_protocol.messages import Input, Role
+from caviar_services.service import Frame, Preparation, Prepared, Service, StepResult
+
+BEAM = "beam:"
+"""Prefix of the actuators that steer beams."""
+
+PATIENCE_S = 600.0
+"""[s] that a run waits for a decision before it blames the agent: learning takes time, and so does looking
+at what was learned."""
+
+
+class OutsideSettings(msgspec.Struct, frozen=True, kw_only=True):
+    """Whom the agent serves (contract, clause 17). Settings of the implementation whose place it takes
+    are not for it."""
+
+    users: tuple[str, ...] = ("*",)
+    except_users: tuple[str, ...] = ()
+
+
+class OutsideAgent(Service[OutsideSettings]):
+    """Declares an agent that decides outside of the run. `declared` makes the class for one session."""
+
+    role: ClassVar[Role] = "agent"
+    outputs: ClassVar[tuple[str, ...]] = ("action",)
+    Settings = OutsideSettings
+    decide: ClassVar[Callable[[Frame], StepResult]]
+    first_seed: ClassVar[Callable[[], int]]
+
+    def prepare(self, preparation: Preparation) -> Prepared:
+        """Declare the actuators, and the seed of the first episode once it is known."""
+        self.run.progress("waiting for the first reset", PATIENCE_S)
+        seed = type(self).first_seed()
+        if self.settings.except_users:
+            return Prepared(notes=("serves the users whom no other agent owns",), seed=seed)
+        owned = tuple(text if ":" in text else BEAM + text for text in self.settings.users)
+        return Prepared(actuators=owned, seed=seed)
+
+    def step(self, frame: Frame) -> StepResult:
+        """What is decided outside."""
+        self.run.progress("waiting for a decision", PATIENCE_S)
+        return type(self).decide(frame)
+
+
+def declared(
+    inputs: tuple[Input, ...], first_seed: Callable[[], int], decide: Callable[[Frame], StepResult]
+) -> type[OutsideAgent]:
+    """The class of an agent with these inputs.
+
+    ``first_seed`` gives the seed of the first episode, −1 for the run's; ``decide`` answers a frame.
+    """
+    fields = {"inputs": inputs, "first_seed": staticmethod(first_seed), "decide": staticmethod(decide)}
+    return type("OutsideAgent", (OutsideAgent,), fields)

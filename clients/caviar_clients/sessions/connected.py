@@ -1,0 +1,132 @@
+"""A session at a broker: the runner of all services in a thread, its agent here."""
+
+from __future__ import annotations
+
+import threading
+from contextlib import suppress
+from queue import Empty, SimpleQueue
+
+from caviar_clients.sessions.agent import declared
+from caviar_clients.sessions.base import Frame, Session
+from caviar_protocol.errors import CaviarError, RunError
+from caviar_protocol.messages import Input
+from caviar_services.connection import Terminated
+from caviar_services.runner import CONNECT_TIMEOUT_S, Runner
+from caviar_services.service import StepResult
+from caviar_services.termination import Termination
+
+IMPLEMENTATION = "gymnasium"
+LEAVE_S = 5.0
+"""[s] that leaving a run may take."""
+_POLL_S = 0.2
+"""[s] between looks at whether the runner still lives."""
+
+
+class ConnectedSession(Session):
+    """The agent ``agent`` of the run at the broker ``broker``, which plays the scenario's episodes.
+
+    It joins at once and gets ready at the first `reset`, whose seed becomes that of the first episode.
+
+    Parameters
+    ----------
+    broker
+        ZeroMQ address.
+    agent
+        Name of a service of the run that nobody else fills (``use = "remote"``).
+    inputs
+        What it consumes.
+    connect_timeout_s
+        Until the broker has to answer [s].
+    """
+
+    def __init__(
+        self,
+        broker: str,
+        agent: str,
+        inputs: tuple[Input, ...],
+        connect_timeout_s: float = CONNECT_TIMEOUT_S,
+    ) -> None:
+        super().__init__()
+        self._grants: SimpleQueue[Frame | CaviarError] = SimpleQueue()
+        self._results: SimpleQueue[StepResult | None] = SimpleQueue()
+        self._seeds: SimpleQueue[int | None] = SimpleQueue()
+        self._termination = _Leaving(self)
+        cls = declared(inputs, self._first_seed, self._decided)
+        runner = Runner(agent, cls, IMPLEMENTATION, broker, connect_timeout_s, self._termination)
+        self._thread = threading.Thread(target=self._serve, args=(runner,), name="session", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Leave the run; behind its last episode that is its orderly end."""
+        if self._frame is not None and self._frame.final and self._thread.is_alive():
+            self._answer(StepResult())
+            self._drained()
+        self._frame = None
+        self.leave()
+        self._thread.join(LEAVE_S)
+
+    def leave(self, error: CaviarError | None = None) -> None:
+        """Make the thread end, and whoever waits for a grant know."""
+        self._termination.requested = True
+        if error is not None:
+            self._grants.put(error)
+        self._seeds.put(None)
+        self._results.put(None)
+
+    def _begin(self, seed: int) -> None:
+        self._seeds.put(seed)
+
+    def _answer(self, result: StepResult) -> None:
+        self._results.put(result)
+
+    def _granted(self) -> Frame:
+        while True:
+            try:
+                grant = self._grants.get(timeout=_POLL_S)
+            except Empty:
+                if not self._thread.is_alive() and self._grants.empty():
+                    raise RunError("the session is closed; make a new one") from None
+                continue
+            if isinstance(grant, CaviarError):
+                raise grant
+            return grant
+
+    def _drained(self) -> None:
+        """Wait until the run is over or the next episode begins."""
+        with suppress(Empty):
+            self._grants.get(timeout=LEAVE_S)
+
+    # --- in the runner's thread --------------------------------------------------------------------
+
+    def _serve(self, runner: Runner) -> None:
+        try:
+            runner.run()
+        except CaviarError as error:
+            self._grants.put(error)
+        else:
+            more = "; with more episodes (run.episodes of the scenario) it could be reset again"
+            self._grants.put(RunError(f"the broker ended the run: {runner.ended}{more}"))
+
+    def _first_seed(self) -> int:
+        seed = self._seeds.get()
+        if seed is None:
+            raise Terminated("the session was closed before its first reset")
+        return seed
+
+    def _decided(self, frame: Frame) -> StepResult:
+        self._grants.put(frame)
+        result = self._results.get()
+        if result is None:
+            raise Terminated("the session was closed")
+        return result
+
+
+class _Leaving(Termination):
+    """Ends the thread of a session and never its process."""
+
+    def __init__(self, session: ConnectedSession) -> None:
+        super().__init__()
+        self._session = session
+
+    def enforce(self, grace_s: float, status: int, last_words: str) -> None:
+        self._session.leave(RunError(last_words))

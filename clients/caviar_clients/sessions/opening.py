@@ -1,0 +1,55 @@
+"""From a scenario to a session of one of its agents."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from caviar_clients.cli.run import checked_scenario
+from caviar_clients.sessions.base import Session
+from caviar_clients.sessions.connected import ConnectedSession
+from caviar_clients.sessions.embedded import EmbeddedSession
+from caviar_protocol.errors import ScenarioError
+from caviar_protocol.messages import Input
+from caviar_protocol.scenario import Scenario
+
+REMOTE = "remote"
+
+
+def opened(path: Path, agent: str | None) -> Scenario:
+    """The scenario of a file, checked."""
+    return checked_scenario(path)
+
+
+def agent_of(scenario: Scenario, agent: str | None) -> str:
+    """The agent whose place a session takes: the one named, the remote one, or the only one.
+
+    Raises `ScenarioError` naming the agents where that does not say which.
+    """
+    agents = {name: spec for name, spec in scenario.services.items() if spec.role == "agent"}
+    remote = [name for name, spec in agents.items() if spec.use == REMOTE]
+    names = ", ".join(agents) or "none"
+    if agent is not None:
+        if agent not in agents:
+            raise ScenarioError(f"the scenario has no agent {agent!r}; its agents are: {names}")
+        return agent
+    found = remote or list(agents)
+    if len(found) != 1:
+        raise ScenarioError(
+            f"name the agent whose place is taken, agent=…; the scenario's agents are: {names}"
+        )
+    return found[0]
+
+
+def open_session(
+    scenario: Scenario,
+    agent: str,
+    inputs: tuple[Input, ...],
+    broker: str | None = None,
+    directory: Path | None = None,
+) -> Session:
+    """A session of ``agent``, at ``broker`` or, without one, in this process."""
+    if broker is None:
+        return EmbeddedSession(scenario, agent, inputs, directory)
+    if directory is not None:
+        raise ScenarioError("a connected run records where its broker says; leave directory=… out")
+    return ConnectedSession(broker, agent, inputs)
