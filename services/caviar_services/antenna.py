@@ -10,6 +10,8 @@ section 7.2, with directions taken from each array outwards).
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from caviar_protocol.arrays import Complex128Array, Float64Array
@@ -45,6 +47,7 @@ def steering_vector(array: AntennaArray, directions: Float64Array) -> Complex128
     return vector
 
 
+@lru_cache(maxsize=256)
 def _grid(array: AntennaArray) -> tuple[Float64Array, Float64Array]:
     """y of each column and z of each row [wavelengths]."""
     y: Float64Array = (

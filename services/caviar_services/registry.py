@@ -21,6 +21,7 @@ BUILT_IN: dict[str, str] = {
     "world:sumo": "caviar_services.world.sumo:SumoWorld",
     "world:trajectory": "caviar_services.world.trajectory:TrajectoryWorld",
     "channel:free-space": "caviar_services.channel.free_space:FreeSpaceChannel",
+    "channel:geometric": "caviar_services.channel.geometric:GeometricChannel",
     "channel:sionna-rt": "caviar_services.channel.sionna_rt:SionnaChannel",
     "sensors:lidar": "caviar_services.sensors.lidar:LidarSensors",
     "link:beams": "caviar_services.link.beams:BeamLink",

@@ -1,8 +1,4 @@
-"""What all channel models share: from a frame to its `Channel` product.
-
-A model finds paths (`ChannelModel.paths`); antennas, carrier phase, order, ids and matrices are
-applied here, in float64, the same way for every rung of the ladder.
-"""
+"""What all channel models share: from a frame to its `Channel` product."""
 
 from __future__ import annotations
 
@@ -18,7 +14,7 @@ from caviar_protocol.arrays import BoolArray
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.scene import antennas
-from caviar_protocol.topics import ChannelOptions, Scene
+from caviar_protocol.topics import Channel, ChannelOptions, Scene
 from caviar_services.channel.assemble import Antenna, PathTable, Product, assemble
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
 
@@ -35,10 +31,20 @@ class Found:
     counts: dict[str, int] = field(default_factory=dict)
 
 
-class ChannelModel(Service[S]):
-    """Base of channel models.
+@dataclass(frozen=True, kw_only=True)
+class Modelled:
+    """What a model made of a frame."""
 
-    A model sets ``rung`` and implements `paths`; it loads what it needs in `load` and says in
+    channel: Channel
+    counts: dict[str, int] = field(default_factory=dict)
+    measured: dict[str, int] = field(default_factory=dict)
+    """Nanoseconds that named phases took."""
+
+
+class ChannelModel(Service[S]):
+    """Base of channel models: from the scene of a frame to its `Channel` product.
+
+    A model sets ``rung`` and implements `model`; it loads what it needs in `load` and says in
     `options` what it models.
     """
 
@@ -54,7 +60,8 @@ class ChannelModel(Service[S]):
                 "a channel needs at least one carrier; add [[carriers]] with name and frequency_hz",
                 key="carriers",
             )
-        self._with_h = False
+        self.with_h = False
+        """Whether somebody asks for the matrices."""
 
     @property
     def options(self) -> ChannelOptions:
@@ -66,28 +73,50 @@ class ChannelModel(Service[S]):
         return ()
 
     @abstractmethod
-    def paths(self, scene: Scene, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]) -> Found:
-        """Paths of all TX/RX pairs of a scene, in any order."""
+    def model(
+        self, frame: Frame, scene: Scene, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]
+    ) -> Modelled:
+        """The channels of all TX/RX pairs of a frame."""
 
     def prepare(self, preparation: Preparation) -> Prepared:
-        self._with_h = "h" in preparation.demand.get("channel", frozenset())
+        self.with_h = "h" in preparation.demand.get("channel", frozenset())
         return Prepared(notes=self.load(preparation))
 
     def step(self, frame: Frame) -> StepResult:
         scene = frame.scene()
         transmitters = [Antenna.of(scene, device) for device in antennas(scene, "tx")]
         receivers = [Antenna.of(scene, device) for device in antennas(scene, "rx")]
+        made = self.model(frame, scene, transmitters, receivers)
+        channel = made.channel
+        return StepResult(
+            products={"channel": channel},
+            fidelity=self.rung,
+            counts={"paths": len(channel.tau), "dropped": channel.dropped, **made.counts},
+            measured=made.measured,
+        )
+
+
+class PathModel(ChannelModel[S]):
+    """Base of models that find the paths of a frame; antennas, carrier phase, order, ids and matrices
+    are applied here, in float64, the same way for every rung of the ladder."""
+
+    @abstractmethod
+    def paths(self, scene: Scene, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]) -> Found:
+        """Paths of all TX/RX pairs of a scene, in any order."""
+
+    def model(
+        self, frame: Frame, scene: Scene, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]
+    ) -> Modelled:
         begin = time.perf_counter_ns()
         found = self.paths(scene, transmitters, receivers)
         traced = time.perf_counter_ns()
         product = Product(
-            rung=self.rung, options=self.options, carriers=self.run.carriers, with_h=self._with_h
+            rung=self.rung, options=self.options, carriers=self.run.carriers, with_h=self.with_h
         )
         channel = assemble(product, transmitters, receivers, found.table, found.los)
         done = time.perf_counter_ns()
-        return StepResult(
-            products={"channel": channel},
-            fidelity=self.rung,
-            counts={"paths": len(channel.tau), "dropped": channel.dropped, **found.counts},
+        return Modelled(
+            channel=channel,
+            counts=found.counts,
             measured={"paths": traced - begin, "assemble": done - traced},
         )

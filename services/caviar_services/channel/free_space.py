@@ -15,14 +15,14 @@ import numpy as np
 from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Scene
 from caviar_services.channel.assemble import Antenna, PathTable
-from caviar_services.channel.base import ChannelModel, Found
+from caviar_services.channel.base import Found, PathModel
 
 
 class FreeSpaceSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The model has nothing to set."""
 
 
-class FreeSpaceChannel(ChannelModel[FreeSpaceSettings]):
+class FreeSpaceChannel(PathModel[FreeSpaceSettings]):
     """One path for each TX/RX pair.
 
     A pair closer than one wavelength of a carrier, so also a device and itself, is outside the

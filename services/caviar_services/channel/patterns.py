@@ -42,12 +42,14 @@ def radiated_field(array: AntennaArray, rotation: Float64Array, directions: Floa
     """
     local = directions @ rotation
     theta_hat, phi_hat = spherical_basis(local)
-    field = _amplitude(array.pattern, local)[:, None] * (theta_hat if array.polarization == "V" else phi_hat)
+    field = element_amplitude(array.pattern, local)[:, None] * (
+        theta_hat if array.polarization == "V" else phi_hat
+    )
     world: Float64Array = field @ rotation.T
     return world
 
 
-def _amplitude(pattern: str, local: Float64Array) -> Float64Array:
+def element_amplitude(pattern: str, local: Float64Array) -> Float64Array:
     """Root of the gain of an element pattern towards unit vectors in device axes, Shape ``[P]``.
 
     ``iso``: 1. ``dipole``: short dipole along z (Balanis, Antenna Theory, eq. 4-26a, gain 1.5).

@@ -17,7 +17,7 @@ from caviar_protocol.errors import PayloadError, ScenarioError, SetupError
 from caviar_protocol.seeding import derive_seed
 from caviar_protocol.topics import AntennaDevice, ChannelOptions, Scene
 from caviar_services.channel.assemble import Antenna, PathTable
-from caviar_services.channel.base import ChannelModel, Found
+from caviar_services.channel.base import Found, PathModel
 from caviar_services.channel.sionna_materials import MaterialSettings, OutsideRange
 from caviar_services.channel.sionna_scene import SceneSettings, SionnaScene
 from caviar_services.channel.sionna_tracer import LaunchOptions, Traced, Tracer
@@ -65,7 +65,7 @@ class SionnaSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     """What to do where a material is not defined at the carrier frequency."""
 
 
-class SionnaChannel(ChannelModel[SionnaSettings]):
+class SionnaChannel(PathModel[SionnaSettings]):
     """Ray-traced channel of one carrier.
 
     Each transmitter is traced by itself, with receivers filled up to a fixed number by parked
