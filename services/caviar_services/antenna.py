@@ -39,7 +39,9 @@ def steering_vector(array: AntennaArray, directions: Float64Array) -> Complex128
     """
     y, z = _grid(array)
     # k̂·r separates, so rows + columns exponentials do instead of rows · columns.
-    columns = np.exp(2j * np.pi * directions[..., 1, None] * y)
+    columns: Complex128Array = np.exp(2j * np.pi * directions[..., 1, None] * y)
+    if array.rows == 1:
+        return columns
     rows = np.exp(2j * np.pi * directions[..., 2, None] * z)
     vector: Complex128Array = (columns[..., :, None] * rows[..., None, :]).reshape(
         *directions.shape[:-1], array.size

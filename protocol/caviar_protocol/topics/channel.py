@@ -6,7 +6,6 @@ from enum import IntEnum
 from typing import Annotated, ClassVar
 
 import msgspec
-import numpy as np
 
 from caviar_protocol.arrays import (
     BoolArray,
@@ -131,7 +130,7 @@ class Channel(Payload, frozen=True, kw_only=True, omit_defaults=True):
             len(offsets) != pairs + 1
             or offsets[0] != 0
             or offsets[-1] != paths
-            or (np.diff(offsets) < 0).any()
+            or (offsets[1:] < offsets[:-1]).any()
         ):
             raise PayloadError(
                 f"Channel.offsets {offsets.tolist()!r:.80} does not cut {paths} paths into {pairs} pairs: "

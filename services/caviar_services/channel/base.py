@@ -14,7 +14,7 @@ from caviar_protocol.arrays import BoolArray
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.scene import antennas
-from caviar_protocol.topics import Channel, ChannelOptions, Scene
+from caviar_protocol.topics import AntennaDevice, Channel, ChannelOptions, Scene
 from caviar_services.channel.assemble import Antenna, PathTable, Product, assemble
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
 
@@ -74,7 +74,11 @@ class ChannelModel(Service[S]):
 
     @abstractmethod
     def model(
-        self, frame: Frame, scene: Scene, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]
+        self,
+        frame: Frame,
+        scene: Scene,
+        transmitters: Sequence[AntennaDevice],
+        receivers: Sequence[AntennaDevice],
     ) -> Modelled:
         """The channels of all TX/RX pairs of a frame."""
 
@@ -84,9 +88,7 @@ class ChannelModel(Service[S]):
 
     def step(self, frame: Frame) -> StepResult:
         scene = frame.scene()
-        transmitters = [Antenna.of(scene, device) for device in antennas(scene, "tx")]
-        receivers = [Antenna.of(scene, device) for device in antennas(scene, "rx")]
-        made = self.model(frame, scene, transmitters, receivers)
+        made = self.model(frame, scene, antennas(scene, "tx"), antennas(scene, "rx"))
         channel = made.channel
         return StepResult(
             products={"channel": channel},
@@ -105,15 +107,21 @@ class PathModel(ChannelModel[S]):
         """Paths of all TX/RX pairs of a scene, in any order."""
 
     def model(
-        self, frame: Frame, scene: Scene, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]
+        self,
+        frame: Frame,
+        scene: Scene,
+        transmitters: Sequence[AntennaDevice],
+        receivers: Sequence[AntennaDevice],
     ) -> Modelled:
         begin = time.perf_counter_ns()
-        found = self.paths(scene, transmitters, receivers)
+        tx = [Antenna.of(scene, device) for device in transmitters]
+        rx = [Antenna.of(scene, device) for device in receivers]
+        found = self.paths(scene, tx, rx)
         traced = time.perf_counter_ns()
         product = Product(
             rung=self.rung, options=self.options, carriers=self.run.carriers, with_h=self.with_h
         )
-        channel = assemble(product, transmitters, receivers, found.table, found.los)
+        channel = assemble(product, tx, rx, found.table, found.los)
         done = time.perf_counter_ns()
         return Modelled(
             channel=channel,

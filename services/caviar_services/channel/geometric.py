@@ -29,19 +29,20 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Annotated, ClassVar, Literal
 
 import msgspec
 import numpy as np
 
-from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, UInt64Array, quantity
-from caviar_protocol.coordinates import SPEED_OF_LIGHT, angles
+from caviar_protocol.arrays import Complex128Array, Float64Array, quantity
+from caviar_protocol.coordinates import SPEED_OF_LIGHT, Pose, Vector, unrotated
+from caviar_protocol.scene import device_pose, device_velocity
 from caviar_protocol.seeding import generator
-from caviar_protocol.topics import Channel, ChannelMatrix, ChannelOptions, Scene
+from caviar_protocol.topics import AntennaDevice, Channel, ChannelMatrix, ChannelOptions, Scene
 from caviar_services.antenna import steering_vector
-from caviar_services.channel.assemble import Antenna
 from caviar_services.channel.base import ChannelModel, Modelled
 from caviar_services.channel.occlusion import Boxes
 from caviar_services.channel.patterns import element_amplitude
@@ -122,20 +123,19 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
     def __init__(self, settings: GeometricSettings, run: RunInfo) -> None:
         super().__init__(settings, run)
         count, k = settings.components, 10 ** (settings.k_factor_db / 10)
-        self._frequency = np.array([carrier.frequency_hz for carrier in run.carriers])
-        self._reflected = np.full(count, math.sqrt(1 / count))
-        rest = math.sqrt(1 / ((k + 1) * (count - 1))) if count > 1 else 0.0
-        self._behind_straight = np.full(count, rest)
+        self._frequency = np.array([carrier.frequency_hz for carrier in run.carriers])[:, None]
+        self._reflected = math.sqrt(1 / count)
+        self._behind_straight = math.sqrt(1 / ((k + 1) * (count - 1))) if count > 1 else 0.0
         self._straight = math.sqrt(k / (k + 1)) if count > 1 else 1.0
         ids = [_id(f"component {number}") for number in range(count)]
-        self._ids = np.array([ids, [_id("straight"), *ids[1:]]], np.uint64)
-        """Of a pair without, and with a line of sight."""
+        self._ids = {False: ids, True: [_id("straight"), *ids[1:]]}
+        """Of a pair, by whether its line of sight is free."""
         self._obstacles = Boxes.aligned([(box.minimum_m, box.maximum_m) for box in settings.obstacles])
         self._draws: dict[tuple[str, str], tuple[int, _Draws]] = {}
         loss_db = 20.0 if settings.nlos_loss_db is None else settings.nlos_loss_db
         self._nlos_factor = 10 ** (-loss_db / 20)
-        unit = settings.normalization == "unit"
-        self._nearest = 0.0 if unit else float((SPEED_OF_LIGHT / self._frequency).max())
+        self._unit = settings.normalization == "unit"
+        self._nearest = 0.0 if self._unit else float((SPEED_OF_LIGHT / self._frequency).max())
 
     @property
     def options(self) -> ChannelOptions:
@@ -146,121 +146,86 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         self._draws.clear()
 
     def model(
-        self, frame: Frame, scene: Scene, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]
+        self,
+        frame: Frame,
+        scene: Scene,
+        transmitters: Sequence[AntennaDevice],
+        receivers: Sequence[AntennaDevice],
     ) -> Modelled:
-        pairs = [(tx, rx) for tx in transmitters for rx in receivers]
-        start = np.array([tx.position for tx, _ in pairs]).reshape(-1, 3)
-        end = np.array([rx.position for _, rx in pairs]).reshape(-1, 3)
-        distance = np.sqrt(((end - start) ** 2).sum(-1))
-        is_far = (distance > 0) & (distance >= self._nearest)
-        los = np.ones(len(pairs), np.bool_)
-        if not is_far.all():
-            chosen = np.flatnonzero(is_far).tolist()
-            pairs = [pairs[index] for index in chosen]
-            start, end, distance = start[is_far], end[is_far], distance[is_far]
-        free = self._line_of_sight(scene, pairs, start, end)
-        los[is_far] = free
-        waves = self._waves(frame, pairs, start, end, distance, free)
-        return Modelled(
-            channel=self._channel(transmitters, receivers, pairs, waves, los, is_far, free),
-            counts={"too_close": int(np.count_nonzero(~is_far))},
-        )
+        waves, count = _Waves(), self.settings.components
+        offsets, los, blocked = [0], [], self._blocks(scene)
+        poses = {device.name: device_pose(scene, device) for device in (*transmitters, *receivers)}
+        speeds = {device.name: _velocity(scene, device) for device in (*transmitters, *receivers)}
+        for tx in transmitters:
+            for rx in receivers:
+                pair = _Line(tx, rx, poses[tx.name], poses[rx.name], speeds[tx.name], speeds[rx.name])
+                is_near = pair.length == 0 or pair.length < self._nearest
+                free = is_near or not blocked(pair)
+                if not is_near:
+                    self._add(waves, frame, pair, free)
+                los.append(free)
+                offsets.append(len(waves.tau))
+        too_close = len(los) - len(waves.tau) // count
+        channel = self._channel(transmitters, receivers, poses, waves, los, offsets)
+        return Modelled(channel=channel, counts={"too_close": too_close} if too_close else {})
 
     # --- the line of sight -----------------------------------------------------------------------
 
-    def _line_of_sight(
-        self, scene: Scene, pairs: Sequence[tuple[Antenna, Antenna]], start: Float64Array, end: Float64Array
-    ) -> BoolArray:
-        """Whether it is free, Shape ``[Q]``."""
+    def _blocks(self, scene: Scene) -> Callable[[_Line], bool]:
+        """What says of a line of this scene whether something blocks it."""
         settings = self.settings
         if settings.nlos_azimuth_deg is not None:
             low, high = settings.nlos_azimuth_deg
-            local = [(line @ tx.rotation).tolist() for line, (tx, _) in zip(end - start, pairs, strict=True)]
             # Ranges may lie anywhere on the circle: [170, 190] is behind an array.
-            return np.array(
-                [(math.degrees(math.atan2(y, x)) - low) % 360 > high - low for x, y, _ in local], np.bool_
-            )
-        free = np.ones(len(pairs), np.bool_)
-        if settings.nlos == "geometry" and pairs:
-            free &= ~self._obstacles.block(start, end).any(-1)
-            boxes = Boxes.of(scene)
-            parents = {device.name: device.parent for device in scene.devices}
-            carries = np.array(
-                [[name in (parents[tx.name], parents[rx.name]) for name in boxes.names] for tx, rx in pairs]
-            )
-            free &= ~(boxes.block(start, end) & ~carries.reshape(len(pairs), -1)).any(-1)
-        return free
+            return lambda pair: (pair.azimuth_deg - low) % 360 <= high - low
+        if settings.nlos == "never":
+            return lambda pair: False
+        boxes = Boxes.of(scene)
+
+        def hidden(pair: _Line) -> bool:
+            ends = np.array([pair.start, pair.end])[:, None]
+            if self._obstacles.block(*ends).any():
+                return True
+            carriers = (pair.tx.parent, pair.rx.parent)
+            met = np.flatnonzero(boxes.block(*ends)[0]).tolist()
+            return any(boxes.names[index] not in carriers for index in met)
+
+        return hidden
 
     # --- waves -----------------------------------------------------------------------------------------
 
-    def _waves(
-        self,
-        frame: Frame,
-        pairs: Sequence[tuple[Antenna, Antenna]],
-        start: Float64Array,
-        end: Float64Array,
-        distance: Float64Array,
-        free: BoolArray,
-    ) -> _Waves:
-        draws = [self._drawn(frame, tx.name, rx.name) for tx, rx in pairs]
-        gain = np.array([row[0] for row in draws]).reshape(len(pairs), -1)
-        excess = np.array([row[1] for row in draws]).reshape(gain.shape)
-        deviation = np.array([row[2] for row in draws]).reshape(*gain.shape, 4)
-        gain = gain * np.where(free[:, None], self._behind_straight, self._reflected)
+    def _add(self, waves: _Waves, frame: Frame, pair: _Line, free: bool) -> None:
+        """The components of a pair.
 
-        line = (end - start) / distance[:, None]
-        zenith, azimuth = angles(line).T[..., None]
-        departure = _unit(zenith + deviation[..., 0], azimuth + deviation[..., 1])
-        arrival = _unit(np.pi - zenith + deviation[..., 2], azimuth + np.pi + deviation[..., 3])
-        if free.any():
-            gain[free, 0], excess[free, 0] = self._straight, 0.0
-            departure[free, 0], arrival[free, 0] = line[free], -line[free]
+        Numbers, not arrays: there are a handful of waves, and an array of three costs as much as ten numbers.
+        """
+        gains, excess, deviations = self._drawn(frame, pair.tx.name, pair.rx.name)
+        scale = self._behind_straight if free else self._reflected
+        delay = pair.length / SPEED_OF_LIGHT
+        loss = 1.0 if free or self._unit else self._nlos_factor
+        for number, gain in enumerate(gains):
+            if free and number == 0:
+                amplitude, tau, departure, arrival = complex(self._straight), delay, pair.along, pair.back
+            else:
+                amplitude, tau = gain * scale, delay + excess[number]
+                tilt = deviations[number]
+                departure = _direction(pair.zenith + tilt[0], pair.azimuth + tilt[1])
+                arrival = _direction(math.pi - pair.zenith + tilt[2], pair.azimuth + math.pi + tilt[3])
+            waves.add(amplitude * loss, tau, departure, arrival, pair)
+        waves.id += self._ids[free]
+        waves.length += [pair.length] * len(gains)
 
-        tau = distance[:, None] / SPEED_OF_LIGHT + excess
-        velocity = np.array([(tx.velocity, rx.velocity) for tx, rx in pairs]).reshape(-1, 2, 1, 3)
-        turns = self._frequency[:, None, None] * tau
-        a = gain * np.exp(-2j * np.pi * (turns - np.round(turns)))
-        if self.settings.normalization == "path-loss":
-            a = a * self._path_gain(pairs, distance, free, departure, arrival)
-        return _Waves(
-            a=a,
-            tau=tau,
-            departure=departure,
-            arrival=arrival,
-            # A source that moves along its wave, and a receiver that moves against it, raise the frequency.
-            doppler_ratio=(velocity[:, 0] * departure + velocity[:, 1] * arrival).sum(-1) / SPEED_OF_LIGHT,
-        )
-
-    def _path_gain(
-        self,
-        pairs: Sequence[tuple[Antenna, Antenna]],
-        distance: Float64Array,
-        free: BoolArray,
-        departure: Float64Array,
-        arrival: Float64Array,
-    ) -> Float64Array:
-        """λ/(4πd), the loss without line of sight and both element patterns, Shape ``[C, Q, L]``."""
-        spreading = SPEED_OF_LIGHT / self._frequency[:, None] / (4 * np.pi * distance)
-        spreading = spreading * np.where(free, 1.0, self._nlos_factor)
-        patterns = [
-            element_amplitude(tx.array.pattern, departure[q] @ tx.rotation)
-            * element_amplitude(rx.array.pattern, arrival[q] @ rx.rotation)
-            for q, (tx, rx) in enumerate(pairs)
-        ]
-        factor: Float64Array = spreading[..., None] * np.array(patterns).reshape(1, len(pairs), -1)
-        return factor
-
-    def _drawn(self, frame: Frame, tx: str, rx: str) -> tuple[Complex128Array, Float64Array, Float64Array]:
+    def _drawn(
+        self, frame: Frame, tx: str, rx: str
+    ) -> tuple[Sequence[complex], Sequence[float], Sequence[Sequence[float]]]:
         """Gain, excess delay and deviations of a pair's components in a frame, sorted by delay."""
         whole_episode = self.settings.redraw == "episode"
         block, row = (0, 0) if whole_episode else divmod(frame.number, BLOCK)
         known = self._draws.get((tx, rx))
         if known is None or known[0] != block:
             random = generator(frame.seed, frame.seed_episode, f"{self.run.name}/{tx}/{rx}", block)
-            known = self._draws[tx, rx] = (
-                block,
-                _Draws.of(random, 1 if whole_episode else BLOCK, self.settings),
-            )
+            known = block, _Draws.of(random, 1 if whole_episode else BLOCK, self.settings)
+            self._draws[tx, rx] = known
         made = known[1]
         return made.gain[row], made.excess[row], made.deviation[row]
 
@@ -268,94 +233,181 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
 
     def _channel(
         self,
-        transmitters: Sequence[Antenna],
-        receivers: Sequence[Antenna],
-        pairs: Sequence[tuple[Antenna, Antenna]],
+        transmitters: Sequence[AntennaDevice],
+        receivers: Sequence[AntennaDevice],
+        poses: Mapping[str, Pose],
         waves: _Waves,
-        los: BoolArray,
-        is_far: BoolArray,
-        free: BoolArray,
+        los: list[bool],
+        offsets: list[int],
     ) -> Channel:
-        count = len(waves.tau) * self.settings.components
-        offsets = np.zeros(len(is_far) + 1, np.int64)
-        np.cumsum(is_far * self.settings.components, out=offsets[1:])
-        carriers = len(self._frequency)
-        ids: UInt64Array = self._ids[free.astype(np.intp)].reshape(-1)
+        tau = np.array(waves.tau, np.float64)
+        # The whole turns of f·τ go first: they are millions, and only the rest is a phase.
+        turns = self._frequency * tau
+        a = np.array(waves.amplitude, np.complex128) * np.exp(-2j * np.pi * (turns - np.round(turns)))
+        in_tx, in_rx = self._in_device_axes(transmitters, receivers, poses, waves, offsets)
+        if not self._unit:
+            a *= self._path_gain(transmitters, receivers, waves, in_tx, in_rx, offsets)
+        count = len(tau)
         return Channel(
             rung=self.rung,
             options=self.options,
             carriers=self.run.carriers,
-            tx=tuple(antenna.name for antenna in transmitters),
-            rx=tuple(antenna.name for antenna in receivers),
-            los=los.reshape(len(transmitters), len(receivers)),
-            offsets=offsets,
-            id=ids,
-            a=waves.a.reshape(carriers, -1),
-            tau=waves.tau.reshape(-1),
-            aod=angles(waves.departure).reshape(-1, 2),
-            aoa=angles(waves.arrival).reshape(-1, 2),
-            doppler=self._frequency[:, None] * waves.doppler_ratio.reshape(-1),
+            tx=tuple(device.name for device in transmitters),
+            rx=tuple(device.name for device in receivers),
+            los=np.array(los, np.bool_).reshape(len(transmitters), len(receivers)),
+            offsets=np.array(offsets, np.int64),
+            id=np.array(waves.id, np.uint64),
+            a=a,
+            tau=tau,
+            aod=np.array([_angles(vector) for vector in waves.departure], np.float64).reshape(-1, 2),
+            aoa=np.array([_angles(vector) for vector in waves.arrival], np.float64).reshape(-1, 2),
+            doppler=self._frequency * np.array(waves.doppler_ratio, np.float64),
             interactions=np.zeros((count, 0), np.uint8),
             points=np.zeros((count, 0, 3)),
             objects=np.zeros((count, 0), np.int32),
-            h=self._matrices(transmitters, receivers, pairs, waves, is_far) if self.with_h else (),
+            h=self._matrices(transmitters, receivers, a, in_tx, in_rx, offsets) if self.with_h else (),
         )
+
+    def _in_device_axes(
+        self,
+        transmitters: Sequence[AntennaDevice],
+        receivers: Sequence[AntennaDevice],
+        poses: Mapping[str, Pose],
+        waves: _Waves,
+        offsets: list[int],
+    ) -> tuple[Float64Array, Float64Array]:
+        """Directions of departure and arrival in the axes of their devices, Shape ``[P, 3]`` each."""
+        departure, arrival = [], []
+        for number, (first, end) in enumerate(pairwise(offsets)):
+            tx, rx = divmod(number, len(receivers))
+            turned_tx = poses[transmitters[tx].name].orientation
+            turned_rx = poses[receivers[rx].name].orientation
+            departure += [unrotated(turned_tx, vector) for vector in waves.departure[first:end]]
+            arrival += [unrotated(turned_rx, vector) for vector in waves.arrival[first:end]]
+        return np.array(departure).reshape(-1, 3), np.array(arrival).reshape(-1, 3)
+
+    def _path_gain(
+        self,
+        transmitters: Sequence[AntennaDevice],
+        receivers: Sequence[AntennaDevice],
+        waves: _Waves,
+        in_tx: Float64Array,
+        in_rx: Float64Array,
+        offsets: list[int],
+    ) -> Float64Array:
+        """λ/(4πd) and both element patterns, Shape ``[C, P]``."""
+        patterns = np.ones(len(waves.tau))
+        for number, (first, end) in enumerate(pairwise(offsets)):
+            tx, rx = divmod(number, len(receivers))
+            patterns[first:end] = element_amplitude(transmitters[tx].array.pattern, in_tx[first:end])
+            patterns[first:end] *= element_amplitude(receivers[rx].array.pattern, in_rx[first:end])
+        factor: Float64Array = (
+            SPEED_OF_LIGHT / self._frequency / (4 * np.pi * np.array(waves.length)) * patterns
+        )
+        return factor
 
     def _matrices(
         self,
-        transmitters: Sequence[Antenna],
-        receivers: Sequence[Antenna],
-        pairs: Sequence[tuple[Antenna, Antenna]],
-        waves: _Waves,
-        is_far: BoolArray,
+        transmitters: Sequence[AntennaDevice],
+        receivers: Sequence[AntennaDevice],
+        a: Complex128Array,
+        in_tx: Float64Array,
+        in_rx: Float64Array,
+        offsets: list[int],
     ) -> tuple[ChannelMatrix, ...]:
-        """H of every carrier and pair; zeros for a pair without waves."""
-        steered, places = [], {}
-        for q, (pair, (tx, rx)) in enumerate(zip(np.flatnonzero(is_far).tolist(), pairs, strict=True)):
-            transmit = steering_vector(tx.array, waves.departure[q] @ tx.rotation)
-            receive = steering_vector(rx.array, waves.arrival[q] @ rx.rotation)
-            steered.append((transmit, receive))
-            places[pair] = q
-        found = []
-        for carrier, a in enumerate(waves.a):
-            for pair in range(len(is_far)):
-                tx_index, rx_index = divmod(pair, len(receivers))
-                q = places.get(pair, -1)
-                if q < 0:
-                    shape = receivers[rx_index].array.size, transmitters[tx_index].array.size
-                    h: Complex128Array = np.zeros(shape, np.complex128)
-                else:
-                    transmit, receive = steered[q]
-                    h = (receive * a[q, :, None]).T @ transmit
-                found.append(ChannelMatrix(carrier=carrier, tx=tx_index, rx=rx_index, h=h))
-        return tuple(found)
+        """H[m, n] = Σ_l a[l] · receive[l, m] · transmit[l, n] of every carrier and pair."""
+        steered = []
+        for number, (first, end) in enumerate(pairwise(offsets)):
+            tx, rx = divmod(number, len(receivers))
+            transmit = steering_vector(transmitters[tx].array, in_tx[first:end])
+            receive = steering_vector(receivers[rx].array, in_rx[first:end])
+            steered.append((tx, rx, slice(first, end), transmit, receive))
+        return tuple(
+            ChannelMatrix(carrier=carrier, tx=tx, rx=rx, h=(receive * of_carrier[mine, None]).T @ transmit)
+            for carrier, of_carrier in enumerate(a)
+            for tx, rx, mine, transmit, receive in steered
+        )
 
 
-@dataclass(frozen=True, eq=False)
+class _Line:
+    """The straight line of a pair."""
+
+    __slots__ = (
+        "along",
+        "azimuth",
+        "back",
+        "end",
+        "length",
+        "rx",
+        "start",
+        "tx",
+        "tx_pose",
+        "velocity",
+        "zenith",
+    )
+
+    def __init__(
+        self,
+        tx: AntennaDevice,
+        rx: AntennaDevice,
+        tx_pose: Pose,
+        rx_pose: Pose,
+        tx_speed: Vector,
+        rx_speed: Vector,
+    ) -> None:
+        self.tx, self.rx, self.tx_pose = tx, rx, tx_pose
+        self.start, self.end = tx_pose.position, rx_pose.position
+        self.velocity = tx_speed, rx_speed
+        (x0, y0, z0), (x1, y1, z1) = self.start, self.end
+        x, y, z = x1 - x0, y1 - y0, z1 - z0
+        self.length = math.hypot(x, y, z)
+        scale = 1 / self.length if self.length > 0 else 0.0
+        self.along, self.back = (x * scale, y * scale, z * scale), (-x * scale, -y * scale, -z * scale)
+        self.zenith, self.azimuth = _angles(self.along)
+
+    @property
+    def azimuth_deg(self) -> float:
+        """Azimuth of RX in the axes of TX [°]."""
+        x, y, _ = unrotated(self.tx_pose.orientation, self.along)
+        return math.degrees(math.atan2(y, x))
+
+
 class _Waves:
-    """Waves of Q pairs with L components each, on C carriers."""
+    """Waves as they are added, pair after pair."""
 
-    a: Complex128Array
-    """Shape ``[C, Q, L]``."""
-    tau: Float64Array
-    """[s], Shape ``[Q, L]``."""
-    departure: Float64Array
-    """Unit vectors in world axes, Shape ``[Q, L, 3]``; ``arrival`` from RX towards the wave."""
-    arrival: Float64Array
-    doppler_ratio: Float64Array
-    """Shape ``[Q, L]``."""
+    def __init__(self) -> None:
+        self.amplitude: list[complex] = []
+        """Without carrier phase and path gain."""
+        self.tau: list[float] = []
+        self.departure: list[Vector] = []
+        """Unit vectors in world axes; ``arrival`` from RX towards the wave."""
+        self.arrival: list[Vector] = []
+        self.doppler_ratio: list[float] = []
+        self.id: list[int] = []
+        self.length: list[float] = []
+        """Of the pair's straight line [m]."""
+
+    def add(self, amplitude: complex, tau: float, departure: Vector, arrival: Vector, pair: _Line) -> None:
+        """One more wave."""
+        self.amplitude.append(amplitude)
+        self.tau.append(tau)
+        self.departure.append(departure)
+        self.arrival.append(arrival)
+        # A source that moves along its wave, and a receiver that moves against it, raise the frequency.
+        tx_speed, rx_speed = pair.velocity
+        self.doppler_ratio.append((_dot(tx_speed, departure) + _dot(rx_speed, arrival)) / SPEED_OF_LIGHT)
 
 
 @dataclass(frozen=True, eq=False)
 class _Draws:
-    """Draws of one pair for some frames, within a frame sorted by delay."""
+    """Draws of one pair for some frames, as lists; within a frame sorted by delay."""
 
-    gain: Complex128Array
-    """Of mean power 1, Shape ``[frames, L]``."""
-    excess: Float64Array
-    """[s], Shape ``[frames, L]``."""
-    deviation: Float64Array
-    """[rad] of departure zenith and azimuth, arrival zenith and azimuth, Shape ``[frames, L, 4]``."""
+    gain: list[list[complex]]
+    """Of mean power 1, by frame and component."""
+    excess: list[list[float]]
+    """[s], by frame and component."""
+    deviation: list[list[list[float]]]
+    """[rad] of departure zenith and azimuth, arrival zenith and azimuth, by frame and component."""
 
     @classmethod
     def of(cls, random: np.random.Generator, frames: int, settings: GeometricSettings) -> _Draws:
@@ -369,13 +421,29 @@ class _Draws:
             settings.azimuth_spread_arrival_deg,
         )
         scale = np.radians(spreads) / math.sqrt(2)  # a Laplacian of scale b has the variance 2b²
-        return cls(gain, excess, random.laplace(0.0, 1.0, (*shape, 4)) * scale)
+        deviation = random.laplace(0.0, 1.0, (*shape, 4)) * scale
+        return cls(gain.tolist(), excess.tolist(), deviation.tolist())
 
 
-def _unit(zenith: Float64Array, azimuth: Float64Array) -> Float64Array:
-    """Unit vectors of directions, Shape ``[..., 3]``; a zenith beyond a pole comes down on its other side."""
-    sine = np.sin(zenith)
-    return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.cos(zenith)], axis=-1)
+def _velocity(scene: Scene, device: AntennaDevice) -> Vector:
+    x, y, z = device_velocity(scene, device).tolist()
+    return (x, y, z)
+
+
+def _direction(zenith: float, azimuth: float) -> Vector:
+    """Unit vector of a direction; a zenith beyond a pole comes down on its other side."""
+    sine = math.sin(zenith)
+    return (sine * math.cos(azimuth), sine * math.sin(azimuth), math.cos(zenith))
+
+
+def _angles(vector: Vector) -> tuple[float, float]:
+    """(zenith, azimuth) [rad]."""
+    x, y, z = vector
+    return (math.atan2(math.hypot(x, y), z), math.atan2(y, x))
+
+
+def _dot(a: Vector, b: Vector) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def _id(kind: str) -> int:
