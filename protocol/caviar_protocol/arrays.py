@@ -10,8 +10,10 @@ gaps are zero, so that equal values give equal bytes (contract, clause 20).
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import cache
-from typing import Annotated, Any, ClassVar, TypeAlias, get_args, get_origin, get_type_hints
+from operator import attrgetter
+from typing import Annotated, Any, ClassVar, NamedTuple, TypeAlias, get_args, get_origin, get_type_hints
 
 import msgspec
 import numpy as np
@@ -100,17 +102,20 @@ class Payload(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     def __post_init__(self) -> None:
         cls = type(self)
         sizes = {size: self._length(fields) for size, fields in self.sizes_from.items()}
-        for name, dtype, shape, spec in _expected(cls):
-            value = getattr(self, name)
+        expected = _expected(cls)
+        # Paths cross here a thousand times a second: what is right is seen with few steps.
+        for value, (name, dtype, shape) in zip(expected.values(self), expected.fields, strict=True):
             if value is None:
                 continue
-            # Paths cross here a thousand times a second: what is right is seen with few steps.
-            if type(value) is not np.ndarray or value.dtype is not dtype or value.ndim != len(shape):
-                _check_array(cls.__name__, name, value, spec, sizes)
-                continue
-            for size, expected in zip(value.shape, shape, strict=True):
-                if size != (expected if type(expected) is int else sizes.setdefault(expected, size)):
-                    _check_array(cls.__name__, name, value, spec, sizes)
+            if type(value) is np.ndarray and value.dtype is dtype and value.ndim == len(shape):
+                for size, wanted in zip(value.shape, shape, strict=True):
+                    if size != wanted and size != (
+                        sizes.setdefault(wanted, size) if type(wanted) is str else -1
+                    ):
+                        break
+                else:
+                    continue
+            _check_array(cls.__name__, name, value, array_fields(cls)[name], sizes)
         self.check()
 
     def check(self) -> None:  # optional hook
@@ -131,11 +136,22 @@ class Payload(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     __hash__ = None  # type: ignore[assignment]  # arrays are not hashable, so neither is their owner
 
 
+class _Expected(NamedTuple):
+    """The array fields of a class: what gets their values, and name, dtype and shape of each."""
+
+    values: Callable[[Any], tuple[Any, ...]]
+    fields: tuple[tuple[str, np.dtype[Any], tuple[Any, ...]], ...]
+
+
 @cache
-def _expected(cls: type) -> tuple[tuple[str, np.dtype[Any], tuple[Any, ...], ArrayField], ...]:
-    """Name, dtype, shape and description of each array field."""
-    fields = array_fields(cls).items()
-    return tuple((name, WIRE_DTYPES[spec.dtype], spec.shape, spec) for name, spec in fields)
+def _expected(cls: type) -> _Expected:
+    fields = array_fields(cls)
+    names = tuple(fields)
+    if len(names) > 1:
+        values: Callable[[Any], tuple[Any, ...]] = attrgetter(*names)
+    else:
+        values = lambda payload: tuple(getattr(payload, name) for name in names)  # noqa: E731
+    return _Expected(values, tuple((n, WIRE_DTYPES[f.dtype], f.shape) for n, f in fields.items()))
 
 
 def _equal(a: Any, b: Any) -> bool:

@@ -119,8 +119,7 @@ class FrameInput:
         return self._payload
 
 
-@dataclass(frozen=True, kw_only=True)
-class Frame:
+class Frame(msgspec.Struct, frozen=True, kw_only=True):
     """One frame as a service sees it."""
 
     episode: int
@@ -176,17 +175,16 @@ class Frame:
         return iter(self.inputs)
 
 
-@dataclass(frozen=True, kw_only=True)
-class StepResult:
+class StepResult(msgspec.Struct, frozen=True, kw_only=True):
     """What a service made of a frame."""
 
-    products: Mapping[str, Payload] = field(default_factory=dict)
+    products: Mapping[str, Payload] = {}
     """Payload by topic; a declared output that is missing here is absent."""
     fidelity: str = ""
     """Rung or quality of the products, for their provenance."""
-    decisions: Mapping[str, str] = field(default_factory=dict)
-    counts: Mapping[str, int] = field(default_factory=dict)
-    measured: Mapping[str, int] = field(default_factory=dict)
+    decisions: Mapping[str, str] = {}
+    counts: Mapping[str, int] = {}
+    measured: Mapping[str, int] = {}
     """Nanoseconds that named phases took."""
     end_episode: bool = False
     """Agents: this frame is the last of the episode."""

@@ -26,7 +26,12 @@ class Inputs:
 
     def decided(self, task: Task) -> bool:
         """Whether all of them are decided, so that the task can be granted or skipped (clause 7)."""
-        return all(self._book.decided(edge, task.frame) for edge in self.taken(task))
+        frame, decided = task.frame, self._book.next
+        for edge in self.taken(task):
+            lag = edge.lag
+            if frame - lag >= decided[edge.source] and frame >= lag:
+                return False
+        return True
 
     def missing(self, task: Task) -> str | None:
         """Cause of the first required input that is absent (clause 10); frame 0 has no earlier one."""

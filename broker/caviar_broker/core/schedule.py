@@ -249,14 +249,15 @@ class EpisodeSchedule:
 
     def _advance_service(self, name: str, now: int) -> None:
         while True:
-            in_flight = sum(t.state is TaskState.GRANTED for t in self._outstanding[name])
+            owed = self._outstanding[name]
+            in_flight = sum(t.state is TaskState.GRANTED for t in owed) if owed else 0
             task = self._turns.candidate(name, in_flight)
             if task is None or not self._inputs.decided(task):
                 return
             if self._ledger.written < max(self._first_entry, self._inputs.latest_entry(task)):
                 self._turns.waiting_for_journal.add(name)
                 return
-            has_room = len(self._outstanding[name]) < self._capacity[name]
+            has_room = len(owed) < self._capacity[name]
             if in_flight and not has_room:
                 return
             if not self._released(task, now):

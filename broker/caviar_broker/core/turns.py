@@ -16,7 +16,7 @@ class Turns:
     """
 
     def __init__(self, graph: Graph, plan: RunPlan, book: DecisionBook) -> None:
-        roles = {service.name: service.role for service in plan.services}
+        self._roles = roles = {service.name: service.role for service in plan.services}
         self.agents = tuple(name for name in graph.order if roles[name] == "agent")
         self.recorders = tuple(name for name in graph.order if roles[name] == "recorder")
         self.others = tuple(name for name in graph.order if name not in self.recorders)
@@ -33,15 +33,15 @@ class Turns:
         No agent runs ahead of one that may end the episode, and no recorder of what may be cut then.
         """
         book = self._book
-        frame = book.next[name] + in_flight
-        if frame >= book.frames and (name not in self.agents or frame > book.frames):
+        frame, role = book.next[name] + in_flight, self._roles[name]
+        if frame >= book.frames and (role != "agent" or frame > book.frames):
             return None
         if frame >= book.finished_frames + self._plan.frames_in_flight + (frame == book.frames):
             self._waiting_for_frames.add(name)
             return None
-        if name in self.agents and any(book.next[agent] < frame for agent in self.agents):
+        if role == "agent" and any(book.next[agent] < frame for agent in self.agents):
             return None
-        if name in self.recorders and any(book.next[other] <= frame for other in self.others):
+        if role == "recorder" and any(book.next[other] <= frame for other in self.others):
             return None
         return book.task(name, frame)
 

@@ -8,10 +8,10 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any, ClassVar
 
+import msgspec
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
@@ -26,8 +26,7 @@ from caviar_protocol.scene import device_pose, device_velocity
 from caviar_protocol.topics import Camera, Depth, Lidar, Link, Scene
 
 
-@dataclass(frozen=True)
-class Moment:
+class Moment(msgspec.Struct, frozen=True):
     """What is known at a frame."""
 
     frame: Frame

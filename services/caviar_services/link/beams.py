@@ -189,27 +189,25 @@ def _score(
     at_tx, at_rx = directions(scene, users)
     towards_rx, towards_tx = at_tx.tolist(), at_rx.tolist()
     k = min(top_k, max((user.tx.array.size * user.rx.array.size for user in users), default=0))
-    scores = _Scores(
-        abs_y=np.zeros(len(users)),
-        top_tx_beam=np.full((len(users), k), -1, dtype=np.int32),
-        top_rx_beam=np.full((len(users), k), -1, dtype=np.int32),
-        top_abs_y=np.zeros((len(users), k)),
-        baseline_abs_y=np.zeros(len(users)),
-        aod_azimuth=np.arctan2(at_tx[:, 1], at_tx[:, 0]),
-        aoa_azimuth=np.arctan2(at_rx[:, 1], at_rx[:, 0]),
-    )
-    served = choices.tx_beam.tolist()
+    chosen, baseline = [0.0] * len(users), [0.0] * len(users)
+    top_tx, top_rx = (np.full((len(users), k), -1, np.int32) for _ in range(2))
+    top_abs_y = np.zeros((len(users), k))
     for u, abs_y in enumerate(sweep_users(users, channels.h)):
         if abs_y is None:
             continue
-        best = best_pairs(abs_y, k)
+        user, best = users[u], best_pairs(abs_y, k)
         listed = len(best.abs_y)
-        scores.top_tx_beam[u, :listed] = best.tx_beam
-        scores.top_rx_beam[u, :listed] = best.rx_beam
-        scores.top_abs_y[u, :listed] = best.abs_y
-        if served[u] >= 0:
-            scores.abs_y[u] = abs_y[choices.tx_beam[u], choices.rx_beam[u]]
-        user = users[u]
-        baseline = beam_towards(user.tx.array, towards_rx[u]), beam_towards(user.rx.array, towards_tx[u])
-        scores.baseline_abs_y[u] = abs_y[baseline]
-    return scores
+        top_tx[u, :listed], top_rx[u, :listed], top_abs_y[u, :listed] = best
+        if choices.tx_beam[u] >= 0:
+            chosen[u] = abs_y[choices.tx_beam[u], choices.rx_beam[u]]
+        straight = beam_towards(user.tx.array, towards_rx[u]), beam_towards(user.rx.array, towards_tx[u])
+        baseline[u] = abs_y[straight]
+    return _Scores(
+        abs_y=np.array(chosen, np.float64),
+        top_tx_beam=top_tx,
+        top_rx_beam=top_rx,
+        top_abs_y=top_abs_y,
+        baseline_abs_y=np.array(baseline, np.float64),
+        aod_azimuth=np.arctan2(at_tx[:, 1], at_tx[:, 0]),
+        aoa_azimuth=np.arctan2(at_rx[:, 1], at_rx[:, 0]),
+    )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
 from fnmatch import fnmatchcase
 from itertools import pairwise
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any, ClassVar, TypeVar, cast
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from caviar_protocol.arrays import Float64Array, Payload
 from caviar_protocol.messages import Status

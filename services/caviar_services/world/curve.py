@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
+
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array
@@ -27,35 +29,49 @@ class MonotoneCurve:
         self.times = times
         self.points = points
         self.slopes = _slopes(times, points)
+        # Evaluated a few numbers at a time, which is faster with numbers than with arrays of three.
+        self._instants: list[float] = times.tolist()
+        self._ends: tuple[list[float], list[float]] = points[0].tolist(), points[-1].tolist()
+        self._segments = [self._coefficients(k) for k in range(len(times) - 1)]
+
+    def _coefficients(self, k: int) -> tuple[float, float, list[tuple[float, float, float, float]]]:
+        """Begin and length [s] of a segment, and the cubic of each coordinate over s from 0 to 1."""
+        length = self.times[k + 1] - self.times[k]
+        step = self.points[k + 1] - self.points[k]
+        d0, d1 = self.slopes[k] * length, self.slopes[k + 1] * length
+        c2, c3 = 3 * step - 2 * d0 - d1, d0 + d1 - 2 * step
+        return (
+            self._instants[k],
+            float(length),
+            list(zip(*np.array([self.points[k], d0, c2, c3]).tolist(), strict=True)),
+        )
 
     def segment(self, t: float) -> int:
         """Index of the segment that holds instant ``t`` [s]; −1 where the curve rests."""
-        if not self.times[0] <= t < self.times[-1]:
+        if not self._instants[0] <= t < self._instants[-1]:
             return -1
-        return int(np.searchsorted(self.times, t, side="right")) - 1
+        return bisect_right(self._instants, t) - 1
 
-    def __call__(self, t: float, order: int = 0) -> Float64Array:
-        """The derivative of an order (0: the value, 1, 2) at instant ``t`` [s], Shape ``[D]``.
+    def at(self, t: float, order: int = 0) -> list[float]:
+        """The derivative of an order (0: the value, 1, 2) at instant ``t`` [s], D numbers.
 
         The second derivative jumps at the points; there it is that of the segment that begins.
         """
         k = self.segment(t)
         if k < 0:
-            ends: Float64Array = self.points[0 if t < self.times[0] else -1]
-            return ends.copy() if order == 0 else np.zeros_like(ends)
-        length = self.times[k + 1] - self.times[k]
-        s = (t - self.times[k]) / length
-        step = self.points[k + 1] - self.points[k]
-        d0, d1 = self.slopes[k] * length, self.slopes[k + 1] * length
-        c2, c3 = 3 * step - 2 * d0 - d1, d0 + d1 - 2 * step
+            ends = self._ends[0 if t < self._instants[0] else 1]
+            return list(ends) if order == 0 else [0.0] * len(ends)
+        begin, length, cubics = self._segments[k]
+        s = (t - begin) / length
         if order == 0:
-            value: Float64Array = self.points[k] + s * (d0 + s * (c2 + s * c3))
-            return value
+            return [p + s * (d0 + s * (c2 + s * c3)) for p, d0, c2, c3 in cubics]
         if order == 1:
-            first: Float64Array = (d0 + s * (2 * c2 + s * 3 * c3)) / length
-            return first
-        second: Float64Array = (2 * c2 + s * 6 * c3) / length**2
-        return second
+            return [(d0 + s * (2 * c2 + s * 3 * c3)) / length for _, d0, c2, c3 in cubics]
+        return [(2 * c2 + s * 6 * c3) / length**2 for _, _, c2, c3 in cubics]
+
+    def __call__(self, t: float, order: int = 0) -> Float64Array:
+        """The same as an array, Shape ``[D]``."""
+        return np.array(self.at(t, order))
 
 
 def _slopes(times: Float64Array, points: Float64Array) -> Float64Array:

@@ -25,6 +25,9 @@ class Mounts:
         self._fixed = tuple(_device(spec, spec.name, "", (0.0, 0.0, 0.0)) for spec in specs if not spec.on)
         self._mounted = tuple(spec for spec in specs if spec.on)
         self._arrived: list[str] = []
+        self._objects: Sequence[tuple[str, Vector]] | None = None
+        self._devices: tuple[Device, ...] = ()
+        """Of the objects of the frame before, which mostly are those of the next one."""
 
     @property
     def fixed_names(self) -> tuple[str, ...]:
@@ -34,6 +37,7 @@ class Mounts:
     def clear(self) -> None:
         """Forget who came first: a new episode begins."""
         self._arrived = []
+        self._objects = None
 
     def devices(self, objects: Sequence[tuple[str, Vector]]) -> tuple[Device, ...]:
         """Devices of a frame, sorted by name.
@@ -41,6 +45,8 @@ class Mounts:
         ``objects`` are the names and dimensions [m] of all objects of the frame. Those that
         were not there in the previous frame count as having come in the given order.
         """
+        if objects == self._objects:
+            return self._devices
         dimensions = dict(objects)
         known = set(self._arrived)
         self._arrived = [name for name in self._arrived if name in dimensions]
@@ -49,7 +55,8 @@ class Mounts:
         for spec in self._mounted:
             carriers = [name for name in self._arrived if _matches(spec, name)][: spec.count]
             found += [_device(spec, f"{name}/{spec.name}", name, dimensions[name]) for name in carriers]
-        return tuple(sorted(found, key=lambda device: device.name))
+        self._objects, self._devices = objects, tuple(sorted(found, key=lambda device: device.name))
+        return self._devices
 
 
 def _matches(spec: DeviceSpec, name: str) -> bool:

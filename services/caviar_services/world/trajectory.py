@@ -112,22 +112,24 @@ class Track:
         self._curve = MonotoneCurve(times, np.array([w.position for w in waypoints]))
         yaws = [w.yaw for w in waypoints if w.yaw is not None]
         self._given = MonotoneCurve(times, np.unwrap(yaws)[:, None]) if yaws else None
+        steps = np.diff(self._curve.points, axis=0)
+        self._moving: list[bool] = np.any(steps[:, :2], axis=1).tolist()
         self._hover = self._hover_yaws()
 
     def position(self, t: float) -> Vector:
         """[m] at instant ``t`` [s]."""
-        x, y, z = self._curve(t).tolist()
+        x, y, z = self._curve.at(t)
         return (x, y, z)
 
     def velocity(self, t: float) -> Vector:
         """[m/s] at instant ``t`` [s]."""
-        x, y, z = self._curve(t, 1).tolist()
+        x, y, z = self._curve.at(t, 1)
         return (x, y, z)
 
     def yaw(self, t: float) -> float:
         """[rad] at instant ``t`` [s], counter-clockwise from +x."""
         if self._given is not None:
-            return float(self._given(t)[0])
+            return self._given.at(t)[0]
         times = self._curve.times
         k = self._curve.segment(t)
         if k < 0:
@@ -139,11 +141,10 @@ class Track:
         return start + (end - start) * s * s * (3 - 2 * s)
 
     def _moves(self, k: int) -> bool:
-        step = self._curve.points[k + 1] - self._curve.points[k]
-        return bool(step[0] or step[1])
+        return self._moving[k]
 
     def _course(self, t: float, k: int) -> float:
-        vx, vy, _ = self._curve(t, 1).tolist()
+        vx, vy, _ = self._curve.at(t, 1)
         if math.hypot(vx, vy) > _SLOW:
             return math.atan2(vy, vx)
         begin, end = self._curve.times[k], self._curve.times[k + 1]
