@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -62,10 +62,16 @@ def device_pose(scene: Scene, device: Device) -> Pose:
 
     Raises `PayloadError` where the parent is not in the scene.
     """
-    mount = Pose(device.position, device.orientation)
-    if not device.parent:
-        return mount
-    return compose(object_pose(scene, _parent_index(scene, device)), mount)
+    # Channel, link and agent ask for the same poses: what was composed is kept with the scene.
+    known: dict[str, tuple[Device, Pose]] = scene.__dict__.setdefault("_poses", {})
+    entry = known.get(device.name)
+    if entry is not None and entry[0] is device:
+        return entry[1]
+    pose = Pose(device.position, device.orientation)
+    if device.parent:
+        pose = compose(object_pose(scene, _parent_index(scene, device)), pose)
+    known[device.name] = device, pose
+    return pose
 
 
 def device_velocity(scene: Scene, device: Device) -> Float64Array:
@@ -76,12 +82,13 @@ def device_velocity(scene: Scene, device: Device) -> Float64Array:
     return velocity
 
 
-def antennas(scene: Scene, role: str) -> list[AntennaDevice]:
+def antennas(scene: Scene, role: str) -> Sequence[AntennaDevice]:
     """Antenna devices that transmit (``"tx"``) or receive (``"rx"``), sorted by name."""
-    return sorted(
-        (d for d in scene.devices if isinstance(d, AntennaDevice) and d.role in (role, "both")),
-        key=lambda device: device.name,
-    )
+    known: dict[str, list[AntennaDevice]] = scene.__dict__.setdefault("_antennas", {})
+    if role not in known:
+        found = (d for d in scene.devices if isinstance(d, AntennaDevice) and d.role in (role, "both"))
+        known[role] = sorted(found, key=lambda device: device.name)
+    return known[role]
 
 
 def _parent_index(scene: Scene, device: Device) -> int:

@@ -91,6 +91,8 @@ class Prepared:
 class FrameInput:
     """One input of a frame: its provenance, and its payload decoded on first use."""
 
+    __slots__ = ("_payload", "body", "header", "provenance")
+
     def __init__(
         self,
         provenance: GrantInput,

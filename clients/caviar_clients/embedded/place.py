@@ -26,6 +26,7 @@ from caviar_services.exchange import (
 from caviar_services.runner import TRIM_EVERY
 from caviar_services.service import Frame, FrameInput, Service, StepResult
 
+ABSENT = m.Status.ABSENT
 Feed = Callable[[ev.Event], None]
 Products: TypeAlias = tuple[ev.Product, ...]
 
@@ -131,10 +132,12 @@ class Place:
         if self._digests:
             inputs = inputs_of(grant, [part for product in products for part in product.payload])
         else:
-            payloads = (product.payload for product in products)
+            left = iter(products)
             inputs = tuple(
-                FrameInput(entry, payload=None if entry.status is m.Status.ABSENT else next(payloads))
-                for entry in grant.inputs
+                [
+                    FrameInput(e) if e.status is ABSENT else FrameInput(e, payload=next(left).payload)
+                    for e in grant.inputs
+                ]
             )
         return frame_of(self._running, self._reset_to, grant, inputs)
 

@@ -81,7 +81,7 @@ class CameraDevice(_Device, frozen=True, kw_only=True, omit_defaults=True, tag="
 Device = AntennaDevice | LidarDevice | CameraDevice
 
 
-class Scene(Payload, frozen=True, kw_only=True, omit_defaults=True):
+class Scene(Payload, frozen=True, kw_only=True, omit_defaults=True, dict=True):
     """State of the virtual world at one instant, as one world knows it.
 
     Objects are sorted by name, devices too. A position is the centre of the object's bounding

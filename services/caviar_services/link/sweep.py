@@ -35,7 +35,7 @@ def sweep(h: Complex128Array, tx: AntennaArray, rx: AntennaArray) -> Float64Arra
         if elements.shape[axis] > 1:
             y = np.fft.fft(y, axis=axis, norm="ortho")
     y = y.reshape(*leading, rx.size, tx.size)
-    magnitude: Float64Array = np.ascontiguousarray(np.abs(y).swapaxes(-1, -2))
+    magnitude: Float64Array = np.abs(y.swapaxes(-1, -2))
     return magnitude
 
 
