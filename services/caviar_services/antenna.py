@@ -37,6 +37,8 @@ def steering_vector(array: AntennaArray, directions: Float64Array) -> Complex128
     ``directions`` are unit vectors k̂ from the array towards the other end in device axes,
     Shape ``[..., 3]``. The element pattern is not part of it.
     """
+    if array.size == 1:
+        return np.ones((*directions.shape[:-1], 1), np.complex128)
     y, z = _grid(array)
     # k̂·r separates, so rows + columns exponentials do instead of rows · columns.
     columns: Complex128Array = np.exp(2j * np.pi * directions[..., 1, None] * y)

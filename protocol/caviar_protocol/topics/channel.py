@@ -125,15 +125,10 @@ class Channel(Payload, frozen=True, kw_only=True, omit_defaults=True):
 
     def check(self) -> None:
         """``offsets`` cuts the path axis into one run for each pair."""
-        offsets, pairs, paths = self.offsets, len(self.tx) * len(self.rx), len(self.tau)
-        if (
-            len(offsets) != pairs + 1
-            or offsets[0] != 0
-            or offsets[-1] != paths
-            or (offsets[1:] < offsets[:-1]).any()
-        ):
+        offsets, pairs, paths = self.offsets.tolist(), len(self.tx) * len(self.rx), len(self.tau)
+        if len(offsets) != pairs + 1 or offsets[0] != 0 or offsets[-1] != paths or offsets != sorted(offsets):
             raise PayloadError(
-                f"Channel.offsets {offsets.tolist()!r:.80} does not cut {paths} paths into {pairs} pairs: "
+                f"Channel.offsets {offsets!r:.80} does not cut {paths} paths into {pairs} pairs: "
                 f"it needs {pairs + 1} ascending entries from 0 to {paths}"
             )
 

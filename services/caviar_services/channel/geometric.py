@@ -27,6 +27,7 @@ without line of sight.
 
 from __future__ import annotations
 
+import cmath
 import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -123,7 +124,8 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
     def __init__(self, settings: GeometricSettings, run: RunInfo) -> None:
         super().__init__(settings, run)
         count, k = settings.components, 10 ** (settings.k_factor_db / 10)
-        self._frequency = np.array([carrier.frequency_hz for carrier in run.carriers])[:, None]
+        self._frequencies = [carrier.frequency_hz for carrier in run.carriers]
+        self._frequency = np.array(self._frequencies)[:, None]
         self._reflected = math.sqrt(1 / count)
         self._behind_straight = math.sqrt(1 / ((k + 1) * (count - 1))) if count > 1 else 0.0
         self._straight = math.sqrt(k / (k + 1)) if count > 1 else 1.0
@@ -240,14 +242,11 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         los: list[bool],
         offsets: list[int],
     ) -> Channel:
-        tau = np.array(waves.tau, np.float64)
-        # The whole turns of f·τ go first: they are millions, and only the rest is a phase.
-        turns = self._frequency * tau
-        a = np.array(waves.amplitude, np.complex128) * np.exp(-2j * np.pi * (turns - np.round(turns)))
+        a = np.array([_with_phase(waves, f) for f in self._frequencies], np.complex128)
         in_tx, in_rx = self._in_device_axes(transmitters, receivers, poses, waves, offsets)
         if not self._unit:
             a *= self._path_gain(transmitters, receivers, waves, in_tx, in_rx, offsets)
-        count = len(tau)
+        count = len(waves.tau)
         return Channel(
             rung=self.rung,
             options=self.options,
@@ -258,7 +257,7 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
             offsets=np.array(offsets, np.int64),
             id=np.array(waves.id, np.uint64),
             a=a,
-            tau=tau,
+            tau=np.array(waves.tau, np.float64),
             aod=np.array([_angles(vector) for vector in waves.departure], np.float64).reshape(-1, 2),
             aoa=np.array([_angles(vector) for vector in waves.arrival], np.float64).reshape(-1, 2),
             doppler=self._frequency * np.array(waves.doppler_ratio, np.float64),
@@ -423,6 +422,14 @@ class _Draws:
         scale = np.radians(spreads) / math.sqrt(2)  # a Laplacian of scale b has the variance 2b²
         deviation = random.laplace(0.0, 1.0, (*shape, 4)) * scale
         return cls(gain.tolist(), excess.tolist(), deviation.tolist())
+
+
+def _with_phase(waves: _Waves, frequency: float) -> list[complex]:
+    """Amplitudes with exp(−j2πfτ)."""
+    # The whole turns of f·τ go first: they are millions, and only the rest is a phase.
+    turns = [frequency * tau for tau in waves.tau]
+    phases = [cmath.rect(1.0, -2 * math.pi * (turn - round(turn))) for turn in turns]
+    return [amplitude * phase for amplitude, phase in zip(waves.amplitude, phases, strict=True)]
 
 
 def _velocity(scene: Scene, device: AntennaDevice) -> Vector:
