@@ -23,6 +23,7 @@ BUILT_IN: dict[str, str] = {
     "channel:free-space": "caviar_services.channel.free_space:FreeSpaceChannel",
     "channel:geometric": "caviar_services.channel.geometric:GeometricChannel",
     "channel:sionna-rt": "caviar_services.channel.sionna_rt:SionnaChannel",
+    "sensors:camera": "caviar_services.sensors.camera:CameraSensors",
     "sensors:lidar": "caviar_services.sensors.lidar:LidarSensors",
     "link:beams": "caviar_services.link.beams:BeamLink",
     "agent:los-beam": "caviar_services.agent.los_beam:LosBeamAgent",

@@ -34,6 +34,8 @@ class SceneryShape:
     """Id of its material in the description; empty where it has none."""
     itu_material: str
     """Name of that material in ITU-R P.2040 (``concrete``); empty where it is not one of those."""
+    colour: tuple[float, float, float] | None = None
+    """Linear sRGB, 0…1, that the description gives its material; None where it gives none."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ def read_scenery(file: Path) -> Scenery:
     """
     root = _parse(file)
     defaults = {d.get("name", ""): d.get("value", "") for d in root.iter("default")}
-    materials = {b.get("id", ""): _itu_material(b) for b in root.findall("bsdf")}
+    materials = {b.get("id", ""): b for b in root.findall("bsdf")}
     shapes: dict[str, SceneryShape] = {}
     for element in root.findall("shape"):
         shape = _shape(file, element, defaults, materials)
@@ -101,7 +103,10 @@ def _parse(file: Path) -> ElementTree.Element:
 
 
 def _shape(
-    file: Path, element: ElementTree.Element, defaults: Mapping[str, str], materials: Mapping[str, str]
+    file: Path,
+    element: ElementTree.Element,
+    defaults: Mapping[str, str],
+    materials: Mapping[str, ElementTree.Element],
 ) -> SceneryShape:
     given = element.get("id") or element.get("name") or ""
     where = f"{file}: shape {given!r}"
@@ -112,13 +117,14 @@ def _shape(
         raise AssetError(f"{where} names no file; give it <string name='filename' value='meshes/….ply'/>")
     mesh = _mesh_file(where, file.parent, _resolved(where, filename.get("value", ""), defaults))
     transform = element.find("transform[@name='to_world']")
-    material, itu = _material_of(where, element, materials)
+    material = _material_of(where, element, materials)
     return SceneryShape(
         name=(given or mesh.stem).removeprefix("mesh-"),
         file=mesh,
         to_world=np.eye(4) if transform is None else _to_world(where, transform, defaults),
-        material=material,
-        itu_material=itu,
+        material="" if material is None else material.get("id", ""),
+        itu_material="" if material is None else _itu_material(material),
+        colour=None if material is None else _colour(where, material),
     )
 
 
@@ -134,20 +140,39 @@ def _mesh_file(where: str, folder: Path, name: str) -> Path:
     return mesh
 
 
-def _material_of(where: str, element: ElementTree.Element, materials: Mapping[str, str]) -> tuple[str, str]:
+def _material_of(
+    where: str, element: ElementTree.Element, materials: Mapping[str, ElementTree.Element]
+) -> ElementTree.Element | None:
     nested = element.find("bsdf")
     if nested is not None:
-        return nested.get("id", ""), _itu_material(nested)
+        return nested
     for reference in element.findall("ref"):
         material = reference.get("id", "")
         if material in materials:
-            return material, materials[material]
+            return materials[material]
         if reference.get("name") == "bsdf":
             raise AssetError(
                 f"{where} refers to material {material!r}, which is not defined; "
                 f"defined are: {', '.join(sorted(materials)) or 'none'}"
             )
-    return "", ""
+    return None
+
+
+def _colour(where: str, bsdf: ElementTree.Element) -> tuple[float, float, float] | None:
+    """The first colour of a material under a name that renderers take one by."""
+    for rgb in bsdf.iter("rgb"):
+        if rgb.get("name") in ("color", "reflectance", "base_color"):
+            value = rgb.get("value", "")
+            try:
+                red, green, blue = _numbers(value, 3)
+            except ValueError:
+                red = green = blue = -1.0
+            if not all(0 <= part <= 1 for part in (red, green, blue)):
+                raise AssetError(
+                    f"{where}: its material has the colour {value!r}; write three numbers from 0 to 1"
+                )
+            return red, green, blue
+    return None
 
 
 def _itu_material(bsdf: ElementTree.Element) -> str:

@@ -16,14 +16,16 @@ from typing import Annotated, Any, ClassVar, TypeVar
 import msgspec
 import numpy as np
 
-from caviar_protocol.arrays import Payload, quantity
-from caviar_protocol.errors import ScenarioError, SetupError
+from caviar_protocol.arrays import Float64Array, Payload, quantity
+from caviar_protocol.coordinates import Pose, rotation_matrix
+from caviar_protocol.errors import PayloadError, ScenarioError, SetupError
 from caviar_protocol.messages import Input, Role
+from caviar_protocol.scene import device_pose
 from caviar_protocol.topics import Scene
 from caviar_protocol.topics.scene import Device
 from caviar_services.llvm import activate_llvm, choose_variant, cuda_devices
 from caviar_services.meshes import Mesh, unit_box
-from caviar_services.scenery import find_scenery, read_scenery
+from caviar_services.scenery import SceneryShape, find_scenery, read_scenery
 from caviar_services.sensors.geometry import TracedScene, active_variant, load_scenery, load_unit_mesh
 from caviar_services.service import Frame, Preparation, Prepared, Service, StepResult
 
@@ -52,6 +54,8 @@ class Sensors(Service[S]):
 
     traced: TracedScene | None = None
     """The scene for rays; None where nothing is asked for."""
+    shapes: tuple[SceneryShape, ...] = ()
+    """Shapes of the scenery, in the order of their owners in `traced`."""
 
     def prepare(self, preparation: Preparation) -> Prepared:
         """Load the scenery and the objects' meshes, and compile what `observe` needs.
@@ -113,11 +117,10 @@ class Sensors(Service[S]):
 
     def _load(self, mi: Any, assets: Mapping[str, Path]) -> TracedScene:
         file = find_scenery(assets)
-        names: tuple[str, ...] = ()
         meshes: list[Mesh] = []
         if file is not None:
             scenery = read_scenery(file)
-            names, meshes = tuple(shape.name for shape in scenery.shapes), load_scenery(mi, scenery)
+            self.shapes, meshes = scenery.shapes, load_scenery(mi, scenery)
         bodies = {"": unit_box()}
         bodies |= {
             name: load_unit_mesh(mi, path)
@@ -131,7 +134,7 @@ class Sensors(Service[S]):
                 key=f"services.{self.run.name}.settings.bodies",
             )
         capacity = dict.fromkeys(bodies, self.settings.bodies_per_asset) | self.settings.bodies
-        return TracedScene(mi, names, meshes, bodies, capacity)
+        return TracedScene(mi, tuple(shape.name for shape in self.shapes), meshes, bodies, capacity)
 
     def _warm_up(self, mi: Any) -> None:
         """Compile the kernels of an update and an observation, on a scene without objects."""
@@ -149,3 +152,30 @@ class Sensors(Service[S]):
         )
         self.traced.update(mi, scene)
         self.observe(mi, self.traced, scene)
+
+
+def pose_outside(traced: TracedScene, scene: Scene, device: Device) -> Pose:
+    """World pose of a sensor, which must not sit inside the mesh that carries it.
+
+    Raises `PayloadError` naming both and the remedy where it does.
+    """
+    if device.parent and device.parent in scene.names:
+        parent = scene.names.index(device.parent)
+        if traced.is_inside(scene.assets[parent], scene.dimensions[parent], device.position):
+            kind = type(device).__struct_config__.tag
+            raise PayloadError(
+                f"{kind} {device.name!r} sits inside its carrier {device.parent!r} and would see only that; "
+                'mount it outside the mesh, for example with mount = "roof" and a position_m above it'
+            )
+    return device_pose(scene, device)
+
+
+def turned(pose: Pose, local: Float64Array) -> Float64Array:
+    """Vectors in a sensor's axes in world axes, Shape ``[3, N]``."""
+    # Written out instead of a matrix product, whose rounding may depend on the BLAS and its threads.
+    return np.stack(
+        [
+            row[0] * local[0] + row[1] * local[1] + row[2] * local[2]
+            for row in rotation_matrix(pose.orientation)
+        ]
+    )

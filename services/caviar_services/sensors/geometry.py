@@ -6,7 +6,7 @@ than building one again: when a vertex moves, Embree rebuilds everything that sh
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from caviar_protocol.arrays import Float32Array, Float64Array, Int32Array
+from caviar_protocol.arrays import Float32Array, Float64Array, Int32Array, Int64Array
 from caviar_protocol.coordinates import Vector
 from caviar_protocol.errors import AssetError, PayloadError
 from caviar_protocol.scene import object_pose
@@ -114,6 +114,8 @@ class Hits:
     """[m] along each ray, Shape ``[N]``; infinite where nothing is hit."""
     owner: Int32Array
     """What is hit, for `TracedScene.name_of`; `NO_HIT` for nothing. Shape ``[N]``."""
+    face: Int64Array
+    """Which triangle is hit, for `TracedScene.face_normals`; 0 where nothing is. Shape ``[N]``."""
 
 
 class _Part:
@@ -161,9 +163,11 @@ class TracedScene:
         self._bodies = dict(bodies)
         self._capacity = dict(capacity)
         self._scenery: _Part | None = None
-        vertices, faces, self._scenery_owner = _merged(meshes)
+        vertices, faces, scenery_owner = _merged(meshes)
+        self.scenery_faces = len(faces)
         if faces.size:
             self._scenery = _Part(mi, "scenery", vertices, faces)
+        self._scenery_normals = _normals(vertices, faces)
         # Parked bodies are collapsed to a point within the scene, where no ray can hit them.
         self._parked = vertices.mean(axis=0) if len(vertices) else np.zeros(3)
         self._start: dict[str, int] = {}
@@ -171,11 +175,16 @@ class TracedScene:
         for asset in sorted(self._bodies):
             self._start[asset] = len(pooled)
             pooled += [self._bodies[asset]] * capacity[asset]
-        _, faces, owner = _merged(pooled)
-        self._body_owner = owner + np.int32(len(names))
+        _, self._body_faces, owner = _merged(pooled)
+        self.face_owner: Int32Array = np.concatenate([scenery_owner, owner + np.int32(len(names))])
+        """Owner of each face, Shape ``[F]``: the scenery's faces, then the bodies'."""
         self._vertex_start = np.cumsum([0, *(len(mesh.vertices) for mesh in pooled)])
-        self._moving = _Part(mi, "bodies", np.tile(self._parked, (self._vertex_start[-1], 1)), faces)
-        self._owner_names: list[str] = [*names, *[""] * len(pooled)]
+        self._vertices = np.tile(self._parked, (self._vertex_start[-1], 1))
+        self._moving = _Part(mi, "bodies", self._vertices, self._body_faces)
+        self.owner_names: list[str] = [*names, *[""] * len(pooled)]
+        """By owner; empty for a body that no object has."""
+        self.object_owner: dict[str, int] = {}
+        """Owner of each object of the last update, by its name."""
 
     def update(self, mi: Any, scene: Scene) -> None:
         """Move the bodies to where the scene's objects are.
@@ -190,16 +199,20 @@ class TracedScene:
                 "another prefix"
             )
         vertices = np.tile(self._parked, (self._vertex_start[-1], 1))
-        self._owner_names[len(self._scenery_names) :] = [""] * (len(self._vertex_start) - 1)
+        scenery_size = len(self._scenery_names)
+        self.owner_names[scenery_size:] = [""] * (len(self._vertex_start) - 1)
+        self.object_owner = {}
         # A new assignment each frame, so that a product depends on its scene alone, whatever came before.
         places = BodyPool(self._capacity).assign(zip(scene.names, scene.assets, strict=True))
         for index, name in enumerate(scene.names):
             asset, slot = places[name]
             body = self._start[asset] + slot
-            self._owner_names[len(self._scenery_names) + body] = name
+            self.owner_names[scenery_size + body] = name
+            self.object_owner[name] = scenery_size + body
             vertices[self._vertex_start[body] : self._vertex_start[body + 1]] = placed(
                 self._bodies[asset], scene.dimensions[index], object_pose(scene, index)
             )
+        self._vertices = vertices
         self._moving.move(mi, vertices)
 
     def trace(self, mi: Any, origin: Float64Array, direction: Float64Array, reach: Float64Array) -> Hits:
@@ -219,27 +232,45 @@ class TracedScene:
         x, y, z, dx, dy, dz, limit = map(mi.Float, aligned_columns(np.vstack([origin, direction, reach])))
         ray = mi.Ray3f(mi.Point3f(x, y, z), mi.Vector3f(dx, dy, dz))
         ray.maxt = limit
-        hit = self._moving.scene.ray_intersect_preliminary(ray, coherent=True)
-        distance, face, moving = hit.t, hit.prim_index, mi.Bool(True)
-        if self._scenery is not None:
-            fixed = self._scenery.scene.ray_intersect_preliminary(ray, coherent=True)
-            moving = distance < fixed.t
-            distance = dr.select(moving, distance, fixed.t)
-            face = dr.select(moving, face, fixed.prim_index)
-        dr.eval(distance, face, moving)
-        return self._hits(distance.numpy(), face.numpy(), moving.numpy())
+        distance, face = self.intersect(mi, ray)
+        dr.eval(distance, face)
+        return self._hits(distance.numpy(), face.numpy())
 
-    def _hits(self, distance: Float32Array, face: Any, moving: Any) -> Hits:
+    def intersect(self, mi: Any, ray: Any) -> tuple[Any, Any]:
+        """Distance [m] and face of each ray's first hit, as Dr.Jit arrays that wait for evaluation.
+
+        Distance is infinite, and the face any number, where nothing is hit.
+        """
+        import drjit as dr
+
+        hit = self._moving.scene.ray_intersect_preliminary(ray, coherent=True)
+        if self._scenery is None:
+            return hit.t, hit.prim_index
+        fixed = self._scenery.scene.ray_intersect_preliminary(ray, coherent=True)
+        moving = hit.t < fixed.t
+        face = dr.select(moving, hit.prim_index + mi.UInt32(self.scenery_faces), fixed.prim_index)
+        return dr.select(moving, hit.t, fixed.t), face
+
+    def occluded(self, ray: Any, active: Any, coherent: bool) -> Any:
+        """Whether each ray hits anything, as a Dr.Jit array that waits for evaluation."""
+        hit = self._moving.scene.ray_test(ray, coherent=coherent, active=active)
+        if self._scenery is not None:
+            hit |= self._scenery.scene.ray_test(ray, coherent=coherent, active=active)
+        return hit
+
+    def _hits(self, distance: Float32Array, face: Any) -> Hits:
         found = np.isfinite(distance)
         # A ray that hits nothing has no face; 0 stands in, so that the tables can be read.
         face = np.where(found, face, 0).astype(np.int64)
-        owner = np.where(
-            moving,
-            self._body_owner[np.where(moving, face, 0)],
-            self._scenery_owner[np.where(moving, 0, face)] if self._scenery is not None else NO_HIT,
-        )
-        owner[~found] = NO_HIT
-        return Hits(distance, owner.astype(np.int32))
+        if not len(self.face_owner):
+            return Hits(distance, np.full(len(distance), NO_HIT, dtype=np.int32), face)
+        owner = np.where(found, self.face_owner[face], np.int32(NO_HIT))
+        return Hits(distance, owner, face)
+
+    def face_normals(self) -> Float32Array:
+        """Unit normal of each face in the last update, world axes, by the right-hand rule; 0 where a
+        face has no area. Shape ``[F, 3]``, in the order of `face_owner`."""
+        return np.concatenate([self._scenery_normals, _normals(self._vertices, self._body_faces)])
 
     def is_inside(self, asset: str, dimensions: Float64Array, point: Vector) -> bool:
         """Whether a point in an object's body axes [m] lies in its mesh, deeper than a millimetre."""
@@ -250,7 +281,7 @@ class TracedScene:
 
     def name_of(self, owner: int) -> str:
         """Name of the object or scenery shape behind an owner of `Hits`, in the last update."""
-        return self._owner_names[owner]
+        return self.owner_names[owner]
 
 
 def _merged(meshes: list[Mesh]) -> tuple[Float64Array, Int32Array, Int32Array]:
@@ -262,3 +293,32 @@ def _merged(meshes: list[Mesh]) -> tuple[Float64Array, Int32Array, Int32Array]:
     counts = [len(mesh.faces) for mesh in meshes]
     owner = np.repeat(np.arange(len(meshes), dtype=np.int32), counts)
     return np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces, dtype=np.int32), owner
+
+
+def _normals(vertices: Float64Array, faces: Int32Array) -> Float32Array:
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    normals = np.cross(b - a, c - a)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    unit: Float64Array = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+    return unit.astype(np.float32)
+
+
+def visible_names(
+    of_owner: Sequence[str], owners: Iterable[Int32Array]
+) -> tuple[tuple[str, ...], Int32Array]:
+    """Names of all that rays hit, sorted, and the index into them of each owner.
+
+    ``of_owner`` has the name of each owner, ``owners`` those of the rays. The index has one entry more,
+    the last, which is −1, so that it can be taken at `NO_HIT` too.
+    """
+    seen = np.zeros(len(of_owner) + 1, dtype=bool)
+    for of_rays in owners:
+        seen[of_rays] = True
+    seen[NO_HIT] = False
+    name_of = {owner: of_owner[owner] for owner in np.flatnonzero(seen).tolist()}
+    names = tuple(sorted(set(name_of.values())))
+    place = {name: position for position, name in enumerate(names)}
+    index = np.full(len(seen), NO_HIT, dtype=np.int32)
+    for owner, name in name_of.items():
+        index[owner] = place[name]
+    return names, index

@@ -10,13 +10,12 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float32Array, Float64Array, Int32Array, Payload
-from caviar_protocol.coordinates import Pose, rotation_matrix
-from caviar_protocol.errors import PayloadError, ScenarioError
-from caviar_protocol.scene import device_pose
+from caviar_protocol.coordinates import Pose
+from caviar_protocol.errors import ScenarioError
 from caviar_protocol.topics import Lidar, LidarDevice, LidarScan, Scene
 from caviar_protocol.topics.scene import Device
-from caviar_services.sensors.base import Sensors, SensorSettings
-from caviar_services.sensors.geometry import NO_HIT, Hits, TracedScene
+from caviar_services.sensors.base import Sensors, SensorSettings, pose_outside, turned
+from caviar_services.sensors.geometry import NO_HIT, TracedScene, visible_names
 from caviar_services.sensors.grid import GridSettings, antenna_positions, occupancy
 from caviar_services.service import Preparation, Prepared
 
@@ -88,7 +87,7 @@ class LidarSensors(Sensors[LidarSettings]):
         )
         bundles = [_rays(traced, scene, device) for device in devices]
         returns = _traced(mi, traced, bundles) if bundles else []
-        names, index = _object_names(traced, returns)
+        names, index = visible_names(traced.owner_names, [item.owner for item in returns])
         scans = tuple(self._scan(scene, item, index) for item in returns)
         return {"lidar": Lidar(object_names=names, scans=scans)}
 
@@ -135,23 +134,9 @@ def ray_directions(
 
 
 def _rays(traced: TracedScene, scene: Scene, device: LidarDevice) -> _Rays:
-    if device.parent and device.parent in scene.names:
-        parent = scene.names.index(device.parent)
-        if traced.is_inside(scene.assets[parent], scene.dimensions[parent], device.position):
-            raise PayloadError(
-                f"lidar {device.name!r} sits inside its carrier {device.parent!r} and would see only that; "
-                'mount it outside the mesh, for example with mount = "roof" and a position_m above it'
-            )
-    pose = device_pose(scene, device)
+    pose = pose_outside(traced, scene, device)
     local = ray_directions(device.beams, device.azimuth_steps, device.elevation_min, device.elevation_max)
-    # Written out instead of a matrix product, whose rounding may depend on the BLAS and its threads.
-    world = np.stack(
-        [
-            row[0] * local[0] + row[1] * local[1] + row[2] * local[2]
-            for row in rotation_matrix(pose.orientation)
-        ]
-    )
-    return _Rays(device, pose, local, world)
+    return _Rays(device, pose, local, turned(pose, local))
 
 
 def _traced(mi: Any, traced: TracedScene, bundles: list[_Rays]) -> list[_Returns]:
@@ -162,20 +147,20 @@ def _traced(mi: Any, traced: TracedScene, bundles: list[_Rays]) -> list[_Returns
     hits = traced.trace(mi, origins, np.concatenate([rays.world for rays in bundles], axis=1), reach)
     ends = np.cumsum(sizes)[:-1]
     return [
-        _returns(rays, Hits(distance, owner))
+        _returns(rays, distance, owner)
         for rays, distance, owner in zip(
             bundles, np.split(hits.distance, ends), np.split(hits.owner, ends), strict=True
         )
     ]
 
 
-def _returns(rays: _Rays, hits: Hits) -> _Returns:
+def _returns(rays: _Rays, distance: Float32Array, owner: Int32Array) -> _Returns:
     hit = (
-        (hits.owner != NO_HIT)
-        & (hits.distance >= np.float64(rays.device.min_range))
-        & (hits.distance <= np.float64(rays.device.max_range))
+        (owner != NO_HIT)
+        & (distance >= np.float64(rays.device.min_range))
+        & (distance <= np.float64(rays.device.max_range))
     )
-    return _Returns(rays, hit, hits.distance[hit], hits.owner[hit])
+    return _Returns(rays, hit, distance[hit], owner[hit])
 
 
 def _scaled(directions: Float64Array, hit: BoolArray, distance: Float64Array) -> Float64Array:
@@ -184,16 +169,3 @@ def _scaled(directions: Float64Array, hit: BoolArray, distance: Float64Array) ->
     for axis in range(3):
         np.multiply(directions[axis][hit], distance, out=points[:, axis])
     return points
-
-
-def _object_names(traced: TracedScene, returns: list[_Returns]) -> tuple[tuple[str, ...], Int32Array]:
-    """Names of all that was hit, sorted, and the index into them of each owner."""
-    owners = np.concatenate([item.owner for item in returns]) if returns else np.zeros(0, dtype=np.int32)
-    counts = np.bincount(owners)
-    name_of = {int(owner): traced.name_of(int(owner)) for owner in np.flatnonzero(counts)}
-    names = tuple(sorted(name_of.values()))
-    index = np.full(len(counts), -1, dtype=np.int32)
-    place = {name: position for position, name in enumerate(names)}
-    for owner, name in name_of.items():
-        index[owner] = place[name]
-    return names, index

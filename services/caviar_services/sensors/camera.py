@@ -1,0 +1,221 @@
+"""Pinhole cameras: pictures, depth, and what is where."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Annotated, Any, ClassVar
+
+import msgspec
+import numpy as np
+
+from caviar_protocol.arrays import Float32Array, Float64Array, Payload, quantity
+from caviar_protocol.coordinates import Pose
+from caviar_protocol.errors import ScenarioError
+from caviar_protocol.topics import (
+    Camera,
+    CameraDevice,
+    CameraImage,
+    Depth,
+    DepthImage,
+    Intrinsics,
+    Scene,
+    Segmentation,
+    SegmentationImage,
+)
+from caviar_protocol.topics.scene import Device
+from caviar_services.sensors.base import Sensors, SensorSettings, pose_outside, turned
+from caviar_services.sensors.colours import Colour, object_colour, shape_colour
+from caviar_services.sensors.geometry import NO_HIT, Hits, TracedScene, visible_names
+from caviar_services.sensors.optics import intrinsics, pixel_rays
+from caviar_services.sensors.shading import Painter, View
+from caviar_services.service import Preparation, Prepared
+
+FAR = float(np.finfo(np.float32).max)
+"""[m]; a camera sees however far."""
+
+
+class CameraSettings(SensorSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of the camera service."""
+
+    body_material: str = "metal"
+    """Material of moving objects in a segmentation; that of the channel model."""
+    colours: dict[str, Colour] = msgspec.field(default_factory=dict)
+    """sRGB, 0…1, by name of a material or class: ``colours = { marble = [0.9, 0.8, 0.7] }``."""
+    sun_azimuth_deg: Annotated[
+        float, quantity("°", "where the sun stands, counter-clockwise from +x")
+    ] = -55.0
+    sun_elevation_deg: Annotated[float, quantity("°", "of the sun above the horizon", ge=-90, le=90)] = 45.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """One camera at one instant."""
+
+    device: CameraDevice
+    optics: Intrinsics
+    pose: Pose
+
+    @property
+    def rays(self) -> Float64Array:
+        """Unit vectors through the pixels' centres in device axes, Shape ``[3, H·W]``."""
+        return pixel_rays(self.device.width, self.device.height, self.optics)
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """What every image says of its camera."""
+        return {
+            "sensor": self.device.name,
+            "intrinsics": self.optics,
+            "position": self.pose.position,
+            "orientation": self.pose.orientation,
+        }
+
+    def image(self, pixels: Any) -> Any:
+        """Values by pixel, Shape ``[H·W, …]``, as an image."""
+        return pixels.reshape(self.device.height, self.device.width, *pixels.shape[1:])
+
+
+class CameraSensors(Sensors[CameraSettings]):
+    """All cameras of the scene: topics ``camera``, ``depth`` and ``segmentation``.
+
+    What is not in demand is not computed: neither a topic, nor part ``normals`` of ``depth``, nor part
+    ``materials`` of ``segmentation`` (clause 5). Normals point to the camera's side of a surface. As
+    for a LIDAR, every object of the scene is solid, the camera's own carrier too.
+    """
+
+    outputs: ClassVar[tuple[str, ...]] = ("camera", "depth", "segmentation")
+    uses_scenery: ClassVar[bool] = True
+    Settings: ClassVar[type[msgspec.Struct]] = CameraSettings
+
+    def prepare(self, preparation: Preparation) -> Prepared:
+        """See `Sensors.prepare`; `ScenarioError` where a colour is none."""
+        for name, colour in self.settings.colours.items():
+            if not all(0 <= value <= 1 for value in colour):
+                raise ScenarioError(
+                    f"colour {list(colour)} of {name!r} is not sRGB; give red, green and blue from 0 to 1",
+                    key=f"services.{self.run.name}.settings.colours.{name}",
+                )
+        self._demand = preparation.demand
+        return super().prepare(preparation)
+
+    def example_devices(self) -> tuple[Device, ...]:
+        """One small camera at the origin."""
+        return (CameraDevice(name="warm-up", width=8, height=6),)
+
+    def release_memory(self) -> None:
+        """Dr.Jit keeps freed buffers, some of each size that it has seen; sizes vary with the edges."""
+        if self.traced is not None:
+            import drjit as dr
+
+            dr.flush_malloc_cache()
+
+    def observe(self, mi: Any, traced: TracedScene, scene: Scene) -> dict[str, Payload]:
+        """One image of each camera on each topic that is in demand."""
+        devices = sorted(
+            (d for d in scene.devices if isinstance(d, CameraDevice)), key=lambda device: device.name
+        )
+        looks = [_Look(device, intrinsics(device), pose_outside(traced, scene, device)) for device in devices]
+        products: dict[str, Payload] = {}
+        if "camera" in self._demand:
+            products["camera"] = self._pictures(mi, traced, scene, looks)
+        if self._demand.keys() & {"depth", "segmentation"}:
+            hits = [_traced(mi, traced, look) for look in looks]
+            if "depth" in self._demand:
+                products["depth"] = self._depth(traced, looks, hits)
+            if "segmentation" in self._demand:
+                products["segmentation"] = self._segmentation(traced, looks, hits)
+        return products
+
+    def _pictures(self, mi: Any, traced: TracedScene, scene: Scene, looks: list[_Look]) -> Camera:
+        azimuth = math.radians(self.settings.sun_azimuth_deg)
+        elevation = math.radians(self.settings.sun_elevation_deg)
+        sun = np.array(
+            [
+                math.cos(elevation) * math.cos(azimuth),
+                math.cos(elevation) * math.sin(azimuth),
+                math.sin(elevation),
+            ]
+        )
+        painter = Painter(mi, traced, self._albedo(traced, scene), sun)
+        return Camera(
+            images=tuple(
+                CameraImage(
+                    **look.fields,
+                    rgb=painter.paint(View(look.device.width, look.device.height, look.optics, look.pose)),
+                )
+                for look in looks
+            )
+        )
+
+    def _albedo(self, traced: TracedScene, scene: Scene) -> Float64Array:
+        """Linear sRGB of each owner, Shape ``[owners, 3]``."""
+        albedo = np.zeros((len(traced.owner_names), 3))
+        albedo[: len(self.shapes)] = self._shape_colours
+        for name, kind in zip(scene.names, scene.classes, strict=True):
+            albedo[traced.object_owner[name]] = object_colour(kind, name, self.settings.colours)
+        return albedo
+
+    @cached_property
+    def _shape_colours(self) -> Float64Array:
+        colours = [shape_colour(shape, self.settings.colours) for shape in self.shapes]
+        return np.array(colours).reshape(-1, 3)
+
+    def _depth(self, traced: TracedScene, looks: list[_Look], hits: list[Hits]) -> Depth:
+        of_face = traced.face_normals() if "normals" in self._demand["depth"] else None
+        return Depth(
+            images=tuple(
+                DepthImage(
+                    **look.fields,
+                    depth=look.image(_depths(look, hit)),
+                    normals=None if of_face is None else look.image(_normals(look, hit, of_face)),
+                )
+                for look, hit in zip(looks, hits, strict=True)
+            )
+        )
+
+    def _segmentation(self, traced: TracedScene, looks: list[_Look], hits: list[Hits]) -> Segmentation:
+        owners = [hit.owner for hit in hits]
+        of_owner = list(traced.owner_names)
+        names, index = visible_names(of_owner, owners)
+        materials: tuple[str, ...] = ()
+        material = None
+        if "materials" in self._demand["segmentation"]:
+            of_owner = [shape.itu_material or shape.material or "unknown" for shape in self.shapes]
+            of_owner += [self.settings.body_material] * (len(traced.owner_names) - len(self.shapes))
+            materials, material = visible_names(of_owner, owners)
+        return Segmentation(
+            object_names=names,
+            material_names=materials,
+            images=tuple(
+                SegmentationImage(
+                    **look.fields,
+                    object=look.image(index[owner]),
+                    material=None if material is None else look.image(material[owner]),
+                )
+                for look, owner in zip(looks, owners, strict=True)
+            ),
+        )
+
+
+def _traced(mi: Any, traced: TracedScene, look: _Look) -> Hits:
+    world = turned(look.pose, look.rays)
+    origin = np.repeat(np.array(look.pose.position)[:, None], world.shape[1], axis=1)
+    return traced.trace(mi, origin, world, np.full(world.shape[1], FAR))
+
+
+def _depths(look: _Look, hits: Hits) -> Float32Array:
+    found = hits.owner != NO_HIT
+    depth = np.zeros(len(found), dtype=np.float32)
+    np.multiply(hits.distance, look.rays[0], out=depth, where=found, casting="same_kind")
+    return depth
+
+
+def _normals(look: _Look, hits: Hits, of_face: Float32Array) -> Float32Array:
+    found = hits.owner != NO_HIT
+    normals = np.zeros((len(found), 3), dtype=np.float32)
+    normals[found] = of_face[hits.face[found]]
+    away = np.einsum("ij,ji->i", normals, turned(look.pose, look.rays)) > 0
+    normals[away] *= -1
+    return normals

@@ -1,0 +1,259 @@
+"""Pictures by ray tracing: sun with shadows, light of the sky, haze, and smooth edges.
+
+Nothing is random. Each pixel looks at its part of the sky in a few fixed directions; the sets of
+16 neighbours complete each other, and a filter that stops at edges joins them. Pixels with an
+edge in them are traced again, at eight points each. So a picture is clean without many samples,
+and the same scene gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from caviar_protocol.arrays import Float32Array, Float64Array, Int64Array, UInt8Array
+from caviar_protocol.coordinates import Pose, rotation_matrix
+from caviar_protocol.topics import Intrinsics
+from caviar_services.columns import aligned_columns
+from caviar_services.sensors.geometry import TracedScene
+
+SUN = (1.0, 0.93, 0.80)
+"""Irradiance of a surface that faces the sun, over π; linear sRGB, as all colours here."""
+ZENITH, HORIZON = (0.22, 0.42, 0.80), (0.72, 0.82, 0.93)
+"""Radiance of the sky."""
+BOUNCED = (0.30, 0.29, 0.27)
+"""What comes from where the sky is hidden: light that streets and façades pass on."""
+SKY_REACH = 60.0
+"""[m]; what is farther does not hide the sky from a surface."""
+HAZE = 1800.0
+"""[m]; after this way, 63 % of what is seen is haze."""
+DIRECTIONS = 6
+"""In which a sample looks for the sky."""
+TILE = 4
+"""Edge length [px] of the square of pixels whose directions complete each other."""
+EDGE_SAMPLES = 8
+"""In a pixel with an edge, one in each of as many rows and columns."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One camera at one instant."""
+
+    width: int
+    height: int
+    optics: Intrinsics
+    pose: Pose
+
+
+class Painter:
+    """Draws pictures of a scene. Use it under `active_variant`, after `TracedScene.update`.
+
+    Parameters
+    ----------
+    albedo
+        Linear sRGB of each owner, Shape ``[owners, 3]``.
+    sun
+        Unit vector towards the sun, world axes.
+    """
+
+    def __init__(self, mi: Any, traced: TracedScene, albedo: Float64Array, sun: Float64Array) -> None:
+        self._mi, self._traced, self._sun = mi, traced, sun
+        table = np.concatenate([traced.face_normals().T, albedo[traced.face_owner].T])
+        self._table = [mi.Float(column) for column in aligned_columns(table)]
+
+    def paint(self, view: View) -> UInt8Array:
+        """sRGB picture of a view, Shape ``[height, width, 3]``, top row first."""
+        rows, columns = np.divmod(np.arange(view.width * view.height), view.width)
+        seen = self._trace(view, columns + 0.5, rows + 0.5, (rows % TILE) * TILE + columns % TILE)
+        colour, edge = self._smoothed(view, seen)
+        pixels = np.flatnonzero(edge)
+        if len(pixels):
+            colour[:, pixels] = self._edges(view, pixels)
+        return encoded(colour).T.reshape(view.height, view.width, 3)
+
+    def _edges(self, view: View, pixels: Int64Array) -> Float32Array:
+        """Colours of pixels that are more than one thing: the mean of several points of each."""
+        part = np.arange(EDGE_SAMPLES)
+        # Steps of 3 mod 8 spread the points so that no two share a row or a column.
+        x, y = (part + 0.5) / EDGE_SAMPLES, ((3 * part + 1) % EDGE_SAMPLES + 0.5) / EDGE_SAMPLES
+        rows, columns = np.divmod(pixels[:, None], view.width)
+        index = np.broadcast_to(part * (TILE * TILE // EDGE_SAMPLES), (len(pixels), EDGE_SAMPLES))
+        seen = self._trace(view, (columns + x).ravel(), (rows + y).ravel(), index.ravel())
+        colour = _stacked(seen.colour(self._mi, seen.ambient))
+        mean: Float32Array = colour.reshape(3, len(pixels), EDGE_SAMPLES).mean(axis=2)
+        return mean
+
+    def _trace(self, view: View, x: Float64Array, y: Float64Array, index: Int64Array) -> _Seen:
+        """What is seen at points of the image [px]; ``index`` [0, 16) chooses where to look for sky."""
+        import drjit as dr
+
+        mi = self._mi
+        px, py, turn = (mi.Float(column) for column in aligned_columns(np.stack([x, y, index])))
+        direction = self._directions(view, px, py)
+        origin = _opaque(mi.Point3f, view.pose.position)
+        distance, face = self._traced.intersect(mi, mi.Ray3f(origin, direction))
+        hit = dr.isfinite(distance)
+        table = [dr.gather(mi.Float, column, face, hit) for column in self._table] if self._table else []
+        normal = mi.Vector3f(*table[:3])
+        normal = dr.select(dr.dot(normal, direction) > 0, -normal, normal)
+        point = origin + distance * direction + normal * (2e-3 + 2e-5 * distance)
+        sun = self._sunlight(point, normal, hit)
+        ambient = self._skylight(point, normal, turn, hit)
+        seen = _Seen(direction, distance, face, normal, mi.Color3f(*table[3:]), sun, ambient, hit)
+        dr.eval(seen.ambient, seen.sun, seen.distance, seen.normal, seen.albedo, seen.direction, seen.hit)
+        return seen
+
+    def _directions(self, view: View, x: Any, y: Any) -> Any:
+        import drjit as dr
+
+        mi, optics = self._mi, view.optics
+        right = (x - _opaque(mi.Float, optics.cx)) / _opaque(mi.Float, optics.fx)
+        down = (y - _opaque(mi.Float, optics.cy)) / _opaque(mi.Float, optics.fy)
+        forward, left, up = (
+            _opaque(mi.Vector3f, column) for column in rotation_matrix(view.pose.orientation).T.tolist()
+        )
+        return dr.normalize(forward - right * left - down * up)
+
+    def _sunlight(self, point: Any, normal: Any, hit: Any) -> Any:
+        """Cosine at which the sun shines on a point; 0 in shadow."""
+        mi = self._mi
+        import drjit as dr
+
+        towards = mi.Vector3f(self._sun.tolist())
+        facing = dr.maximum(dr.dot(normal, towards), 0.0)
+        lit = hit & (facing > 0)
+        shadow = self._traced.occluded(mi.Ray3f(point, towards), lit, coherent=True)
+        return dr.select(lit & ~shadow, facing, 0.0)
+
+    def _skylight(self, point: Any, normal: Any, turn: Any, hit: Any) -> Any:
+        """Mean of what comes to a surface from all sides but the sun, weighted with the cosine."""
+        import drjit as dr
+
+        mi = self._mi
+        across, along = mi.coordinate_system(normal)
+        total = mi.Color3f(0.0)
+        for number in range(DIRECTIONS):
+            # Points of a Fibonacci spiral on the disc, lifted to the hemisphere (Malley's method), in
+            # an order in which the 16 sets of neighbours interleave.
+            share = (number * TILE * TILE + turn + 0.5) / (DIRECTIONS * TILE * TILE)
+            angle = (number * TILE * TILE + turn) * (math.pi * (3 - math.sqrt(5)))
+            radius = dr.sqrt(share)
+            sine, cosine = dr.sincos(angle)
+            height = dr.sqrt(dr.maximum(1 - share, 0.0))
+            towards = across * (radius * cosine) + along * (radius * sine) + normal * height
+            ray = mi.Ray3f(point, towards)
+            ray.maxt = mi.Float(SKY_REACH)
+            hidden = self._traced.occluded(ray, hit, coherent=False)
+            total += dr.select(hidden, mi.Color3f(BOUNCED), _sky(mi, towards))
+        return total / DIRECTIONS
+
+    def _smoothed(self, view: View, seen: _Seen) -> tuple[Float32Array, Any]:
+        """Colours of one sample a pixel, skylight joined over each pixel's tile; where edges are."""
+        import drjit as dr
+
+        mi = self._mi
+        width, height = _opaque(mi.Int32, view.width), _opaque(mi.Int32, view.height)
+        index = dr.arange(mi.Int32, view.width * view.height)
+        row = index // width
+        column = index - row * width
+        total, count, edge = mi.Color3f(seen.ambient), mi.Float(1.0), mi.Bool(False)
+        for dy in range(-TILE // 2, TILE // 2):
+            for dx in range(-TILE // 2, TILE // 2):
+                if dx == dy == 0:
+                    continue
+                inside = (column + dx >= 0) & (column + dx < width) & (row + dy >= 0) & (row + dy < height)
+                other = dr.select(inside, index + dy * width + dx, index)
+                same = seen.same_surface(mi, other)
+                total += dr.select(same, dr.gather(mi.Color3f, seen.ambient, other), 0.0)
+                count += dr.select(same, mi.Float(1.0), 0.0)
+        for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+            inside = (column + dx >= 0) & (column + dx < width) & (row + dy >= 0) & (row + dy < height)
+            other = dr.select(inside, index + dy * width + dx, index)
+            edge |= ~seen.same_picture(mi, other)
+        colour = seen.colour(mi, total / count)
+        dr.eval(colour, edge)
+        return _stacked(colour), edge.numpy()
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What samples of a picture see, as Dr.Jit arrays."""
+
+    direction: Any
+    distance: Any
+    face: Any
+    normal: Any
+    albedo: Any
+    sun: Any
+    """Cosine at which the sun shines on it; 0 in shadow."""
+    ambient: Any
+    """Light from everywhere else."""
+    hit: Any
+
+    def same_surface(self, mi: Any, other: Any) -> Any:
+        """Whether each sample and its ``other`` one lie in one smooth surface."""
+        import drjit as dr
+
+        between = dr.gather(mi.Float, self.distance, other) * dr.gather(mi.Vector3f, self.direction, other)
+        between -= self.distance * self.direction
+        flat = dr.abs(dr.dot(between, self.normal)) < 0.02 + 2e-3 * self.distance
+        alike = dr.dot(dr.gather(mi.Vector3f, self.normal, other), self.normal) > 0.9
+        return self.hit & dr.gather(mi.Bool, self.hit, other) & flat & alike
+
+    def same_picture(self, mi: Any, other: Any) -> Any:
+        """Whether no edge of a surface, a colour or a shadow runs between each sample and its other."""
+        import drjit as dr
+
+        both = dr.gather(mi.Bool, self.hit, other)
+        light = dr.abs(dr.gather(mi.Float, self.sun, other) - self.sun) < 0.1
+        paint = dr.gather(mi.Color3f, self.albedo, other) - self.albedo
+        paint = dr.abs(paint.x) + dr.abs(paint.y) + dr.abs(paint.z) < 0.02
+        return (~self.hit & ~both) | (self.same_surface(mi, other) & light & paint)
+
+    def colour(self, mi: Any, ambient: Any) -> Any:
+        """Linear sRGB under this ``ambient`` light, seen through the air."""
+        import drjit as dr
+
+        light = mi.Color3f(SUN) * self.sun + ambient
+        haze = 1 - dr.exp(-self.distance / HAZE)
+        seen = dr.lerp(self.albedo * light, mi.Color3f(HORIZON), haze)
+        return dr.select(self.hit, seen, _sky(mi, self.direction))
+
+
+def encoded(colour: Float32Array) -> UInt8Array:
+    """8-bit sRGB (IEC 61966-2-1) of linear colours, what is too bright cut off."""
+    table: UInt8Array = _SRGB[(np.clip(colour, 0, 1) * (len(_SRGB) - 1) + 0.5).astype(np.int32)]
+    return table
+
+
+def _srgb_table(size: int = 1 << 14) -> UInt8Array:
+    linear = np.arange(size) / (size - 1)
+    curve = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return np.round(255 * curve).astype(np.uint8)
+
+
+_SRGB = _srgb_table()
+
+
+def _sky(mi: Any, direction: Any) -> Any:
+    """Radiance from a direction without anything in it; below the horizon that of the haze."""
+    import drjit as dr
+
+    height = dr.sqrt(dr.maximum(direction.z, 0.0))
+    return dr.lerp(mi.Color3f(HORIZON), mi.Color3f(ZENITH), height)
+
+
+def _opaque(kind: Any, value: Any) -> Any:
+    """A value that changes from frame to frame without becoming part of the compiled kernel."""
+    import drjit as dr
+
+    made = kind(value)
+    dr.make_opaque(made)
+    return made
+
+
+def _stacked(colour: Any) -> Float32Array:
+    return np.stack([channel.numpy() for channel in colour])
