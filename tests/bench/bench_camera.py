@@ -20,8 +20,9 @@ import numpy as np
 from bench_lidar import traffic
 
 from caviar_protocol.codec import encode_payload
-from caviar_protocol.coordinates import Pose, quaternion_from_euler
+from caviar_protocol.coordinates import Pose, compose, quaternion_from_euler
 from caviar_protocol.messages import GrantInput, Status
+from caviar_protocol.scene import object_pose
 from caviar_protocol.topics import Camera, CameraDevice, Scene
 from caviar_services.sensors.camera import CameraSensors, CameraSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo, StepResult
@@ -39,10 +40,22 @@ DEMANDS: dict[str, dict[str, frozenset[str]]] = {
 }
 
 
+CENTRE, YAW = (-110.0, -70.0), -0.375
+"""Of the traffic, in Munich: a street between two blocks, and the square that it leads to."""
+
+
 def street(frame: int, count: int, place: Pose) -> Scene:
-    """The traffic of the LIDAR's benchmark, below a fixed camera."""
+    """The traffic of the LIDAR's benchmark in a street, below a fixed camera."""
+    moved = traffic(frame, count)
+    turn = Pose((*CENTRE, 0.0), quaternion_from_euler(YAW))
+    poses = [compose(turn, object_pose(moved, index)) for index in range(count)]
     camera = CameraDevice(name="camera", position=place.position, orientation=place.orientation)
-    return msgspec.structs.replace(traffic(frame, count), devices=(camera,))
+    return msgspec.structs.replace(
+        moved,
+        position=np.array([pose.position for pose in poses]),
+        orientation=np.array([pose.orientation for pose in poses]),
+        devices=(camera,),
+    )
 
 
 def step(service: CameraSensors, frame: int, scene: Scene) -> tuple[float, int, StepResult]:
@@ -80,8 +93,8 @@ def main() -> None:
     parser.add_argument("--scene", default="munich", help="name of a scene of sionna-rt")
     parser.add_argument("--objects", type=int, default=36)
     parser.add_argument("--frames", type=int, default=30)
-    parser.add_argument("--position", type=float, nargs=3, default=(-40.0, -12.0, 7.0), help="[m]")
-    parser.add_argument("--heading", type=float, nargs=2, default=(15.0, 10.0), help="yaw, pitch [°]")
+    parser.add_argument("--position", type=float, nargs=3, default=(-62.0, -84.0, 9.0), help="[m]")
+    parser.add_argument("--heading", type=float, nargs=2, default=(160.0, 12.0), help="yaw, pitch [°]")
     parser.add_argument("--picture", type=Path, help="PNG of the last frame")
     told = parser.parse_args()
     with TemporaryDirectory() as folder:

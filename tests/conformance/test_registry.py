@@ -19,7 +19,12 @@ from caviar_services.testing import CONFORMANCE, ServiceConformance
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "deploy" / "scenarios"
 
-EXTRAS = {"world:sumo": "libsumo", "channel:sionna-rt": "sionna", "sensors:lidar": "mitsuba"}
+EXTRAS = {
+    "world:sumo": "libsumo",
+    "channel:sionna-rt": "sionna",
+    "sensors:camera": "mitsuba",
+    "sensors:lidar": "mitsuba",
+}
 """Package without which an implementation cannot run; a base install skips it."""
 
 OVERRIDES: dict[str, dict[str, object]] = {

@@ -13,7 +13,7 @@ from caviar_services.scenery import SceneryShape
 Colour = tuple[float, float, float]
 
 MATERIALS: dict[str, Colour] = {
-    "concrete": (0.54, 0.54, 0.53),
+    "concrete": (0.62, 0.61, 0.60),
     "marble": (0.86, 0.80, 0.70),
     "brick": (0.66, 0.41, 0.33),
     "wood": (0.64, 0.50, 0.36),
@@ -31,18 +31,18 @@ MATERIALS: dict[str, Colour] = {
 """sRGB, 0…1, of a surface of each material of Recommendation ITU-R P.2040."""
 
 CLASSES: dict[str, Colour] = {
-    "car": (0.80, 0.20, 0.17),
-    "bus": (0.93, 0.70, 0.13),
-    "truck": (0.16, 0.42, 0.72),
-    "pedestrian": (0.16, 0.60, 0.42),
-    "uav": (0.93, 0.45, 0.10),
+    "car": (0.78, 0.36, 0.31),
+    "bus": (0.93, 0.74, 0.25),
+    "truck": (0.25, 0.47, 0.74),
+    "pedestrian": (0.20, 0.60, 0.45),
+    "uav": (0.93, 0.50, 0.16),
 }
 """sRGB, 0…1, of the moving objects of each class."""
 
 OTHER: Colour = (0.62, 0.60, 0.62)
 """Where neither material nor class is known."""
 
-SHADES = 0.10
+SHAPE_SHADES, OBJECT_SHADES = 0.2, 0.45
 """Things of one colour differ by up to this share, so that neighbours can be told apart."""
 
 
@@ -63,17 +63,19 @@ def shape_colour(shape: SceneryShape, chosen: Mapping[str, Colour]) -> Float64Ar
             return linear(chosen[name])
     if shape.colour is not None:
         return np.array(shape.colour)
-    return shaded(linear(MATERIALS.get(shape.itu_material, OTHER)), shape.name.partition("-itu_")[0])
+    return shaded(
+        linear(MATERIALS.get(shape.itu_material, OTHER)), shape.name.partition("-itu_")[0], SHAPE_SHADES
+    )
 
 
 def object_colour(kind: str, name: str, chosen: Mapping[str, Colour]) -> Float64Array:
     """Linear sRGB of a moving object of class ``kind``, Shape ``[3]``."""
-    return shaded(linear(chosen.get(kind) or CLASSES.get(kind, OTHER)), name)
+    return shaded(linear(chosen.get(kind) or CLASSES.get(kind, OTHER)), name, OBJECT_SHADES)
 
 
-def shaded(colour: Float64Array, name: str) -> Float64Array:
-    """A shade of a colour, the same for the same name."""
+def shaded(colour: Float64Array, name: str, share: float) -> Float64Array:
+    """A shade of a colour, lighter or darker by up to a ``share``, the same for the same name."""
     value = zlib.crc32(name.encode())
     light, warm = ((value >> shift & 0xFFFF) / 0x7FFF - 1 for shift in (0, 16))
-    factor = 1 + SHADES * (2 * light + warm * np.array([0.6, 0.0, -0.6]))
+    factor = 1 + share * (0.7 * light + 0.3 * warm * np.array([1.0, 0.0, -1.0]))
     return np.clip(colour * factor, 0.0, 1.0)

@@ -24,7 +24,9 @@ SUN = (1.0, 0.93, 0.80)
 """Irradiance of a surface that faces the sun, over π; linear sRGB, as all colours here."""
 ZENITH, HORIZON = (0.22, 0.42, 0.80), (0.72, 0.82, 0.93)
 """Radiance of the sky."""
-BOUNCED = (0.30, 0.29, 0.27)
+SKYLIGHT = 1.25
+"""How much brighter the sky is for surfaces than in the picture, where it would be white."""
+BOUNCED = (0.36, 0.35, 0.33)
 """What comes from where the sky is hidden: light that streets and façades pass on."""
 SKY_REACH = 60.0
 """[m]; what is farther does not hide the sky from a surface."""
@@ -147,7 +149,7 @@ class Painter:
             ray = mi.Ray3f(point, towards)
             ray.maxt = mi.Float(SKY_REACH)
             hidden = self._traced.occluded(ray, hit, coherent=False)
-            total += dr.select(hidden, mi.Color3f(BOUNCED), _sky(mi, towards))
+            total += dr.select(hidden, mi.Color3f(BOUNCED), SKYLIGHT * _sky(mi, towards))
         return total / DIRECTIONS
 
     def _smoothed(self, view: View, seen: _Seen) -> tuple[Float32Array, Any]:

@@ -11,18 +11,34 @@ from typing import Any, ClassVar, TypeVar, cast
 
 import msgspec
 import numpy as np
+import pytest
 from msgspec.structs import replace
 
 from caviar_protocol.arrays import Float64Array, Payload
+from caviar_protocol.coordinates import Pose
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import Recording
-from caviar_protocol.scene import antennas
-from caviar_protocol.topics import Action, BeamChoice, Channel, Lidar, Link, Scene
+from caviar_protocol.scene import antennas, device_pose
+from caviar_protocol.topics import (
+    PAYLOADS,
+    Action,
+    BeamChoice,
+    CameraDevice,
+    Channel,
+    Depth,
+    Lidar,
+    Link,
+    Scene,
+    Segmentation,
+)
 from caviar_services.service import Frame, FrameInput, Preparation, Service
 from caviar_services.testing import samples
 from caviar_services.testing.base import EPISODE_SEED, FRAMES, Played, ServiceConformance
 
 P = TypeVar("P", bound=Payload)
+
+_PIXELS = {"camera": "rgb", "depth": "depth", "segmentation": "object"}
+"""Field with the pixels of each kind of image."""
 
 
 def _products(played: Played, topic: str, cls: type[P]) -> Iterator[P]:
@@ -165,6 +181,56 @@ class SensorConformance(ServiceConformance):
                 assert (np.diff(scan.ray) > 0).all()
                 assert ((scan.object >= 0) & (scan.object < len(lidar.object_names))).all()
                 np.testing.assert_allclose(np.linalg.norm(scan.points, axis=1), scan.range, rtol=1e-5)
+
+    def test_images_are_those_of_the_scenes_cameras(self, played: Played) -> None:
+        """Size, pose and optics; sorted by name, one of each camera on each topic."""
+        for topic in {"camera", "depth", "segmentation"} & set(self.service_class.outputs):
+            products = _products(played, topic, PAYLOADS[topic])
+            for frame, product in zip(played.frames, products, strict=True):
+                scene = frame.scene()
+                devices = [device for device in scene.devices if isinstance(device, CameraDevice)]
+                images = product.images  # type: ignore[attr-defined]  # all three have them
+                for device, image in zip(devices, images, strict=True):
+                    assert image.sensor == device.name
+                    assert Pose(image.position, image.orientation) == device_pose(scene, device)
+                    assert (image.intrinsics.cx, image.intrinsics.cy) == (device.width / 2, device.height / 2)
+                    assert getattr(image, _PIXELS[topic]).shape[:2] == (device.height, device.width)
+
+    def test_depth_and_segmentation_agree_on_what_is_there(self, played: Played) -> None:
+        """Where something has a depth, it has a name, a material and a normal of length 1."""
+        if not {"depth", "segmentation"} <= set(self.service_class.outputs):
+            pytest.skip("sees no images")
+        products = zip(
+            _products(played, "depth", Depth), _products(played, "segmentation", Segmentation), strict=True
+        )
+        for depth, segmentation in products:
+            for near, named in zip(depth.images, segmentation.images, strict=True):
+                assert near.normals is not None
+                assert named.material is not None
+                found = near.depth > 0
+                assert found.any(), "the street has ground and wall in sight"
+                np.testing.assert_array_equal(named.object >= 0, found)
+                np.testing.assert_array_equal(named.material >= 0, found)
+                assert named.object.max() < len(segmentation.object_names)
+                assert named.material.max() < len(segmentation.material_names)
+                length = np.linalg.norm(near.normals, axis=2)
+                np.testing.assert_allclose(length, np.where(found, 1.0, 0.0), atol=1e-5)
+
+    def test_only_topics_and_parts_in_demand_are_computed(self, tmp_path: Path) -> None:
+        """Clause 5: one topic asked for, without its parts."""
+        for topic in self.service_class.outputs:
+            service = self.build(tmp_path)
+            try:
+                demand = {topic: frozenset[str]()}
+                service.prepare(Preparation(demand=demand, assets=self.street(service, tmp_path)))
+                service.reset(0, EPISODE_SEED, 0)
+                products = service.step(self.frames_of(service, 0)[0]).products
+            finally:
+                service.close()
+            assert set(products) == {topic}
+            for image in getattr(products[topic], "images", ()):
+                assert getattr(image, "normals", None) is None
+                assert getattr(image, "material", None) is None
 
     def test_what_nobody_asks_for_is_not_computed(self, tmp_path: Path) -> None:
         """Clause 5."""
