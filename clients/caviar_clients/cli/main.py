@@ -110,13 +110,14 @@ def inspect(
 def plot(
     run: RunDirectory,
     out: Annotated[Path | None, typer.Option(help="where the PNGs go; by default into the run")] = None,
-    frame: Annotated[int | None, typer.Option(help="frame of the map and the LIDAR scan")] = None,
+    frame: Annotated[int | None, typer.Option(help="frame of map, scan and images")] = None,
     user: Annotated[str | None, typer.Option(help="receiver whose |y| is drawn")] = None,
+    camera: Annotated[str | None, typer.Option(help="camera whose images are drawn")] = None,
 ) -> None:
-    """Draw a run: the map with rays and beam, |y| over time and angle, a LIDAR scan."""
+    """Draw a run: the map with rays and beam, |y| over time and angle, a LIDAR scan, what a camera saw."""
     from caviar_clients.cli.plot import plot_run
 
-    for picture in plot_run(run, out, frame, user):
+    for picture in plot_run(run, out, frame, user, camera):
         typer.echo(picture)
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from caviar_clients.plots.camera import CameraView, draw_view
 from caviar_clients.plots.fig8 import choose_user, draw_over_angle, draw_over_time, series
 from caviar_clients.plots.footprints import Footprints, footprints
 from caviar_clients.plots.lidar import draw_scan
@@ -13,7 +15,7 @@ from caviar_clients.plots.map import MapData, draw_map
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.recording import RecordedFrame, Recording
-from caviar_protocol.topics import AntennaArray, Channel, Lidar, Link
+from caviar_protocol.topics import AntennaArray, Camera, Channel, Depth, Lidar, Link, Segmentation
 from caviar_services.antenna import steering_vector
 from caviar_services.channel.patterns import radiated_field
 from caviar_services.link.codebook import dft_codebook
@@ -21,9 +23,13 @@ from caviar_services.scenery import find_scenery, read_scenery
 
 
 def plot_run(
-    run: Path, out: Path | None = None, frame: int | None = None, user: str | None = None
+    run: Path,
+    out: Path | None = None,
+    frame: int | None = None,
+    user: str | None = None,
+    camera: str | None = None,
 ) -> list[Path]:
-    """Draw what a recording holds: a map, |y| over time and over the angle of arrival, a LIDAR scan.
+    """Draw what a recording holds: map, |y| over time and angle of arrival, LIDAR scan, a camera's images.
 
     Parameters
     ----------
@@ -32,20 +38,22 @@ def plot_run(
     out
         Folder of the pictures; the run directory by default.
     frame
-        Frame of the first episode for map and scan; by default the middle of those that have most
-        to show.
+        Frame of the first episode for map, scan and images; by default the middle of those that have
+        most to show.
     user
         Receiver, or its object, for |y| and the beam; by default the one that was there longest.
+    camera
+        Camera whose images are drawn; by default the first, of those that are fixed if there are any.
 
     Returns
     -------
     list of Path
-        The files, in the order map, |y|, LIDAR. What was not recorded is not drawn.
+        The files, in the order map, |y|, LIDAR, camera. What was not recorded is not drawn.
 
     Raises
     ------
     RecordingError
-        It is not a recording, it holds nothing to draw, or frame or user are not in it.
+        It is not a recording, it holds nothing to draw, or frame, user or camera are not in it.
     SetupError
         Matplotlib is missing; names the command that installs it.
     """
@@ -65,8 +73,15 @@ def plot_run(
     if "lidar" in topics:
         files.append(folder / "lidar.png")
         _scan(_frame(recording, frame, "lidar", chosen), files[-1])
+    seen = [topic for topic in ("camera", "depth", "segmentation") if topic in topics]
+    if seen:
+        shown = _frame(recording, frame, seen[0], chosen)
+        view = camera_view(shown, camera)
+        files += draw_view(view, f"Camera {view.sensor}: {_moment(shown)}", folder)
+    elif camera is not None:
+        raise RecordingError(f"{run} holds no images of a camera; leave out --camera")
     if not files:
-        raise RecordingError(f"{run} holds nothing to draw: neither scene, link nor lidar")
+        raise RecordingError(f"{run} holds nothing to draw: neither scene, link, lidar nor camera")
     return files
 
 
@@ -104,6 +119,43 @@ def _scan(frame: RecordedFrame, file: Path) -> None:
         raise RecordingError(f"frame {frame.number} has no LIDAR scan; choose another with --frame")
     scan = lidar.scans[0]
     draw_scan(scan, lidar, frame.scene(), f"LIDAR {scan.sensor}: {_moment(frame)}", file)
+
+
+def camera_view(frame: RecordedFrame, camera: str | None) -> CameraView:
+    """All that one camera saw in a frame; by default the first, of the fixed ones if there are any.
+
+    Raises `RecordingError` with the known names where it saw nothing.
+    """
+    topics: dict[str, type[Camera] | type[Depth] | type[Segmentation]] = {
+        "camera": Camera,
+        "depth": Depth,
+        "segmentation": Segmentation,
+    }
+    found: dict[str, dict[str, Any]] = {}
+    for topic, cls in topics.items():
+        for _, payload in sorted(frame.of(topic, cls).items()):
+            for image in payload.images:
+                found.setdefault(image.sensor, {})[topic] = (payload, image)
+    if not found or (camera is not None and camera not in found):
+        asked = f"no images of camera {camera!r}" if camera else "no images"
+        known = f"it has those of {', '.join(sorted(found))}" if found else "choose another with --frame"
+        raise RecordingError(f"frame {frame.number} has {asked}; {known}")
+    sensor = camera or min(found, key=lambda name: ("/" in name, name))
+    seen, scene = found[sensor], frame.scene()
+    _, picture = seen.get("camera", (None, None))
+    _, depth = seen.get("depth", (None, None))
+    named, ids = seen.get("segmentation", (None, None))
+    return CameraView(
+        sensor=sensor,
+        rgb=None if picture is None else picture.rgb,
+        depth=None if depth is None else depth.depth,
+        normals=None if depth is None else depth.normals,
+        objects=None if ids is None else ids.object,
+        object_names=() if named is None else named.object_names,
+        materials=None if ids is None else ids.material,
+        material_names=() if named is None else named.material_names,
+        moving=frozenset() if scene is None else frozenset(scene.names),
+    )
 
 
 def _scenery(recording: Recording) -> Footprints | None:
