@@ -65,6 +65,8 @@ def _panels(view: CameraView) -> Iterator[tuple[str, str, _Draw, float]]:
         yield "rgb", "Picture", lambda _, axes: _show(axes, rgb), _aspect(rgb)
     if (depth := view.depth) is not None:
         yield "depth", "Depth", lambda drawn, axes: _draw_depth(drawn, axes, depth), _aspect(depth)
+    if (normals := view.normals) is not None:
+        yield "normals", "Normals", lambda _, axes: _draw_normals(axes, normals), _aspect(normals)
     if (objects := view.objects) is not None:
         colours = object_colours(view.object_names, view.moving)
         yield (
@@ -73,8 +75,6 @@ def _panels(view: CameraView) -> Iterator[tuple[str, str, _Draw, float]]:
             lambda _, axes: _draw_ids(axes, objects, view.object_names, colours, view.moving),
             _aspect(objects),
         )
-    if (normals := view.normals) is not None:
-        yield "normals", "Normals", lambda _, axes: _draw_normals(axes, normals), _aspect(normals)
     if (materials := view.materials) is not None:
         spread = object_colours(view.material_names, frozenset(view.material_names))
         yield (
@@ -146,7 +146,8 @@ def _draw_depth(drawn: Any, axes: Any, depth: Float32Array) -> None:
         cmap="viridis_r",
         norm=LogNorm(float(near), float(max(far, 1.01 * near))),
     )
-    bar = drawn.colorbar(shown, ax=axes, label="Depth along the optical axis [m]", pad=0.02, shrink=0.9)
+    beside = axes.inset_axes((1.02, 0.0, 0.035, 1.0))
+    bar = drawn.colorbar(shown, cax=beside, label="Depth along the optical axis [m]")
     bar.ax.yaxis.set_major_locator(LogLocator(base=10, subs=(1, 2, 5)))
     bar.ax.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     bar.ax.yaxis.set_minor_formatter(NullFormatter())
@@ -182,7 +183,7 @@ def _draw_ids(
 
 
 def largest(ids: Int32Array, names: tuple[str, ...], first: frozenset[str]) -> list[int]:
-    """Indices of the names with most pixels, at most `NAMED`; three quarters of the places are for ``first``."""
+    """Indices of the names with most pixels, at most `NAMED`; three of four places are for ``first``."""
     pixels = np.bincount(ids[ids >= 0].ravel(), minlength=len(names))
     order = [int(i) for i in np.argsort(-pixels, kind="stable") if pixels[i]]
     front = [i for i in order if names[i] in first]
