@@ -53,6 +53,19 @@ def test_street_canyon_has_the_digest_of_the_distributed_run(tmp_path: Path) -> 
     assert digest_of(run(arguments[0], tmp_path / "many", "--frames", "12", timeout=120)) == embedded
 
 
+@pytest.mark.channel
+def test_cameras_have_the_same_digest_in_every_run(tmp_path: Path) -> None:
+    """Pictures too: twice in one process each, with a channel beside them, and distributed."""
+    for library in ("mitsuba", "sionna.rt"):
+        pytest.importorskip(library, reason="needs the extras")
+    scenario = SCENARIOS / "cameras.toml"
+    digests = [
+        digest_of(run(scenario, tmp_path / str(number), "--frames", "3", *how, timeout=120))
+        for number, how in enumerate((["--embedded"], ["--embedded"], []))
+    ]
+    assert digests == digests[:1] * 3
+
+
 def test_realtime_pace_does_not_wait(tmp_path: Path) -> None:
     """A hundred frames of an hour each."""
     hours = ("sampling_period_ns = 100_000_000 ", "sampling_period_ns = 3_600_000_000_000 ")

@@ -104,7 +104,11 @@ class DepthImage(_Image, frozen=True, kw_only=True, omit_defaults=True):
 
     depth: Annotated[Float32Array, array("<f4", "H", "W", unit="m", doc="along the optical axis; 0: no hit")]
     normals: (
-        Annotated[Float32Array, array("<f4", "H", "W", 3, unit="1", doc="unit, world axes; 0: no hit")] | None
+        Annotated[
+            Float32Array,
+            array("<f4", "H", "W", 3, unit="1", doc="unit, world axes, to the camera's side; 0: no hit"),
+        ]
+        | None
     ) = None
 
 
