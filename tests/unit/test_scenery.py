@@ -85,6 +85,29 @@ def test_the_itu_material_is_told_by_the_id_of_any_material(tmp_path: Path, name
     assert shape.itu_material == expected
 
 
+@pytest.mark.parametrize(
+    ("inside", "expected"),
+    [
+        ('<rgb name="color" value="0.1 0.2 0.3"/>', (0.1, 0.2, 0.3)),
+        ('<bsdf type="diffuse"><rgb name="reflectance" value="1, 0, 0.5"/></bsdf>', (1.0, 0.0, 0.5)),
+        ('<rgb name="specular" value="0.1 0.2 0.3"/>', None),
+        ("", None),
+    ],
+)
+def test_the_colour_is_that_of_the_material(
+    tmp_path: Path, inside: str, expected: tuple[float, float, float] | None
+) -> None:
+    material = f'<bsdf type="twosided" id="m">{inside}</bsdf>'
+    assert only_shape(tmp_path, material + SHAPE.format("wall", '<ref id="m"/>')).colour == expected
+
+
+@pytest.mark.parametrize("value", ["red", "0.1 0.2", "1.5 0 0", ""])
+def test_a_colour_that_is_none_is_refused(tmp_path: Path, value: str) -> None:
+    material = f'<bsdf type="diffuse" id="m"><rgb name="reflectance" value="{value}"/></bsdf>'
+    with pytest.raises(AssetError, match=r"mesh-wall.*three numbers from 0 to 1"):
+        only_shape(tmp_path, material + SHAPE.format("wall", '<ref id="m"/>'))
+
+
 def test_steps_of_a_transform_act_in_the_order_they_stand(tmp_path: Path) -> None:
     """Scale, then a quarter turn about z, then a shift: (1, 2, 3) by hand."""
     steps = (
