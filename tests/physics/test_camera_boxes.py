@@ -188,6 +188,19 @@ def test_an_empty_scene_is_all_sky(service: CameraSensors) -> None:
     assert rgb[0].sum() < rgb[-1].sum(), "lighter towards the horizon"
 
 
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 3), (2, 1)])
+@pytest.mark.parametrize("bodies", [0, 1])
+def test_images_of_a_few_pixels_and_scenes_without_a_triangle(width: int, height: int, bodies: int) -> None:
+    """Without scenery, and with room for no body or for one."""
+    things = {"box": Body((5, 0, 0), (2, 4, 4))} if bodies else {}
+    few = prepared(settings=CameraSettings(bodies_per_asset=bodies))
+    device = CameraDevice(name="camera", width=width, height=height, field_of_view=0.2)
+    picture, depth, segmentation = seen(few, scene_of(things, device))
+    assert picture.images[0].rgb.shape == (height, width, 3)
+    np.testing.assert_array_equal(depth.images[0].depth, np.full((height, width), 4.0 * bodies))
+    np.testing.assert_array_equal(segmentation.images[0].object, np.full((height, width), bodies - 1))
+
+
 def test_without_cameras_the_products_have_no_images(service: CameraSensors) -> None:
     picture, depth, segmentation = seen(service, EMPTY)
     assert picture.images == depth.images == segmentation.images == ()

@@ -64,6 +64,8 @@ class Painter:
     def __init__(self, mi: Any, traced: TracedScene, albedo: Float64Array, sun: Float64Array) -> None:
         self._mi, self._traced, self._sun = mi, traced, sun
         table = np.concatenate([traced.face_normals().T, albedo[traced.face_owner].T])
+        if not table.size:
+            table = np.zeros((6, 1))  # of a face that no ray hits: nothing can be read from an empty table
         self._table = [mi.Float(column) for column in aligned_columns(table)]
 
     def paint(self, view: View) -> UInt8Array:
@@ -98,7 +100,7 @@ class Painter:
         origin = _opaque(mi.Point3f, view.pose.position)
         distance, face = self._traced.intersect(mi, mi.Ray3f(origin, direction))
         hit = dr.isfinite(distance)
-        table = [dr.gather(mi.Float, column, face, hit) for column in self._table] if self._table else []
+        table = [dr.gather(mi.Float, column, face, hit) for column in self._table]
         normal = mi.Vector3f(*table[:3])
         normal = dr.select(dr.dot(normal, direction) > 0, -normal, normal)
         point = origin + distance * direction + normal * (2e-3 + 2e-5 * distance)
