@@ -197,7 +197,7 @@ def test_images_of_a_few_pixels_and_scenes_without_a_triangle(width: int, height
     device = CameraDevice(name="camera", width=width, height=height, field_of_view=0.2)
     picture, depth, segmentation = seen(few, scene_of(things, device))
     assert picture.images[0].rgb.shape == (height, width, 3)
-    np.testing.assert_array_equal(depth.images[0].depth, np.full((height, width), 4.0 * bodies))
+    np.testing.assert_allclose(depth.images[0].depth, np.full((height, width), 4.0 * bodies), atol=1e-5)
     np.testing.assert_array_equal(segmentation.images[0].object, np.full((height, width), bodies - 1))
 
 
