@@ -106,7 +106,7 @@ class Painter:
         point = origin + distance * direction + normal * (2e-3 + 2e-5 * distance)
         sun = self._sunlight(point, normal, hit)
         ambient = self._skylight(point, normal, turn, hit)
-        seen = _Seen(direction, distance, face, normal, mi.Color3f(*table[3:]), sun, ambient, hit)
+        seen = _Seen(direction, distance, normal, mi.Color3f(*table[3:]), sun, ambient, hit)
         dr.eval(seen.ambient, seen.sun, seen.distance, seen.normal, seen.albedo, seen.direction, seen.hit)
         return seen
 
@@ -123,9 +123,9 @@ class Painter:
 
     def _sunlight(self, point: Any, normal: Any, hit: Any) -> Any:
         """Cosine at which the sun shines on a point; 0 in shadow."""
-        mi = self._mi
         import drjit as dr
 
+        mi = self._mi
         towards = mi.Vector3f(self._sun.tolist())
         facing = dr.maximum(dr.dot(normal, towards), 0.0)
         lit = hit & (facing > 0)
@@ -188,7 +188,6 @@ class _Seen:
 
     direction: Any
     distance: Any
-    face: Any
     normal: Any
     albedo: Any
     sun: Any
@@ -260,4 +259,8 @@ def _opaque(kind: Any, value: Any) -> Any:
 
 
 def _stacked(colour: Any) -> Float32Array:
+    """Rows red, green, blue of a Dr.Jit colour, in one evaluation."""
+    import drjit as dr
+
+    dr.eval(colour)
     return np.stack([channel.numpy() for channel in colour])
