@@ -10,10 +10,9 @@ gaps are zero, so that equal values give equal bytes (contract, clause 20).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
-from operator import attrgetter
-from typing import Annotated, Any, ClassVar, NamedTuple, TypeAlias, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, ClassVar, TypeAlias, get_args, get_origin, get_type_hints
 
 import msgspec
 import numpy as np
@@ -100,23 +99,29 @@ class Payload(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Names of sizes, and the tuple fields that have this length: ``{"N": ("names", "classes")}``."""
 
     def __post_init__(self) -> None:
-        cls = type(self)
-        sizes = {size: self._length(fields) for size, fields in self.sizes_from.items()}
-        expected = _expected(cls)
-        # Paths cross here a thousand times a second: what is right is seen with few steps.
-        for value, (name, dtype, shape) in zip(expected.values(self), expected.fields, strict=True):
-            if value is None:
-                continue
-            if type(value) is np.ndarray and value.dtype is dtype and value.ndim == len(shape):
-                for size, wanted in zip(value.shape, shape, strict=True):
-                    if size != wanted and size != (
-                        sizes.setdefault(wanted, size) if type(wanted) is str else -1
-                    ):
-                        break
-                else:
-                    continue
-            _check_array(cls.__name__, name, value, array_fields(cls)[name], sizes)
+        layout = _layout(type(self))
+        arrays = [getattr(self, name) for name in layout.required]
+        # Payloads are made a thousand times a second: equal shapes are looked at once.
+        shapes: tuple[Any, ...] = ()
+        try:
+            shapes = (*[a.shape for a in arrays], *[len(getattr(self, f)) for f in layout.listed])
+            is_known = [a.dtype for a in arrays] == layout.dtypes and shapes in layout.known
+        except (AttributeError, TypeError):  # no array, or no length: told below
+            is_known = False
+        if not is_known or any(getattr(self, f) is not None for f in layout.optional):
+            self._check_arrays()
+            if len(layout.known) >= KNOWN_SHAPES:
+                layout.known.clear()
+            layout.known.add(shapes)
         self.check()
+
+    def _check_arrays(self) -> None:
+        """Raise `PayloadError` naming the first array that is not as declared."""
+        sizes = {size: self._length(fields) for size, fields in self.sizes_from.items()}
+        for name, spec in array_fields(type(self)).items():
+            value = getattr(self, name)
+            if value is not None:
+                _check_array(type(self).__name__, name, value, spec, sizes)
 
     def check(self) -> None:  # optional hook
         """Raise `PayloadError` where fields contradict each other beyond what shapes say."""
@@ -136,22 +141,37 @@ class Payload(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     __hash__ = None  # type: ignore[assignment]  # arrays are not hashable, so neither is their owner
 
 
-class _Expected(NamedTuple):
-    """The array fields of a class: what gets their values, and name, dtype and shape of each."""
+KNOWN_SHAPES = 256
+"""Combinations of shapes of one class that are remembered at most."""
 
-    values: Callable[[Any], tuple[Any, ...]]
-    fields: tuple[tuple[str, np.dtype[Any], tuple[Any, ...]], ...]
+
+@dataclass(frozen=True)
+class _Layout:
+    """What a payload class promises, for a quick look at one of its objects."""
+
+    required: tuple[str, ...]
+    """Arrays that every object has."""
+    dtypes: list[np.dtype[Any]]
+    listed: tuple[str, ...]
+    """Tuple fields whose lengths are sizes."""
+    optional: tuple[str, ...]
+    """Arrays that may be None."""
+    known: set[tuple[Any, ...]]
+    """Shapes and lengths that were seen to agree."""
 
 
 @cache
-def _expected(cls: type) -> _Expected:
+def _layout(cls: type[Payload]) -> _Layout:
     fields = array_fields(cls)
-    names = tuple(fields)
-    if len(names) > 1:
-        values: Callable[[Any], tuple[Any, ...]] = attrgetter(*names)
-    else:
-        values = lambda payload: tuple(getattr(payload, name) for name in names)  # noqa: E731
-    return _Expected(values, tuple((n, WIRE_DTYPES[f.dtype], f.shape) for n, f in fields.items()))
+    optional = {f.name for f in msgspec.structs.fields(cls) if f.name in fields and not f.required}
+    required = tuple(name for name in fields if name not in optional)
+    return _Layout(
+        required=required,
+        dtypes=[WIRE_DTYPES[fields[name].dtype] for name in required],
+        listed=tuple(field for names in cls.sizes_from.values() for field in names),
+        optional=tuple(name for name in fields if name in optional),
+        known=set(),
+    )
 
 
 def _equal(a: Any, b: Any) -> bool:

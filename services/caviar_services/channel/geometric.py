@@ -32,8 +32,8 @@ import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
-from typing import Annotated, ClassVar, Literal
+from itertools import pairwise, product
+from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -243,9 +243,12 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         offsets: list[int],
     ) -> Channel:
         a = np.array([_with_phase(waves, f) for f in self._frequencies], np.complex128)
-        in_tx, in_rx = self._in_device_axes(transmitters, receivers, poses, waves, offsets)
+        pairs = [
+            _Arrived(tx, rx, poses[tx.name], poses[rx.name], slice(*ends))
+            for (tx, rx), ends in zip(product(transmitters, receivers), pairwise(offsets), strict=True)
+        ]
         if not self._unit:
-            a *= self._path_gain(transmitters, receivers, waves, in_tx, in_rx, offsets)
+            a *= self._path_gain(waves, pairs)
         count = len(waves.tau)
         return Channel(
             rung=self.rung,
@@ -264,68 +267,63 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
             interactions=np.zeros((count, 0), np.uint8),
             points=np.zeros((count, 0, 3)),
             objects=np.zeros((count, 0), np.int32),
-            h=self._matrices(transmitters, receivers, a, in_tx, in_rx, offsets) if self.with_h else (),
+            h=self._matrices(a, waves, pairs, len(receivers)) if self.with_h else (),
         )
 
-    def _in_device_axes(
-        self,
-        transmitters: Sequence[AntennaDevice],
-        receivers: Sequence[AntennaDevice],
-        poses: Mapping[str, Pose],
-        waves: _Waves,
-        offsets: list[int],
-    ) -> tuple[Float64Array, Float64Array]:
-        """Directions of departure and arrival in the axes of their devices, Shape ``[P, 3]`` each."""
-        departure, arrival = [], []
-        for number, (first, end) in enumerate(pairwise(offsets)):
-            tx, rx = divmod(number, len(receivers))
-            turned_tx = poses[transmitters[tx].name].orientation
-            turned_rx = poses[receivers[rx].name].orientation
-            departure += [unrotated(turned_tx, vector) for vector in waves.departure[first:end]]
-            arrival += [unrotated(turned_rx, vector) for vector in waves.arrival[first:end]]
-        return np.array(departure).reshape(-1, 3), np.array(arrival).reshape(-1, 3)
-
-    def _path_gain(
-        self,
-        transmitters: Sequence[AntennaDevice],
-        receivers: Sequence[AntennaDevice],
-        waves: _Waves,
-        in_tx: Float64Array,
-        in_rx: Float64Array,
-        offsets: list[int],
-    ) -> Float64Array:
+    def _path_gain(self, waves: _Waves, pairs: Sequence[_Arrived]) -> Float64Array:
         """λ/(4πd) and both element patterns, Shape ``[C, P]``."""
         patterns = np.ones(len(waves.tau))
-        for number, (first, end) in enumerate(pairwise(offsets)):
-            tx, rx = divmod(number, len(receivers))
-            patterns[first:end] = element_amplitude(transmitters[tx].array.pattern, in_tx[first:end])
-            patterns[first:end] *= element_amplitude(receivers[rx].array.pattern, in_rx[first:end])
+        for pair in pairs:
+            patterns[pair.mine] = element_amplitude(pair.tx.array.pattern, pair.departures(waves))
+            patterns[pair.mine] *= element_amplitude(pair.rx.array.pattern, pair.arrivals(waves))
         factor: Float64Array = (
             SPEED_OF_LIGHT / self._frequency / (4 * np.pi * np.array(waves.length)) * patterns
         )
         return factor
 
     def _matrices(
-        self,
-        transmitters: Sequence[AntennaDevice],
-        receivers: Sequence[AntennaDevice],
-        a: Complex128Array,
-        in_tx: Float64Array,
-        in_rx: Float64Array,
-        offsets: list[int],
+        self, a: Complex128Array, waves: _Waves, pairs: Sequence[_Arrived], receivers: int
     ) -> tuple[ChannelMatrix, ...]:
         """H[m, n] = Σ_l a[l] · receive[l, m] · transmit[l, n] of every carrier and pair."""
         steered = []
-        for number, (first, end) in enumerate(pairwise(offsets)):
-            tx, rx = divmod(number, len(receivers))
-            transmit = steering_vector(transmitters[tx].array, in_tx[first:end])
-            receive = steering_vector(receivers[rx].array, in_rx[first:end])
-            steered.append((tx, rx, slice(first, end), transmit, receive))
-        return tuple(
-            ChannelMatrix(carrier=carrier, tx=tx, rx=rx, h=(receive * of_carrier[mine, None]).T @ transmit)
-            for carrier, of_carrier in enumerate(a)
-            for tx, rx, mine, transmit, receive in steered
-        )
+        for pair in pairs:
+            transmit = steering_vector(pair.tx.array, pair.departures(waves))
+            # A single element sees every direction with the same phase.
+            single = pair.rx.array.size == 1
+            steered.append(
+                (transmit, None if single else steering_vector(pair.rx.array, pair.arrivals(waves)))
+            )
+        found = []
+        for carrier, of_carrier in enumerate(a):
+            for number, (pair, (transmit, receive)) in enumerate(zip(pairs, steered, strict=True)):
+                tx, rx = divmod(number, receivers)
+                mine = of_carrier[pair.mine]
+                h = mine[None] @ transmit if receive is None else (receive * mine[:, None]).T @ transmit
+                found.append(ChannelMatrix(carrier=carrier, tx=tx, rx=rx, h=h))
+        return tuple(found)
+
+
+class _Arrived(NamedTuple):
+    """A pair, and which of the waves are its own."""
+
+    tx: AntennaDevice
+    rx: AntennaDevice
+    tx_pose: Pose
+    rx_pose: Pose
+    mine: slice
+
+    def departures(self, waves: _Waves) -> Float64Array:
+        """In the axes of TX, Shape ``[L, 3]``."""
+        return _in_axes(self.tx_pose, waves.departure[self.mine])
+
+    def arrivals(self, waves: _Waves) -> Float64Array:
+        """In the axes of RX, Shape ``[L, 3]``."""
+        return _in_axes(self.rx_pose, waves.arrival[self.mine])
+
+
+def _in_axes(pose: Pose, vectors: Sequence[Vector]) -> Float64Array:
+    turned = pose.orientation
+    return np.array([unrotated(turned, vector) for vector in vectors], np.float64).reshape(-1, 3)
 
 
 class _Line:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,8 @@ from caviar_protocol.topics.scene import AntennaArray
 
 SORTED_WHOLE = 256
 """Pairs up to which sorting all of them is faster than looking for the best first."""
+SMALL = 64
+"""Elements along an axis up to which a product of matrices is faster than a fast transform."""
 
 
 class Pairs(NamedTuple):
@@ -32,11 +35,22 @@ def sweep(h: Complex128Array, tx: AntennaArray, rx: AntennaArray) -> Float64Arra
     elements = h.reshape(*leading, rx.columns, rx.rows, tx.columns, tx.rows)
     y = elements
     for axis in (-4, -3, -2, -1):
-        if elements.shape[axis] > 1:
+        size = elements.shape[axis]
+        if size > SMALL:
             y = np.fft.fft(y, axis=axis, norm="ortho")
+        elif size > 1:
+            y = (y.swapaxes(axis, -1) @ _fourier(size)).swapaxes(axis, -1)
     y = y.reshape(*leading, rx.size, tx.size)
     magnitude: Float64Array = np.abs(y.swapaxes(-1, -2))
     return magnitude
+
+
+@lru_cache(maxsize=SMALL)
+def _fourier(size: int) -> Complex128Array:
+    """The unitary Fourier matrix, entries exp(−j2πkn/N)/sqrt(N)."""
+    n = np.arange(size)
+    matrix: Complex128Array = np.exp(-2j * np.pi * (np.outer(n, n) % size) / size) / np.sqrt(size)
+    return matrix
 
 
 def best_pairs(abs_y: Float64Array, k: int) -> Pairs:

@@ -60,7 +60,7 @@ def channels_of(channel: Channel, users: Sequence[User]) -> UserChannels:
         c, t, r = key
         known[u] = True
         los[u] = channel.los[t, r]
-        has_path[u] = bool(np.any(channel.a[c, channel.pair(user.tx.name, user.rx.name)]))
+        has_path[u] = bool(channel.a[c, channel.pair(user.tx.name, user.rx.name)].any())
         if has_path[u]:
             found[u] = _checked(user, matrices.get(key))  # type: ignore[arg-type]  # no None in it
     return UserChannels(known, has_path, los, tuple(found))
