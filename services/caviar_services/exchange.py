@@ -151,7 +151,7 @@ def plain_done_of(
 
 
 def _products(use: str, result: StepResult) -> list[tuple[str, Payload]]:
-    products = sorted(result.products.items())
+    products = sorted(result.products.items()) if len(result.products) > 1 else [*result.products.items()]
     for topic, payload in products:
         if type(payload) is not PAYLOADS.get(topic):
             raise PayloadError(f"{use} made a payload {type(payload).__name__} for the topic {topic!r}")

@@ -131,13 +131,14 @@ class Episodes:
             ev.Product(h.topic, peer.name, message.frame, t_ns, h.digest, h.fidelity, payload)
             for h, payload in zip(message.products, event.payloads, strict=True)
         ]
-        report = Report(
-            source=peer.name,
-            decisions=message.decisions,
-            counts=message.counts,
-            measured=message.measured,
-        )
-        told = report if message.decisions or message.counts or message.measured else None
+        told: Report | None = None
+        if message.decisions or message.counts or message.measured:
+            told = Report(
+                source=peer.name,
+                decisions=message.decisions,
+                counts=message.counts,
+                measured=message.measured,
+            )
         if message.seed >= 0:
             self._seed_chosen(peer, message, schedule, now)
         schedule.done(peer.name, message.frame, products, now, told, end=message.end_episode)

@@ -25,6 +25,12 @@ class Turns:
         self.waiting_for_journal: set[str] = set()
         self.waiting_for_pace: set[str] = set()
         self._waiting_for_frames: set[str] = set()
+        self._finished = 0
+        """Finished frames when somebody was last woken for them."""
+        self._concern = {
+            name: {*graph.consumers[name], *self.recorders, *(self.agents if name in self.agents else ())}
+            for name in graph.order
+        }
         self._graph, self._plan, self._book = graph, plan, book
 
     def candidate(self, name: str, in_flight: int) -> Task | None:
@@ -48,11 +54,10 @@ class Turns:
     def decided(self, name: str) -> None:
         """A service's task was decided: whom may that concern?"""
         self.concerned.add(name)
-        self.concerned.update(self._graph.consumers[name])
-        self.concerned.update(self.recorders)
-        if name in self.agents:
-            self.concerned.update(self.agents)
-        self.wake(self._waiting_for_frames)
+        self.concerned.update(self._concern[name])
+        if self._book.finished_frames != self._finished:
+            self._finished = self._book.finished_frames
+            self.wake(self._waiting_for_frames)
 
     def wake(self, waiting: set[str]) -> None:
         """What these services waited for has come."""

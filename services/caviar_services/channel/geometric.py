@@ -213,7 +213,13 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
                 tilt = deviations[number]
                 departure = _direction(pair.zenith + tilt[0], pair.azimuth + tilt[1])
                 arrival = _direction(math.pi - pair.zenith + tilt[2], pair.azimuth + math.pi + tilt[3])
-            waves.add(amplitude * loss, tau, departure, arrival, pair)
+            waves.amplitude.append(amplitude * loss)
+            waves.tau.append(tau)
+            waves.departure.append(departure)
+            waves.arrival.append(arrival)
+            # A source that moves along its wave, and a receiver that moves against it, raise the frequency.
+            approach = _dot(pair.velocity[0], departure) + _dot(pair.velocity[1], arrival)
+            waves.doppler_ratio.append(approach / SPEED_OF_LIGHT)
         waves.id += self._ids[free]
         waves.length += [pair.length] * len(gains)
 
@@ -383,16 +389,6 @@ class _Waves:
         self.id: list[int] = []
         self.length: list[float] = []
         """Of the pair's straight line [m]."""
-
-    def add(self, amplitude: complex, tau: float, departure: Vector, arrival: Vector, pair: _Line) -> None:
-        """One more wave."""
-        self.amplitude.append(amplitude)
-        self.tau.append(tau)
-        self.departure.append(departure)
-        self.arrival.append(arrival)
-        # A source that moves along its wave, and a receiver that moves against it, raise the frequency.
-        tx_speed, rx_speed = pair.velocity
-        self.doppler_ratio.append((_dot(tx_speed, departure) + _dot(rx_speed, arrival)) / SPEED_OF_LIGHT)
 
 
 @dataclass(frozen=True, eq=False)
