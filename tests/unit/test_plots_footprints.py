@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from caviar_clients.plots.footprints import footprints, read_ply
+from caviar_clients.plots.footprints import footprints
 from caviar_protocol.errors import AssetError
+from caviar_protocol.ply import read_ply
 
 QUADS = [(0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)]
 

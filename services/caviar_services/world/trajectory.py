@@ -6,7 +6,7 @@ import csv
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import msgspec
 import numpy as np
@@ -51,7 +51,7 @@ class TrajectorySettings(WorldSettings, frozen=True, kw_only=True, forbid_unknow
 class TrajectoryWorld(World[TrajectorySettings]):
     """Objects that follow timed waypoints; they rest before the first and after the last one."""
 
-    Settings = TrajectorySettings
+    Settings: ClassVar[type[msgspec.Struct]] = TrajectorySettings
 
     def __init__(self, settings: TrajectorySettings, run: RunInfo) -> None:
         super().__init__(settings, run)

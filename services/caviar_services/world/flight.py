@@ -1,0 +1,199 @@
+"""World ``flight``: objects that agents fly, a UAV for instance, beside scripted ones.
+
+A flown object obeys one motion command per frame; without one it brakes and hovers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import replace
+from itertools import pairwise
+from typing import Annotated, ClassVar
+
+import msgspec
+
+from caviar_protocol.arrays import quantity
+from caviar_protocol.coordinates import quaternion_from_euler
+from caviar_protocol.errors import PayloadError, ScenarioError
+from caviar_protocol.messages import Input
+from caviar_protocol.topics import Action, VelocityCommand, WaypointCommand
+from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
+from caviar_services.world.assets import scenery_assets
+from caviar_services.world.base import ObjectState
+from caviar_services.world.flyer import Flyer, Limits, Motion
+from caviar_services.world.obstacles import Obstacles, scenery_triangles
+from caviar_services.world.shapes import SHAPES
+from caviar_services.world.trajectory import Length, MovingObject, TrajectorySettings, TrajectoryWorld
+
+SUB_STEP_NS = 10_000_000
+"""Step of the integration; sub-steps end at its multiples, and where a frame is."""
+
+
+class FlownObject(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One object that agents fly, and what it is capable of."""
+
+    name: Annotated[str, msgspec.Meta(min_length=1, max_length=100)]
+    kind: str = "uav"
+    """Class of the object; one without a mesh of its own is a box."""
+    dimensions_m: tuple[Length, Length, Length] = (0.6, 0.6, 0.25)
+    """Length, width, height."""
+    start_m: tuple[float, float, float]
+    """Centre of the object at the start of every episode."""
+    start_yaw_deg: float = 0.0
+    max_speed_m_s: Annotated[float, quantity("m/s", "in any direction", gt=0)]
+    max_acceleration_m_s2: Annotated[float, quantity("m/s2", "in any direction", gt=0)]
+    clearance_m: Annotated[float, quantity("m", "least distance of the centre from scenery", gt=0)] = 1.0
+    minimum_m: tuple[float, float, float] | None = None
+    """Least x, y and z of the centre; unset: no bounds but the ground at z = 0. Faces of scenery
+    that lie at this height or lower are no obstacles."""
+    maximum_m: tuple[float, float, float] | None = None
+    """Greatest x, y and z of the centre; unset: no bounds."""
+
+
+class FlightSettings(TrajectorySettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of the world ``flight``."""
+
+    objects: tuple[MovingObject, ...] = ()
+    """Scripted objects, as in the world ``trajectory``."""
+    flown: tuple[FlownObject, ...]
+
+
+class FlightWorld(TrajectoryWorld):
+    """Objects that agents fly, with limited speed and acceleration, clear of the scenery."""
+
+    Settings: ClassVar[type[msgspec.Struct]] = FlightSettings
+    inputs: ClassVar[tuple[Input, ...]] = (Input(topic="action", lag=1, required=False),)
+
+    def __init__(self, settings: FlightSettings, run: RunInfo) -> None:
+        super().__init__(settings, run)
+        self._flown: dict[str, FlownObject] = {}
+        self._flyers: dict[str, Flyer] = {}
+        self._elapsed_ns = 0
+        for index, thing in enumerate(settings.flown):
+            key = f"services.{run.name}.settings.flown[{index}]"
+            name = (settings.prefix or "") + thing.name
+            if name in self._flown or name in self._tracks:
+                raise ScenarioError(f"a second object is named {name!r}; give it another name", key=key)
+            self._flown[name] = thing
+            self._flyers[name] = Flyer(_limits(thing, key))
+
+    def prefixes(self) -> tuple[str, ...]:
+        """The setting, or all names, which are known."""
+        return (self.settings.prefix,) if self.settings.prefix else (*self._tracks, *self._flown)
+
+    def mesh_classes(self) -> tuple[str, ...]:
+        """The classes of the objects, those that have a mesh."""
+        flown = {thing.kind for thing in self._flown.values()}
+        return tuple(sorted((flown & SHAPES.keys()) | set(super().mesh_classes())))
+
+    def prepare(self, preparation: Preparation) -> Prepared:
+        """Load the scenery as obstacles, and see that every flown object starts clear of it."""
+        triangles = scenery_triangles(scenery_assets(self.settings.scenery))
+        for index, (name, flyer) in enumerate(self._flyers.items()):
+            thing = self._flown[name]
+            flyer.obstacles = Obstacles(triangles[triangles[..., 2].max(axis=1) > flyer.limits.low[2]])
+            distance = flyer.obstacles.distance(thing.start_m, thing.clearance_m)
+            if distance < thing.clearance_m:
+                raise ScenarioError(
+                    f"{list(thing.start_m)} is {distance:.3f} m from the scenery, and {name!r} keeps "
+                    f"{thing.clearance_m} m; start farther away",
+                    key=f"services.{self.run.name}.settings.flown[{index}].start_m",
+                )
+        return super().prepare(preparation)
+
+    def begin(self, episode: int, seed: int) -> None:
+        """Every episode starts at the same place; then commands decide."""
+        self._elapsed_ns = 0
+        for name, thing in self._flown.items():
+            self._flyers[name].reset(thing.start_m, math.radians(thing.start_yaw_deg))
+
+    def step(self, frame: Frame) -> StepResult:
+        """The scene at the frame's instant, the commands having acted since the one before."""
+        motions = self._motions(frame)
+        counts: Counter[str] = Counter()
+        elapsed_ns = frame.t_ns - self._t0_ns
+        steps = _sub_steps(self._elapsed_ns, elapsed_ns)
+        for name, flyer in self._flyers.items():
+            counts.update(flyer.fly(motions.get(name), steps))
+        self._elapsed_ns = elapsed_ns
+        return replace(super().step(frame), counts=dict(counts))
+
+    def _motions(self, frame: Frame) -> dict[str, Motion]:
+        """What each flown object is told to do; beams and schedules are not for worlds."""
+        found: dict[str, tuple[str, Motion]] = {}
+        for agent, action in frame.of("action", Action).items():
+            for command in action.commands:
+                if not isinstance(command, VelocityCommand | WaypointCommand):
+                    continue
+                name = command.object
+                if name not in self._flyers:
+                    known = ", ".join(map(repr, self._flyers)) or "none"
+                    raise PayloadError(
+                        f"agent {agent!r} commands the motion of {name!r}, which world {self.run.name!r} "
+                        f"does not fly; it flies {known}"
+                    )
+                if name in found:
+                    raise PayloadError(
+                        f"agents {found[name][0]!r} and {agent!r} both command the motion of {name!r}; "
+                        f"let one of them own 'motion:{name}'"
+                    )
+                found[name] = agent, _motion(command, agent)
+        return {name: motion for name, (_, motion) in found.items()}
+
+    def objects_at(self, elapsed_ns: int) -> Iterable[ObjectState]:
+        """The scripted objects, and the flown ones where they are now."""
+        yield from super().objects_at(elapsed_ns)
+        for name, flyer in self._flyers.items():
+            thing = self._flown[name]
+            yield ObjectState(
+                name=name,
+                kind=thing.kind,
+                position=flyer.position,
+                orientation=quaternion_from_euler(flyer.yaw),
+                velocity=flyer.velocity,
+                dimensions=thing.dimensions_m,
+            )
+
+
+def _motion(command: VelocityCommand | WaypointCommand, agent: str) -> Motion:
+    if isinstance(command, WaypointCommand):
+        motion = Motion(target=command.position, speed=command.speed)
+        values: tuple[float, ...] = (*command.position, command.speed)
+    else:
+        motion = Motion(velocity=command.velocity)
+        values = command.velocity
+    if not all(map(math.isfinite, values)):
+        raise PayloadError(f"agent {agent!r} commands {command}, which is not finite; command numbers")
+    return motion
+
+
+def _limits(thing: FlownObject, key: str) -> Limits:
+    half = math.hypot(*thing.dimensions_m) / 2
+    if thing.clearance_m < half:
+        raise ScenarioError(
+            f"{thing.clearance_m} m is less than half the diagonal of the object; write at least "
+            f"{math.ceil(half * 100) / 100}",
+            key=f"{key}.clearance_m",
+        )
+    low = thing.minimum_m or (-math.inf, -math.inf, thing.dimensions_m[2] / 2)
+    high = thing.maximum_m or (math.inf, math.inf, math.inf)
+    if not all(a <= x <= b for a, x, b in zip(low, thing.start_m, high, strict=True)):
+        raise ScenarioError(
+            f"{list(thing.start_m)} is not within {list(low)} and {list(high)}; start inside",
+            key=f"{key}.start_m",
+        )
+    return Limits(
+        speed=thing.max_speed_m_s,
+        acceleration=thing.max_acceleration_m_s2,
+        clearance=thing.clearance_m,
+        low=low,
+        high=high,
+    )
+
+
+def _sub_steps(start_ns: int, end_ns: int) -> list[float]:
+    """Lengths [s] of the sub-steps between two instants."""
+    grid = range((start_ns // SUB_STEP_NS + 1) * SUB_STEP_NS, end_ns, SUB_STEP_NS)
+    return [(b - a) / 1e9 for a, b in pairwise([start_ns, *grid, end_ns]) if b > a]

@@ -1,0 +1,247 @@
+"""Scenery as obstacles: where a ball may go between its triangles.
+
+Triangles lie in the cells of a horizontal grid. Those around the ball are kept until it has gone
+some way, so that a step looks at few of them, and in free flight at none.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from caviar_protocol.arrays import Float64Array, Int64Array
+from caviar_protocol.coordinates import Vector
+from caviar_protocol.errors import AssetError
+from caviar_protocol.ply import read_ply
+from caviar_services.scenery import read_scenery
+
+_CELL = 10.0
+"""Side of a grid cell [m]."""
+
+_MOST_CELLS = 1_000_000
+"""Wider scenery has larger cells."""
+
+_HORIZON = 20.0
+"""How far [m] beyond what a step needs is looked for triangles."""
+
+_AROUND = 2.0
+"""Way [m] for which the triangles beside a wall are kept."""
+
+_ROUNDING = 1e-9
+"""Way [m] into a plane that counts as none."""
+
+_WORN = 1e-6
+"""Clearance [m] that such ways may take away in all."""
+
+_REST: Vector = (0.0, 0.0, 0.0)
+
+
+class Obstacles:
+    """Triangles [m], Shape ``[T, 3, 3]``, that a ball must not come near."""
+
+    def __init__(self, triangles: Float64Array) -> None:
+        self._corners = np.ascontiguousarray(triangles, dtype=np.float64).reshape(-1, 3, 3)
+        self._grid = _Grid(self._corners) if len(self._corners) else None
+        self._centre: Vector = _REST
+        self._reach = -math.inf
+        self._around: _Faces | None = None
+
+    @classmethod
+    def none(cls) -> Obstacles:
+        """Nothing in the way."""
+        return cls(np.zeros((0, 3, 3)))
+
+    def distance(self, point: Vector, within: float = math.inf) -> float:
+        """Distance [m] of a point from the nearest triangle; ``within`` where that is farther."""
+        near = self._near(point, within)
+        return min(_Faces(near).gaps(point)[0].min(), within) if len(near) else within
+
+    def clear_distance(self, start: Vector, end: Vector, radius: float) -> float:
+        """How far [m] a ball can go on a straight way until a triangle is nearer than ``radius``.
+
+        Goes on by what is free around each place, and ends at most 1 µm too early.
+        """
+        length = math.dist(start, end)
+        gone = 0.0
+        while gone < length:
+            x, y, z = (a + (b - a) * gone / length for a, b in zip(start, end, strict=True))
+            free = self.distance((x, y, z), radius + _HORIZON) - radius
+            if free < 1e-6:
+                return gone
+            gone += free
+        return length
+
+    def slide(self, start: Vector, step: Vector, radius: float) -> Vector:
+        """What a ball [m] may do of a step: all, what is left of it along surfaces, or nothing.
+
+        Returns ``step`` itself where it is free. A ball that starts ``radius`` away from all triangles
+        is so, but for rounding, on the whole way of what is returned: a triangle lies behind the plane
+        through its point nearest to the start, across the line to the start, and the way does not come
+        nearer than ``radius`` to that plane. Beside an edge this asks for a little more than needed.
+        """
+        need = radius + math.hypot(*step)
+        if self._reach - math.dist(start, self._centre) < need:
+            self._look_around(start, need)
+        if self._around is None or step == _REST:
+            return step
+        distances, gaps = self._around.gaps(start)
+        near = distances < need
+        if not near.any():
+            return step
+        room = distances[near] - radius
+        return _within(step, np.where(np.abs(room) < _WORN, 0.0, room), gaps[near])
+
+    def _look_around(self, centre: Vector, need: float) -> None:
+        """Keep the triangles that steps from places around this one can come near."""
+        corners = self._near(centre, need + _HORIZON)
+        distances = _Faces(corners).gaps(centre)[0] if len(corners) else np.zeros(0)
+        free = float(distances.min(initial=need + _HORIZON))
+        self._centre = centre
+        self._reach = max(free, need + _AROUND)
+        kept = corners[distances < self._reach]
+        self._around = _Faces(kept) if len(kept) else None
+
+    def _near(self, point: Vector, within: float) -> Float64Array:
+        """Corners of the triangles of which some point may be ``within`` of a point."""
+        if self._grid is None or math.isinf(within):
+            return self._corners
+        return self._corners[self._grid.find(point, within)]
+
+
+def _within(step: Vector, room: Float64Array, gaps: Float64Array) -> Vector:
+    """A step that goes into no plane by more than the room before it.
+
+    Violated planes are taken one after the other, the worst first: along one plane, then along
+    the line where two meet; a third one ends the motion.
+    """
+    normals = gaps / np.maximum(np.sqrt(_dot(gaps, gaps)), _ROUNDING)[:, None]
+    move = step
+    before: Vector | None = None
+    for _ in range(3):
+        short = _dot(normals, np.array(move)) + room
+        worst = int(short.argmin())
+        if short[worst] >= -_ROUNDING:
+            return move
+        x, y, z = normals[worst].tolist()
+        move = _along(step, (x, y, z), before)
+        before = (x, y, z)
+    return _REST
+
+
+def _along(step: Vector, normal: Vector, before: Vector | None) -> Vector:
+    """A step without what goes into a plane, nor into the one ``before``."""
+    into = min(_scalar(step, normal), 0.0)
+    move = (step[0] - into * normal[0], step[1] - into * normal[1], step[2] - into * normal[2])
+    if before is None or _scalar(move, before) >= 0:
+        return move
+    (ax, ay, az), (bx, by, bz) = before, normal
+    crease = (ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx)
+    size = _scalar(crease, crease)
+    if size == 0:
+        return _REST
+    share = _scalar(step, crease) / size
+    return (crease[0] * share, crease[1] * share, crease[2] * share)
+
+
+def _scalar(a: Vector, b: Vector) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+class _Faces:
+    """Some triangles, with what the distance from a point needs."""
+
+    def __init__(self, corners: Float64Array) -> None:
+        self._corners = corners
+        self._edges = np.roll(corners, -1, axis=1) - corners
+        squared = _dot(self._edges, self._edges)
+        self._inverse = np.divide(1.0, squared, out=np.zeros_like(squared), where=squared > 0)
+        normal = np.cross(self._edges[:, 0], self._edges[:, 1])
+        size = np.sqrt(_dot(normal, normal))
+        self._solid = size > 1e-12 * squared.max(axis=1, initial=0.0)
+        self._normal = normal / np.where(self._solid, size, 1.0)[:, None]
+        self._inward = np.cross(self._normal[:, None], self._edges)
+
+    def gaps(self, point: Vector) -> tuple[Float64Array, Float64Array]:
+        """Distances [m], Shape ``[T]``, and vectors from the nearest points to ``point``, ``[T, 3]``.
+
+        The nearest point is the foot on the plane where that lies inside, else one of an edge
+        (Ericson, "Real-Time Collision Detection", 2005, section 5.1.5).
+        """
+        ways = np.array(point) - self._corners
+        t = np.clip(_dot(ways, self._edges) * self._inverse, 0.0, 1.0)
+        gaps = ways - t[..., None] * self._edges
+        squared = _dot(gaps, gaps)
+        gap = gaps[np.arange(len(gaps)), squared.argmin(axis=1)]
+        inside = self._solid & (_dot(ways, self._inward) >= 0).all(axis=1)
+        height = _dot(ways[:, 0], self._normal)
+        gap = np.where(inside[:, None], height[:, None] * self._normal, gap)
+        return np.sqrt(_dot(gap, gap)), gap
+
+
+class _Grid:
+    """Numbers of triangles by horizontal cell, one cell after the other in one array."""
+
+    def __init__(self, corners: Float64Array) -> None:
+        self._low, self._high = corners.min(axis=1), corners.max(axis=1)
+        self._origin = self._low[:, :2].min(axis=0)
+        extent = self._high[:, :2].max(axis=0) - self._origin
+        self._cell = max(_CELL, math.sqrt(float(extent[0] * extent[1]) / _MOST_CELLS), *(extent / 10_000))
+        self._shape = (extent // self._cell).astype(np.int64) + 1
+        first = ((self._low[:, :2] - self._origin) // self._cell).astype(np.int64)
+        last = ((self._high[:, :2] - self._origin) // self._cell).astype(np.int64)
+        columns, rows = (last - first + 1).T
+        owners = np.repeat(np.arange(len(corners)), columns * rows)
+        starts = np.cumsum(columns * rows) - columns * rows
+        inside = np.arange(len(owners)) - starts[owners]
+        column = first[owners, 0] + inside % columns[owners]
+        row = first[owners, 1] + inside // columns[owners]
+        cells = row * self._shape[0] + column
+        order = np.argsort(cells, kind="stable")
+        self._owners: Int64Array = owners[order].astype(np.int64)
+        self._starts = np.searchsorted(cells[order], np.arange(int(self._shape.prod()) + 1))
+
+    def find(self, point: Vector, within: float) -> Int64Array:
+        """Triangles whose bounding box is ``within`` of a point along every axis, sorted."""
+        low, high = np.array(point) - within, np.array(point) + within
+        limits = (self._shape - 1).astype(np.float64)
+        first = np.clip((low[:2] - self._origin) // self._cell, 0, limits).astype(np.int64)
+        last = np.clip((high[:2] - self._origin) // self._cell, 0, limits).astype(np.int64)
+        runs = [
+            self._owners[self._starts[row + first[0]] : self._starts[row + last[0] + 1]]
+            for row in np.arange(first[1], last[1] + 1) * self._shape[0]
+        ]
+        found = np.unique(np.concatenate(runs))
+        inside = (self._low[found] <= high) & (self._high[found] >= low)
+        near: Int64Array = found[inside.all(axis=1)]
+        return near
+
+
+def _dot(a: Float64Array, b: Float64Array) -> Float64Array:
+    # Written out: the same order of operations on every processor.
+    found: Float64Array = a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
+    return found
+
+
+def scenery_triangles(assets: Mapping[str, Path | bytes]) -> Float64Array:
+    """All triangles of a world's scenery in world coordinates [m], Shape ``[T, 3, 3]``.
+
+    Raises `AssetError` naming a mesh that cannot be read or is not finite.
+    """
+    found: list[Float64Array] = []
+    for xml in _descriptions(assets):
+        for shape in read_scenery(xml).shapes:
+            vertices, faces = read_ply(shape.file)
+            if not np.isfinite(vertices).all():
+                raise AssetError(f"{shape.file}: a vertex is not finite; export it again")
+            world = vertices @ shape.to_world[:3, :3].T + shape.to_world[:3, 3]
+            found.append(world[faces])
+    return np.concatenate(found) if found else np.zeros((0, 3, 3))
+
+
+def _descriptions(assets: Mapping[str, Path | bytes]) -> Iterable[Path]:
+    for name, content in sorted(assets.items()):
+        if PurePosixPath(name).match("scenery/*.xml") and isinstance(content, Path):
+            yield content

@@ -1,0 +1,222 @@
+"""Flown objects: they obey commands within their limits, and reach where they are sent."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from caviar_protocol.coordinates import Vector, euler_from_quaternion
+from caviar_protocol.errors import PayloadError, ScenarioError
+from caviar_protocol.messages import GrantInput, Status
+from caviar_protocol.topics import Action, BeamChoice, Scene, VelocityCommand, WaypointCommand
+from caviar_protocol.topics.action import Command
+from caviar_services.service import Frame, FrameInput, RunInfo, StepResult
+from caviar_services.world.flight import FlightSettings, FlightWorld, FlownObject
+from caviar_services.world.trajectory import MovingObject
+
+SPEED, ACCELERATION = 12.0, 4.0
+PERIOD_NS = 100_000_000
+
+coordinates = st.floats(-80.0, 80.0, allow_subnormal=False)
+points = st.tuples(coordinates, coordinates, st.floats(1.0, 60.0))
+
+
+def flown(**changes: object) -> FlownObject:
+    plain: dict[str, object] = {
+        "name": "uav",
+        "start_m": (0.0, 0.0, 30.0),
+        "max_speed_m_s": SPEED,
+        "max_acceleration_m_s2": ACCELERATION,
+    }
+    return FlownObject(**{**plain, **changes})  # type: ignore[arg-type]
+
+
+def world(*objects: FlownObject, scripted: Sequence[MovingObject] = ()) -> FlightWorld:
+    made = FlightWorld(
+        FlightSettings(flown=objects or (flown(),), objects=tuple(scripted)), RunInfo(name="world")
+    )
+    made.reset(0, 1, 0)
+    made.step(Frame(episode=0, number=0, t_ns=0))
+    return made
+
+
+def commanded(number: int, agents: dict[str, tuple[Command, ...]], **changes: int) -> Frame:
+    """Frame with the agents' actions of the frame before."""
+    inputs = tuple(
+        FrameInput(
+            GrantInput(topic="action", source=name, status=Status.FRESH, frame=number - 1),
+            payload=Action(commands=commands),
+        )
+        for name, commands in agents.items()
+    )
+    t_ns = changes.pop("t_ns", number * PERIOD_NS)
+    return Frame(episode=0, number=number, t_ns=t_ns, previous=number - 1, inputs=inputs, **changes)
+
+
+def state(result: StepResult, name: str = "uav") -> tuple[np.ndarray, np.ndarray, float]:
+    """Position, velocity and yaw."""
+    scene = result.products["scene"]
+    assert isinstance(scene, Scene)
+    i = scene.names.index(name)
+    return scene.position[i], scene.velocity[i], euler_from_quaternion(scene.orientation[i].tolist())[0]
+
+
+def fly(made: FlightWorld, command: Command | None, frames: int, first: int = 1) -> list[StepResult]:
+    agents: dict[str, tuple[Command, ...]] = {"agent": (command,)} if command else {}
+    return [made.step(commanded(first + k, agents)) for k in range(frames)]
+
+
+@given(points, st.floats(0.5, 30.0))
+@settings(max_examples=60, deadline=None)
+def test_a_waypoint_is_reached_without_passing_it_or_any_limit(target: Vector, speed: float) -> None:
+    """The way there is straight: no place is farther from the target than the one before."""
+    made = world()
+    distance = math.dist((0.0, 0.0, 30.0), target)
+    allowed = min(speed, SPEED)
+    duration = distance / allowed + 2 * allowed / ACCELERATION + 1.0
+    results = fly(made, WaypointCommand(object="uav", position=target, speed=speed), int(duration * 10) + 1)
+    before, slow = distance, np.zeros(3)
+    for result in results:
+        position, velocity, _ = state(result)
+        left = float(np.linalg.norm(position - target))
+        assert left <= before + 1e-9
+        assert np.linalg.norm(velocity) <= allowed + 1e-9
+        assert np.linalg.norm(velocity - slow) <= ACCELERATION * PERIOD_NS / 1e9 + 1e-9
+        before, slow = left, velocity
+    assert before < 1e-3
+    assert np.linalg.norm(slow) < 1e-2
+
+
+@given(st.tuples(coordinates, coordinates, st.floats(0.0, 80.0)))
+@settings(max_examples=40, deadline=None)
+def test_a_velocity_is_taken_up_with_the_greatest_acceleration(asked: Vector) -> None:
+    """x = a·t²/2 until the speed is reached, then x = v·t − v²/2a."""
+    made = world()
+    speed = min(math.hypot(*asked), SPEED)
+    direction = np.array(asked) / max(math.hypot(*asked), 1e-12)
+    for k, result in enumerate(fly(made, VelocityCommand(object="uav", velocity=asked), 40), 1):
+        t = k * PERIOD_NS / 1e9
+        rising = speed / ACCELERATION
+        way = ACCELERATION * t * t / 2 if t < rising else speed * t - speed * speed / (2 * ACCELERATION)
+        position, velocity, _ = state(result)
+        # In the sub-step in which the speed is reached the acceleration is smaller.
+        np.testing.assert_allclose(position, np.array([0, 0, 30]) + way * direction, atol=ACCELERATION * 1e-4)
+        np.testing.assert_allclose(velocity, min(ACCELERATION * t, speed) * direction, atol=1e-9)
+
+
+def test_without_a_command_it_brakes_and_hovers_and_keeps_its_yaw() -> None:
+    made = world()
+    fast = fly(made, VelocityCommand(object="uav", velocity=(6.0, -8.0, 0.0)), 30)[-1]
+    start, velocity, yaw = state(fast)
+    assert np.linalg.norm(velocity) == pytest.approx(10.0)
+    assert yaw == pytest.approx(math.atan2(-8, 6))
+    end, rest, kept = state(fly(made, None, 40, first=31)[-1])
+    assert rest.tolist() == [0.0, 0.0, 0.0]
+    assert np.linalg.norm(end - start) == pytest.approx(10.0**2 / (2 * ACCELERATION), abs=1e-2)
+    assert kept == pytest.approx(yaw, abs=1e-9)
+
+
+def test_a_skipped_frame_is_flown_with_the_command_that_comes() -> None:
+    command = VelocityCommand(object="uav", velocity=(5.0, 1.0, 0.0))
+    step_by_step = state(fly(world(), command, 7)[-1])
+    at_once = state(world().step(commanded(7, {"agent": (command,)})))
+    for one, other in zip(step_by_step, at_once, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_uneven_instants_are_flown_too() -> None:
+    """Speed at an instant that is no multiple of the sub-step."""
+    made = world()
+    command = VelocityCommand(object="uav", velocity=(1.0, 0.0, 0.0))
+    result = made.step(commanded(1, {"agent": (command,)}, t_ns=123_456_789))
+    assert state(result)[1][0] == pytest.approx(ACCELERATION * 0.123456789)
+
+
+def test_every_episode_starts_at_the_same_place() -> None:
+    made = world(flown(start_yaw_deg=90.0))
+    fly(made, VelocityCommand(object="uav", velocity=(5.0, 0.0, 0.0)), 5)
+    made.reset(1, 2, 0)
+    position, velocity, yaw = state(made.step(Frame(episode=1, number=0, t_ns=0)))
+    assert position.tolist() == [0.0, 0.0, 30.0]
+    assert velocity.tolist() == [0.0, 0.0, 0.0]
+    assert yaw == pytest.approx(math.pi / 2)
+
+
+def test_too_much_speed_is_counted_and_not_flown() -> None:
+    made = world()
+    result = fly(made, VelocityCommand(object="uav", velocity=(0.0, 100.0, 0.0)), 50)[-1]
+    assert result.counts == {"limited-speed": 1}
+    np.testing.assert_allclose(state(result)[1], (0.0, SPEED, 0.0))
+
+
+def test_the_geofence_and_the_ground_are_limits() -> None:
+    made = world(flown(maximum_m=(10.0, 20.0, 40.0), minimum_m=(-10.0, -20.0, 5.0)), flown(name="low"))
+    out = fly(made, VelocityCommand(object="uav", velocity=(9.0, 0.0, -6.0)), 80)[-1]
+    assert state(out)[0].tolist() == [10.0, 0.0, 5.0]
+    assert out.counts == {"stopped-by-geofence": 1}
+    down = fly(made, VelocityCommand(object="low", velocity=(0.0, 0.0, -9.0)), 80, first=81)[-1]
+    assert state(down, "low")[0][2] == 0.125  # it stands on the ground
+    assert state(down, "low")[1].tolist() == [0.0, 0.0, 0.0]
+
+
+def test_scripted_objects_follow_their_script_beside_it() -> None:
+    script = MovingObject(name="van", kind="car", waypoints=((0.0, 0.0, 0.0, 1.0), (1.0, 8.0, 0.0, 1.0)))
+    made = world(scripted=[script])
+    result = fly(made, WaypointCommand(object="uav", position=(0.0, 0.0, 35.0), speed=2.0), 10)[-1]
+    assert state(result, "van")[0].tolist() == [8.0, 0.0, 1.0]
+    assert state(result)[0][2] > 30.5
+
+
+def test_beams_are_not_for_worlds() -> None:
+    made = world()
+    beam = BeamChoice(tx="bs", rx="rx", tx_beam=3)
+    result = made.step(commanded(1, {"agent": (beam,)}))
+    assert state(result)[0].tolist() == [0.0, 0.0, 30.0]
+
+
+def test_an_unknown_object_is_refused_by_name() -> None:
+    with pytest.raises(PayloadError, match=r"'pilot'.*'uva'.*flies 'uav', 'b'"):
+        world(flown(), flown(name="b")).step(
+            commanded(1, {"pilot": (VelocityCommand(object="uva", velocity=(1.0, 0.0, 0.0)),)})
+        )
+
+
+def test_two_agents_cannot_fly_one_object() -> None:
+    command = VelocityCommand(object="uav", velocity=(1.0, 0.0, 0.0))
+    with pytest.raises(PayloadError, match="'a' and 'b' both command the motion of 'uav'"):
+        world().step(commanded(1, {"a": (command,), "b": (command,)}))
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        VelocityCommand(object="uav", velocity=(math.nan, 0.0, 0.0)),
+        WaypointCommand(object="uav", position=(0.0, math.inf, 0.0), speed=1.0),
+    ],
+)
+def test_a_command_that_is_not_finite_is_refused(command: Command) -> None:
+    with pytest.raises(PayloadError, match="not finite"):
+        world().step(commanded(1, {"agent": (command,)}))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"start_m": (0.0, 0.0, 0.0)}, "start inside"),
+        ({"maximum_m": (5.0, -1.0, 50.0)}, "start inside"),
+        ({"clearance_m": 0.3}, "half the diagonal"),
+    ],
+)
+def test_contradicting_settings_are_refused(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(ScenarioError, match=message):
+        world(flown(**changes))
+
+
+def test_two_objects_of_one_name_are_refused() -> None:
+    with pytest.raises(ScenarioError, match="second object is named 'uav'"):
+        world(flown(), flown())
