@@ -29,6 +29,7 @@ BUILT_IN: dict[str, str] = {
     "link:beams": "caviar_services.link.beams:BeamLink",
     "agent:los-beam": "caviar_services.agent.los_beam:LosBeamAgent",
     "agent:random": "caviar_services.agent.random:RandomAgent",
+    "agent:waypoints": "caviar_services.agent.waypoints:WaypointsAgent",
     "agent:oracle": "caviar_services.agent.oracle:OracleAgent",
     "recorder:mcap": "caviar_services.recorder.mcap:McapRecorder",
 }

@@ -23,6 +23,8 @@ EXTRAS = {
     "world:sumo": "libsumo",
     "channel:sionna-rt": "sionna",
     "sensors:camera": "mitsuba",
+    "world:flight": "sionna",
+    "channel:sionna-rt": "sionna",
     "sensors:lidar": "mitsuba",
 }
 """Package without which an implementation cannot run; a base install skips it."""

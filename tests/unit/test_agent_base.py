@@ -10,7 +10,7 @@ from link_builders import antenna, frame_of, given, scene_of
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.pairs import Pair
-from caviar_protocol.topics import Action, BeamChoice, Scene
+from caviar_protocol.topics import Action, BeamChoice, Scene, VelocityCommand
 from caviar_services.agent.base import Agent, AgentSettings
 from caviar_services.registry import load
 from caviar_services.service import Frame, Preparation, RunInfo
@@ -90,6 +90,48 @@ def test_an_agent_that_leaves_users_to_others_declares_none_by_name() -> None:
 def test_owning_something_else_than_beams_is_refused_with_the_key(actuator: str) -> None:
     with pytest.raises(ScenarioError, match=rf"services\.pilot\.users: '{actuator}' is no beam"):
         agent((actuator,))
+
+
+class DriverAgent(FirstBeamAgent):
+    """Moves a UAV, too."""
+
+    def other_actuators(self) -> tuple[str, ...]:
+        return ("motion:uav",)
+
+    def other_commands(self, frame: Frame, scene: Scene) -> Iterator[VelocityCommand]:
+        yield VelocityCommand(object="uav", velocity=(1.0, 2.0, 0.0))
+
+
+def driver(users: tuple[str, ...], except_users: tuple[str, ...] = ()) -> DriverAgent:
+    return DriverAgent(AgentSettings(users=users, except_users=except_users), RunInfo(name="pilot"))
+
+
+def test_other_commands_stand_behind_the_beams() -> None:
+    """Sorted by actuator: ``beam:`` before ``motion:`` before ``schedule:``."""
+    commands = action(driver(("motion:uav", "car.1*"))).commands
+    assert [type(command) for command in commands] == [BeamChoice] * 4 + [VelocityCommand]
+
+
+@pytest.mark.parametrize(
+    ("users", "except_users", "expected"),
+    [
+        (("motion:uav", "uav/rx"), (), ("beam:uav/rx", "motion:uav")),
+        (("*",), (), ("beam:*", "motion:uav")),
+        (("motion:uav",), (), ("motion:uav",)),
+        (("*",), ("beam:car.*",), ("motion:uav",)),
+    ],
+)
+def test_other_actuators_are_always_declared(
+    users: tuple[str, ...], except_users: tuple[str, ...], expected: tuple[str, ...]
+) -> None:
+    assert driver(users, except_users).prepare(Preparation(demand={})).actuators == expected
+
+
+def test_owning_the_motion_of_another_object_is_refused() -> None:
+    with pytest.raises(
+        ScenarioError, match="'motion:uva' is no beam, and this agent steers beams and 'motion:uav'"
+    ):
+        driver(("motion:uva",))
 
 
 def test_the_final_grant_takes_no_action() -> None:

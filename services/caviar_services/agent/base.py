@@ -1,4 +1,7 @@
-"""What every beam-selecting agent is: whom it serves, and what it hears."""
+"""What every beam-selecting agent is: whom it serves, and what it hears.
+
+Some command more than beams, the motion of an object for instance (`Agent.other_actuators`).
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,7 @@ from caviar_protocol.errors import ScenarioError
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.pairs import Pair, pairs_of
 from caviar_protocol.topics import Action, BeamChoice, Scene
+from caviar_protocol.topics.action import Command
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
 
 BEAM = "beam:"
@@ -38,7 +42,8 @@ S = TypeVar("S", bound=AgentSettings)
 class Agent(Service[S]):
     """Base of agents that choose a beam pair for each of their users, every frame.
 
-    Subclasses implement `choose`. The final grant of an episode takes no action (contract,
+    Subclasses implement `choose`, and `other_actuators` with `other_commands` where they command more
+    than beams. The final grant of an episode takes no action (contract,
     clause 16).
     """
 
@@ -52,28 +57,39 @@ class Agent(Service[S]):
     def __init__(self, settings: S, run: RunInfo) -> None:
         super().__init__(settings, run)
         for text in settings.users:
-            if text.startswith(_OTHER_ACTUATORS):
+            if text.startswith(_OTHER_ACTUATORS) and text not in self.other_actuators():
+                known = " and ".join(("beams", *map(repr, self.other_actuators())))
                 raise ScenarioError(
-                    f"{text!r} is no beam, and this agent steers beams only; write 'beam:<receiver>'",
+                    f"{text!r} is no beam, and this agent steers {known} only; write 'beam:<receiver>'",
                     key=f"services.{run.name}.users",
                 )
         self._owned = _receivers(settings.users)
         self._others = _receivers(settings.except_users)
 
     def prepare(self, preparation: Preparation) -> Prepared:
-        """Declare the actuators. One that leaves users to others owns nothing by name."""
+        """Declare the actuators. One that leaves users to others owns no beam by name."""
+        others = self.other_actuators()
         if self.settings.except_users:
-            return Prepared(notes=("serves the users whom no other agent owns",))
-        return Prepared(actuators=tuple(BEAM + text for text in self._owned))
+            return Prepared(actuators=others, notes=("serves the users whom no other agent owns",))
+        return Prepared(actuators=(*(BEAM + text for text in self._owned), *others))
+
+    def other_actuators(self) -> tuple[str, ...]:
+        """Actuators that this agent owns beside its beams, by their whole names, sorted."""
+        return ()
+
+    def other_commands(self, frame: Frame, scene: Scene) -> Iterable[Command]:
+        """Commands for `other_actuators`, in their order; one without is left to itself."""
+        return ()
 
     def step(self, frame: Frame) -> StepResult:
-        """One choice per user, sorted by actuator, then TX, then carrier."""
+        """One choice per user, sorted by actuator, then TX, then carrier, and the other commands."""
         if frame.final:
             return StepResult()
         scene = frame.scene()
         pairs = [pair for pair in pairs_of(scene) if self.serves(pair.rx.name)]
         choices = sorted(self.choose(frame, scene, pairs), key=lambda c: (c.rx, c.tx, c.carrier))
-        return StepResult(products={"action": Action(commands=tuple(choices))})
+        commands = (*choices, *self.other_commands(frame, scene))
+        return StepResult(products={"action": Action(commands=commands)})
 
     def serves(self, rx: str) -> bool:
         """Whether this agent serves the receiver of that name."""

@@ -15,6 +15,18 @@ from caviar_services.link.codebook import beam_towards
 from caviar_services.service import Frame
 
 
+def straight_choices(scene: Scene, pairs: Sequence[Pair]) -> Iterator[BeamChoice]:
+    """The straight-line pair of beams of each pair of devices, the same on every carrier."""
+    at_tx, at_rx = (vectors.tolist() for vectors in directions(scene, pairs))
+    for pair, towards_rx, towards_tx in zip(pairs, at_tx, at_rx, strict=True):
+        yield BeamChoice(
+            tx=pair.tx.name,
+            rx=pair.rx.name,
+            tx_beam=beam_towards(pair.tx.array, towards_rx),
+            rx_beam=beam_towards(pair.rx.array, towards_tx),
+        )
+
+
 class LosBeamAgent(Agent[AgentSettings]):
     """Points both beams along the straight line."""
 
@@ -22,11 +34,4 @@ class LosBeamAgent(Agent[AgentSettings]):
 
     def choose(self, frame: Frame, scene: Scene, pairs: Sequence[Pair]) -> Iterator[BeamChoice]:
         """The straight-line pair of each user, the same on every carrier."""
-        at_tx, at_rx = (vectors.tolist() for vectors in directions(scene, pairs))
-        for pair, towards_rx, towards_tx in zip(pairs, at_tx, at_rx, strict=True):
-            yield BeamChoice(
-                tx=pair.tx.name,
-                rx=pair.rx.name,
-                tx_beam=beam_towards(pair.tx.array, towards_rx),
-                rx_beam=beam_towards(pair.rx.array, towards_tx),
-            )
+        return straight_choices(scene, pairs)
