@@ -94,6 +94,13 @@ def with_overrides(scenario: Scenario, frames: int | None = None, seed: int | No
     if not changes:
         return scenario
     run = type(scenario.run)
+    instants = len(scenario.run.instants_s)
+    if frames is not None and 0 < instants < frames:
+        raise (
+            Place("run")
+            .at("frames")
+            .error(f"is {frames}, and the scenario has {instants} instants; write at most {instants}")
+        )
     values = msgspec.structs.asdict(scenario.run) | changes
     return msgspec.structs.replace(scenario, run=convert_table(run, values, Place("run")))
 

@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 
 from caviar_protocol.errors import ScenarioError
+from caviar_protocol.instants import with_instants
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario_checks import check_scenario, settings_place
 from caviar_protocol.tables import Place, Source, convert_table
@@ -45,6 +46,8 @@ def parse_scenario(text: str, file: str = "", folder: Path | None = None) -> Sce
         raise _syntax_error(error, text, file) from error
     lines = {dotted(path): line for path, line in key_lines(text.replace("\r\n", "\n")).items()}
     source = Source(file=file, lines=lines)
+    if isinstance(table.get("run"), dict):
+        table["run"] = with_instants(table["run"], Place("run", source))
     scenario = convert_table(Scenario, table, Place("", source))
     scenario = msgspec.structs.replace(scenario, source=source)
     check_scenario(scenario)

@@ -19,6 +19,10 @@ from scenarios_support import (
     scenario_file,
 )
 
+from caviar_protocol.instants import instants_ns
+from caviar_protocol.recording import Recording
+from caviar_protocol.scenario_loader import load_scenario
+
 SICK = """
 [services.sick]
 role = "sensors"
@@ -40,6 +44,21 @@ def test_smoke_has_the_digest_of_the_distributed_run(tmp_path: Path) -> None:
     distributed = digest_of(run(scenario, tmp_path / "many"))
     assert digest_of(run(scenario, tmp_path / "one", "--embedded")) == distributed
     assert digest_of(run(scenario, tmp_path / "short", "--embedded", "--frames", "99")) != distributed
+
+
+def test_frames_stand_at_the_instants_of_the_scenario(tmp_path: Path) -> None:
+    """The objects are there, too: the same place at the same instant of an evenly spaced run."""
+    finished = run(SCENARIOS / "instants.toml", tmp_path / "one", "--embedded")
+    assert digest_of(finished) == digest_of(run(SCENARIOS / "instants.toml", tmp_path / "many"))
+    planned = load_scenario(SCENARIOS / "instants.toml").run
+    frames = list(Recording(finished.directory).frames())
+    assert tuple(frame.t_ns for frame in frames) == instants_ns(planned.instants_s)
+    even = run(scenario_file(tmp_path), tmp_path / "even", "--embedded")
+    places = {frame.t_ns: product.body for frame, product in Recording(even.directory).of("scene")}
+    own = {frame.t_ns: product.body for frame, product in Recording(finished.directory).of("scene")}
+    common = places.keys() & own.keys()
+    assert len(common) == 12
+    assert all(bytes(places[t]) == bytes(own[t]) for t in common)
 
 
 @pytest.mark.channel

@@ -40,7 +40,7 @@ class Episodes:
                 attempt=peer.attempt,
                 episode=run.episode,
                 seed=run.seed,
-                t0_ns=run.plan.t_ns(0),
+                t0_ns=0,  # the first instant may be a later one
                 seed_episode=run.seed_episode,
             )
             run.send(peer, message)

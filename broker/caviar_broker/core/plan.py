@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from caviar_protocol.instants import instants_ns
 from caviar_protocol.messages import Policy, Role
 from caviar_protocol.scenario import Scenario
 
@@ -52,6 +53,8 @@ class RunPlan:
     services: tuple[ServicePlan, ...]
     frames: int
     sampling_period_ns: int
+    instants_ns: tuple[int, ...] = ()
+    """Simulated time of each frame, where these are not evenly spaced."""
     episodes: int = 1
     seed: int = 0
     realtime: bool = False
@@ -66,8 +69,11 @@ class RunPlan:
     """Decisions imposed in a replay, by (service, episode, frame) (clause 6)."""
 
     def t_ns(self, frame: int) -> int:
-        """Simulated time of a frame of any episode [ns]."""
-        return frame * self.sampling_period_ns
+        """Simulated time of a frame of any episode [ns]; one behind the last comes a period later."""
+        if not self.instants_ns:
+            return frame * self.sampling_period_ns
+        last = len(self.instants_ns) - 1
+        return self.instants_ns[min(frame, last)] + max(0, frame - last) * self.sampling_period_ns
 
 
 def plan_run(scenario: Scenario, run: str, told: Mapping[str, Mapping[str, Any]]) -> RunPlan:
@@ -90,6 +96,7 @@ def plan_run(scenario: Scenario, run: str, told: Mapping[str, Mapping[str, Any]]
         ),
         frames=scenario.run.frames,
         sampling_period_ns=scenario.run.sampling_period_ns,
+        instants_ns=instants_ns(scenario.run.instants_s),
         episodes=scenario.run.episodes,
         seed=scenario.run.seed,
         realtime=scenario.run.pace == "realtime",

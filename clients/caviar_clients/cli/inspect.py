@@ -60,7 +60,7 @@ class RunSummary(msgspec.Struct, kw_only=True):
     episodes: int
     frames: int
     frames_planned: int
-    simulated_s: Annotated[float, quantity("s", "frames times sampling period")]
+    simulated_s: Annotated[float, quantity("s", "up to a sampling period behind the last frames")]
     bytes: Annotated[int, quantity("B", "size of the segments")]
     sources: list[SourceSummary]
     link: LinkSummary | None
@@ -83,9 +83,10 @@ def summarise(recording: Recording) -> RunSummary:
     """The summary of a recording. Damaged frames are listed and count as if they had no products."""
     metadata, damage = recording.metadata, []
     sources: dict[tuple[str, str], SourceSummary] = {}
-    totals, episodes = _LinkTotals(), set()
+    totals = _LinkTotals()
+    episodes: dict[int, int] = {}  # to the last instant [ns]
     for frame in recording.frames():
-        episodes.add(frame.episode)
+        episodes[frame.episode] = max(frame.t_ns, episodes.get(frame.episode, 0))
         for entry in frame.inputs:
             key = (entry.topic, entry.source)
             source = sources.setdefault(key, SourceSummary(topic=entry.topic, source=entry.source))
@@ -104,7 +105,7 @@ def summarise(recording: Recording) -> RunSummary:
         episodes=len(episodes),
         frames=len(recording),
         frames_planned=metadata.frames * _episodes_planned(metadata.scenario),
-        simulated_s=len(recording) * metadata.sampling_period_ns / 1e9,
+        simulated_s=sum(last + metadata.sampling_period_ns for last in episodes.values()) / 1e9,
         bytes=sum(file.stat().st_size for file in recording.files),
         sources=[sources[key] for key in sorted(sources)],
         link=totals.summary(),

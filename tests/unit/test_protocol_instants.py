@@ -1,0 +1,101 @@
+"""Instants of frames that a scenario lists."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from caviar_broker.core.plan import plan_run
+from caviar_protocol.errors import ScenarioError
+from caviar_protocol.instants import instants_ns
+from caviar_protocol.scenario import Scenario
+from caviar_protocol.scenario_checks import resolved, with_overrides
+from caviar_protocol.scenario_loader import parse_scenario
+
+TEXT = """\
+[run]
+name = "x"
+INSTANTS
+[services.streets]
+role = "world"
+use = "trajectory"
+budget_ms = 5
+"""
+
+
+def parsed(lines: str) -> Scenario:
+    return parse_scenario(TEXT.replace("INSTANTS", lines), "x.toml", Path())
+
+
+@given(st.lists(st.integers(0, 10**13), min_size=1, max_size=20, unique=True).map(sorted))
+def test_whole_nanoseconds_are_exact(expected: list[int]) -> None:
+    """Written with nine decimals, as in a file, and planned as they are."""
+    text = ", ".join(f"{t // 10**9}.{t % 10**9:09d}" for t in expected)
+    scenario = parsed(f"instants_s = [{text}]")
+    assert instants_ns(scenario.run.instants_s) == tuple(expected)
+    plan = plan_run(scenario, "run", {})
+    assert [plan.t_ns(frame) for frame in range(plan.frames)] == expected
+    assert all(t % plan.sampling_period_ns == 0 for t in expected if expected != [0])
+    assert plan.t_ns(plan.frames) == expected[-1] + plan.sampling_period_ns  # the final grant
+
+
+def test_frames_and_period_follow() -> None:
+    """0.1 s and 0.35 s are both multiples of 50 ms, and of nothing longer."""
+    run = parsed("instants_s = [0, 0.1, 0.35]").run
+    assert (run.frames, run.sampling_period_ns) == (3, 50_000_000)
+
+
+def test_one_instant_is_a_run_of_one_frame() -> None:
+    run = parsed("instants_s = [0.0]").run
+    assert (run.frames, run.sampling_period_ns) == (1, 100_000_000)
+
+
+def test_without_instants_frames_are_evenly_spaced() -> None:
+    plan = plan_run(parsed("frames = 4\nsampling_period_ns = 7"), "run", {})
+    assert [plan.t_ns(frame) for frame in range(5)] == [0, 7, 14, 21, 28]
+
+
+def test_the_resolved_scenario_has_all_three() -> None:
+    found = json.loads(json.dumps(resolved(parsed("instants_s = [0.5, 0.75]"))))["run"]
+    assert (found["instants_s"], found["frames"], found["sampling_period_ns"]) == (
+        [0.5, 0.75],
+        2,
+        250_000_000,
+    )
+
+
+def test_fewer_frames_are_the_first_instants_and_more_are_refused() -> None:
+    scenario = parsed("instants_s = [0.1, 0.2, 0.4]")
+    plan = plan_run(with_overrides(scenario, frames=2), "run", {})
+    assert [plan.t_ns(frame) for frame in range(plan.frames)] == [100_000_000, 200_000_000]
+    assert plan.t_ns(2) == 400_000_000
+    with pytest.raises(ScenarioError, match=r"run\.frames: is 4, and the scenario has 3 instants"):
+        with_overrides(scenario, frames=4)
+
+
+@pytest.mark.parametrize(
+    ("lines", "key", "says"),
+    [
+        ("instants_s = [0.0, 0.2, 0.2]", "run.instants_s[2]", "0.2 does not come after 0.2"),
+        ("instants_s = [0.3, 0.1]", "run.instants_s[1]", "0.1 does not come after 0.3"),
+        ("instants_s = [0.0, 0.0000000005]", "run.instants_s[1]", "at most 9 decimals"),
+        ("instants_s = [-1.0, 0.0]", "run.instants_s[0]", "is -1.0, write seconds ≥ 0"),
+        ("instants_s = [0.0, inf]", "run.instants_s[1]", "is inf, write seconds ≥ 0"),
+        ("instants_s = [nan]", "run.instants_s[0]", "is nan, write seconds ≥ 0"),
+        ("instants_s = []", "run.instants_s", "is empty, write the instant of each frame"),
+        ("instants_s = 3", "run.instants_s", "is 3, write"),
+        ("instants_s = [0.0, true]", "run.instants_s[1]", "is true, write a number"),
+        ("instants_s = [0.0]\nframes = 1", "run.frames", "follows from instants_s; remove one of both keys"),
+        ("instants_s = [0.0]\nsampling_period_ns = 1", "run.sampling_period_ns", "follows from instants_s"),
+    ],
+)
+def test_what_is_no_list_of_instants_is_named(lines: str, key: str, says: str) -> None:
+    with pytest.raises(ScenarioError) as caught:
+        parsed(lines)
+    assert caught.value.key == key
+    assert caught.value.line in (3, 4)
+    assert says in str(caught.value)
