@@ -14,7 +14,7 @@ from caviar_services.meshes import box
 from caviar_services.service import Preparation, RunInfo
 from caviar_services.world.assets import scenery_assets
 from caviar_services.world.flight import FlightSettings, FlightWorld, FlownObject
-from caviar_services.world.flyer import STOPPED_BY_OBSTACLE, Flyer, Limits, Motion
+from caviar_services.world.flyer import SLID_ALONG_OBSTACLE, STOPPED_BY_OBSTACLE, Flyer, Limits, Motion
 from caviar_services.world.obstacles import Obstacles, scenery_triangles
 
 Bounds = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
@@ -77,13 +77,6 @@ def test_a_needle_is_its_longest_edge() -> None:
     obstacles = Obstacles(np.array([[[0.0, 0, 0], [4.0, 0, 0], [2.0, 0, 0]], [[9.0, 0, 0]] * 3]))
     assert obstacles.distance((2.0, 3.0, 0.0)) == pytest.approx(3.0)
     assert obstacles.distance((9.0, 0.0, 2.0)) == pytest.approx(2.0)
-
-
-def test_the_clear_way_ends_before_a_wall() -> None:
-    obstacles = Obstacles(triangles(((10.0, 10.1), (-20.0, 20.0), (0.0, 30.0))))
-    assert obstacles.clear_distance((0.0, 1.0, 5.0), (40.0, 1.0, 5.0), 1.5) == pytest.approx(8.5, abs=2e-6)
-    assert obstacles.clear_distance((0.0, 1.0, 5.0), (0.0, 9.0, 5.0), 1.5) == 8.0
-    assert Obstacles.none().clear_distance((0.0, 0.0, 0.0), (0.0, 3.0, 4.0), 2.0) == 5.0
 
 
 def flyer(obstacles: Obstacles, speed: float, acceleration: float, clearance: float = 1.0) -> Flyer:
@@ -171,6 +164,33 @@ def test_in_a_corner_it_stops_and_gets_out_again() -> None:
     assert 8.4 < made.position[1] <= 9.0 + 1e-6
     made.fly(Motion(target=(0.0, 0.0, 0.0), speed=5.0), [0.01] * 500)
     assert math.dist(made.position, (0.0, 0.0, 0.0)) < 1e-2
+
+
+def test_the_same_commands_lead_to_the_same_flight_bit_by_bit() -> None:
+    """What is remembered of the flight before does not matter."""
+    rng = np.random.default_rng(12)
+    obstacles = Obstacles(triangles(*(random_box(rng, 30.0) for _ in range(20))))
+    made = flyer(obstacles, 20.0, 30.0, 0.5)
+    start = next(vector(p) for p in rng.uniform(-40, 40, (500, 3)) if obstacles.distance(vector(p)) > 3.0)
+    targets = [vector(p) for p in rng.uniform(-30, 30, (20, 3))]
+    flights = []
+    events: set[str] = set()
+    for _ in range(2):
+        made.reset(start, 0.0)
+        places = []
+        for target in targets:
+            events |= set(made.fly(Motion(target=target, speed=20.0), [0.01] * 100))
+            places.append((made.position, made.velocity))
+        flights.append(places)
+    assert flights[0] == flights[1]
+    assert SLID_ALONG_OBSTACLE in events
+
+
+def test_nothing_stands_in_the_way_where_there_is_no_scenery() -> None:
+    made = flyer(Obstacles.none(), 10.0, 50.0)
+    made.reset((0.0, 0.0, 0.0), 0.0)
+    assert made.fly(Motion(velocity=(10.0, 0.0, 0.0)), [0.01] * 200) == {}
+    assert made.position[0] == pytest.approx(10.0 * 2.0 - 10.0**2 / (2 * 50.0))
 
 
 @needs_scenes

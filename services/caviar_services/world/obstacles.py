@@ -59,21 +59,6 @@ class Obstacles:
         near = self._near(point, within)
         return min(_Faces(near).gaps(point)[0].min(), within) if len(near) else within
 
-    def clear_distance(self, start: Vector, end: Vector, radius: float) -> float:
-        """How far [m] a ball can go on a straight way until a triangle is nearer than ``radius``.
-
-        Goes on by what is free around each place, and ends at most 1 µm too early.
-        """
-        length = math.dist(start, end)
-        gone = 0.0
-        while gone < length:
-            x, y, z = (a + (b - a) * gone / length for a, b in zip(start, end, strict=True))
-            free = self.distance((x, y, z), radius + _HORIZON) - radius
-            if free < 1e-6:
-                return gone
-            gone += free
-        return length
-
     def slide(self, start: Vector, step: Vector, radius: float) -> Vector:
         """What a ball [m] may do of a step: all, what is left of it along surfaces, or nothing.
 
