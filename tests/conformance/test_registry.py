@@ -21,7 +21,6 @@ SCENARIOS = Path(__file__).resolve().parents[2] / "deploy" / "scenarios"
 
 EXTRAS = {
     "world:sumo": "libsumo",
-    "channel:sionna-rt": "sionna",
     "sensors:camera": "mitsuba",
     "world:flight": "sionna",
     "channel:sionna-rt": "sionna",

@@ -13,8 +13,8 @@ from caviar_protocol.topics.scene import AntennaArray
 SORTED_WHOLE = 256
 """Pairs up to which sorting all of them is faster than looking for the best first."""
 SMALL = 32
-"""Elements along an axis up to which a product of matrices is faster than a fast transform. From 64 on it would
-also be shared out to threads, which on a busy machine wait for each other ten times as long."""
+"""Elements along an axis up to which a product of matrices is faster than a fast transform. From 64 on it
+would be shared out to threads too, which on a busy machine wait for each other ten times as long."""
 
 
 class Pairs(NamedTuple):
