@@ -120,11 +120,7 @@ def angles(vectors: Float64Array) -> Float64Array:
 
     Uses atan2 of the horizontal part, so that directions near the poles keep their precision.
     """
-    horizontal = np.hypot(vectors[..., 0], vectors[..., 1])
-    return np.stack(
-        [
-            np.arctan2(horizontal, vectors[..., 2]),
-            np.arctan2(vectors[..., 1], vectors[..., 0]),
-        ],
-        axis=-1,
-    )
+    found = np.empty((*vectors.shape[:-1], 2))
+    found[..., 0] = np.arctan2(np.hypot(vectors[..., 0], vectors[..., 1]), vectors[..., 2])
+    found[..., 1] = np.arctan2(vectors[..., 1], vectors[..., 0])
+    return found

@@ -184,11 +184,23 @@ def free_space(*frequencies: float) -> ChannelModel[Any]:
     return model
 
 
-def sionna(frequency: float, assets: Mapping[str, Path] | None = None, **settings: Any) -> ChannelModel[Any]:
+def geometric(*frequencies: float, seed: int = 1, **settings: Any) -> ChannelModel[Any]:
+    from caviar_services.channel.geometric import GeometricChannel, GeometricSettings
+
+    run = RunInfo(name="channel", seed=seed, carriers=carriers(*frequencies))
+    model = GeometricChannel(msgspec.convert(settings, GeometricSettings), run)
+    model.prepare(Preparation(demand={"channel": frozenset({"h"})}))
+    return model
+
+
+def sionna(
+    frequency: float | Sequence[float], assets: Mapping[str, Path] | None = None, **settings: Any
+) -> ChannelModel[Any]:
     from caviar_services.channel.sionna_rt import SionnaChannel, SionnaSettings
 
     settings = {"samples": 20_000, "bodies": 2, "receivers_at_once": 8, **settings}
-    run = RunInfo(name="channel", seed=1, carriers=carriers(frequency))
+    frequencies = [frequency] if isinstance(frequency, int | float) else frequency
+    run = RunInfo(name="channel", seed=1, carriers=carriers(*frequencies))
     model = SionnaChannel(msgspec.convert(settings, SionnaSettings), run)
     model.prepare(Preparation(demand={"channel": frozenset({"h"})}, assets=assets or {}))
     return model
@@ -198,9 +210,18 @@ def carriers(*frequencies: float) -> tuple[Carrier, ...]:
     return tuple(Carrier(name=f"c{i}", frequency_hz=f) for i, f in enumerate(frequencies))
 
 
-def measure(model: ChannelModel[Any], at: Scene) -> Channel:
+def measure(model: ChannelModel[Any], at: Scene, number: int = 0) -> Channel:
+    """The product for a scene; what is drawn depends on the run's seed and the frame's number."""
     source = FrameInput(GrantInput(topic="scene", source="world", status=Status.FRESH), payload=at)
-    channel = model.step(Frame(episode=0, number=0, t_ns=0, inputs=(source,))).products["channel"]
+    frame = Frame(
+        episode=0,
+        number=number,
+        t_ns=number * 100_000_000,
+        inputs=(source,),
+        service=model.run.name,
+        seed=model.run.seed,
+    )
+    channel = model.step(frame).products["channel"]
     assert isinstance(channel, Channel)
     return channel
 

@@ -86,14 +86,6 @@ def test_an_unknown_setting_is_refused_by_name() -> None:
         model(max_dept=3)
 
 
-def test_two_carriers_are_refused_by_name() -> None:
-    run = RunInfo(
-        name="channel", carriers=(Carrier(name="a", frequency_hz=1e9), Carrier(name="b", frequency_hz=2e9))
-    )
-    with pytest.raises(ScenarioError, match="2: a, b"):
-        SionnaChannel(SionnaSettings(), run)
-
-
 @pytest.mark.channel
 class TestPreparing:
     """What is wrong with a scenario or its scenery comes out in `prepare`, as one message."""

@@ -18,7 +18,7 @@ from caviar_services.registry import load
 from caviar_services.service import Frame, Preparation, RunInfo
 from caviar_services.world.base import World
 
-NAMES = ("smoke", "street-canyon", "uav-munich")
+NAMES = ("fig2", "geometric", "smoke", "street-canyon", "uav-base-station", "uav-munich")
 with_sumo = [
     pytest.mark.sumo,
     pytest.mark.skipif(importlib.util.find_spec("libsumo") is None, reason="needs the world extra"),
@@ -74,7 +74,7 @@ def test_frames_stand_at_the_start_of_a_line(repository: Path, name: str) -> Non
     assert sum(line.startswith("frames = ") for line in text.splitlines()) == 1
 
 
-@pytest.mark.parametrize("name", ["smoke", "uav-munich"])
+@pytest.mark.parametrize("name", ["geometric", "smoke", "uav-munich"])
 def test_a_flight_begins_and_ends_at_rest_within_the_run(repository: Path, name: str) -> None:
     scenario = scenario_named(repository, name)
     scenes = play(world_of(scenario), scenario, 1, scenario.run.frames)

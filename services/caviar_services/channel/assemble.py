@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 
@@ -117,9 +119,14 @@ def assemble(
         geometry = _geometry(table, transmitters, receivers)
         a = _amplitudes(product.carriers, table, geometry, transmitters, receivers)
     finite = _finite(table, geometry, a)
-    dropped = int((~finite).sum())
-    order = np.flatnonzero(finite)[_order(table.take(finite), _select(geometry, finite), a[:, finite])]
-    table, geometry, a = table.take(order), _select(geometry, order), a[:, order]
+    dropped = len(finite) - int(np.count_nonzero(finite))
+    if dropped:
+        table, geometry, a = table.take(finite), _select(geometry, finite), a[:, finite]
+    aod, aoa = angles(geometry.departure), angles(geometry.arrival)
+    if len(table.pair) > 1:
+        order = _order(table, geometry, aod, aoa, a)
+        table, geometry, a = table.take(order), _select(geometry, order), a[:, order]
+        aod, aoa = aod[order], aoa[order]
 
     pairs = len(transmitters) * len(receivers)
     offsets = np.searchsorted(table.pair, np.arange(pairs + 1)).astype(np.int64)
@@ -137,8 +144,8 @@ def assemble(
         id=_ids(table),
         a=a,
         tau=geometry.tau,
-        aod=angles(geometry.departure),
-        aoa=angles(geometry.arrival),
+        aod=aod,
+        aoa=aoa,
         doppler=frequency[:, None] * geometry.doppler_ratio,
         interactions=table.types[:, :depth],
         points=table.points[:, :depth],
@@ -150,6 +157,8 @@ def assemble(
 
 def _canonical_names(table: PathTable) -> PathTable:
     """Names that occur, sorted; points and objects behind the last interaction set to their filler."""
+    if not table.types.shape[1]:
+        return replace(table, object_names=(), object_velocity=np.zeros((0, 3)))
     used = table.types != 0
     objects = np.where(used, table.objects, -1)
     occurring = np.unique(objects[used])
@@ -195,20 +204,25 @@ def _amplitudes(
 ) -> Complex128Array:
     """a = field_rx · transfer · field_tx · exp(−j2πfτ), Shape ``[C, P]``."""
     tx, rx = np.divmod(table.pair, max(len(receivers), 1))
-    sent = np.zeros((len(tx), 3))
-    for index, antenna in enumerate(transmitters):
-        mine = tx == index
-        sent[mine] = radiated_field(antenna.array, antenna.rotation, geometry.departure[mine])
-    taken = np.zeros((len(rx), 3))
-    for index, antenna in enumerate(receivers):
-        mine = rx == index
-        taken[mine] = radiated_field(antenna.array, antenna.rotation, geometry.arrival[mine])
+    sent = _fields(transmitters, tx, geometry.departure)
+    taken = _fields(receivers, rx, geometry.arrival)
     frequency = np.array([carrier.frequency_hz for carrier in carriers])
     # The whole turns of f·τ go first: they are millions, and only the rest is a phase.
     turns = frequency[:, None] * geometry.tau
     phase = np.exp(-2j * np.pi * (turns - np.round(turns)))
     a: Complex128Array = np.einsum("pi,cpij,pj->cp", taken, table.transfer, sent) * phase
     return a
+
+
+def _fields(antennas: Sequence[Antenna], which: Int64Array, directions: Float64Array) -> Float64Array:
+    """Field of the antenna that each path has at one end, towards the path, Shape ``[P, 3]``."""
+    if len(antennas) == 1:
+        return radiated_field(antennas[0].array, antennas[0].rotation, directions)
+    fields = np.zeros((len(which), 3))
+    for index, antenna in enumerate(antennas):
+        mine = which == index
+        fields[mine] = radiated_field(antenna.array, antenna.rotation, directions[mine])
+    return fields
 
 
 def _select(geometry: PathGeometry, which: Int64Array | BoolArray) -> PathGeometry:
@@ -229,7 +243,9 @@ def _finite(table: PathTable, geometry: PathGeometry, a: Complex128Array) -> Boo
     return finite
 
 
-def _order(table: PathTable, geometry: PathGeometry, a: Complex128Array) -> Int64Array:
+def _order(
+    table: PathTable, geometry: PathGeometry, aod: Float64Array, aoa: Float64Array, a: Complex128Array
+) -> Int64Array:
     """Permutation into the order that `Channel` promises.
 
     Floats are compared exactly, without quantising: a path's values do not depend on the
@@ -237,7 +253,6 @@ def _order(table: PathTable, geometry: PathGeometry, a: Complex128Array) -> Int6
     Amplitude breaks the ties of paths that agree in all else.
     """
     depth = table.types.shape[1]
-    aod, aoa = angles(geometry.departure), angles(geometry.arrival)
     keys: list[np.ndarray[tuple[int, ...], np.dtype[np.generic]]] = [table.pair, (table.types != 0).sum(1)]
     keys += [table.types[:, d] for d in range(depth)]
     keys += [table.objects[:, d] for d in range(depth)]
@@ -250,30 +265,30 @@ def _ids(table: PathTable) -> UInt64Array:
     ids = np.zeros(len(table.pair), np.uint64)
     if not len(ids):
         return ids
-    depth = table.types.shape[1]
-    discrete = np.concatenate([table.types.astype(np.int32), table.objects], axis=1)
-    kinds, kind = np.unique(discrete, axis=0, return_inverse=True)
-    kind = kind.reshape(-1)
-    base = np.array(
-        [
-            _name_hash(
-                tuple(
-                    (int(t), table.object_names[o])
-                    for t, o in zip(row[:depth], row[depth:], strict=True)
-                    if t
-                )
-            )
-            for row in kinds
-        ],
-        np.uint64,
-    )
+    base, kind = _kinds(table)
     # Sorted, so paths of one kind and pair stand together: rank = distance to the run's start.
-    starts = np.flatnonzero(np.r_[True, (kind[1:] != kind[:-1]) | (table.pair[1:] != table.pair[:-1])])
-    lengths = np.diff(np.r_[starts, len(ids)])
-    rank = np.arange(len(ids)) - np.repeat(starts, lengths)
+    place = np.arange(len(ids))
+    first = np.ones(len(ids), np.bool_)
+    first[1:] = (kind[1:] != kind[:-1]) | (table.pair[1:] != table.pair[:-1])
+    rank = place - np.maximum.accumulate(np.where(first, place, 0))
     return _mix(base[kind] + rank.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15))
 
 
+def _kinds(table: PathTable) -> tuple[UInt64Array, Int64Array]:
+    """Hashes of the kinds of paths that occur, and which of them each path is."""
+    depth = table.types.shape[1]
+    if not depth:
+        return np.array([_name_hash(())], np.uint64), np.zeros(len(table.pair), np.int64)
+    discrete = np.concatenate([table.types.astype(np.int32), table.objects], axis=1)
+    kinds, kind = np.unique(discrete, axis=0, return_inverse=True)
+    named = (
+        tuple((t, table.object_names[o]) for t, o in zip(row[:depth], row[depth:], strict=True) if t)
+        for row in kinds.tolist()
+    )
+    return np.array([_name_hash(names) for names in named], np.uint64), kind.reshape(-1)
+
+
+@lru_cache(maxsize=4096)
 def _name_hash(kind: tuple[tuple[int, str], ...]) -> int:
     text = "\0".join(f"{interaction}\0{name}" for interaction, name in kind)
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little")
@@ -295,9 +310,9 @@ def _matrices(
 ) -> tuple[ChannelMatrix, ...]:
     """H[m, n] = Σ_p a[p] · receive[p, m] · transmit[p, n] of every carrier and pair."""
     steered = []
-    for pair in range(len(offsets) - 1):
+    for pair, (begin, end) in enumerate(pairwise(offsets.tolist())):
         tx, rx = divmod(pair, len(receivers))
-        mine = slice(int(offsets[pair]), int(offsets[pair + 1]))
+        mine = slice(begin, end)
         transmit = _steering(transmitters[tx], geometry.departure[mine])
         receive = _steering(receivers[rx], geometry.arrival[mine])
         steered.append((tx, rx, mine, receive, transmit))

@@ -52,6 +52,9 @@ from caviar_services.service import Frame, RunInfo
 BLOCK = 256
 """Frames whose draws are made at once: a generator costs more than what one frame takes from it."""
 
+KEPT = 4096
+"""Pairs whose draws are kept at most."""
+
 Corner = tuple[float, float, float]
 Spread = Annotated[float, quantity("°", "standard deviation of a Laplacian", ge=0, le=180)]
 
@@ -133,7 +136,8 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         self._ids = {False: ids, True: [_id("straight"), *ids[1:]]}
         """Of a pair, by whether its line of sight is free."""
         self._obstacles = Boxes.aligned([(box.minimum_m, box.maximum_m) for box in settings.obstacles])
-        self._draws: dict[tuple[str, str], tuple[int, _Draws]] = {}
+        self._draws: dict[tuple[str, str], _Draws] = {}
+        self._block = 0
         loss_db = 20.0 if settings.nlos_loss_db is None else settings.nlos_loss_db
         self._nlos_factor = 10 ** (-loss_db / 20)
         self._unit = settings.normalization == "unit"
@@ -201,7 +205,7 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
 
         Numbers, not arrays: there are a handful of waves, and an array of three costs as much as ten numbers.
         """
-        gains, excess, deviations = self._drawn(frame, pair.tx.name, pair.rx.name)
+        gains, excess, deviations = self._drawn(frame, pair.tx.name, pair.rx.name, free)
         scale = self._behind_straight if free else self._reflected
         delay = pair.length / SPEED_OF_LIGHT
         loss = 1.0 if free or self._unit else self._nlos_factor
@@ -224,18 +228,24 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         waves.length += [pair.length] * len(gains)
 
     def _drawn(
-        self, frame: Frame, tx: str, rx: str
+        self, frame: Frame, tx: str, rx: str, free: bool
     ) -> tuple[Sequence[complex], Sequence[float], Sequence[Sequence[float]]]:
-        """Gain, excess delay and deviations of a pair's components in a frame, sorted by delay."""
+        """Gain, excess delay and deviations of a pair's components in a frame, sorted by delay.
+
+        Where the line of sight is ``free``, component 0 stands in front and its delay is not used.
+        """
         whole_episode = self.settings.redraw == "episode"
         block, row = (0, 0) if whole_episode else divmod(frame.number, BLOCK)
-        known = self._draws.get((tx, rx))
-        if known is None or known[0] != block:
+        if block != self._block or (whole_episode and len(self._draws) >= KEPT):
+            # Pairs that have left go with it; the others draw the same again.
+            self._draws.clear()
+            self._block = block
+        made = self._draws.get((tx, rx))
+        if made is None:
             random = generator(frame.seed, frame.seed_episode, f"{self.run.name}/{tx}/{rx}", block)
-            known = block, _Draws.of(random, 1 if whole_episode else BLOCK, self.settings)
-            self._draws[tx, rx] = known
-        made = known[1]
-        return made.gain[row], made.excess[row], made.deviation[row]
+            made = _Draws.of(random, 1 if whole_episode else BLOCK, self.settings)
+            self._draws[tx, rx] = made
+        return made.gain[row], (made.excess_free if free else made.excess)[row], made.deviation[row]
 
     # --- the product -----------------------------------------------------------------------------------
 
@@ -399,6 +409,8 @@ class _Draws:
     """Of mean power 1, by frame and component."""
     excess: list[list[float]]
     """[s], by frame and component."""
+    excess_free: list[list[float]]
+    """The same, sorted behind component 0: dropping the shortest of all would make the others longer."""
     deviation: list[list[list[float]]]
     """[rad] of departure zenith and azimuth, arrival zenith and azimuth, by frame and component."""
 
@@ -406,7 +418,10 @@ class _Draws:
     def of(cls, random: np.random.Generator, frames: int, settings: GeometricSettings) -> _Draws:
         shape = (frames, settings.components)
         gain = random.normal(0.0, math.sqrt(0.5), (*shape, 2)).view(np.complex128)[..., 0]
-        excess = np.sort(random.exponential(settings.delay_spread_ns * 1e-9, shape), axis=-1)
+        excess = random.exponential(settings.delay_spread_ns * 1e-9, shape)
+        excess_free = excess.copy()
+        excess_free[:, 1:].sort(axis=-1)
+        excess.sort(axis=-1)
         spreads = (
             settings.zenith_spread_departure_deg,
             settings.azimuth_spread_departure_deg,
@@ -415,7 +430,7 @@ class _Draws:
         )
         scale = np.radians(spreads) / math.sqrt(2)  # a Laplacian of scale b has the variance 2b²
         deviation = random.laplace(0.0, 1.0, (*shape, 4)) * scale
-        return cls(gain.tolist(), excess.tolist(), deviation.tolist())
+        return cls(gain.tolist(), excess.tolist(), excess_free.tolist(), deviation.tolist())
 
 
 def _with_phase(waves: _Waves, frequency: float) -> list[complex]:

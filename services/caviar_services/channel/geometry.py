@@ -51,6 +51,8 @@ def path_geometry(
     f_D / f = Σ_i (v_i − v_{i+1})·k_i / c (a source that approaches raises the frequency).
     """
     paths, depth = points.shape[:2]
+    if not depth:
+        return _straight(end - start, end_velocity - start_velocity)
     corners = np.concatenate([start[:, None], points, end[:, None]], axis=1)
     velocity = np.concatenate([start_velocity[:, None], point_velocity, end_velocity[:, None]], axis=1)
     # Unused corners move onto the receiver, so that their segments have length zero.
@@ -67,4 +69,16 @@ def path_geometry(
         departure=along[:, 0],
         arrival=-along[rows, count],
         doppler_ratio=-(np.diff(velocity, axis=1) * along).sum((1, 2)) / SPEED_OF_LIGHT,
+    )
+
+
+def _straight(line: Float64Array, separation: Float64Array) -> PathGeometry:
+    """Geometry of paths without interactions: TX to RX [m], and its change [m/s], Shape ``[P, 3]`` each."""
+    length = np.sqrt((line**2).sum(-1))
+    along = line / np.where(length > 0, length, 1.0)[:, None]
+    return PathGeometry(
+        tau=length / SPEED_OF_LIGHT,
+        departure=along,
+        arrival=-along,
+        doppler_ratio=-(separation * along).sum(-1) / SPEED_OF_LIGHT,
     )

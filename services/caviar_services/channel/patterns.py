@@ -18,8 +18,9 @@ def spherical_basis(directions: Float64Array, pole: float = 0.0) -> tuple[Float6
     at_pole = horizontal <= pole
     safe = np.where(at_pole, 1.0, horizontal)
     cosine, sine = np.where(at_pole, 1.0, x / safe), np.where(at_pole, 0.0, y / safe)
-    theta_hat = np.stack([z * cosine, z * sine, -horizontal], axis=-1)
-    phi_hat = np.stack([-sine, cosine, np.zeros_like(z)], axis=-1)
+    theta_hat, phi_hat = np.empty_like(directions), np.zeros_like(directions)
+    theta_hat[..., 0], theta_hat[..., 1], theta_hat[..., 2] = z * cosine, z * sine, -horizontal
+    phi_hat[..., 0], phi_hat[..., 1] = -sine, cosine
     return theta_hat, phi_hat
 
 

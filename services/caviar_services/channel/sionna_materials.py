@@ -59,6 +59,10 @@ def itu_constants(
     return a * gigahertz**b, c * gigahertz**d
 
 
+Constants = tuple[float, float]
+"""Relative permittivity and conductivity [S/m]."""
+
+
 def set_materials(
     scene: Any, frequency_hz: float, changes: Mapping[str, MaterialSettings], outside: OutsideRange
 ) -> None:
@@ -80,6 +84,23 @@ def set_materials(
         except ValueError as error:
             raise ScenarioError(f"material {name!r}: {error}; correct settings.materials.{name}") from error
     scene.frequency = frequency_hz
+
+
+def itu_materials(
+    scene: Any, frequency_hz: float, changes: Mapping[str, MaterialSettings], outside: OutsideRange
+) -> list[tuple[Any, Constants]]:
+    """Materials of a `sionna.rt.Scene` that may differ between carriers, with their constants at one."""
+    found = []
+    for name, material in scene.radio_materials.items():
+        change = changes.get(name, MaterialSettings())
+        if hasattr(material, "itu_type") and not change.is_electric:
+            permittivity, conductivity = itu_constants(name, material.itu_type, frequency_hz, outside)
+            if change.relative_permittivity is not None:
+                permittivity = change.relative_permittivity
+            if change.conductivity_s_per_m is not None:
+                conductivity = change.conductivity_s_per_m
+            found.append((material, (permittivity, conductivity)))
+    return found
 
 
 def _set_material(

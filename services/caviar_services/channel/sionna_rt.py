@@ -66,10 +66,11 @@ class SionnaSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 
 
 class SionnaChannel(PathModel[SionnaSettings]):
-    """Ray-traced channel of one carrier.
+    """Ray-traced channel, on any number of carriers.
 
     Each transmitter is traced by itself, with receivers filled up to a fixed number by parked
-    ones: so the kernels do not depend on who is in the scene.
+    ones: so the kernels do not depend on who is in the scene. Several carriers share the paths; a path that
+    one of them does not have is of amplitude 0 there.
     """
 
     Settings: ClassVar[type[msgspec.Struct]] = SionnaSettings
@@ -78,12 +79,6 @@ class SionnaChannel(PathModel[SionnaSettings]):
 
     def __init__(self, settings: SionnaSettings, run: RunInfo) -> None:
         super().__init__(settings, run)
-        if len(run.carriers) > 1:
-            raise ScenarioError(
-                f"sionna-rt traces one carrier, the scenario has {len(run.carriers)}: "
-                f"{', '.join(carrier.name for carrier in run.carriers)}; keep one of them",
-                key="carriers",
-            )
         self._variant = ""
         self._scene: SionnaScene
         self._tracer: Tracer
@@ -107,12 +102,12 @@ class SionnaChannel(PathModel[SionnaSettings]):
         self.run.progress("importing the ray tracer", _COMPILE_GRACE_S)
         notes = self._start()
         self.run.progress("loading the scene", _COMPILE_GRACE_S)
-        frequency = self.run.carriers[0].frequency_hz
+        frequencies = tuple(carrier.frequency_hz for carrier in self.run.carriers)
         self._scene = SionnaScene(
             preparation.assets,
             self._pool_sizes(preparation.assets),
             SceneSettings(
-                frequency_hz=frequency,
+                frequencies_hz=frequencies,
                 body_material=s.body_material,
                 materials=s.materials,
                 outside_itu_range=s.outside_itu_range,
@@ -132,7 +127,8 @@ class SionnaChannel(PathModel[SionnaSettings]):
             diffraction=s.diffraction,
             scattering=s.scattering,
         )
-        self._tracer = Tracer(self._scene.mi_scene, SPEED_OF_LIGHT / frequency, launch)
+        wavelengths = [SPEED_OF_LIGHT / frequency for frequency in frequencies]
+        self._tracer = Tracer(self._scene.mi_scene, wavelengths, self._scene.tune, launch)
         self._at_once = self._receivers_at_once()
         return (*notes, *self._warm_up())
 
@@ -190,7 +186,10 @@ class SionnaChannel(PathModel[SionnaSettings]):
         )
         return PathTable(
             pair=pair,
-            transfer=_joined([part.transfer for _, part in parts], (0, 3, 3), np.complex128)[None],
+            transfer=np.concatenate(
+                [np.zeros((len(self.run.carriers), 0, 3, 3), np.complex128), *(p.transfer for _, p in parts)],
+                1,
+            ),
             types=types,
             objects=self._scene.object_index(shapes, primitives),
             points=points,

@@ -19,14 +19,19 @@ from caviar_protocol.errors import AssetError, PayloadError
 from caviar_protocol.scene import object_pose
 from caviar_protocol.topics import Scene
 from caviar_services.channel.sionna_materials import (
+    Constants,
     MaterialSettings,
     OutsideRange,
     itu_constants,
+    itu_materials,
     set_materials,
 )
 from caviar_services.columns import aligned_columns
 from caviar_services.meshes import BodyPool, Mesh, box, placed, unit_box
 from caviar_services.scenery import find_scenery, read_scenery
+
+_Tuning = tuple[float, list[tuple[Any, Constants]]]
+"""Frequency [Hz] of a carrier, and what is to be set at materials."""
 
 Body = tuple[str, int]
 """Asset and slot of a body in the pool."""
@@ -45,7 +50,8 @@ _SKIN = "caviar-body"
 class SceneSettings:
     """What the scene is made with."""
 
-    frequency_hz: float
+    frequencies_hz: tuple[float, ...]
+    """Of the carriers. The scene is at the first one, unless it is tuned to another."""
     body_material: str
     materials: Mapping[str, MaterialSettings]
     outside_itu_range: OutsideRange
@@ -70,9 +76,10 @@ class SionnaScene:
     """
 
     def __init__(self, assets: Mapping[str, Path], pool: Mapping[str, int], settings: SceneSettings) -> None:
-        skin = itu_constants(
-            "body_material", settings.body_material, settings.frequency_hz, settings.outside_itu_range
-        )
+        skins = [
+            itu_constants("body_material", settings.body_material, frequency, settings.outside_itu_range)
+            for frequency in settings.frequencies_hz
+        ]
         self._scene = _load(find_scenery(assets), settings.weld)
         self._scenery = frozenset(self._scene.objects)
         self.low, self.high = _bounds(self._scene) if self._scenery else (np.zeros(3), np.zeros(3))
@@ -80,16 +87,30 @@ class SionnaScene:
         self._meshes = {asset: _unit_mesh(asset, assets) for asset in pool}
         self._bodies: list[Body] = [(asset, slot) for asset in sorted(pool) for slot in range(pool[asset])]
         self._standing: frozenset[Body] = frozenset()
-        moving = self._moving_shapes(skin, settings.body_material == "metal")
+        moving = self._moving_shapes(skins[0], settings.body_material == "metal")
         moved = sum(len(mesh.vertices) for mesh in moving[-1].meshes)
         self._replace_shapes([*_by_material(self._scene), *moving])
         self._vertices = self._corners[len(self._corners) - moved :]
-        set_materials(self._scene, settings.frequency_hz, settings.materials, settings.outside_itu_range)
+        first, outside = settings.frequencies_hz[0], settings.outside_itu_range
+        set_materials(self._scene, first, settings.materials, outside)
+        self._carriers: list[_Tuning] = []
+        for frequency, skin in zip(settings.frequencies_hz, skins, strict=True):
+            constants = itu_materials(self._scene, frequency, settings.materials, outside)
+            if self._bodies:
+                constants.append((moving[-1].material, skin))
+            self._carriers.append((frequency, constants))
 
     @property
     def mi_scene(self) -> Any:
         """The Mitsuba scene."""
         return self._scene.mi_scene
+
+    def tune(self, carrier: int) -> None:
+        """Set frequency and materials to those of a carrier."""
+        frequency, constants = self._carriers[carrier]
+        for material, (permittivity, conductivity) in constants:
+            material.relative_permittivity, material.conductivity = permittivity, conductivity
+        self._scene.frequency = frequency
 
     @property
     def parking(self) -> Float64Array:

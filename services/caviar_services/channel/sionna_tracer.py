@@ -8,6 +8,7 @@ with positions as arrays instead of one device object each, and their flat buffe
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -59,7 +60,8 @@ class Traced:
     receiver: Int64Array
     """Index of the receiver, Shape ``[P]``."""
     transfer: Complex128Array
-    """Dyad from the field sent to the field received, world axes, without carrier phase; ``[P, 3, 3]``."""
+    """Dyad from the field sent to the field received, world axes, without carrier phase; Shape
+    ``[C, P, 3, 3]`` with C carriers."""
     types: UInt8Array
     """`Interaction` of each point, Shape ``[P, D]``."""
     shapes: Int64Array
@@ -75,7 +77,7 @@ class Traced:
         """These paths."""
         return Traced(
             receiver=self.receiver[which],
-            transfer=self.transfer[which],
+            transfer=self.transfer[:, which],
             types=self.types[which],
             shapes=self.shapes[which],
             primitives=self.primitives[which],
@@ -87,11 +89,32 @@ class Traced:
 class Tracer:
     """The stages of the solver, bound to a scene and a set of options.
 
-    Everything that a kernel depends on is fixed here: options, wavelength, number of receivers. So the
+    Everything that a kernel depends on is fixed here: options, wavelengths, number of receivers. So the
     first call compiles and the others do not.
+
+    Where paths run does not depend on the carrier: they are found once, and only their fields are computed
+    for each one. Rays that could be reflected, refracted or scattered choose by the materials at the
+    first carrier.
+
+    Parameters
+    ----------
+    mi_scene
+        The scene, tuned to the first carrier.
+    wavelengths
+        Of the carriers [m].
+    tune
+        Called with the index of a carrier: sets the scene's frequency and materials.
+    options
+        What is traced.
     """
 
-    def __init__(self, mi_scene: Any, wavelength: float, options: LaunchOptions) -> None:
+    def __init__(
+        self,
+        mi_scene: Any,
+        wavelengths: Sequence[float],
+        tune: Callable[[int], None],
+        options: LaunchOptions,
+    ) -> None:
         import drjit as dr
         import mitsuba as mi
         from sionna.rt.antenna_pattern import antenna_pattern_registry
@@ -100,7 +123,8 @@ class Tracer:
 
         self.mi_scene = mi_scene
         self._options = options
-        self._wavelength = dr.opaque(mi.Float, wavelength)
+        self._wavelengths = [dr.opaque(mi.Float, wavelength) for wavelength in wavelengths]
+        self._tune = tune
         # The two orthogonal isotropic fields at both ends give the whole polarisation transfer, to
         # which any element pattern in any orientation is applied afterwards.
         self._patterns = antenna_pattern_registry.get("iso")(polarization="VH").patterns
@@ -142,12 +166,27 @@ class Tracer:
                 diffraction=options.diffraction,
                 diffraction_lit_region=True,
             )
-            upright = _points(np.zeros((1, 3))), _points(np.zeros((len(receivers), 3)))
-            buffer = self._fields(
-                wavelength=self._wavelength,
+            self._compute_fields(buffer, source, targets)
+            buffer.discard_invalid()
+        return _read(buffer, len(self._wavelengths), options.max_depth, transmitter, receivers, limit_reached)
+
+    def _compute_fields(self, buffer: Any, source: Any, targets: Any) -> None:
+        """Give the buffer the amplitudes of all carriers, in their order; valid is what any of them has."""
+        import drjit as dr
+        import mitsuba as mi
+
+        upright = _points(np.zeros((1, 3))), _points(np.zeros((dr.width(targets), 3)))
+        geometric, carried = dr.copy(buffer.valid), mi.Bool(False)
+        amplitudes: list[Any] = []
+        for carrier, wavelength in enumerate(self._wavelengths):
+            if carrier:
+                self._tune(carrier)
+                buffer.valid = dr.copy(geometric)
+            self._fields(
+                wavelength=wavelength,
                 paths=buffer,
-                samples_per_src=options.samples,
-                diffraction=options.diffraction,
+                samples_per_src=self._options.samples,
+                diffraction=self._options.diffraction,
                 src_positions=source,
                 tgt_positions=targets,
                 src_orientations=upright[0],
@@ -155,8 +194,12 @@ class Tracer:
                 src_antenna_patterns=self._patterns,
                 tgt_antenna_patterns=self._patterns,
             )
-            buffer.discard_invalid()
-        return _read(buffer, options.max_depth, transmitter, receivers, limit_reached)
+            amplitudes += buffer.a
+            carried |= buffer.valid
+        if len(self._wavelengths) > 1:
+            dr.eval(amplitudes, carried)  # before the materials change again
+            self._tune(0)
+            buffer.valid, buffer.a = carried, amplitudes
 
 
 def _points(positions: Float64Array) -> Any:
@@ -166,7 +209,12 @@ def _points(positions: Float64Array) -> Any:
 
 
 def _read(
-    buffer: Any, max_depth: int, transmitter: Float64Array, receivers: Float64Array, limit_reached: bool
+    buffer: Any,
+    carriers: int,
+    max_depth: int,
+    transmitter: Float64Array,
+    receivers: Float64Array,
+    limit_reached: bool,
 ) -> Traced:
     import drjit as dr
 
@@ -174,7 +222,7 @@ def _read(
     if paths == 0:
         return Traced(
             receiver=np.zeros(0, np.int64),
-            transfer=np.zeros((0, 3, 3), np.complex128),
+            transfer=np.zeros((carriers, 0, 3, 3), np.complex128),
             types=np.zeros((0, max_depth), np.uint8),
             shapes=np.zeros((0, max_depth), np.int64),
             primitives=np.zeros((0, max_depth), np.int64),
@@ -186,11 +234,11 @@ def _read(
     receiver = buffer.target_indices.numpy().astype(np.int64)
     types = _TYPES[buffer.interaction_types.numpy()[:, :max_depth]]
     points = np.stack([v.numpy()[:, :max_depth] for v in vertices], axis=-1).astype(np.float64)
-    jones = np.empty((paths, 2, 2), np.complex128)
-    for taken in range(2):
-        for sent in range(2):
-            jones[:, taken, sent] = dr.real(buffer.a[taken][sent]).numpy()
-            jones[:, taken, sent] += 1j * dr.imag(buffer.a[taken][sent]).numpy()
+    jones = np.empty((carriers, paths, 2, 2), np.complex128)
+    for carrier, taken, sent in np.ndindex(carriers, 2, 2):
+        amplitude = buffer.a[2 * carrier + taken][sent]
+        jones[carrier, :, taken, sent] = dr.real(amplitude).numpy()
+        jones[carrier, :, taken, sent] += 1j * dr.imag(amplitude).numpy()
     return Traced(
         receiver=receiver,
         transfer=_dyad(jones, transmitter, receivers[receiver], points, types),
@@ -209,7 +257,7 @@ def _dyad(
     points: Float64Array,
     types: UInt8Array,
 ) -> Complex128Array:
-    """World-axes dyads, Shape ``[P, 3, 3]``, of Jones matrices between spherical bases.
+    """World-axes dyads, Shape ``[C, P, 3, 3]``, of Jones matrices between spherical bases.
 
     The bases are those of the directions that the solver saw, which are of float32 positions.
     """
@@ -223,8 +271,7 @@ def _dyad(
     last = np.where(direct[:, None], start, padded[rows, np.maximum(count - 1, 0)])
     sent = np.stack(spherical_basis(_unit(first - start), _POLE), axis=-2)
     taken = np.stack(spherical_basis(_unit(last - end), _POLE), axis=-2)
-    dyad: Complex128Array = np.einsum("pix,pij,pjy->pxy", taken, jones, sent)
-    return dyad
+    return np.stack([np.einsum("pix,pij,pjy->pxy", taken, of_carrier, sent) for of_carrier in jones])
 
 
 def _unit(vectors: Float64Array) -> Float64Array:

@@ -8,11 +8,11 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import replace
 from itertools import pairwise
 from typing import Annotated, ClassVar
 
 import msgspec
+from msgspec.structs import replace
 
 from caviar_protocol.arrays import quantity
 from caviar_protocol.coordinates import quaternion_from_euler
