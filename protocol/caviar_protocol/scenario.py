@@ -18,9 +18,6 @@ from caviar_protocol.tables import Source
 from caviar_protocol.topics.channel import Carrier
 from caviar_protocol.topics.scene import AntennaArray
 
-REMOTE = "remote"
-"""What a service uses that a process from outside fills: nobody here starts it."""
-
 
 class _Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Base of all tables of a scenario: unknown keys are refused."""
@@ -36,7 +33,6 @@ class Timeouts(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     rejoin_s: Annotated[
         float, quantity("s", "for a service that died to come back; 0: the run ends", ge=0)
     ] = 0.0
-    """A remote service is waited for 30 s where this is 0."""
     shutdown_s: Annotated[float, quantity("s", "for BYE; then the process is killed", gt=0)] = 2.0
     heartbeat_s: Annotated[float, quantity("s", "between heartbeats", gt=0)] = 0.25
     liveness_s: Annotated[float, quantity("s", "silence after which a remote peer is gone", gt=0)] = 1.5
@@ -101,7 +97,7 @@ class ServiceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     role: Role
     use: str
-    """Registered implementation of that role; ``remote``: a process from outside fills the place."""
+    """Registered implementation of that role."""
     budget_ms: Annotated[float, quantity("ms", "wall time for a frame; misses are counted", gt=0)]
     policy: Policy = "wait"
     max_in_flight: Annotated[

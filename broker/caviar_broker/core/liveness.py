@@ -53,19 +53,17 @@ class Liveness:
         peer.move(ServiceEvent.LOST, now)
         if run.over:
             return
-        may_return = self._may_return(peer)
-        patience = f"; its return is awaited for {run.plan.rejoin(peer.plan) / 1e9:g} s" if may_return else ""
-        run.notice("lost", peer.name, text + patience, owed[0].frame if owed else -1)
+        run.notice("lost", peer.name, text, owed[0].frame if owed else -1)
         if not run.takes_part(peer):
             return
-        if not may_return:
+        if not self._may_return(peer):
             run.fail(text, peer.name, now)
         elif schedule:
             schedule.pause(peer.name)
 
     def _may_return(self, peer: Peer) -> bool:
         """Whether the loss of a service is survived for a while: it was ready once, and got somewhere."""
-        return self._run.plan.rejoin(peer.plan) > 0 and peer.ready is not None and peer.losses < MAX_LOSSES
+        return self._run.plan.limits.rejoin > 0 and peer.ready is not None and peer.losses < MAX_LOSSES
 
     # --- deadlines -----------------------------------------------------------------------------------
 
@@ -114,7 +112,7 @@ class Liveness:
             case ServiceState.RESETTING:
                 return peer.silent_until(peer.since, limits.reset)
             case ServiceState.LOST:
-                return peer.since + self._run.plan.rejoin(peer.plan)
+                return peer.since + limits.rejoin
             case ServiceState.ACTIVE:
                 schedule = self._episodes.schedule
                 task = schedule.awaited(peer.name) if schedule else None
@@ -134,7 +132,7 @@ class Liveness:
                 names = ", ".join(str(p) for p in missing)
                 return f"{names} did not connect within {limits.connect / 1e9:g} s (timeouts.connect_s)"
             case ServiceState.LOST:
-                waited = f"{self._run.plan.rejoin(peer.plan) / 1e9:g} s (timeouts.rejoin_s)"
+                waited = f"{limits.rejoin / 1e9:g} s (timeouts.rejoin_s)"
                 return f"{peer} died and did not come back within {waited}: {peer.verdict}"
             case _:
                 key = "ready_s" if peer.state is ServiceState.PREPARING else "reset_s"

@@ -8,12 +8,10 @@ from typing import Any
 
 from caviar_protocol.instants import instants_ns
 from caviar_protocol.messages import Policy, Role
-from caviar_protocol.scenario import REMOTE, Scenario
+from caviar_protocol.scenario import Scenario
 
 SECOND = 1_000_000_000
 """[ns]"""
-REMOTE_REJOIN_S = 30.0
-"""[s] that a remote service gets to come back, unless the scenario says otherwise."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,9 +25,6 @@ class ServicePlan:
     """Implementation that the scenario names; empty: any."""
     policy: Policy = "wait"
     max_in_flight: int = 1
-    rejoin: int = 0
-    """How long its return is waited for when it died [ns], where the run's limits do not say; 0: the run
-    ends."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     scenario: Mapping[str, Any] = field(default_factory=dict)
     """What WELCOME tells it about the scenario."""
@@ -47,7 +42,7 @@ class Limits:
     heartbeat: int = SECOND // 4
     liveness: int = 3 * SECOND // 2
     rejoin: int = 0
-    """0: a service that dies ends the run, unless it has a ``rejoin`` of its own."""
+    """0: a service that dies ends the run."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,10 +68,6 @@ class RunPlan:
     imposed: Mapping[tuple[str, int, int], Mapping[str, str]] = field(default_factory=dict)
     """Decisions imposed in a replay, by (service, episode, frame) (clause 6)."""
 
-    def rejoin(self, service: ServicePlan) -> int:
-        """How long the return of a service is waited for when it died [ns]; 0: the run ends."""
-        return self.limits.rejoin or service.rejoin
-
     def t_ns(self, frame: int) -> int:
         """Simulated time of a frame of any episode [ns]; one behind the last comes a period later."""
         if not self.instants_ns:
@@ -94,11 +85,10 @@ def plan_run(scenario: Scenario, run: str, told: Mapping[str, Mapping[str, Any]]
             ServicePlan(
                 name=name,
                 role=spec.role,
-                use="" if spec.use == REMOTE else spec.use,
+                use=spec.use,
                 budget_ns=round(spec.budget_ms * 1e6),
                 policy=spec.policy,
                 max_in_flight=spec.max_in_flight,
-                rejoin=round(REMOTE_REJOIN_S * SECOND) if spec.use == REMOTE else 0,
                 settings=spec.settings,
                 scenario=told.get(name, {}),
             )

@@ -16,7 +16,7 @@ from typing import Any
 
 from caviar_broker.processes import describe_exit
 from caviar_protocol.errors import RunError
-from caviar_protocol.scenario import REMOTE, Scenario, ServiceSpec
+from caviar_protocol.scenario import Scenario
 
 KILL_AFTER_S = 1.0
 """[s] that a process gets after SIGTERM before SIGKILL, beyond the run's ``shutdown_s``."""
@@ -115,7 +115,7 @@ class Launcher:
             command += ["--frames", str(self.frames)]
         if self.seed is not None:
             command += ["--seed", str(self.seed)]
-        command += ["--supervised", *self._own()]
+        command += ["--supervised", *self.scenario.services]
         with (self.directory / "logs" / "broker.log").open("wb") as log:
             self._broker = subprocess.Popen(  # noqa: S603  # our own module with checked arguments
                 command,
@@ -130,12 +130,8 @@ class Launcher:
         os.set_blocking(self._broker.stdin.fileno(), False)
         self._selector.register(self._broker.stdout, selectors.EVENT_READ)
 
-    def _own(self) -> Mapping[str, ServiceSpec]:
-        """The services that are started here."""
-        return {name: spec for name, spec in self.scenario.services.items() if spec.use != REMOTE}
-
     def _start_services(self) -> None:
-        for name, spec in self._own().items():
+        for name, spec in self.scenario.services.items():
             path = self.directory / "logs" / f"{name}.log"
             command = [sys.executable, "-m", "caviar_services", name]
             command += ["--use", f"{spec.role}:{spec.use}", "--broker", self.endpoint]

@@ -57,15 +57,11 @@ def broker(
     """Run only the broker; start the services with `caviar service`, here or on other machines."""
     from caviar_broker.__main__ import parser, serve
     from caviar_clients.cli.run import checked_scenario, run_directory
-    from caviar_protocol.scenario import REMOTE
 
     checked = checked_scenario(scenario, frames, seed)
     directory = run_directory(out, checked.run.name)
     typer.echo(f"run {directory}; start its services with --broker and this broker's address:")
     for name, spec in checked.services.items():
-        if spec.use == REMOTE:
-            typer.echo(f"  {spec.role} {name!r} is yours to fill: clients/minimal/agent.py shows how")
-            continue
         typer.echo("  " + shlex.join(["caviar", "service", name, "--use", f"{spec.role}:{spec.use}"]))
     arguments = [str(scenario), "--bind", bind, "--directory", str(directory)]
     for name, value in (("--frames", frames), ("--seed", seed)):

@@ -19,22 +19,12 @@ from caviar_clients.cli.inside import EmbeddedLauncher
 from caviar_clients.cli.launch import Launcher
 from caviar_clients.cli.summary import link_figures, summary_of, summary_table
 from caviar_protocol.errors import DeclarationError, RunError
-from caviar_protocol.messages import Role
-from caviar_protocol.scenario import REMOTE, Scenario
+from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario_checks import scenario_error, settings_place, with_overrides
 from caviar_protocol.scenario_loader import load_scenario
 from caviar_protocol.tables import convert_settings
 from caviar_services.registry import load
 
-PRODUCES: Mapping[Role, frozenset[str]] = {
-    "world": frozenset({"scene"}),
-    "channel": frozenset({"channel"}),
-    "sensors": frozenset({"lidar", "camera", "depth", "segmentation"}),
-    "link": frozenset({"link"}),
-    "agent": frozenset({"action"}),
-    "recorder": frozenset(),
-}
-"""What a remote service may produce, by its role."""
 QUIET = frozenset({"stale", "note", "idle", "lag"})
 """Kinds of notices that are logged, and only counted on the screen."""
 
@@ -48,9 +38,6 @@ def checked_scenario(path: Path, frames: int | None = None, seed: int | None = N
     scenario = with_overrides(load_scenario(path), frames, seed)
     produced: set[str] = set()
     for name, spec in scenario.services.items():
-        if spec.use == REMOTE:
-            produced.update(PRODUCES[spec.role])
-            continue
         try:
             implementation = load(spec.role, spec.use)
         except DeclarationError as error:
@@ -100,8 +87,6 @@ def run_scenario(
 ) -> int:
     """Run a scenario; the exit status: 0 exactly if it came to its end."""
     scenario = checked_scenario(path, frames, seed)
-    if embedded:
-        _require_nobody_from_outside(scenario)
     if json_file is not None:
         _write(json_file, "")  # before the run, since after it an unwritable file would cost the figures
     directory = run_directory(out, scenario.run.name)
@@ -138,17 +123,6 @@ def run_scenario(
     return 130 if interrupted.came else 1 if outcome["error"] else 0
 
 
-def _require_nobody_from_outside(scenario: Scenario) -> None:
-    for name, spec in scenario.services.items():
-        if spec.use == REMOTE:
-            raise scenario_error(
-                scenario,
-                f"services.{name}.use",
-                f"{spec.role} {name!r} is remote, and nobody can join a run in one process; leave "
-                "--embedded out, write another `use`, or drive the run as a gymnasium environment",
-            )
-
-
 class _Interruption:
     """Ctrl-C as an order to end the run; a second one ends without waiting."""
 
@@ -176,7 +150,7 @@ class _Watcher:
     """Shows what the broker reports."""
 
     def __init__(self, bar: Progress, console: Console, scenario: Scenario) -> None:
-        self._bar, self._console, self._scenario = bar, console, scenario
+        self._bar, self._console = bar, console
         total = scenario.run.frames * scenario.run.episodes
         self._task = bar.add_task("starting", total=total, rate="", misses="")
         self._first: tuple[float, int] | None = None
@@ -185,27 +159,12 @@ class _Watcher:
     def take(self, event: Mapping[str, Any]) -> None:
         """Show one event."""
         match event["event"]:
-            case "listening":
-                self._say_who_is_awaited(event["endpoint"])
             case "frame":
                 self._frame(event["frames"], event["misses"])
             case "notice" if event["kind"] not in QUIET:
                 self._notice(event)
             case "finished":
                 self._finished(event)
-
-    def _say_who_is_awaited(self, endpoint: str) -> None:
-        """Name the services that somebody else has to start, and how."""
-        for name, spec in self._scenario.services.items():
-            if spec.use == REMOTE:
-                patience = self._scenario.timeouts.connect_s
-                self._console.print(
-                    f"waiting {patience:g} s (timeouts.connect_s) for {spec.role} {name!r} at {endpoint}; "
-                    f"start it now, for example: python clients/minimal/agent.py {endpoint} {name}",
-                    highlight=False,
-                    soft_wrap=True,
-                    markup=False,
-                )
 
     def _frame(self, frames: int, misses: int) -> None:
         now = time.monotonic()

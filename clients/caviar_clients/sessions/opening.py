@@ -10,7 +10,9 @@ from caviar_clients.sessions.connected import ConnectedSession
 from caviar_clients.sessions.embedded import EmbeddedSession
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.messages import Input
-from caviar_protocol.scenario import REMOTE, Scenario
+from caviar_protocol.scenario import Scenario
+
+REMOTE = "remote"
 
 
 def opened(path: Path, agent: str | None) -> Scenario:
