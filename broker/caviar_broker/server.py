@@ -256,6 +256,8 @@ class BrokerServer:
         before = self.clock.peer(hello.name)
         attempt = before.attempt if before else 0
         self._replying = route
+        if before is not None and before.present:
+            self._watchdog.recheck(hello.name)  # one that was killed may be back before its death shows
         self.clock.receive(ev.Joined(hello), time.monotonic_ns())
         peer = self.clock.peer(hello.name)
         if peer is not None and peer.attempt > attempt:
@@ -353,6 +355,10 @@ class BrokerServer:
 
     def _turn_away(self, action: ev.TurnAway) -> None:
         self._reply(self._replying, action.refusal)
+        text = f"a connection was turned away: {action.refusal.message}"
+        text = self._grumbles.tell(f"refused {action.refusal.code}", text, time.monotonic_ns())
+        if text:
+            self._observer.notice(ev.Notice("refused", action.name, text, self.clock.episode))
 
     def _finished(self, action: ev.Finished) -> None:
         self.outcome = action

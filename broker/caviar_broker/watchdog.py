@@ -121,6 +121,12 @@ class Watchdog:
             else:
                 self._check_remote(service, watched, now)
 
+    def recheck(self, service: str) -> None:
+        """Somebody else claims the name of a service: whether a remote one still is there, asked now."""
+        watched = self._watched.get(service)
+        if watched is not None and watched.process is None and watched.pulse is not None:
+            self._probe(service, watched.pulse)
+
     def close(self) -> None:
         """Stop watching."""
         for service in tuple(self._watched):
@@ -143,6 +149,9 @@ class Watchdog:
                     service, "has no heartbeat connection: its death shows only when it is due to answer"
                 )
         elif now - watched.heard_at > 2 * self.heartbeat_ns:
-            reason = self.probe(watched.pulse)
-            if reason:
-                self.lost(service, f"it is unreachable or stopped: {reason}")
+            self._probe(service, watched.pulse)
+
+    def _probe(self, service: str, pulse: bytes) -> None:
+        reason = self.probe(pulse)
+        if reason:
+            self.lost(service, f"it is unreachable or stopped: {reason}")

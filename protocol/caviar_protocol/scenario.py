@@ -18,6 +18,11 @@ from caviar_protocol.tables import Source
 from caviar_protocol.topics.channel import Carrier
 from caviar_protocol.topics.scene import AntennaArray
 
+REMOTE = "remote"
+"""What ``use`` says of a service that the user starts, anywhere: its place in the run is held free."""
+REMOTE_REJOIN_S = 30.0
+"""[s] that a remote service gets to come back, where ``rejoin_s`` is not given."""
+
 
 class _Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Base of all tables of a scenario: unknown keys are refused."""
@@ -30,9 +35,10 @@ class Timeouts(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     ready_s: Annotated[float, quantity("s", "for READY, beyond a declared grace", gt=0)] = 120.0
     reset_s: Annotated[float, quantity("s", "for RESET_DONE", gt=0)] = 60.0
     stall_s: Annotated[float, quantity("s", "without progress, under wait", gt=0)] = 30.0
-    rejoin_s: Annotated[
-        float, quantity("s", "for a service that died to come back; 0: the run ends", ge=0)
-    ] = 0.0
+    rejoin_s: (
+        Annotated[float, quantity("s", "for a service that died to come back; 0: the run ends", ge=0)] | None
+    ) = None
+    """Absent: `REMOTE_REJOIN_S` for remote services, 0 for those that `caviar run` starts."""
     shutdown_s: Annotated[float, quantity("s", "for BYE; then the process is killed", gt=0)] = 2.0
     heartbeat_s: Annotated[float, quantity("s", "between heartbeats", gt=0)] = 0.25
     liveness_s: Annotated[float, quantity("s", "silence after which a remote peer is gone", gt=0)] = 1.5
@@ -97,7 +103,7 @@ class ServiceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     role: Role
     use: str
-    """Registered implementation of that role."""
+    """Registered implementation of that role; `REMOTE`: whatever the user starts and connects."""
     budget_ms: Annotated[float, quantity("ms", "wall time for a frame; misses are counted", gt=0)]
     policy: Policy = "wait"
     max_in_flight: Annotated[
@@ -107,6 +113,11 @@ class ServiceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Agents: the receivers (or actuators) this agent owns, as patterns; empty: a default agent,
     which serves whoever is left (clause 17)."""
     settings: dict[str, Any] = {}
+
+    @property
+    def remote(self) -> bool:
+        """Whether the user starts this service, and not `caviar run`."""
+        return self.use == REMOTE
 
 
 class Scenario(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):

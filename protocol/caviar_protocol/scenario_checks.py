@@ -49,6 +49,18 @@ def check_scenario(scenario: Scenario) -> None:
     _check_antennas(scenario, root.at("devices"))
 
 
+def refuse_remote(scenario: Scenario) -> None:
+    """Raise `ScenarioError` for a remote service, in a run that has no broker to connect to."""
+    for name, spec in scenario.services.items():
+        if spec.remote:
+            raise scenario_error(
+                scenario,
+                f"services.{name}.use",
+                f"is {spec.use!r}, but a run in one process has no address to connect to; "
+                f"name an implementation of {spec.role}, or run it without --embedded",
+            )
+
+
 def devices_of(scenario: Scenario, world: str) -> tuple[DeviceSpec, ...]:
     """The devices that a world publishes.
 

@@ -45,6 +45,9 @@ class Sim:
     policy: m.Policy = "wait"
     use: str = ""
     """Implementation that the scenario names."""
+    remote: bool = False
+    rejoin: int | None = None
+    """How long its return is waited for [ns], instead of what the limits say."""
     budget: int = 100 * MS
     max_in_flight: int = 1
     hello: Mapping[str, Any] = field(default_factory=dict)
@@ -71,6 +74,8 @@ class Sim:
             name=self.name,
             role=self.role,
             use=self.use,
+            remote=self.remote,
+            rejoin=self.rejoin,
             budget_ns=self.budget,
             policy=self.policy,
             max_in_flight=self.max_in_flight,

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -127,6 +128,28 @@ def test_a_service_that_makes_no_progress_is_blamed_with_all_that_is_known(tmp_p
         assert word in error
     assert "last heartbeat" in error
     assert "phase 'playing', progress 0" in error
+
+
+def test_a_remote_service_that_is_back_before_its_death_is_known_takes_its_place(tmp_path: Path) -> None:
+    """Whoever starts it again at once is not told that the name is taken."""
+    run = plan("world", "sensors", limits={"heartbeat": 60_000 * MS, "liveness": 120_000 * MS})
+    services = [replace(s, remote=True, rejoin=5000 * MS) for s in run.services]
+    with serving(replace(run, services=tuple(services)), tmp_path) as broker:
+        with Client(broker.endpoint, "world") as first:
+            first.join()
+            first.attach()
+        with Client(broker.endpoint, "world") as second:
+            assert second.join().attempt == 2
+            second.attach()
+            with Client(broker.endpoint, "world") as third:
+                third.send(third.hello)
+                assert third.expect(m.Refuse).code == "name-taken"
+            eventually(lambda: any(n.kind == "refused" for n in broker.witness.notices), "it is told")
+        assert [n.kind for n in broker.witness.notices if n.service == "world"][:3] == [
+            "lost",
+            "away",
+            "back",
+        ]
 
 
 def test_a_remote_service_without_heartbeats_is_noted(tmp_path: Path) -> None:

@@ -291,3 +291,63 @@ def test_nothing_happens_after_the_end() -> None:
     run.perform()
     assert len(run.log) == told
     assert run.clock.next_deadline() is None
+
+
+# --- services that the user starts ------------------------------------------------------------------
+
+REMOTE = {"remote": True, "rejoin": 10 * SECOND}
+
+
+def test_only_the_remote_service_of_a_run_may_come_back_where_the_run_says_nothing() -> None:
+    run = Simulation(loop(agent=REMOTE), frames=8).join().run(granted("agent", 3))
+    run.kill("agent")
+    run.after(SECOND, lambda: run.hello("agent"))
+    run.run(granted("link", 5))
+    assert [n.text for n in run.notices("away", "agent")] == [
+        "agent 'agent' is away; the run waits for it for at most 10 s (timeouts.rejoin_s)"
+    ]
+    assert [n.text for n in run.notices("back", "agent")] == ["agent 'agent' came back after 1 s"]
+    run.kill("channel")
+    assert run.run().outcome.culprit == "channel"
+    assert not run.notices("away", "channel")
+
+
+def test_a_run_is_the_same_after_a_remote_service_came_back() -> None:
+    run = Simulation(loop(agent={**REMOTE, "latency": 20 * MS}), frames=8).join().run(granted("agent", 3))
+    run.kill("agent")
+    run.after(SECOND, lambda: run.hello("agent"))
+    assert run.run().outcome.digest == digest(frames=8)
+
+
+def test_a_remote_service_that_stays_away_is_blamed_after_its_own_time() -> None:
+    run = Simulation(loop(agent=REMOTE), limits=Limits(rejoin=SECOND)).join().run(granted("agent", 1))
+    lost = run.now
+    run.kill("agent", "its connection is gone")
+    run.run()
+    assert "agent 'agent' died and did not come back within 10 s (timeouts.rejoin_s)" in run.outcome.error
+    assert run.log[-1][0] - lost >= 10 * SECOND
+
+
+@pytest.mark.parametrize("state", [RunState.JOINING, RunState.PREPARING, RunState.RESETTING])
+def test_a_remote_service_may_be_started_again_before_the_first_frame_too(state: RunState) -> None:
+    services = loop(world={"ready_after": 20 * MS, "reset_after": 20 * MS}, agent=REMOTE)
+    run = Simulation(services, frames=8)
+    if state is RunState.JOINING:
+        run.join("agent").step()
+    else:
+        run.join().run(lambda run: run.clock.state is state)
+    run.kill("agent")
+    assert run.notices("away", "agent")
+    run.after(SECOND, lambda: run.hello("agent"))
+    if state is RunState.JOINING:
+        run.join("world", "channel", "link", "recorder")
+    assert run.run().outcome.error == ""
+    assert run.outcome.digest == digest(frames=8)
+
+
+def test_a_remote_service_that_nobody_starts_is_named_with_the_remedy() -> None:
+    run = Simulation(loop(agent=REMOTE)).join("world", "channel", "link", "recorder").run()
+    assert run.outcome.culprit == "agent"
+    assert run.outcome.error == (
+        "agent 'agent' did not connect within 30 s (timeouts.connect_s); start agent while the run waits"
+    )

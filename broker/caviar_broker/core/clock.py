@@ -164,7 +164,8 @@ class FrameClock:
         assert (run.graph is None) == (run.state is RunState.JOINING) or run.over, "a graph too early"
         if schedule is not None:
             schedule.validate()
-            absent = [p.name for p in peers if p.state is not ServiceState.ACTIVE and run.takes_part(p)]
-            assert not absent or self.plan.limits.rejoin, f"{absent} are not in the episode"
+            away = [p for p in peers if p.state is not ServiceState.ACTIVE and run.takes_part(p)]
+            absent = [p.name for p in away if not p.rejoin(self.plan.limits)]
+            assert not absent, f"{absent} are not in the episode"
         if run.state is RunState.FINISHED:
             assert not any(p.present for p in peers), "finished while somebody is here"

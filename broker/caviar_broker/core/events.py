@@ -160,8 +160,8 @@ class Notice(msgspec.Struct, frozen=True):
     """Something the user or the log must know: nothing late, dropped or overwritten in silence."""
 
     kind: str
-    """``miss``, ``late``, ``skipped``, ``fault``, ``lost``, ``idle``, ``lag``, ``stale``,
-    ``discarded`` or ``note``."""
+    """``miss``, ``late``, ``skipped``, ``fault``, ``lost``, ``away``, ``back``, ``refused``, ``idle``,
+    ``lag``, ``stale``, ``discarded`` or ``note``."""
     service: str
     text: str
     episode: int = 0

@@ -44,6 +44,8 @@ class Joining:
                 run.fail(f"{hello.role} {hello.name!r} was refused: {refusal.message}", hello.name, now)
             return
         peer = run.peers[hello.name]
+        if peer.state is ServiceState.LOST:
+            run.notice("back", peer.name, f"{peer} came back after {(now - peer.since) / 1e9:.3g} s")
         peer.join(hello, now)
         run.send(
             peer,

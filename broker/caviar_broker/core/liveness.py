@@ -58,12 +58,18 @@ class Liveness:
             return
         if not self._may_return(peer):
             run.fail(text, peer.name, now)
-        elif schedule:
+            return
+        limit = peer.rejoin(run.plan.limits) / 1e9
+        told = f"{peer} is away; the run waits for it for at most {limit:g} s (timeouts.rejoin_s)"
+        run.notice("away", peer.name, told, owed[0].frame if owed else -1)
+        if schedule:
             schedule.pause(peer.name)
 
     def _may_return(self, peer: Peer) -> bool:
-        """Whether the loss of a service is survived for a while: it was ready once, and got somewhere."""
-        return self._run.plan.limits.rejoin > 0 and peer.ready is not None and peer.losses < MAX_LOSSES
+        """Whether the loss of a service is survived for a while: it was ready once, or is started by
+        hand and can be again; and it got somewhere."""
+        was_ready = peer.ready is not None or peer.plan.remote
+        return peer.rejoin(self._run.plan.limits) > 0 and was_ready and peer.losses < MAX_LOSSES
 
     # --- deadlines -----------------------------------------------------------------------------------
 
@@ -112,7 +118,7 @@ class Liveness:
             case ServiceState.RESETTING:
                 return peer.silent_until(peer.since, limits.reset)
             case ServiceState.LOST:
-                return peer.since + limits.rejoin
+                return peer.since + peer.rejoin(limits)
             case ServiceState.ACTIVE:
                 schedule = self._episodes.schedule
                 task = schedule.awaited(peer.name) if schedule else None
@@ -130,9 +136,12 @@ class Liveness:
             case ServiceState.EXPECTED:
                 missing = [p for p in self._run.peers.values() if p.state is ServiceState.EXPECTED]
                 names = ", ".join(str(p) for p in missing)
-                return f"{names} did not connect within {limits.connect / 1e9:g} s (timeouts.connect_s)"
+                remote = [p.name for p in missing if p.plan.remote]
+                hint = f"; start {' and '.join(remote)} while the run waits" if remote else ""
+                waited = f"{limits.connect / 1e9:g} s (timeouts.connect_s)"
+                return f"{names} did not connect within {waited}{hint}"
             case ServiceState.LOST:
-                waited = f"{limits.rejoin / 1e9:g} s (timeouts.rejoin_s)"
+                waited = f"{peer.rejoin(limits) / 1e9:g} s (timeouts.rejoin_s)"
                 return f"{peer} died and did not come back within {waited}: {peer.verdict}"
             case _:
                 key = "ready_s" if peer.state is ServiceState.PREPARING else "reset_s"

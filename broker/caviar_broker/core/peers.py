@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from caviar_broker.core.plan import ServicePlan
+from caviar_broker.core.plan import Limits, ServicePlan
 from caviar_broker.core.tasks import Task
 from caviar_broker.core.transitions import PRESENT, SERVICE, ServiceEvent, ServiceState, step
 from caviar_protocol.messages import Asset, Hello, Ready
@@ -87,6 +87,10 @@ class Peer:
         A phase that declared a longer grace, such as compilation, has that (clause 14).
         """
         return max(since, self.advanced_at) + max(limit, self.grace_ns)
+
+    def rejoin(self, limits: Limits) -> int:
+        """How long its return is waited for once it is lost [ns]; 0: not at all."""
+        return limits.rejoin if self.plan.rejoin is None else self.plan.rejoin
 
     @property
     def doing(self) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 from caviar_protocol.instants import instants_ns
 from caviar_protocol.messages import Policy, Role
-from caviar_protocol.scenario import Scenario
+from caviar_protocol.scenario import REMOTE_REJOIN_S, Scenario
 
 SECOND = 1_000_000_000
 """[ns]"""
@@ -23,11 +23,15 @@ class ServicePlan:
     budget_ns: int
     use: str = ""
     """Implementation that the scenario names; empty: any."""
+    remote: bool = False
+    """Whether the user starts it, so that it may come back however early it was lost."""
     policy: Policy = "wait"
     max_in_flight: int = 1
     settings: Mapping[str, Any] = field(default_factory=dict)
     scenario: Mapping[str, Any] = field(default_factory=dict)
     """What WELCOME tells it about the scenario."""
+    rejoin: int | None = None
+    """How long its return is waited for [ns]; None: as `Limits` says."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,12 +89,14 @@ def plan_run(scenario: Scenario, run: str, told: Mapping[str, Mapping[str, Any]]
             ServicePlan(
                 name=name,
                 role=spec.role,
-                use=spec.use,
+                use="" if spec.remote else spec.use,
+                remote=spec.remote,
                 budget_ns=round(spec.budget_ms * 1e6),
                 policy=spec.policy,
                 max_in_flight=spec.max_in_flight,
                 settings=spec.settings,
                 scenario=told.get(name, {}),
+                rejoin=round(REMOTE_REJOIN_S * SECOND) if spec.remote and t.rejoin_s is None else None,
             )
             for name, spec in scenario.services.items()
         ),
@@ -110,6 +116,6 @@ def plan_run(scenario: Scenario, run: str, told: Mapping[str, Mapping[str, Any]]
             shutdown=round(t.shutdown_s * SECOND),
             heartbeat=round(t.heartbeat_s * SECOND),
             liveness=round(t.liveness_s * SECOND),
-            rejoin=round(t.rejoin_s * SECOND),
+            rejoin=round((t.rejoin_s or 0.0) * SECOND),
         ),
     )

@@ -16,7 +16,7 @@ from typing import Any
 
 from caviar_broker.processes import describe_exit
 from caviar_protocol.errors import RunError
-from caviar_protocol.scenario import Scenario
+from caviar_protocol.scenario import Scenario, ServiceSpec
 
 KILL_AFTER_S = 1.0
 """[s] that a process gets after SIGTERM before SIGKILL, beyond the run's ``shutdown_s``."""
@@ -50,7 +50,8 @@ class Launcher:
     """Runs one scenario as processes of this machine.
 
     Use as a context manager: however the block is left, no process of the run survives it.
-    ``events()`` yields what the broker reports, until the run is over.
+    ``events()`` yields what the broker reports, until the run is over. Remote services are left to
+    the user, who learns from ``endpoint`` where they are awaited.
     """
 
     scenario: Scenario
@@ -106,6 +107,11 @@ class Launcher:
         child = self._children.get(service)
         return child.log if child else None
 
+    @property
+    def _local(self) -> dict[str, ServiceSpec]:
+        """The services that are started here."""
+        return {name: spec for name, spec in self.scenario.services.items() if not spec.remote}
+
     # --- starting ----------------------------------------------------------------------------------
 
     def _start_broker(self) -> None:
@@ -115,7 +121,7 @@ class Launcher:
             command += ["--frames", str(self.frames)]
         if self.seed is not None:
             command += ["--seed", str(self.seed)]
-        command += ["--supervised", *self.scenario.services]
+        command += ["--supervised", *self._local]
         with (self.directory / "logs" / "broker.log").open("wb") as log:
             self._broker = subprocess.Popen(  # noqa: S603  # our own module with checked arguments
                 command,
@@ -131,7 +137,7 @@ class Launcher:
         self._selector.register(self._broker.stdout, selectors.EVENT_READ)
 
     def _start_services(self) -> None:
-        for name, spec in self.scenario.services.items():
+        for name, spec in self._local.items():
             path = self.directory / "logs" / f"{name}.log"
             command = [sys.executable, "-m", "caviar_services", name]
             command += ["--use", f"{spec.role}:{spec.use}", "--broker", self.endpoint]

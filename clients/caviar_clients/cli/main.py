@@ -62,7 +62,8 @@ def broker(
     directory = run_directory(out, checked.run.name)
     typer.echo(f"run {directory}; start its services with --broker and this broker's address:")
     for name, spec in checked.services.items():
-        typer.echo("  " + shlex.join(["caviar", "service", name, "--use", f"{spec.role}:{spec.use}"]))
+        use = "IMPLEMENTATION" if spec.remote else spec.use
+        typer.echo("  " + shlex.join(["caviar", "service", name, "--use", f"{spec.role}:{use}"]))
     arguments = [str(scenario), "--bind", bind, "--directory", str(directory)]
     for name, value in (("--frames", frames), ("--seed", seed)):
         arguments += [] if value is None else [name, str(value)]

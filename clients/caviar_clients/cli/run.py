@@ -17,16 +17,28 @@ from rich.text import Text
 
 from caviar_clients.cli.inside import EmbeddedLauncher
 from caviar_clients.cli.launch import Launcher
+from caviar_clients.cli.remote import reachable, start_command, waiting_text
 from caviar_clients.cli.summary import link_figures, summary_of, summary_table
 from caviar_protocol.errors import DeclarationError, RunError
 from caviar_protocol.scenario import Scenario
-from caviar_protocol.scenario_checks import scenario_error, settings_place, with_overrides
+from caviar_protocol.scenario_checks import refuse_remote, scenario_error, settings_place, with_overrides
 from caviar_protocol.scenario_loader import load_scenario
 from caviar_protocol.tables import convert_settings
 from caviar_services.registry import load
 
 QUIET = frozenset({"stale", "note", "idle", "lag"})
 """Kinds of notices that are logged, and only counted on the screen."""
+REPEATED = frozenset({"away", "back"})
+"""Kinds of notices that are shown every time, since what they ask of the user is always new."""
+TOPICS_OF: Mapping[str, tuple[str, ...]] = {
+    "world": ("scene",),
+    "channel": ("channel",),
+    "sensors": ("lidar", "camera", "depth", "segmentation"),
+    "link": ("link",),
+    "agent": ("action",),
+    "recorder": (),
+}
+"""What a remote service may produce, by its role; what it does produce it says when it joins."""
 
 
 def checked_scenario(path: Path, frames: int | None = None, seed: int | None = None) -> Scenario:
@@ -38,6 +50,9 @@ def checked_scenario(path: Path, frames: int | None = None, seed: int | None = N
     scenario = with_overrides(load_scenario(path), frames, seed)
     produced: set[str] = set()
     for name, spec in scenario.services.items():
+        if spec.remote:
+            produced.update(TOPICS_OF[spec.role])
+            continue
         try:
             implementation = load(spec.role, spec.use)
         except DeclarationError as error:
@@ -87,6 +102,8 @@ def run_scenario(
 ) -> int:
     """Run a scenario; the exit status: 0 exactly if it came to its end."""
     scenario = checked_scenario(path, frames, seed)
+    if embedded:
+        refuse_remote(scenario)
     if json_file is not None:
         _write(json_file, "")  # before the run, since after it an unwritable file would cost the figures
     directory = run_directory(out, scenario.run.name)
@@ -155,16 +172,26 @@ class _Watcher:
         self._task = bar.add_task("starting", total=total, rate="", misses="")
         self._first: tuple[float, int] | None = None
         self._shown: dict[tuple[str, str], int] = {}
+        self._scenario, self._endpoint = scenario, ""
 
     def take(self, event: Mapping[str, Any]) -> None:
         """Show one event."""
         match event["event"]:
+            case "listening":
+                self._listening(event["endpoint"])
             case "frame":
                 self._frame(event["frames"], event["misses"])
             case "notice" if event["kind"] not in QUIET:
                 self._notice(event)
             case "finished":
                 self._finished(event)
+
+    def _listening(self, endpoint: str) -> None:
+        self._endpoint = reachable(endpoint)
+        for name, spec in self._scenario.services.items():
+            if spec.remote:
+                connect_s = self._scenario.timeouts.connect_s
+                self._tell(waiting_text(name, spec, endpoint, connect_s), "bold")
 
     def _frame(self, frames: int, misses: int) -> None:
         now = time.monotonic()
@@ -186,10 +213,20 @@ class _Watcher:
         """Show the first of each kind and service; the rest is in events.jsonl."""
         key = (event["kind"], event["service"])
         self._shown[key] = self._shown.get(key, 0) + 1
-        if self._shown[key] == 1:
+        if self._shown[key] == 1 or event["kind"] in REPEATED:
             frame = f" in frame {event['frame']}" if event["frame"] >= 0 else ""
             text = f"{event['kind']}: {event['service']}{frame}: {event['text']}"
-            self._console.print(text, highlight=False, soft_wrap=True, style="yellow", markup=False)
+            self._tell(text + self._remedy(event), "yellow")
+
+    def _remedy(self, event: Mapping[str, Any]) -> str:
+        """How to bring a remote service back."""
+        spec = self._scenario.services.get(event["service"])
+        if event["kind"] != "away" or spec is None or not spec.remote:
+            return ""
+        return f"; start it again with  {start_command(event['service'], spec, self._endpoint)}"
+
+    def _tell(self, text: str, style: str) -> None:
+        self._console.print(text, highlight=False, soft_wrap=True, style=style, markup=False)
 
 
 def _progress_bar(console: Console) -> Progress:

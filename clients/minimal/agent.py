@@ -1,0 +1,60 @@
+"""A whole agent, written from protocol/SPEC.md alone: python agent.py tcp://HOST:PORT NAME"""
+import hashlib, itertools, os, struct, sys, threading, time, msgpack, zmq
+
+ENDPOINT, NAME = sys.argv[1:3]
+INPUTS = [{"topic": "scene"}, {"topic": "link", "lag": 1, "required": False}]
+message = {"version": [1, 0], "name": NAME, "role": "agent", "inputs": INPUTS, "outputs": ["action"]}
+
+def beat(welcome):
+    pulse, beating = zmq.Context().socket(zmq.DEALER), {"type": "ATTACH", **who, "name": NAME}
+    pulse.connect(ENDPOINT)
+    for sequence in itertools.count():
+        pulse.send(msgpack.packb(beating))
+        answer = msgpack.unpackb(pulse.recv()) if pulse.poll(welcome["liveness_ns"] / 1e6) else {}
+        if answer.get("type") != "HEARTBEAT_ACK":
+            os.write(2, f"{NAME}: from the broker came {answer or 'no answer to a heartbeat'}\n".encode())
+            os._exit(1)  # the other thread may be waiting for a message that never comes
+        beating = {"type": "HEARTBEAT", "sequence": sequence}
+        time.sleep(welcome["heartbeat_ns"] / 1e9)
+
+def done(grant, parts):
+    report = {"type": "DONE", **who, "episode": grant["episode"], "frame": grant["frame"]}
+    antennas, best, commands = [], {}, []
+    topics = [entry["topic"] for entry in grant["inputs"] if entry["status"] != "absent"]
+    for topic, header, body in zip(topics, map(msgpack.unpackb, parts[::2]), parts[1::2], strict=True):
+        antennas += [device for device in header.get("devices", []) if device["type"] == "antenna"]
+        if topic == "link":  # of the frame before: [:, 0] of these lists is the best pair of each user
+            beams = [struct.unpack_from(f"<{users * k}i", body, header[key]["offset"])[:: k or 1]
+                     for key in ("top_tx_beam", "top_rx_beam") for users, k in [header[key]["shape"]]]
+            best = {(row[0], row[1]): row[2:] for row in zip(header["tx"], header["rx"], *beams, strict=True)}
+    for rx, tx in itertools.product(sorted(antennas, key=lambda antenna: antenna["name"]), repeat=2):
+        if rx is not tx and rx["role"] != "tx" and tx["role"] != "rx":
+            tx_beam, rx_beam = best.get((tx["name"], rx["name"]), (0, 0))
+            beams = {"tx_beam": max(tx_beam, 0)} | ({"rx_beam": rx_beam} if rx_beam > 0 else {})
+            commands.append({"type": "beam", "tx": tx["name"], "rx": rx["name"], **beams})
+    payload = msgpack.packb({"commands": commands})
+    digest = hashlib.sha256(len(payload).to_bytes(8, "little") + payload).hexdigest()
+    product = {"products": [{"topic": "action", "digest": digest}]}
+    return [msgpack.packb(report)] if grant.get("final") else [msgpack.packb(report | product), payload, b""]
+
+with zmq.Context() as context, context.socket(zmq.DEALER) as broker:
+    broker.linger = 1000  # [ms] at the end, so that a broker that is gone holds nobody up
+    broker.connect(ENDPOINT)
+    broker.send(msgpack.packb({"type": "HELLO", **message}))
+    while message.get("type") != "SHUTDOWN":
+        header, *parts = broker.recv_multipart()
+        match (message := msgpack.unpackb(header))["type"]:
+            case kind if kind in ("REFUSE", "STALE", "ERROR") or message.get("version", [1])[0] != 1:
+                sys.exit(f"{NAME}: {kind}: {message.get('message', message)}")
+            case "WELCOME":
+                who = {"epoch": message["epoch"], "attempt": message["attempt"]}
+                threading.Thread(target=beat, args=[message], daemon=True).start()
+            case "PREPARE":
+                broker.send(msgpack.packb({"type": "READY", **who, "actuators": ["beam:*"]}))
+            case "RESET":
+                stored = {}
+                broker.send(msgpack.packb({"type": "RESET_DONE", **who, "episode": message["episode"]}))
+            case "GRANT":
+                stored[message["frame"]] = stored.get(message["frame"]) or done(message, parts)
+                broker.send_multipart(stored[message["frame"]])
+    broker.send(msgpack.packb({"type": "BYE", **who}))
