@@ -98,6 +98,9 @@ def channel(frame: int, users: int = 3) -> Channel:
     interactions = np.tile(np.array([[0], [1]], np.uint8), (reached, 1))
     points = np.zeros((2 * reached, 1, 3))
     points[1::2, 0] = bounce
+    towards = np.empty((2, 2 * reached, 3))  # from the transmitter, from the receiver
+    towards[0, 0::2], towards[0, 1::2] = ends - start, bounce - start
+    towards[1, 0::2], towards[1, 1::2] = start - ends, bounce - ends
     length = np.empty(2 * reached)
     length[0::2] = np.linalg.norm(ends - start, axis=1)
     length[1::2] = np.linalg.norm(ends - mirrored, axis=1)
@@ -112,13 +115,19 @@ def channel(frame: int, users: int = 3) -> Channel:
         id=np.arange(2 * reached, dtype=np.uint64),
         a=(1e-3 / length)[None].astype(np.complex128),
         tau=length / 3e8,
-        aod=np.zeros((2 * reached, 2)),
-        aoa=np.zeros((2 * reached, 2)),
+        aod=_angles(towards[0]),
+        aoa=_angles(towards[1]),
         doppler=np.zeros((1, 2 * reached)),
         interactions=interactions,
         points=points,
         objects=interactions.astype(np.int32) - 1,
     )
+
+
+def _angles(towards: np.ndarray) -> np.ndarray:
+    """(zenith, azimuth) of directions."""
+    x, y, z = towards.T
+    return np.stack([np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)], axis=-1)
 
 
 def lidar(frame: int) -> Lidar:

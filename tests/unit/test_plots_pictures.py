@@ -11,7 +11,8 @@ from recording_samples import channel, lidar, link, scene
 
 from caviar_clients.cli.plot import beam_gain
 from caviar_clients.plots.lidar import draw_scan, range_image
-from caviar_clients.plots.map import MapData, _beam, _common_prefix, _rays, _view, draw_map
+from caviar_clients.plots.map import MapData, _common_prefix, chosen_beam, draw_map, view_of
+from caviar_clients.plots.rays import rays
 from caviar_protocol.scene import device_pose
 from caviar_protocol.topics import AntennaArray, LidarDevice, LidarScan
 from caviar_services.link.codebook import beam_towards, pointing_directions
@@ -37,7 +38,9 @@ def a_map(**changes) -> MapData:
 
 def test_rays_run_from_transmitter_over_their_points_to_the_receiver():
     data = a_map()
-    lines, gains = _rays(data)
+    found = rays(data.scene, data.channel)
+    lines, gains = found.lines, found.gains
+    assert not len(found.tick_gains)
     assert len(lines) == 4  # two cars with two paths each, the third has none
     receiver = next(d for d in data.scene.devices if d.name == "car.1/rx")
     end = device_pose(data.scene, receiver).position[:2]
@@ -78,7 +81,7 @@ def test_the_lobe_stands_at_the_array_and_points_to_the_user():
     chosen = int(beam_towards(AntennaArray(columns=16), local))
     links = link(2)
     links.tx_beam[:] = chosen
-    beam = _beam(a_map(link=links))
+    beam = chosen_beam(a_map(link=links))
     assert beam is not None
     assert beam.label == f"beam {chosen} of bs, chosen for car.1/rx"
     reach = beam.outline - [0.0, 20.0]
@@ -92,19 +95,19 @@ def test_the_lobe_stands_at_the_array_and_points_to_the_user():
     "changes", [{"link": None}, {"user": None}, {"user": ("bs", "gone/rx", "c0")}, {"beam_gain": None}]
 )
 def test_without_a_chosen_beam_there_is_no_lobe(changes):
-    assert _beam(a_map(**changes)) is None
+    assert chosen_beam(a_map(**changes)) is None
 
 
 def test_the_view_holds_everything_and_is_never_tiny():
     data = a_map()
-    (left, right), (bottom, top) = _view(data, None)
+    (left, right), (bottom, top) = view_of(data, None)
     x, y = data.scene.position[:, 0], data.scene.position[:, 1]
     assert left < x.min()
     assert x.max() < right
     assert bottom < y.min()
     assert top > 30.0  # the wall that reflects
     single = a_map(scene=scene(0, cars=1), channel=None)
-    (left, right), (bottom, top) = _view(single, None)
+    (left, right), (bottom, top) = view_of(single, None)
     assert right - left >= 40.0
     assert top - bottom >= 40.0
 
@@ -113,7 +116,7 @@ def test_a_ray_that_strays_far_does_not_shrink_the_picture():
     far = channel(2)
     points = far.points.copy()
     points[1, 0] = [900.0, 30.0, 0.0]
-    (left, right), _ = _view(a_map(channel=msgspec.structs.replace(far, points=points)), None)
+    (left, right), _ = view_of(a_map(channel=msgspec.structs.replace(far, points=points)), None)
     assert right - left < 100.0
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from caviar_clients.plots.footprints import Footprints
+from caviar_clients.plots.rays import Rays, rays, scale
 from caviar_clients.plots.style import BLACK, GREY, LIGHT_GREY, ORANGE, SKY, VERMILION, figure, legend_below
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.coordinates import rotation_matrix
@@ -22,11 +23,10 @@ BeamGain = Callable[[AntennaArray, int, Float64Array], Float64Array]
 """``gain(array, beam, directions)``: amplitude of a codebook beam towards unit vectors in device
 axes, Shape ``[N, 3]`` to ``[N]``, 1 at its greatest."""
 
-_PATHS_OF_A_PAIR = 25
-"""Of a pair so many of the strongest paths are drawn."""
-
-_RANGE_DB = 50.0
-"""Paths weaker than the strongest by more than this have the last colour."""
+TICK = 0.05
+"""Length of the ticks of paths whose route is unknown, of the width of the map."""
+TICK_COLOR = "#21918c"  # the middle of viridis
+TICK_LABEL = "path of unknown route: departure, arrival"
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +45,8 @@ class MapData:
 
 def draw_map(data: MapData, file: Path) -> None:
     """Draw the map of one frame."""
-    beam = _beam(data)
-    view = _view(data, beam)
+    beam = chosen_beam(data)
+    view = view_of(data, beam)
     (left, right), (bottom, top) = view
     # As high as the view needs, beside 1.5 inches for the colour bar, above 1.6 for title and legend.
     height = float(np.clip((top - bottom) / (right - left) * 8.0 + 1.6, 4.5, 11.0))
@@ -54,12 +54,12 @@ def draw_map(data: MapData, file: Path) -> None:
         axes = drawn.subplots()
         axes.set_xlim(view[0])
         axes.set_ylim(view[1])
-        _draw_scenery(axes, data.footprints)
-        _draw_rays(drawn, axes, data)
+        draw_scenery(axes, data.footprints)
+        _add_rays(drawn, axes, data)
         if beam is not None:
-            _draw_beam(axes, beam)
-        _draw_objects(axes, data)
-        _draw_antennas(axes, data)
+            draw_beam(axes, beam)
+        draw_objects(axes, data)
+        draw_antennas(axes, data)
         axes.set_aspect("equal")
         axes.set_xlabel("x, east [m]")
         axes.set_ylabel("y, north [m]")
@@ -67,7 +67,7 @@ def draw_map(data: MapData, file: Path) -> None:
         legend_below(drawn, axes)
 
 
-def _view(data: MapData, beam: _Beam | None) -> tuple[tuple[float, float], tuple[float, float]]:
+def view_of(data: MapData, beam: Beam | None) -> tuple[tuple[float, float], tuple[float, float]]:
     """Limits of x and y [m]: objects, devices and the beam, ray points unless far off; at least 40 m."""
     devices = [device_pose(data.scene, device).position[:2] for device in data.scene.devices]
     core = np.concatenate([data.scene.position[:, :2], np.array(devices).reshape(-1, 2)])
@@ -88,7 +88,7 @@ def _view(data: MapData, beam: _Beam | None) -> tuple[tuple[float, float], tuple
     return (left, right), (bottom, top)
 
 
-def _draw_scenery(axes: Any, footprints: Footprints | None) -> None:
+def draw_scenery(axes: Any, footprints: Footprints | None) -> None:
     from matplotlib.collections import LineCollection, PolyCollection
 
     if footprints is None:
@@ -101,50 +101,37 @@ def _draw_scenery(axes: Any, footprints: Footprints | None) -> None:
     axes.add_collection(LineCollection(edges, colors=GREY, linewidths=0.6, zorder=1.1))
 
 
-def _draw_rays(drawn: Any, axes: Any, data: MapData) -> None:
-    """Every path as a line over its interaction points, the strongest on top."""
+def draw_rays(axes: Any, drawn: Rays, limits: tuple[float, float]) -> list[Any]:
+    """Every path as a line over its interaction points, or as ticks; the strongest on top.
+
+    Returns the collections, whose colours are those of ``limits`` [dB].
+    """
     from matplotlib.collections import LineCollection
 
-    lines, gains = _rays(data)
-    if not lines:
+    (left, right), collections = axes.get_xlim(), []
+    ticks = drawn.ticks(TICK * (right - left))
+    style = {"cmap": "viridis", "clim": limits, "alpha": 0.85, "zorder": 2}
+    for lines, gains, width in ((drawn.lines, drawn.gains, 1.1), (ticks, drawn.tick_gains, 2.0)):
+        order = np.argsort(gains, kind="stable")
+        if len(order):
+            ordered: list[Any] = [lines[i] for i in order]
+            collections.append(LineCollection(ordered, array=gains[order], linewidths=width, **style))
+            axes.add_collection(collections[-1])
+    return collections
+
+
+def _add_rays(drawn: Any, axes: Any, data: MapData) -> None:
+    found = rays(data.scene, data.channel)
+    if not len(found.all_gains):
         return
-    order = np.argsort(gains)
-    top = float(gains.max())
-    rays = LineCollection(
-        [lines[i] for i in order],
-        array=gains[order],
-        cmap="viridis",
-        clim=(max(float(gains.min()), top - _RANGE_DB) - 1e-9, top),
-        linewidths=1.1,
-        alpha=0.85,
-        zorder=2,
-    )
-    axes.add_collection(rays)
-    drawn.colorbar(rays, ax=axes, label="Path gain [dB]", shrink=0.75, pad=0.01)
-
-
-def _rays(data: MapData) -> tuple[list[Float64Array], Float64Array]:
-    """Polylines in x and y [m], and path gains of the first carrier [dB]."""
-    channel, lines, gains = data.channel, [], []
-    if channel is None or not len(channel.carriers):
-        return [], np.zeros(0)
-    places = {d.name: np.array(device_pose(data.scene, d).position) for d in data.scene.devices}
-    power = np.abs(channel.a[0]) ** 2
-    for tx in channel.tx:
-        for rx in channel.rx:
-            if tx not in places or rx not in places:
-                continue
-            pair = channel.pair(tx, rx)
-            strongest = np.argsort(-power[pair])[:_PATHS_OF_A_PAIR] + pair.start
-            for path in strongest[power[strongest] > 0]:
-                used = channel.interactions[path] != Interaction.NONE
-                lines.append(np.vstack([places[tx], channel.points[path][used], places[rx]])[:, :2])
-                gains.append(10 * np.log10(power[path]))
-    return lines, np.array(gains)
+    collections = draw_rays(axes, found, scale(found.all_gains))
+    drawn.colorbar(collections[0], ax=axes, label="Path gain [dB]", shrink=0.75, pad=0.01)
+    if len(found.tick_gains):
+        axes.plot([], [], color=TICK_COLOR, linewidth=2.0, label=TICK_LABEL)
 
 
 @dataclass(frozen=True, eq=False)
-class _Beam:
+class Beam:
     """The chosen beam's pattern around its array, cut at the elevation of the user."""
 
     outline: Float64Array
@@ -152,7 +139,7 @@ class _Beam:
     label: str
 
 
-def _beam(data: MapData) -> _Beam | None:
+def chosen_beam(data: MapData) -> Beam | None:
     found = _chosen(data)
     if found is None or data.beam_gain is None:
         return None
@@ -171,10 +158,10 @@ def _beam(data: MapData) -> _Beam | None:
     gain = data.beam_gain(device.array, beam, world @ rotation_matrix(pose.orientation))
     radius = max(0.6 * distance, 5.0) * gain / max(float(gain.max()), 1e-9)
     outline: Float64Array = np.array(pose.position[:2]) + radius[:, None] * around
-    return _Beam(outline, f"beam {beam} of {device.name}, chosen for {rx}")
+    return Beam(outline, f"beam {beam} of {device.name}, chosen for {rx}")
 
 
-def _draw_beam(axes: Any, beam: _Beam) -> None:
+def draw_beam(axes: Any, beam: Beam) -> None:
     axes.fill(*beam.outline.T, facecolor=VERMILION, alpha=0.22, linewidth=0, zorder=3)
     axes.plot(*beam.outline.T, color=VERMILION, linewidth=1.3, zorder=3.1, label=beam.label)
 
@@ -191,7 +178,7 @@ def _chosen(data: MapData) -> tuple[AntennaDevice, int, str] | None:
     return None if device is None or beam < 0 else (device, beam, data.user[1])
 
 
-def _draw_objects(axes: Any, data: MapData) -> None:
+def draw_objects(axes: Any, data: MapData) -> None:
     """Bounding boxes from above, a mark at the front, names where there is room."""
     from matplotlib.collections import PolyCollection
 
@@ -271,7 +258,7 @@ def _overlap(a: Rectangle, b: Rectangle) -> bool:
     return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
-def _draw_antennas(axes: Any, data: MapData) -> None:
+def draw_antennas(axes: Any, data: MapData) -> None:
     """Transmitters as triangles with their names, receivers as dots."""
     from matplotlib.patheffects import withStroke
 
