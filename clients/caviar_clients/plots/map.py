@@ -110,7 +110,7 @@ def draw_rays(axes: Any, drawn: Rays, limits: tuple[float, float]) -> list[Any]:
 
     (left, right), collections = axes.get_xlim(), []
     ticks = drawn.ticks(TICK * (right - left))
-    style = {"cmap": "viridis", "clim": limits, "alpha": 0.85, "zorder": 2}
+    style: dict[str, Any] = {"cmap": "viridis", "clim": limits, "alpha": 0.85, "zorder": 2}
     for lines, gains, width in ((drawn.lines, drawn.gains, 1.1), (ticks, drawn.tick_gains, 2.0)):
         order = np.argsort(gains, kind="stable")
         if len(order):
