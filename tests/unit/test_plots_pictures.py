@@ -11,7 +11,7 @@ from recording_samples import channel, lidar, link, scene
 
 from caviar_clients.cli.plot import beam_gain
 from caviar_clients.plots.lidar import draw_scan, range_image
-from caviar_clients.plots.map import MapData, _common_prefix, chosen_beam, draw_map, view_of
+from caviar_clients.plots.map import MapData, chosen_beam, common_prefix, draw_map, view_of
 from caviar_clients.plots.rays import rays
 from caviar_protocol.scene import device_pose
 from caviar_protocol.topics import AntennaArray, LidarDevice, LidarScan
@@ -121,10 +121,10 @@ def test_a_ray_that_strays_far_does_not_shrink_the_picture():
 
 
 def test_names_lose_what_all_have_in_common():
-    assert _common_prefix(["vehicle.east.1", "vehicle.east.2"]) == "vehicle.east."
-    assert _common_prefix(["vehicle.east.1", "vehicle.west.1"]) == "vehicle."
-    assert _common_prefix(["car", "uav"]) == ""
-    assert _common_prefix(["world.car"]) == ""
+    assert common_prefix(["vehicle.east.1", "vehicle.east.2"]) == "vehicle.east."
+    assert common_prefix(["vehicle.east.1", "vehicle.west.1"]) == "vehicle."
+    assert common_prefix(["car", "uav"]) == ""
+    assert common_prefix(["world.car"]) == ""
 
 
 def test_the_range_image_has_ahead_in_the_middle_and_left_on_the_left():

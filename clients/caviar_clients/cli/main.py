@@ -122,6 +122,27 @@ def plot(
         typer.echo(picture)
 
 
+@app.command()
+def video(
+    run: RunDirectory,
+    out: Annotated[
+        Path | None,
+        typer.Option(help=".mp4 (needs ffmpeg) or .gif; by default into the run, .mp4 if there is ffmpeg"),
+    ] = None,
+    fps: Annotated[float | None, typer.Option(help="frames shown a second; by default real time")] = None,
+    frames: Annotated[str | None, typer.Option(help="A:B, frames A to B - 1 of the first episode")] = None,
+    camera: Annotated[str | None, typer.Option(help="camera whose pictures are shown")] = None,
+    width: Annotated[int | None, typer.Option(help="pixels, even; by default 1280, of a GIF 960")] = None,
+    user: Annotated[str | None, typer.Option(help="receiver whose |y| and beam are shown")] = None,
+) -> None:
+    """Make a video of a run: the map with rays and beam, |y| over time, and what a camera saw."""
+    from caviar_clients.cli.video import film_run
+
+    film = film_run(run, out, fps, frames, camera, width, user, _errors)
+    pace = f"{film.fps:g} frames/s, {film.speed:.3g} times real time"
+    typer.echo(f"{film.file}: {film.frames} frames of {film.size[0]}×{film.size[1]}, {pace}")
+
+
 def main() -> None:
     """Entry point: errors meant for the user become one line and status 1."""
     try:

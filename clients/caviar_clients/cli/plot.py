@@ -67,7 +67,7 @@ def plot_run(
         _map(recording, _frame(recording, frame, "channel", chosen), chosen, files[-1])
     if chosen is not None:
         files += [folder / "beams-over-time.png", folder / "beams-over-angle.png"]
-        data, agent = series(recording, chosen), _agent(recording)
+        data, agent = series(recording, chosen), agent_names(recording)
         draw_over_time(data, agent, files[-2])
         draw_over_angle(data, agent, files[-1])
     if "lidar" in topics:
@@ -77,7 +77,7 @@ def plot_run(
     if seen:
         shown = _frame(recording, frame, seen[0], chosen)
         view = camera_view(shown, camera)
-        files += draw_view(view, f"Camera {view.sensor}: {_moment(shown)}", folder)
+        files += draw_view(view, f"Camera {view.sensor}: {moment(shown)}", folder)
     elif camera is not None:
         raise RecordingError(f"{run} holds no images of a camera; leave out --camera")
     if not files:
@@ -96,19 +96,31 @@ def beam_gain(array: AntennaArray, beam: int, directions: Float64Array) -> Float
     return gain
 
 
-def _map(recording: Recording, frame: RecordedFrame, user: tuple[str, str, str] | None, file: Path) -> None:
+def map_data(
+    recording: Recording,
+    frame: RecordedFrame,
+    user: tuple[str, str, str] | None,
+    footprints: Footprints | None,
+) -> MapData | None:
+    """What a map shows of a frame; None where the frame has no scene."""
     scene = frame.scene()
     if scene is None:
-        raise RecordingError(f"frame {frame.number} has no scene; choose another with --frame")
-    data = MapData(
+        return None
+    return MapData(
         scene=scene,
         channel=next(iter(frame.of("channel", Channel).values()), None),
         link=next(iter(frame.of("link", Link).values()), None),
-        footprints=_scenery(recording),
+        footprints=footprints,
         beam_gain=beam_gain,
         user=user,
-        title=f"{recording.metadata.name}: {_moment(frame)}",
+        title=f"{recording.metadata.name}: {moment(frame)}",
     )
+
+
+def _map(recording: Recording, frame: RecordedFrame, user: tuple[str, str, str] | None, file: Path) -> None:
+    data = map_data(recording, frame, user, scenery(recording))
+    if data is None:
+        raise RecordingError(f"frame {frame.number} has no scene; choose another with --frame")
     draw_map(data, file)
 
 
@@ -118,7 +130,7 @@ def _scan(frame: RecordedFrame, file: Path) -> None:
     if lidar is None:
         raise RecordingError(f"frame {frame.number} has no LIDAR scan; choose another with --frame")
     scan = lidar.scans[0]
-    draw_scan(scan, lidar, frame.scene(), f"LIDAR {scan.sensor}: {_moment(frame)}", file)
+    draw_scan(scan, lidar, frame.scene(), f"LIDAR {scan.sensor}: {moment(frame)}", file)
 
 
 def camera_view(frame: RecordedFrame, camera: str | None) -> CameraView:
@@ -158,7 +170,8 @@ def camera_view(frame: RecordedFrame, camera: str | None) -> CameraView:
     )
 
 
-def _scenery(recording: Recording) -> Footprints | None:
+def scenery(recording: Recording) -> Footprints | None:
+    """Footprints of the recorded scenery; None where there is none."""
     description = find_scenery(recording.assets)
     if description is None:
         return None
@@ -194,7 +207,7 @@ def _worth(frame: RecordedFrame, user: tuple[str, str, str] | None) -> int:
     return 0
 
 
-def _agent(recording: Recording) -> str:
+def agent_names(recording: Recording) -> str:
     """What served the users, for the legend: the implementation where there was one agent."""
     services = recording.metadata.scenario.get("services")
     specs = services.values() if isinstance(services, dict) else ()
@@ -202,6 +215,7 @@ def _agent(recording: Recording) -> str:
     return ", ".join(used) or "none"
 
 
-def _moment(frame: RecordedFrame) -> str:
+def moment(frame: RecordedFrame) -> str:
+    """Episode, but for the first, frame and simulated time."""
     episode = f"episode {frame.episode}, " if frame.episode else ""
     return f"{episode}frame {frame.number}, t = {frame.t_ns * 1e-9:.2f} s"

@@ -99,7 +99,7 @@ def draw_over_time(data: UserSeries, agent: str, file: Path) -> None:
     """Fig. 8: |y| over time above, the angle of arrival below; NLOS shaded."""
     with figure(file, 9.0, 6.0) as drawn:
         top, bottom = drawn.subplots(2, 1, sharex=True, height_ratios=(3, 2))
-        for label, values, style in _curves(data, agent):
+        for label, values, style in curves(data, agent):
             top.plot(
                 data.time,
                 np.where(data.has_path, values, np.nan),
@@ -107,7 +107,7 @@ def draw_over_time(data: UserSeries, agent: str, file: Path) -> None:
                 **style,
             )
         for axes in (top, bottom):
-            _shade(axes, data)
+            shade(axes, data)
             axes.grid(color=LIGHT_GREY, linewidth=0.6)
         top.set_ylabel("|y|")
         top.set_ylim(bottom=0)
@@ -124,7 +124,7 @@ def draw_over_angle(data: UserSeries, agent: str, file: Path) -> None:
     with figure(file, 9.0, 5.0) as drawn:
         axes = drawn.subplots()
         theta = np.degrees(_wrapped(data.theta))
-        for label, values, style in _curves(data, agent):
+        for label, values, style in curves(data, agent):
             color = style["color"]
             for mask, face in ((data.has_path & data.los, color), (data.has_path & ~data.los, "none")):
                 axes.scatter(
@@ -146,7 +146,7 @@ _MARKERS = {OPTIMUM: "o", AGENT: "s", BASELINE: "^"}
 _SIZES = {OPTIMUM: 54, AGENT: 24, BASELINE: 7}
 
 
-def _curves(data: UserSeries, agent: str) -> list[tuple[str, Float64Array, dict[str, Any]]]:
+def curves(data: UserSeries, agent: str) -> list[tuple[str, Float64Array, dict[str, Any]]]:
     """Label, values and style; drawn so that curves which coincide can still be seen."""
     return [
         ("optimum", data.best, {"color": OPTIMUM, "linewidth": 2.8}),
@@ -155,7 +155,7 @@ def _curves(data: UserSeries, agent: str) -> list[tuple[str, Float64Array, dict[
     ]
 
 
-def _shade(axes: Any, data: UserSeries) -> None:
+def shade(axes: Any, data: UserSeries) -> None:
     """Background of frames without line of sight, and of those without any path."""
     half = np.median(np.diff(data.time)) / 2 if len(data.time) > 1 else 0.5
     for mask, color, label in (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,9 @@ from caviar_protocol.coordinates import rotation_matrix
 from caviar_protocol.scene import antennas, device_pose
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Channel, Link, Scene
 from caviar_protocol.topics.channel import Interaction
+
+View = tuple[tuple[float, float], tuple[float, float]]
+"""Limits of x and of y [m]."""
 
 BeamGain = Callable[[AntennaArray, int, Float64Array], Float64Array]
 """``gain(array, beam, directions)``: amplitude of a codebook beam towards unit vectors in device
@@ -67,7 +70,7 @@ def draw_map(data: MapData, file: Path) -> None:
         legend_below(drawn, axes)
 
 
-def view_of(data: MapData, beam: Beam | None) -> tuple[tuple[float, float], tuple[float, float]]:
+def view_of(data: MapData, beam: Beam | None) -> View:
     """Limits of x and y [m]: objects, devices and the beam, ray points unless far off; at least 40 m."""
     devices = [device_pose(data.scene, device).position[:2] for device in data.scene.devices]
     core = np.concatenate([data.scene.position[:, :2], np.array(devices).reshape(-1, 2)])
@@ -178,7 +181,18 @@ def _chosen(data: MapData) -> tuple[AntennaDevice, int, str] | None:
     return None if device is None or beam < 0 else (device, beam, data.user[1])
 
 
-def draw_objects(axes: Any, data: MapData) -> None:
+@dataclass
+class Labels:
+    """How names stand in a map; kept from frame to frame, names stay on the side where they were."""
+
+    width: float = 570.0
+    """Of the axes, about [points]."""
+    prefix: str | None = None
+    """What names leave out at their beginning; by default what all of the scene have in common."""
+    sides: dict[str, int] = field(default_factory=dict)
+
+
+def draw_objects(axes: Any, data: MapData, labels: Labels | None = None) -> None:
     """Bounding boxes from above, a mark at the front, names where there is room."""
     from matplotlib.collections import PolyCollection
 
@@ -205,49 +219,57 @@ def draw_objects(axes: Any, data: MapData) -> None:
     for color, label in ((ORANGE, "object with a device"), (SKY, "other object")):
         if color in colors:
             axes.scatter([], [], marker="s", s=60, color=color, edgecolors=BLACK, linewidths=0.7, label=label)
-    _name_objects(axes, scene, np.array(boxes), carriers)
+    _name_objects(axes, scene, np.array(boxes), carriers, labels or Labels())
 
 
-def _name_objects(axes: Any, scene: Scene, boxes: Float64Array, carriers: set[str]) -> None:
+def _name_objects(axes: Any, scene: Scene, boxes: Float64Array, carriers: set[str], labels: Labels) -> None:
     """Names without what all have in common, where there is room; those with a device come first."""
     from matplotlib.patheffects import withStroke
 
     halo = [withStroke(linewidth=2.0, foreground="white")]
-    common = _common_prefix(scene.names)
-    # A character of 8 points is about 5 points wide; the axes are about 570 points wide.
-    (left, right), points = axes.get_xlim(), 570.0
-    unit = (right - left) / points
-    taken = [(*box.min(axis=0), *box.max(axis=0)) for box in boxes]
+    prefix = common_prefix(scene.names) if labels.prefix is None else labels.prefix
+    (left, right) = axes.get_xlim()
+    unit = (right - left) / labels.width
+    # As large as the mark that stands for a tiny object; a character of 8 points is about 5 points wide.
+    centre, least = scene.position[:, :2], 4.0 * unit
+    low = np.minimum(boxes.min(axis=1), centre - least)
+    high = np.maximum(boxes.max(axis=1), centre + least)
+    taken: list[Rectangle] = [(*a, *b) for a, b in zip(low.tolist(), high.tolist(), strict=True)]
+    for device in antennas(scene, "tx"):
+        if not device.parent:
+            x, y, _ = device_pose(scene, device).position
+            wide = 3.5 * len(device.name) * unit
+            taken.append((x - max(wide, 6 * unit), y - 6 * unit, x + max(wide, 6 * unit), y + 22 * unit))
     for i in sorted(range(len(boxes)), key=lambda i: (scene.names[i] not in carriers, scene.names[i])):
-        text = scene.names[i].removeprefix(common)
-        place = _free_place(boxes[i], 5.0 * len(text) * unit, 9.0 * unit, 2.0 * unit, taken)
-        if place is not None:
-            taken.append(place)
-            axes.text(*place[:2], text, fontsize=8, path_effects=halo, zorder=6, clip_on=True)
+        name = scene.names[i]
+        text = name.removeprefix(prefix)
+        places = _places(taken[i], 5.0 * len(text) * unit, 9.0 * unit, 2.0 * unit)
+        before = labels.sides.get(name, 0)
+        for side in sorted(range(len(places)), key=lambda side: (side != before, side)):
+            if not any(_overlap(places[side], other) for other in taken):
+                taken.append(places[side])
+                labels.sides[name] = side
+                axes.text(*places[side][:2], text, fontsize=8, path_effects=halo, zorder=6, clip_on=True)
+                break
 
 
 Rectangle = tuple[float, float, float, float]
 """Left, bottom, right, top [m]."""
 
 
-def _free_place(
-    box: Float64Array, width: float, height: float, gap: float, taken: Sequence[Rectangle]
-) -> Rectangle | None:
-    """Above, below, right or left of a box, where nothing is taken."""
-    (x0, y0), (x1, y1) = box.min(axis=0).tolist(), box.max(axis=0).tolist()
-    for x, y in (
+def _places(box: Rectangle, width: float, height: float, gap: float) -> list[Rectangle]:
+    """Above, below, right and left of a box."""
+    x0, y0, x1, y1 = box
+    corners = (
         ((x0 + x1 - width) / 2, y1 + gap),
         ((x0 + x1 - width) / 2, y0 - gap - height),
         (x1 + gap, (y0 + y1 - height) / 2),
         (x0 - gap - width, (y0 + y1 - height) / 2),
-    ):
-        place = (x, y, x + width, y + height)
-        if not any(_overlap(place, other) for other in taken):
-            return place
-    return None
+    )
+    return [(x, y, x + width, y + height) for x, y in corners]
 
 
-def _common_prefix(names: Sequence[str]) -> str:
+def common_prefix(names: Sequence[str]) -> str:
     """The dotted parts that all names begin with; empty for a single name."""
     parts = [name.split(".")[:-1] for name in names] if len(names) > 1 else []
     same = itertools.takewhile(lambda level: len(set(level)) == 1, zip(*parts, strict=False))

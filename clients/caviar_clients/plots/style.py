@@ -36,20 +36,28 @@ _SETTINGS: dict[str, Any] = {
 
 
 @contextmanager
+def styled() -> Iterator[None]:
+    """The settings of all pictures. Raises `SetupError` where Matplotlib is missing."""
+    try:
+        from matplotlib import rc_context
+    except ModuleNotFoundError as error:
+        raise SetupError(
+            f"pictures need {error.name!r}, which is not installed; run: pip install 'caviar-sim[plot]'"
+        ) from error
+    with rc_context(_SETTINGS):
+        yield
+
+
+@contextmanager
 def figure(file: Path, width: float, height: float, layout: Layout = "constrained") -> Iterator[Any]:
     """A figure [inches] that is saved as PNG, cut to what is drawn, when the block ends.
 
     Raises `SetupError` with the command to install Matplotlib where it is missing, `RunError`
     where the file cannot be written.
     """
-    try:
-        from matplotlib import rc_context
+    with styled():
         from matplotlib.figure import Figure
-    except ModuleNotFoundError as error:
-        raise SetupError(
-            f"pictures need {error.name!r}, which is not installed; run: pip install 'caviar-sim[plot]'"
-        ) from error
-    with rc_context(_SETTINGS):
+
         drawn = Figure(figsize=(width, height), layout=layout)
         yield drawn
         try:

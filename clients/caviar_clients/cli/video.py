@@ -1,0 +1,265 @@
+"""``caviar video``: a recording as a film."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from caviar_clients.cli.plot import agent_names, map_data, scenery
+from caviar_clients.plots.fig8 import UserSeries, choose_user, series
+from caviar_clients.plots.film import GIF_FPS, WRITERS, find_ffmpeg
+from caviar_clients.plots.map import View, chosen_beam, common_prefix, view_of
+from caviar_clients.plots.moving import MovingMap, Plan
+from caviar_clients.plots.rays import rays, scale
+from caviar_protocol.arrays import UInt8Array
+from caviar_protocol.errors import RecordingError, SetupError
+from caviar_protocol.recording import RecordedFrame, Recording
+from caviar_protocol.tables import suggestion
+from caviar_protocol.topics import Camera
+
+FASTEST = 30.0
+"""Frames a second at most where none are asked for; real time, where that is slower."""
+_WIDTHS = {".mp4": 1280, ".gif": 960}
+_SAMPLES = 6
+"""Pictures whose colours become a GIF's palette."""
+
+User = tuple[str, str, str]
+
+
+@dataclass(frozen=True)
+class Film:
+    """A video that was written."""
+
+    file: Path
+    frames: int
+    fps: float
+    speed: float
+    """Simulated time over playing time."""
+    size: tuple[int, int]
+    """Width and height [pixels]."""
+
+
+def film_run(
+    run: Path,
+    out: Path | None = None,
+    fps: float | None = None,
+    frames: str | None = None,
+    camera: str | None = None,
+    width: int | None = None,
+    user: str | None = None,
+    console: Console | None = None,
+) -> Film:
+    """Make a video of a recording: the map, |y| of one user, and what a camera saw.
+
+    Parameters
+    ----------
+    run
+        Run directory or segment.
+    out
+        File, whose suffix says the format: ``.mp4``, which needs ffmpeg, or ``.gif``. By default
+        ``video.mp4`` in the run directory where there is ffmpeg, ``video.gif`` where not.
+    fps
+        Frames shown a second; by default as fast as simulated time, but at most 30.
+    frames
+        ``A:B``, frames A to B − 1 of the first episode, either may be left out; by default all frames
+        of all episodes. Frames without a scene are left out.
+    camera
+        Camera whose pictures are shown; by default the first, of those that are fixed if there are any.
+    width
+        Pixels, even; by default 1280, and 960 of a GIF.
+    user
+        Receiver, or its object, for |y| and the beam; by default the one that was there longest.
+    console
+        Where progress is shown; by default nowhere.
+
+    Raises
+    ------
+    RecordingError
+        It is not a recording, or frames, camera or user are not in it.
+    SetupError
+        Matplotlib or ffmpeg is missing, or format, speed and width do not go together.
+    RunError
+        The file cannot be written; there is none then, not even half of one.
+    """
+    recording = Recording(run)
+    file = out or recording.directory / ("video.mp4" if find_ffmpeg() else "video.gif")
+    suffix = file.suffix.lower()
+    rate, pixels = _format(file, suffix, fps, width, recording.metadata.sampling_period_ns)
+    chosen = choose_user(recording, user or "") if "link" in recording.topics else None
+    survey = _survey(recording, _indices(recording, frames), chosen, camera)
+    moving = MovingMap(survey.plan, pixels)
+    count = len(survey.indices)
+    spread = sorted({round(i) for i in np.linspace(0, count - 1, min(_SAMPLES, count))})
+    samples = list(_pictures(recording, survey, moving, chosen, spread)) if suffix == ".gif" else []
+    samples = samples or list(_pictures(recording, survey, moving, chosen, spread[:1]))
+    with _progress(console) as bar:
+        task = bar.add_task("drawing", total=count)
+        drawn = _pictures(recording, survey, moving, chosen, range(count))
+        WRITERS[suffix](_counted(drawn, bar, task), samples, count, rate, file)
+    speed = rate * recording.metadata.sampling_period_ns * 1e-9
+    return Film(file, count, rate, speed, moving.size)
+
+
+def _format(
+    file: Path, suffix: str, fps: float | None, width: int | None, period_ns: int
+) -> tuple[float, int]:
+    """Frames a second and width [pixels]."""
+    if suffix not in WRITERS:
+        raise SetupError(
+            f"{file} ends in {suffix or 'nothing'!r}, which is no format of a video; write .mp4 or .gif"
+        )
+    if suffix == ".mp4" and find_ffmpeg() is None:
+        raise SetupError(
+            f"{file} needs ffmpeg, which is not installed; run: apt-get install ffmpeg (or: pip install "
+            f"imageio-ffmpeg), or write {file.with_suffix('.gif').name} instead"
+        )
+    rate = min(1e9 / period_ns, FASTEST) if fps is None else fps
+    if not 0 < rate <= (GIF_FPS if suffix == ".gif" else 240):
+        raise SetupError(f"--fps is {rate:g}; write more than 0 and at most 50 for a GIF, 240 for an MP4")
+    pixels = _WIDTHS[suffix] if width is None else width
+    if not 320 <= pixels <= 3840 or pixels % 2:
+        raise SetupError(f"--width is {pixels}; write an even number from 320 to 3840")
+    return rate, pixels
+
+
+def _indices(recording: Recording, frames: str | None) -> list[int]:
+    """Places in the recording of the frames asked for."""
+    if frames is None:
+        return list(range(len(recording)))
+    numbers = [entry.frame for i in range(len(recording)) if (entry := recording.entry(i)).episode == 0]
+    has = (
+        f"{recording.path} has frames {min(numbers)} to {max(numbers)} of its first episode"
+        if numbers
+        else (f"{recording.path} has no frame of a first episode; leave out --frames")
+    )
+    match = re.fullmatch(r"(\d*):(\d*)", frames)
+    if match is None:
+        raise RecordingError(f"--frames is {frames!r}; write A:B for frames A to B - 1; {has}")
+    first, stop = int(match[1] or 0), int(match[2]) if match[2] else max(numbers, default=0) + 1
+    found = [i for i, number in enumerate(numbers) if first <= number < stop]
+    if not found:
+        raise RecordingError(f"--frames is {frames!r}, in which there is no frame; {has}")
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Survey:
+    """What a first look at the frames found."""
+
+    indices: list[int]
+    plan: Plan
+
+
+def _survey(recording: Recording, indices: Sequence[int], user: User | None, camera: str | None) -> _Survey:
+    ground, kept = scenery(recording), []
+    views: list[View] = []
+    gains: list[tuple[float, float]] = []
+    aspects: dict[str, float] = {}
+    kinds: set[bool] = set()
+    names: set[str] = set()
+    has_ticks = has_beam = False
+    for index in indices:
+        frame = RecordedFrame(recording, index)
+        for sensor, picture in _seen(frame).items():
+            aspects.setdefault(sensor, picture.shape[0] / picture.shape[1])
+        data = map_data(recording, frame, user, None)
+        if data is None:
+            continue
+        kept.append(index)
+        beam, found = chosen_beam(data), rays(data.scene, data.channel)
+        views.append(view_of(data, beam))
+        if len(found.all_gains):
+            gains.append(scale(found.all_gains))
+        has_ticks |= bool(len(found.tick_gains))
+        has_beam |= beam is not None
+        carriers = {device.parent for device in data.scene.devices}
+        kinds |= {name in carriers for name in data.scene.names}
+        names |= set(data.scene.names)
+    if not kept:
+        raise RecordingError(f"{recording.path} holds no scene in these frames, so there is no map to draw")
+    sensor = _camera(recording, aspects, camera)
+    plan = Plan(
+        name=recording.metadata.name,
+        view=_union(views),
+        gains_db=scale(np.array(gains).ravel()) if gains else None,
+        has_ticks=has_ticks,
+        has_beam=has_beam,
+        kinds=frozenset(kinds),
+        prefix=common_prefix(sorted(names)),
+        footprints=ground,
+        series=None if user is None else _cut(series(recording, user), kept),
+        agent=agent_names(recording),
+        camera=sensor,
+        aspect=aspects.get(sensor or "", 0.75),
+    )
+    return _Survey(kept, plan)
+
+
+def _camera(recording: Recording, known: dict[str, float], camera: str | None) -> str | None:
+    if camera is None:
+        return min(known, key=lambda name: ("/" in name, name), default=None)
+    if camera in known:
+        return camera
+    if not known:
+        raise RecordingError(
+            f"{recording.path} holds no pictures of camera {camera!r}, nor of any other; leave out --camera"
+        )
+    hint = suggestion(camera, known)
+    listed = "" if hint.startswith("known") else f" known: {', '.join(sorted(known))}"
+    raise RecordingError(f"{recording.path} holds no pictures of camera {camera!r}; {hint}{listed}")
+
+
+def _seen(frame: RecordedFrame) -> dict[str, UInt8Array]:
+    """Pictures by camera."""
+    payloads = frame.of("camera", Camera).values()
+    return {image.sensor: image.rgb for payload in payloads for image in payload.images}
+
+
+def _union(views: Sequence[View]) -> View:
+    limits = np.array(views)
+    low, high = limits[..., 0].min(axis=0).tolist(), limits[..., 1].max(axis=0).tolist()
+    return (low[0], high[0]), (low[1], high[1])
+
+
+def _cut(data: UserSeries, indices: list[int]) -> UserSeries:
+    arrays = {
+        name: getattr(data, name)[indices]
+        for name in ("time", "present", "has_path", "los", "abs_y", "best", "baseline", "theta")
+    }
+    return UserSeries(data.tx, data.rx, data.carrier, **arrays)
+
+
+def _pictures(
+    recording: Recording, survey: _Survey, moving: MovingMap, user: User | None, steps: Sequence[int]
+) -> Iterator[UInt8Array]:
+    """Of these steps of the survey; a camera that saw nothing in a frame keeps its last picture."""
+    last = None
+    for step in steps:
+        frame = RecordedFrame(recording, survey.indices[step])
+        data = map_data(recording, frame, user, None)
+        if survey.plan.camera is not None:
+            last = _seen(frame).get(survey.plan.camera, last)
+        if data is not None:
+            yield moving.draw(data, step, last)
+
+
+def _counted(pictures: Iterator[UInt8Array], bar: Progress, task: object) -> Iterator[UInt8Array]:
+    for picture in pictures:
+        yield picture
+        bar.advance(task)  # type: ignore[arg-type]
+
+
+def _progress(console: Console | None) -> Progress:
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=console or Console(quiet=True),
+    )

@@ -1,0 +1,149 @@
+"""Pictures one after another as a file: an animated GIF by Pillow, an MP4 by an ``ffmpeg`` of the machine."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from importlib import import_module
+from itertools import pairwise
+from pathlib import Path
+
+from caviar_protocol.arrays import UInt8Array
+from caviar_protocol.errors import RunError, SetupError
+
+Pictures = Iterable[UInt8Array]
+"""sRGB, Shape ``[height, width, 3]``, all of the same even size."""
+
+Writer = Callable[[Pictures, Sequence[UInt8Array], int, float, Path], None]
+"""``writer(pictures, samples, count, fps, file)``; ``samples`` are some of the ``count`` pictures."""
+
+GIF_FPS = 50
+"""Viewers slow down a GIF that is faster: its unit is 10 ms, and they take 1 for unset."""
+
+_ENCODERS = (
+    ("libx264", ("-crf", "20", "-preset", "medium", "-tune", "animation")),
+    ("libopenh264", ("-b:v", "6M")),
+    ("mpeg4", ("-q:v", "3")),
+)
+"""The best first, with what sets their quality; a build of ffmpeg has the third at least."""
+
+
+def find_ffmpeg() -> str | None:
+    """The machine's ``ffmpeg``, or else that of the package ``imageio-ffmpeg`` where it is installed."""
+    found = shutil.which("ffmpeg")
+    if found is None:
+        try:
+            found = str(import_module("imageio_ffmpeg").get_ffmpeg_exe())
+        except (ModuleNotFoundError, RuntimeError):
+            return None
+    return found
+
+
+def write_gif(pictures: Pictures, samples: Sequence[UInt8Array], count: int, fps: float, file: Path) -> None:
+    """An endless animated GIF with one palette for all pictures.
+
+    Raises `RunError` where the file cannot be written; then there is none.
+    """
+    from PIL import Image
+
+    sheet = Image.new("RGB", (samples[0].shape[1], sum(len(sample) for sample in samples)))
+    top = 0
+    for sample in samples:
+        sheet.paste(Image.fromarray(sample), (0, top))
+        top += len(sample)
+    palette = sheet.quantize(256, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    images = (
+        Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures
+    )
+    images = iter(images)
+    first = next(images)
+    with _part_of(file) as part:
+        first.save(
+            part, format="GIF", save_all=True, append_images=images, loop=0, duration=durations_ms(fps, count)
+        )
+
+
+def write_mp4(pictures: Pictures, samples: Sequence[UInt8Array], count: int, fps: float, file: Path) -> None:
+    """An MP4 that browsers and slides play: H.264 where ffmpeg has it, planes of 4:2:0.
+
+    Raises `SetupError` where there is no ffmpeg, `RunError` with its last line where it fails; then
+    there is no file.
+    """
+    ffmpeg = find_ffmpeg()
+    if ffmpeg is None:
+        raise SetupError(
+            f"{file} needs ffmpeg, which is not installed; run: apt-get install ffmpeg (or: pip install "
+            f"imageio-ffmpeg), or write {file.with_suffix('.gif').name} instead"
+        )
+    height, width, _ = samples[0].shape
+    with _part_of(file) as part, tempfile.TemporaryFile() as log:
+        command = [
+            ffmpeg, "-hide_banner", "-loglevel", "error", "-y",
+            "-f", "rawvideo", "-pixel_format", "rgb24", "-video_size", f"{width}x{height}",
+            "-framerate", f"{fps:g}", "-i", "-", *_encoder(ffmpeg), "-pix_fmt", "yuv420p",
+            "-movflags", "+faststart", "-f", "mp4", str(part.resolve()),
+        ]  # fmt: skip
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=log, stderr=log)  # noqa: S603  # as above
+        try:
+            _feed(process, pictures)
+        except BaseException:
+            process.kill()
+            process.wait()
+            raise
+        if process.wait():
+            log.seek(0)
+            said = log.read().decode(errors="replace").strip().rpartition("\n")[2]
+            raise RunError(f"ffmpeg could not write {file}: {said or f'status {process.returncode}'}")
+
+
+def _feed(process: subprocess.Popen[bytes], pictures: Pictures) -> None:
+    """Write all pictures; if ffmpeg ends early, its status says so afterwards."""
+    pipe = process.stdin
+    if pipe is None:
+        return
+    try:
+        for picture in pictures:
+            pipe.write(picture.tobytes())
+        pipe.close()
+    except BrokenPipeError:
+        process.wait()
+
+
+def _encoder(ffmpeg: str) -> list[str]:
+    """Options that choose the best encoder of a build."""
+    listed = subprocess.run(  # noqa: S603  # our own arguments
+        [ffmpeg, "-hide_banner", "-encoders"], capture_output=True, text=True, check=False
+    ).stdout
+    for name, options in _ENCODERS:
+        if f" {name} " in listed:
+            return ["-c:v", name, *options]
+    return []
+
+
+@contextmanager
+def _part_of(file: Path) -> Iterator[Path]:
+    """A place beside ``file`` to write to; it becomes ``file`` if the block ends well."""
+    part = file.with_name(f".{file.name}.part")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        yield part
+        part.replace(file)
+    except OSError as error:
+        raise RunError(
+            f"cannot write {file}: {error.strerror or error}; choose another with --out"
+        ) from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def durations_ms(fps: float, count: int) -> list[int]:
+    """How long each picture is shown, multiples of 10 that are right on average."""
+    ends = [round(100 * number / fps) for number in range(count + 1)]
+    return [10 * (end - start) for start, end in pairwise(ends)]
+
+
+WRITERS: dict[str, Writer] = {".mp4": write_mp4, ".gif": write_gif}
+"""By the suffix of the file."""

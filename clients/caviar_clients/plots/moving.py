@@ -1,0 +1,298 @@
+"""The pictures of a video: the map with what moves, |y| over time, and what a camera saw."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from caviar_clients.plots.camera import SKY_GREY
+from caviar_clients.plots.fig8 import UserSeries, curves, shade
+from caviar_clients.plots.footprints import Footprints
+from caviar_clients.plots.map import (
+    TICK_COLOR,
+    TICK_LABEL,
+    Labels,
+    MapData,
+    View,
+    chosen_beam,
+    draw_antennas,
+    draw_beam,
+    draw_objects,
+    draw_rays,
+    draw_scenery,
+)
+from caviar_clients.plots.rays import rays
+from caviar_clients.plots.style import BLACK, GREY, LIGHT_GREY, ORANGE, SKY, VERMILION, styled
+from caviar_protocol.arrays import UInt8Array
+
+_WIDTH = 11.0
+"""Of a picture [inches]; all sizes below are inches too, so that texts grow with the pixels."""
+_LEFT, _RIGHT = 0.75, 0.2
+_ABOVE, _BELOW = 0.75, 0.95
+"""Of the map: for two lines of text, and for the labels of its axis and the legend."""
+_BAR = 0.95
+"""For the colour bar and its labels."""
+_CURVES = 1.35
+_BETWEEN = 0.95
+"""Map and curves, or picture and curves."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Plan:
+    """What is the same in all pictures of a video."""
+
+    name: str
+    view: View
+    gains_db: tuple[float, float] | None
+    """Limits of the colours of paths; None where there are none."""
+    has_ticks: bool
+    """Paths of unknown route occur."""
+    has_beam: bool
+    kinds: frozenset[bool]
+    """Whether objects with a device (True) and others (False) occur."""
+    prefix: str
+    """What names of objects leave out."""
+    footprints: Footprints | None
+    series: UserSeries | None
+    """|y| in all frames of the video."""
+    agent: str
+    camera: str | None
+    aspect: float = 0.75
+    """Height over width of the camera's pictures."""
+
+
+class MovingMap:
+    """Draws one picture after another; what stands still is drawn once.
+
+    Parameters
+    ----------
+    plan
+        What all pictures share.
+    width
+        Pixels, even; the height follows from the content and is even too.
+    """
+
+    def __init__(self, plan: Plan, width: int) -> None:
+        with styled():
+            self._plan = plan
+            self._build(width)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height [pixels]."""
+        width, height = self._canvas.get_width_height()
+        return int(width), int(height)
+
+    def draw(self, data: MapData, step: int, picture: UInt8Array | None) -> UInt8Array:
+        """The picture of one frame, Shape ``[height, width, 3]``.
+
+        Parameters
+        ----------
+        data
+            Scene, channel and link of the frame.
+        step
+            Its place in the plan's series.
+        picture
+            What the camera saw; None where it has not seen anything yet.
+        """
+        with styled():
+            self._canvas.restore_region(self._still)
+            beam = chosen_beam(data)
+            self._over(self._map, lambda: self._draw_map(data))
+            self._write(self._when, data.title)
+            self._write(self._what, "" if beam is None else beam.label)
+            if self._camera is not None:
+                self._over(self._camera, lambda: self._show(picture))
+            if self._curves is not None:
+                self._over(self._curves, lambda: self._point(step))
+            drawn: UInt8Array = np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
+        return drawn
+
+    def _build(self, width: int) -> None:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        plan, places = self._plan, _places(self._plan)
+        dpi = width / _WIDTH
+        pixels = 2 * round(places.height * dpi / 2)
+        # A hundredth of a pixel more, since Matplotlib rounds the product down.
+        self._figure = Figure(figsize=((width + 0.01) / dpi, (pixels + 0.01) / dpi), dpi=dpi)
+        self._canvas = FigureCanvasAgg(self._figure)
+        self._camera = None if places.camera is None else self._axes(places, places.camera)
+        self._curves = None if places.curves is None else self._axes(places, places.curves)
+        self._map = self._axes(places, places.map)
+        self._labels = Labels(width=places.map[2] * 72, prefix=plan.prefix)
+        self._prepare_map(places)
+        if self._camera is not None:
+            self._camera.set_title(f"camera {plan.camera}", fontsize=10, loc="left")
+            self._camera.set(xticks=[], yticks=[], facecolor=SKY_GREY)
+        if self._curves is not None and plan.series is not None:
+            self._prepare_curves(self._curves, plan.series)
+        x, y = places.map[0] / _WIDTH, 1 - 0.12 / places.height
+        style: dict[str, Any] = {"va": "top", "animated": True}
+        self._when = self._figure.text(x, y, "", fontsize=12, fontweight="bold", **style)
+        self._what = self._figure.text(x, 1 - 0.42 / places.height, "", fontsize=10, color=VERMILION, **style)
+        self._canvas.draw()
+        self._still = self._canvas.copy_from_bbox(self._figure.bbox)
+
+    def _axes(self, places: _Places, place: Rectangle) -> Any:
+        left, bottom, width, height = place
+        scale = (_WIDTH, places.height, _WIDTH, places.height)
+        return self._figure.add_axes(
+            [a / b for a, b in zip((left, bottom, width, height), scale, strict=True)]
+        )
+
+    def _prepare_map(self, places: _Places) -> None:
+        from matplotlib.cm import ScalarMappable
+        from matplotlib.colors import Normalize
+
+        axes, plan = self._map, self._plan
+        (x0, x1), (y0, y1) = _filling(plan.view, places.map[3] / places.map[2])
+        axes.set(xlim=(x0, x1), ylim=(y0, y1), xlabel="x, east [m]", ylabel="y, north [m]")
+        axes.set_autoscale_on(False)
+        draw_scenery(axes, plan.footprints)
+        if plan.gains_db is not None:
+            left, bottom, width, height = places.map
+            bar = self._axes(places, (left + width + 0.1, bottom + 0.1 * height, 0.14, 0.8 * height))
+            colors = ScalarMappable(Normalize(*plan.gains_db), "viridis")
+            self._figure.colorbar(colors, cax=bar, label="Path gain [dB]")
+        handles = _legend(plan)
+        # Beside the axis label, so that a legend of one row fits below the map.
+        self._figure.legend(
+            handles=handles, loc="lower left", ncols=len(handles), frameon=False, fontsize=9,
+            bbox_to_anchor=((places.map[0] - 0.1) / _WIDTH, 0.02 / places.height), borderaxespad=0,
+            columnspacing=1.4, handletextpad=0.5,
+        )  # fmt: skip
+
+    def _prepare_curves(self, axes: Any, data: UserSeries) -> None:
+        for (_, values, style), label in zip(
+            curves(data, self._plan.agent), ("best", f"chosen ({self._plan.agent})", "baseline"), strict=True
+        ):
+            axes.plot(data.time, np.where(data.has_path, values, np.nan), label=label, **style)
+        shade(axes, data)
+        axes.set_ylim(bottom=0)
+        axes.margins(x=0)
+        axes.set_xlim(*axes.get_xlim())
+        axes.grid(color=LIGHT_GREY, linewidth=0.6)
+        axes.set_ylabel("|y|")
+        axes.set_xlabel("Time [s]")
+        axes.legend(
+            loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=5, frameon=False, fontsize=8.5, borderaxespad=0.2,
+            columnspacing=1.0, handletextpad=0.4, handlelength=1.6,
+        )  # fmt: skip
+
+    def _over(self, axes: Any, draw: Callable[[], None]) -> None:
+        """Draw over what stands still, and forget it."""
+        before = set(axes.get_children())
+        draw()
+        added = [artist for artist in axes.get_children() if artist not in before]
+        for artist in sorted(added, key=lambda artist: artist.get_zorder()):
+            axes.draw_artist(artist)
+        for artist in added:
+            artist.remove()
+
+    def _write(self, place: Any, text: str) -> None:
+        place.set_text(text)
+        self._figure.draw_artist(place)
+
+    def _draw_map(self, data: MapData) -> None:
+        if self._plan.gains_db is not None:
+            draw_rays(self._map, rays(data.scene, data.channel), self._plan.gains_db)
+        beam = chosen_beam(data)
+        if beam is not None:
+            draw_beam(self._map, beam)
+        draw_objects(self._map, data, self._labels)
+        draw_antennas(self._map, data)
+
+    def _show(self, picture: UInt8Array | None) -> None:
+        if picture is not None:
+            height, width, _ = picture.shape
+            self._camera.imshow(picture, extent=(0, width, height, 0), aspect="auto", zorder=1)
+        else:
+            self._camera.text(0.5, 0.5, "no picture yet", transform=self._camera.transAxes, ha="center")
+
+    def _point(self, step: int) -> None:
+        data = self._plan.series
+        if data is None or self._curves is None:
+            return
+        time = data.time[step]
+        self._curves.axvline(time, color=GREY, linewidth=1.2, zorder=3)
+        for _, values, style in curves(data, self._plan.agent):
+            if data.has_path[step]:
+                self._curves.scatter(
+                    time, values[step], s=34, color=style["color"], edgecolors="white", linewidths=0.8, zorder=4,
+                    clip_on=False,
+                )  # fmt: skip
+
+
+Rectangle = tuple[float, float, float, float]
+"""Left, bottom, width, height [inches]."""
+
+
+@dataclass(frozen=True)
+class _Places:
+    height: float
+    map: Rectangle
+    camera: Rectangle | None
+    curves: Rectangle | None
+
+
+def _places(plan: Plan) -> _Places:
+    """The camera stands right of the map and |y| below it; without a camera |y| is below the map."""
+    beside = _BAR if plan.gains_db is not None else 0.0
+    (x0, x1), (y0, y1) = plan.view
+    shape = (y1 - y0) / (x1 - x0)
+    if plan.camera is None:
+        width = _WIDTH - _LEFT - beside - _RIGHT
+        height = float(np.clip(shape * width, 3.4, 5.2))
+        below = 0.0 if plan.series is None else _CURVES + _BETWEEN
+        bottom = _BELOW + below
+        curves_at = None if plan.series is None else (_LEFT, _BELOW, width, _CURVES)
+        return _Places(bottom + height + _ABOVE, (_LEFT, bottom, width, height), None, curves_at)
+    width = 0.48 * _WIDTH
+    left = _LEFT + width + beside + 0.3
+    seen = _WIDTH - left - _RIGHT
+    tall = seen * plan.aspect
+    if plan.series is not None:
+        left_curves = left + 0.4
+        total = tall + _BETWEEN + _CURVES
+    else:
+        left_curves, total = left, tall
+    height = max(float(np.clip(shape * width, 3.4, 5.2)), total)
+    top = _BELOW + height
+    camera = (left, top - tall if plan.series is not None else _BELOW + (height - tall) / 2, seen, tall)
+    curves_at = None if plan.series is None else (left_curves, _BELOW, seen - 0.4, _CURVES)
+    return _Places(top + _ABOVE, (_LEFT, _BELOW, width, height), camera, curves_at)
+
+
+def _filling(view: View, shape: float) -> View:
+    """The view, made larger so that a panel of this height over width is full."""
+    (x0, x1), (y0, y1) = view
+    x, y = (x0 + x1) / 2, (y0 + y1) / 2
+    half = max((x1 - x0) / 2, (y1 - y0) / 2 / shape)
+    return (x - half, x + half), (y - half * shape, y + half * shape)
+
+
+def _legend(plan: Plan) -> list[Any]:
+    from matplotlib.lines import Line2D
+
+    def mark(marker: str, size: float, color: str, edge: str, label: str) -> Any:
+        return Line2D(
+            [], [], linestyle="none", marker=marker, markersize=size, color=color, markeredgecolor=edge,
+            markeredgewidth=0.7, label=label,
+        )  # fmt: skip
+
+    handles = []
+    if True in plan.kinds:
+        handles.append(mark("s", 8, ORANGE, BLACK, "object with a device"))
+    if False in plan.kinds:
+        handles.append(mark("s", 8, SKY, BLACK, "other object"))
+    handles += [mark("^", 10, BLACK, "white", "transmitter"), mark("o", 4.5, BLACK, "white", "receiver")]
+    if plan.has_beam:
+        handles.append(Line2D([], [], color=VERMILION, linewidth=1.3, label="chosen beam"))
+    if plan.has_ticks:
+        handles.append(Line2D([], [], color=TICK_COLOR, linewidth=2.0, label=TICK_LABEL))
+    return handles
