@@ -129,7 +129,9 @@ def video(
         Path | None,
         typer.Option(help=".mp4 (needs ffmpeg) or .gif; by default into the run, .mp4 if there is ffmpeg"),
     ] = None,
-    fps: Annotated[float | None, typer.Option(help="frames shown a second; by default real time")] = None,
+    fps: Annotated[
+        float | None, typer.Option(help="frames shown a second; by default real time, from 5 to 30")
+    ] = None,
     frames: Annotated[str | None, typer.Option(help="A:B, frames A to B - 1 of the first episode")] = None,
     camera: Annotated[str | None, typer.Option(help="camera whose pictures are shown")] = None,
     width: Annotated[int | None, typer.Option(help="pixels, even; by default 1280, of a GIF 960")] = None,

@@ -9,22 +9,21 @@ from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from caviar_clients.cli.plot import agent_names, map_data, scenery
 from caviar_clients.plots.fig8 import UserSeries, choose_user, series
-from caviar_clients.plots.film import GIF_FPS, WRITERS, find_ffmpeg
+from caviar_clients.plots.film import GIF_FPS, WRITERS, find_ffmpeg, needed_ffmpeg
 from caviar_clients.plots.map import View, chosen_beam, common_prefix, view_of
 from caviar_clients.plots.moving import MovingMap, Plan
 from caviar_clients.plots.rays import rays, scale
 from caviar_protocol.arrays import UInt8Array
 from caviar_protocol.errors import RecordingError, SetupError
 from caviar_protocol.recording import RecordedFrame, Recording
-from caviar_protocol.tables import suggestion
 from caviar_protocol.topics import Camera
 
-FASTEST = 30.0
-"""Frames a second at most where none are asked for; real time, where that is slower."""
+SLOWEST, FASTEST = 5.0, 30.0
+"""Frames a second where none are asked for: simulated time, within these."""
 _WIDTHS = {".mp4": 1280, ".gif": 960}
 _SAMPLES = 6
 """Pictures whose colours become a GIF's palette."""
@@ -65,7 +64,7 @@ def film_run(
         File, whose suffix says the format: ``.mp4``, which needs ffmpeg, or ``.gif``. By default
         ``video.mp4`` in the run directory where there is ffmpeg, ``video.gif`` where not.
     fps
-        Frames shown a second; by default as fast as simulated time, but at most 30.
+        Frames shown a second; by default as fast as simulated time, but from 5 to 30.
     frames
         ``A:B``, frames A to B − 1 of the first episode, either may be left out; by default all frames
         of all episodes. Frames without a scene are left out.
@@ -114,12 +113,9 @@ def _format(
         raise SetupError(
             f"{file} ends in {suffix or 'nothing'!r}, which is no format of a video; write .mp4 or .gif"
         )
-    if suffix == ".mp4" and find_ffmpeg() is None:
-        raise SetupError(
-            f"{file} needs ffmpeg, which is not installed; run: apt-get install ffmpeg (or: pip install "
-            f"imageio-ffmpeg), or write {file.with_suffix('.gif').name} instead"
-        )
-    rate = min(1e9 / period_ns, FASTEST) if fps is None else fps
+    if suffix == ".mp4":
+        needed_ffmpeg(file)
+    rate = min(max(1e9 / period_ns, SLOWEST), FASTEST) if fps is None else fps
     if not 0 < rate <= (GIF_FPS if suffix == ".gif" else 240):
         raise SetupError(f"--fps is {rate:g}; write more than 0 and at most 50 for a GIF, 240 for an MP4")
     pixels = _WIDTHS[suffix] if width is None else width
@@ -183,20 +179,20 @@ def _survey(recording: Recording, indices: Sequence[int], user: User | None, cam
         names |= set(data.scene.names)
     if not kept:
         raise RecordingError(f"{recording.path} holds no scene in these frames, so there is no map to draw")
-    sensor = _camera(recording, aspects, camera)
+    shown = _camera(recording, aspects, camera)
     plan = Plan(
-        name=recording.metadata.name,
         view=_union(views),
         gains_db=scale(np.array(gains).ravel()) if gains else None,
         has_ticks=has_ticks,
         has_beam=has_beam,
         kinds=frozenset(kinds),
         prefix=common_prefix(sorted(names)),
+        user="" if user is None else user[1].split("/")[0],
         footprints=ground,
         series=None if user is None else _cut(series(recording, user), kept),
         agent=agent_names(recording),
-        camera=sensor,
-        aspect=aspects.get(sensor or "", 0.75),
+        camera=shown,
+        aspect=aspects.get(shown or "", 0.75),
     )
     return _Survey(kept, plan)
 
@@ -206,13 +202,12 @@ def _camera(recording: Recording, known: dict[str, float], camera: str | None) -
         return min(known, key=lambda name: ("/" in name, name), default=None)
     if camera in known:
         return camera
+    without = f"these frames of {recording.path} hold no pictures of camera {camera!r}"
     if not known:
-        raise RecordingError(
-            f"{recording.path} holds no pictures of camera {camera!r}, nor of any other; leave out --camera"
-        )
-    hint = suggestion(camera, known)
-    listed = "" if hint.startswith("known") else f" known: {', '.join(sorted(known))}"
-    raise RecordingError(f"{recording.path} holds no pictures of camera {camera!r}; {hint}{listed}")
+        raise RecordingError(f"{without}, nor of any other; leave out --camera")
+    near = difflib.get_close_matches(camera, known, n=1)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    raise RecordingError(f"{without}; {hint}known: {', '.join(sorted(known))}")
 
 
 def _seen(frame: RecordedFrame) -> dict[str, UInt8Array]:
@@ -249,10 +244,10 @@ def _pictures(
             yield moving.draw(data, step, last)
 
 
-def _counted(pictures: Iterator[UInt8Array], bar: Progress, task: object) -> Iterator[UInt8Array]:
+def _counted(pictures: Iterator[UInt8Array], bar: Progress, task: TaskID) -> Iterator[UInt8Array]:
     for picture in pictures:
         yield picture
-        bar.advance(task)  # type: ignore[arg-type]
+        bar.advance(task)
 
 
 def _progress(console: Console | None) -> Progress:

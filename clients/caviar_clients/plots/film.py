@@ -42,6 +42,17 @@ def find_ffmpeg() -> str | None:
     return found
 
 
+def needed_ffmpeg(file: Path) -> str:
+    """Like `find_ffmpeg`; raises `SetupError` with the command to install it, where there is none."""
+    found = find_ffmpeg()
+    if found is None:
+        raise SetupError(
+            f"{file} needs ffmpeg, which is not installed; run: apt-get install ffmpeg (or: pip install "
+            f"imageio-ffmpeg), or write {file.with_suffix('.gif').name} instead"
+        )
+    return found
+
+
 def write_gif(pictures: Pictures, samples: Sequence[UInt8Array], count: int, fps: float, file: Path) -> None:
     """An endless animated GIF with one palette for all pictures.
 
@@ -72,12 +83,7 @@ def write_mp4(pictures: Pictures, samples: Sequence[UInt8Array], count: int, fps
     Raises `SetupError` where there is no ffmpeg, `RunError` with its last line where it fails; then
     there is no file.
     """
-    ffmpeg = find_ffmpeg()
-    if ffmpeg is None:
-        raise SetupError(
-            f"{file} needs ffmpeg, which is not installed; run: apt-get install ffmpeg (or: pip install "
-            f"imageio-ffmpeg), or write {file.with_suffix('.gif').name} instead"
-        )
+    ffmpeg = needed_ffmpeg(file)
     height, width, _ = samples[0].shape
     with _part_of(file) as part, tempfile.TemporaryFile() as log:
         command = [

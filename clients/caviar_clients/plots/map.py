@@ -189,6 +189,8 @@ class Labels:
     """Of the axes, about [points]."""
     prefix: str | None = None
     """What names leave out at their beginning; by default what all of the scene have in common."""
+    marked: str = ""
+    """Object whose name stands out."""
     sides: dict[str, int] = field(default_factory=dict)
 
 
@@ -206,7 +208,7 @@ def draw_objects(axes: Any, data: MapData, labels: Labels | None = None) -> None
         rotation = rotation_matrix(scene.orientation[i].tolist())[:2, :2]
         centre, size = scene.position[i, :2], scene.dimensions[i, :2]
         boxes.append(centre + (outline * size) @ rotation.T)
-        fronts.append(centre + (np.array([[0.5, 0.5], [0.5, -0.5], [0.28, 0.0]]) * size) @ rotation.T)
+        fronts.append(centre + (np.array([[0.25, 0.5], [0.25, -0.5], [0.5, 0.0]]) * size) @ rotation.T)
     colors = [ORANGE if name in carriers else SKY for name in scene.names]
     axes.add_collection(PolyCollection(boxes, facecolors=colors, edgecolors=BLACK, linewidths=0.7, zorder=4))
     axes.add_collection(PolyCollection(fronts, facecolors=BLACK, linewidths=0, zorder=4.1))
@@ -249,7 +251,10 @@ def _name_objects(axes: Any, scene: Scene, boxes: Float64Array, carriers: set[st
             if not any(_overlap(places[side], other) for other in taken):
                 taken.append(places[side])
                 labels.sides[name] = side
-                axes.text(*places[side][:2], text, fontsize=8, path_effects=halo, zorder=6, clip_on=True)
+                standing = {"color": VERMILION, "fontweight": "bold"} if name == labels.marked else {}
+                axes.text(
+                    *places[side][:2], text, fontsize=8, path_effects=halo, zorder=6, clip_on=True, **standing
+                )
                 break
 
 

@@ -31,8 +31,8 @@ from caviar_protocol.arrays import UInt8Array
 _WIDTH = 11.0
 """Of a picture [inches]; all sizes below are inches too, so that texts grow with the pixels."""
 _LEFT, _RIGHT = 0.75, 0.2
-_ABOVE, _BELOW = 0.75, 0.95
-"""Of the map: for two lines of text, and for the labels of its axis and the legend."""
+_ABOVE, _LINE, _BELOW = 0.45, 0.28, 0.95
+"""Of the map: for a line of text, one more for the beam, and for the labels of its axis and the legend."""
 _BAR = 0.95
 """For the colour bar and its labels."""
 _CURVES = 1.35
@@ -44,7 +44,6 @@ _BETWEEN = 0.95
 class Plan:
     """What is the same in all pictures of a video."""
 
-    name: str
     view: View
     gains_db: tuple[float, float] | None
     """Limits of the colours of paths; None where there are none."""
@@ -55,6 +54,8 @@ class Plan:
     """Whether objects with a device (True) and others (False) occur."""
     prefix: str
     """What names of objects leave out."""
+    user: str
+    """Object of the user whose beam is shown; empty where there is none."""
     footprints: Footprints | None
     series: UserSeries | None
     """|y| in all frames of the video."""
@@ -121,14 +122,15 @@ class MovingMap:
         # A hundredth of a pixel more, since Matplotlib rounds the product down.
         self._figure = Figure(figsize=((width + 0.01) / dpi, (pixels + 0.01) / dpi), dpi=dpi)
         self._canvas = FigureCanvasAgg(self._figure)
-        self._camera = None if places.camera is None else self._axes(places, places.camera)
+        self._camera: Any = None if places.camera is None else self._axes(places, places.camera)
         self._curves = None if places.curves is None else self._axes(places, places.curves)
         self._map = self._axes(places, places.map)
-        self._labels = Labels(width=places.map[2] * 72, prefix=plan.prefix)
+        self._labels = Labels(width=places.map[2] * 72, prefix=plan.prefix, marked=plan.user)
         self._prepare_map(places)
         if self._camera is not None:
             self._camera.set_title(f"camera {plan.camera}", fontsize=10, loc="left")
             self._camera.set(xticks=[], yticks=[], facecolor=SKY_GREY)
+            self._camera.spines[:].set_visible(False)
         if self._curves is not None and plan.series is not None:
             self._prepare_curves(self._curves, plan.series)
         x, y = places.map[0] / _WIDTH, 1 - 0.12 / places.height
@@ -141,9 +143,10 @@ class MovingMap:
     def _axes(self, places: _Places, place: Rectangle) -> Any:
         left, bottom, width, height = place
         scale = (_WIDTH, places.height, _WIDTH, places.height)
-        return self._figure.add_axes(
-            [a / b for a, b in zip((left, bottom, width, height), scale, strict=True)]
-        )
+        share: Any = [a / b for a, b in zip((left, bottom, width, height), scale, strict=True)]
+        axes = self._figure.add_axes(share)
+        axes.tick_params(labelsize=9.5)
+        return axes
 
     def _prepare_map(self, places: _Places) -> None:
         from matplotlib.cm import ScalarMappable
@@ -180,8 +183,8 @@ class MovingMap:
         axes.set_ylabel("|y|")
         axes.set_xlabel("Time [s]")
         axes.legend(
-            loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=5, frameon=False, fontsize=8.5, borderaxespad=0.2,
-            columnspacing=1.0, handletextpad=0.4, handlelength=1.6,
+            loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=5, frameon=False, fontsize=8.5,
+            borderaxespad=0.2, columnspacing=1.0, handletextpad=0.4, handlelength=1.6,
         )  # fmt: skip
 
     def _over(self, axes: Any, draw: Callable[[], None]) -> None:
@@ -220,12 +223,11 @@ class MovingMap:
             return
         time = data.time[step]
         self._curves.axvline(time, color=GREY, linewidth=1.2, zorder=3)
-        for _, values, style in curves(data, self._plan.agent):
+        for (_, values, style), size in zip(curves(data, self._plan.agent), (80, 34, 9), strict=True):
             if data.has_path[step]:
                 self._curves.scatter(
-                    time, values[step], s=34, color=style["color"], edgecolors="white", linewidths=0.8, zorder=4,
-                    clip_on=False,
-                )  # fmt: skip
+                    time, values[step], s=size, color=style["color"], linewidths=0, zorder=4, clip_on=False
+                )
 
 
 Rectangle = tuple[float, float, float, float]
@@ -245,15 +247,16 @@ def _places(plan: Plan) -> _Places:
     beside = _BAR if plan.gains_db is not None else 0.0
     (x0, x1), (y0, y1) = plan.view
     shape = (y1 - y0) / (x1 - x0)
+    above = _ABOVE + _LINE * plan.has_beam
     if plan.camera is None:
         width = _WIDTH - _LEFT - beside - _RIGHT
         height = float(np.clip(shape * width, 3.4, 5.2))
         below = 0.0 if plan.series is None else _CURVES + _BETWEEN
         bottom = _BELOW + below
         curves_at = None if plan.series is None else (_LEFT, _BELOW, width, _CURVES)
-        return _Places(bottom + height + _ABOVE, (_LEFT, bottom, width, height), None, curves_at)
-    width = 0.48 * _WIDTH
-    left = _LEFT + width + beside + 0.3
+        return _Places(bottom + height + above, (_LEFT, bottom, width, height), None, curves_at)
+    width = 0.47 * _WIDTH
+    left = _LEFT + width + beside + 0.15
     seen = _WIDTH - left - _RIGHT
     tall = seen * plan.aspect
     if plan.series is not None:
@@ -265,7 +268,7 @@ def _places(plan: Plan) -> _Places:
     top = _BELOW + height
     camera = (left, top - tall if plan.series is not None else _BELOW + (height - tall) / 2, seen, tall)
     curves_at = None if plan.series is None else (left_curves, _BELOW, seen - 0.4, _CURVES)
-    return _Places(top + _ABOVE, (_LEFT, _BELOW, width, height), camera, curves_at)
+    return _Places(top + above, (_LEFT, _BELOW, width, height), camera, curves_at)
 
 
 def _filling(view: View, shape: float) -> View:
