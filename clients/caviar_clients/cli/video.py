@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -13,9 +14,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 
 from caviar_clients.cli.plot import agent_names, map_data, scenery
 from caviar_clients.plots.fig8 import UserSeries, choose_user, series
-from caviar_clients.plots.film import GIF_FPS, WRITERS, find_ffmpeg, needed_ffmpeg
+from caviar_clients.plots.film import GIF_FPS, WRITERS, Reel, find_ffmpeg, needed_ffmpeg
 from caviar_clients.plots.map import View, chosen_beam, common_prefix, view_of
-from caviar_clients.plots.moving import MovingMap, Plan
+from caviar_clients.plots.moving import MovingMap, Plan, key_colours
 from caviar_clients.plots.rays import rays, scale
 from caviar_protocol.arrays import UInt8Array
 from caviar_protocol.errors import RecordingError, SetupError
@@ -99,8 +100,8 @@ def film_run(
     samples = samples or list(_pictures(recording, survey, moving, chosen, spread[:1]))
     with _progress(console) as bar:
         task = bar.add_task("drawing", total=count)
-        drawn = _pictures(recording, survey, moving, chosen, range(count))
-        WRITERS[suffix](_counted(drawn, bar, task), samples, count, rate, file)
+        drawn = _counted(_pictures(recording, survey, moving, chosen, range(count)), bar, task)
+        WRITERS[suffix](Reel(drawn, count, rate, samples, key_colours()), file)
     speed = rate * recording.metadata.sampling_period_ns * 1e-9
     return Film(file, count, rate, speed, moving.size)
 

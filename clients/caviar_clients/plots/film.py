@@ -5,20 +5,35 @@ from __future__ import annotations
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from caviar_protocol.arrays import UInt8Array
 from caviar_protocol.errors import RunError, SetupError
 
-Pictures = Iterable[UInt8Array]
-"""sRGB, Shape ``[height, width, 3]``, all of the same even size."""
 
-Writer = Callable[[Pictures, Sequence[UInt8Array], int, float, Path], None]
-"""``writer(pictures, samples, count, fps, file)``; ``samples`` are some of the ``count`` pictures."""
+@dataclass(frozen=True, eq=False)
+class Reel:
+    """Pictures in sRGB, Shape ``[height, width, 3]``, all of the same even size."""
+
+    pictures: Iterator[UInt8Array]
+    """Made while they are written."""
+    count: int
+    fps: float
+    samples: Sequence[UInt8Array]
+    """At least one of the pictures, for their size and colours."""
+    keys: UInt8Array
+    """Colours that a palette has whatever else there is, Shape ``[K, 3]``."""
+
+
+Writer = Callable[[Reel, Path], None]
 
 GIF_FPS = 50
 """Viewers slow down a GIF that is faster: its unit is 10 ms, and they take 1 for unset."""
@@ -53,48 +68,54 @@ def needed_ffmpeg(file: Path) -> str:
     return found
 
 
-def write_gif(pictures: Pictures, samples: Sequence[UInt8Array], count: int, fps: float, file: Path) -> None:
+def write_gif(reel: Reel, file: Path) -> None:
     """An endless animated GIF with one palette for all pictures.
 
     Raises `RunError` where the file cannot be written; then there is none.
     """
     from PIL import Image
 
-    sheet = Image.new("RGB", (samples[0].shape[1], sum(len(sample) for sample in samples)))
-    top = 0
-    for sample in samples:
-        sheet.paste(Image.fromarray(sample), (0, top))
-        top += len(sample)
-    palette = sheet.quantize(256, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    palette = _palette(reel)
     images = (
-        Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures
+        Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE)
+        for picture in reel.pictures
     )
-    images = iter(images)
-    first = next(images)
     with _part_of(file) as part:
-        first.save(
-            part, format="GIF", save_all=True, append_images=images, loop=0, duration=durations_ms(fps, count)
-        )
+        next(images).save(
+            part, format="GIF", save_all=True, append_images=images, loop=0,
+            duration=durations_ms(reel.fps, reel.count),
+        )  # fmt: skip
 
 
-def write_mp4(pictures: Pictures, samples: Sequence[UInt8Array], count: int, fps: float, file: Path) -> None:
+def _palette(reel: Reel) -> Any:
+    """An image with a palette of the key colours, and for the rest those most frequent in the samples."""
+    from PIL import Image
+
+    sheet = Image.fromarray(np.concatenate(reel.samples))
+    rest = sheet.quantize(256 - len(reel.keys), method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(reel.keys.tobytes() + bytes(rest.getpalette() or ()))
+    return palette
+
+
+def write_mp4(reel: Reel, file: Path) -> None:
     """An MP4 that browsers and slides play: H.264 where ffmpeg has it, planes of 4:2:0.
 
     Raises `SetupError` where there is no ffmpeg, `RunError` with its last line where it fails; then
     there is no file.
     """
     ffmpeg = needed_ffmpeg(file)
-    height, width, _ = samples[0].shape
+    height, width, _ = reel.samples[0].shape
     with _part_of(file) as part, tempfile.TemporaryFile() as log:
         command = [
             ffmpeg, "-hide_banner", "-loglevel", "error", "-y",
             "-f", "rawvideo", "-pixel_format", "rgb24", "-video_size", f"{width}x{height}",
-            "-framerate", f"{fps:g}", "-i", "-", *_encoder(ffmpeg), "-pix_fmt", "yuv420p",
+            "-framerate", f"{reel.fps:g}", "-i", "-", *_encoder(ffmpeg), "-pix_fmt", "yuv420p",
             "-movflags", "+faststart", "-f", "mp4", str(part.resolve()),
         ]  # fmt: skip
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=log, stderr=log)  # noqa: S603  # as above
         try:
-            _feed(process, pictures)
+            _feed(process, reel.pictures)
         except BaseException:
             process.kill()
             process.wait()
@@ -105,7 +126,7 @@ def write_mp4(pictures: Pictures, samples: Sequence[UInt8Array], count: int, fps
             raise RunError(f"ffmpeg could not write {file}: {said or f'status {process.returncode}'}")
 
 
-def _feed(process: subprocess.Popen[bytes], pictures: Pictures) -> None:
+def _feed(process: subprocess.Popen[bytes], pictures: Iterator[UInt8Array]) -> None:
     """Write all pictures; if ffmpeg ends early, its status says so afterwards."""
     pipe = process.stdin
     if pipe is None:

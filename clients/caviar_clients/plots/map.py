@@ -26,6 +26,9 @@ BeamGain = Callable[[AntennaArray, int, Float64Array], Float64Array]
 """``gain(array, beam, directions)``: amplitude of a codebook beam towards unit vectors in device
 axes, Shape ``[N, 3]`` to ``[N]``, 1 at its greatest."""
 
+BEAM_ALPHA = 0.22
+"""Opacity of the beam's area."""
+
 TICK = 0.05
 """Length of the ticks of paths whose route is unknown, of the width of the map."""
 TICK_COLOR = "#21918c"  # the middle of viridis
@@ -165,7 +168,7 @@ def chosen_beam(data: MapData) -> Beam | None:
 
 
 def draw_beam(axes: Any, beam: Beam) -> None:
-    axes.fill(*beam.outline.T, facecolor=VERMILION, alpha=0.22, linewidth=0, zorder=3)
+    axes.fill(*beam.outline.T, facecolor=VERMILION, alpha=BEAM_ALPHA, linewidth=0, zorder=3)
     axes.plot(*beam.outline.T, color=VERMILION, linewidth=1.3, zorder=3.1, label=beam.label)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -12,6 +13,7 @@ from caviar_clients.plots.camera import SKY_GREY
 from caviar_clients.plots.fig8 import UserSeries, curves, shade
 from caviar_clients.plots.footprints import Footprints
 from caviar_clients.plots.map import (
+    BEAM_ALPHA,
     TICK_COLOR,
     TICK_LABEL,
     Labels,
@@ -25,7 +27,7 @@ from caviar_clients.plots.map import (
     draw_scenery,
 )
 from caviar_clients.plots.rays import rays
-from caviar_clients.plots.style import BLACK, GREY, LIGHT_GREY, ORANGE, SKY, VERMILION, styled
+from caviar_clients.plots.style import BLACK, BLUE, GREY, LIGHT_GREY, ORANGE, SKY, VERMILION, styled
 from caviar_protocol.arrays import UInt8Array
 
 _WIDTH = 11.0
@@ -180,8 +182,15 @@ class MovingMap:
         axes.margins(x=0)
         axes.set_xlim(*axes.get_xlim())
         axes.grid(color=LIGHT_GREY, linewidth=0.6)
-        axes.set_ylabel("|y|")
         axes.set_xlabel("Time [s]")
+        # Powers of ten stand in the label: above the axis is the legend.
+        highest = float(np.max(data.best, where=data.has_path, initial=0.0))
+        power = math.floor(math.log10(highest)) if highest > 0 else 0
+        if -2 <= power < 4:
+            axes.set_ylabel("|y|")
+        else:
+            axes.set_ylabel(f"|y| [$10^{{{power}}}$]")
+            axes.yaxis.set_major_formatter(lambda value, _: f"{value / 10.0**power:g}")
         axes.legend(
             loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=5, frameon=False, fontsize=8.5,
             borderaxespad=0.2, columnspacing=1.0, handletextpad=0.4, handlelength=1.6,
@@ -269,6 +278,19 @@ def _places(plan: Plan) -> _Places:
     camera = (left, top - tall if plan.series is not None else _BELOW + (height - tall) / 2, seen, tall)
     curves_at = None if plan.series is None else (left_curves, _BELOW, seen - 0.4, _CURVES)
     return _Places(top + above, (_LEFT, _BELOW, width, height), camera, curves_at)
+
+
+def key_colours() -> UInt8Array:
+    """The colours that mean something, and steps from black to white, Shape ``[K, 3]``."""
+    from matplotlib import colormaps
+    from matplotlib.colors import to_rgb
+
+    named = np.array([to_rgb(color) for color in (BLACK, GREY, LIGHT_GREY, ORANGE, SKY, BLUE, VERMILION)])
+    lobe = 1 + BEAM_ALPHA * (named[-1:] - 1)
+    gains = colormaps["viridis"](np.linspace(0, 1, 40))[:, :3]
+    steps = np.linspace(0, 1, 12)[:, None].repeat(3, axis=1)
+    result: UInt8Array = np.round(255 * np.concatenate([named, lobe, gains, steps])).astype(np.uint8)
+    return result
 
 
 def _filling(view: View, shape: float) -> View:
