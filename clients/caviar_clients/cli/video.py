@@ -111,9 +111,8 @@ def _format(
 ) -> tuple[float, int]:
     """Frames a second and width [pixels]."""
     if suffix not in WRITERS:
-        raise SetupError(
-            f"{file} ends in {suffix or 'nothing'!r}, which is no format of a video; write .mp4 or .gif"
-        )
+        what = f"ends in {suffix!r}, which is no format of a video" if suffix else "has no suffix"
+        raise SetupError(f"{file} {what}; write .mp4 or .gif")
     if suffix == ".mp4":
         needed_ffmpeg(file)
     rate = min(max(1e9 / period_ns, SLOWEST), FASTEST) if fps is None else fps

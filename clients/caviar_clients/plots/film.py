@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from caviar_protocol.arrays import UInt8Array
+from caviar_protocol.arrays import Int64Array, UInt8Array
 from caviar_protocol.errors import RunError, SetupError
 
 
@@ -91,11 +91,20 @@ def _palette(reel: Reel) -> Any:
     """An image with a palette of the key colours, and for the rest those most frequent in the samples."""
     from PIL import Image
 
-    sheet = Image.fromarray(np.concatenate(reel.samples))
+    pixels = np.concatenate(reel.samples).reshape(-1, 3)
+    # The background is most of a picture and would take most of the palette.
+    other = pixels[~np.isin(_cells(pixels), _cells(reel.keys))]
+    sheet = Image.fromarray((other if len(other) else pixels)[None])
     rest = sheet.quantize(256 - len(reel.keys), method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
     palette = Image.new("P", (1, 1))
     palette.putpalette(reel.keys.tobytes() + bytes(rest.getpalette() or ()))
     return palette
+
+
+def _cells(colours: UInt8Array) -> Int64Array:
+    """The same number for colours that hardly differ, Shape ``[N, 3]`` to ``[N]``."""
+    cells: Int64Array = (colours >> 3).astype(np.int64) @ np.array([1 << 10, 1 << 5, 1])
+    return cells
 
 
 def write_mp4(reel: Reel, file: Path) -> None:
@@ -156,14 +165,14 @@ def _part_of(file: Path) -> Iterator[Path]:
     part = file.with_name(f".{file.name}.part")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        yield part
-        part.replace(file)
+        try:
+            yield part
+            part.replace(file)
+        finally:
+            part.unlink(missing_ok=True)
     except OSError as error:
-        raise RunError(
-            f"cannot write {file}: {error.strerror or error}; choose another with --out"
-        ) from error
-    finally:
-        part.unlink(missing_ok=True)
+        said = error.strerror or error
+        raise RunError(f"cannot write {file}: {said}; choose another with --out") from error
 
 
 def durations_ms(fps: float, count: int) -> list[int]:
