@@ -49,7 +49,7 @@ def image(name: str, number: int, which: int) -> CameraImage:
         sensor=name,
         position=(0, 0, 5),
         orientation=(1, 0, 0, 0),
-        intrinsics=Intrinsics(fx=20, fy=20, cx=20, cy=15, width=40, height=30),
+        intrinsics=Intrinsics(fx=20, fy=20, cx=20, cy=15),
         rgb=rgb,
     )
 

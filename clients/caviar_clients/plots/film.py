@@ -6,7 +6,7 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
 from itertools import pairwise
@@ -37,6 +37,9 @@ Writer = Callable[[Reel, Path], None]
 
 GIF_FPS = 50
 """Viewers slow down a GIF that is faster: its unit is 10 ms, and they take 1 for unset."""
+
+_APART = 8
+"""Colours of a palette differ from its key colours by more than this in some channel."""
 
 _ENCODERS = (
     ("libx264", ("-crf", "20", "-preset", "medium", "-tune", "animation")),
@@ -96,8 +99,12 @@ def _palette(reel: Reel) -> Any:
     other = pixels[~np.isin(_cells(pixels), _cells(reel.keys))]
     sheet = Image.fromarray((other if len(other) else pixels)[None])
     rest = sheet.quantize(256 - len(reel.keys), method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    found = np.array(rest.getpalette(), np.int64).reshape(-1, 3)
+    # Pillow looks up colours in steps of 4: one beside a key colour would be taken in its place.
+    apart = np.abs(found[:, None] - reel.keys).max(axis=2).min(axis=1) > _APART
+    colours = np.concatenate([reel.keys, found[apart], np.repeat(reel.keys[:1], 256, axis=0)])[:256]
     palette = Image.new("P", (1, 1))
-    palette.putpalette(reel.keys.tobytes() + bytes(rest.getpalette() or ()))
+    palette.putpalette(colours.astype(np.uint8).tobytes())
     return palette
 
 
@@ -140,12 +147,9 @@ def _feed(process: subprocess.Popen[bytes], pictures: Iterator[UInt8Array]) -> N
     pipe = process.stdin
     if pipe is None:
         return
-    try:
+    with suppress(BrokenPipeError), pipe:
         for picture in pictures:
             pipe.write(picture.tobytes())
-        pipe.close()
-    except BrokenPipeError:
-        process.wait()
 
 
 def _encoder(ffmpeg: str) -> list[str]:

@@ -236,7 +236,7 @@ def _name_objects(axes: Any, scene: Scene, boxes: Float64Array, carriers: set[st
     (left, right) = axes.get_xlim()
     unit = (right - left) / labels.width
     # As large as the mark that stands for a tiny object; a character of 8 points is about 5 points wide.
-    centre, least = scene.position[:, :2], 4.0 * unit
+    centre, least = scene.position[:, :2], 5.0 * unit
     low = np.minimum(boxes.min(axis=1), centre - least)
     high = np.maximum(boxes.max(axis=1), centre + least)
     taken: list[Rectangle] = [(*a, *b) for a, b in zip(low.tolist(), high.tolist(), strict=True)]
