@@ -9,12 +9,12 @@ import pytest
 from recording_samples import absent, frame, link, product, record, recorder
 
 from caviar_clients.plots.fig8 import (
-    _shade,
     _without_jumps,
     choose_user,
     draw_over_angle,
     draw_over_time,
     series,
+    shade,
 )
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.recording import Recording
@@ -112,5 +112,5 @@ def test_nlos_frames_are_shaded(tmp_path):
         def axvspan(self, left, right, label=None, **_):
             spans.append((round(left, 3), round(right, 3), label))
 
-    _shade(Axes(), data)
+    shade(Axes(), data)
     assert spans == [(-0.05, 0.05, "NLOS"), (0.45, 0.55, None), (0.95, 1.05, None)]

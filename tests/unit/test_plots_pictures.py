@@ -11,7 +11,15 @@ from recording_samples import channel, lidar, link, scene
 
 from caviar_clients.cli.plot import beam_gain
 from caviar_clients.plots.lidar import draw_scan, range_image
-from caviar_clients.plots.map import MapData, chosen_beam, common_prefix, draw_map, view_of
+from caviar_clients.plots.map import (
+    Labels,
+    MapData,
+    chosen_beam,
+    common_prefix,
+    draw_map,
+    draw_objects,
+    view_of,
+)
 from caviar_clients.plots.rays import rays
 from caviar_protocol.scene import device_pose
 from caviar_protocol.topics import AntennaArray, LidarDevice, LidarScan
@@ -188,3 +196,27 @@ def test_a_scan_without_hits_is_drawn(tmp_path):
     )
     draw_scan(empty, lidar(0), scene(0), "empty", tmp_path / "lidar.png")
     assert (tmp_path / "lidar.png").stat().st_size > 1000
+
+
+def test_a_name_stays_on_the_side_where_it_was_and_is_never_cut():
+    from matplotlib.figure import Figure
+
+    axes = Figure().subplots()
+    axes.set(xlim=(-35.0, 35.0), ylim=(-20.0, 40.0))
+    labels = Labels(width=400.0, prefix="car.", marked="car.1")
+    draw_objects(axes, a_map(scene=scene(0)), labels)
+    assert {text.get_text() for text in axes.texts} == {"0", "1", "2"}
+    (marked,) = (text for text in axes.texts if text.get_fontweight() == "bold")
+    assert marked.get_text() == "1"
+    labels.sides["car.0"] = 1  # below, where it had no need to be
+    for text in list(axes.texts):
+        text.remove()
+    draw_objects(axes, a_map(scene=scene(1)), labels)
+    heights = {text.get_text(): text.get_position()[1] for text in axes.texts}
+    assert heights["0"] < 0.0 < heights["2"]
+    axes.set_xlim(-29.0, 41.0)  # cuts the first car
+    for text in list(axes.texts):
+        text.remove()
+    draw_objects(axes, a_map(scene=scene(0)), Labels(width=400.0, prefix=""))
+    assert {text.get_text() for text in axes.texts} >= {"car.1", "car.2"}
+    assert all(text.get_position()[0] >= -29.0 for text in axes.texts)

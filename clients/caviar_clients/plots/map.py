@@ -95,6 +95,7 @@ def view_of(data: MapData, beam: Beam | None) -> View:
 
 
 def draw_scenery(axes: Any, footprints: Footprints | None) -> None:
+    """Areas and outlines of buildings."""
     from matplotlib.collections import LineCollection, PolyCollection
 
     if footprints is None:
@@ -146,6 +147,7 @@ class Beam:
 
 
 def chosen_beam(data: MapData) -> Beam | None:
+    """The beam chosen for the user of the map; None where there is none."""
     found = _chosen(data)
     if found is None or data.beam_gain is None:
         return None
@@ -168,6 +170,7 @@ def chosen_beam(data: MapData) -> Beam | None:
 
 
 def draw_beam(axes: Any, beam: Beam) -> None:
+    """The pattern as an area with an outline."""
     axes.fill(*beam.outline.T, facecolor=VERMILION, alpha=BEAM_ALPHA, linewidth=0, zorder=3)
     axes.plot(*beam.outline.T, color=VERMILION, linewidth=1.3, zorder=3.1, label=beam.label)
 
@@ -251,7 +254,8 @@ def _name_objects(axes: Any, scene: Scene, boxes: Float64Array, carriers: set[st
         places = _places(taken[i], 5.0 * len(text) * unit, 9.0 * unit, 2.0 * unit)
         before = labels.sides.get(name, 0)
         for side in sorted(range(len(places)), key=lambda side: (side != before, side)):
-            if not any(_overlap(places[side], other) for other in taken):
+            inside = _within(places[side], axes.get_xlim(), axes.get_ylim())
+            if inside and not any(_overlap(places[side], other) for other in taken):
                 taken.append(places[side])
                 labels.sides[name] = side
                 standing = {"color": VERMILION, "fontweight": "bold"} if name == labels.marked else {}
@@ -282,6 +286,10 @@ def common_prefix(names: Sequence[str]) -> str:
     parts = [name.split(".")[:-1] for name in names] if len(names) > 1 else []
     same = itertools.takewhile(lambda level: len(set(level)) == 1, zip(*parts, strict=False))
     return "".join(f"{level[0]}." for level in same)
+
+
+def _within(a: Rectangle, x: tuple[float, float], y: tuple[float, float]) -> bool:
+    return x[0] <= a[0] and a[2] <= x[1] and y[0] <= a[1] and a[3] <= y[1]
 
 
 def _overlap(a: Rectangle, b: Rectangle) -> bool:
