@@ -16,6 +16,7 @@ from caviar_clients.plots.map import (
     BEAM_ALPHA,
     TICK_COLOR,
     TICK_LABEL,
+    Beam,
     Labels,
     MapData,
     View,
@@ -104,7 +105,7 @@ class MovingMap:
         with styled():
             self._canvas.restore_region(self._still)
             beam = chosen_beam(data)
-            self._over(self._map, lambda: self._draw_map(data))
+            self._over(self._map, lambda: self._draw_map(data, beam))
             self._write(self._when, data.title)
             self._write(self._what, "" if beam is None else beam.label)
             if self._camera is not None:
@@ -210,10 +211,9 @@ class MovingMap:
         place.set_text(text)
         self._figure.draw_artist(place)
 
-    def _draw_map(self, data: MapData) -> None:
+    def _draw_map(self, data: MapData, beam: Beam | None) -> None:
         if self._plan.gains_db is not None:
             draw_rays(self._map, rays(data.scene, data.channel), self._plan.gains_db)
-        beam = chosen_beam(data)
         if beam is not None:
             draw_beam(self._map, beam)
         draw_objects(self._map, data, self._labels)
