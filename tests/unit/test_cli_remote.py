@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from caviar_broker.core.plan import SECOND, plan_run
 from caviar_clients.cli import remote
 from caviar_clients.cli.main import app
-from caviar_clients.cli.run import TOPICS_OF, checked_scenario
+from caviar_clients.sessions.checking import TOPICS_OF, checked_scenario
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.messages import Role
 from caviar_protocol.scenario import ServiceSpec

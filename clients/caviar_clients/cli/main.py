@@ -56,7 +56,8 @@ def broker(
 ) -> None:
     """Run only the broker; start the services with `caviar service`, here or on other machines."""
     from caviar_broker.__main__ import parser, serve
-    from caviar_clients.cli.run import checked_scenario, run_directory
+    from caviar_clients.cli.run import run_directory
+    from caviar_clients.sessions.checking import checked_scenario
 
     checked = checked_scenario(scenario, frames, seed)
     directory = run_directory(out, checked.run.name)

@@ -19,55 +19,15 @@ from caviar_clients.cli.inside import EmbeddedLauncher
 from caviar_clients.cli.launch import Launcher
 from caviar_clients.cli.remote import reachable, start_command, waiting_text
 from caviar_clients.cli.summary import link_figures, summary_of, summary_table
-from caviar_protocol.errors import DeclarationError, RunError
+from caviar_clients.sessions.checking import checked_scenario
+from caviar_protocol.errors import RunError
 from caviar_protocol.scenario import Scenario
-from caviar_protocol.scenario_checks import refuse_remote, scenario_error, settings_place, with_overrides
-from caviar_protocol.scenario_loader import load_scenario
-from caviar_protocol.tables import convert_settings
-from caviar_services.registry import load
+from caviar_protocol.scenario_checks import refuse_remote
 
 QUIET = frozenset({"stale", "note", "idle", "lag"})
 """Kinds of notices that are logged, and only counted on the screen."""
 REPEATED = frozenset({"away", "back"})
 """Kinds of notices that are shown every time, since what they ask of the user is always new."""
-TOPICS_OF: Mapping[str, tuple[str, ...]] = {
-    "world": ("scene",),
-    "channel": ("channel",),
-    "sensors": ("lidar", "camera", "depth", "segmentation"),
-    "link": ("link",),
-    "agent": ("action",),
-    "recorder": (),
-}
-"""What a remote service may produce, by its role; what it does produce it says when it joins."""
-
-
-def checked_scenario(path: Path, frames: int | None = None, seed: int | None = None) -> Scenario:
-    """Load a scenario and check it against the implementations it uses.
-
-    Raises `ScenarioError` naming file, key and line for an implementation or a setting that does
-    not exist, and for a topic to record that no implementation produces.
-    """
-    scenario = with_overrides(load_scenario(path), frames, seed)
-    produced: set[str] = set()
-    for name, spec in scenario.services.items():
-        if spec.remote:
-            produced.update(TOPICS_OF[spec.role])
-            continue
-        try:
-            implementation = load(spec.role, spec.use)
-        except DeclarationError as error:
-            raise scenario_error(scenario, f"services.{name}.use", str(error)) from error
-        convert_settings(implementation.Settings, spec.settings, settings_place(scenario, name))
-        produced.update(implementation.outputs)
-    for index, entry in enumerate(scenario.run.record):
-        topic = entry.partition(".")[0]
-        if topic not in produced:
-            raise scenario_error(
-                scenario,
-                f"run.record[{index}]",
-                f"no service of the run produces {topic!r}; remove it, or add a service that does",
-            )
-    return scenario
 
 
 def run_directory(root: Path, name: str) -> Path:

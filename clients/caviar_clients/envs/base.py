@@ -15,7 +15,8 @@ from caviar_clients.envs.observations import Moment, Part, part
 from caviar_clients.envs.rewards import KINDS, Reward, RewardKind
 from caviar_clients.envs.users import Users
 from caviar_clients.sessions.base import Frame, Session
-from caviar_clients.sessions.opening import agent_of, open_session, opened
+from caviar_clients.sessions.checking import checked_scenario
+from caviar_clients.sessions.opening import agent_of, open_session
 from caviar_protocol.errors import RunError, ScenarioError
 from caviar_protocol.messages import Input
 from caviar_protocol.topics import Action, Link
@@ -72,7 +73,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
             raise ScenarioError(f"render_mode is {render_mode!r}; write 'rgb_array' or None")
         if not observe:
             raise ScenarioError("observe names no part; write observe=('aoa',)")
-        self.scenario = opened(Path(scenario), agent)
+        self.scenario = checked_scenario(Path(scenario))
         self.agent = agent_of(self.scenario, agent)
         self.render_mode = render_mode
         self.users = Users(self.scenario, (users,) if isinstance(users, str) else users)

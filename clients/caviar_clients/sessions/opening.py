@@ -4,20 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from caviar_clients.cli.run import checked_scenario
 from caviar_clients.sessions.base import Session
 from caviar_clients.sessions.connected import ConnectedSession
 from caviar_clients.sessions.embedded import EmbeddedSession
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.messages import Input
 from caviar_protocol.scenario import Scenario
-
-REMOTE = "remote"
-
-
-def opened(path: Path, agent: str | None) -> Scenario:
-    """The scenario of a file, checked."""
-    return checked_scenario(path)
 
 
 def agent_of(scenario: Scenario, agent: str | None) -> str:
@@ -26,7 +18,7 @@ def agent_of(scenario: Scenario, agent: str | None) -> str:
     Raises `ScenarioError` naming the agents where that does not say which.
     """
     agents = {name: spec for name, spec in scenario.services.items() if spec.role == "agent"}
-    remote = [name for name, spec in agents.items() if spec.use == REMOTE]
+    remote = [name for name, spec in agents.items() if spec.remote]
     names = ", ".join(agents) or "none"
     if agent is not None:
         if agent not in agents:
