@@ -14,12 +14,13 @@ from hypothesis import strategies as st
 from link_builders import CARRIER, antenna, channel_of, choices, frame_of, given, random_h, scene_of
 
 from caviar_protocol.arrays import Complex128Array
+from caviar_protocol.beams import beam_towards
 from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.pairs import directions, pairs_of
 from caviar_protocol.topics import AntennaDevice, Carrier, Channel, Link
 from caviar_services.link.beams import BeamLink, BeamLinkSettings
-from caviar_services.link.codebook import beam_towards, dft_codebook
+from caviar_services.link.codebook import dft_codebook
 from caviar_services.service import FrameInput, RunInfo, StepResult
 
 BS = antenna("bs", "tx", (1, 4), power_dbm=30.0)

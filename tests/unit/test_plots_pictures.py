@@ -21,9 +21,10 @@ from caviar_clients.plots.map import (
     view_of,
 )
 from caviar_clients.plots.rays import rays
+from caviar_protocol.beams import beam_towards
 from caviar_protocol.scene import device_pose
 from caviar_protocol.topics import AntennaArray, LidarDevice, LidarScan
-from caviar_services.link.codebook import beam_towards, pointing_directions
+from caviar_services.link.codebook import pointing_directions
 
 pytest.importorskip("matplotlib")
 Image = pytest.importorskip("PIL.Image")

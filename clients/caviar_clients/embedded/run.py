@@ -57,6 +57,10 @@ class EmbeddedRun:
     ) -> None:
         if directory is None:
             scenario = _without_recorders(scenario)
+        for name in seats or {}:
+            # Settings of the implementation whose place is taken are not for whoever takes it.
+            seated = replace_field(scenario.services[name], settings={})
+            scenario = replace_field(scenario, services={**scenario.services, name: seated})
         scenario = with_ownership(scenario)
         folder = (directory or Path()).resolve()
         plan = plan_run(scenario, folder.name, briefings(scenario, folder))

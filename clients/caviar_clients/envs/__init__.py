@@ -9,3 +9,4 @@ env = gymnasium.make("caviar/BeamSelection-v0", scenario="deploy/scenarios/geome
 import gymnasium
 
 gymnasium.register("caviar/BeamSelection-v0", "caviar_clients.envs.beam_selection:BeamSelectionEnv")
+gymnasium.register("caviar/UavPath-v0", "caviar_clients.envs.uav_path:UavPathEnv")

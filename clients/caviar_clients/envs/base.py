@@ -12,6 +12,7 @@ import numpy as np
 from gymnasium import spaces
 
 from caviar_clients.envs.observations import Moment, Part, part
+from caviar_clients.envs.render import MapRenderer
 from caviar_clients.envs.rewards import KINDS, Reward, RewardKind
 from caviar_clients.envs.users import Users
 from caviar_clients.sessions.base import Frame, Session
@@ -85,6 +86,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         self._reward = Reward(reward)
         self._broker = broker
         self._directory = None if directory is None else Path(directory)
+        self._renderer: MapRenderer | None = None
         self._session: Session | None = None
         self._moment: Moment | None = None
 
@@ -114,7 +116,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         if now.link is None:
             raise RunError(f"agent {self.agent!r} got no link of frame {before.frame.number}; is there one?")
         served = {(pair.tx.name, pair.rx.name) for _, pair in before.users}
-        reward = self._reward.of(now.link, served)
+        reward = self._reward.of(now.link, served) + self._further_reward(before, now)
         return self._observation(now), reward, self._terminated(now), now.frame.final, self._info(now)
 
     def close(self) -> None:
@@ -125,15 +127,24 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
 
     def render(self) -> Any:
         """A map of the scene as an RGB image, Shape ``[H, W, 3]``."""
-        if self.render_mode is None:
+        moment = self._moment
+        if self.render_mode is None or moment is None:
             return None
-        raise NotImplementedError
+        if self._renderer is None:
+            self._renderer = MapRenderer()
+        pair = moment.users[0][1] if moment.users else None
+        title = f"frame {moment.frame.number}, t = {moment.frame.t_ns / 1e9:.2f} s"
+        return self._renderer.draw(moment.scene, moment.link, pair, title)
 
     # --- what a kind of environment says -------------------------------------------------------------
 
     @abstractmethod
     def _commands(self, action: A, moment: Moment) -> Sequence[Command]:
         """What the agent's decision means."""
+
+    def _further_reward(self, before: Moment, now: Moment) -> float:
+        """What is rewarded beside the link."""
+        return 0.0
 
     def _terminated(self, moment: Moment) -> bool:
         """Whether the goal is reached, or cannot be any more."""

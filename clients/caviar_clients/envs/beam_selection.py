@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,8 +23,8 @@ class BeamSelectionEnv(SessionEnv[np.int64 | NDArray[np.int64]]):
     place, ``MultiDiscrete`` with one entry for each place otherwise. Parameters as `SessionEnv`.
     """
 
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
+    def __init__(self, scenario: str | Path, **options: Any) -> None:
+        super().__init__(scenario, **options)
         sizes = [place.beam_pairs for place in self.users.places]
         self.action_space = spaces.Discrete(sizes[0]) if len(sizes) == 1 else spaces.MultiDiscrete(sizes)
 

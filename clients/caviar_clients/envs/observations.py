@@ -37,6 +37,10 @@ class Moment(msgspec.Struct, frozen=True):
     """(place, pair) of those who are there."""
 
 
+FAR = 1e6
+"""Bound of what has none of its own: metres, metres a second, magnitudes."""
+
+
 class Part(ABC):
     """One part of the observation. ``sensor`` is what stands behind the colon of its name."""
 
@@ -62,19 +66,18 @@ class _PerUser(Part):
     """Numbers for each place; zeros for an empty one."""
 
     width: ClassVar[int] = 1
-    bound: ClassVar[float] = math.inf
+    bound: ClassVar[float] = FAR
 
     @property
     def space(self) -> spaces.Box:
-        shape = (len(self.users),) if self.width == 1 else (len(self.users), self.width)
-        return spaces.Box(-self.bound, self.bound, shape, np.float32)
-
-    def _blank(self) -> NDArray[np.float32]:
-        return np.zeros(self.space_shape, np.float32)
+        return spaces.Box(-self.bound, self.bound, self._shape, np.float32)
 
     @property
-    def space_shape(self) -> tuple[int, ...]:
-        return (len(self.users),) if self.width == 1 else (len(self.users), self.width)
+    def _shape(self) -> tuple[int, ...]:
+        return (len(self.users) * self.width,)
+
+    def _blank(self) -> NDArray[np.float32]:
+        return np.zeros(self._shape, np.float32)
 
 
 class AngleOfArrival(_PerUser):
@@ -108,26 +111,26 @@ class AngleOfDeparture(_PerUser):
 
 
 class Position(_PerUser):
-    """Position [m] of the receiver in the world. Shape ``[U, 3]``."""
+    """Position [m] of the receiver in the world, x, y, z place by place. Shape ``[3·U]``."""
 
     width = 3
 
     def read(self, moment: Moment) -> NDArray[np.float32]:
         values = self._blank()
         for place, pair in moment.users:
-            values[place] = device_pose(moment.scene, pair.rx).position
+            values[3 * place : 3 * place + 3] = device_pose(moment.scene, pair.rx).position
         return values
 
 
 class Velocity(_PerUser):
-    """Velocity [m/s] of the receiver in world axes. Shape ``[U, 3]``."""
+    """Velocity [m/s] of the receiver in world axes, place by place. Shape ``[3·U]``."""
 
     width = 3
 
     def read(self, moment: Moment) -> NDArray[np.float32]:
         values = self._blank()
         for place, pair in moment.users:
-            values[place] = device_velocity(moment.scene, pair.rx)
+            values[3 * place : 3 * place + 3] = device_velocity(moment.scene, pair.rx)
         return values
 
 
@@ -184,7 +187,7 @@ class DepthImage(Part):
 
     @property
     def space(self) -> spaces.Box:
-        return spaces.Box(0, np.inf, self._shape, np.float32)
+        return spaces.Box(0, FAR, self._shape, np.float32)
 
     def read(self, moment: Moment) -> NDArray[np.float32] | None:
         for depth in moment.frame.of("depth", Depth).values():

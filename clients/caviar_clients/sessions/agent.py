@@ -18,9 +18,8 @@ PATIENCE_S = 600.0
 at what was learned."""
 
 
-class OutsideSettings(msgspec.Struct, frozen=True, kw_only=True):
-    """Whom the agent serves (contract, clause 17). Settings of the implementation whose place it takes
-    are not for it."""
+class OutsideSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Whom the agent serves (contract, clause 17)."""
 
     users: tuple[str, ...] = ("*",)
     except_users: tuple[str, ...] = ()

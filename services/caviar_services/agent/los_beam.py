@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from caviar_protocol.beams import beam_towards
 from caviar_protocol.pairs import Pair, directions
 from caviar_protocol.topics import BeamChoice, Scene
 from caviar_services.agent.base import Agent, AgentSettings
-from caviar_services.link.codebook import beam_towards
 from caviar_services.service import Frame
 
 

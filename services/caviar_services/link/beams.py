@@ -15,13 +15,13 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int32Array, quantity
+from caviar_protocol.beams import beam_towards
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.pairs import directions
 from caviar_protocol.topics import Carrier, Channel, Link, Scene
 from caviar_protocol.topics.scene import Device
 from caviar_services.link.base import LinkModel
 from caviar_services.link.choices import Choices, choices_of
-from caviar_services.link.codebook import beam_towards
 from caviar_services.link.sweep import best_pairs
 from caviar_services.link.users import User, UserChannels, channels_of, sweep_users, users_of
 from caviar_services.service import Frame, StepResult

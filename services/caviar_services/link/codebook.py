@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -38,30 +37,6 @@ def _dft(size: int) -> Complex128Array:
     # k·n is reduced modulo N first, so that the phase of large codebooks keeps full precision.
     matrix: Complex128Array = np.exp(2j * np.pi * (np.outer(n, n) % size) / size) / math.sqrt(size)
     return matrix
-
-
-def beam_towards(array: AntennaArray, direction: Sequence[float]) -> int:
-    """Beam with the greatest ``|c_k* a(k̂)|`` towards a direction, a unit vector in device axes.
-
-    Along one axis of N elements with a spacing of d wavelengths, and u the direction's cosine,
-    ``|c_k* a| = |sin(πNv)| / (sqrt(N)·|sin πv|)`` with ``v = d·u − k/N`` (Tse and Viswanath, section
-    7.3.4). The numerator is the same for all k, so the best k is the one nearest to N·d·u, modulo N:
-    wrapped beams, end-fire directions and grating lobes need no special cases. Of two beams with equal
-    gain the one of lower index is taken.
-    """
-    _, y, z = direction
-    column = _nearest(array.columns, array.horizontal_spacing * y)
-    row = _nearest(array.rows, -array.vertical_spacing * z)  # rows count from +z to −z
-    return column * array.rows + row
-
-
-def _nearest(size: int, turns: float) -> int:
-    """The k of 0 … size − 1 with the least ``|turns − k/size|`` modulo 1."""
-    exact = size * turns
-    below = math.ceil(exact - 0.5)
-    is_tie = exact - below == 0.5
-    beam = below % size
-    return 0 if is_tie and beam == size - 1 else beam
 
 
 def pointing_directions(array: AntennaArray, beam: int) -> Float64Array:
