@@ -3,12 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import NamedTuple
 
 from caviar_broker.core.decisions import DecisionBook
 from caviar_broker.core.events import Product
 from caviar_broker.core.graph import Edge, Graph
-from caviar_broker.core.tasks import Task, provenance
+from caviar_broker.core.tasks import Decision, Task, provenance
 from caviar_protocol.messages import GrantInput
+
+
+class Gathered(NamedTuple):
+    """Inputs of a task, all of them decided."""
+
+    decisions: list[tuple[Edge, Decision]]
+    cause: str | None
+    """Why the first required input is absent (clause 10); frame 0 has no earlier one."""
+    entry: int
+    """Number of the last journal entry that a grant relies on from before its frame (clause 18): the
+    service's own, lag 1 inputs and held products."""
+
+    def provided(self, frame: int) -> tuple[list[GrantInput], list[Product]]:
+        """Provenance of every input, and the products of those that are not absent."""
+        inputs = [provenance(edge.topic, edge.source, decision, frame) for edge, decision in self.decisions]
+        return inputs, [decision.product for _, decision in self.decisions if decision.product is not None]
 
 
 class Inputs:
@@ -24,49 +41,28 @@ class Inputs:
         edges = self._all if task.frame < self._book.frames else self._lagged
         return edges[task.service]
 
-    def decided(self, task: Task) -> bool:
-        """Whether all of them are decided, so that the task can be granted or skipped (clause 7)."""
-        frame, decided = task.frame, self._book.next
-        for edge in self.taken(task):
+    def gathered(self, task: Task) -> Gathered | None:
+        """What is decided about its inputs; None while one of them is not (clause 7)."""
+        frame, undecided = task.frame, self._book.next
+        edges = self.taken(task)
+        for edge in edges:
             lag = edge.lag
-            if frame - lag >= decided[edge.source] and frame >= lag:
-                return False
-        return True
-
-    def missing(self, task: Task) -> str | None:
-        """Cause of the first required input that is absent (clause 10); frame 0 has no earlier one."""
-        for edge in self.taken(task):
-            if edge.required and task.frame >= edge.lag:
-                decision = self._book.decision(edge, task.frame)
-                if decision.product is None:
-                    return decision.cause
-        return None
-
-    def latest_entry(self, task: Task) -> int:
-        """Number of the last journal entry that a grant relies on from before its frame (clause 18).
-
-        That is the service's own last decision, lag 1 inputs and held products; what was decided in
-        this very frame would be decided again. Entries become safe in order, so nothing is missing
-        between them.
-        """
-        frame = task.frame
-        latest = self._book.entry(task.service, frame - 1)
-        for edge in self.taken(task):
+            if frame - lag >= undecided[edge.source] and frame >= lag:
+                return None
+        # The service's own last decision is relied on too. What was decided in this very frame would be
+        # decided again. Entries become safe in order, so nothing is missing between them.
+        cause, entry = None, self._book.entry(task.service, frame - 1)
+        decisions = []
+        for edge in edges:
+            decision = self._book.decision(edge, frame)
+            decisions.append((edge, decision))
+            if decision.product is None and edge.required and frame >= edge.lag and cause is None:
+                cause = decision.cause
             if edge.lag:
-                latest = max(latest, self._book.entry(edge.source, frame - edge.lag))
-            latest = max(latest, self._book.decision(edge, frame).journal)
-        return latest
-
-    def provide(self, task: Task) -> tuple[list[GrantInput], list[Product]]:
-        """Provenance of every input, and the products of those that are not absent."""
-        inputs: list[GrantInput] = []
-        products: list[Product] = []
-        for edge in self.taken(task):
-            decision = self._book.decision(edge, task.frame)
-            inputs.append(provenance(edge.topic, edge.source, decision, task.frame))
-            if decision.product is not None:
-                products.append(decision.product)
-        return inputs, products
+                entry = max(entry, self._book.entry(edge.source, frame - edge.lag))
+            if decision.journal > entry:
+                entry = decision.journal
+        return Gathered(decisions, cause, entry)
 
     def lacking(self, source: str) -> str:
         """Who waits for which input of a source now; empty if nobody does."""

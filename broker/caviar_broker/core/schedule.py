@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from caviar_broker.core.decisions import DecisionBook
 from caviar_broker.core.events import Action, Latency, Notice, Product
 from caviar_broker.core.graph import Graph
-from caviar_broker.core.inputs import Inputs
+from caviar_broker.core.inputs import Gathered, Inputs
 from caviar_broker.core.ledger import Ledger
 from caviar_broker.core.pace import Pacer
 from caviar_broker.core.plan import RunPlan, ServicePlan
@@ -252,29 +252,29 @@ class EpisodeSchedule:
             owed = self._outstanding[name]
             in_flight = sum(t.state is TaskState.GRANTED for t in owed) if owed else 0
             task = self._turns.candidate(name, in_flight)
-            if task is None or not self._inputs.decided(task):
+            inputs = self._inputs.gathered(task) if task is not None else None
+            if task is None or inputs is None:
                 return
-            if self._ledger.written < max(self._first_entry, self._inputs.latest_entry(task)):
+            if self._ledger.written < max(self._first_entry, inputs.entry):
                 self._turns.waiting_for_journal.add(name)
                 return
             has_room = len(owed) < self._capacity[name]
             if in_flight and not has_room:
                 return
-            if not self._released(task, now):
+            if self.plan.realtime and not self._released(task, now):
                 self._turns.waiting_for_pace.add(name)
                 return
-            cause = self._inputs.missing(task)
-            if in_flight and cause is not None:
+            if in_flight and inputs.cause is not None:
                 return  # it is skipped when its turn has come
             if task.eligible_at is None:
                 task.eligible_at = now
-            if cause is not None:
+            if inputs.cause is not None:
                 task.move(TaskEvent.SKIP)
-                self._notice("skipped", task, cause)
-                self._book.consequence(task, cause, now)
+                self._notice("skipped", task, inputs.cause)
+                self._book.consequence(task, inputs.cause, now)
                 self._turns.decided(task.service)
             elif has_room and name not in self._paused:
-                self._grant(task, now)
+                self._grant(task, inputs, now)
             else:
                 return
 
@@ -295,17 +295,17 @@ class EpisodeSchedule:
         """When the frame that somebody waits for will be due; None if nobody does."""
         return self._pacer.next_instant() if self._turns.waiting_for_pace else None
 
-    def _grant(self, task: Task, now: int) -> None:
+    def _grant(self, task: Task, inputs: Gathered, now: int) -> None:
         owed = self._outstanding[task.service]
         previous = owed[-1].frame if owed else self._completed[task.service]
         task.move(TaskEvent.GRANT)
         task.started_at = now
-        task.order = self._order(task, previous)
+        task.order = self._order(task, inputs, previous)
         owed.append(task)
         self.grants.append(task.order)
 
-    def _order(self, task: Task, previous: int) -> GrantOrder:
-        inputs, products = self._inputs.provide(task)
+    def _order(self, task: Task, gathered: Gathered, previous: int) -> GrantOrder:
+        inputs, products = gathered.provided(task.frame)
         reports: list[Report] = []
         if task.service in self._turns.recorders:
             told = [product for product in self._late if product.frame <= task.frame]
