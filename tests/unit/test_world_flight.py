@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from caviar_protocol.coordinates import Vector, euler_from_quaternion
-from caviar_protocol.errors import PayloadError, ScenarioError
+from caviar_protocol.errors import PayloadError, RunError, ScenarioError
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.topics import Action, BeamChoice, Scene, VelocityCommand, WaypointCommand
 from caviar_protocol.topics.action import Command
-from caviar_services.service import Frame, FrameInput, RunInfo, StepResult
+from caviar_services.service import Frame, FrameInput, Preparation, RunInfo, StepResult
 from caviar_services.world.flight import FlightSettings, FlightWorld, FlownObject
 from caviar_services.world.trajectory import MovingObject
 
@@ -184,6 +184,26 @@ def test_an_unknown_object_is_refused_by_name() -> None:
         world(flown(), flown(name="b")).step(
             commanded(1, {"pilot": (VelocityCommand(object="uva", velocity=(1.0, 0.0, 0.0)),)})
         )
+
+
+def test_what_another_world_flies_is_left_to_it() -> None:
+    """But not what a prefix of this world's own claims."""
+    made = world(flown(name="sky.uav"))
+    made.prepare(Preparation(demand={}, producers={"scene": ("sea", "world")}))
+    elsewhere = VelocityCommand(object="sea.boat", velocity=(1.0, 0.0, 0.0))
+    position, velocity, _ = state(made.step(commanded(1, {"agent": (elsewhere,)})), "sky.uav")
+    assert (position.tolist(), velocity.tolist()) == ([0.0, 0.0, 30.0], [0.0, 0.0, 0.0])
+    mine = VelocityCommand(object="sky.uav2", velocity=(1.0, 0.0, 0.0))
+    with pytest.raises(PayloadError, match=r"'sky\.uav2', which world 'world' does not fly"):
+        made.step(commanded(2, {"agent": (mine,)}))
+
+
+def test_a_process_that_comes_back_in_the_middle_does_not_start_over() -> None:
+    """The broker resets it and grants the frame that is owed: commands so far are not known to it."""
+    made = world()
+    made.reset(0, 1, 0)
+    with pytest.raises(RunError, match="came back in frame 7"):
+        made.step(commanded(7, {}))
 
 
 def test_two_agents_cannot_fly_one_object() -> None:

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from caviar_protocol.arrays import quantity
 from caviar_protocol.coordinates import quaternion_from_euler
-from caviar_protocol.errors import PayloadError, ScenarioError
+from caviar_protocol.errors import PayloadError, RunError, ScenarioError
 from caviar_protocol.messages import Input
 from caviar_protocol.topics import Action, VelocityCommand, WaypointCommand
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
@@ -61,7 +61,10 @@ class FlightSettings(TrajectorySettings, frozen=True, kw_only=True, forbid_unkno
 
 
 class FlightWorld(TrajectoryWorld):
-    """Objects that agents fly, with limited speed and acceleration, clear of the scenery."""
+    """Objects that agents fly, with limited speed and acceleration, clear of the scenery.
+
+    Beside other worlds of a run, commands for objects of no name of its own are left to them.
+    """
 
     Settings: ClassVar[type[msgspec.Struct]] = FlightSettings
     inputs: ClassVar[tuple[Input, ...]] = (Input(topic="action", lag=1, required=False),)
@@ -71,6 +74,8 @@ class FlightWorld(TrajectoryWorld):
         self._flown: dict[str, FlownObject] = {}
         self._flyers: dict[str, Flyer] = {}
         self._elapsed_ns = 0
+        self._begun = False
+        self._alone = True
         for index, thing in enumerate(settings.flown):
             key = f"services.{run.name}.settings.flown[{index}]"
             name = (settings.prefix or "") + thing.name
@@ -90,6 +95,7 @@ class FlightWorld(TrajectoryWorld):
 
     def prepare(self, preparation: Preparation) -> Prepared:
         """Load the scenery as obstacles, and see that every flown object starts clear of it."""
+        self._alone = len(preparation.producers.get("scene", ())) <= 1
         triangles = scenery_triangles(scenery_assets(self.settings.scenery))
         for index, (name, flyer) in enumerate(self._flyers.items()):
             thing = self._flown[name]
@@ -105,12 +111,18 @@ class FlightWorld(TrajectoryWorld):
 
     def begin(self, episode: int, seed: int) -> None:
         """Every episode starts at the same place; then commands decide."""
-        self._elapsed_ns = 0
+        self._elapsed_ns, self._begun = 0, False
         for name, thing in self._flown.items():
             self._flyers[name].reset(thing.start_m, math.radians(thing.start_yaw_deg))
 
     def step(self, frame: Frame) -> StepResult:
         """The scene at the frame's instant, the commands having acted since the one before."""
+        if frame.number > 0 and not self._begun:
+            raise RunError(
+                f"world {self.run.name!r} came back in frame {frame.number}: where its objects had been "
+                "flown to is lost with the process that knew it; start the run again"
+            )
+        self._begun = True
         motions = self._motions(frame)
         counts: Counter[str] = Counter()
         elapsed_ns = frame.t_ns - self._t0_ns
@@ -129,6 +141,8 @@ class FlightWorld(TrajectoryWorld):
                     continue
                 name = command.object
                 if name not in self._flyers:
+                    if not self._alone and not name.startswith(self.prefixes()):
+                        continue
                     known = ", ".join(map(repr, self._flyers)) or "none"
                     raise PayloadError(
                         f"agent {agent!r} commands the motion of {name!r}, which world {self.run.name!r} "
