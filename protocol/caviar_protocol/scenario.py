@@ -52,7 +52,7 @@ class Run(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     sampling_period_ns: Annotated[int, quantity("ns", "T_sam", gt=0)] = 100_000_000
     instants_s: tuple[Annotated[float, quantity("s", "instant of a frame", ge=0)], ...] = ()
     """Instants of the frames of an episode, in place of ``frames`` and ``sampling_period_ns``, which
-    follow from it (`caviar_protocol.instants`)."""
+    follow from it. ``instants_ns`` and ``file:PATH.csv`` are read into it (`caviar_protocol.instants`)."""
     episodes: Annotated[int, quantity("1", "episodes", ge=1)] = 1
     seed: Annotated[int, quantity("1", "seed of everything random", ge=0, le=2**63 - 1)] = 1
     pace: Literal["fast", "realtime"] = "fast"

@@ -47,7 +47,7 @@ def parse_scenario(text: str, file: str = "", folder: Path | None = None) -> Sce
     lines = {dotted(path): line for path, line in key_lines(text.replace("\r\n", "\n")).items()}
     source = Source(file=file, lines=lines)
     if isinstance(table.get("run"), dict):
-        table["run"] = with_instants(table["run"], Place("run", source))
+        table["run"] = with_instants(table["run"], Place("run", source), folder or Path())
     scenario = convert_table(Scenario, table, Place("", source))
     scenario = msgspec.structs.replace(scenario, source=source)
     check_scenario(scenario)

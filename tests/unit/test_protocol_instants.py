@@ -43,6 +43,48 @@ def test_whole_nanoseconds_are_exact(expected: list[int]) -> None:
     assert plan.t_ns(plan.frames) == expected[-1] + plan.sampling_period_ns  # the final grant
 
 
+@given(st.lists(st.integers(0, 10**15), min_size=1, max_size=20, unique=True).map(sorted))
+def test_whole_numbers_of_nanoseconds_are_the_same_instants(expected: list[int]) -> None:
+    scenario = parsed(f"instants_ns = {expected}")
+    assert plan_run(scenario, "run", {}).instants_ns == tuple(expected)
+
+
+def test_a_file_lists_instants(tmp_path: Path) -> None:
+    """With comments and empty lines, and relative to the scenario."""
+    (tmp_path / "when.csv").write_text("# of a measurement\nt_s\n0.0\n\n0.1\n  0.350000001\n")
+    text = TEXT.replace("INSTANTS", 'instants_s = "file:when.csv"')
+    scenario = parse_scenario(text, "x.toml", tmp_path)
+    assert plan_run(scenario, "run", {}).instants_ns == (0, 100_000_000, 350_000_001)
+    assert scenario.run.frames == 3
+
+
+@pytest.mark.parametrize(
+    ("content", "line", "says"),
+    [
+        ("t_s\n0.1\n0.1\n", 3, "0.1 does not come after 0.1"),
+        ("t_s\n0.1\nsoon\n", 3, "'soon' is no number"),
+        ("t_s\n0.0000000001\n", 2, "at most 9 decimals"),
+        ("t_s\n-1\n", 2, "seconds ≥ 0"),
+        ("t_s\nnan\n", 2, "seconds ≥ 0"),
+        ("time\n0.1\n", 1, "the first line is 'time'; write t_s"),
+        ("t_s\n", None, "holds no instant"),
+    ],
+)
+def test_what_is_wrong_in_a_file_is_named_with_its_line(
+    tmp_path: Path, content: str, line: int | None, says: str
+) -> None:
+    (tmp_path / "when.csv").write_text(content)
+    with pytest.raises(ScenarioError) as caught:
+        parse_scenario(TEXT.replace("INSTANTS", 'instants_s = "file:when.csv"'), "x.toml", tmp_path)
+    assert (caught.value.file, caught.value.line) == (str(tmp_path / "when.csv"), line)
+    assert says in str(caught.value)
+
+
+def test_a_file_that_is_not_there_is_named() -> None:
+    with pytest.raises(ScenarioError, match=r"run\.instants_s: .*nowhere\.csv cannot be read"):
+        parsed('instants_s = "file:nowhere.csv"')
+
+
 def test_frames_and_period_follow() -> None:
     """0.1 s and 0.35 s are both multiples of 50 ms, and of nothing longer."""
     run = parsed("instants_s = [0, 0.1, 0.35]").run
@@ -89,6 +131,13 @@ def test_fewer_frames_are_the_first_instants_and_more_are_refused() -> None:
         ("instants_s = []", "run.instants_s", "is empty, write the instant of each frame"),
         ("instants_s = 3", "run.instants_s", "is 3, write"),
         ("instants_s = [0.0, true]", "run.instants_s[1]", "is true, write a number"),
+        ("instants_ns = [0, 3, 2]", "run.instants_ns[2]", "2 does not come after 3"),
+        ("instants_ns = [0, 1.5]", "run.instants_ns[1]", "is 1.5, write whole nanoseconds ≥ 0"),
+        ("instants_ns = [-4]", "run.instants_ns[0]", "is -4, write whole nanoseconds ≥ 0"),
+        ("instants_ns = []", "run.instants_ns", "is [], write the instant of each frame"),
+        ("instants_ns = [90071992547409931]", "run.instants_ns[0]", "so late that nanoseconds"),
+        ("instants_ns = [0]\nframes = 1", "run.frames", "follows from instants_ns; remove one of both"),
+        ("instants_ns = [0]\ninstants_s = [0.0]", "run.instants_s", "follows from instants_ns"),
         ("instants_s = [0.0]\nframes = 1", "run.frames", "follows from instants_s; remove one of both keys"),
         ("instants_s = [0.0]\nsampling_period_ns = 1", "run.sampling_period_ns", "follows from instants_s"),
     ],
