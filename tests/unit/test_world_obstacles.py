@@ -79,6 +79,9 @@ def test_a_needle_is_its_longest_edge() -> None:
     assert obstacles.distance((9.0, 0.0, 2.0)) == pytest.approx(2.0)
 
 
+MS = 1_000_000
+
+
 def flyer(obstacles: Obstacles, speed: float, acceleration: float, clearance: float = 1.0) -> Flyer:
     made = Flyer(
         Limits(
@@ -114,7 +117,7 @@ def test_no_flight_comes_too_near_to_boxes(speed: float, step_s: float) -> None:
             target = vector(rng.uniform(-20, 20, 3))
             for _ in range(math.ceil(25 / (speed * step_s)) + 3):
                 before = np.array(made.position)
-                hits += len(made.fly(Motion(target=target, speed=speed), [step_s]))
+                hits += len(made.fly(Motion(target=target, speed=speed), round(step_s * 1e9)))
                 after = np.array(made.position)
                 assert min(from_box(after, b) for b in bounds) >= clearance - 1e-5
                 assert math.hypot(*made.velocity) <= speed + 1e-9
@@ -135,7 +138,7 @@ def test_no_speed_leads_through_a_thin_wall(speed: float) -> None:
         course = rng.normal((1.0, 0.0, 0.0), 0.3)
         velocity = vector(course / np.linalg.norm(course) * speed)
         for _ in range(30):
-            made.fly(Motion(velocity=velocity), [0.1])
+            made.fly(Motion(velocity=velocity), 100 * MS)
             assert made.position[0] <= 9.0 + 1e-6
 
 
@@ -143,12 +146,12 @@ def test_along_a_wall_it_slides_and_head_on_it_stops() -> None:
     wall = Obstacles(triangles(((10.0, 12.0), (-300.0, 300.0), (-300.0, 300.0))))
     made = flyer(wall, 10.0, 50.0)
     made.reset((0.0, 0.0, 0.0), 0.0)
-    made.fly(Motion(velocity=(6.0, 8.0, 0.0)), [0.01] * 400)
+    made.fly(Motion(velocity=(6.0, 8.0, 0.0)), 4000 * MS)
     assert made.velocity[0] == pytest.approx(0.0, abs=1e-9)
     assert made.velocity[1] > 5.0
     head_on = flyer(wall, 10.0, 50.0)
     head_on.reset((0.0, 0.0, 0.0), 0.0)
-    events = head_on.fly(Motion(velocity=(10.0, 0.0, 0.0)), [0.01] * 400)
+    events = head_on.fly(Motion(velocity=(10.0, 0.0, 0.0)), 4000 * MS)
     assert events == {STOPPED_BY_OBSTACLE: 1}
     assert 8.5 < head_on.position[0] <= 9.0
 
@@ -159,10 +162,10 @@ def test_in_a_corner_it_stops_and_gets_out_again() -> None:
     )
     made = flyer(Obstacles(corner), 10.0, 50.0)
     made.reset((0.0, 0.0, 0.0), 0.0)
-    made.fly(Motion(velocity=(7.0, 6.0, 0.0)), [0.01] * 400)
+    made.fly(Motion(velocity=(7.0, 6.0, 0.0)), 4000 * MS)
     assert 8.4 < made.position[0] <= 9.0 + 1e-6
     assert 8.4 < made.position[1] <= 9.0 + 1e-6
-    made.fly(Motion(target=(0.0, 0.0, 0.0), speed=5.0), [0.01] * 500)
+    made.fly(Motion(target=(0.0, 0.0, 0.0), speed=5.0), 5000 * MS)
     assert math.dist(made.position, (0.0, 0.0, 0.0)) < 1e-2
 
 
@@ -179,17 +182,61 @@ def test_the_same_commands_lead_to_the_same_flight_bit_by_bit() -> None:
         made.reset(start, 0.0)
         places = []
         for target in targets:
-            events |= set(made.fly(Motion(target=target, speed=20.0), [0.01] * 100))
+            events |= set(made.fly(Motion(target=target, speed=20.0), 1000 * MS))
             places.append((made.position, made.velocity))
         flights.append(places)
     assert flights[0] == flights[1]
     assert SLID_ALONG_OBSTACLE in events
 
 
+def among_boxes(seed: int) -> tuple[Flyer, np.random.Generator, list[Bounds]]:
+    """Something that flies at the origin, with a dozen boxes around it."""
+    rng = np.random.default_rng(seed)
+    bounds = [b for b in (random_box(rng, 25.0) for _ in range(16)) if from_box(np.zeros(3), b) > 1.5]
+    made = flyer(Obstacles(triangles(*bounds)), 12.0, 4.0)
+    made.reset((0.0, 0.0, 0.0), 0.0)
+    return made, rng, bounds
+
+
+def motion(rng: np.random.Generator) -> Motion:
+    place = vector(rng.uniform(-25, 25, 3))
+    return Motion(velocity=place) if rng.random() < 0.5 else Motion(target=place, speed=12.0)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_acceleration_keeps_its_limit_at_walls_too(seed: int) -> None:
+    """Seen in steps that are shorter than a sub-step."""
+    made, rng, bounds = among_boxes(seed)
+    events: set[str] = set()
+    for _ in range(20):
+        wanted = motion(rng)
+        for _ in range(400):
+            before = made.velocity
+            events |= set(made.fly(wanted, 7 * MS))
+            assert math.dist(before, made.velocity) <= 4.0 * 0.007 * (1 + 1e-9)
+            assert min(from_box(np.array(made.position), b) for b in bounds) >= 1.0 - 1e-9
+    assert events & {SLID_ALONG_OBSTACLE, STOPPED_BY_OBSTACLE}
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_how_the_time_is_cut_makes_no_difference(seed: int) -> None:
+    """Bit by bit, also where nothing ends with a sub-step."""
+    whole, rng, _ = among_boxes(seed)
+    cut, _, _ = among_boxes(seed)
+    for _ in range(12):
+        wanted, left = motion(rng), int(rng.integers(30 * MS, 3000 * MS))
+        whole.fly(wanted, left)
+        while left:
+            length = min(left, int(rng.integers(1, 400 * MS)))
+            cut.fly(wanted, length)
+            left -= length
+        assert (whole.position, whole.velocity, whole.yaw) == (cut.position, cut.velocity, cut.yaw)
+
+
 def test_nothing_stands_in_the_way_where_there_is_no_scenery() -> None:
     made = flyer(Obstacles.none(), 10.0, 50.0)
     made.reset((0.0, 0.0, 0.0), 0.0)
-    assert made.fly(Motion(velocity=(10.0, 0.0, 0.0)), [0.01] * 200) == {}
+    assert made.fly(Motion(velocity=(10.0, 0.0, 0.0)), 2000 * MS) == {}
     assert made.position[0] == pytest.approx(10.0 * 2.0 - 10.0**2 / (2 * 50.0))
 
 
@@ -206,7 +253,7 @@ def test_flights_over_munich_keep_clear_of_it() -> None:
     for _ in range(25):
         target = vector(rng.uniform((-200, -200, 2), (250, 300, 30)))
         for _ in range(4):
-            events |= set(made.fly(Motion(target=target, speed=40.0), [0.01] * 50))
+            events |= set(made.fly(Motion(target=target, speed=40.0), 500 * MS))
             assert obstacles.distance(made.position, 5.0) >= 1.0 - 1e-5
     assert events
 
@@ -220,5 +267,5 @@ def test_a_start_inside_the_clearance_is_refused() -> None:
         name="uav", start_m=(8.5, 21.3, 26.5), max_speed_m_s=5.0, max_acceleration_m_s2=2.0, clearance_m=2.0
     )
     made = FlightWorld(FlightSettings(scenery="sionna:munich", flown=(thing,)), RunInfo(name="world"))
-    with pytest.raises(ScenarioError, match=r"m from the scenery, and 'uav' keeps 2.0 m"):
+    with pytest.raises(ScenarioError, match=r"m from the scenery, and 'uav' keeps 2\.000 m"):
         made.prepare(Preparation(demand={}))

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable
-from itertools import pairwise
 from typing import Annotated, ClassVar
 
 import msgspec
@@ -26,9 +25,6 @@ from caviar_services.world.flyer import Flyer, Limits, Motion
 from caviar_services.world.obstacles import Obstacles, scenery_triangles
 from caviar_services.world.shapes import SHAPES
 from caviar_services.world.trajectory import Length, MovingObject, TrajectorySettings, TrajectoryWorld
-
-SUB_STEP_NS = 10_000_000
-"""Step of the integration; sub-steps end at its multiples, and where a frame is."""
 
 
 class FlownObject(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -100,11 +96,11 @@ class FlightWorld(TrajectoryWorld):
         for index, (name, flyer) in enumerate(self._flyers.items()):
             thing = self._flown[name]
             flyer.obstacles = Obstacles(triangles[triangles[..., 2].max(axis=1) > flyer.limits.low[2]])
-            distance = flyer.obstacles.distance(thing.start_m, thing.clearance_m)
-            if distance < thing.clearance_m:
+            distance = flyer.obstacles.distance(thing.start_m, flyer.limits.kept)
+            if distance < flyer.limits.kept:
                 raise ScenarioError(
                     f"{list(thing.start_m)} is {distance:.3f} m from the scenery, and {name!r} keeps "
-                    f"{thing.clearance_m} m; start farther away",
+                    f"{flyer.limits.kept:.3f} m; start farther away",
                     key=f"services.{self.run.name}.settings.flown[{index}].start_m",
                 )
         return super().prepare(preparation)
@@ -126,9 +122,9 @@ class FlightWorld(TrajectoryWorld):
         motions = self._motions(frame)
         counts: Counter[str] = Counter()
         elapsed_ns = frame.t_ns - self._t0_ns
-        steps = _sub_steps(self._elapsed_ns, elapsed_ns)
+        length_ns = elapsed_ns - self._elapsed_ns
         for name, flyer in self._flyers.items():
-            counts.update(flyer.fly(motions.get(name), steps))
+            counts.update(flyer.fly(motions.get(name), length_ns))
         self._elapsed_ns = elapsed_ns
         return replace(super().step(frame), counts=dict(counts))
 
@@ -205,9 +201,3 @@ def _limits(thing: FlownObject, key: str) -> Limits:
         low=low,
         high=high,
     )
-
-
-def _sub_steps(start_ns: int, end_ns: int) -> list[float]:
-    """Lengths [s] of the sub-steps between two instants."""
-    grid = range((start_ns // SUB_STEP_NS + 1) * SUB_STEP_NS, end_ns, SUB_STEP_NS)
-    return [(b - a) / 1e9 for a, b in pairwise([start_ns, *grid, end_ns]) if b > a]

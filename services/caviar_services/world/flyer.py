@@ -1,17 +1,25 @@
-"""One flown object: a point whose velocity changes by a bounded acceleration.
+"""One flown object: a point with bounded speed and acceleration that keeps clear of obstacles.
 
-Between sub-steps the acceleration is constant, so that ``x = v₀·t + a·t²/2`` holds exactly.
+Time is cut into sub-steps of one length, counted from the instant at which the command last
+changed, so that it makes no difference how a flight is cut into frames. In a sub-step the velocity
+goes straight to a set-point with the greatest acceleration, and stays there. A sub-step is taken
+where the way through it and to a stop behind it is free. Otherwise the part of the set-point that
+leads into what is in the way is taken off; at last the object brakes, the way for which was found
+free before. So speed, acceleration and clearance hold at once, at any speed.
 """
 
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Iterable
+from collections import Counter, deque
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from caviar_protocol.coordinates import Vector
 from caviar_services.world.obstacles import Obstacles
+
+SUB_STEP_NS = 10_000_000
+"""[ns]"""
 
 LIMITED_SPEED = "limited-speed"
 """The command asked for more than the greatest speed."""
@@ -31,10 +39,19 @@ _HOVERING = 0.05
 _STANDSTILL = 0.01
 """Share of the speed below which what is left along a surface counts as none."""
 
+_ARRIVED = 1e-6
+"""[m] from its target at which an object is there."""
 
-_ROUNDING = 1e-9
-"""[m]"""
+_AT_ONCE = 8
+"""Sub-steps that are looked at together at most, while nothing is in the way."""
 
+_CONTACTS = 3
+"""Planes that a set-point is bent along at once; where three meet the object brakes."""
+
+_ROUNDING = 1e-12
+"""Share of the greatest speed by which a command that is scaled to it may miss it."""
+
+_H = SUB_STEP_NS / 1e9
 _REST: Vector = (0.0, 0.0, 0.0)
 
 
@@ -52,6 +69,11 @@ class Limits:
     high: Vector
     """Corners of the permitted box [m]."""
 
+    @property
+    def kept(self) -> float:
+        """``clearance``, and what a path bends away from its chord in a sub-step: a·h²/8 [m]."""
+        return self.clearance + self.acceleration * _H**2 / 8
+
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
@@ -60,6 +82,29 @@ class Motion:
     velocity: Vector = (0.0, 0.0, 0.0)
     target: Vector | None = None
     speed: float = 0.0
+
+
+_HOVER = Motion()
+
+
+class _Piece(NamedTuple):
+    """A sub-step: constant acceleration for ``ramp`` [s], then the constant velocity ``after``."""
+
+    position: Vector
+    velocity: Vector
+    acceleration: Vector
+    ramp: float
+    after: Vector
+    event: str = ""
+    """What limited it."""
+
+    def at(self, t: float) -> tuple[Vector, Vector]:
+        """Position [m] and velocity [m/s] after a time [s]."""
+        u = min(t, self.ramp)
+        position = _sum(_sum(self.position, self.velocity, u), self.acceleration, 0.5 * u * u)
+        if t < self.ramp:
+            return position, _sum(self.velocity, self.acceleration, u)
+        return _sum(position, self.after, t - self.ramp), self.after
 
 
 class Flyer:
@@ -73,86 +118,163 @@ class Flyer:
     def reset(self, position: Vector, yaw: float) -> None:
         """At rest at a position [m], with a yaw [rad]."""
         self.position: Vector = position
-        self.velocity: Vector = (0.0, 0.0, 0.0)
+        self.velocity: Vector = _REST
         self.yaw = yaw
+        self._motion = _HOVER
+        self._restart()
 
-    def fly(self, motion: Motion | None, steps: Iterable[float]) -> Counter[str]:
-        """Move through sub-steps of these lengths [s]; without a motion brake and hover.
+    def _restart(self) -> None:
+        """Count sub-steps from here on."""
+        self._begin, self._begin_yaw = (self.position, self.velocity), self.yaw
+        self._into_ns = 0
+        self._pieces: deque[_Piece] = deque()
+        self._at_once = _AT_ONCE
+
+    def fly(self, motion: Motion | None, length_ns: int) -> Counter[str]:
+        """Move for a time [ns]; without a motion brake and hover.
 
         Returns what limited the motion, each at most once.
         """
         events: set[str] = set()
-        wanted = motion or Motion()
+        wanted = motion or _HOVER
         asked = math.hypot(*wanted.velocity) if wanted.target is None else wanted.speed
-        if asked > self.limits.speed:
+        if asked > self.limits.speed * (1 + _ROUNDING):
             events.add(LIMITED_SPEED)
-        for dt in steps:
-            before = self.velocity
-            after = _towards(before, self._desired(wanted, dt), self.limits.acceleration * dt)
-            self._move(before, after, dt, events)
-            vx, vy, _ = self.velocity
-            if math.hypot(vx, vy) > _HOVERING:
-                self.yaw = math.atan2(vy, vx)
-        return Counter(events)
+        if wanted != self._motion:
+            self._motion = wanted
+            self._restart()
+        self._into_ns += length_ns
+        while self._into_ns >= SUB_STEP_NS:
+            events.add(self._next().event)
+            self._begin = self._pieces.popleft().at(_H)
+            self._begin_yaw = _course(self._begin[1], self._begin_yaw)
+            self._into_ns -= SUB_STEP_NS
+        self.position, self.velocity = self._begin
+        if self._into_ns:
+            events.add(self._next().event)
+            self.position, self.velocity = self._next().at(self._into_ns / 1e9)
+        self.yaw = _course(self.velocity, self._begin_yaw)
+        return Counter(events - {""})
 
-    def _desired(self, motion: Motion, dt: float) -> Vector:
-        """Velocity [m/s] to have at the end of a sub-step."""
+    def _next(self) -> _Piece:
+        """The sub-step under way."""
+        if not self._pieces:
+            found = self._several()
+            self._at_once = min(2 * self._at_once, _AT_ONCE) if found else 1
+            self._pieces.extend(found or [self._one()])
+        return self._pieces[0]
+
+    def _several(self) -> list[_Piece]:
+        """The next sub-steps, if nothing is in their way."""
+        state, pieces, places = self._begin, list[_Piece](), list[Vector]()
+        for _ in range(self._at_once):
+            wish = self._desired(*state)
+            if wish == state[1] == _REST:
+                if not pieces:
+                    return [_Piece(state[0], _REST, _REST, 0.0, _REST)]
+                break
+            pieces.append(self._towards(*state, wish))
+            state = pieces[-1].at(_H)
+            places += [state[0], self._stop(*state)]
+        return [] if self._in_the_way(places)[1] else pieces
+
+    def _one(self) -> _Piece:
+        """The next sub-step, along what is in the way, or braking."""
+        wish = self._desired(*self._begin)
+        planes: list[Vector] = []
+        event = ""
+        for _ in range(_CONTACTS):
+            bent = _bent(wish, planes)
+            piece = self._towards(*self._begin, bent)
+            end = piece.at(_H)
+            plane, found = self._in_the_way([end[0], self._stop(*end)])
+            if not found:
+                if event == SLID_ALONG_OBSTACLE and math.hypot(*bent) <= _STANDSTILL * math.hypot(*wish):
+                    event = STOPPED_BY_OBSTACLE
+                return piece._replace(event=event)
+            event = found
+            planes.append(plane)
+        stopped = STOPPED_BY_OBSTACLE if event == SLID_ALONG_OBSTACLE else event
+        return self._towards(*self._begin, _REST)._replace(event=stopped)
+
+    def _towards(self, position: Vector, velocity: Vector, after: Vector) -> _Piece:
+        """The sub-step in which the velocity goes to ``after``, as far as it gets."""
+        change = _sum(after, velocity, -1.0)
+        size = math.hypot(*change)
+        if size == 0.0:
+            return _Piece(position, velocity, _REST, 0.0, after)
+        most = self.limits.acceleration
+        return _Piece(position, velocity, _scaled(change, most / size), size / most, after)
+
+    def _stop(self, position: Vector, velocity: Vector) -> Vector:
+        """Where an object comes to rest that brakes as hard as it can [m]."""
+        return _sum(position, velocity, math.hypot(*velocity) / (2 * self.limits.acceleration))
+
+    def _in_the_way(self, places: list[Vector]) -> tuple[Vector, str]:
+        """What is in the way of straight lines to and between places: a unit vector away from it,
+        and the event that it makes; empty where there is nothing."""
+        here = self._begin[0]
+        for place in places:
+            for axis in range(3):
+                if place[axis] < self.limits.low[axis] and place[axis] < here[axis]:
+                    return _unit(axis, 1.0), STOPPED_BY_GEOFENCE
+                if place[axis] > self.limits.high[axis] and place[axis] > here[axis]:
+                    return _unit(axis, -1.0), STOPPED_BY_GEOFENCE
+        ways = [_sum(place, here, -1.0) for place in places]
+        plane = self.obstacles.in_the_way(here, ways, self.limits.kept)
+        return (_REST, "") if plane is None else (plane, SLID_ALONG_OBSTACLE)
+
+    def _desired(self, position: Vector, velocity: Vector) -> Vector:
+        """Velocity [m/s] to strive for in a sub-step.
+
+        On the way to a target it is the greatest w from which, braking as hard as it can, the object
+        comes to rest there behind this sub-step of length h. With the speed v towards the target, the
+        ramp from v to w and the stop from w are as long as the way d:
+        w·h ± (w − v)²/2a + w²/2a = d, with the sign of v − w.
+        """
+        motion, a = self._motion, self.limits.acceleration
         if motion.target is None:
             speed = math.hypot(*motion.velocity)
-            return _scaled(motion.velocity, min(1.0, self.limits.speed / speed)) if speed else motion.velocity
-        way = _sum(motion.target, self.position, -1.0)
-        distance = math.hypot(*way)
-        if distance == 0.0:
-            return (0.0, 0.0, 0.0)
-        now = math.hypot(*self.velocity)
-        # The greatest v with (now + v)·dt/2 + v²/2a ≤ distance: what is then left is the way in
-        # which v brakes to rest. Closer than one sub-step the next one has to end at rest.
-        half = self.limits.acceleration * dt / 2
-        root = half * half + self.limits.acceleration * (2 * distance - now * dt)
-        brake = math.sqrt(root) - half if root > 0 else 0.0
-        speed = min(motion.speed, self.limits.speed, brake, distance / dt - now / 2)
-        return _scaled(way, max(speed, 0.0) / distance)
-
-    def _move(self, before: Vector, after: Vector, dt: float, events: set[str]) -> None:
-        mean = _scaled(_sum(before, after), 0.5)
-        length = math.hypot(*mean) * dt
-        pieces = max(1, math.ceil(length / (self.limits.clearance / 2)))
-        for _ in range(pieces):
-            step = _scaled(mean, dt / pieces)
-            taken, after = self._permitted(step, after, events)
-            if taken is not step:
-                mean = _scaled(taken, pieces / dt)
-            self.position = _clamped(_sum(self.position, taken), self.limits.low, self.limits.high)
-        self.velocity = after
-
-    def _permitted(self, step: Vector, velocity: Vector, events: set[str]) -> tuple[Vector, Vector]:
-        """What of a step may be taken, and the velocity then."""
-        wish = step
-        end = _sum(self.position, step)
-        inside = _clamped(end, self.limits.low, self.limits.high)
-        if inside != end:
-            events.add(STOPPED_BY_GEOFENCE)
-            step = _sum(inside, self.position, -1.0)
-            velocity = _masked(velocity, inside, end)
-            if inside == self.position:
-                return _REST, velocity
-        taken = self.obstacles.slide(self.position, step, self.limits.clearance)
-        if taken is step:
-            return taken, velocity
-        end = _sum(self.position, taken)
-        leaves = max(map(abs, _sum(_clamped(end, self.limits.low, self.limits.high), end, -1.0))) > _ROUNDING
-        if leaves or math.hypot(*taken) <= _STANDSTILL * math.hypot(*wish):
-            events.add(STOPPED_BY_OBSTACLE)
-            return _REST, _REST
-        events.add(SLID_ALONG_OBSTACLE)
-        return taken, _scaled(taken, math.hypot(*velocity) / math.hypot(*step))
+            return _scaled(motion.velocity, min(1.0, self.limits.speed / speed)) if speed else _REST
+        way = _sum(motion.target, position, -1.0)
+        d = math.hypot(*way)
+        if d < _ARRIVED:
+            return _REST
+        v = _dot(velocity, way) / d
+        if d >= v * _H + v * abs(v) / (2 * a):
+            slope = _H + v / a
+            w = (d + v * v / (2 * a)) / slope if slope > 0.0 else math.inf
+        else:
+            square = (_H - v / a) ** 2 - (4 / a) * (v * v / (2 * a) - d)
+            w = max(0.0, a / 2 * (v / a - _H + math.sqrt(square))) if square > 0.0 else 0.0
+        return _scaled(way, min(w, motion.speed, self.limits.speed) / d)
 
 
-def _towards(now: Vector, desired: Vector, most: float) -> Vector:
-    """``now`` changed towards ``desired``, by at most ``most``."""
-    change = _sum(desired, now, -1.0)
-    size = math.hypot(*change)
-    return desired if size <= most else _sum(now, change, most / size)
+def _bent(wish: Vector, planes: list[Vector]) -> Vector:
+    """A velocity without what leads into planes, given by unit vectors away from them."""
+    if not planes:
+        return wish
+    found = _sum(wish, planes[-1], -min(_dot(wish, planes[-1]), 0.0))
+    if len(planes) == 1 or _dot(found, planes[0]) >= 0.0:
+        return found
+    (ax, ay, az), (bx, by, bz) = planes
+    crease = (ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx)
+    square = _dot(crease, crease)
+    return _scaled(crease, _dot(wish, crease) / square) if square > 1e-12 else _REST
+
+
+def _course(velocity: Vector, yaw: float) -> float:
+    vx, vy, _ = velocity
+    return math.atan2(vy, vx) if math.hypot(vx, vy) > _HOVERING else yaw
+
+
+def _unit(axis: int, sign: float) -> Vector:
+    x, y, z = (sign if axis == i else 0.0 for i in range(3))
+    return (x, y, z)
+
+
+def _dot(a: Vector, b: Vector) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def _sum(a: Vector, b: Vector, factor: float = 1.0) -> Vector:
@@ -161,14 +283,3 @@ def _sum(a: Vector, b: Vector, factor: float = 1.0) -> Vector:
 
 def _scaled(v: Vector, factor: float) -> Vector:
     return (v[0] * factor, v[1] * factor, v[2] * factor)
-
-
-def _clamped(v: Vector, low: Vector, high: Vector) -> Vector:
-    x, y, z = (min(max(c, a), b) for c, a, b in zip(v, low, high, strict=True))
-    return (x, y, z)
-
-
-def _masked(v: Vector, a: Vector, b: Vector) -> Vector:
-    """``v`` without the components in which ``a`` and ``b`` differ."""
-    x, y, z = (c if p == q else 0.0 for c, p, q in zip(v, a, b, strict=True))
-    return (x, y, z)

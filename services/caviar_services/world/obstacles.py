@@ -7,7 +7,7 @@ some way, so that a step looks at few of them, and in free flight at none.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -48,6 +48,9 @@ class Obstacles:
         self._centre: Vector = _REST
         self._reach = -math.inf
         self._around: _Faces | None = None
+        self._seen_from: Vector | None = None
+        self._seen: tuple[Float64Array, Float64Array]
+        """Distances and gaps from there: several ways are tried from one place."""
 
     @classmethod
     def none(cls) -> Obstacles:
@@ -59,32 +62,41 @@ class Obstacles:
         near = self._near(point, within)
         return min(_Faces(near).gaps(point)[0].min(), within) if len(near) else within
 
-    def slide(self, start: Vector, step: Vector, radius: float) -> Vector:
-        """What a ball [m] may do of a step: all, what is left of it along surfaces, or nothing.
+    def in_the_way(self, start: Vector, ways: Sequence[Vector], radius: float) -> Vector | None:
+        """What a ball [m] would touch on its ways [m] from a start: a unit vector away from it, or None.
 
-        Returns ``step`` itself where it is free. A ball that starts ``radius`` away from all triangles
-        is so, but for rounding, on the whole way of what is returned: a triangle lies behind the plane
-        through its point nearest to the start, across the line to the start, and the way does not come
-        nearer than ``radius`` to that plane. Beside an edge this asks for a little more than needed.
+        A triangle lies behind the plane through its point nearest to the start, across the line to the
+        start. Where no way comes nearer than ``radius`` to any of these planes, the straight lines between
+        the ends are free too. Beside an edge this asks for a little more than needed. Of several planes
+        it is the one that a way goes into the farthest.
         """
-        need = radius + math.hypot(*step)
+        need = radius + max(math.hypot(*way) for way in ways)
         if self._reach - math.dist(start, self._centre) < need:
             self._look_around(start, need)
-        if self._around is None or step == _REST:
-            return step
-        distances, gaps = self._around.gaps(start)
+        if self._around is None:
+            return None
+        if start != self._seen_from:
+            self._seen_from, self._seen = start, self._around.gaps(start)
+        distances, gaps = self._seen
         near = distances < need
         if not near.any():
-            return step
-        room = distances[near] - radius
-        return _within(step, np.where(np.abs(room) < _WORN, 0.0, room), gaps[near])
+            return None
+        distance = distances[near]
+        room = np.where(np.abs(distance - radius) < _WORN, 0.0, distance - radius)
+        normals = gaps[near] / np.maximum(distance, _ROUNDING)[:, None]
+        short = (normals @ np.array(ways).T).min(axis=1) + room
+        worst = int(short.argmin())
+        if short[worst] >= -_ROUNDING:
+            return None
+        x, y, z = normals[worst].tolist()
+        return (x, y, z)
 
     def _look_around(self, centre: Vector, need: float) -> None:
         """Keep the triangles that steps from places around this one can come near."""
         corners = self._near(centre, need + _HORIZON)
         distances = _Faces(corners).gaps(centre)[0] if len(corners) else np.zeros(0)
         free = float(distances.min(initial=need + _HORIZON))
-        self._centre = centre
+        self._centre, self._seen_from = centre, None
         self._reach = max(free, need + _AROUND)
         kept = corners[distances < self._reach]
         self._around = _Faces(kept) if len(kept) else None
@@ -94,45 +106,6 @@ class Obstacles:
         if self._grid is None or math.isinf(within):
             return self._corners
         return self._corners[self._grid.find(point, within)]
-
-
-def _within(step: Vector, room: Float64Array, gaps: Float64Array) -> Vector:
-    """A step that goes into no plane by more than the room before it.
-
-    Violated planes are taken one after the other, the worst first: along one plane, then along
-    the line where two meet; a third one ends the motion.
-    """
-    normals = gaps / np.maximum(np.sqrt(_dot(gaps, gaps)), _ROUNDING)[:, None]
-    move = step
-    before: Vector | None = None
-    for _ in range(3):
-        short = _dot(normals, np.array(move)) + room
-        worst = int(short.argmin())
-        if short[worst] >= -_ROUNDING:
-            return move
-        x, y, z = normals[worst].tolist()
-        move = _along(step, (x, y, z), before)
-        before = (x, y, z)
-    return _REST
-
-
-def _along(step: Vector, normal: Vector, before: Vector | None) -> Vector:
-    """A step without what goes into a plane, nor into the one ``before``."""
-    into = min(_scalar(step, normal), 0.0)
-    move = (step[0] - into * normal[0], step[1] - into * normal[1], step[2] - into * normal[2])
-    if before is None or _scalar(move, before) >= 0:
-        return move
-    (ax, ay, az), (bx, by, bz) = before, normal
-    crease = (ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx)
-    size = _scalar(crease, crease)
-    if size == 0:
-        return _REST
-    share = _scalar(step, crease) / size
-    return (crease[0] * share, crease[1] * share, crease[2] * share)
-
-
-def _scalar(a: Vector, b: Vector) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 class _Faces:
