@@ -13,7 +13,7 @@ from link_builders import random_h
 from caviar_protocol.topics import AntennaArray
 from caviar_services.antenna import steering_vector
 from caviar_services.link.codebook import dft_codebook, pointing_directions
-from caviar_services.link.sweep import best_pairs, sweep
+from caviar_services.link.sweep import Pairs, best_pairs, sweep
 
 
 @pytest.mark.parametrize(
@@ -69,6 +69,6 @@ def test_best_pairs_are_sorted_and_ties_go_to_the_lowest_index(
     grid = np.resize(np.array(values, dtype=np.float64), (rows, columns))
     pairs = [(p, q) for p in range(rows) for q in range(columns)]
     expected = sorted(pairs, key=lambda pair: -grid[pair])[:k]
-    best = best_pairs(grid, k)
+    best = Pairs(*(found[0] for found in best_pairs(grid[None], k)))
     assert list(zip(best.tx_beam.tolist(), best.rx_beam.tolist(), strict=True)) == expected
     assert best.abs_y.tolist() == [grid[pair] for pair in expected]

@@ -89,8 +89,9 @@ def test_users_with_different_arrays_are_swept_in_their_own_shapes_and_order() -
     devices = [antenna(f"r{i}", "rx", (1, 1 + i % 2), (5.0 + i, 0.0, 0.0)) for i in range(4)]
     users = users_of(scene_of(BS, *devices), (CARRIER,))
     h = [random_h(i, 1 + i % 2, 4) for i in range(3)]
-    swept = sweep_users(users, [*h, None])
-    assert [None if s is None else s.shape for s in swept] == [(4, 1), (4, 2), (4, 1), None]
-    for matrix, abs_y in zip(h, swept, strict=False):
-        assert abs_y is not None
+    groups = sweep_users(users, [*h, None])
+    swept = {u: abs_y for group in groups for u, abs_y in zip(group.users, group.abs_y, strict=True)}
+    assert {u: abs_y.shape for u, abs_y in swept.items()} == {0: (4, 1), 1: (4, 2), 2: (4, 1)}
+    for u, matrix in enumerate(h):
+        abs_y = swept[u]
         assert np.sum(abs_y**2) == pytest.approx(np.sum(np.abs(matrix) ** 2))

@@ -27,14 +27,13 @@ class OracleAgent(Agent[AgentSettings]):
         if channel is None:
             raise PayloadError(f"{self.run.name} was granted frame {frame.number} without a channel")
         users = [User(pair.tx, pair.rx, carrier) for carrier in channel.carriers for pair in pairs]
-        for user, abs_y in zip(users, sweep_users(users, channels_of(channel, users).h), strict=True):
-            if abs_y is None:
-                continue
-            best = best_pairs(abs_y, 1)
-            yield BeamChoice(
-                tx=user.tx.name,
-                rx=user.rx.name,
-                tx_beam=int(best.tx_beam[0]),
-                rx_beam=int(best.rx_beam[0]),
-                carrier=user.carrier.name,
-            )
+        for swept in sweep_users(users, channels_of(channel, users).h):
+            best = best_pairs(swept.abs_y, 1)
+            for u, tx_beam, rx_beam in zip(swept.users, best.tx_beam[:, 0], best.rx_beam[:, 0], strict=True):
+                yield BeamChoice(
+                    tx=users[u].tx.name,
+                    rx=users[u].rx.name,
+                    tx_beam=int(tx_beam),
+                    rx_beam=int(rx_beam),
+                    carrier=users[u].carrier.name,
+                )

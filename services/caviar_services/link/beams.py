@@ -22,8 +22,8 @@ from caviar_protocol.topics import Carrier, Channel, Link, Scene
 from caviar_protocol.topics.scene import Device
 from caviar_services.link.base import LinkModel
 from caviar_services.link.choices import Choices, choices_of
-from caviar_services.link.sweep import best_pairs
-from caviar_services.link.users import User, UserChannels, channels_of, sweep_users, users_of
+from caviar_services.link.sweep import Pairs, best_pairs
+from caviar_services.link.users import Swept, User, UserChannels, channels_of, sweep_users, users_of
 from caviar_services.service import Frame, StepResult
 
 BOLTZMANN = 1.380649e-23
@@ -190,24 +190,39 @@ def _score(
     towards_rx, towards_tx = at_tx.tolist(), at_rx.tolist()
     k = min(top_k, max((user.tx.array.size * user.rx.array.size for user in users), default=0))
     chosen, baseline = [0.0] * len(users), [0.0] * len(users)
-    top_tx, top_rx = (np.full((len(users), k), -1, np.int32) for _ in range(2))
-    top_abs_y = np.zeros((len(users), k))
-    for u, abs_y in enumerate(sweep_users(users, channels.h)):
-        if abs_y is None:
-            continue
-        user, best = users[u], best_pairs(abs_y, k)
-        listed = len(best.abs_y)
-        top_tx[u, :listed], top_rx[u, :listed], top_abs_y[u, :listed] = best
-        if choices.tx_beam[u] >= 0:
-            chosen[u] = abs_y[choices.tx_beam[u], choices.rx_beam[u]]
-        straight = beam_towards(user.tx.array, towards_rx[u]), beam_towards(user.rx.array, towards_tx[u])
-        baseline[u] = abs_y[straight]
+    tx_beams, rx_beams = choices.tx_beam.tolist(), choices.rx_beam.tolist()
+    swept = sweep_users(users, channels.h)
+    for group in swept:
+        for u, abs_y in zip(group.users, group.abs_y, strict=True):
+            user = users[u]
+            if tx_beams[u] >= 0:
+                chosen[u] = abs_y[tx_beams[u], rx_beams[u]]
+            straight = (
+                beam_towards(user.tx.array, towards_rx[u]),
+                beam_towards(user.rx.array, towards_tx[u]),
+            )
+            baseline[u] = abs_y[straight]
+    best = _listed(swept, len(users), k)
     return _Scores(
         abs_y=np.array(chosen, np.float64),
-        top_tx_beam=top_tx,
-        top_rx_beam=top_rx,
-        top_abs_y=top_abs_y,
+        top_tx_beam=best.tx_beam,
+        top_rx_beam=best.rx_beam,
+        top_abs_y=best.abs_y,
         baseline_abs_y=np.array(baseline, np.float64),
         aod_azimuth=np.arctan2(at_tx[:, 1], at_tx[:, 0]),
         aoa_azimuth=np.arctan2(at_rx[:, 1], at_rx[:, 0]),
     )
+
+
+def _listed(swept: Sequence[Swept], users: int, k: int) -> Pairs:
+    """The best pairs of all users, Shape ``[U, k]``; −1 and |y| 0 where a user has fewer."""
+    found = [best_pairs(group.abs_y, k) for group in swept]
+    if len(swept) == 1 and found[0].abs_y.shape == (users, k):
+        return found[0]  # all users in their order
+    listed = Pairs(np.full((users, k), -1, np.int32), np.full((users, k), -1, np.int32), np.zeros((users, k)))
+    for group, pairs in zip(swept, found, strict=True):
+        length = pairs.abs_y.shape[1]
+        listed.tx_beam[group.users, :length] = pairs.tx_beam
+        listed.rx_beam[group.users, :length] = pairs.rx_beam
+        listed.abs_y[group.users, :length] = pairs.abs_y
+    return listed

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from caviar_protocol.arrays import Complex128Array, Float64Array, Int32Array
+from caviar_protocol.arrays import Complex128Array, Float64Array, Int32Array, Int64Array
 from caviar_protocol.topics.scene import AntennaArray
 
 SORTED_WHOLE = 256
@@ -18,7 +18,7 @@ would be shared out to threads too, which on a busy machine wait for each other 
 
 
 class Pairs(NamedTuple):
-    """Beam pairs, best first, Shape ``[k]`` each."""
+    """Beam pairs of U users, best first, Shape ``[U, k]`` each."""
 
     tx_beam: Int32Array
     rx_beam: Int32Array
@@ -55,18 +55,28 @@ def _fourier(size: int) -> Complex128Array:
 
 
 def best_pairs(abs_y: Float64Array, k: int) -> Pairs:
-    """The ``k`` pairs with the greatest |y|, Shape ``[Nt, Nr]``; all of them where there are fewer.
+    """The ``k`` pairs with the greatest |y|, Shape ``[U, Nt, Nr]``; all of them where there are fewer.
 
     The first one is eq. (2) of the paper. Of equal ones the lowest pair index
     ``tx_beam·Nr + rx_beam`` comes first.
     """
-    flat = abs_y.ravel()
-    k = min(k, flat.size)
-    if flat.size <= SORTED_WHOLE:
-        order = np.argsort(-flat, kind="stable")[:k]
+    flat = abs_y.reshape(len(abs_y), -1)
+    k = min(k, flat.shape[1])
+    if flat.shape[1] <= SORTED_WHOLE:
+        order = np.argsort(-flat, axis=-1, kind="stable")[:, :k]
     else:
-        threshold = np.partition(flat, flat.size - k)[flat.size - k]
-        candidates = np.flatnonzero(flat >= threshold)
-        order = candidates[np.argsort(-flat[candidates], kind="stable")][:k]
-    tx_beam, rx_beam = np.divmod(order, abs_y.shape[1])
-    return Pairs(tx_beam.astype(np.int32), rx_beam.astype(np.int32), flat[order])
+        order = np.array([_best_of_many(row, k) for row in flat])
+    tx_beam = order // abs_y.shape[2]
+    return Pairs(
+        tx_beam.astype(np.int32),
+        (order - tx_beam * abs_y.shape[2]).astype(np.int32),
+        flat[np.arange(len(flat))[:, None], order],
+    )
+
+
+def _best_of_many(flat: Float64Array, k: int) -> Int64Array:
+    """Indices of the ``k`` greatest, found without sorting all."""
+    threshold = np.partition(flat, flat.size - k)[flat.size - k]
+    candidates = np.flatnonzero(flat >= threshold)
+    order: Int64Array = candidates[np.argsort(-flat[candidates], kind="stable")][:k]
+    return order

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.pairs import Pair, pairs_of
-from caviar_protocol.topics import Carrier, Channel, Scene
+from caviar_protocol.topics import AntennaArray, Carrier, Channel, Scene
 from caviar_services.link.sweep import sweep
 
 
@@ -20,6 +21,9 @@ class User(Pair):
     """A pair on one carrier."""
 
     carrier: Carrier
+
+    def __str__(self) -> str:
+        return f"{self.tx.name} → {self.rx.name} on {self.carrier.name}"
 
 
 def users_of(scene: Scene, carriers: Sequence[Carrier]) -> list[User]:
@@ -51,48 +55,54 @@ def channels_of(channel: Channel, users: Sequence[User]) -> UserChannels:
     tx_index = {name: index for index, name in enumerate(channel.tx)}
     rx_index = {name: index for index, name in enumerate(channel.rx)}
     matrices = {(matrix.carrier, matrix.tx, matrix.rx): matrix.h for matrix in channel.h}
-    known, has_path, los = (np.zeros(len(users), dtype=np.bool_) for _ in range(3))
+    offsets, receivers = channel.offsets.tolist(), len(channel.rx)
+    known, has_path, los = ([False] * len(users) for _ in range(3))
     found: list[Complex128Array | None] = [None] * len(users)
     for u, user in enumerate(users):
         key = (carriers.get(user.carrier.name), tx_index.get(user.tx.name), rx_index.get(user.rx.name))
         if None in key:
             continue
         c, t, r = key
+        first = t * receivers + r  # type: ignore[operator]  # no None in it
         known[u] = True
-        los[u] = channel.los[t, r]
-        has_path[u] = bool(channel.a[c, channel.pair(user.tx.name, user.rx.name)].any())
+        los[u] = bool(channel.los[t, r])
+        has_path[u] = bool(channel.a[c, offsets[first] : offsets[first + 1]].any())
         if has_path[u]:
             found[u] = _checked(user, matrices.get(key))  # type: ignore[arg-type]  # no None in it
-    return UserChannels(known, has_path, los, tuple(found))
+    return UserChannels(
+        known=np.array(known, np.bool_),
+        has_path=np.array(has_path, np.bool_),
+        los=np.array(los, np.bool_),
+        h=tuple(found),
+    )
 
 
 def _checked(user: User, h: Complex128Array | None) -> Complex128Array:
-    name = f"{user.tx.name} → {user.rx.name} on {user.carrier.name}"
     if h is None:
         raise PayloadError(
-            f"the channel has paths for {name} but no H; its service has to compute part 'h', "
+            f"the channel has paths for {user} but no H; its service has to compute part 'h', "
             "which is in demand"
         )
     expected = (user.rx.array.size, user.tx.array.size)
     if h.shape != expected:
         raise PayloadError(
-            f"H of {name} has shape {h.shape}, the arrays of the scene need {expected} (RX × TX elements)"
+            f"H of {user} has shape {h.shape}, the arrays of the scene need {expected} (RX × TX elements)"
         )
     return h
 
 
-def sweep_users(users: Sequence[User], h: Sequence[Complex128Array | None]) -> list[Float64Array | None]:
-    """|y| of all beam pairs of each user, Shape ``[Nt, Nr]``; None where H is None.
+class Swept(NamedTuple):
+    """Users with equal arrays, swept as one batch."""
 
-    Users with equal arrays are swept as one batch.
-    """
-    swept: list[Float64Array | None] = [None] * len(users)
-    groups = defaultdict(list)
-    for index, (user, matrix) in enumerate(zip(users, h, strict=True)):
+    users: list[int]
+    abs_y: Float64Array
+    """|y| of all beam pairs, Shape ``[len(users), Nt, Nr]``."""
+
+
+def sweep_users(users: Sequence[User], h: Sequence[Complex128Array | None]) -> list[Swept]:
+    """|y| of all beam pairs of the users with an H."""
+    groups: dict[tuple[AntennaArray, AntennaArray], list[int]] = defaultdict(list)
+    for index, matrix in enumerate(h):
         if matrix is not None:
-            groups[user.tx.array, user.rx.array].append((index, matrix))
-    for (tx, rx), members in groups.items():
-        batch = sweep(np.array([matrix for _, matrix in members]), tx, rx)
-        for (index, _), abs_y in zip(members, batch, strict=True):
-            swept[index] = abs_y
-    return swept
+            groups[users[index].tx.array, users[index].rx.array].append(index)
+    return [Swept(found, sweep(np.array([h[u] for u in found]), *arrays)) for arrays, found in groups.items()]
