@@ -185,7 +185,8 @@ def free_space(*frequencies: float) -> ChannelModel[Any]:
 
 
 def geometric(*frequencies: float, seed: int = 1, **settings: Any) -> ChannelModel[Any]:
-    from caviar_services.channel.geometric import GeometricChannel, GeometricSettings
+    from caviar_services.channel.geometric import GeometricChannel
+    from caviar_services.channel.geometric_settings import GeometricSettings
 
     run = RunInfo(name="channel", seed=seed, carriers=carriers(*frequencies))
     model = GeometricChannel(msgspec.convert(settings, GeometricSettings), run)

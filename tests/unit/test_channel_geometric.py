@@ -12,7 +12,8 @@ from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.coordinates import quaternion_from_euler
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Channel, Scene
-from caviar_services.channel.geometric import GeometricChannel, GeometricSettings
+from caviar_services.channel.geometric import GeometricChannel
+from caviar_services.channel.geometric_settings import GeometricSettings
 from caviar_services.channel.occlusion import Boxes
 from caviar_services.registry import load
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo, StepResult
