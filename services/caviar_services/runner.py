@@ -60,6 +60,8 @@ class Runner:
         Until the broker has to answer HELLO, or a request for scenery [s].
     termination
         How this runner is told to end; none: not by signals.
+    own_process
+        Whether the process is this service's own, so that its memory may be tuned for it.
     """
 
     def __init__(
@@ -70,7 +72,10 @@ class Runner:
         endpoint: str,
         connect_timeout_s: float = CONNECT_TIMEOUT_S,
         termination: Termination | None = None,
+        *,
+        own_process: bool = True,
     ) -> None:
+        self._own_process = own_process
         self.name, self.use, self.cls = name, use, cls
         self.ended = ""
         """Why the broker ended the run, once it did."""
@@ -167,9 +172,10 @@ class Runner:
                     assets = self._fetch(message.assets)
                 files = self._store.folder_of(assets) if assets else {}
                 prepared = service.prepare(preparation_of(message, files))
-            # What was loaded stays: collections look only at what frames leave behind, all of it, soon.
-            gc.collect()
-            gc.freeze()
+            if self._own_process:
+                # What was loaded stays: collections look only at what frames leave behind, all of it, soon.
+                gc.collect()
+                gc.freeze()
             self._broker.send(ready_of(self._identity, prepared, assets))
 
     def _fetch(self, assets: Sequence[m.Asset]) -> list[m.Asset]:
@@ -234,7 +240,8 @@ class Runner:
         if grant.frame % TRIM_EVERY == TRIM_EVERY - 1:
             with self._reporting("release", grant.episode, grant.frame):
                 self._running.release_memory()
-                trim_memory()
+                if self._own_process:
+                    trim_memory()
 
     def _answer(self, reset: m.Reset, grant: m.Grant, parts: Sequence[zmq.Frame]) -> list[Any]:
         """DONE with its products, or FAULT, as it travels."""

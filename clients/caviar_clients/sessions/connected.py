@@ -52,7 +52,9 @@ class ConnectedSession(Session):
         self._seeds: SimpleQueue[int | None] = SimpleQueue()
         self._termination = _Leaving(self)
         cls = declared(inputs, self._first_seed, self._decided)
-        runner = Runner(agent, cls, IMPLEMENTATION, broker, connect_timeout_s, self._termination)
+        runner = Runner(
+            agent, cls, IMPLEMENTATION, broker, connect_timeout_s, self._termination, own_process=False
+        )
         self._thread = threading.Thread(target=self._serve, args=(runner,), name="session", daemon=True)
         self._thread.start()
 
