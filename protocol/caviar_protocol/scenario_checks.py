@@ -134,6 +134,27 @@ def owned_by(patterns: Iterable[str], name: str) -> bool:
     return any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)
 
 
+def patterns_overlap(a: str, b: str) -> bool:
+    """Whether some name matches both patterns, in which ``*`` is any text and ``?`` any character."""
+    reachable = {(0, 0)}
+    todo = [(0, 0)]
+    while todo:
+        i, j = todo.pop()
+        if i == len(a) and j == len(b):
+            return True
+        head_a, head_b = a[i : i + 1], b[j : j + 1]
+        steps = set()
+        if head_a == "*":
+            steps |= {(i + 1, j)} | ({(i, j + 1)} if head_b else set())
+        if head_b == "*":
+            steps |= {(i, j + 1)} | ({(i + 1, j)} if head_a else set())
+        if head_a and head_b and (head_a == head_b or "?" in (head_a, head_b)):
+            steps.add((i + 1, j + 1))
+        todo += steps - reachable
+        reachable |= steps
+    return False
+
+
 def _plain(value: Any) -> Any:
     """Built-in types, with every field of a struct; `msgspec.to_builtins` leaves out defaults."""
     if isinstance(value, msgspec.Struct):

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from caviar_protocol.errors import DeclarationError
 from caviar_protocol.messages import Demand, Hello
+from caviar_protocol.scenario_checks import patterns_overlap
 
 WILDCARD = "*"
 """Topic of an input that takes every topic (recorders)."""
@@ -106,32 +107,11 @@ def check_actuators(actuators: Mapping[str, Iterable[str]]) -> None:
     claimed = [(pattern, agent) for agent, found in actuators.items() for pattern in found]
     for index, (pattern, agent) in enumerate(claimed):
         for other_pattern, other in claimed[:index]:
-            if other != agent and _overlap(pattern, other_pattern):
+            if other != agent and patterns_overlap(pattern, other_pattern):
                 raise DeclarationError(
                     f"agents {other!r} and {agent!r} clash: an actuator may match {other_pattern!r} of the "
                     f"one and {pattern!r} of the other; give each its own `users`"
                 )
-
-
-def _overlap(a: str, b: str) -> bool:
-    """Whether some name matches both patterns, in which ``*`` is any text and ``?`` any character."""
-    reachable = {(0, 0)}
-    todo = [(0, 0)]
-    while todo:
-        i, j = todo.pop()
-        if i == len(a) and j == len(b):
-            return True
-        head_a, head_b = a[i : i + 1], b[j : j + 1]
-        steps = set()
-        if head_a == "*":
-            steps |= {(i + 1, j)} | ({(i, j + 1)} if head_b else set())
-        if head_b == "*":
-            steps |= {(i, j + 1)} | ({(i + 1, j)} if head_a else set())
-        if head_a and head_b and (head_a == head_b or "?" in (head_a, head_b)):
-            steps.add((i + 1, j + 1))
-        todo += steps - reachable
-        reachable |= steps
-    return False
 
 
 def _edge_key(edge: Edge) -> tuple[str, str, int]:

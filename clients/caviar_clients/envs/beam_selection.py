@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from caviar_clients.envs.base import SessionEnv
 from caviar_clients.envs.observations import Moment
+from caviar_protocol.errors import PayloadError
 from caviar_protocol.topics import BeamChoice
 from caviar_protocol.topics.action import Command
 
@@ -25,11 +26,19 @@ class BeamSelectionEnv(SessionEnv[np.int64 | NDArray[np.int64]]):
 
     def __init__(self, scenario: str | Path, **options: Any) -> None:
         super().__init__(scenario, **options)
-        sizes = [place.beam_pairs for place in self.users.places]
+        self._sizes = sizes = [place.beam_pairs for place in self.users.places]
         self.action_space = spaces.Discrete(sizes[0]) if len(sizes) == 1 else spaces.MultiDiscrete(sizes)
 
     def _commands(self, action: np.int64 | NDArray[np.int64], moment: Moment) -> Sequence[Command]:
-        chosen = [int(action)] if len(self.users) == 1 else np.asarray(action).tolist()
+        chosen, sizes = np.ravel(action).tolist(), self._sizes
+        if len(chosen) != len(sizes) or not all(
+            isinstance(index, int) and 0 <= index < size for index, size in zip(chosen, sizes, strict=True)
+        ):
+            highest = ", ".join(str(size - 1) for size in sizes)
+            raise PayloadError(
+                f"the action is {action!r}; write {len(sizes)} whole number(s), one a place, "
+                f"from 0 to at most {highest}"
+            )
         commands = []
         for place, pair in moment.users:
             tx_beam, rx_beam = divmod(chosen[place], pair.rx.array.size)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.pairs import Pair, pairs_of
 from caviar_protocol.scenario import DeviceSpec, Scenario
-from caviar_protocol.scenario_checks import owned_by
+from caviar_protocol.scenario_checks import owned_by, patterns_overlap
 from caviar_protocol.topics import AntennaArray, Scene
 
 
@@ -49,7 +49,8 @@ class Users:
             if rx is not tx and self._may_serve(rx)
         ]
         if not self._groups:
-            names = ", ".join(d.name for d in antennas if d.role in ("rx", "both")) or "none"
+            receivers = (d for d in antennas if d.role in ("rx", "both"))
+            names = ", ".join(_full_name(d) for d in receivers) or "none"
             raise ScenarioError(f"no receiver of the scenario is {' or '.join(patterns)}; there are: {names}")
         self._first: dict[tuple[str, str], int] = {}
         self.places: list[Place] = []
@@ -80,11 +81,16 @@ class Users:
 
     def _may_serve(self, rx: DeviceSpec) -> bool:
         """Whether a receiver of this device may match; names of objects are only known later."""
-        return bool(rx.on) or owned_by(self._patterns, rx.name)
+        return any(patterns_overlap(_full_name(rx), pattern) for pattern in self._patterns)
 
 
 def _name(device: DeviceSpec) -> str:
     return device.name
+
+
+def _full_name(device: DeviceSpec) -> str:
+    """Name of a device in the run; a pattern where it is on one."""
+    return f"{device.on}/{device.name}" if device.on else device.name
 
 
 def _spec_name(device: str) -> str:

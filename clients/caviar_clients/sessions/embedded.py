@@ -43,6 +43,8 @@ class EmbeddedSession(Session):
         super().__init__()
         self.notices: deque[str] = deque(maxlen=TOLD)
         """What the run told last."""
+        if directory is not None:
+            directory.mkdir(parents=True, exist_ok=True)
         endless = replace(scenario, run=replace(scenario.run, episodes=ENDLESS))
         self._seed = -1
         cls = declared(inputs, lambda: self._seed, _decided_outside)
@@ -58,14 +60,19 @@ class EmbeddedSession(Session):
         self._seed = seed
 
     def _answer(self, result: StepResult) -> None:
+        if self._run.outcome is not None:
+            raise self._over()
         self._seat.answer(result)
 
     def _granted(self) -> Frame:
         for _ in self._steps:
             if self._seat.frame is not None:
                 return self._seat.frame
+        raise self._over()
+
+    def _over(self) -> RunError:
         outcome = self._run.outcome
-        raise RunError(outcome.error if outcome and outcome.error else "the run is over; begin a new one")
+        return RunError(outcome.error if outcome and outcome.error else "the run is over; begin a new one")
 
     def _notice(self, notice: ev.Notice) -> None:
         self.notices.append(f"{notice.kind}: {notice.service}: {notice.text}")
