@@ -353,6 +353,15 @@ def test_a_mistake_is_named_with_what_to_write(options: dict[str, Any], told: li
         assert text in str(error.value)
 
 
+@pytest.mark.parametrize("seed", [2**63, 2**64])
+def test_a_seed_that_no_run_can_have_is_refused_and_the_environment_goes_on(seed: int) -> None:
+    with environment() as env:
+        env.reset(seed=1)
+        with pytest.raises(PayloadError, match=rf"seed={seed}; write a whole number from 0 to 2\*\*63 - 1"):
+            env.reset(seed=seed)
+        assert env.reset(seed=2**63 - 1)[1]["frame"] == 0
+
+
 def test_options_of_reset_are_refused_by_name() -> None:
     with environment() as env, pytest.raises(ScenarioError, match=r"\['frames'\].*in the scenario"):
         env.reset(options={"frames": 3})

@@ -7,10 +7,12 @@ from collections.abc import Mapping
 from types import TracebackType
 
 from caviar_protocol.arrays import Payload
+from caviar_protocol.errors import PayloadError
 from caviar_services.service import Frame as Frame
 from caviar_services.service import StepResult
 
 _NO_SEED = -1
+_HIGHEST_SEED = 2**63 - 1
 
 
 class Session(ABC):
@@ -28,10 +30,16 @@ class Session(ABC):
 
         Without one the next episode follows on the last one's seed. An episode that is under way ends.
         """
+        if seed is not None and not 0 <= seed <= _HIGHEST_SEED:
+            raise PayloadError(f"seed={seed}; write a whole number from 0 to 2**63 - 1")
         chosen = _NO_SEED if seed is None else seed
         if self._frame is None:
             self._begin(chosen)
-        elif self._frame.final:
+            self._frame = self._granted()
+            if _begins(self._frame, seed):
+                return self._frame
+            # Whoever had the place before left the run in the middle of an episode.
+        if self._frame.final:
             self._answer(StepResult(seed=chosen))
         else:
             self._answer(StepResult(end_episode=True, seed=chosen))
@@ -70,3 +78,9 @@ class Session(ABC):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _begins(frame: Frame, seed: int | None) -> bool:
+    """Whether a frame is the first one of an episode, of this seed where one is chosen."""
+    chosen = seed is None or (frame.seed, frame.seed_episode) == (seed, 0)
+    return frame.number == 0 and not frame.final and chosen

@@ -1,0 +1,331 @@
+"""Environments of gymnasium at real brokers, and with the real ray tracer."""
+
+from __future__ import annotations
+
+import os
+import re
+import select
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scenarios_support import SCENARIOS, pid_of, running, scenario_file
+
+from caviar_clients.envs.beam_selection import BeamSelectionEnv
+from caviar_clients.envs.uav_path import UavPathEnv
+from caviar_clients.sessions.connected import ConnectedSession
+from caviar_protocol.errors import PayloadError, RunError
+from caviar_protocol.messages import Input
+from caviar_protocol.recording import Recording
+from caviar_protocol.topics import Action, VelocityCommand
+
+PARTS = ("aoa", "aod", "position", "velocity", "last_abs_y")
+FRAMES, EPISODES, BEAMS = 60, 3, 64
+WITHIN_S = 30.0
+ENDPOINT = re.compile(r"waiting for 'agent' \(agent\) at (tcp://[\w.:-]+)[^\w.:-]")
+REMOTE = ('use = "los-beam"', 'use = "remote"')
+
+
+# --- at a broker ---------------------------------------------------------------------------------------
+
+
+class Waiting:
+    """``caviar run`` that waits for the agent of a process like this one."""
+
+    def __init__(self, process: subprocess.Popen[str], mark: str, scenario: Path, out: Path) -> None:
+        self._process, self.mark, self.scenario, self.out = process, mark, scenario, out
+        self.output = ""
+        self.endpoint = self._endpoint()
+
+    def _endpoint(self) -> str:
+        assert self._process.stdout is not None
+        until = time.monotonic() + WITHIN_S
+        while not (found := ENDPOINT.search(self.output)):
+            ready, _, _ = select.select([self._process.stdout], [], [], max(0.0, until - time.monotonic()))
+            data = os.read(self._process.stdout.fileno(), 65536) if ready else b""
+            assert data, f"no endpoint came: {self.output}"
+            self.output += data.decode()
+        return found[1]
+
+    def environment(self, **options: Any) -> BeamSelectionEnv:
+        """An environment at the run."""
+        return BeamSelectionEnv(self.scenario, **{"broker": self.endpoint, "observe": PARTS} | options)
+
+    def ended(self) -> tuple[int, str]:
+        """Status of the run, and what it printed."""
+        output, _ = self._process.communicate(timeout=WITHIN_S)
+        return self._process.returncode, self.output + output
+
+
+@contextmanager
+def waiting(
+    folder: Path, frames: int = FRAMES, episodes: int = EPISODES, rejoin_s: float = 0.5
+) -> Iterator[Waiting]:
+    """The shipped geometric scenario, shorter, with the agent's place free."""
+    changes = [("frames = 500", f"frames = {frames}\nepisodes = {episodes}"), REMOTE]
+    scenario = scenario_file(folder, changes, f"[timeouts]\nrejoin_s = {rejoin_s}\n", base="geometric")
+    out = folder / "out"
+    with running(scenario, out, "--bind", "tcp://127.0.0.1:0") as (process, mark):
+        yield Waiting(process, mark, scenario, out)
+
+
+def hundred_steps(env: BeamSelectionEnv) -> list[Any]:
+    """What 100 steps give: an episode of a chosen seed, one left in the middle, and one that follows it."""
+    told: list[Any] = []
+    index = 0
+    for seed, steps in ((77, FRAMES), (78, 13), (None, 27)):
+        observation, info = env.reset(seed=seed)
+        told.append((plain(observation), plain(info)))
+        for _ in range(steps):
+            observation, reward, terminated, truncated, info = env.step(np.int64(11 * index % BEAMS))
+            told.append((plain(observation), reward, terminated, truncated, plain(info)))
+            index += 1
+    assert index == 100
+    return told
+
+
+def plain(found: dict[str, Any]) -> dict[str, Any]:
+    """Arrays as lists, which can be compared."""
+    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in found.items()}
+
+
+def step_until(env: BeamSelectionEnv, until: float) -> None:
+    """Steps for as long as the run goes on, and the clock is not there."""
+    while time.monotonic() < until:
+        env.step(np.int64(0))
+
+
+def test_a_hundred_steps_are_equal_in_this_process_and_at_a_broker(tmp_path: Path) -> None:
+    with waiting(tmp_path) as run:
+        with closing(run.environment(broker=None)) as embedded:
+            here = hundred_steps(embedded)
+        with closing(run.environment()) as connected:
+            there = hundred_steps(connected)
+        assert there == here
+        assert len({step[1] for step in here if len(step) == 5}) == 100, "every frame's reward is another one"
+        status, output = run.ended()
+    assert status == 1, "it was left in the middle of its third episode"
+    assert "did not come back within 0.5 s (timeouts.rejoin_s): it left: the session was closed" in output
+
+
+def test_an_environment_that_closes_behind_the_last_episode_lets_the_run_end_well(tmp_path: Path) -> None:
+    rewards = []
+    with waiting(tmp_path, frames=20, episodes=2) as run:
+        with closing(run.environment()) as env:
+            for seed in (5, None):
+                env.reset(seed=seed)
+                truncated = False
+                while not truncated:
+                    _, reward, _, truncated, _ = env.step(np.int64(9))
+                    rewards.append(reward)
+        status, output = run.ended()
+    assert status == 0, output
+    assert len(rewards) == 40
+    recording = Recording(next(run.out.glob("*/")))
+    assert len(recording) == 40, "and every frame is recorded"
+
+
+@pytest.mark.parametrize("steps", [0, 7, FRAMES])
+def test_an_environment_takes_over_a_place_that_was_left_and_begins_an_episode_of_its_own(
+    tmp_path: Path, steps: int
+) -> None:
+    with waiting(tmp_path, rejoin_s=WITHIN_S) as run:
+        left = run.environment()
+        left.reset(seed=5)
+        for _ in range(steps):
+            left.step(np.int64(0))
+        left.close()
+        with closing(run.environment(broker=None)) as embedded:
+            embedded.reset(seed=9)
+            wanted = [embedded.step(np.int64(0))[1] for _ in range(8)]
+        with closing(run.environment()) as env:
+            assert env.reset(seed=9)[1] == {"frame": 0, "t_ns": 0}
+            assert [env.step(np.int64(0))[1] for _ in range(8)] == wanted
+
+
+def test_an_environment_takes_over_a_place_without_a_seed_at_the_next_episode(tmp_path: Path) -> None:
+    with waiting(tmp_path, rejoin_s=WITHIN_S) as run:
+        with closing(run.environment()) as left:
+            left.reset(seed=5)
+            left.step(np.int64(0))
+        with closing(run.environment(broker=None)) as embedded:
+            embedded.reset(seed=5)
+            embedded.reset()
+            wanted = [embedded.step(np.int64(0))[1] for _ in range(8)]
+        with closing(run.environment()) as env:
+            assert env.reset()[1] == {"frame": 0, "t_ns": 0}
+            assert [env.step(np.int64(0))[1] for _ in range(8)] == wanted
+
+
+def test_a_reset_behind_the_last_episode_says_that_there_is_none(tmp_path: Path) -> None:
+    with waiting(tmp_path, frames=4, episodes=1) as run, closing(run.environment()) as env:
+        env.reset()
+        while not env.step(np.int64(0))[3]:
+            pass
+        with pytest.raises(RunError, match=r"the broker ended the run.*run\.episodes of the scenario"):
+            env.reset()
+        assert run.ended()[0] == 0
+
+
+def test_an_action_that_is_refused_leaves_the_run_as_it_was(tmp_path: Path) -> None:
+    with waiting(tmp_path, frames=4, episodes=1) as run:
+        with closing(run.environment()) as env:
+            env.reset(seed=1)
+            with pytest.raises(PayloadError, match=r"the action is .*64.*63"):
+                env.step(np.int64(BEAMS))
+            for _ in range(4):
+                truncated = env.step(np.int64(0))[3]
+            assert truncated
+        assert run.ended()[0] == 0
+
+
+def test_no_broker_at_the_address_is_told_in_time() -> None:
+    address, began = "tcp://127.0.0.1:9", time.monotonic()  # port 9 is below what a process may open
+    session = ConnectedSession(address, "agent", (Input(topic="scene"),), connect_timeout_s=1)
+    with closing(session), pytest.raises(RunError, match=re.escape(address)):
+        session.reset()
+    assert time.monotonic() - began < 10
+
+
+def test_an_agent_that_the_run_does_not_wait_for_is_refused(tmp_path: Path) -> None:
+    with waiting(tmp_path, frames=4, episodes=1) as run:
+        session = ConnectedSession(run.endpoint, "agnet", (Input(topic="scene"),))
+        with closing(session), pytest.raises(RunError, match=r"no service 'agnet'; did you mean 'agent'\?"):
+            session.reset()
+
+
+def test_a_broker_that_is_killed_ends_the_next_step_and_not_this_process(tmp_path: Path) -> None:
+    with waiting(tmp_path, frames=10_000) as run:
+        env = run.environment()
+        with closing(env):
+            env.reset(seed=1)
+            env.step(np.int64(0))
+            os.kill(pid_of(run.mark, "caviar_broker"), signal.SIGKILL)
+            began = time.monotonic()
+            with pytest.raises(RunError, match=re.escape(run.endpoint)):
+                step_until(env, began + WITHIN_S)  # what was granted before may come yet
+            assert time.monotonic() - began < WITHIN_S
+            with pytest.raises(RunError):
+                env.step(np.int64(0))
+        env.close()
+        assert run.ended()[0] != 0
+
+
+def test_a_session_that_is_closed_before_its_first_reset_lets_go_at_once(tmp_path: Path) -> None:
+    with waiting(tmp_path) as run:
+        session = ConnectedSession(run.endpoint, "agent", (Input(topic="scene"),))
+        began = time.monotonic()
+        session.close()
+        assert time.monotonic() - began < 10
+        session.close()
+
+
+# --- in the air ----------------------------------------------------------------------------------------
+
+pathfinding = pytest.mark.channel
+MOUTH, INSIDE = (9.0, 178.0, 15.0), (23.0, 195.0, 14.0)
+"""The mouth of the street in sight of the base station, and a point between the blocks [m]."""
+START = (-2.0, 140.0, 17.825)
+"""The receiver at the start: under the UAV, whose height is 0.25 m, and another 0.05 m."""
+
+
+@contextmanager
+def flight(scenario: Path = SCENARIOS / "uav-path.toml", **options: Any) -> Iterator[UavPathEnv]:
+    """The UAV over Munich."""
+    pytest.importorskip("sionna.rt", reason="sionna-rt is not installed")
+    with closing(UavPathEnv(scenario, **options)) as env:
+        yield env
+
+
+def towards(observation: dict[str, Any], point: tuple[float, float, float]) -> tuple[Any, float]:
+    """An action that leads to a point and brakes near to it, and the way that is left [m]."""
+    way = np.array(point) - observation["position"]
+    left = float(np.linalg.norm(way))
+    return (way / max(left, 8.0)).astype(np.float32), left
+
+
+@pathfinding
+def test_flying_into_a_street_loses_the_line_of_sight_and_ends_at_the_goal() -> None:
+    with flight(goal_m=INSIDE, reach_m=2.0, progress_weight=0.1) as env:
+        observation, _ = env.reset(seed=1)
+        assert observation["goal"] == pytest.approx([25.0, 55.0, -4.0], abs=1e-4)
+        seen: dict[str, list[bool]] = {"to the mouth": [], "into it": []}
+        terminated = truncated = False
+        for leg, point in (("to the mouth", MOUTH), ("into it", INSIDE)):
+            while not (terminated or truncated):
+                action, left = towards(observation, point)
+                if left < 2.0 and point is MOUTH:
+                    break
+                before = float(np.linalg.norm(observation["goal"]))
+                observation, reward, terminated, truncated, info = env.step(action)
+                nearer = before - float(np.linalg.norm(observation["goal"]))
+                assert reward == pytest.approx(info["abs_y"][0] + 0.1 * nearer, abs=1e-5)
+                assert env.observation_space.contains(observation)
+                seen[leg].append(bool(info["los"][0]))
+        assert terminated
+        assert not truncated
+    assert all(seen["to the mouth"]), "the base station sees the mouth"
+    assert seen["into it"][0]
+    assert not any(seen["into it"][-5:]), "and not what is between the blocks"
+    assert sorted(seen["into it"], reverse=True) == seen["into it"], "it is lost once"
+    assert np.linalg.norm(observation["goal"]) <= 2.0
+
+
+@pathfinding
+def test_staying_keeps_the_line_of_sight_and_no_goal_never_terminates() -> None:
+    with flight() as env:
+        observation, _ = env.reset(seed=1)
+        assert "goal" not in observation
+        assert observation["position"] == pytest.approx(START, abs=1e-4)
+        for _ in range(20):
+            observation, reward, terminated, truncated, info = env.step(np.zeros(3, np.float32))
+            assert info["los"].tolist() == [True]
+            assert not terminated
+            assert not truncated
+            assert reward == info["abs_y"][0] > 0
+        assert observation["position"] == pytest.approx(START, abs=1e-4)
+
+
+@pathfinding
+def test_an_action_longer_than_1_is_shortened_to_the_greatest_speed(tmp_path: Path) -> None:
+    with flight(directory=tmp_path / "run") as env:
+        env.reset(seed=1)
+        for action in ([1, 1, 1], [3, 0, -4], [0.3, 0, -0.4]):
+            env.step(np.array(action, np.float32))
+    recording = Recording(tmp_path / "run")
+    flown = [
+        command.velocity
+        for frame in range(3)
+        for command in recording.frame(0, frame).of("action", Action)["agent"].commands
+        if isinstance(command, VelocityCommand)
+    ]
+    each = 15.0 / 3**0.5
+    wanted = [(each, each, each), (9.0, 0.0, -12.0), (4.5, 0.0, -6.0)]
+    assert flown == [pytest.approx(velocity, rel=1e-6) for velocity in wanted]
+
+
+@pathfinding
+@pytest.mark.parametrize("action", [[np.nan, 0, 0], [np.inf, 0, 0]])
+def test_an_action_that_is_no_number_is_refused(action: list[float]) -> None:
+    with flight() as env:
+        env.reset(seed=1)
+        with pytest.raises(PayloadError, match="write three numbers within -1 and 1"):
+            env.step(np.array(action, np.float32))
+        env.step(np.zeros(3, np.float32))
+
+
+@pathfinding
+def test_the_same_seed_and_the_same_flight_give_the_same_channel() -> None:
+    with flight() as env:
+        found = []
+        for _ in range(2):
+            env.reset(seed=3)
+            found.append([env.step(np.array([0.2, 0.9, -0.1], np.float32))[1] for _ in range(8)])
+    assert found[0] == found[1]
+    assert len(set(found[0])) == 8
