@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,11 @@ import pytest
 from link_builders import antenna, frame_of, given, scene_of
 from msgspec.structs import replace
 
+from caviar_clients.envs.beam_selection import BeamSelectionEnv
 from caviar_clients.envs.observations import PARTS, Moment, Part, part
 from caviar_clients.envs.users import Users
 from caviar_protocol.coordinates import quaternion_from_euler
-from caviar_protocol.errors import ScenarioError
+from caviar_protocol.errors import RunError, ScenarioError
 from caviar_protocol.scenario import DeviceSpec, Scenario
 from caviar_protocol.scenario_loader import load_scenario
 from caviar_protocol.tables import convert_settings
@@ -324,7 +326,7 @@ def test_the_last_magnitude_is_0_in_frame_0(scenario: Scenario) -> None:
     [
         ({"cells": [12, 7, 3], "minimum_m": [0, 0, 0], "maximum_m": [24, 7, 9]}, (12, 7, 3)),
         ({"minimum_m": [-5, 0, 0], "maximum_m": [5, 7, 3], "cell_m": [2, 2, 3]}, (5, 4, 1)),
-        ({"minimum_m": [0, 0, 0], "maximum_m": [0.3, 0.3, 0.05], "cell_m": [0.1, 0.1, 0.1]}, (3, 3, 1)),
+        ({"minimum_m": [0, 0, 0], "maximum_m": [2.1, 2.7, 0.05], "cell_m": [0.3, 0.3, 0.1]}, (7, 9, 1)),
     ],
 )
 def test_the_shape_of_the_grid_is_that_of_the_settings_and_of_the_grid_itself(
@@ -408,6 +410,78 @@ def test_images_are_rows_by_columns_of_the_camera_that_is_named(
 @pytest.mark.parametrize("name", ["camera:dash", "depth:dash", "lidar_grid"])
 def test_a_sensor_that_left_is_not_known(scenario: Scenario, name: str) -> None:
     assert read(scenario, name, cars(2)) is None
+
+
+SENSORS = """
+[services.lidar]
+role = "sensors"
+use = "lidar"
+budget_ms = 400
+[services.lidar.settings]
+grid = { minimum_m = [-50, -20, 0], maximum_m = [50, 30, 20], cells = [20, 10, 4] }
+[services.camera]
+role = "sensors"
+use = "camera"
+budget_ms = 400
+[[devices]]
+name = "top"
+kind = "lidar"
+on = "car"
+mount = "roof"
+position_m = [0, 0, 0.3]
+beams = 8
+azimuth_steps = 90
+[[devices]]
+name = "wall"
+kind = "camera"
+position_m = [-40, 0, 4]
+yaw_deg = 90
+pitch_deg = 16
+size_px = [28, 20]
+[[devices]]
+name = "bird"
+kind = "camera"
+on = "car-?"
+size_px = [9, 6]
+"""
+"""The camera on the wall looks at the car, which is 12 m north of it at first; a car-1 never comes."""
+
+
+@pytest.mark.channel
+def test_sensors_are_seen_to_the_last_frame_and_what_is_not_known_is_zeros_handed_out_anew(
+    tmp_path: Path,
+) -> None:
+    pytest.importorskip("mitsuba", reason="Mitsuba is not installed")
+    path = tmp_path / "scenario.toml"
+    path.write_text((SCENARIOS / "smoke.toml").read_text().replace("frames = 100", "frames = 4") + SENSORS)
+    observe = ("lidar_grid", "camera:wall", "depth:wall", "camera:bird")
+    with closing(BeamSelectionEnv(path, observe=observe)) as env:
+        seen = [env.reset(seed=1)[0]]
+        for _ in range(4):
+            observation, _, _, truncated, _ = env.step(np.array([0, 0]))
+            assert env.observation_space.contains(observation)
+            assert not observation["camera:bird"].any()
+            observation["camera:bird"] += 1
+            seen.append(observation)
+    assert truncated
+    assert seen[0]["lidar_grid"].shape == (20, 10, 4)
+    depth = seen[0]["depth:wall"]
+    assert 10 < depth[depth > 0].min() < 12.5, "the car is there"
+    for name in ("camera:wall", "depth:wall"):
+        assert (seen[1][name] != seen[0][name]).any(), "it moves"
+    for name in ("lidar_grid", "camera:wall", "depth:wall"):
+        assert seen[3][name].any()
+        assert (seen[4][name] == seen[3][name]).all(), f"{name} of the last frame"
+
+
+def test_a_sensor_that_no_service_computes_is_told_with_the_remedy(tmp_path: Path) -> None:
+    wall = '[[devices]]\nname = "wall"\nkind = "camera"\nposition_m = [0, 0, 9]\n'
+    path = tmp_path / "scenario.toml"
+    path.write_text((SCENARIOS / "smoke.toml").read_text() + wall)
+    told = "agent 'agent' needs topic 'camera', which no service of the run produces; add one that does"
+    env = BeamSelectionEnv(path, observe=("camera",))
+    with closing(env), pytest.raises(RunError, match=told):
+        env.reset(seed=1)
 
 
 @pytest.mark.parametrize(

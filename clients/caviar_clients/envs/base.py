@@ -10,6 +10,7 @@ from typing import Any, Generic, TypeVar
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from msgspec.structs import replace
 
 from caviar_clients.envs.observations import Moment, Part, part
 from caviar_clients.envs.render import MapRenderer
@@ -158,8 +159,11 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
 
     def _at(self, frame: Frame) -> Moment:
         link = frame.only("link", Link)
-        if frame.final and self._moment is not None:
-            return Moment(frame, self._moment.scene, link, self._moment.users)
+        last = self._moment
+        if frame.final and last is not None:
+            # Only the link comes with it; what else was seen in the last frame still is.
+            seen = (item for item in last.frame.inputs if item.provenance.topic != "link")
+            return Moment(replace(frame, inputs=(*frame.inputs, *seen)), last.scene, link, last.users)
         scene = frame.scene()
         return Moment(frame, scene, link, self.users.present(scene))
 
