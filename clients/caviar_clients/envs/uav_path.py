@@ -61,8 +61,9 @@ class UavPathEnv(SessionEnv[NDArray[np.float32]]):
         self._steered = self._receivers_of_agent()
         self._goal: Vector | None = None
         if goal_m is not None:
-            x, y, z = goal_m
-            self._goal = (float(x), float(y), float(z))
+            self._goal = _vector(goal_m)
+            if self._goal is None:
+                raise ScenarioError(f"goal_m={goal_m!r} is no point; write three finite numbers, x, y, z [m]")
             way = {"goal": spaces.Box(-FAR, FAR, (3,), np.float32)}
             self.observation_space = spaces.Dict({**self.observation_space.spaces, **way})
         self._reach, self._progress_weight = reach_m, progress_weight
@@ -106,9 +107,10 @@ class UavPathEnv(SessionEnv[NDArray[np.float32]]):
             )
             for pair, towards_rx, towards_tx in zip(pairs, at_tx, at_rx, strict=True)
         ]
-        x, y, z = np.asarray(action, np.float64).tolist()
-        if not all(map(math.isfinite, (x, y, z))):
+        share = _vector(action)
+        if share is None:
             raise PayloadError(f"the action is {action}; write three numbers within -1 and 1")
+        x, y, z = share
         speed = self._max_speed / max(1.0, math.hypot(x, y, z))
         flight = VelocityCommand(object=self.vehicle, velocity=(x * speed, y * speed, z * speed))
         return [*sorted(choices, key=lambda choice: (choice.rx, choice.tx)), flight]
@@ -133,3 +135,15 @@ class UavPathEnv(SessionEnv[NDArray[np.float32]]):
 
     def _terminated(self, moment: Moment) -> bool:
         return self._goal is not None and bool(np.linalg.norm(self._way(moment)) <= self._reach)
+
+
+def _vector(numbers: Any) -> Vector | None:
+    """Three finite numbers; None where it is something else."""
+    try:
+        found = np.asarray(numbers, np.float64)
+    except (TypeError, ValueError):
+        return None
+    if found.shape != (3,) or not np.isfinite(found).all():
+        return None
+    x, y, z = found.tolist()
+    return x, y, z
