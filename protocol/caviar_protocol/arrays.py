@@ -10,8 +10,10 @@ gaps are zero, so that equal values give equal bytes (contract, clause 20).
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
+from operator import attrgetter
 from typing import Annotated, Any, ClassVar, TypeAlias, get_args, get_origin, get_type_hints
 
 import msgspec
@@ -100,12 +102,12 @@ class Payload(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
     def __post_init__(self) -> None:
         layout = _layout(type(self))
-        arrays = [getattr(self, name) for name in layout.required]
         # Payloads are made a thousand times a second: equal shapes are looked at once.
         shapes: tuple[Any, ...] = ()
         try:
-            shapes = (*[a.shape for a in arrays], *[len(getattr(self, f)) for f in layout.listed])
-            is_known = [a.dtype for a in arrays] == layout.dtypes and shapes in layout.known
+            lengths = [len(getattr(self, field)) for field in layout.listed]
+            shapes = (*layout.shapes_of(self), *lengths)
+            is_known = layout.dtypes_of(self) == layout.dtypes and shapes in layout.known
         except (AttributeError, TypeError):  # no array, or no length: told below
             is_known = False
         if not is_known or any(getattr(self, f) is not None for f in layout.optional):
@@ -149,9 +151,11 @@ KNOWN_SHAPES = 256
 class _Layout:
     """What a payload class promises, for a quick look at one of its objects."""
 
-    required: tuple[str, ...]
-    """Arrays that every object has."""
-    dtypes: list[np.dtype[Any]]
+    dtypes_of: Callable[[Any], tuple[Any, ...]]
+    """Element types of the arrays that every object has, and ``shapes_of`` their shapes."""
+    shapes_of: Callable[[Any], tuple[Any, ...]]
+    dtypes: tuple[np.dtype[Any], ...]
+    """As declared."""
     listed: tuple[str, ...]
     """Tuple fields whose lengths are sizes."""
     optional: tuple[str, ...]
@@ -166,12 +170,20 @@ def _layout(cls: type[Payload]) -> _Layout:
     optional = {f.name for f in msgspec.structs.fields(cls) if f.name in fields and not f.required}
     required = tuple(name for name in fields if name not in optional)
     return _Layout(
-        required=required,
-        dtypes=[WIRE_DTYPES[fields[name].dtype] for name in required],
+        dtypes_of=_getter([f"{name}.dtype" for name in required]),
+        shapes_of=_getter([f"{name}.shape" for name in required]),
+        dtypes=tuple(WIRE_DTYPES[fields[name].dtype] for name in required),
         listed=tuple(field for names in cls.sizes_from.values() for field in names),
         optional=tuple(name for name in fields if name in optional),
         known=set(),
     )
+
+
+def _getter(paths: Sequence[str]) -> Callable[[Any], tuple[Any, ...]]:
+    """All of these attributes at once."""
+    if len(paths) > 1:
+        return attrgetter(*paths)
+    return lambda owner: tuple(attrgetter(path)(owner) for path in paths)
 
 
 def _equal(a: Any, b: Any) -> bool:

@@ -10,9 +10,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
-from caviar_protocol.arrays import Float64Array
 from caviar_protocol.coordinates import Vector, unrotated
 from caviar_protocol.scene import antennas, device_pose
 from caviar_protocol.topics import AntennaDevice, Scene
@@ -34,24 +31,30 @@ def pairs_of(scene: Scene) -> list[Pair]:
     return [Pair(tx, rx) for tx in antennas(scene, "tx") for rx in receivers if rx.name != tx.name]
 
 
-def directions(scene: Scene, pairs: Sequence[Pair]) -> tuple[Float64Array, Float64Array]:
+def directions(scene: Scene, pairs: Sequence[Pair]) -> tuple[list[Vector], list[Vector]]:
     """Direction of RX from TX in the TX device's axes, and of TX from RX in the RX device's axes.
 
-    Unit vectors, Shape ``[U, 3]`` each. Two devices at one point see each other at boresight.
+    Unit vectors, one of each for every pair. Two devices at one point see each other at boresight.
     """
-    devices = {device.name: device for pair in pairs for device in (pair.tx, pair.rx)}
-    poses = {name: device_pose(scene, device) for name, device in devices.items()}
+    # Link and agent ask for the same pairs: what was computed is kept with the scene.
+    known: dict[tuple[str, str], tuple[Pair, Vector, Vector]] = scene.__dict__.setdefault("_directions", {})
     at_tx, at_rx = [], []
     for pair in pairs:
-        tx, rx = poses[pair.tx.name], poses[pair.rx.name]
-        (x0, y0, z0), (x1, y1, z1) = tx.position, rx.position
-        dx, dy, dz = x1 - x0, y1 - y0, z1 - z0
-        length = math.hypot(dx, dy, dz)
-        if length > 0:
-            dx, dy, dz = dx / length, dy / length, dz / length
-            at_tx.append(unrotated(tx.orientation, (dx, dy, dz)))
-            at_rx.append(unrotated(rx.orientation, (-dx, -dy, -dz)))
-        else:
-            at_tx.append(BORESIGHT)
-            at_rx.append(BORESIGHT)
-    return np.array(at_tx).reshape(-1, 3), np.array(at_rx).reshape(-1, 3)
+        names = pair.tx.name, pair.rx.name
+        entry = known.get(names)
+        if entry is None or entry[0].tx is not pair.tx or entry[0].rx is not pair.rx:
+            entry = known[names] = (pair, *_along(scene, pair))
+        at_tx.append(entry[1])
+        at_rx.append(entry[2])
+    return at_tx, at_rx
+
+
+def _along(scene: Scene, pair: Pair) -> tuple[Vector, Vector]:
+    tx, rx = device_pose(scene, pair.tx), device_pose(scene, pair.rx)
+    (x0, y0, z0), (x1, y1, z1) = tx.position, rx.position
+    dx, dy, dz = x1 - x0, y1 - y0, z1 - z0
+    length = math.hypot(dx, dy, dz)
+    if length == 0:
+        return BORESIGHT, BORESIGHT
+    dx, dy, dz = dx / length, dy / length, dz / length
+    return unrotated(tx.orientation, (dx, dy, dz)), unrotated(rx.orientation, (-dx, -dy, -dz))

@@ -39,12 +39,12 @@ def steering_vector(array: AntennaArray, directions: Float64Array) -> Complex128
     """
     if array.size == 1:
         return np.ones((*directions.shape[:-1], 1), np.complex128)
-    y, z = _grid(array)
+    y, z = _phases(array)
     # k̂·r separates, so rows + columns exponentials do instead of rows · columns.
-    columns: Complex128Array = np.exp(2j * np.pi * directions[..., 1, None] * y)
+    columns: Complex128Array = np.exp(directions[..., 1, None] * y)
     if array.rows == 1:
         return columns
-    rows = np.exp(2j * np.pi * directions[..., 2, None] * z)
+    rows = np.exp(directions[..., 2, None] * z)
     vector: Complex128Array = (columns[..., :, None] * rows[..., None, :]).reshape(
         *directions.shape[:-1], array.size
     )
@@ -61,3 +61,10 @@ def _grid(array: AntennaArray) -> tuple[Float64Array, Float64Array]:
         (array.rows - 1) / 2 - np.arange(array.rows, dtype=np.float64)
     ) * array.vertical_spacing
     return y, z
+
+
+@lru_cache(maxsize=256)
+def _phases(array: AntennaArray) -> tuple[Complex128Array, Complex128Array]:
+    """j2π times the grid."""
+    y, z = _grid(array)
+    return 2j * np.pi * y, 2j * np.pi * z

@@ -131,8 +131,18 @@ def done_of(
             m.ProductHeader(topic=topic, digest=payload_digest(header, body), fidelity=result.fidelity)
         )
         parts += [header, body]
-    measured = {**result.measured, "step": step_ns, "encode": time.monotonic_ns() - started}
-    return _done(identity, grant, result, tuple(headers), measured), parts
+    done = m.Done(
+        **identity,
+        episode=grant.episode,
+        frame=grant.frame,
+        products=tuple(headers),
+        decisions=dict(result.decisions),
+        measured={**result.measured, "step": step_ns, "encode": time.monotonic_ns() - started},
+        counts=dict(result.counts),
+        end_episode=result.end_episode,
+        seed=result.seed,
+    )
+    return done, parts
 
 
 def plain_done_of(
@@ -140,14 +150,20 @@ def plain_done_of(
 ) -> tuple[m.Done, tuple[Payload, ...]]:
     """DONE without digests, and the products as they are, for a consumer in this process.
 
-    Raises `PayloadError` for a product that is not its topic's.
+    What a recorder would be told beside them is left out: there is none. Raises `PayloadError` for a
+    product that is not its topic's.
     """
     products = _products(use, result)
-    headers = tuple(
-        m.ProductHeader(topic=topic, digest="", fidelity=result.fidelity) for topic, _ in products
+    done = m.Done(
+        epoch=identity["epoch"],
+        attempt=identity["attempt"],
+        episode=grant.episode,
+        frame=grant.frame,
+        products=tuple([m.ProductHeader(topic=t, digest="", fidelity=result.fidelity) for t, _ in products]),
+        end_episode=result.end_episode,
+        seed=result.seed,
     )
-    done = _done(identity, grant, result, headers, result.measured)
-    return done, tuple(payload for _, payload in products)
+    return done, tuple([payload for _, payload in products])
 
 
 def _products(use: str, result: StepResult) -> list[tuple[str, Payload]]:
@@ -156,23 +172,3 @@ def _products(use: str, result: StepResult) -> list[tuple[str, Payload]]:
         if type(payload) is not PAYLOADS.get(topic):
             raise PayloadError(f"{use} made a payload {type(payload).__name__} for the topic {topic!r}")
     return products
-
-
-def _done(
-    identity: dict[str, int],
-    grant: m.Grant,
-    result: StepResult,
-    headers: tuple[m.ProductHeader, ...],
-    measured: Mapping[str, int],
-) -> m.Done:
-    return m.Done(
-        **identity,
-        episode=grant.episode,
-        frame=grant.frame,
-        products=headers,
-        decisions=dict(result.decisions),
-        measured=dict(measured),
-        counts=dict(result.counts),
-        end_episode=result.end_episode,
-        seed=result.seed,
-    )

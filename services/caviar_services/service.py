@@ -143,11 +143,12 @@ class Frame(msgspec.Struct, frozen=True, kw_only=True):
 
     def of(self, topic: str, cls: type[P]) -> dict[str, P]:
         """Payloads of a topic by source, those that are present."""
-        return {
-            item.provenance.source: cast(P, item.payload)
-            for item in self.inputs
-            if item.provenance.topic == topic and item.present
-        }
+        found: dict[str, P] = {}
+        for item in self.inputs:
+            entry = item.provenance
+            if entry.topic == topic and entry.status is not Status.ABSENT:
+                found[entry.source] = cast(P, item.payload)
+        return found
 
     def only(self, topic: str, cls: type[P]) -> P | None:
         """Payload of a topic that has one source; None where absent.

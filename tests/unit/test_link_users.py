@@ -34,8 +34,8 @@ def test_directions_turn_with_the_device_and_with_the_object_it_is_mounted_on() 
     on_car = antenna("car/rx", "rx", yaw=mount, parent="car")
     scene = scene_of(bs, on_car, objects={"car": ((30.0, 30.0, 0.0), heading)})
     at_tx, at_rx = directions(scene, pairs_of(scene))
-    assert angles(at_tx)[0, 1] == pytest.approx(math.radians(45 - 10))
-    assert angles(at_rx)[0, 1] == pytest.approx(math.radians(-135 - 60 - 25 + 360))
+    assert angles(np.array(at_tx))[0, 1] == pytest.approx(math.radians(45 - 10))
+    assert angles(np.array(at_rx))[0, 1] == pytest.approx(math.radians(-135 - 60 - 25 + 360))
 
 
 def test_directions_keep_their_height() -> None:
@@ -58,7 +58,7 @@ def test_a_held_channel_does_not_cover_a_device_that_came_later() -> None:
     scene = scene_of(BS, CAR, antenna("new/rx", "rx", position=(0.0, 9.0, 0.0)))
     channel = channel_of(("bs",), ("car/rx", "gone/rx"), {("mmwave", "bs", "car/rx"): random_h(1, 2, 4)})
     found = channels_of(channel, users_of(scene, channel.carriers))
-    assert found.known.tolist() == [True, False]
+    assert found.unknown == 1
     assert found.has_path.tolist() == [True, False]
     assert found.h[1] is None
 

@@ -104,13 +104,14 @@ class DecisionBook:
 
     def fresh(self, task: Task, products: Mapping[str, Product], now: int) -> None:
         """The task was answered in time; a declared product that is missing is absent."""
-        cause = f"{task.service} produced no {{}} in frame {task.frame}"
-        decisions = {
-            topic: Decision(Status.FRESH, products[topic])
-            if topic in products
-            else Decision(Status.ABSENT, None, cause.format(topic))
-            for topic in self._due_topics(task)
-        }
+        decisions = {}
+        for topic in self._due_topics(task):
+            product = products.get(topic)
+            if product is not None:
+                decisions[topic] = Decision(Status.FRESH, product)
+            else:
+                cause = f"{task.service} produced no {topic} in frame {task.frame}"
+                decisions[topic] = Decision(Status.ABSENT, None, cause)
         self._decide(task, decisions, "done", now)
         if task.service in self._holding:
             self._renew(products.values(), task.journal)

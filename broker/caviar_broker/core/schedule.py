@@ -250,16 +250,16 @@ class EpisodeSchedule:
     def _advance_service(self, name: str, now: int) -> None:
         while True:
             owed = self._outstanding[name]
-            in_flight = sum(t.state is TaskState.GRANTED for t in owed) if owed else 0
+            has_room = len(owed) < self._capacity[name]
+            in_flight = len([t for t in owed if t.state is TaskState.GRANTED]) if owed else 0
+            if in_flight and not has_room:
+                return  # its answer brings it back
             task = self._turns.candidate(name, in_flight)
             inputs = self._inputs.gathered(task) if task is not None else None
             if task is None or inputs is None:
                 return
             if self._ledger.written < max(self._first_entry, inputs.entry):
                 self._turns.waiting_for_journal.add(name)
-                return
-            has_room = len(owed) < self._capacity[name]
-            if in_flight and not has_room:
                 return
             if self.plan.realtime and not self._released(task, now):
                 self._turns.waiting_for_pace.add(name)
@@ -393,6 +393,8 @@ class EpisodeSchedule:
             self._turns.decided(task.service)
 
     def _measure(self, task: Task, now: int) -> None:
+        if self.plan.ephemeral:
+            return
         elapsed = now - task.started_at
         missed = task.overran or elapsed > self._plans[task.service].budget_ns
         if missed and not task.overran:

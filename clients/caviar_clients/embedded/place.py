@@ -114,14 +114,17 @@ class Place:
             self._feed(answer)
 
     def _grant(self, grant: m.Grant, products: Products) -> None:
-        answer: ev.Event | None = None
-        with self._guard("step", grant.episode, grant.frame) as guard:
+        answer, phase = None, "step"
+        try:
             frame = self._frame(grant, products)
             began = time.monotonic_ns()
             result = self._running.step(frame)
             stepped = time.monotonic_ns()
-            guard.phase = "encode"
+            phase = "encode"
             answer = self._done(grant, result, stepped - began)
+        except Exception:  # told as any other; a guard that is not needed would cost as much as a service
+            with self._guard(phase, grant.episode, grant.frame):
+                raise
         if answer is not None:
             self._feed(answer)
         if grant.frame % TRIM_EVERY == TRIM_EVERY - 1:

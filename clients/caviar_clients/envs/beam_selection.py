@@ -30,7 +30,8 @@ class BeamSelectionEnv(SessionEnv[np.int64 | NDArray[np.int64]]):
         self.action_space = spaces.Discrete(sizes[0]) if len(sizes) == 1 else spaces.MultiDiscrete(sizes)
 
     def _commands(self, action: np.int64 | NDArray[np.int64], moment: Moment) -> Sequence[Command]:
-        chosen, sizes = np.ravel(action).tolist(), self._sizes
+        sizes = self._sizes
+        chosen = [int(action)] if isinstance(action, np.integer) else np.ravel(action).tolist()
         if len(chosen) != len(sizes) or not all(
             isinstance(index, int) and 0 <= index < size for index, size in zip(chosen, sizes, strict=True)
         ):

@@ -90,7 +90,7 @@ class AngleOfArrival(_PerUser):
         values = self._blank()
         pairs = [pair for _, pair in moment.users]
         _, at_rx = directions(moment.scene, pairs)
-        for (place, _), (x, y, _) in zip(moment.users, at_rx.tolist(), strict=True):
+        for (place, _), (x, y, _) in zip(moment.users, at_rx, strict=True):
             values[place] = math.atan2(y, x)
         return values
 
@@ -105,7 +105,7 @@ class AngleOfDeparture(_PerUser):
         values = self._blank()
         pairs = [pair for _, pair in moment.users]
         at_tx, _ = directions(moment.scene, pairs)
-        for (place, _), (x, y, _) in zip(moment.users, at_tx.tolist(), strict=True):
+        for (place, _), (x, y, _) in zip(moment.users, at_tx, strict=True):
             values[place] = math.atan2(y, x)
         return values
 

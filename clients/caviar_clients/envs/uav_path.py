@@ -97,7 +97,7 @@ class UavPathEnv(SessionEnv[NDArray[np.float32]]):
 
     def _commands(self, action: NDArray[np.float32], moment: Moment) -> Sequence[Command]:
         pairs = [pair for _, pair in moment.users if owned_by(self._steered, pair.rx.name)]
-        at_tx, at_rx = (vectors.tolist() for vectors in directions(moment.scene, pairs))
+        at_tx, at_rx = directions(moment.scene, pairs)
         choices = [
             BeamChoice(
                 tx=pair.tx.name,

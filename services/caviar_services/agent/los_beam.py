@@ -17,7 +17,7 @@ from caviar_services.service import Frame
 
 def straight_choices(scene: Scene, pairs: Sequence[Pair]) -> Iterator[BeamChoice]:
     """The straight-line pair of beams of each pair of devices, the same on every carrier."""
-    at_tx, at_rx = (vectors.tolist() for vectors in directions(scene, pairs))
+    at_tx, at_rx = directions(scene, pairs)
     for pair, towards_rx, towards_tx in zip(pairs, at_tx, at_rx, strict=True):
         yield BeamChoice(
             tx=pair.tx.name,

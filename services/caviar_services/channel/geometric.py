@@ -30,12 +30,21 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 from itertools import pairwise, product
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from caviar_protocol.arrays import Complex128Array, Float64Array
+from caviar_protocol.arrays import (
+    BoolArray,
+    Complex128Array,
+    Float64Array,
+    Int32Array,
+    Int64Array,
+    UInt8Array,
+    UInt64Array,
+)
 from caviar_protocol.coordinates import SPEED_OF_LIGHT, Pose
 from caviar_protocol.scene import device_pose
 from caviar_protocol.seeding import generator
@@ -92,6 +101,7 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         loss_db = 20.0 if settings.nlos_loss_db is None else settings.nlos_loss_db
         self._nlos_factor = 10 ** (-loss_db / 20)
         self._unit = settings.normalization == "unit"
+        self._options = self.options
         self._nearest = 0.0 if self._unit else float((SPEED_OF_LIGHT / self._frequency).max())
 
     @property
@@ -216,24 +226,24 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         ]
         if not self._unit:
             a *= self._path_gain(waves, pairs)
-        count = len(waves.tau)
+        constant = _constant(tuple(los), tuple(offsets), tuple(waves.id), len(transmitters))
         return Channel(
             rung=self.rung,
-            options=self.options,
+            options=self._options,
             carriers=self.run.carriers,
-            tx=tuple(device.name for device in transmitters),
-            rx=tuple(device.name for device in receivers),
-            los=np.array(los, np.bool_).reshape(len(transmitters), len(receivers)),
-            offsets=np.array(offsets, np.int64),
-            id=np.array(waves.id, np.uint64),
+            tx=tuple([device.name for device in transmitters]),
+            rx=tuple([device.name for device in receivers]),
+            los=constant.los,
+            offsets=constant.offsets,
+            id=constant.id,
             a=a,
             tau=np.array(waves.tau, np.float64),
             aod=np.array([angles(vector) for vector in waves.departure], np.float64).reshape(-1, 2),
             aoa=np.array([angles(vector) for vector in waves.arrival], np.float64).reshape(-1, 2),
             doppler=self._frequency * np.array(waves.doppler_ratio, np.float64),
-            interactions=np.zeros((count, 0), np.uint8),
-            points=np.zeros((count, 0, 3)),
-            objects=np.zeros((count, 0), np.int32),
+            interactions=constant.interactions,
+            points=constant.points,
+            objects=constant.objects,
             h=self._matrices(a, waves, pairs, len(receivers)) if self.with_h else (),
         )
 
@@ -268,6 +278,35 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
                 h = mine[None] @ transmit if receive is None else (receive * mine[:, None]).T @ transmit
                 found.append(ChannelMatrix(carrier=carrier, tx=tx, rx=rx, h=h))
         return tuple(found)
+
+
+class _Constant(NamedTuple):
+    """What changes only when a line of sight does."""
+
+    los: BoolArray
+    offsets: Int64Array
+    id: UInt64Array
+    interactions: UInt8Array
+    points: Float64Array
+    objects: Int32Array
+
+
+@lru_cache(maxsize=64)
+def _constant(
+    los: tuple[bool, ...], offsets: tuple[int, ...], ids: tuple[int, ...], transmitters: int
+) -> _Constant:
+    paths = offsets[-1]
+    arrays = _Constant(
+        los=np.array(los, np.bool_).reshape(transmitters, len(los) // max(transmitters, 1)),
+        offsets=np.array(offsets, np.int64),
+        id=np.array(ids, np.uint64),
+        interactions=np.zeros((paths, 0), np.uint8),
+        points=np.zeros((paths, 0, 3)),
+        objects=np.zeros((paths, 0), np.int32),
+    )
+    for array in arrays:
+        array.flags.writeable = False  # several products share it
+    return arrays
 
 
 def _id(kind: str) -> int:

@@ -140,6 +140,8 @@ def with_phase(waves: Waves, frequency: float) -> list[complex]:
 
 
 def velocity(scene: Scene, device: AntennaDevice) -> Vector:
+    if not device.parent:
+        return (0.0, 0.0, 0.0)
     x, y, z = device_velocity(scene, device).tolist()
     return (x, y, z)
 

@@ -7,15 +7,17 @@ beside the pair along the straight line (the baseline of section 4).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int32Array, quantity
 from caviar_protocol.beams import beam_towards
+from caviar_protocol.coordinates import Vector
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.pairs import directions
 from caviar_protocol.topics import Carrier, Channel, Link, Scene
@@ -23,7 +25,7 @@ from caviar_protocol.topics.scene import Device
 from caviar_services.link.base import LinkModel
 from caviar_services.link.choices import Choices, choices_of
 from caviar_services.link.sweep import Pairs, best_pairs
-from caviar_services.link.users import Swept, User, UserChannels, channels_of, sweep_users, users_of
+from caviar_services.link.users import Swept, User, UserChannels, Users, channels_of, sweep_users, users_of
 from caviar_services.service import Frame, StepResult
 
 BOLTZMANN = 1.380649e-23
@@ -69,11 +71,10 @@ class BeamLink(LinkModel[BeamLinkSettings]):
         choices = choices_of(frame, users)
         channels = channels_of(channel, users)
         scores = _score(scene, users, choices, channels, self.settings.top_k)
-        without_path = int(np.count_nonzero(~channels.has_path))
-        without_channel = int(np.count_nonzero(~channels.known))
+        without_path = sum([h is None for h in channels.h])
         counts = {
-            "users-without-path": without_path - without_channel,  # what is unknown has no path either
-            "users-without-channel": without_channel,
+            "users-without-path": without_path - channels.unknown,  # what is unknown has no path either
+            "users-without-channel": channels.unknown,
             "commands-for-absent-users": choices.outdated,
         }
         return StepResult(
@@ -86,7 +87,7 @@ class BeamLink(LinkModel[BeamLinkSettings]):
         self, budget: _Budget, choices: Choices, channels: UserChannels, scores: _Scores, without_path: int
     ) -> Link:
         settings = self.settings
-        best = scores.top_abs_y.max(axis=1, initial=0.0)
+        best = scores.top_abs_y[:, :1].reshape(-1)  # no column where there is no user
         snr = budget.power_over_noise * scores.abs_y**2
         efficiency = np.log2(1 + snr)
         if settings.max_spectral_efficiency is not None:
@@ -130,7 +131,7 @@ class _Budget:
 
     devices: tuple[Device, ...]
     carriers: tuple[Carrier, ...]
-    users: list[User]
+    users: Users
     tx: tuple[str, ...]
     rx: tuple[str, ...]
     carrier: tuple[str, ...]
@@ -169,25 +170,23 @@ def transmit_power(user: User) -> float:
     return 10 ** ((user.tx.power_dbm - 30) / 10)
 
 
-@dataclass(frozen=True)
-class _Scores:
+class _Scores(NamedTuple):
     """Fields of `Link` that come out of the sweep."""
 
     abs_y: Float64Array
-    top_tx_beam: Int32Array
-    top_rx_beam: Int32Array
-    top_abs_y: Float64Array
     baseline_abs_y: Float64Array
     aod_azimuth: Float64Array
     aoa_azimuth: Float64Array
+    top_tx_beam: Int32Array
+    top_rx_beam: Int32Array
+    top_abs_y: Float64Array
 
 
 def _score(
-    scene: Scene, users: Sequence[User], choices: Choices, channels: UserChannels, top_k: int
+    scene: Scene, users: Users, choices: Choices, channels: UserChannels, top_k: int
 ) -> _Scores:
     """Sweep all pairs of all users and read off the chosen, the best and the baseline pairs."""
-    at_tx, at_rx = directions(scene, users)
-    towards_rx, towards_tx = at_tx.tolist(), at_rx.tolist()
+    towards_rx, towards_tx = directions(scene, users)
     k = min(top_k, max((user.tx.array.size * user.rx.array.size for user in users), default=0))
     chosen, baseline = [0.0] * len(users), [0.0] * len(users)
     tx_beams, rx_beams = choices.tx_beam.tolist(), choices.rx_beam.tolist()
@@ -202,16 +201,12 @@ def _score(
                 beam_towards(user.rx.array, towards_tx[u]),
             )
             baseline[u] = abs_y[straight]
-    best = _listed(swept, len(users), k)
-    return _Scores(
-        abs_y=np.array(chosen, np.float64),
-        top_tx_beam=best.tx_beam,
-        top_rx_beam=best.rx_beam,
-        top_abs_y=best.abs_y,
-        baseline_abs_y=np.array(baseline, np.float64),
-        aod_azimuth=np.arctan2(at_tx[:, 1], at_tx[:, 0]),
-        aoa_azimuth=np.arctan2(at_rx[:, 1], at_rx[:, 0]),
-    )
+    numbers = np.array([chosen, baseline, _azimuths(towards_rx), _azimuths(towards_tx)], np.float64)
+    return _Scores(*numbers, *_listed(swept, len(users), k))
+
+
+def _azimuths(directions: Sequence[Vector]) -> list[float]:
+    return [math.atan2(y, x) for x, y, _ in directions]
 
 
 def _listed(swept: Sequence[Swept], users: int, k: int) -> Pairs:

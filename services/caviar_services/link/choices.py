@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -13,15 +12,14 @@ from caviar_protocol.arrays import Int32Array
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.messages import Status
 from caviar_protocol.topics import Action, BeamChoice, UserSchedule
-from caviar_services.link.users import User
+from caviar_services.link.users import User, Users
 from caviar_services.service import Frame
 
 _LISTED = 8
 """Names that an error message lists at most."""
 
 
-@dataclass(frozen=True)
-class Choices:
+class Choices(NamedTuple):
     """Chosen beams per user, −1 where no agent serves it, Shape ``[U]`` each."""
 
     tx_beam: Int32Array
@@ -30,7 +28,7 @@ class Choices:
     """Commands of held actions whose user is no longer there."""
 
 
-def choices_of(frame: Frame, users: Sequence[User]) -> Choices:
+def choices_of(frame: Frame, users: Users) -> Choices:
     """The beams that the agents of this frame chose.
 
     A choice without a carrier holds for every carrier on which its agent makes no other. Where an
@@ -61,20 +59,15 @@ def _commands(frame: Frame) -> Iterator[tuple[str, bool, object]]:
 class _Book:
     """Commands of a frame, entered one after the other."""
 
-    users: Sequence[User]
+    users: Users
     chosen: dict[int, tuple[str, BeamChoice]] = field(default_factory=dict)
     scheduled: dict[str, tuple[str, str]] = field(default_factory=dict)
     outdated: int = 0
 
-    def __post_init__(self) -> None:
-        self.of_pair: dict[tuple[str, str], list[int]] = defaultdict(list)
-        for index, user in enumerate(self.users):
-            self.of_pair[user.tx.name, user.rx.name].append(index)
-
     def choose(self, agent: str, held: bool, command: BeamChoice) -> None:
         indices = [
             index
-            for index in self.of_pair.get((command.tx, command.rx), ())
+            for index in self.users.of_pair.get((command.tx, command.rx), ())
             if command.carrier in ("", self.users[index].carrier.name)
         ]
         if not indices:
@@ -87,7 +80,7 @@ class _Book:
             self.chosen[index] = (agent, command)
 
     def schedule(self, agent: str, held: bool, command: UserSchedule) -> None:
-        if (command.tx, command.rx) not in self.of_pair:
+        if (command.tx, command.rx) not in self.users.of_pair:
             self._no_such_user(agent, held, command.tx, command.rx, "")
             return
         if command.tx in self.scheduled:
@@ -103,7 +96,7 @@ class _Book:
         for index, (_, command) in self.chosen.items():
             if self.scheduled.get(command.tx, ("", command.rx))[1] == command.rx:
                 tx_beam[index], rx_beam[index] = command.tx_beam, command.rx_beam
-        return Choices(np.array(tx_beam, np.int32), np.array(rx_beam, np.int32), self.outdated)
+        return Choices(*np.array([tx_beam, rx_beam], np.int32), self.outdated)
 
     def _first_wins(
         self, index: int, previous: tuple[str, BeamChoice], agent: str, command: BeamChoice

@@ -63,15 +63,12 @@ def best_pairs(abs_y: Float64Array, k: int) -> Pairs:
     flat = abs_y.reshape(len(abs_y), -1)
     k = min(k, flat.shape[1])
     if flat.shape[1] <= SORTED_WHOLE:
-        order = np.argsort(-flat, axis=-1, kind="stable")[:, :k]
+        order = (-flat).argsort(-1, "stable")[:, :k]
     else:
         order = np.array([_best_of_many(row, k) for row in flat])
-    tx_beam = order // abs_y.shape[2]
-    return Pairs(
-        tx_beam.astype(np.int32),
-        (order - tx_beam * abs_y.shape[2]).astype(np.int32),
-        flat[np.arange(len(flat))[:, None], order],
-    )
+    tx_beam, rx_beam = np.divmod(order.astype(np.int32), np.int32(abs_y.shape[2]))
+    first = np.arange(0, flat.size, flat.shape[1])[:, None]
+    return Pairs(tx_beam, rx_beam, flat.take(order + first))
 
 
 def _best_of_many(flat: Float64Array, k: int) -> Int64Array:

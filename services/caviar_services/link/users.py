@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -26,18 +27,53 @@ class User(Pair):
         return f"{self.tx.name} → {self.rx.name} on {self.carrier.name}"
 
 
-def users_of(scene: Scene, carriers: Sequence[Carrier]) -> list[User]:
+class Users(tuple[User, ...]):
+    """The users of a scene, and what can be looked up as long as they stay the same."""
+
+    _place: tuple[object, list[tuple[int, int, int] | None]] | None = None
+
+    @cached_property
+    def of_pair(self) -> dict[tuple[str, str], list[int]]:
+        """Users of each pair of devices, by name."""
+        found: dict[tuple[str, str], list[int]] = defaultdict(list)
+        for index, user in enumerate(self):
+            found[user.tx.name, user.rx.name].append(index)
+        return dict(found)
+
+    @cached_property
+    def batch(self) -> list[int]:
+        """A number for each user, the same for those with equal arrays."""
+        numbers: dict[tuple[AntennaArray, AntennaArray], int] = {}
+        return [numbers.setdefault((user.tx.array, user.rx.array), len(numbers)) for user in self]
+
+    def places(self, channel: Channel) -> list[tuple[int, int, int] | None]:
+        """Carrier, TX and RX of each user as the channel product counts them; None where it has them not."""
+        axes = (channel.carriers, channel.tx, channel.rx)
+        if self._place is None or self._place[0] != axes:
+            carriers = {carrier.name: index for index, carrier in enumerate(channel.carriers)}
+            tx = {name: index for index, name in enumerate(channel.tx)}
+            rx = {name: index for index, name in enumerate(channel.rx)}
+            found = [
+                (carriers[user.carrier.name], tx[user.tx.name], rx[user.rx.name])
+                if user.carrier.name in carriers and user.tx.name in tx and user.rx.name in rx
+                else None
+                for user in self
+            ]
+            self._place = axes, found
+        return self._place[1]
+
+
+def users_of(scene: Scene, carriers: Sequence[Carrier]) -> Users:
     """All users: carriers in the given order, then TX, then RX by name."""
     pairs = pairs_of(scene)
-    return [User(pair.tx, pair.rx, carrier) for carrier in carriers for pair in pairs]
+    return Users(User(pair.tx, pair.rx, carrier) for carrier in carriers for pair in pairs)
 
 
-@dataclass(frozen=True)
-class UserChannels:
+class UserChannels(NamedTuple):
     """What the channel product says about each user, Shape ``[U]`` each."""
 
-    known: BoolArray
-    """The channel covers the pair. A held channel does not cover a device that came later."""
+    unknown: int
+    """Users that the channel does not cover: a held channel has no device that came later."""
     has_path: BoolArray
     """At least one path with an amplitude other than 0 on the user's carrier."""
     los: BoolArray
@@ -45,36 +81,26 @@ class UserChannels:
     """H, Shape ``[Nr, Nt]``; None without a path."""
 
 
-def channels_of(channel: Channel, users: Sequence[User]) -> UserChannels:
+def channels_of(channel: Channel, users: Users) -> UserChannels:
     """Look up each user in the channel product.
 
     Raises `PayloadError` naming the user where paths reach it but its H is missing or does not
     fit its arrays.
     """
-    carriers = {carrier.name: index for index, carrier in enumerate(channel.carriers)}
-    tx_index = {name: index for index, name in enumerate(channel.tx)}
-    rx_index = {name: index for index, name in enumerate(channel.rx)}
     matrices = {(matrix.carrier, matrix.tx, matrix.rx): matrix.h for matrix in channel.h}
-    offsets, receivers = channel.offsets.tolist(), len(channel.rx)
-    known, has_path, los = ([False] * len(users) for _ in range(3))
+    offsets, free, receivers = channel.offsets.tolist(), channel.los.tolist(), len(channel.rx)
+    unknown, has_path, los = 0, [False] * len(users), [False] * len(users)
     found: list[Complex128Array | None] = [None] * len(users)
-    for u, user in enumerate(users):
-        key = (carriers.get(user.carrier.name), tx_index.get(user.tx.name), rx_index.get(user.rx.name))
-        if None in key:
+    for u, place in enumerate(users.places(channel)):
+        if place is None:
+            unknown += 1
             continue
-        c, t, r = key
-        first = t * receivers + r  # type: ignore[operator]  # no None in it
-        known[u] = True
-        los[u] = bool(channel.los[t, r])
-        has_path[u] = bool(channel.a[c, offsets[first] : offsets[first + 1]].any())
-        if has_path[u]:
-            found[u] = _checked(user, matrices.get(key))  # type: ignore[arg-type]  # no None in it
-    return UserChannels(
-        known=np.array(known, np.bool_),
-        has_path=np.array(has_path, np.bool_),
-        los=np.array(los, np.bool_),
-        h=tuple(found),
-    )
+        c, t, r = place
+        first = t * receivers + r
+        los[u] = free[t][r]
+        if np.count_nonzero(channel.a[c, offsets[first] : offsets[first + 1]]):
+            has_path[u], found[u] = True, _checked(users[u], matrices.get(place))
+    return UserChannels(unknown, *np.array([has_path, los], np.bool_), tuple(found))
 
 
 def _checked(user: User, h: Complex128Array | None) -> Complex128Array:
@@ -99,10 +125,13 @@ class Swept(NamedTuple):
     """|y| of all beam pairs, Shape ``[len(users), Nt, Nr]``."""
 
 
-def sweep_users(users: Sequence[User], h: Sequence[Complex128Array | None]) -> list[Swept]:
+def sweep_users(users: Users, h: Sequence[Complex128Array | None]) -> list[Swept]:
     """|y| of all beam pairs of the users with an H."""
-    groups: dict[tuple[AntennaArray, AntennaArray], list[int]] = defaultdict(list)
-    for index, matrix in enumerate(h):
+    groups: dict[int, list[int]] = defaultdict(list)
+    for index, (matrix, batch) in enumerate(zip(h, users.batch, strict=True)):
         if matrix is not None:
-            groups[users[index].tx.array, users[index].rx.array].append(index)
-    return [Swept(found, sweep(np.array([h[u] for u in found]), *arrays)) for arrays, found in groups.items()]
+            groups[batch].append(index)
+    return [
+        Swept(found, sweep(np.array([h[u] for u in found]), users[found[0]].tx.array, users[found[0]].rx.array))
+        for found in groups.values()
+    ]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from abc import abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, ClassVar, NamedTuple, TypeVar
@@ -134,18 +134,27 @@ class World(Service[W]):
             twice = next(name for name, following in pairwise(names) if name == following)
             raise PayloadError(f"world {self.run.name!r} has two objects named {twice!r}")
         meshes = set(self.mesh_classes())
+        position, orientation, velocity, dimensions = _tables(states)
         return Scene(
             names=names,
             classes=tuple(state.kind for state in states),
             assets=tuple(f"objects/{s.kind}.ply" if s.kind in meshes else "" for s in states),
-            position=_rows([state.position for state in states], 3),
-            orientation=_rows([state.orientation for state in states], 4),
-            velocity=_rows([state.velocity for state in states], 3),
-            dimensions=_rows([state.dimensions for state in states], 3),
+            position=position,
+            orientation=orientation,
+            velocity=velocity,
+            dimensions=dimensions,
             devices=devices,
         )
 
 
-def _rows(rows: Iterable[tuple[float, ...]], width: int) -> Float64Array:
-    # + 0.0: a negative zero and a zero are equal, and so must their bytes be.
-    return np.array(list(rows), dtype="<f8").reshape(-1, width) + 0.0
+def _tables(states: Sequence[ObjectState]) -> tuple[Float64Array, ...]:
+    """Positions, orientations, velocities and dimensions, one row an object each."""
+    fields = [(state.position, state.orientation, state.velocity, state.dimensions) for state in states]
+    columns = zip(*fields, strict=True) if fields else ()
+    # One array of all numbers, cut up. + 0.0: a negative zero and a zero are equal, so must their bytes be.
+    numbers = np.array([x for column in columns for vector in column for x in vector], dtype="<f8") + 0.0
+    count, tables, begin = len(states), [], 0
+    for width in (3, 4, 3, 3):
+        tables.append(numbers[begin : begin + count * width].reshape(count, width))
+        begin += count * width
+    return tuple(tables)
