@@ -110,7 +110,7 @@ class Payload(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
             is_known = layout.dtypes_of(self) == layout.dtypes and shapes in layout.known
         except (AttributeError, TypeError):  # no array, or no length: told below
             is_known = False
-        if not is_known or any(getattr(self, f) is not None for f in layout.optional):
+        if not is_known or (layout.optional and any(getattr(self, f) is not None for f in layout.optional)):
             self._check_arrays()
             if len(layout.known) >= KNOWN_SHAPES:
                 layout.known.clear()
@@ -183,7 +183,10 @@ def _getter(paths: Sequence[str]) -> Callable[[Any], tuple[Any, ...]]:
     """All of these attributes at once."""
     if len(paths) > 1:
         return attrgetter(*paths)
-    return lambda owner: tuple(attrgetter(path)(owner) for path in paths)
+    if not paths:
+        return lambda owner: ()
+    single = attrgetter(*paths)
+    return lambda owner: (single(owner),)
 
 
 def _equal(a: Any, b: Any) -> bool:

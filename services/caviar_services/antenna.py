@@ -67,4 +67,4 @@ def _grid(array: AntennaArray) -> tuple[Float64Array, Float64Array]:
 def _phases(array: AntennaArray) -> tuple[Complex128Array, Complex128Array]:
     """j2π times the grid."""
     y, z = _grid(array)
-    return 2j * np.pi * y, 2j * np.pi * z
+    return np.multiply(2j * np.pi, y, dtype=np.complex128), np.multiply(2j * np.pi, z, dtype=np.complex128)

@@ -32,6 +32,8 @@ from caviar_protocol.topics import Carrier, Scene
 S = TypeVar("S", bound=msgspec.Struct)
 P = TypeVar("P", bound=Payload)
 
+_ABSENT = Status.ABSENT
+
 Progress = Callable[[str, float], None]
 """``progress(phase, grace_s)``: tell the broker what is being done, and that it advances.
 
@@ -108,7 +110,7 @@ class FrameInput:
     @property
     def present(self) -> bool:
         """Whether there is a payload: fresh, held or late."""
-        return self.provenance.status is not Status.ABSENT
+        return self.provenance.status is not _ABSENT
 
     @property
     def payload(self) -> Payload:
@@ -146,7 +148,7 @@ class Frame(msgspec.Struct, frozen=True, kw_only=True):
         found: dict[str, P] = {}
         for item in self.inputs:
             entry = item.provenance
-            if entry.topic == topic and entry.status is not Status.ABSENT:
+            if entry.topic == topic and entry.status is not _ABSENT:
                 found[entry.source] = cast(P, item.payload)
         return found
 

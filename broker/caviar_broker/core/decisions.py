@@ -13,6 +13,7 @@ from caviar_broker.core.transitions import DECIDED, OUTSTANDING, TaskState
 from caviar_protocol.digest import RunDigest
 from caviar_protocol.messages import Status
 
+_FRESH = Status.FRESH
 _FIRST = Decision(Status.ABSENT, None, "there is no earlier frame")
 
 
@@ -108,7 +109,7 @@ class DecisionBook:
         for topic in self._due_topics(task):
             product = products.get(topic)
             if product is not None:
-                decisions[topic] = Decision(Status.FRESH, product)
+                decisions[topic] = Decision(_FRESH, product)
             else:
                 cause = f"{task.service} produced no {topic} in frame {task.frame}"
                 decisions[topic] = Decision(Status.ABSENT, None, cause)

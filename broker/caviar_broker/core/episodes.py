@@ -10,6 +10,8 @@ from caviar_broker.core.tasks import GrantOrder
 from caviar_broker.core.transitions import RunEvent, RunState, ServiceEvent, ServiceState, TaskState
 from caviar_protocol.messages import Cancel, Done, EpisodeEnd, Fault, Grant, Report, Reset
 
+_ACTIVE, _RUNNING = ServiceState.ACTIVE, RunState.RUNNING
+
 
 class Episodes:
     """Drives the schedule of one episode after the other (clauses 1, 6, 16 and 18)."""
@@ -181,7 +183,7 @@ class Episodes:
         outstanding = owed[0].frame if owed else -1
         if not run.current(peer, answer.epoch, answer.attempt, kind, outstanding):
             return None
-        asked = (run.episode, outstanding) if owed and peer.state is ServiceState.ACTIVE else None
+        asked = (run.episode, outstanding) if owed and peer.state is _ACTIVE else None
         if (answer.episode, answer.frame) == asked:
             return schedule
         run.stale(peer, kind, f"{kind} for episode {answer.episode} frame {answer.frame}", outstanding)
@@ -197,7 +199,7 @@ class Episodes:
     def pump(self, now: int) -> None:
         """Let the schedule act, and carry out what it wants."""
         run, schedule = self._run, self.schedule
-        if schedule is None or run.state is not RunState.RUNNING:
+        if schedule is None or run.state is not _RUNNING:
             return
         schedule.advance(now)
         for task, remedy in schedule.overruns:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import NamedTuple
+
+import msgspec
 
 from caviar_broker.core.decisions import DecisionBook
 from caviar_broker.core.events import Product
@@ -12,7 +13,7 @@ from caviar_broker.core.tasks import Decision, Task, provenance
 from caviar_protocol.messages import GrantInput
 
 
-class Gathered(NamedTuple):
+class Gathered(msgspec.Struct, frozen=True):
     """Inputs of a task, all of them decided."""
 
     decisions: list[tuple[Edge, Decision]]

@@ -32,14 +32,11 @@ class Run:
         """Seed of the next episode, and the agent that chose it."""
         self.digest = RunDigest()
         self.ledger = Ledger(kept=not plan.ephemeral)
+        self.over = False
+        """Whether the run has ended, if perhaps not everybody has left."""
         self.error = ""
         self.culprit = ""
         self.actions: list[Action] = []
-
-    @property
-    def over(self) -> bool:
-        """Whether the run has ended, if perhaps not everybody has left."""
-        return self.state is RunState.STOPPING or self.state is RunState.FINISHED
 
     def takes_part(self, peer: Peer) -> bool:
         """Whether the run needs a service: all until the graph is known, then those in it (clause 5)."""
@@ -68,6 +65,7 @@ class Run:
     def enter(self, event: RunEvent, now: int) -> None:
         """Take a transition of the table."""
         self.state, self.since = step(RUN, self.state, event), now
+        self.over = self.state in (RunState.STOPPING, RunState.FINISHED)
 
     def fail(self, error: str, culprit: str, now: int) -> None:
         """End the run with blame; the first blame counts."""

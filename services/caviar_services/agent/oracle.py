@@ -11,7 +11,7 @@ from caviar_protocol.pairs import Pair
 from caviar_protocol.topics import BeamChoice, Channel, Scene
 from caviar_services.agent.base import Agent, AgentSettings
 from caviar_services.link.sweep import best_pairs
-from caviar_services.link.users import User, channels_of, sweep_users
+from caviar_services.link.users import User, Users, channels_of, sweep_users
 from caviar_services.service import Frame
 
 
@@ -26,7 +26,7 @@ class OracleAgent(Agent[AgentSettings]):
         channel = frame.only("channel", Channel)
         if channel is None:
             raise PayloadError(f"{self.run.name} was granted frame {frame.number} without a channel")
-        users = [User(pair.tx, pair.rx, carrier) for carrier in channel.carriers for pair in pairs]
+        users = Users(User(pair.tx, pair.rx, carrier) for carrier in channel.carriers for pair in pairs)
         for swept in sweep_users(users, channels_of(channel, users).h):
             best = best_pairs(swept.abs_y, 1)
             for u, tx_beam, rx_beam in zip(swept.users, best.tx_beam[:, 0], best.rx_beam[:, 0], strict=True):

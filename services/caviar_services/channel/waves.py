@@ -6,8 +6,8 @@ import cmath
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array
@@ -17,7 +17,7 @@ from caviar_protocol.topics import AntennaDevice, Scene
 from caviar_services.channel.geometric_settings import GeometricSettings
 
 
-class PairWaves(NamedTuple):
+class PairWaves(msgspec.Struct, frozen=True):
     """A pair, and which of the waves are its own."""
 
     tx: AntennaDevice

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import NamedTuple, cast
+from typing import cast
 
+import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Int32Array
@@ -19,7 +20,7 @@ _LISTED = 8
 """Names that an error message lists at most."""
 
 
-class Choices(NamedTuple):
+class Choices(msgspec.Struct, frozen=True):
     """Chosen beams per user, −1 where no agent serves it, Shape ``[U]`` each."""
 
     tx_beam: Int32Array
@@ -96,7 +97,8 @@ class _Book:
         for index, (_, command) in self.chosen.items():
             if self.scheduled.get(command.tx, ("", command.rx))[1] == command.rx:
                 tx_beam[index], rx_beam[index] = command.tx_beam, command.rx_beam
-        return Choices(*np.array([tx_beam, rx_beam], np.int32), self.outdated)
+        beams = np.array(tx_beam + rx_beam, np.int32).reshape(2, -1)
+        return Choices(beams[0], beams[1], self.outdated)
 
     def _first_wins(
         self, index: int, previous: tuple[str, BeamChoice], agent: str, command: BeamChoice

@@ -66,7 +66,9 @@ def best_pairs(abs_y: Float64Array, k: int) -> Pairs:
         order = (-flat).argsort(-1, "stable")[:, :k]
     else:
         order = np.array([_best_of_many(row, k) for row in flat])
-    tx_beam, rx_beam = np.divmod(order.astype(np.int32), np.int32(abs_y.shape[2]))
+    tx_beam, rx_beam = order.astype(np.int32), np.zeros(order.shape, np.int32)
+    if abs_y.shape[2] > 1:
+        tx_beam, rx_beam = np.divmod(tx_beam, np.int32(abs_y.shape[2]))
     first = np.arange(0, flat.size, flat.shape[1])[:, None]
     return Pairs(tx_beam, rx_beam, flat.take(order + first))
 

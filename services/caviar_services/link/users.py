@@ -6,8 +6,8 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array
@@ -69,7 +69,7 @@ def users_of(scene: Scene, carriers: Sequence[Carrier]) -> Users:
     return Users(User(pair.tx, pair.rx, carrier) for carrier in carriers for pair in pairs)
 
 
-class UserChannels(NamedTuple):
+class UserChannels(msgspec.Struct, frozen=True):
     """What the channel product says about each user, Shape ``[U]`` each."""
 
     unknown: int
@@ -100,7 +100,8 @@ def channels_of(channel: Channel, users: Users) -> UserChannels:
         los[u] = free[t][r]
         if np.count_nonzero(channel.a[c, offsets[first] : offsets[first + 1]]):
             has_path[u], found[u] = True, _checked(users[u], matrices.get(place))
-    return UserChannels(unknown, *np.array([has_path, los], np.bool_), tuple(found))
+    flags = np.array(has_path + los, np.bool_).reshape(2, -1)
+    return UserChannels(unknown, flags[0], flags[1], tuple(found))
 
 
 def _checked(user: User, h: Complex128Array | None) -> Complex128Array:
@@ -117,7 +118,7 @@ def _checked(user: User, h: Complex128Array | None) -> Complex128Array:
     return h
 
 
-class Swept(NamedTuple):
+class Swept(msgspec.Struct, frozen=True):
     """Users with equal arrays, swept as one batch."""
 
     users: list[int]
@@ -131,7 +132,8 @@ def sweep_users(users: Users, h: Sequence[Complex128Array | None]) -> list[Swept
     for index, (matrix, batch) in enumerate(zip(h, users.batch, strict=True)):
         if matrix is not None:
             groups[batch].append(index)
-    return [
-        Swept(found, sweep(np.array([h[u] for u in found]), users[found[0]].tx.array, users[found[0]].rx.array))
-        for found in groups.values()
-    ]
+    swept = []
+    for found in groups.values():
+        first = users[found[0]]
+        swept.append(Swept(found, sweep(np.array([h[u] for u in found]), first.tx.array, first.rx.array)))
+    return swept

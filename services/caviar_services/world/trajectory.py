@@ -78,12 +78,13 @@ class TrajectoryWorld(World[TrajectorySettings]):
         """All objects, at all times."""
         t = elapsed_ns / 1e9
         for name, (thing, track) in self._tracks.items():
+            velocity = track.velocity(t)
             yield ObjectState(
                 name=name,
                 kind=thing.kind,
                 position=track.position(t),
-                orientation=quaternion_from_euler(track.yaw(t)),
-                velocity=track.velocity(t),
+                orientation=quaternion_from_euler(track.yaw(t, velocity)),
+                velocity=velocity,
                 dimensions=thing.dimensions_m,
             )
 
@@ -126,8 +127,8 @@ class Track:
         x, y, z = self._curve.at(t, 1)
         return (x, y, z)
 
-    def yaw(self, t: float) -> float:
-        """[rad] at instant ``t`` [s], counter-clockwise from +x."""
+    def yaw(self, t: float, velocity: Vector | None = None) -> float:
+        """[rad] at instant ``t`` [s], counter-clockwise from +x; ``velocity`` there, if it is known."""
         if self._given is not None:
             return self._given.at(t)[0]
         times = self._curve.times
@@ -135,7 +136,7 @@ class Track:
         if k < 0:
             return self._hover[0][0] if t < times[0] else self._hover[-1][1]
         if self._moves(k):
-            return self._course(t, k)
+            return self._course(t, k, velocity or self.velocity(t))
         start, end = self._hover[k]
         s = (t - float(times[k])) / float(times[k + 1] - times[k])
         return start + (end - start) * s * s * (3 - 2 * s)
@@ -143,8 +144,8 @@ class Track:
     def _moves(self, k: int) -> bool:
         return self._moving[k]
 
-    def _course(self, t: float, k: int) -> float:
-        vx, vy, _ = self._curve.at(t, 1)
+    def _course(self, t: float, k: int, velocity: Vector) -> float:
+        vx, vy, _ = velocity
         if math.hypot(vx, vy) > _SLOW:
             return math.atan2(vy, vx)
         begin, end = self._curve.times[k], self._curve.times[k + 1]
