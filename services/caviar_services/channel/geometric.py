@@ -226,7 +226,8 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         ]
         if not self._unit:
             a *= self._path_gain(waves, pairs)
-        constant = _constant(tuple(los), tuple(offsets), tuple(waves.id), len(transmitters))
+        shape = (len(transmitters), len(receivers))
+        constant = _constant(tuple(los), tuple(offsets), tuple(waves.id), shape)
         return Channel(
             rung=self.rung,
             options=self._options,
@@ -293,11 +294,11 @@ class _Constant(NamedTuple):
 
 @lru_cache(maxsize=64)
 def _constant(
-    los: tuple[bool, ...], offsets: tuple[int, ...], ids: tuple[int, ...], transmitters: int
+    los: tuple[bool, ...], offsets: tuple[int, ...], ids: tuple[int, ...], shape: tuple[int, int]
 ) -> _Constant:
     paths = offsets[-1]
     arrays = _Constant(
-        los=np.array(los, np.bool_).reshape(transmitters, len(los) // max(transmitters, 1)),
+        los=np.array(los, np.bool_).reshape(shape),
         offsets=np.array(offsets, np.int64),
         id=np.array(ids, np.uint64),
         interactions=np.zeros((paths, 0), np.uint8),
