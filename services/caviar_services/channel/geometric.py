@@ -41,6 +41,7 @@ from caviar_protocol.scene import device_pose
 from caviar_protocol.seeding import generator
 from caviar_protocol.topics import AntennaDevice, Channel, ChannelMatrix, ChannelOptions, Scene
 from caviar_services.antenna import steering_vector
+from caviar_services.channel.atmosphere import amplitude_factor
 from caviar_services.channel.base import ChannelModel, Modelled
 from caviar_services.channel.geometric_settings import GeometricSettings
 from caviar_services.channel.occlusion import Boxes
@@ -219,7 +220,7 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         count = len(waves.tau)
         return Channel(
             rung=self.rung,
-            options=self.options,
+            options=self.modelled,
             carriers=self.run.carriers,
             tx=tuple(device.name for device in transmitters),
             rx=tuple(device.name for device in receivers),
@@ -238,7 +239,7 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         )
 
     def _path_gain(self, waves: Waves, pairs: Sequence[PairWaves]) -> Float64Array:
-        """λ/(4πd) and both element patterns, Shape ``[C, P]``."""
+        """λ/(4πd), both element patterns and absorption, Shape ``[C, P]``."""
         patterns = np.ones(len(waves.tau))
         for pair in pairs:
             patterns[pair.mine] = element_amplitude(pair.tx.array.pattern, pair.departures(waves))
@@ -246,6 +247,8 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         factor: Float64Array = (
             SPEED_OF_LIGHT / self._frequency / (4 * np.pi * np.array(waves.length)) * patterns
         )
+        if self.absorption_db_per_km is not None:
+            factor *= amplitude_factor(self.absorption_db_per_km, np.array(waves.tau))
         return factor
 
     def _matrices(

@@ -17,7 +17,7 @@ from caviar_protocol.errors import PayloadError, ScenarioError, SetupError
 from caviar_protocol.seeding import derive_seed
 from caviar_protocol.topics import AntennaDevice, ChannelOptions, Scene
 from caviar_services.channel.assemble import Antenna, PathTable
-from caviar_services.channel.base import Found, PathModel
+from caviar_services.channel.base import ChannelSettings, Found, PathModel
 from caviar_services.channel.sionna_materials import MaterialSettings, OutsideRange
 from caviar_services.channel.sionna_scene import SceneSettings, SionnaScene
 from caviar_services.channel.sionna_tracer import LaunchOptions, Traced, Tracer
@@ -33,7 +33,7 @@ _LANES = 20_000_000
 _COMPILE_GRACE_S = 120.0
 
 
-class SionnaSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     """What is modelled, and how finely."""
 
     max_depth: Annotated[int, quantity("1", "interactions of a path at most", ge=0, le=16)] = 3
@@ -52,14 +52,14 @@ class SionnaSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
         int | None, quantity("1", "receivers of one launch; absent: as the scenario has")
     ] = None
     bodies: Annotated[int, quantity("1", "moving objects of one mesh at most", ge=0, le=4096)] = 32
-    pool: dict[str, int] = {}
+    pool: dict[str, int] = msgspec.field(default_factory=dict)
     """Bodies of single meshes where ``bodies`` does not fit, by file name without ending: ``car = 64``;
     ``box`` for objects without a mesh."""
     without_body: tuple[str, ...] = ()
     """Classes of objects that the waves pass through."""
     body_material: str = "metal"
     """ITU-R P.2040 material of moving objects."""
-    materials: dict[str, MaterialSettings] = {}
+    materials: dict[str, MaterialSettings] = msgspec.field(default_factory=dict)
     """Changes to materials of the scenery, by name."""
     outside_itu_range: OutsideRange = "refuse"
     """What to do where a material is not defined at the carrier frequency."""
