@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any, Literal
 
+import msgspec
 import numpy as np
 import pytest
 from channel_lab import (
     Array,
     Plate,
     antenna,
+    carriers,
     measure,
     mirrored,
     permittivity,
@@ -24,12 +25,13 @@ from channel_lab import (
     write_scenery,
 )
 
-from caviar_protocol.errors import ScenarioError
+from caviar_protocol.codec import encode_payload
+from caviar_protocol.errors import AssetError, ScenarioError
 from caviar_protocol.topics import Channel, Scene
 from caviar_services.channel.base import ChannelModel
 from caviar_services.channel.sionna_materials import ItuMaterial, MaterialPolicy, itu_material
-from caviar_services.channel.sionna_rt import SionnaChannel
-from caviar_services.channel.sionna_scene import SceneSettings, SionnaScene
+from caviar_services.channel.sionna_rt import SionnaChannel, SionnaSettings
+from caviar_services.service import Preparation, RunInfo
 from caviar_services.world.assets import scenery_assets
 
 pytestmark = pytest.mark.channel
@@ -52,8 +54,11 @@ BUNDLED = (
     "simple_wedge",
     "triple_reflector",
 )
-BRICK = ("brick@c2: nearest 40 GHz", "brick@c3: nearest 110 GHz")
-"""What all bundled scenes with brick use of it: neither 60 nor 100 GHz is in 1–40 or 110–330 GHz."""
+BRICK = {
+    "nearest": ("brick@c2: nearest 40 GHz", "brick@c3: nearest 110 GHz"),
+    "extrapolate": ("brick@c2: extrapolate 1–40 GHz", "brick@c3: extrapolate 110–330 GHz"),
+}
+"""What scenes with brick use of it: neither 60 nor 100 GHz is in 1–40 or 110–330 GHz."""
 WITH_BRICK = {"floor_wall", "munich", "simple_street_canyon", "simple_street_canyon_with_cars"}
 
 
@@ -165,60 +170,53 @@ def test_the_notes_say_what_was_used(tmp_path: Path) -> None:
     """Material, type, ranges, carrier, frequency, policy and constants; with what the scenario changes."""
     corners = [(-9, -9, 0), (9, -9, 0), (9, 9, 0)]
     assets = write_scenery(tmp_path, [Plate("p", corners, "brick"), Plate("q", corners, "brick")])
-    model = sionna(
-        60e9,
-        assets,
-        outside_itu_range="nearest",
-        materials={"skin-q": {"relative_permittivity": 4.5}},
-        samples=100,
-        receivers_at_once=1,
+    settings = {
+        "outside_itu_range": "nearest",
+        "materials": {"skin-q": {"relative_permittivity": 4.5}},
+        "samples": 100,
+        "receivers_at_once": 1,
+    }
+    run = RunInfo(name="channel", carriers=carriers(28e9, 60e9))
+    model = SionnaChannel(msgspec.convert(settings, SionnaSettings), run)
+    notes = model.prepare(Preparation(demand={}, assets=assets)).notes
+    told = (
+        "material {} (ITU brick) is defined for 1–40 GHz, 110–330 GHz; on carrier 'c1' at 60 GHz it has "
+        "(nearest 40 GHz) relative permittivity {}, conductivity 0.04294 S/m"
     )
-    notes = noted(model)
-    assert notes == [
-        "material 'skin-p' (ITU brick) is defined for 1–40 GHz, 110–330 GHz; on carrier 'c0' at 60 GHz it has "
-        "(nearest 40 GHz) relative permittivity 3.91, conductivity 0.04294 S/m",
-        "material 'skin-q' (ITU brick) is defined for 1–40 GHz, 110–330 GHz; on carrier 'c0' at 60 GHz it has "
-        "(nearest 40 GHz) relative permittivity 4.5, conductivity 0.04294 S/m",
+    assert [note for note in notes if note.startswith("material")] == [
+        told.format("'skin-p'", 3.91),
+        told.format("'skin-q'", 4.5),
     ]
-
-
-def noted(model: ChannelModel[Any]) -> list[str]:
-    assert isinstance(model, SionnaChannel)
-    return [use.note(model.run.carriers[use.carrier].name) for use in model.outside]
 
 
 # --- bundled scenes -----------------------------------------------------------------------------
 
 
 def test_these_are_all_bundled_scenes() -> None:
-    with pytest.raises(ScenarioError) as caught:
+    with pytest.raises(AssetError) as caught:
         scenery_assets("sionna:none")
-    assert set(re.findall(r"[a-z_]+", str(caught.value).split(":")[-1])) >= set(BUNDLED)
+    assert str(caught.value).endswith(f"known: {', '.join(BUNDLED)}")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", BUNDLED)
 def test_bundled_scenes_run_on_four_carriers(name: str) -> None:
-    """2.8, 28, 60 and 100 GHz in one product: a free line of sight, and roofs that reflect on all four.
-
-    Where nothing is outside its range, the policies are the same, so that only loading is left to see.
-    """
+    """2.8, 28, 60 and 100 GHz in one product: a free line of sight, and a reflection from below on all four,
+    under either policy; what was used where is in the product."""
     assets = scenery_assets(f"sionna:{name}")
-    used = BRICK if name in WITH_BRICK else ()
-    nearest = over(assets, "nearest")
-    assert nearest.options.materials_outside == used
-    extrapolated = tuple(re.sub("nearest 40.*", "extrapolate 1–40 GHz", text) for text in used)
-    extrapolated = tuple(re.sub("nearest 110.*", "extrapolate 110–330 GHz", text) for text in extrapolated)
-    if used:
-        assert over(assets, "extrapolate").options.materials_outside == extrapolated
-    else:
-        settings = SceneSettings(
-            frequencies_hz=FREQUENCIES,
-            body_material="metal",
-            materials=MaterialPolicy(outside="extrapolate"),
-            weld=False,
-        )
-        assert SionnaScene(assets, {}, settings).outside == ()
+    nearest, extrapolated = over(assets, "nearest"), over(assets, "extrapolate")
+    has_brick = name in WITH_BRICK
+    assert nearest.options.materials_outside == (BRICK["nearest"] if has_brick else ())
+    assert extrapolated.options.materials_outside == (BRICK["extrapolate"] if has_brick else ())
+    if not has_brick:
+        assert encode_payload(nearest)[1] == encode_payload(extrapolated)[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(WITH_BRICK))
+def test_bundled_scenes_with_brick_are_refused_at_60_ghz_by_default(name: str) -> None:
+    with pytest.raises(ScenarioError, match=r"'brick' \(ITU brick\) is defined for 1–40 GHz, 110–330 GHz"):
+        sionna(60e9, scenery_assets(f"sionna:{name}"), bodies=0)
 
 
 def over(assets: Any, outside: str) -> Channel:
@@ -237,14 +235,15 @@ def over(assets: Any, outside: str) -> Channel:
     straight = [spherical_wave(float(np.linalg.norm(rx - tx)), f) for f in FREQUENCIES]
     assert np.isfinite(channel.a).all()
     assert (np.abs(channel.a) > 0).all()
+    assert channel.interactions[:, 0].tolist() == [0, 1]
     np.testing.assert_allclose(np.abs(channel.a[:, 0]), np.abs(straight), rtol=0.02)
     return channel
 
 
 def above(model: ChannelModel[Any]) -> tuple[Array, Array]:
     low, high = model._scene.low, model._scene.high  # type: ignore[attr-defined]
-    middle = np.array([*(low + high)[:2] / 2, high[2] + 7.0])
-    return middle + [1.0, 2.0, 0.0], middle + [9.0, -5.0, 3.0]
+    x, y, z = (low[0] + high[0]) / 2, (low[1] + high[1]) / 2, high[2]
+    return np.array([x + 0.3, y + 0.2, z + 2]), np.array([x + 0.1, y + 0.4, z + 3])
 
 
 def pair(tx: Array, rx: Array) -> Scene:
