@@ -25,7 +25,13 @@ from caviar_protocol import arrays, fields, limits, messages, topics
 from caviar_protocol.arrays import WIRE_DTYPES, ArrayField
 from caviar_protocol.topics import PARTS
 
-SINCE: dict[str, str] = {"Ready.seed": "1.1", "Done.seed": "1.1", "Reset.seed_episode": "1.1"}
+SINCE: dict[str, str] = {
+    "Ready.seed": "1.1",
+    "Done.seed": "1.1",
+    "Reset.seed_episode": "1.1",
+    "ChannelOptions.materials_outside": "1.1",
+    "ChannelOptions.absorption_db_per_km": "1.1",
+}
 """Minor version that brought a field (``Grant.reports``) or a class (``Grant``); 1.0 unless said here."""
 
 _MARKER = re.compile(r"(<!-- (\w+)(?:: ([\w ]+))? -->\n).*?(<!-- end -->)", re.DOTALL)

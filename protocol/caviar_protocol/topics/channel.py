@@ -56,6 +56,12 @@ class ChannelOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=Tr
     """Diffuse reflection."""
     max_depth: Annotated[int, quantity("1", "interactions of a path at most", ge=0)] = 0
     samples: Annotated[int, quantity("1", "rays launched per transmitter", ge=0)] = 0
+    materials_outside: tuple[str, ...] = ()
+    """Materials used outside the range they are defined in, as ``brick@mmwave: nearest 40 GHz``."""
+    absorption_db_per_km: tuple[
+        Annotated[float, quantity("dB/km", "specific attenuation by the air", ge=0)], ...
+    ] = ()
+    """By the air (ITU-R P.676), for each carrier; empty: none."""
 
 
 class ChannelMatrix(Payload, frozen=True, kw_only=True, omit_defaults=True):

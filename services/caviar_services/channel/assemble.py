@@ -31,6 +31,7 @@ from caviar_protocol.topics import (
     Scene,
 )
 from caviar_services.antenna import steering_vector
+from caviar_services.channel.atmosphere import amplitude_factor
 from caviar_services.channel.geometry import PathGeometry, path_geometry
 from caviar_services.channel.patterns import radiated_field
 
@@ -104,6 +105,8 @@ class Product:
     options: ChannelOptions
     carriers: tuple[Carrier, ...]
     with_h: bool
+    absorption_db_per_km: Float64Array | None = None
+    """By the air, on each carrier, Shape ``[C]``; None: no atmosphere."""
 
 
 def assemble(
@@ -113,11 +116,13 @@ def assemble(
     table: PathTable,
     los: BoolArray,
 ) -> Channel:
-    """The canonical product: antennas and carrier phase applied, non-finite paths dropped, sorted."""
+    """The canonical product: antennas, phase and absorption applied, non-finite paths dropped, sorted."""
     table = _canonical_names(table)
     with np.errstate(invalid="ignore"):  # what is not finite is dropped and counted below
         geometry = _geometry(table, transmitters, receivers)
         a = _amplitudes(product.carriers, table, geometry, transmitters, receivers)
+        if product.absorption_db_per_km is not None:
+            a = a * amplitude_factor(product.absorption_db_per_km, geometry.tau)
     finite = _finite(table, geometry, a)
     dropped = len(finite) - int(np.count_nonzero(finite))
     if dropped:

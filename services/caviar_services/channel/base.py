@@ -6,19 +6,31 @@ import time
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import ClassVar, TypeVar
 
 import msgspec
+import numpy as np
 
-from caviar_protocol.arrays import BoolArray
+from caviar_protocol.arrays import BoolArray, Float64Array
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.scene import antennas
 from caviar_protocol.topics import AntennaDevice, Channel, ChannelOptions, Scene
 from caviar_services.channel.assemble import Antenna, PathTable, Product, assemble
+from caviar_services.channel.atmosphere import Atmosphere, specific_attenuation
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
 
-S = TypeVar("S", bound=msgspec.Struct)
+
+class ChannelSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What can be set on every channel model."""
+
+    atmosphere: Atmosphere | None = None
+    """Air that absorbs along every path (ITU-R P.676); ``{}`` is that of the Recommendation's figures, and
+    absent is none."""
+
+
+S = TypeVar("S", bound=ChannelSettings)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,13 +72,23 @@ class ChannelModel(Service[S]):
                 "a channel needs at least one carrier; add [[carriers]] with name and frequency_hz",
                 key="carriers",
             )
+        self.absorption_db_per_km = self._absorption()
+        """Specific attenuation of the air on each carrier, Shape ``[C]``; None: no atmosphere."""
         self.with_h = False
         """Whether somebody asks for the matrices."""
 
     @property
     def options(self) -> ChannelOptions:
-        """What the products model."""
+        """What the products model, beside absorption."""
         return ChannelOptions()
+
+    @cached_property
+    def modelled(self) -> ChannelOptions:
+        """`options`, with the absorption that all models share; known once `load` is through."""
+        if self.absorption_db_per_km is None:
+            return self.options
+        absorption = tuple(self.absorption_db_per_km.tolist())
+        return msgspec.structs.replace(self.options, absorption_db_per_km=absorption)
 
     def load(self, preparation: Preparation) -> tuple[str, ...]:
         """Load scenery, compile, warm up; notes for the user."""
@@ -84,7 +106,7 @@ class ChannelModel(Service[S]):
 
     def prepare(self, preparation: Preparation) -> Prepared:
         self.with_h = "h" in preparation.demand.get("channel", frozenset())
-        return Prepared(notes=self.load(preparation))
+        return Prepared(notes=(*self.load(preparation), *self._absorption_notes()))
 
     def step(self, frame: Frame) -> StepResult:
         scene = frame.scene()
@@ -96,6 +118,28 @@ class ChannelModel(Service[S]):
             counts={"paths": len(channel.tau), "dropped": channel.dropped, **made.counts},
             measured=made.measured,
         )
+
+    def _absorption(self) -> Float64Array | None:
+        air = self.settings.atmosphere
+        if air is None:
+            return None
+        try:
+            return np.array(
+                [specific_attenuation(air, carrier.frequency_hz) for carrier in self.run.carriers]
+            )
+        except ScenarioError as error:
+            raise ScenarioError(str(error), key=f"services.{self.run.name}.settings.atmosphere") from error
+
+    def _absorption_notes(self) -> tuple[str, ...]:
+        air = self.settings.atmosphere
+        if air is None or self.absorption_db_per_km is None:
+            return ()
+        of_carriers = ", ".join(
+            f"{absorbed:.3g} dB/km on {carrier.name!r}"
+            for carrier, absorbed in zip(self.run.carriers, self.absorption_db_per_km, strict=True)
+        )
+        state = f"{air.temperature_k:g} K, {air.pressure_hpa:g} hPa, {air.water_vapour_g_m3:g} g/m³"
+        return (f"atmosphere (ITU-R P.676) at {state}: {of_carriers}",)
 
 
 class PathModel(ChannelModel[S]):
@@ -119,7 +163,11 @@ class PathModel(ChannelModel[S]):
         found = self.paths(scene, tx, rx)
         traced = time.perf_counter_ns()
         product = Product(
-            rung=self.rung, options=self.options, carriers=self.run.carriers, with_h=self.with_h
+            rung=self.rung,
+            options=self.modelled,
+            carriers=self.run.carriers,
+            with_h=self.with_h,
+            absorption_db_per_km=self.absorption_db_per_km,
         )
         channel = assemble(product, tx, rx, found.table, found.los)
         done = time.perf_counter_ns()

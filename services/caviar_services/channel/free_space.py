@@ -9,17 +9,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import ClassVar
 
-import msgspec
 import numpy as np
 
 from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Scene
 from caviar_services.channel.assemble import Antenna, PathTable
-from caviar_services.channel.base import Found, PathModel
+from caviar_services.channel.base import ChannelSettings, Found, PathModel
 
 
-class FreeSpaceSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The model has nothing to set."""
+class FreeSpaceSettings(ChannelSettings, frozen=True, kw_only=True):
+    """What all channel models have; nothing of its own."""
 
 
 class FreeSpaceChannel(PathModel[FreeSpaceSettings]):
@@ -29,7 +28,7 @@ class FreeSpaceChannel(PathModel[FreeSpaceSettings]):
     far field that the formula holds in: it has no path and counts as ``too_close``.
     """
 
-    Settings: ClassVar[type[msgspec.Struct]] = FreeSpaceSettings
+    Settings: ClassVar[type[ChannelSettings]] = FreeSpaceSettings
     rung: ClassVar[str] = "free-space"
 
     def paths(self, scene: Scene, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]) -> Found:

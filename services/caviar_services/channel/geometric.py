@@ -50,6 +50,7 @@ from caviar_protocol.scene import device_pose
 from caviar_protocol.seeding import generator
 from caviar_protocol.topics import AntennaDevice, Channel, ChannelMatrix, ChannelOptions, Scene
 from caviar_services.antenna import steering_vector
+from caviar_services.channel.atmosphere import amplitude_factor
 from caviar_services.channel.base import ChannelModel, Modelled
 from caviar_services.channel.geometric_settings import GeometricSettings
 from caviar_services.channel.occlusion import Boxes
@@ -101,7 +102,6 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         loss_db = 20.0 if settings.nlos_loss_db is None else settings.nlos_loss_db
         self._nlos_factor = 10 ** (-loss_db / 20)
         self._unit = settings.normalization == "unit"
-        self._options = self.options
         self._nearest = 0.0 if self._unit else float((SPEED_OF_LIGHT / self._frequency).max())
 
     @property
@@ -230,7 +230,7 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         constant = _constant(tuple(los), tuple(offsets), tuple(waves.id), shape)
         return Channel(
             rung=self.rung,
-            options=self._options,
+            options=self.modelled,
             carriers=self.run.carriers,
             tx=tuple([device.name for device in transmitters]),
             rx=tuple([device.name for device in receivers]),
@@ -249,7 +249,7 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         )
 
     def _path_gain(self, waves: Waves, pairs: Sequence[PairWaves]) -> Float64Array:
-        """λ/(4πd) and both element patterns, Shape ``[C, P]``."""
+        """λ/(4πd), both element patterns and absorption, Shape ``[C, P]``."""
         patterns = np.ones(len(waves.tau))
         for pair in pairs:
             patterns[pair.mine] = element_amplitude(pair.tx.array.pattern, pair.departures(waves))
@@ -257,6 +257,8 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         factor: Float64Array = (
             SPEED_OF_LIGHT / self._frequency / (4 * np.pi * np.array(waves.length)) * patterns
         )
+        if self.absorption_db_per_km is not None:
+            factor *= amplitude_factor(self.absorption_db_per_km, np.array(waves.tau))
         return factor
 
     def _matrices(

@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from caviar_protocol.arrays import quantity
+from caviar_services.channel.base import ChannelSettings
 
 Corner = tuple[float, float, float]
 Spread = Annotated[float, quantity("°", "standard deviation of a Laplacian", ge=0, le=180)]
@@ -27,8 +28,8 @@ class Obstacle(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
             raise ValueError(f"minimum_m {self.minimum_m} is not below maximum_m {self.maximum_m}")
 
 
-class GeometricSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of the channel ``geometric``."""
+class GeometricSettings(ChannelSettings, frozen=True, kw_only=True):
+    """Settings of the channel ``geometric``; ``atmosphere`` goes with ``path-loss``."""
 
     components: Annotated[int, quantity("1", "waves of a pair, L", ge=1, le=64)] = 3
     k_factor_db: Annotated[
@@ -69,3 +70,7 @@ class GeometricSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
             raise ValueError('obstacles block nothing without nlos = "geometry"')
         if self.nlos_loss_db is not None and self.normalization != "path-loss":
             raise ValueError('nlos_loss_db belongs to normalization = "path-loss"')
+        if self.atmosphere is not None and self.normalization != "path-loss":
+            raise ValueError(
+                'atmosphere belongs to normalization = "path-loss": "unit" has no loss over distance'
+            )

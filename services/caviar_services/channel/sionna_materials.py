@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import msgspec
 
 from caviar_protocol.errors import ScenarioError
 
-OutsideRange = Literal["refuse", "nearest"]
+OutsideRange = Literal["error", "nearest", "extrapolate"]
+"""Where a carrier lies in none of the ranges that ITU-R P.2040 defines a material in: refuse it; take the
+constants of the nearest end of a range; or follow the power law of that range beyond its end."""
+
+Constants = tuple[float, float]
+"""Relative permittivity and conductivity [S/m]."""
 
 
 class MaterialSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -26,91 +33,192 @@ class MaterialSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
         """Whether both electric constants are given, so that no ITU material is needed."""
         return self.relative_permittivity is not None and self.conductivity_s_per_m is not None
 
+    def applied(self, constants: Constants) -> Constants:
+        """These constants with the changes."""
+        permittivity, conductivity = constants
+        if self.relative_permittivity is not None:
+            permittivity = self.relative_permittivity
+        if self.conductivity_s_per_m is not None:
+            conductivity = self.conductivity_s_per_m
+        return permittivity, conductivity
 
-def itu_constants(
-    name: str, itu_type: str, frequency_hz: float, outside: OutsideRange
-) -> tuple[float, float]:
-    """Relative permittivity and conductivity [S/m] of an ITU material (P.2040, eqs. 28 and 29).
 
-    Raises `ScenarioError` naming the material, its ranges and the remedies where the frequency is outside all
-    of them, unless ``outside`` is ``nearest``: then the constants are those at the nearest end.
+@dataclass(frozen=True, kw_only=True)
+class MaterialPolicy:
+    """What a scenario says about materials."""
+
+    changes: Mapping[str, MaterialSettings] = field(default_factory=dict)
+    """By name of the material in the scenery."""
+    outside: OutsideRange = "error"
+    key: str = "settings"
+    """Of the settings in the scenario, for messages."""
+
+    def of(self, name: str) -> MaterialSettings:
+        return self.changes.get(name, MaterialSettings())
+
+
+@dataclass(frozen=True, kw_only=True)
+class ItuMaterial:
+    """A material of ITU-R P.2040 at one frequency."""
+
+    itu_type: str
+    frequency_hz: float
+    ranges_ghz: tuple[tuple[float, float], ...]
+    """Where the material is defined."""
+    taken_ghz: tuple[float, float]
+    """The range whose parameters were taken."""
+    policy: OutsideRange
+    constants: Constants
+
+    @property
+    def is_outside(self) -> bool:
+        """Whether the frequency lies outside all ranges."""
+        return not self.taken_ghz[0] <= self.frequency_hz / 1e9 <= self.taken_ghz[1]
+
+    @property
+    def source(self) -> str:
+        """What was taken in place of constants that are not defined, in short."""
+        low, high = self.taken_ghz
+        if self.policy == "extrapolate":
+            return f"extrapolate {low:g}–{high:g} GHz"
+        return f"nearest {_clamped(self.frequency_hz / 1e9, self.taken_ghz):g} GHz"
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutsideUse:
+    """That a material is used where ITU-R P.2040 does not define it."""
+
+    name: str
+    carrier: int
+    """Index of the carrier."""
+    itu: ItuMaterial
+    constants: Constants
+    """As used, with what the scenario changes."""
+
+    def brief(self, carrier: str) -> str:
+        """For the provenance: ``brick@mmwave: nearest 40 GHz``."""
+        return f"{self.name}@{carrier}: {self.itu.source}"
+
+    def note(self, carrier: str) -> str:
+        """For the user, with the constants."""
+        permittivity, conductivity = self.constants
+        return (
+            f"material {self.name!r} (ITU {self.itu.itu_type}) is defined for {_spans(self.itu.ranges_ghz)}; "
+            f"on carrier {carrier!r} at {self.itu.frequency_hz / 1e9:g} GHz it has ({self.itu.source}) "
+            f"relative permittivity {permittivity:.4g}, conductivity {conductivity:.4g} S/m"
+        )
+
+
+def itu_material(
+    name: str, itu_type: str, frequency_hz: float, policy: MaterialPolicy, remedy: str = ""
+) -> ItuMaterial:
+    """A material by its ITU-R P.2040 type: a·f^b and c·f^d with f in GHz (P.2040-3, eqs. 28 and 29, table 3).
+
+    Outside of all ranges the nearest one counts, by the distance [Hz] of its nearest end; of two equally
+    near, the first of the table. Raises `ScenarioError` naming material, ranges and remedies under the policy
+    ``error``; ``remedy`` stands in place of constants of the user's own.
     """
     from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
 
-    table = ITU_MATERIALS_PROPERTIES.get(itu_type)
+    table: Mapping[tuple[float, float], tuple[float, ...]] | None = ITU_MATERIALS_PROPERTIES.get(itu_type)
     if table is None:
         raise ScenarioError(
             f"there is no ITU material {itu_type!r}; known: {', '.join(sorted(ITU_MATERIALS_PROPERTIES))}"
         )
     gigahertz = frequency_hz / 1e9
-    ranges: Sequence[tuple[float, float]] = list(table)
-    inside = next((r for r in ranges if r[0] <= gigahertz <= r[1]), None)
-    if inside is None:
-        if outside == "refuse":
-            spans = ", ".join(f"{low:g}–{high:g} GHz" for low, high in ranges)
+    taken = next((r for r in table if r[0] <= gigahertz <= r[1]), None)
+    evaluated = gigahertz
+    if taken is None:
+        if policy.outside == "error":
+            own = f"give it relative_permittivity and conductivity_s_per_m in {policy.key}.materials.{name}"
             raise ScenarioError(
-                f"material {name!r} (ITU {itu_type}) is defined for {spans}, the carrier is at "
-                f"{gigahertz:g} GHz; choose a carrier within, give the material relative_permittivity and "
-                f'conductivity_s_per_m in settings.materials.{name}, or set outside_itu_range = "nearest"'
+                f"material {name!r} (ITU {itu_type}) is defined for {_spans(tuple(table))}, the carrier is "
+                f"at {gigahertz:g} GHz; choose a carrier within, {remedy or own}, or set outside_itu_range = "
+                '"nearest" (constants of the nearest end) or "extrapolate" (power law of the nearest range)',
+                key=f"{policy.key}.outside_itu_range",
             )
-        inside = min(ranges, key=lambda r: min(abs(gigahertz - r[0]), abs(gigahertz - r[1])))
-        gigahertz = min(max(gigahertz, inside[0]), inside[1])
-    a, b, c, d = table[inside]
-    return a * gigahertz**b, c * gigahertz**d
+        taken = min(table, key=lambda r: abs(gigahertz - _clamped(gigahertz, r)))
+        if policy.outside == "nearest":
+            evaluated = _clamped(gigahertz, taken)
+    a, b, c, d = table[taken]
+    return ItuMaterial(
+        itu_type=itu_type,
+        frequency_hz=frequency_hz,
+        ranges_ghz=tuple(table),
+        taken_ghz=taken,
+        policy=policy.outside,
+        constants=(a * evaluated**b, c * evaluated**d),
+    )
 
 
-Constants = tuple[float, float]
-"""Relative permittivity and conductivity [S/m]."""
+@contextmanager
+def any_frequency() -> Iterator[None]:
+    """While a scene is loaded, which Sionna RT does at 3.5 GHz, no material is outside its range.
+
+    The materials then have constants that mean nothing: `freeze` and `set_materials` are to follow.
+    """
+    from sionna.rt.radio_materials import itu_material as module
+
+    evaluate = module.itu_material
+    module.itu_material = lambda name, frequency: (1.0, 0.0)
+    try:
+        yield
+    finally:
+        module.itu_material = evaluate
 
 
-def set_materials(
-    scene: Any, frequency_hz: float, changes: Mapping[str, MaterialSettings], outside: OutsideRange
-) -> None:
+def freeze(scene: Any) -> None:
+    """Let no change of the scene's frequency change a material."""
+    for material in scene.radio_materials.values():
+        if hasattr(material, "itu_type"):
+            material.frequency_update_callback = None
+
+
+def set_materials(scene: Any, frequency_hz: float, policy: MaterialPolicy) -> None:
     """Give all materials of a `sionna.rt.Scene` their constants at the carrier.
 
     Constants are set here rather than by Sionna RT, whose float32 frequency puts 60 GHz outside of
-    a range that ends at 60 GHz. Raises `ScenarioError` for an unknown name or a bad value.
+    a range that ends at 60 GHz; the scene's own materials are frozen. Raises `ScenarioError` for an unknown
+    name or a bad value.
     """
     materials = scene.radio_materials
-    unknown = sorted(changes.keys() - materials.keys())
+    unknown = sorted(policy.changes.keys() - materials.keys())
     if unknown:
         raise ScenarioError(
             f"the scenery has no material {unknown[0]!r}; it has: {', '.join(sorted(materials))}"
         )
     for name, material in materials.items():
-        change = changes.get(name, MaterialSettings())
         try:
-            _set_material(name, material, frequency_hz, change, outside)
+            _set_material(name, material, frequency_hz, policy)
         except ValueError as error:
             raise ScenarioError(f"material {name!r}: {error}; correct settings.materials.{name}") from error
     scene.frequency = frequency_hz
 
 
 def itu_materials(
-    scene: Any, frequency_hz: float, changes: Mapping[str, MaterialSettings], outside: OutsideRange
-) -> list[tuple[Any, Constants]]:
-    """Materials of a `sionna.rt.Scene` that may differ between carriers, with their constants at one."""
+    scene: Any, frequency_hz: float, policy: MaterialPolicy
+) -> list[tuple[Any, ItuMaterial, Constants]]:
+    """Materials of a `sionna.rt.Scene` that may differ between carriers, with their constants at one, as ITU
+    defines them and as changed."""
     found = []
     for name, material in scene.radio_materials.items():
-        change = changes.get(name, MaterialSettings())
-        if hasattr(material, "itu_type") and not change.is_electric:
-            permittivity, conductivity = itu_constants(name, material.itu_type, frequency_hz, outside)
-            if change.relative_permittivity is not None:
-                permittivity = change.relative_permittivity
-            if change.conductivity_s_per_m is not None:
-                conductivity = change.conductivity_s_per_m
-            found.append((material, (permittivity, conductivity)))
+        itu = _itu_of(name, material, frequency_hz, policy)
+        if itu is not None:
+            found.append((material, itu, policy.of(name).applied(itu.constants)))
     return found
 
 
-def _set_material(
-    name: str, material: Any, frequency_hz: float, change: MaterialSettings, outside: OutsideRange
-) -> None:
-    if hasattr(material, "itu_type"):
-        material.frequency_update_callback = None
-        if not change.is_electric:
-            constants = itu_constants(name, material.itu_type, frequency_hz, outside)
-            material.relative_permittivity, material.conductivity = constants
+def _itu_of(name: str, material: Any, frequency_hz: float, policy: MaterialPolicy) -> ItuMaterial | None:
+    """The ITU material that a material of the scene is; None for others, and for those that nothing needs."""
+    if not hasattr(material, "itu_type") or policy.of(name).is_electric or not material.is_used:
+        return None
+    return itu_material(name, material.itu_type, frequency_hz, policy)
+
+
+def _set_material(name: str, material: Any, frequency_hz: float, policy: MaterialPolicy) -> None:
+    change, itu = policy.of(name), _itu_of(name, material, frequency_hz, policy)
+    if itu is not None:
+        material.relative_permittivity, material.conductivity = itu.constants
     for attribute, value in (
         ("relative_permittivity", change.relative_permittivity),
         ("conductivity", change.conductivity_s_per_m),
@@ -120,3 +228,12 @@ def _set_material(
     ):
         if value is not None:
             setattr(material, attribute, value)
+
+
+def _clamped(gigahertz: float, span: tuple[float, float]) -> float:
+    """The frequency of a range that is nearest to this one."""
+    return min(max(gigahertz, span[0]), span[1])
+
+
+def _spans(ranges: tuple[tuple[float, float], ...]) -> str:
+    return ", ".join(f"{low:g}–{high:g} GHz" for low, high in ranges)

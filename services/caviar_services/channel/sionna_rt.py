@@ -17,8 +17,13 @@ from caviar_protocol.errors import PayloadError, ScenarioError, SetupError
 from caviar_protocol.seeding import derive_seed
 from caviar_protocol.topics import AntennaDevice, ChannelOptions, Scene
 from caviar_services.channel.assemble import Antenna, PathTable
-from caviar_services.channel.base import Found, PathModel
-from caviar_services.channel.sionna_materials import MaterialSettings, OutsideRange
+from caviar_services.channel.base import ChannelSettings, Found, PathModel
+from caviar_services.channel.sionna_materials import (
+    MaterialPolicy,
+    MaterialSettings,
+    OutsideRange,
+    OutsideUse,
+)
 from caviar_services.channel.sionna_scene import SceneSettings, SionnaScene
 from caviar_services.channel.sionna_tracer import LaunchOptions, Traced, Tracer
 from caviar_services.channel.specular import refined_points
@@ -33,7 +38,7 @@ _LANES = 20_000_000
 _COMPILE_GRACE_S = 120.0
 
 
-class SionnaSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     """What is modelled, and how finely."""
 
     max_depth: Annotated[int, quantity("1", "interactions of a path at most", ge=0, le=16)] = 3
@@ -52,17 +57,18 @@ class SionnaSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
         int | None, quantity("1", "receivers of one launch; absent: as the scenario has")
     ] = None
     bodies: Annotated[int, quantity("1", "moving objects of one mesh at most", ge=0, le=4096)] = 32
-    pool: dict[str, int] = {}
+    pool: dict[str, int] = msgspec.field(default_factory=dict)
     """Bodies of single meshes where ``bodies`` does not fit, by file name without ending: ``car = 64``;
     ``box`` for objects without a mesh."""
     without_body: tuple[str, ...] = ()
     """Classes of objects that the waves pass through."""
     body_material: str = "metal"
     """ITU-R P.2040 material of moving objects."""
-    materials: dict[str, MaterialSettings] = {}
+    materials: dict[str, MaterialSettings] = msgspec.field(default_factory=dict)
     """Changes to materials of the scenery, by name."""
-    outside_itu_range: OutsideRange = "refuse"
-    """What to do where a material is not defined at the carrier frequency."""
+    outside_itu_range: OutsideRange = "error"
+    """Where ITU-R P.2040 does not define a material at a carrier: ``error``; ``nearest``, the constants of
+    the nearest end of a range; ``extrapolate``, the power law of that range."""
 
 
 class SionnaChannel(PathModel[SionnaSettings]):
@@ -82,6 +88,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         self._variant = ""
         self._scene: SionnaScene
         self._tracer: Tracer
+        self._outside: tuple[OutsideUse, ...] = ()
         self._at_once = 1
 
     @property
@@ -95,6 +102,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
             scattering=s.scattering,
             max_depth=s.max_depth,
             samples=s.samples,
+            materials_outside=tuple(use.brief(self.run.carriers[use.carrier].name) for use in self._outside),
         )
 
     def load(self, preparation: Preparation) -> tuple[str, ...]:
@@ -109,11 +117,16 @@ class SionnaChannel(PathModel[SionnaSettings]):
             SceneSettings(
                 frequencies_hz=frequencies,
                 body_material=s.body_material,
-                materials=s.materials,
-                outside_itu_range=s.outside_itu_range,
+                materials=MaterialPolicy(
+                    changes=s.materials,
+                    outside=s.outside_itu_range,
+                    key=f"services.{self.run.name}.settings",
+                ),
                 weld=s.diffraction,
             ),
         )
+        self._outside = self._scene.outside
+        notes += tuple(use.note(self.run.carriers[use.carrier].name) for use in self._outside)
         seed = s.launch_seed
         if seed is None:
             seed = derive_seed(self.run.seed, 0, f"{self.run.name}/launch")

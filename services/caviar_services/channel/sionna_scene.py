@@ -20,9 +20,11 @@ from caviar_protocol.scene import object_pose
 from caviar_protocol.topics import Scene
 from caviar_services.channel.sionna_materials import (
     Constants,
-    MaterialSettings,
-    OutsideRange,
-    itu_constants,
+    MaterialPolicy,
+    OutsideUse,
+    any_frequency,
+    freeze,
+    itu_material,
     itu_materials,
     set_materials,
 )
@@ -45,6 +47,9 @@ _HALF_BOX = 4.0
 _PARKING = "caviar-parking"
 _SKIN = "caviar-body"
 
+_SKIN_NAME = "body_material"
+_OTHER_SKIN = "choose another body_material"
+
 
 @dataclass(frozen=True, kw_only=True)
 class SceneSettings:
@@ -53,8 +58,7 @@ class SceneSettings:
     frequencies_hz: tuple[float, ...]
     """Of the carriers. The scene is at the first one, unless it is tuned to another."""
     body_material: str
-    materials: Mapping[str, MaterialSettings]
-    outside_itu_range: OutsideRange
+    materials: MaterialPolicy
     weld: bool
     """Join vertices at one place, so that edges between faces are known (diffraction)."""
 
@@ -76,9 +80,11 @@ class SionnaScene:
     """
 
     def __init__(self, assets: Mapping[str, Path], pool: Mapping[str, int], settings: SceneSettings) -> None:
+        bodied = any(pool.values())
         skins = [
-            itu_constants("body_material", settings.body_material, frequency, settings.outside_itu_range)
+            itu_material(_SKIN_NAME, settings.body_material, frequency, settings.materials, _OTHER_SKIN)
             for frequency in settings.frequencies_hz
+            if bodied
         ]
         self._scene = _load(find_scenery(assets), settings.weld)
         self._scenery = frozenset(self._scene.objects)
@@ -87,18 +93,28 @@ class SionnaScene:
         self._meshes = {asset: _unit_mesh(asset, assets) for asset in pool}
         self._bodies: list[Body] = [(asset, slot) for asset in sorted(pool) for slot in range(pool[asset])]
         self._standing: frozenset[Body] = frozenset()
-        moving = self._moving_shapes(skins[0], settings.body_material == "metal")
+        moving = self._moving_shapes(skins[0].constants if skins else None, settings.body_material == "metal")
         moved = sum(len(mesh.vertices) for mesh in moving[-1].meshes)
         self._replace_shapes([*_by_material(self._scene), *moving])
         self._vertices = self._corners[len(self._corners) - moved :]
-        first, outside = settings.frequencies_hz[0], settings.outside_itu_range
-        set_materials(self._scene, first, settings.materials, outside)
+        set_materials(self._scene, settings.frequencies_hz[0], settings.materials)
         self._carriers: list[_Tuning] = []
-        for frequency, skin in zip(settings.frequencies_hz, skins, strict=True):
-            constants = itu_materials(self._scene, frequency, settings.materials, outside)
-            if self._bodies:
-                constants.append((moving[-1].material, skin))
-            self._carriers.append((frequency, constants))
+        outside: list[OutsideUse] = []
+        for carrier, frequency in enumerate(settings.frequencies_hz):
+            found = itu_materials(self._scene, frequency, settings.materials)
+            used = [(material.name, itu, constants) for material, itu, constants in found]
+            tuning = [(material, constants) for material, _, constants in found]
+            if skins:
+                used.append((_SKIN_NAME, skins[carrier], skins[carrier].constants))
+                tuning.append((moving[-1].material, skins[carrier].constants))
+            self._carriers.append((frequency, tuning))
+            outside += [
+                OutsideUse(name=name, carrier=carrier, itu=itu, constants=constants)
+                for name, itu, constants in used
+                if itu.is_outside
+            ]
+        self.outside = tuple(outside)
+        """Materials used where they are not defined, by carrier."""
 
     @property
     def mi_scene(self) -> Any:
@@ -176,7 +192,7 @@ class SionnaScene:
     def _middle(self) -> Float64Array:
         return (self.low + self.high) / 2
 
-    def _moving_shapes(self, constants: tuple[float, float], metal: bool) -> list[_Shape]:
+    def _moving_shapes(self, constants: Constants | None, metal: bool) -> list[_Shape]:
         """The box around the parked receivers, and last the moving bodies; one shape where both are metal."""
         from sionna.rt import RadioMaterial
 
@@ -188,12 +204,14 @@ class SionnaScene:
             Mesh(np.tile(self._middle, (len(mesh.vertices), 1)), mesh.faces)
             for mesh in (self._meshes[asset] for asset, _ in self._bodies)
         ]
-        if bodies:
+        if constants is not None and metal:
             skin = RadioMaterial(f"{_SKIN}-skin", 0.1, *constants)
-            if metal:
-                return [_Shape(_SKIN, skin, [_PARKING, *names], [walls, *bodies])]
+            return [_Shape(_SKIN, skin, [_PARKING, *names], [walls, *bodies])]
         closed = _Shape(_PARKING, RadioMaterial(f"{_PARKING}-walls", conductivity=1e7), [_PARKING], [walls])
-        return [closed, _Shape(_SKIN, skin, names, bodies)] if bodies else [closed]
+        if constants is None:
+            return [closed]
+        skin = RadioMaterial(f"{_SKIN}-skin", 0.1, *constants)
+        return [closed, _Shape(_SKIN, skin, names, bodies)]
 
     def _replace_shapes(self, shapes: Sequence[_Shape]) -> None:
         """Put these shapes in place of what was loaded, and number their triangles."""
@@ -223,13 +241,16 @@ def _load(description: Path | None, weld: bool) -> Any:
     if description is not None:
         read_scenery(description)  # says what is wrong with a file before the renderer does
     try:
-        return load_scene(
-            None if description is None else str(description),
-            merge_shapes=False,
-            remove_duplicate_vertices=weld,
-        )
+        with any_frequency():
+            scene = load_scene(
+                None if description is None else str(description),
+                merge_shapes=False,
+                remove_duplicate_vertices=weld,
+            )
     except (ValueError, TypeError, RuntimeError) as error:
         raise AssetError(f"{description}: the ray tracer cannot load it: {error}") from error
+    freeze(scene)
+    return scene
 
 
 def _bounds(scene: Any) -> tuple[Float64Array, Float64Array]:
