@@ -196,8 +196,7 @@ class DecisionBook:
         )
 
     def _finish_frames(self) -> None:
-        while self.finished_frames < min(self.frames, min(self.next.values())):
-            frame = self.finished_frames
+        for frame in range(self.finished_frames, min(self.frames, *self.next.values())):
             if not self._plan.ephemeral:
                 self._digest.add_frame(self._episode, frame, self._fresh(frame))
             t_ns = self._plan.t_ns(frame)

@@ -278,7 +278,7 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
             for number, (pair, (transmit, receive)) in enumerate(zip(pairs, steered, strict=True)):
                 tx, rx = divmod(number, receivers)
                 mine = of_carrier[pair.mine]
-                h = mine[None] @ transmit if receive is None else (receive * mine[:, None]).T @ transmit
+                h = mine.dot(transmit)[None] if receive is None else (receive * mine[:, None]).T @ transmit
                 found.append(ChannelMatrix(carrier=carrier, tx=tx, rx=rx, h=h))
         return tuple(found)
 
