@@ -26,6 +26,7 @@ from caviar_services.channel.sionna_materials import (
     itu_materials,
     set_materials,
 )
+from caviar_services.channel.sionna_planes import PlaneTable, plane_numbers
 from caviar_services.columns import aligned_columns
 from caviar_services.meshes import BodyPool, Mesh, box, placed, unit_box
 from caviar_services.scenery import find_scenery, read_scenery
@@ -151,17 +152,25 @@ class SionnaScene:
             params = self._scene.mi_scene_params
             params[f"{_SKIN}.vertex_positions"] = _floats(self._vertices)
             params.update()
+            self.planes.update(self._corners, self._moving_plane)
         self._standing = frozenset(standing)
         return tuple(names), velocity
 
-    def planes(self, shapes: Int64Array, primitives: Int64Array) -> tuple[Float64Array, Float64Array]:
-        """A corner [m] and the normal (of any length) of triangles, each of Shape ``[..., 3]``, in float64.
+    def triangles(self, shapes: Int64Array, primitives: Int64Array) -> Int64Array:
+        """Number, through all shapes, of triangles of process-local shapes; anything for no shape."""
+        number = self._offsets[self._where(shapes)] + primitives
+        clipped: Int64Array = np.clip(number, 0, len(self._faces) - 1)
+        return clipped
 
-        Anything for no shape.
-        """
-        triangle = np.clip(self._offsets[self._where(shapes)] + primitives, 0, len(self._faces) - 1)
-        a, b, c = np.moveaxis(self._corners[self._faces[triangle]], -2, 0)
+    def surfaces(self, triangles: Int64Array) -> tuple[Float64Array, Float64Array]:
+        """A corner [m] and the normal (of any length) of triangles, each of Shape ``[..., 3]``; float64."""
+        a, b, c = np.moveaxis(self._corners[self._faces[triangles]], -2, 0)
         return a, np.cross(b - a, c - a)
+
+    def face_number(self, triangles: Int64Array) -> Int32Array:
+        """Number of the plane of triangles within their object: the same in every frame."""
+        piece = np.searchsorted(self._first_triangles, triangles, side="right") - 1
+        return (self.plane_of[triangles] - self._first_planes[piece]).astype(np.int32)
 
     def object_index(self, shapes: Int64Array, primitives: Int64Array) -> Int32Array:
         """Index into the names of `place` of triangles of process-local shapes; −1 for no shape."""
@@ -215,6 +224,23 @@ class SionnaScene:
         self._corners = np.concatenate([mesh.vertices for mesh in meshes])
         self._faces = np.concatenate([mesh.faces + b for mesh, b in zip(meshes, before, strict=True)])
         self._names = tuple(name for shape in shapes for name in shape.names)
+        self._number_planes(meshes)
+
+    def _number_planes(self, meshes: Sequence[Mesh]) -> None:
+        """Number the planes of these pieces; bodies, each of which is a point yet, by their unit meshes."""
+        still = len(meshes) - len(self._bodies)
+        of_asset = {asset: plane_numbers(mesh) for asset, mesh in self._meshes.items()}
+        numbers = [plane_numbers(mesh) for mesh in meshes[:still]]
+        numbers += [of_asset[asset] for asset, _ in self._bodies]
+        counts = np.array([int(number.max(initial=-1)) + 1 for number in numbers], np.int64)
+        self._first_planes = np.cumsum(counts) - counts
+        self._moving_plane = int(counts[:still].sum())
+        self.plane_of = np.concatenate(
+            [number + first for number, first in zip(numbers, self._first_planes, strict=True)]
+        ).astype(np.int64)
+        """Plane of each triangle, numbered through all objects."""
+        self.planes = PlaneTable(self.plane_of, self._faces.astype(np.int64))
+        self.planes.update(self._corners)
 
 
 def _load(description: Path | None, weld: bool) -> Any:
