@@ -60,14 +60,14 @@ def chains_of(launch: Launch, scene: SionnaScene) -> Chains:
             ray, chain = ray[going], chain[going]
         if not len(ray):
             break
-        kind, plane, token, tokens = _tokens(launch, d, ray, scene)
-        key = chain * tokens + token
-        begins = np.ones(len(key), np.bool_)
-        begins[1:] = key[1:] != key[:-1]
+        # Neighbouring rays mostly meet the same: only the first of each run is looked at.
+        begins = _begins(launch, d, ray, chain)
         heads = np.flatnonzero(begins)
-        _, first, inverse = np.unique(key[heads], return_index=True, return_inverse=True)
-        first = heads[first]
-        before, kind, plane = chain[first], kind[first], plane[first]
+        kind, plane, token, tokens = _tokens(launch, d, ray[heads], scene)
+        key = chain[heads] * tokens + token
+        _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
+        kind, plane, first = kind[first], plane[first], heads[first]
+        before = chain[first]
         planes, straight = planes[before], straight[before] & ((kind == REFLECTED) | (kind == REFRACTED))
         planes[:, d] = np.where(kind == REFLECTED, plane, -1)
         chain = inverse.reshape(-1)[np.cumsum(begins) - 1]
@@ -86,6 +86,19 @@ def chains_of(launch: Launch, scene: SionnaScene) -> Chains:
         np.concatenate([np.zeros((0, count), np.int32), *(part.planes for part in found)]),
         np.concatenate([np.zeros(0, np.bool_), *(part.straight for part in found)]),
     )
+
+
+def _begins(launch: Launch, d: int, ray: Int64Array, chain: Int64Array) -> BoolArray:
+    """Which rays differ from those before them, in what they met or the chain that they come from."""
+    bounce = launch.bounces[d]
+    told_apart = [chain, *(column.numpy()[ray] for column in (bounce.kind, bounce.shape, bounce.primitive))]
+    if launch.wedges is not None:
+        told_apart += [side.numpy()[ray] for side in (launch.wedges.prim0, launch.wedges.primn)]
+    begins = np.ones(len(ray), np.bool_)
+    begins[1:] = False
+    for column in told_apart:
+        begins[1:] |= column[1:] != column[:-1]
+    return begins
 
 
 def _tokens(
