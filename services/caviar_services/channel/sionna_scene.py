@@ -26,7 +26,7 @@ from caviar_services.channel.sionna_materials import (
     itu_materials,
     set_materials,
 )
-from caviar_services.channel.sionna_planes import PlaneTable, plane_numbers
+from caviar_services.channel.sionna_planes import PlaneTable, plane_numbers, shared_planes
 from caviar_services.columns import aligned_columns
 from caviar_services.meshes import BodyPool, Mesh, box, placed, unit_box
 from caviar_services.scenery import find_scenery, read_scenery
@@ -169,8 +169,7 @@ class SionnaScene:
 
     def face_number(self, triangles: Int64Array) -> Int32Array:
         """Number of the plane of triangles within their object: the same in every frame."""
-        piece = np.searchsorted(self._first_triangles, triangles, side="right") - 1
-        return (self.plane_of[triangles] - self._first_planes[piece]).astype(np.int32)
+        return self._face_of[triangles]
 
     def object_index(self, shapes: Int64Array, primitives: Int64Array) -> Int32Array:
         """Index into the names of `place` of triangles of process-local shapes; −1 for no shape."""
@@ -232,14 +231,18 @@ class SionnaScene:
         of_asset = {asset: plane_numbers(mesh) for asset, mesh in self._meshes.items()}
         numbers = [plane_numbers(mesh) for mesh in meshes[:still]]
         numbers += [of_asset[asset] for asset, _ in self._bodies]
+        self._face_of = np.concatenate(numbers)
         counts = np.array([int(number.max(initial=-1)) + 1 for number in numbers], np.int64)
-        self._first_planes = np.cumsum(counts) - counts
-        self._moving_plane = int(counts[:still].sum())
-        self.plane_of = np.concatenate(
-            [number + first for number, first in zip(numbers, self._first_planes, strict=True)]
-        ).astype(np.int64)
-        """Plane of each triangle, numbered through all objects."""
-        self.planes = PlaneTable(self.plane_of, self._faces.astype(np.int64))
+        before = np.cumsum(counts) - counts
+        parts = np.concatenate([number + first for number, first in zip(numbers, before, strict=True)])
+        faces = self._faces.astype(np.int64)
+        apart = PlaneTable(parts.astype(np.int64), faces)
+        apart.update(self._corners)
+        shared = shared_planes(apart, int(counts[:still].sum()))
+        self.plane_of = shared[parts]
+        """Infinite plane of each triangle, numbered through all objects."""
+        self._moving_plane = len(apart.normal) and int(shared.max()) + 1 - int(counts[still:].sum())
+        self.planes = PlaneTable(self.plane_of, faces)
         self.planes.update(self._corners)
 
 
