@@ -41,8 +41,8 @@ def model(name: str, **settings: Any) -> ChannelModel[Any]:
     assets = {
         asset: file for asset, file in scenery_assets(f"sionna:{name}").items() if isinstance(file, Path)
     }
-    settings = {"bodies": 12, "outside_itu_range": "nearest", **settings}
-    return sionna(28e9, assets, **settings)
+    rough = {material: {"scattering_coefficient": 0.3} for material in ("concrete", "marble")}
+    return sionna(28e9, assets, **{"bodies": 12, "materials": rough, **settings})
 
 
 def things(seed: int, name: str) -> list[Thing]:

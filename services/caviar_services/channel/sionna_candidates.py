@@ -109,14 +109,14 @@ def _tokens(
     bounce = launch.bounces[d]
     kind = bounce.kind.numpy()[ray].astype(np.int64)
     shape = bounce.shape.numpy()[ray].astype(np.int64)
-    plane = scene.plane_of[scene.triangles(shape, bounce.primitive.numpy()[ray].astype(np.int64))]
-    planes = len(scene.planes.triangle)
+    plane = scene.plane_of[scene.triangle_numbers(shape, bounce.primitive.numpy()[ray].astype(np.int64))]
+    planes = len(scene.plane_table.triangle)
     token = np.where(kind == REFLECTED, plane, planes + kind)
     edges = 0
     bent = kind == DIFFRACTED
     if bent.any():
         sides = np.stack([side.numpy()[ray[bent]] for side in (launch.wedges.prim0, launch.wedges.primn)])
-        sides = np.sort(scene.triangles(shape[bent], sides.astype(np.int64)), axis=0)
+        sides = np.sort(scene.triangle_numbers(shape[bent], sides.astype(np.int64)), axis=0)
         _, edge = np.unique(sides[0] * len(scene.plane_of) + sides[1], return_inverse=True)
         edges = int(edge.max()) + 1
         token[bent] = planes + 16 + edge.reshape(-1)

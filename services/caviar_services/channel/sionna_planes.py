@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from caviar_protocol.arrays import Float64Array, Int32Array, Int64Array
+from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
 from caviar_services.meshes import Mesh
 
 _OFF_PLANE = 2e-5
@@ -12,6 +12,9 @@ _OFF_PLANE = 2e-5
 
 _ANGLE = 2e-4
 """[rad] Largest angle between the normals of a plane's triangles."""
+
+_RIM = 1e-3
+"""[m]; a point this near a triangle is one of it."""
 
 
 def plane_numbers(mesh: Mesh) -> Int32Array:
@@ -85,6 +88,8 @@ class PlaneTable:
 
     def __init__(self, numbers: Int64Array, faces: Int64Array) -> None:
         self._faces = faces
+        self._numbers = numbers
+        self._corners = np.zeros((0, 3))
         self._order = np.argsort(numbers, kind="stable")
         count = int(numbers.max(initial=-1)) + 1
         self._begin = np.searchsorted(numbers[self._order], np.arange(count))
@@ -100,6 +105,7 @@ class PlaneTable:
 
     def update(self, corners: Float64Array, first: int = 0) -> None:
         """Take planes from ``first`` on from these corners of all meshes [m], Shape ``[V, 3]``."""
+        self._corners = corners
         begin = self._begin[first:]
         if not len(begin):
             return
@@ -118,3 +124,38 @@ class PlaneTable:
         self.normal[first:] = normal[chosen] / np.where(length > 0, length, 1.0)
         self.low[first:] = np.minimum.reduceat(triangles.min(1), begin)
         self.high[first:] = np.maximum.reduceat(triangles.max(1), begin)
+
+    def first_holding(self, triangles: Int64Array, points: Float64Array) -> Int64Array:
+        """For each point [m], Shape ``[N, 3]``, in one of these triangles, the first triangle of the same
+        plane that holds it too.
+
+        Where faces coincide, the floor of a house and the ground below it, or two houses' common wall, a ray
+        hits whichever was looked at first, which depends on the rays beside it.
+        """
+        if not len(triangles):
+            return triangles
+        plane = self._numbers[triangles]
+        begin = self._begin[plane]
+        sizes = np.append(self._begin[1:], len(self._order))[plane] - begin
+        hit = np.repeat(np.arange(len(triangles)), sizes)
+        place = np.arange(len(hit)) - np.repeat(np.cumsum(sizes) - sizes, sizes) + begin[hit]
+        candidate = self._order[place]
+        held = _holds(self._corners[self._faces[candidate]], points[hit])
+        first = triangles.copy()
+        # Within a plane triangles are in ascending order.
+        hits, where = np.unique(hit[held], return_index=True)
+        first[hits] = candidate[held][where]
+        return first
+
+
+def _holds(triangles: Float64Array, points: Float64Array) -> BoolArray:
+    """Whether points lie in triangles of their plane or at most `_RIM` outside, Shape ``[N]``."""
+    normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    length = np.linalg.norm(normal, axis=1)
+    inside: BoolArray = length > 0
+    normal /= np.where(inside, length, 1.0)[:, None]
+    for corner in range(3):
+        edge = triangles[:, (corner + 1) % 3] - triangles[:, corner]
+        across = (np.cross(edge, points - triangles[:, corner]) * normal).sum(1)
+        inside &= across >= -_RIM * np.linalg.norm(edge, axis=1)
+    return inside

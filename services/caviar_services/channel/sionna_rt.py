@@ -22,6 +22,7 @@ from caviar_services.channel.sionna_launch import LaunchOptions
 from caviar_services.channel.sionna_materials import MaterialSettings, OutsideRange
 from caviar_services.channel.sionna_scene import SceneSettings, SionnaScene
 from caviar_services.channel.sionna_tracer import Traced, Tracer
+from caviar_services.channel.specular import refined_points
 from caviar_services.llvm import activate_llvm, choose_variant
 from caviar_services.service import Preparation, RunInfo
 
@@ -141,7 +142,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         _refuse_buried(scene, self.settings.without_body)
         names, velocity = self._scene.place(scene, frozenset(self.settings.without_body))
         parts = [self._launch(t, transmitter, receivers) for t, transmitter in enumerate(transmitters)]
-        table = self._table(parts, names, velocity)
+        table = self._table(parts, names, velocity, transmitters, receivers)
         straight = (table.types == 0).all(1)
         los = np.zeros(len(transmitters) * len(receivers), bool)
         los[table.pair[straight]] = True
@@ -154,24 +155,39 @@ class SionnaChannel(PathModel[SionnaSettings]):
         )
 
     def _table(
-        self, parts: Sequence[tuple[Int64Array, Traced]], names: tuple[str, ...], velocity: Float64Array
+        self,
+        parts: Sequence[tuple[Int64Array, Traced]],
+        names: tuple[str, ...],
+        velocity: Float64Array,
+        transmitters: Sequence[Antenna],
+        receivers: Sequence[Antenna],
     ) -> PathTable:
-        """What all launches found, with names."""
+        """What all launches found, with names, and specular points in float64."""
         depth = self.settings.max_depth
+        pair = _joined([pair for pair, _ in parts], (0,), np.int64)
+        types = _joined([part.types for _, part in parts], (0, depth), np.uint8)
         shapes = _joined([part.shapes for _, part in parts], (0, depth), np.int64)
         primitives = _joined([part.primitives for _, part in parts], (0, depth), np.int64)
+        tx, rx = np.divmod(pair, max(len(receivers), 1))
+        points = refined_points(
+            np.array([antenna.position for antenna in transmitters]).reshape(-1, 3)[tx],
+            _joined([part.points for _, part in parts], (0, depth, 3), np.float64),
+            np.array([antenna.position for antenna in receivers]).reshape(-1, 3)[rx],
+            types,
+            self._scene.planes(shapes, primitives),
+        )
         return PathTable(
-            pair=_joined([pair for pair, _ in parts], (0,), np.int64),
+            pair=pair,
             transfer=np.concatenate(
                 [np.zeros((len(self.run.carriers), 0, 3, 3), np.complex128), *(p.transfer for _, p in parts)],
                 1,
             ),
-            types=_joined([part.types for _, part in parts], (0, depth), np.uint8),
+            types=types,
             objects=self._scene.object_index(shapes, primitives),
-            faces=self._scene.face_number(self._scene.triangles(shapes, primitives)),
-            points=_joined([part.points for _, part in parts], (0, depth, 3), np.float64),
+            points=points,
             object_names=names,
             object_velocity=velocity,
+            faces=self._scene.face_number(shapes, primitives),
         )
 
     def _launch(

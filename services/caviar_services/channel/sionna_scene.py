@@ -152,24 +152,34 @@ class SionnaScene:
             params = self._scene.mi_scene_params
             params[f"{_SKIN}.vertex_positions"] = _floats(self._vertices)
             params.update()
-            self.planes.update(self._corners, self._moving_plane)
+            self.plane_table.update(self._corners, self._moving_plane)
         self._standing = frozenset(standing)
         return tuple(names), velocity
 
-    def triangles(self, shapes: Int64Array, primitives: Int64Array) -> Int64Array:
+    def planes(self, shapes: Int64Array, primitives: Int64Array) -> tuple[Float64Array, Float64Array]:
+        """A corner [m] and the normal (of any length) of triangles, each of Shape ``[..., 3]``, in float64.
+
+        Anything for no shape.
+        """
+        a, b, c = np.moveaxis(self._corners[self._faces[self.triangle_numbers(shapes, primitives)]], -2, 0)
+        return a, np.cross(b - a, c - a)
+
+    def triangle_numbers(self, shapes: Int64Array, primitives: Int64Array) -> Int64Array:
         """Number, through all shapes, of triangles of process-local shapes; anything for no shape."""
         number = self._offsets[self._where(shapes)] + primitives
         clipped: Int64Array = np.clip(number, 0, len(self._faces) - 1)
         return clipped
 
-    def surfaces(self, triangles: Int64Array) -> tuple[Float64Array, Float64Array]:
-        """A corner [m] and the normal (of any length) of triangles, each of Shape ``[..., 3]``; float64."""
-        a, b, c = np.moveaxis(self._corners[self._faces[triangles]], -2, 0)
-        return a, np.cross(b - a, c - a)
+    def shapes_of(self, triangles: Int64Array) -> tuple[Int64Array, Int64Array]:
+        """Process-local shape of triangles by number, and their numbers within it."""
+        order = np.argsort(self._offsets)
+        where = order[np.searchsorted(self._offsets[order], triangles, side="right") - 1]
+        return self._ids[where], triangles - self._offsets[where]
 
-    def face_number(self, triangles: Int64Array) -> Int32Array:
-        """Number of the plane of triangles within their object: the same in every frame."""
-        return self._face_of[triangles]
+    def face_number(self, shapes: Int64Array, primitives: Int64Array) -> Int32Array:
+        """Number of the plane of triangles within their object, the same in every frame; anything for no
+        shape."""
+        return self._face_of[self.triangle_numbers(shapes, primitives)]
 
     def object_index(self, shapes: Int64Array, primitives: Int64Array) -> Int32Array:
         """Index into the names of `place` of triangles of process-local shapes; −1 for no shape."""
@@ -242,8 +252,8 @@ class SionnaScene:
         self.plane_of = shared[parts]
         """Infinite plane of each triangle, numbered through all objects."""
         self._moving_plane = len(apart.normal) and int(shared.max()) + 1 - int(counts[still:].sum())
-        self.planes = PlaneTable(self.plane_of, faces)
-        self.planes.update(self._corners)
+        self.plane_table = PlaneTable(self.plane_of, faces)
+        self.plane_table.update(self._corners)
 
 
 def _load(description: Path | None, weld: bool) -> Any:

@@ -154,7 +154,7 @@ class Tracer:
         chains, scattered = chains_of(launch, self._scene), scattered_of(launch)
         if at_once is None:
             at_once = max(1, _LANES // max(len(chains.ray), len(scattered[0]), 1))
-        table = Planes(self._scene.planes)
+        table = Planes(self._scene.plane_table)
         parts = [
             self._batch(
                 launch, chains, scattered, table, transmitter, begin, receivers[begin : begin + at_once]
@@ -190,9 +190,9 @@ class Tracer:
         buffer.discard_invalid()
         if not len(kept):
             return _nothing(len(self._wavelengths), self._options.max_depth, lost)
-        points = self._settle(buffer, candidates, kept, transmitter, receivers)
+        self._settle(buffer, candidates, kept, transmitter, receivers)
         self._compute_fields(buffer, source, targets)
-        traced = _read(buffer, len(self._wavelengths), transmitter, receivers, points, lost)
+        traced = _read(buffer, len(self._wavelengths), transmitter, receivers, lost)
         return traced.take(buffer.valid.numpy()).seen_from(begin)
 
     def _candidates(
@@ -309,24 +309,31 @@ class Tracer:
         kept: Int64Array,
         transmitter: Float64Array,
         receivers: Float64Array,
-    ) -> Float64Array:
-        """Points [m] of the paths found, Shape ``[P, D, 3]``: those of specular paths in float64; put into
-        the buffer too. Paths that met another plane than their own belong to another chain; they are marked.
+    ) -> None:
+        """Make what the buffer holds the same whichever rays were beside: of faces that coincide, the first
+        was met, and specular points are where the planes say. Mark paths that met other planes than
+        those of their chain: they belong to another chain.
         """
         import mitsuba as mi
 
         types, shapes, primitives, points = _geometry(buffer)
-        triangles = self._scene.triangles(shapes, primitives)
         wanted = candidates.planes[kept][:, : types.shape[1]]
+        triangles = self._scene.triangle_numbers(shapes, primitives)
         own = ((wanted < 0) | (wanted == self._scene.plane_of[triangles])).all(1)
+        buffer.valid = mi.UInt(aligned_indices(own)) != 0
+        met = (types == Interaction.REFLECTION) | (types == Interaction.TRANSMISSION)
+        met &= (own & ~candidates.found[kept])[:, None]
+        if not met.any():
+            return
+        first = self._scene.plane_table.first_holding(triangles[met], points[met])
+        shapes[met], primitives[met] = self._scene.shapes_of(first)
+        buffer._shapes = _tensor(mi.TensorXu, mi.UInt(aligned_indices(shapes.ravel())), shapes)
+        buffer._primitives = _tensor(mi.TensorXu, mi.UInt(aligned_indices(primitives.ravel())), shapes)
         start = np.broadcast_to(transmitter, (len(kept), 3))
         end = receivers[candidates.receiver[kept]]
-        points = refined_points(start, points, end, types, self._scene.surfaces(triangles))
-        for axis, column in zip("xyz", aligned_columns(points.reshape(-1, 3).T), strict=True):
-            if len(column):
-                setattr(buffer, f"_vertices_{axis}", mi.TensorXf(mi.Float(column), points.shape[:2]))
-        buffer.valid = mi.UInt(aligned_indices(own)) != 0
-        return points
+        exact = refined_points(start, points, end, types, self._scene.planes(shapes, primitives))
+        for axis, column in zip("xyz", aligned_columns(exact.reshape(-1, 3).T), strict=True):
+            setattr(buffer, f"_vertices_{axis}", _tensor(mi.TensorXf, mi.Float(column), shapes))
 
     def _compute_fields(self, buffer: Any, source: Any, targets: Any) -> None:
         """Give the buffer the amplitudes of all carriers, in their order; valid is what any of them has."""
@@ -358,6 +365,10 @@ class Tracer:
             dr.eval(amplitudes, carried)  # before the materials change again
             self._scene.tune(0)
             buffer.valid, buffer.a = carried, amplitudes
+
+
+def _tensor(kind: Any, values: Any, like: Int64Array) -> Any:
+    return kind(values, like.shape)
 
 
 def _nothing(carriers: int, depth: int, lost: int) -> Traced:
@@ -407,14 +418,13 @@ def _read(
     carriers: int,
     transmitter: Float64Array,
     receivers: Float64Array,
-    points: Float64Array,
     lost: int,
 ) -> Traced:
     import drjit as dr
 
     dr.eval(buffer.a, buffer.valid)
     receiver = buffer.target_indices.numpy().astype(np.int64)
-    types, shapes, primitives, traced = _geometry(buffer)
+    types, shapes, primitives, points = _geometry(buffer)
     jones = np.empty((carriers, len(receiver), 2, 2), np.complex128)
     for carrier, taken, sent in np.ndindex(carriers, 2, 2):
         amplitude = buffer.a[2 * carrier + taken][sent]
@@ -422,7 +432,7 @@ def _read(
         jones[carrier, :, taken, sent] += 1j * dr.imag(amplitude).numpy()
     return Traced(
         receiver=receiver,
-        transfer=_dyad(jones, transmitter, receivers[receiver], traced, types),
+        transfer=_dyad(jones, transmitter, receivers[receiver], points, types),
         types=types,
         shapes=shapes,
         primitives=primitives,
