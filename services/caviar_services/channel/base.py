@@ -13,6 +13,7 @@ import msgspec
 from caviar_protocol.arrays import BoolArray
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.messages import Input, Role
+from caviar_protocol.paths import changes
 from caviar_protocol.scene import antennas
 from caviar_protocol.topics import AntennaDevice, Channel, ChannelOptions, Scene
 from caviar_services.channel.assemble import Antenna, PathTable, Product, assemble
@@ -62,6 +63,7 @@ class ChannelModel(Service[S]):
             )
         self.with_h = False
         """Whether somebody asks for the matrices."""
+        self._before: tuple[int, int, Channel] | None = None
 
     @property
     def options(self) -> ChannelOptions:
@@ -90,12 +92,24 @@ class ChannelModel(Service[S]):
         scene = frame.scene()
         made = self.model(frame, scene, antennas(scene, "tx"), antennas(scene, "rx"))
         channel = made.channel
+        counts = {"paths": len(channel.tau), "dropped": channel.dropped, **self._turnover(frame, channel)}
         return StepResult(
             products={"channel": channel},
             fidelity=self.rung,
-            counts={"paths": len(channel.tau), "dropped": channel.dropped, **made.counts},
+            counts={**counts, **made.counts},
             measured=made.measured,
         )
+
+    def _turnover(self, frame: Frame, channel: Channel) -> dict[str, int]:
+        """Births and deaths of paths since the frame before; nothing where this model did not make it.
+
+        They are no part of the product, which follows from its frame alone.
+        """
+        before, self._before = self._before, (frame.episode, frame.number, channel)
+        if before is None or before[:2] != (frame.episode, frame.number - 1):
+            return {}
+        turnover = changes(before[2], channel)
+        return {"births": turnover.births, "deaths": turnover.deaths}
 
 
 class PathModel(ChannelModel[S]):
