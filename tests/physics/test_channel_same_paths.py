@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import pytest
 from same_paths import EVERYTHING, POSITIONS, SCENES, SPECULAR, asked, digest, model, of_receiver, places
 
 from caviar_services.channel.base import ChannelModel
+from caviar_services.channel.sionna_candidates import Chains, Planes
 
 pytestmark = [pytest.mark.channel, pytest.mark.slow]
 
@@ -107,3 +109,37 @@ def test_another_process_makes_no_difference(settings: str, everything: ChannelM
         [sys.executable, str(script), name, settings], capture_output=True, text=True, timeout=120, check=True
     )
     assert there.stdout == here
+
+
+def test_no_path_is_ruled_out(traced: tuple[str, ChannelModel[Any]], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Judging chains by the boxes around their planes spares work, and no path: nothing comes to light where
+    every receiver is offered every chain, some twenty times as many."""
+    name, channel = traced
+    where = places(6, name, 10)
+    judged = asked(channel, name, where, TEN, seed=6)
+    seen: list[float] = []
+
+    def all_of_them(planes: Planes, chains: Chains, source: Any, targets: Any) -> tuple[Any, Any]:
+        some = possible(planes, chains, source, targets)
+        unsure = replace(chains, straight=np.zeros_like(chains.straight))
+        every = possible(planes, unsure, source, targets)
+        seen.append(len(every[0]) / len(some[0]))
+        return every
+
+    possible = Planes.possible
+    monkeypatch.setattr(Planes, "possible", all_of_them)
+    offered = asked(channel, name, where, TEN, seed=6)
+    assert min(seen) > 5
+    assert digest(offered) == digest(judged)
+
+
+def test_coinciding_faces_are_told_apart() -> None:
+    """Under the houses of the scene lies its ground, and their walls touch: with transmission, rays meet
+    two faces in one place. Which of them a path names depends on nobody else."""
+    name = "simple_street_canyon_with_cars"
+    smooth = model(name, max_depth=2, refraction=True, samples=5_000, materials={})
+    for group in range(2):
+        where = places(50 + group, name, 10)
+        together = asked(smooth, name, where, TEN, group)
+        for rx, place in zip(TEN, where, strict=True):
+            assert of_receiver(asked(smooth, name, place[None], [rx], group), rx) == of_receiver(together, rx)
