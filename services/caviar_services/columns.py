@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from caviar_protocol.arrays import Float32Array, Float64Array
+from caviar_protocol.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 
 
 def aligned_columns(rows: Float64Array) -> Float32Array:
@@ -20,3 +21,10 @@ def aligned_columns(rows: Float64Array) -> Float32Array:
     columns = buffer[start : start + count * stride].reshape(count, stride)[:, :size]
     columns[...] = rows
     return columns
+
+
+def aligned_indices(values: Int64Array | BoolArray) -> NDArray[np.uint32]:
+    """Indices as uint32, Shape ``[N]``, laid out like `aligned_columns`."""
+    column: NDArray[np.uint32] = aligned_columns(np.zeros((1, len(values)))).view(np.uint32)[0]
+    column[...] = values
+    return column

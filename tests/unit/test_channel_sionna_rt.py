@@ -237,10 +237,13 @@ class TestFrames:
         assert len(channel.tau) == 0
 
     def test_candidates_beyond_the_limit_are_counted(self, tmp_path: Path) -> None:
+        """The limit is one of each pair: direct path and ground reflection are two candidates."""
         ends = (
             AntennaDevice(name="r", role="rx", position=(10.0, 0, 5)),
             AntennaDevice(name="s", role="rx", position=(-7.0, 0, 5)),
             AntennaDevice(name="t", role="tx", position=(0.0, 0, 5)),
         )
-        result = step(prepared(scenery(tmp_path, "brick"), max_paths=2), (), *ends)
-        assert result.counts["path_limit_reached"] == 1
+        enough = step(prepared(scenery(tmp_path, "brick"), max_paths=2), (), *ends)
+        assert (enough.counts["paths"], enough.counts["path_limit_reached"]) == (4, 0)
+        result = step(prepared(scenery(tmp_path, "brick"), max_paths=1), (), *ends)
+        assert (result.counts["paths"], result.counts["path_limit_reached"]) == (2, 2)

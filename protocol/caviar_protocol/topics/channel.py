@@ -84,6 +84,11 @@ class Channel(Payload, frozen=True, kw_only=True, omit_defaults=True):
     interaction types, object names, then delay, departure and arrival angles. Angles are in
     world axes: zenith from +z, azimuth counter-clockwise from +x. ``a`` contains
     exp(−j2πfτ): its phase is absolute, and τ is the true propagation delay.
+
+    A path's ``id`` is unique in its pair. It is a hash of the interaction types, the names of the objects
+    and, where a model knows them, the numbers of their faces, which are planes of an object; paths that agree
+    in all that are told apart by their rank. So a path keeps its id while ends and objects move;
+    `caviar_protocol.paths.changes` says which were born and died between two products.
     """
 
     sizes_from: ClassVar[dict[str, tuple[str, ...]]] = {"C": ("carriers",), "T": ("tx",), "R": ("rx",)}
@@ -105,9 +110,7 @@ class Channel(Payload, frozen=True, kw_only=True, omit_defaults=True):
     offsets: Annotated[Int64Array, array("<i8", "L1", unit="1", doc="T·R + 1 path offsets")]
     object_names: tuple[str, ...] = ()
     """What ``objects`` points into: moving objects and scenery by name."""
-    id: Annotated[
-        UInt64Array, array("<u8", "P", unit="1", doc="stable id: hash of the sort key's discrete part")
-    ]
+    id: Annotated[UInt64Array, array("<u8", "P", unit="1", doc="stable id: hash of types, objects and faces")]
     a: Annotated[Complex128Array, array("<c16", "C", "P", unit="1", doc="amplitude gain incl. exp(−j2πfτ)")]
     tau: Annotated[Float64Array, array("<f8", "P", unit="s", doc="absolute delay")]
     aod: Annotated[Float64Array, array("<f8", "P", 2, unit="rad", doc="departure (zenith, azimuth)")]

@@ -83,6 +83,9 @@ class PathTable:
     object_names: tuple[str, ...]
     object_velocity: Float64Array
     """Velocity [m/s] of each named object, Shape ``[len(object_names), 3]``."""
+    faces: Int32Array | None = None
+    """Number of the plane of each point within its object, the same in every frame, Shape ``[P, D]``;
+    absent: unknown."""
 
     def take(self, which: Int64Array | BoolArray) -> PathTable:
         """These paths, in this order."""
@@ -94,6 +97,7 @@ class PathTable:
             points=self.points[which],
             object_names=self.object_names,
             object_velocity=self.object_velocity,
+            faces=None if self.faces is None else self.faces[which],
         )
 
 
@@ -178,6 +182,7 @@ def _canonical_names(table: PathTable) -> PathTable:
         points=np.where(used[..., None], table.points, 0.0),
         object_names=tuple(table.object_names[i] for i in order),
         object_velocity=table.object_velocity[order],
+        faces=None if table.faces is None else np.where(used, table.faces, 0).astype(np.int32),
     )
 
 
@@ -266,16 +271,19 @@ def _order(
 
 
 def _ids(table: PathTable) -> UInt64Array:
-    """Stable ids of sorted paths: hash of types, object names and the rank among equals in the pair."""
+    """Stable ids of sorted paths: hash of types, object names, faces, and rank among equals in the pair."""
     ids = np.zeros(len(table.pair), np.uint64)
     if not len(ids):
         return ids
     base, kind = _kinds(table)
-    # Sorted, so paths of one kind and pair stand together: rank = distance to the run's start.
+    # In a stable order, so the rank follows the sorted paths: distance to the start of the run of equals.
+    order = np.lexsort((kind, table.pair))
     place = np.arange(len(ids))
     first = np.ones(len(ids), np.bool_)
-    first[1:] = (kind[1:] != kind[:-1]) | (table.pair[1:] != table.pair[:-1])
-    rank = place - np.maximum.accumulate(np.where(first, place, 0))
+    ranked, pair = kind[order], table.pair[order]
+    first[1:] = (ranked[1:] != ranked[:-1]) | (pair[1:] != pair[:-1])
+    rank = np.empty(len(ids), np.int64)
+    rank[order] = place - np.maximum.accumulate(np.where(first, place, 0))
     return _mix(base[kind] + rank.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15))
 
 
@@ -284,18 +292,23 @@ def _kinds(table: PathTable) -> tuple[UInt64Array, Int64Array]:
     depth = table.types.shape[1]
     if not depth:
         return np.array([_name_hash(())], np.uint64), np.zeros(len(table.pair), np.int64)
-    discrete = np.concatenate([table.types.astype(np.int32), table.objects], axis=1)
+    faces = np.zeros_like(table.objects) if table.faces is None else table.faces
+    discrete = np.concatenate([table.types.astype(np.int32), table.objects, faces], axis=1)
     kinds, kind = np.unique(discrete, axis=0, return_inverse=True)
     named = (
-        tuple((t, table.object_names[o]) for t, o in zip(row[:depth], row[depth:], strict=True) if t)
+        tuple(
+            (t, table.object_names[o], f)
+            for t, o, f in zip(row[:depth], row[depth : 2 * depth], row[2 * depth :], strict=True)
+            if t
+        )
         for row in kinds.tolist()
     )
     return np.array([_name_hash(names) for names in named], np.uint64), kind.reshape(-1)
 
 
 @lru_cache(maxsize=4096)
-def _name_hash(kind: tuple[tuple[int, str], ...]) -> int:
-    text = "\0".join(f"{interaction}\0{name}" for interaction, name in kind)
+def _name_hash(kind: tuple[tuple[int, str, int], ...]) -> int:
+    text = "\0".join(f"{interaction}\0{name}\0{face}" for interaction, name, face in kind)
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little")
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Float64Array
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.messages import Input, Role
+from caviar_protocol.paths import changes
 from caviar_protocol.scene import antennas
 from caviar_protocol.topics import AntennaDevice, Channel, ChannelOptions, Scene
 from caviar_services.channel.assemble import Antenna, PathTable, Product, assemble
@@ -146,6 +147,8 @@ class PathModel(ChannelModel[S]):
     """Base of models that find the paths of a frame; antennas, carrier phase, order, ids and matrices
     are applied here, in float64, the same way for every rung of the ladder."""
 
+    _before: tuple[int, int, Channel] | None = None
+
     @abstractmethod
     def paths(self, scene: Scene, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]) -> Found:
         """Paths of all TX/RX pairs of a scene, in any order."""
@@ -173,6 +176,17 @@ class PathModel(ChannelModel[S]):
         done = time.perf_counter_ns()
         return Modelled(
             channel=channel,
-            counts=found.counts,
+            counts={**self._turnover(frame, channel), **found.counts},
             measured={"paths": traced - begin, "assemble": done - traced},
         )
+
+    def _turnover(self, frame: Frame, channel: Channel) -> dict[str, int]:
+        """Births and deaths of paths since the frame before; nothing where this model did not make it.
+
+        They are no part of the product, which follows from its frame alone.
+        """
+        before, self._before = self._before, (frame.episode, frame.number, channel)
+        if before is None or before[:2] != (frame.episode, frame.number - 1):
+            return {}
+        turnover = changes(before[2], channel)
+        return {"births": turnover.births, "deaths": turnover.deaths}

@@ -18,6 +18,7 @@ from caviar_protocol.seeding import derive_seed
 from caviar_protocol.topics import AntennaDevice, ChannelOptions, Scene
 from caviar_services.channel.assemble import Antenna, PathTable
 from caviar_services.channel.base import ChannelSettings, Found, PathModel
+from caviar_services.channel.sionna_launch import LaunchOptions
 from caviar_services.channel.sionna_materials import (
     MaterialPolicy,
     MaterialSettings,
@@ -25,15 +26,12 @@ from caviar_services.channel.sionna_materials import (
     OutsideUse,
 )
 from caviar_services.channel.sionna_scene import SceneSettings, SionnaScene
-from caviar_services.channel.sionna_tracer import LaunchOptions, Traced, Tracer
+from caviar_services.channel.sionna_tracer import Traced, Tracer
 from caviar_services.channel.specular import refined_points
 from caviar_services.llvm import activate_llvm, choose_variant
 from caviar_services.service import Preparation, RunInfo
 
 Array = NDArray[Any]
-
-_LANES = 20_000_000
-"""Samples · depth · receivers of one launch at most: 40 B each in the solver."""
 
 _COMPILE_GRACE_S = 120.0
 
@@ -51,10 +49,10 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     """Diffuse reflection; needs a scattering_coefficient above 0 in ``materials``."""
     launch_seed: Annotated[int | None, quantity("1", "of the ray launch; absent: from the run's seed")] = None
     max_paths: Annotated[
-        int, quantity("1", "candidates per transmitter; more are lost and counted", ge=1)
+        int, quantity("1", "candidates of a TX/RX pair; more are lost and counted", ge=1)
     ] = 200_000
     receivers_at_once: Annotated[
-        int | None, quantity("1", "receivers of one launch; absent: as the scenario has")
+        int | None, quantity("1", "receivers looked at together; absent: as many as fit")
     ] = None
     bodies: Annotated[int, quantity("1", "moving objects of one mesh at most", ge=0, le=4096)] = 32
     pool: dict[str, int] = msgspec.field(default_factory=dict)
@@ -74,9 +72,9 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
 class SionnaChannel(PathModel[SionnaSettings]):
     """Ray-traced channel, on any number of carriers.
 
-    Each transmitter is traced by itself, with receivers filled up to a fixed number by parked
-    ones: so the kernels do not depend on who is in the scene. Several carriers share the paths; a path that
-    one of them does not have is of amplitude 0 there.
+    Each transmitter launches its rays once a frame, whoever receives, and every receiver is offered all
+    that they met: its paths do not depend on which others there are. Several carriers share the paths;
+    a path that one of them does not have is of amplitude 0 there.
     """
 
     Settings: ClassVar[type[msgspec.Struct]] = SionnaSettings
@@ -89,7 +87,6 @@ class SionnaChannel(PathModel[SionnaSettings]):
         self._scene: SionnaScene
         self._tracer: Tracer
         self._outside: tuple[OutsideUse, ...] = ()
-        self._at_once = 1
 
     @property
     def options(self) -> ChannelOptions:
@@ -141,8 +138,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
             scattering=s.scattering,
         )
         wavelengths = [SPEED_OF_LIGHT / frequency for frequency in frequencies]
-        self._tracer = Tracer(self._scene.mi_scene, wavelengths, self._scene.tune, launch)
-        self._at_once = self._receivers_at_once()
+        self._tracer = Tracer(self._scene, wavelengths, launch)
         return (*notes, *self._warm_up())
 
     def release_memory(self) -> None:
@@ -158,11 +154,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
             mi.set_variant(self._variant)
         _refuse_buried(scene, self.settings.without_body)
         names, velocity = self._scene.place(scene, frozenset(self.settings.without_body))
-        parts = [
-            self._launch(t, transmitter, begin, receivers)
-            for t, transmitter in enumerate(transmitters)
-            for begin in range(0, len(receivers), self._at_once)
-        ]
+        parts = [self._launch(t, transmitter, receivers) for t, transmitter in enumerate(transmitters)]
         table = self._table(parts, names, velocity, transmitters, receivers)
         straight = (table.types == 0).all(1)
         los = np.zeros(len(transmitters) * len(receivers), bool)
@@ -172,7 +164,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         return Found(
             table=table,
             los=los.reshape(len(transmitters), len(receivers)),
-            counts={"path_limit_reached": sum(part.limit_reached for _, part in parts)},
+            counts={"path_limit_reached": sum(part.lost for _, part in parts)},
         )
 
     def _table(
@@ -208,21 +200,17 @@ class SionnaChannel(PathModel[SionnaSettings]):
             points=points,
             object_names=names,
             object_velocity=velocity,
+            faces=self._scene.face_number(shapes, primitives),
         )
 
     def _launch(
-        self, t: int, transmitter: Antenna, begin: int, receivers: Sequence[Antenna]
+        self, t: int, transmitter: Antenna, receivers: Sequence[Antenna]
     ) -> tuple[Int64Array, Traced]:
-        """Paths of one transmitter to some receivers, with the pair that each belongs to."""
-        chosen = receivers[begin : begin + self._at_once]
-        targets = np.tile(self._scene.parking, (self._at_once, 1))
-        targets[: len(chosen)] = [receiver.position for receiver in chosen]
-        traced = self._tracer.trace(transmitter.position, targets)
-        itself = [receiver.name == transmitter.name for receiver in chosen]
-        real = np.zeros(self._at_once, bool)
-        real[: len(chosen)] = np.logical_not(itself)
-        traced = traced.take(real[traced.receiver])
-        return t * len(receivers) + begin + traced.receiver, traced
+        """Paths of one transmitter to the receivers, with the pair that each belongs to."""
+        others = [r for r, receiver in enumerate(receivers) if receiver.name != transmitter.name]
+        targets = np.array([receivers[r].position for r in others]).reshape(-1, 3)
+        traced = self._tracer.trace(transmitter.position, targets, self.settings.receivers_at_once)
+        return t * len(receivers) + np.array(others, np.int64)[traced.receiver], traced
 
     def _start(self) -> tuple[str, ...]:
         """Import the ray tracer with its library and variant; notes that say which."""
@@ -253,20 +241,13 @@ class SionnaChannel(PathModel[SionnaSettings]):
             )
         return {name: self.settings.pool.get(stem, self.settings.bodies) for stem, name in by_stem.items()}
 
-    def _receivers_at_once(self) -> int:
-        s = self.settings
-        if s.receivers_at_once is not None:
-            return s.receivers_at_once
-        announced = sum(d.count for d in self.run.devices if d.kind == "antenna" and d.role in ("rx", "both"))
-        return max(1, min(announced, _LANES // (s.samples * max(s.max_depth, 1))))
-
     def _warm_up(self) -> tuple[str, ...]:
         """Compile every kernel that frames need: move the bodies, and trace what finds paths."""
         self.run.progress("compiling kernels", _COMPILE_GRACE_S)
         begin = time.monotonic()
         middle = (self._scene.low + self._scene.high) / 2
         above = np.array([middle[0], middle[1], self._scene.high[2] + 10.0])
-        receivers = above + np.arange(1, self._at_once + 1)[:, None] * np.array([1.3, 0.7, -0.1])
+        receivers = above + np.arange(1, 9)[:, None] * np.array([1.3, 0.7, -0.1])
         self._tracer.trace(above, receivers)
         self._tracer.trace(above + 0.5, receivers + 0.25)
         self.run.progress("kernels compiled", 0.0)

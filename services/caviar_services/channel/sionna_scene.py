@@ -28,6 +28,7 @@ from caviar_services.channel.sionna_materials import (
     itu_materials,
     set_materials,
 )
+from caviar_services.channel.sionna_planes import PlaneTable, plane_numbers, shared_planes
 from caviar_services.columns import aligned_columns
 from caviar_services.meshes import BodyPool, Mesh, box, placed, unit_box
 from caviar_services.scenery import find_scenery, read_scenery
@@ -167,6 +168,7 @@ class SionnaScene:
             params = self._scene.mi_scene_params
             params[f"{_SKIN}.vertex_positions"] = _floats(self._vertices)
             params.update()
+            self.plane_table.update(self._corners, self._moving_plane)
         self._standing = frozenset(standing)
         return tuple(names), velocity
 
@@ -175,9 +177,25 @@ class SionnaScene:
 
         Anything for no shape.
         """
-        triangle = np.clip(self._offsets[self._where(shapes)] + primitives, 0, len(self._faces) - 1)
-        a, b, c = np.moveaxis(self._corners[self._faces[triangle]], -2, 0)
+        a, b, c = np.moveaxis(self._corners[self._faces[self.triangle_numbers(shapes, primitives)]], -2, 0)
         return a, np.cross(b - a, c - a)
+
+    def triangle_numbers(self, shapes: Int64Array, primitives: Int64Array) -> Int64Array:
+        """Number, through all shapes, of triangles of process-local shapes; anything for no shape."""
+        number = self._offsets[self._where(shapes)] + primitives
+        clipped: Int64Array = np.clip(number, 0, len(self._faces) - 1)
+        return clipped
+
+    def shapes_of(self, triangles: Int64Array) -> tuple[Int64Array, Int64Array]:
+        """Process-local shape of triangles by number, and their numbers within it."""
+        order = np.argsort(self._offsets)
+        where = order[np.searchsorted(self._offsets[order], triangles, side="right") - 1]
+        return self._ids[where], triangles - self._offsets[where]
+
+    def face_number(self, shapes: Int64Array, primitives: Int64Array) -> Int32Array:
+        """Number of the plane of triangles within their object, the same in every frame; anything for no
+        shape."""
+        return self._face_of[self.triangle_numbers(shapes, primitives)]
 
     def object_index(self, shapes: Int64Array, primitives: Int64Array) -> Int32Array:
         """Index into the names of `place` of triangles of process-local shapes; −1 for no shape."""
@@ -233,6 +251,27 @@ class SionnaScene:
         self._corners = np.concatenate([mesh.vertices for mesh in meshes])
         self._faces = np.concatenate([mesh.faces + b for mesh, b in zip(meshes, before, strict=True)])
         self._names = tuple(name for shape in shapes for name in shape.names)
+        self._number_planes(meshes)
+
+    def _number_planes(self, meshes: Sequence[Mesh]) -> None:
+        """Number the planes of these pieces; bodies, each of which is a point yet, by their unit meshes."""
+        still = len(meshes) - len(self._bodies)
+        of_asset = {asset: plane_numbers(mesh) for asset, mesh in self._meshes.items()}
+        numbers = [plane_numbers(mesh) for mesh in meshes[:still]]
+        numbers += [of_asset[asset] for asset, _ in self._bodies]
+        self._face_of = np.concatenate(numbers)
+        counts = np.array([int(number.max(initial=-1)) + 1 for number in numbers], np.int64)
+        before = np.cumsum(counts) - counts
+        parts = np.concatenate([number + first for number, first in zip(numbers, before, strict=True)])
+        faces = self._faces.astype(np.int64)
+        apart = PlaneTable(parts.astype(np.int64), faces)
+        apart.update(self._corners)
+        shared = shared_planes(apart, int(counts[:still].sum()))
+        self.plane_of = shared[parts]
+        """Infinite plane of each triangle, numbered through all objects."""
+        self._moving_plane = len(apart.normal) and int(shared.max()) + 1 - int(counts[still:].sum())
+        self.plane_table = PlaneTable(self.plane_of, faces)
+        self.plane_table.update(self._corners)
 
 
 def _load(description: Path | None, weld: bool) -> Any:

@@ -8,8 +8,8 @@ with positions as arrays instead of one device object each, and their flat buffe
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,16 +18,30 @@ from caviar_protocol.arrays import (
     BoolArray,
     Complex128Array,
     Float64Array,
+    Int32Array,
     Int64Array,
     UInt8Array,
 )
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.patterns import spherical_basis
-from caviar_services.channel.sionna_candidates import candidate_generator
-from caviar_services.columns import aligned_columns
+from caviar_services.channel.sionna_candidates import (
+    Chains,
+    Planes,
+    chains_of,
+    first_of_each,
+    positions,
+    scattered_of,
+)
+from caviar_services.channel.sionna_launch import Launch, Launcher, LaunchOptions
+from caviar_services.channel.sionna_scene import SionnaScene
+from caviar_services.channel.specular import refined_points
+from caviar_services.columns import aligned_columns, aligned_indices
 
 _POLE = 1.2e-5
 """Below this horizontal part of a direction Sionna RT sets its azimuth to 0 (100 float32 epsilons)."""
+
+_LANES = 8_000_000
+"""Candidates to be looked at together at most."""
 
 _TYPES = np.zeros(17, np.uint8)
 _TYPES[[1, 2, 4, 8]] = (
@@ -37,20 +51,6 @@ _TYPES[[1, 2, 4, 8]] = (
     Interaction.DIFFRACTION,
 )
 """Interaction of each flag of `sionna.rt.constants.InteractionType`."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class LaunchOptions:
-    """What is traced, and with how many rays."""
-
-    max_depth: int
-    samples: int
-    max_paths: int
-    seed: int
-    reflection: bool
-    refraction: bool
-    diffraction: bool
-    scattering: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,8 +70,8 @@ class Traced:
     """Triangle of that shape, Shape ``[P, D]``."""
     points: Float64Array
     """Interaction points [m], Shape ``[P, D, 3]``."""
-    limit_reached: bool
-    """Whether more candidates were found than ``max_paths``; the surplus is lost."""
+    lost: int
+    """How many more candidates were found than ``max_paths`` of each receiver."""
 
     def take(self, which: BoolArray) -> Traced:
         """These paths."""
@@ -82,15 +82,35 @@ class Traced:
             shapes=self.shapes[which],
             primitives=self.primitives[which],
             points=self.points[which],
-            limit_reached=self.limit_reached,
+            lost=self.lost,
         )
+
+    def seen_from(self, first: int) -> Traced:
+        """The same with receivers counted from this one on."""
+        return replace(self, receiver=self.receiver + first)
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidates:
+    """P candidates of one transmitter, in the order: direct paths, chains, scattering points."""
+
+    ray: Int64Array
+    """Ray of the launch whose first interactions they take, Shape ``[P]``."""
+    depth: Int64Array
+    """How many, Shape ``[P]``."""
+    receiver: Int64Array
+    """Shape ``[P]``."""
+    planes: Int32Array
+    """Plane that has to reflect at each interaction, −1 where any may, Shape ``[P, D]``."""
+    found: BoolArray
+    """Known to be a path; of the others the image method finds out, Shape ``[P]``."""
 
 
 class Tracer:
     """The stages of the solver, bound to a scene and a set of options.
 
-    Everything that a kernel depends on is fixed here: options, wavelengths, number of receivers. So the
-    first call compiles and the others do not.
+    Everything that a kernel depends on is fixed here: options and wavelengths. So the first call compiles
+    and the others do not.
 
     Where paths run does not depend on the carrier: they are found once, and only their fields are computed
     for each one. Rays that could be reflected, refracted or scattered choose by the materials at the
@@ -98,89 +118,234 @@ class Tracer:
 
     Parameters
     ----------
-    mi_scene
+    scene
         The scene, tuned to the first carrier.
     wavelengths
         Of the carriers [m].
-    tune
-        Called with the index of a carrier: sets the scene's frequency and materials.
     options
         What is traced.
     """
 
-    def __init__(
-        self,
-        mi_scene: Any,
-        wavelengths: Sequence[float],
-        tune: Callable[[int], None],
-        options: LaunchOptions,
-    ) -> None:
+    def __init__(self, scene: SionnaScene, wavelengths: Sequence[float], options: LaunchOptions) -> None:
         import drjit as dr
         import mitsuba as mi
         from sionna.rt.antenna_pattern import antenna_pattern_registry
         from sionna.rt.path_solvers.field_calculator import FieldCalculator
         from sionna.rt.path_solvers.image_method import ImageMethod
 
-        self.mi_scene = mi_scene
+        self._scene = scene
         self._options = options
         self._wavelengths = [dr.opaque(mi.Float, wavelength) for wavelength in wavelengths]
-        self._tune = tune
         # The two orthogonal isotropic fields at both ends give the whole polarisation transfer, to
         # which any element pattern in any orientation is applied afterwards.
         self._patterns = antenna_pattern_registry.get("iso")(polarization="VH").patterns
-        self._candidates = candidate_generator()
+        self._launcher = Launcher(scene.mi_scene, options)
         self._images = ImageMethod()
         self._fields = FieldCalculator()
 
-    def trace(self, transmitter: Float64Array, receivers: Float64Array) -> Traced:
-        """Paths from one transmitter [3] to all receivers [R, 3], positions in metres."""
-        import drjit as dr
+    def trace(self, transmitter: Float64Array, receivers: Float64Array, at_once: int | None = None) -> Traced:
+        """Paths from one transmitter [3] to all receivers [R, 3], positions in metres.
 
+        ``at_once`` receivers are handled together, or as many as fit: to the paths it makes no difference.
+        """
         options = self._options
-        source, targets = _points(transmitter[None]), _points(receivers)
-        buffer = self._candidates(
-            mi_scene=self.mi_scene,
+        source = positions(transmitter[None])
+        launch = self._launcher(source) if options.max_depth else Launch((), None)
+        chains, scattered = chains_of(launch, self._scene), scattered_of(launch)
+        if at_once is None:
+            at_once = max(1, _LANES // max(len(chains.ray), len(scattered[0]), 1))
+        table = Planes(self._scene.plane_table)
+        parts = [
+            self._batch(
+                launch, chains, scattered, table, transmitter, begin, receivers[begin : begin + at_once]
+            )
+            for begin in range(0, len(receivers), at_once)
+        ]
+        return _joined(parts, len(self._wavelengths), options.max_depth)
+
+    def _batch(
+        self,
+        launch: Launch,
+        chains: Chains,
+        scattered: tuple[Int64Array, Int64Array],
+        table: Planes,
+        transmitter: Float64Array,
+        begin: int,
+        receivers: Float64Array,
+    ) -> Traced:
+        source, targets = positions(transmitter[None]), positions(receivers)
+        candidates, lost = self._candidates(launch, chains, scattered, table, source, targets)
+        if not len(candidates.ray):
+            return _nothing(len(self._wavelengths), self._options.max_depth, lost)
+        buffer = self._buffer(launch, candidates)
+        buffer = self._images(
+            scene=self._scene.mi_scene,
+            paths=buffer,
             src_positions=source,
             tgt_positions=targets,
-            samples_per_src=options.samples,
-            max_num_paths_per_src=options.max_paths,
-            max_depth=options.max_depth,
-            los=True,
-            specular_reflection=options.reflection,
-            diffuse_reflection=options.scattering,
-            refraction=options.refraction,
-            diffraction=options.diffraction,
-            edge_diffraction=False,
-            seed=options.seed,
+            diffraction=self._options.diffraction,
+            diffraction_lit_region=True,
         )
+        kept = np.flatnonzero(buffer.valid.numpy())
+        buffer.discard_invalid()
+        if not len(kept):
+            return _nothing(len(self._wavelengths), self._options.max_depth, lost)
+        self._settle(buffer, candidates, kept, transmitter, receivers)
+        self._compute_fields(buffer, source, targets)
+        traced = _read(buffer, len(self._wavelengths), transmitter, receivers, lost)
+        return traced.take(buffer.valid.numpy()).seen_from(begin)
+
+    def _candidates(
+        self,
+        launch: Launch,
+        chains: Chains,
+        scattered: tuple[Int64Array, Int64Array],
+        table: Planes,
+        source: Any,
+        targets: Any,
+    ) -> tuple[_Candidates, int]:
+        """All candidates of these receivers, and how many more were found than ``max_paths`` of each."""
+        depth = len(chains.planes.T)
+        direct = self._seen(source, targets)
+        chain, receiver = table.possible(chains, source, targets)
+        point, reached = self._reached(launch, *scattered, targets)
+        none = np.zeros(len(direct), np.int64)
+        whole = _Candidates(
+            np.concatenate([none, chains.ray[chain], scattered[0][point]]),
+            np.concatenate([none, chains.depth[chain], scattered[1][point]]),
+            np.concatenate([direct, receiver, reached]),
+            np.concatenate(
+                [np.full((len(direct), depth), -1), chains.planes[chain], np.full((len(point), depth), -1)]
+            ).astype(np.int32),
+            np.repeat([True, False, True], [len(direct), len(chain), len(point)]),
+        )
+        kept = first_of_each(whole.receiver, self._options.max_paths)
+        lost = len(kept) - int(kept.sum())
+        if not lost:
+            return whole, 0
+        return _Candidates(
+            whole.ray[kept], whole.depth[kept], whole.receiver[kept], whole.planes[kept], whole.found[kept]
+        ), lost
+
+    def _seen(self, source: Any, targets: Any) -> Int64Array:
+        """Receivers that the transmitter sees."""
+        import drjit as dr
+        from sionna.rt.constants import MIN_SEGMENT_LENGTH
+        from sionna.rt.utils import spawn_ray_to
+
+        origins = dr.repeat(source, dr.width(targets))
+        free = dr.norm(targets - origins) > MIN_SEGMENT_LENGTH
+        free &= ~self._scene.mi_scene.ray_test(spawn_ray_to(origins, targets), active=free)
+        seen: Int64Array = np.flatnonzero(free.numpy())
+        return seen
+
+    def _reached(
+        self, launch: Launch, ray: Int64Array, depth: Int64Array, targets: Any
+    ) -> tuple[Int64Array, Int64Array]:
+        """Scattering points and the receivers that each of them reaches, on the side that was lit."""
+        import drjit as dr
+        import mitsuba as mi
+
+        if not len(ray):
+            return ray, ray
+        parts: list[tuple[Int64Array, Int64Array]] = []
+        receivers = dr.width(targets)
+        per_point = dr.opaque(mi.UInt, receivers)
+        for d, bounce in enumerate(launch.bounces):
+            first = int(np.searchsorted(depth, d + 1))
+            rays = ray[first : int(np.searchsorted(depth, d + 1, side="right"))]
+            if not len(rays):
+                continue
+            lane = dr.arange(mi.UInt, len(rays) * receivers)
+            of_ray = dr.gather(mi.UInt, mi.UInt(aligned_indices(rays)), lane // per_point)
+            target = dr.gather(mi.Point3f, targets, lane % per_point)
+            hit = dr.zeros(mi.Interaction3f, len(rays) * receivers)
+            hit.p = dr.gather(mi.Point3f, bounce.point, of_ray)
+            hit.n = dr.gather(mi.Normal3f, bounce.normal, of_ray)
+            back = hit.spawn_ray_to(target)
+            lit = dr.dot(mi.Vector3f(hit.n), back.d) > 0.0
+            lit &= ~self._scene.mi_scene.ray_test(back, active=lit)
+            kept: Any = dr.compress(lit)
+            lanes = kept.numpy().astype(np.int64)
+            parts.append((first + lanes // receivers, lanes % receivers))
+        return np.concatenate([point for point, _ in parts]), np.concatenate([rx for _, rx in parts])
+
+    def _buffer(self, launch: Launch, candidates: _Candidates) -> Any:
+        """The solver's buffer with these candidates."""
+        import drjit as dr
+        import mitsuba as mi
+        from sionna.rt.path_solvers.paths_buffer import PathsBuffer
+        from sionna.rt.utils import WedgeGeometry
+
+        count, depth = len(candidates.ray), max(self._options.max_depth, 1)
+        buffer = PathsBuffer(count, self._options.max_depth, self._options.diffraction)
+        ray = mi.UInt(aligned_indices(candidates.ray))
+        interactions = mi.UInt(aligned_indices(candidates.depth))
+        buffer._tgt_indices = mi.UInt(aligned_indices(candidates.receiver))
+        buffer._valid = mi.UInt(aligned_indices(candidates.found)) != 0
+        place = dr.arange(mi.UInt, count) * depth
+        for d, bounce in enumerate(launch.bounces):
+            used = interactions > d
+            for tensor, of_rays in (
+                (buffer._interaction_types, bounce.kind),
+                (buffer._shapes, bounce.shape),
+                (buffer._primitives, bounce.primitive),
+                (buffer._probs, bounce.probability),
+                (buffer._vertices_x, bounce.point.x),
+                (buffer._vertices_y, bounce.point.y),
+                (buffer._vertices_z, bounce.point.z),
+            ):
+                dr.scatter(tensor.array, dr.gather(type(of_rays), of_rays, ray, used), place + d, used)
+        if self._options.diffraction and launch.wedges is not None:
+            buffer._diffracting_wedges = dr.gather(WedgeGeometry, launch.wedges, ray, interactions > 0)
         buffer.schedule()
         dr.eval()
-        buffer.shrink()
-        limit_reached = buffer.buffer_size >= options.max_paths
-        if buffer.buffer_size:
-            buffer = self._images(
-                scene=self.mi_scene,
-                paths=buffer,
-                src_positions=source,
-                tgt_positions=targets,
-                diffraction=options.diffraction,
-                diffraction_lit_region=True,
-            )
-            self._compute_fields(buffer, source, targets)
-            buffer.discard_invalid()
-        return _read(buffer, len(self._wavelengths), options.max_depth, transmitter, receivers, limit_reached)
+        return buffer
+
+    def _settle(
+        self,
+        buffer: Any,
+        candidates: _Candidates,
+        kept: Int64Array,
+        transmitter: Float64Array,
+        receivers: Float64Array,
+    ) -> None:
+        """Make what the buffer holds the same whichever rays were beside: of faces that coincide, the first
+        was met, and specular points are where the planes say. Mark paths that met other planes than
+        those of their chain: they belong to another chain.
+        """
+        import mitsuba as mi
+
+        types, shapes, primitives, points = _geometry(buffer)
+        wanted = candidates.planes[kept][:, : types.shape[1]]
+        triangles = self._scene.triangle_numbers(shapes, primitives)
+        own = ((wanted < 0) | (wanted == self._scene.plane_of[triangles])).all(1)
+        buffer.valid = mi.UInt(aligned_indices(own)) != 0
+        met = (types == Interaction.REFLECTION) | (types == Interaction.TRANSMISSION)
+        met &= (own & ~candidates.found[kept])[:, None]
+        if not met.any():
+            return
+        first = self._scene.plane_table.first_holding(triangles[met], points[met])
+        shapes[met], primitives[met] = self._scene.shapes_of(first)
+        buffer._shapes = _tensor(mi.TensorXu, mi.UInt(aligned_indices(shapes.ravel())), shapes)
+        buffer._primitives = _tensor(mi.TensorXu, mi.UInt(aligned_indices(primitives.ravel())), shapes)
+        start = np.broadcast_to(transmitter, (len(kept), 3))
+        end = receivers[candidates.receiver[kept]]
+        exact = refined_points(start, points, end, types, self._scene.planes(shapes, primitives))
+        for axis, column in zip("xyz", aligned_columns(exact.reshape(-1, 3).T), strict=True):
+            setattr(buffer, f"_vertices_{axis}", _tensor(mi.TensorXf, mi.Float(column), shapes))
 
     def _compute_fields(self, buffer: Any, source: Any, targets: Any) -> None:
         """Give the buffer the amplitudes of all carriers, in their order; valid is what any of them has."""
         import drjit as dr
         import mitsuba as mi
 
-        upright = _points(np.zeros((1, 3))), _points(np.zeros((dr.width(targets), 3)))
+        upright = positions(np.zeros((1, 3))), positions(np.zeros((dr.width(targets), 3)))
         geometric, carried = dr.copy(buffer.valid), mi.Bool(False)
         amplitudes: list[Any] = []
         for carrier, wavelength in enumerate(self._wavelengths):
             if carrier:
-                self._tune(carrier)
+                self._scene.tune(carrier)
                 buffer.valid = dr.copy(geometric)
             self._fields(
                 wavelength=wavelength,
@@ -198,43 +363,69 @@ class Tracer:
             carried |= buffer.valid
         if len(self._wavelengths) > 1:
             dr.eval(amplitudes, carried)  # before the materials change again
-            self._tune(0)
+            self._scene.tune(0)
             buffer.valid, buffer.a = carried, amplitudes
 
 
-def _points(positions: Float64Array) -> Any:
-    import mitsuba as mi
+def _tensor(kind: Any, values: Any, like: Int64Array) -> Any:
+    return kind(values, like.shape)
 
-    return mi.Point3f(*map(mi.Float, aligned_columns(positions.T)))
+
+def _nothing(carriers: int, depth: int, lost: int) -> Traced:
+    return Traced(
+        receiver=np.zeros(0, np.int64),
+        transfer=np.zeros((carriers, 0, 3, 3), np.complex128),
+        types=np.zeros((0, depth), np.uint8),
+        shapes=np.zeros((0, depth), np.int64),
+        primitives=np.zeros((0, depth), np.int64),
+        points=np.zeros((0, depth, 3)),
+        lost=lost,
+    )
+
+
+def _joined(parts: Sequence[Traced], carriers: int, depth: int) -> Traced:
+    if len(parts) == 1:
+        return parts[0]
+    parts = [_nothing(carriers, depth, 0), *parts]
+    return Traced(
+        receiver=np.concatenate([part.receiver for part in parts]),
+        transfer=np.concatenate([part.transfer for part in parts], axis=1),
+        types=np.concatenate([part.types for part in parts]),
+        shapes=np.concatenate([part.shapes for part in parts]),
+        primitives=np.concatenate([part.primitives for part in parts]),
+        points=np.concatenate([part.points for part in parts]),
+        lost=sum(part.lost for part in parts),
+    )
+
+
+def _geometry(buffer: Any) -> tuple[UInt8Array, Int64Array, Int64Array, Float64Array]:
+    """Types, shapes, triangles and points that a buffer holds, each of Shape ``[P, D]`` or ``[P, D, 3]``."""
+    import drjit as dr
+
+    depth = buffer.max_depth
+    vertices = (buffer.vertices_x, buffer.vertices_y, buffer.vertices_z)
+    dr.eval(vertices, buffer.interaction_types, buffer.shapes, buffer.primitives)
+    return (
+        _TYPES[buffer.interaction_types.numpy()[:, :depth]],
+        buffer.shapes.numpy()[:, :depth].astype(np.int64),
+        buffer.primitives.numpy()[:, :depth].astype(np.int64),
+        np.stack([v.numpy()[:, :depth] for v in vertices], axis=-1).astype(np.float64),
+    )
 
 
 def _read(
     buffer: Any,
     carriers: int,
-    max_depth: int,
     transmitter: Float64Array,
     receivers: Float64Array,
-    limit_reached: bool,
+    lost: int,
 ) -> Traced:
     import drjit as dr
 
-    paths = int(buffer.buffer_size)
-    if paths == 0:
-        return Traced(
-            receiver=np.zeros(0, np.int64),
-            transfer=np.zeros((carriers, 0, 3, 3), np.complex128),
-            types=np.zeros((0, max_depth), np.uint8),
-            shapes=np.zeros((0, max_depth), np.int64),
-            primitives=np.zeros((0, max_depth), np.int64),
-            points=np.zeros((0, max_depth, 3)),
-            limit_reached=limit_reached,
-        )
-    vertices = (buffer.vertices_x, buffer.vertices_y, buffer.vertices_z)
-    dr.eval(buffer.a, vertices, buffer.interaction_types, buffer.shapes, buffer.primitives)
+    dr.eval(buffer.a, buffer.valid)
     receiver = buffer.target_indices.numpy().astype(np.int64)
-    types = _TYPES[buffer.interaction_types.numpy()[:, :max_depth]]
-    points = np.stack([v.numpy()[:, :max_depth] for v in vertices], axis=-1).astype(np.float64)
-    jones = np.empty((carriers, paths, 2, 2), np.complex128)
+    types, shapes, primitives, points = _geometry(buffer)
+    jones = np.empty((carriers, len(receiver), 2, 2), np.complex128)
     for carrier, taken, sent in np.ndindex(carriers, 2, 2):
         amplitude = buffer.a[2 * carrier + taken][sent]
         jones[carrier, :, taken, sent] = dr.real(amplitude).numpy()
@@ -243,10 +434,10 @@ def _read(
         receiver=receiver,
         transfer=_dyad(jones, transmitter, receivers[receiver], points, types),
         types=types,
-        shapes=buffer.shapes.numpy()[:, :max_depth].astype(np.int64),
-        primitives=buffer.primitives.numpy()[:, :max_depth].astype(np.int64),
+        shapes=shapes,
+        primitives=primitives,
         points=points,
-        limit_reached=limit_reached,
+        lost=lost,
     )
 
 

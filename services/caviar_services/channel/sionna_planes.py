@@ -1,0 +1,161 @@
+"""Triangles that lie in one plane: what a specular path meets is a plane of an object, not a triangle."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
+from caviar_services.meshes import Mesh
+
+_OFF_PLANE = 2e-5
+"""Farthest corner from the plane, as a part of the mesh's extent; float32 corners are within 1e-7."""
+
+_ANGLE = 2e-4
+"""[rad] Largest angle between the normals of a plane's triangles."""
+
+_RIM = 1e-3
+"""[m]; a point this near a triangle is one of it."""
+
+
+def plane_numbers(mesh: Mesh) -> Int32Array:
+    """Number of the plane that each triangle of a mesh lies in, Shape ``[F]``.
+
+    Planes are numbered in the order of their first triangles, so a number stays what it is while the
+    mesh moves, turns and is stretched: what lies in one plane does so afterwards. Triangles need not touch:
+    a path has one point in a plane at most. A triangle without area is a plane of its own.
+    """
+    corners = mesh.vertices[mesh.faces]
+    count = len(corners)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(normal, axis=1)
+    flat = area > 0
+    normal[flat] /= area[flat, None]
+    extent = float(np.ptp(mesh.vertices, axis=0).max()) if len(mesh.vertices) else 0.0
+    label = np.full(count, -1, np.int64)
+    # The largest triangle's normal is the most exact one: it defines the plane.
+    for first in np.argsort(-area, kind="stable").tolist():
+        if label[first] >= 0:
+            continue
+        label[first] = first
+        if not flat[first]:
+            continue
+        rest = np.flatnonzero((label < 0) & flat)
+        rest = rest[np.abs((corners[rest, 0] - corners[first, 0]) @ normal[first]) <= _OFF_PLANE * extent]
+        across = np.linalg.norm(np.cross(normal[rest], normal[first]), axis=1)
+        rest = rest[across <= _ANGLE]
+        off = np.abs((corners[rest] - corners[first, 0]) @ normal[first]).max(1, initial=0.0)
+        label[rest[off <= _OFF_PLANE * extent]] = first
+    return _in_order(label)
+
+
+def _in_order(label: Int64Array) -> Int32Array:
+    """Labels renumbered in the order in which they first occur."""
+    _, first, inverse = np.unique(label, return_index=True, return_inverse=True)
+    rank = np.empty(len(first), np.int32)
+    rank[np.argsort(first)] = np.arange(len(first), dtype=np.int32)
+    return rank[inverse.reshape(-1)]
+
+
+def shared_planes(table: PlaneTable, count: int) -> Int64Array:
+    """For each plane of a table, the number of the infinite plane that it is a part of, Shape ``[P]``.
+
+    The first ``count`` planes, which stand still, share one where they agree to a grid of 1e-4 in the
+    normal and 1 mm in the offset: the walls of a row of houses reflect as one. The others are on their own.
+    """
+    normal, middle = table.normal[:count], (table.low[:count].min(0) + table.high[:count].max(0)) / 2
+    # One of both directions of a normal: that whose first component of some size is positive.
+    leading = np.argmax(np.abs(normal) > 1e-3, axis=1)
+    normal = normal * np.where(np.take_along_axis(normal, leading[:, None], 1) < 0, -1.0, 1.0)
+    offset = ((table.origin[:count] - middle) * normal).sum(1)
+    cells = np.round(np.column_stack([normal * 1e4, offset * 1e3])).astype(np.int64)
+    flat = np.flatnonzero((normal != 0).any(1))
+    label = np.arange(len(table.normal))
+    _, first, inverse = np.unique(cells[flat], axis=0, return_index=True, return_inverse=True)
+    label[flat] = flat[first][inverse.reshape(-1)]
+    return _in_order(label).astype(np.int64)
+
+
+class PlaneTable:
+    """Where the planes of many meshes are: a triangle of each, and the box around all of its triangles.
+
+    Parameters
+    ----------
+    numbers
+        Plane of each triangle, counted through all meshes from 0, Shape ``[F]``.
+    faces
+        Corners of each triangle, Shape ``[F, 3]``.
+    """
+
+    def __init__(self, numbers: Int64Array, faces: Int64Array) -> None:
+        self._faces = faces
+        self._numbers = numbers
+        self._corners = np.zeros((0, 3))
+        self._order = np.argsort(numbers, kind="stable")
+        count = int(numbers.max(initial=-1)) + 1
+        self._begin = np.searchsorted(numbers[self._order], np.arange(count))
+        self.triangle = np.zeros(count, np.int64)
+        """The triangle that stands for each plane."""
+        self.origin = np.zeros((count, 3))
+        """A point of each plane [m]."""
+        self.normal = np.zeros((count, 3))
+        """Unit normal; 0 where a plane has no area."""
+        self.low = np.zeros((count, 3))
+        """Box around the triangles of each plane [m]."""
+        self.high = np.zeros((count, 3))
+
+    def update(self, corners: Float64Array, first: int = 0) -> None:
+        """Take planes from ``first`` on from these corners of all meshes [m], Shape ``[V, 3]``."""
+        self._corners = corners
+        begin = self._begin[first:]
+        if not len(begin):
+            return
+        order = self._order[begin[0] :]
+        triangles = corners[self._faces[order]]
+        normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+        square = (normal**2).sum(1)
+        begin = begin - begin[0]
+        largest = np.maximum.reduceat(square, begin)
+        sizes = np.diff(np.append(begin, len(order)))
+        hits = np.flatnonzero(square == np.repeat(largest, sizes))
+        chosen = hits[np.searchsorted(hits, begin)]
+        self.triangle[first:] = order[chosen]
+        self.origin[first:] = triangles[chosen, 0]
+        length = np.sqrt(largest)[:, None]
+        self.normal[first:] = normal[chosen] / np.where(length > 0, length, 1.0)
+        self.low[first:] = np.minimum.reduceat(triangles.min(1), begin)
+        self.high[first:] = np.maximum.reduceat(triangles.max(1), begin)
+
+    def first_holding(self, triangles: Int64Array, points: Float64Array) -> Int64Array:
+        """For each point [m], Shape ``[N, 3]``, in one of these triangles, the first triangle of the same
+        plane that holds it too.
+
+        Where faces coincide, the floor of a house and the ground below it, or two houses' common wall, a ray
+        hits whichever was looked at first, which depends on the rays beside it.
+        """
+        if not len(triangles):
+            return triangles
+        plane = self._numbers[triangles]
+        begin = self._begin[plane]
+        sizes = np.append(self._begin[1:], len(self._order))[plane] - begin
+        hit = np.repeat(np.arange(len(triangles)), sizes)
+        place = np.arange(len(hit)) - np.repeat(np.cumsum(sizes) - sizes, sizes) + begin[hit]
+        candidate = self._order[place]
+        held = _holds(self._corners[self._faces[candidate]], points[hit])
+        first = triangles.copy()
+        # Within a plane triangles are in ascending order.
+        hits, where = np.unique(hit[held], return_index=True)
+        first[hits] = candidate[held][where]
+        return first
+
+
+def _holds(triangles: Float64Array, points: Float64Array) -> BoolArray:
+    """Whether points lie in triangles of their plane or at most `_RIM` outside, Shape ``[N]``."""
+    normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    length = np.linalg.norm(normal, axis=1)
+    inside: BoolArray = length > 0
+    normal /= np.where(inside, length, 1.0)[:, None]
+    for corner in range(3):
+        edge = triangles[:, (corner + 1) % 3] - triangles[:, corner]
+        across = (np.cross(edge, points - triangles[:, corner]) * normal).sum(1)
+        inside &= across >= -_RIM * np.linalg.norm(edge, axis=1)
+    return inside
