@@ -79,17 +79,24 @@ class Launcher:
             | DIFFRACTED * options.diffraction
         )
 
-    def __call__(self, source: Any) -> Launch:
-        """Launch from one position, a `mitsuba.Point3f` of width 1."""
+    def __call__(self, source: Any, part: tuple[int, int] = (0, 1)) -> Launch:
+        """Launch from one position, a `mitsuba.Point3f` of width 1.
+
+        Of ``part = (k, n)`` every n-th ray, from the k-th on: neighbours go with different parts.
+        """
         import drjit as dr
         import mitsuba as mi
 
-        samples = self._options.samples
-        self._sampler.seed(self._options.seed, samples)
+        number, parts = part
+        samples = len(range(number, self._options.samples, parts))
+        self._sampler.seed(self._options.seed + number, samples)
         origin = dr.repeat(source, samples)
         direction = mi.Vector3f(self._directions)
+        if parts > 1:
+            ray = dr.arange(mi.UInt, samples) * dr.opaque(mi.UInt, parts) + dr.opaque(mi.UInt, number)
+            direction = dr.gather(mi.Vector3f, self._directions, ray)
         active, enabled = dr.full(mi.Bool, True, samples), dr.full(mi.UInt, self._enabled, samples)
-        wedges = self._no_wedges()
+        wedges = self._no_wedges(samples)
         dr.make_opaque(origin, direction, active, enabled, wedges)
         bounces = []
         for _ in range(self._options.max_depth):
@@ -99,10 +106,10 @@ class Launcher:
             bounces.append(bounce)
         return Launch(tuple(bounces), wedges)
 
-    def _no_wedges(self) -> Any:
+    def _no_wedges(self, samples: int) -> Any:
         from sionna.rt.utils import WedgeGeometry
 
-        return WedgeGeometry.build_with_size(self._options.samples) if self._options.diffraction else None
+        return WedgeGeometry.build_with_size(samples) if self._options.diffraction else None
 
     def _bounce(self, origin: Any, direction: Any, active: Any, enabled: Any, wedges: Any) -> tuple[Any, ...]:
         """Next interaction of all rays, and how they go on. Rules of what may follow what are Sionna RT's."""

@@ -18,6 +18,7 @@ from caviar_protocol.seeding import derive_seed
 from caviar_protocol.topics import AntennaDevice, ChannelOptions, Scene
 from caviar_services.channel.assemble import Antenna, PathTable
 from caviar_services.channel.base import ChannelSettings, Found, PathModel
+from caviar_services.channel.sionna_follow import Followed
 from caviar_services.channel.sionna_launch import LaunchOptions
 from caviar_services.channel.sionna_materials import (
     MaterialPolicy,
@@ -51,6 +52,12 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     max_paths: Annotated[
         int, quantity("1", "candidates of a TX/RX pair; more are lost and counted", ge=1)
     ] = 200_000
+    follow: (
+        Annotated[int, quantity("1", "frames in which all rays are launched, a part in each", ge=2, le=1000)]
+        | None
+    ) = None
+    """Chains of reflections are followed from frame to frame instead of being looked for with all rays in
+    each: new ones are found within this many frames. Absent: each frame stands on its own."""
     receivers_at_once: Annotated[
         int | None, quantity("1", "receivers looked at together; absent: as many as fit")
     ] = None
@@ -86,6 +93,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         self._variant = ""
         self._scene: SionnaScene
         self._tracer: Tracer
+        self._followed: dict[str, Followed] = {}
         self._outside: tuple[OutsideUse, ...] = ()
 
     @property
@@ -154,7 +162,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
             mi.set_variant(self._variant)
         _refuse_buried(scene, self.settings.without_body)
         names, velocity = self._scene.place(scene, frozenset(self.settings.without_body))
-        parts = [self._launch(t, transmitter, receivers) for t, transmitter in enumerate(transmitters)]
+        parts = [self._launch(t, transmitter, receivers, names) for t, transmitter in enumerate(transmitters)]
         table = self._table(parts, names, velocity, transmitters, receivers)
         straight = (table.types == 0).all(1)
         los = np.zeros(len(transmitters) * len(receivers), bool)
@@ -204,12 +212,15 @@ class SionnaChannel(PathModel[SionnaSettings]):
         )
 
     def _launch(
-        self, t: int, transmitter: Antenna, receivers: Sequence[Antenna]
+        self, t: int, transmitter: Antenna, receivers: Sequence[Antenna], names: tuple[str, ...]
     ) -> tuple[Int64Array, Traced]:
         """Paths of one transmitter to the receivers, with the pair that each belongs to."""
         others = [r for r, receiver in enumerate(receivers) if receiver.name != transmitter.name]
         targets = np.array([receivers[r].position for r in others]).reshape(-1, 3)
-        traced = self._tracer.trace(transmitter.position, targets, self.settings.receivers_at_once)
+        s, followed = self.settings, None
+        if s.follow is not None:
+            followed = self._followed.setdefault(transmitter.name, Followed(s.follow))
+        traced = self._tracer.trace(transmitter.position, targets, s.receivers_at_once, followed, names)
         return t * len(receivers) + np.array(others, np.int64)[traced.receiver], traced
 
     def _start(self) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from caviar_protocol.arrays import Float64Array, Int32Array, Int64Array
+from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
 from caviar_protocol.errors import AssetError, PayloadError
 from caviar_protocol.scene import object_pose
 from caviar_protocol.topics import Scene
@@ -196,6 +196,51 @@ class SionnaScene:
         """Number of the plane of triangles within their object, the same in every frame; anything for no
         shape."""
         return self._face_of[self.triangle_numbers(shapes, primitives)]
+
+    def moved_triangles(
+        self, triangles: Int64Array, before: tuple[str, ...], now: tuple[str, ...]
+    ) -> Int64Array:
+        """Numbers of the same triangles of the same objects, where `place` has given bodies to others since.
+
+        ``before`` and ``now`` are what it returned; −1 where an object has left or has another mesh.
+        """
+        if before == now:
+            return triangles
+        first = len(now) - len(self._bodies)
+        place = {name: number for number, name in enumerate(now[first:], start=first)}
+        piece = np.searchsorted(self._first_triangles, triangles, side="right") - 1
+        moved = np.arange(len(now))
+        for number, name in enumerate(before[first:], start=first):
+            there = place.get(name, -1)
+            is_same = there >= 0 and self._bodies[there - first][0] == self._bodies[number - first][0]
+            moved[number] = there if is_same else -1
+        start = self._first_triangles[moved[piece]] + triangles - self._first_triangles[piece]
+        return np.where(moved[piece] >= 0, start, -1)
+
+    def is_of_body(self, triangles: Int64Array) -> BoolArray:
+        """Whether triangles by number are of moving bodies."""
+        first = len(self._names) - len(self._bodies)
+        moving: BoolArray = triangles >= self._first_triangles[first] if self._bodies else triangles < 0
+        return moving
+
+    def twins(self, triangles: Int64Array) -> tuple[Int64Array, Int64Array]:
+        """Triangles of bodies, by number, on all bodies of the same mesh that stand for an object now.
+
+        Returns which of those given each belongs to, and its number, each of Shape ``[L]``.
+        """
+        first = len(self._names) - len(self._bodies)
+        piece = np.searchsorted(self._first_triangles, triangles, side="right") - 1
+        local = triangles - self._first_triangles[piece]
+        assets = [asset for asset, _ in self._bodies]
+        which, found = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+        for asset in sorted(set(assets)):
+            mine = np.flatnonzero([asset == assets[p - first] for p in piece.tolist()])
+            there = [number for number, body in enumerate(self._bodies, start=first)
+                     if body[0] == asset and body in self._standing]
+            starts = self._first_triangles[np.array(there, np.int64)]
+            which.append(np.repeat(mine, len(there)))
+            found.append((local[mine][:, None] + starts).ravel())
+        return np.concatenate(which), np.concatenate(found)
 
     def object_index(self, shapes: Int64Array, primitives: Int64Array) -> Int32Array:
         """Index into the names of `place` of triangles of process-local shapes; −1 for no shape."""

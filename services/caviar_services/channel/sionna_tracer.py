@@ -32,6 +32,7 @@ from caviar_services.channel.sionna_candidates import (
     positions,
     scattered_of,
 )
+from caviar_services.channel.sionna_follow import Followed
 from caviar_services.channel.sionna_launch import Launch, Launcher, LaunchOptions
 from caviar_services.channel.sionna_scene import SionnaScene
 from caviar_services.channel.specular import refined_points
@@ -143,15 +144,28 @@ class Tracer:
         self._images = ImageMethod()
         self._fields = FieldCalculator()
 
-    def trace(self, transmitter: Float64Array, receivers: Float64Array, at_once: int | None = None) -> Traced:
+    def trace(
+        self,
+        transmitter: Float64Array,
+        receivers: Float64Array,
+        at_once: int | None = None,
+        followed: Followed | None = None,
+        names: tuple[str, ...] = (),
+    ) -> Traced:
         """Paths from one transmitter [3] to all receivers [R, 3], positions in metres.
 
         ``at_once`` receivers are handled together, or as many as fit: to the paths it makes no difference.
+        With ``followed``, what the transmitter's last launches met, a part of the rays is launched; ``names``
+        is what `SionnaScene.place` returned.
         """
         options = self._options
         source = positions(transmitter[None])
-        launch = self._launcher(source) if options.max_depth else Launch((), None)
-        chains, scattered = chains_of(launch, self._scene), scattered_of(launch)
+        if followed is not None and options.max_depth:
+            launch, chains = followed.step(self._launcher, source, self._scene, names)
+        else:
+            launch = self._launcher(source) if options.max_depth else Launch((), None)
+            chains = chains_of(launch, self._scene)
+        scattered = scattered_of(launch)
         if at_once is None:
             at_once = max(1, _LANES // max(len(chains.ray), len(scattered[0]), 1))
         table = Planes(self._scene.plane_table)
