@@ -1,6 +1,6 @@
 """A receiver's paths are the same however they are asked for.
 
-``CAVIAR_SAME_PATHS=200`` draws 200 receivers in each scene instead of 40.
+``CAVIAR_SAME_PATHS=200`` draws 200 receivers in each scene instead of 20.
 """
 
 from __future__ import annotations
