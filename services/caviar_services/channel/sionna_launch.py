@@ -85,6 +85,8 @@ class Launcher:
         import mitsuba as mi
 
         samples = self._options.samples
+        if not self._enabled:
+            return Launch((), None)
         self._sampler.seed(self._options.seed, samples)
         origin = dr.repeat(source, samples)
         direction = mi.Vector3f(self._directions)
