@@ -16,7 +16,7 @@ from caviar_protocol.topics import AntennaArray, Channel
 from caviar_services.channel.base import ChannelModel
 from caviar_services.world.assets import scenery_assets
 
-POSITIONS = int(os.environ.get("CAVIAR_SAME_PATHS", "40"))
+POSITIONS = int(os.environ.get("CAVIAR_SAME_PATHS", "20"))
 """Receivers that are drawn in each scene."""
 
 SCENES = {

@@ -1,6 +1,6 @@
 """A receiver's paths are the same however they are asked for.
 
-``CAVIAR_SAME_PATHS=200`` draws 200 receivers in each scene instead of 40.
+``CAVIAR_SAME_PATHS=200`` draws 200 receivers in each scene instead of 20.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ import pytest
 from same_paths import EVERYTHING, POSITIONS, SCENES, SPECULAR, asked, digest, model, of_receiver, places
 
 from caviar_services.channel.base import ChannelModel
-from caviar_services.channel.sionna_candidates import Chains, Planes
+from caviar_services.channel.sionna_candidates import Planes
+from caviar_services.channel.sionna_chains import Chains
 
 pytestmark = [pytest.mark.channel, pytest.mark.slow]
 

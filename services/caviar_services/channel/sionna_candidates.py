@@ -1,7 +1,6 @@
 """Which paths could be: specular chains and scattering points of a launch, offered to every receiver.
 
-A chain is a sequence of planes that some ray went along. Chains come from the transmitter's launch alone, and
-every receiver is offered all of them: so its paths depend neither on which others are traced with it nor on
+Every receiver is offered all of them: so its paths depend neither on which others are traced with it nor on
 whether a ray happened to pass near it. Most chains cannot be a path to most receivers, which the
 image method tells from the planes and the boxes around them before anything is traced.
 """
@@ -14,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
-from caviar_services.channel.sionna_launch import DIFFRACTED, REFLECTED, REFRACTED, SCATTERED, Launch
+from caviar_services.channel.sionna_chains import Chains, chains_of, scattered_of
+from caviar_services.channel.sionna_launch import Launch, LaunchOptions
 from caviar_services.channel.sionna_planes import PlaneTable
 from caviar_services.channel.sionna_scene import SionnaScene
 from caviar_services.columns import aligned_columns, aligned_indices
@@ -30,101 +30,117 @@ _GRAZING = 0.03
 
 
 @dataclass(frozen=True, eq=False)
-class Chains:
-    """C specular chains, or specular ends behind a scattering point."""
+class Candidates:
+    """P candidates for paths from one transmitter."""
 
     ray: Int64Array
-    """The first ray that went along each, Shape ``[C]``."""
+    """Ray of the launch whose first interactions they take, Shape ``[P]``."""
     depth: Int64Array
-    """Interactions of each, Shape ``[C]``."""
+    """How many, Shape ``[P]``."""
+    receiver: Int64Array
+    """Index of the receiver, Shape ``[P]``."""
     planes: Int32Array
-    """Plane at each interaction that is a reflection, −1 elsewhere, Shape ``[C, D]``."""
-    straight: BoolArray
-    """Whether a chain has but reflections and transmissions, Shape ``[C]``."""
+    """Plane that has to reflect at each interaction, −1 where any may, Shape ``[P, D]``."""
+    found: BoolArray
+    """Known to be a path; of the others the image method finds out, Shape ``[P]``."""
 
-
-def chains_of(launch: Launch, scene: SionnaScene) -> Chains:
-    """All chains that rays of a launch went along, shortest first, then in a stable order."""
-    count = len(launch.bounces)
-    ray = np.zeros(0, np.int64)
-    chain = np.zeros(0, np.int64)
-    planes, straight = np.full((1, count), -1, np.int32), np.ones(1, np.bool_)
-    found: list[Chains] = []
-    for d, bounce in enumerate(launch.bounces):
-        kinds = bounce.kind.numpy()
-        if d == 0:
-            ray = np.flatnonzero(kinds)
-            chain = np.zeros(len(ray), np.int64)
-        else:
-            going = kinds[ray] != 0
-            ray, chain = ray[going], chain[going]
-        if not len(ray):
-            break
-        # Neighbouring rays mostly meet the same: only the first of each run is looked at.
-        begins = _begins(launch, d, ray, chain)
-        heads = np.flatnonzero(begins)
-        kind, plane, token, tokens = _tokens(launch, d, ray[heads], scene)
-        key = chain[heads] * tokens + token
-        _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
-        kind, plane, first = kind[first], plane[first], heads[first]
-        before = chain[first]
-        planes, straight = planes[before], straight[before] & ((kind == REFLECTED) | (kind == REFRACTED))
-        planes[:, d] = np.where(kind == REFLECTED, plane, -1)
-        chain = inverse.reshape(-1)[np.cumsum(begins) - 1]
-        specular = kind != SCATTERED
-        found.append(
-            Chains(
-                ray[first][specular],
-                np.full(int(specular.sum()), d + 1, np.int64),
-                planes[specular],
-                straight[specular],
-            )
+    def take(self, which: Int64Array | BoolArray) -> Candidates:
+        """These candidates."""
+        return Candidates(
+            self.ray[which], self.depth[which], self.receiver[which], self.planes[which], self.found[which]
         )
-    return Chains(
-        _stacked([part.ray for part in found], (0,)),
-        _stacked([part.depth for part in found], (0,)),
-        np.concatenate([np.zeros((0, count), np.int32), *(part.planes for part in found)]),
-        np.concatenate([np.zeros(0, np.bool_), *(part.straight for part in found)]),
-    )
 
 
-def _begins(launch: Launch, d: int, ray: Int64Array, chain: Int64Array) -> BoolArray:
-    """Which rays differ from those before them, in what they met or the chain that they come from."""
-    bounce = launch.bounces[d]
-    told_apart = [chain, *(column.numpy()[ray] for column in (bounce.kind, bounce.shape, bounce.primitive))]
-    if launch.wedges is not None:
-        told_apart += [side.numpy()[ray] for side in (launch.wedges.prim0, launch.wedges.primn)]
-    begins = np.ones(len(ray), np.bool_)
-    begins[1:] = False
-    for column in told_apart:
-        begins[1:] |= column[1:] != column[:-1]
-    return begins
+class Offer:
+    """What a launch offers to every receiver.
 
+    Parameters
+    ----------
+    scene
+        Where the rays went.
+    launch
+        The rays.
+    source
+        Where they came from, a `mitsuba.Point3f` of width 1.
+    options
+        What is traced.
+    """
 
-def _tokens(
-    launch: Launch, d: int, ray: Int64Array, scene: SionnaScene
-) -> tuple[Int64Array, Int64Array, Int64Array, int]:
-    """Kind, plane, and what tells interactions of these rays apart: the plane of a reflection, the edge of a
-    diffraction, else the kind alone; and how many of these there can be."""
-    bounce = launch.bounces[d]
-    kind = bounce.kind.numpy()[ray].astype(np.int64)
-    shape = bounce.shape.numpy()[ray].astype(np.int64)
-    plane = scene.plane_of[scene.triangle_numbers(shape, bounce.primitive.numpy()[ray].astype(np.int64))]
-    planes = len(scene.plane_table.triangle)
-    token = np.where(kind == REFLECTED, plane, planes + kind)
-    edges = 0
-    bent = kind == DIFFRACTED
-    if bent.any():
-        sides = np.stack([side.numpy()[ray[bent]] for side in (launch.wedges.prim0, launch.wedges.primn)])
-        sides = np.sort(scene.triangle_numbers(shape[bent], sides.astype(np.int64)), axis=0)
-        _, edge = np.unique(sides[0] * len(scene.plane_of) + sides[1], return_inverse=True)
-        edges = int(edge.max()) + 1
-        token[bent] = planes + 16 + edge.reshape(-1)
-    return kind, plane, token, planes + 16 + edges
+    def __init__(self, scene: SionnaScene, launch: Launch, source: Any, options: LaunchOptions) -> None:
+        self.launch = launch
+        self._mi_scene = scene.mi_scene
+        self._source = source
+        self._options = options
+        self._planes = Planes(scene.plane_table)
+        self._chains = chains_of(launch, scene, options.max_depth)
+        self._scattered = scattered_of(launch)
 
+    @property
+    def size(self) -> int:
+        """Candidates for each receiver, those that cannot be included."""
+        return max(len(self._chains.ray), len(self._scattered[0]))
 
-def _stacked(parts: list[Int64Array], empty: tuple[int, ...]) -> Int64Array:
-    return np.concatenate([np.zeros(empty, np.int64), *parts])
+    def candidates(self, targets: Any) -> tuple[Candidates, Launch, int]:
+        """Direct paths, chains and scattering points for receivers, a `mitsuba.Point3f`, that could be paths;
+        the launch that their rays are of; and how many more there are than ``max_paths`` of each.
+        """
+        chains, scattered = self._chains, self._scattered
+        direct = self._seen(targets)
+        chain, receiver = self._planes.possible(chains, self._source, targets)
+        point, reached = self._reached(targets)
+        none = np.zeros(len(direct), np.int64)
+        any_plane = np.full((len(direct) + len(point), self._options.max_depth), -1, np.int32)
+        every = Candidates(
+            np.concatenate([none, chains.ray[chain], scattered[0][point]]),
+            np.concatenate([none, chains.depth[chain], scattered[1][point]]),
+            np.concatenate([direct, receiver, reached]),
+            np.concatenate([any_plane[: len(direct)], chains.planes[chain], any_plane[len(direct) :]]),
+            np.repeat([True, False, True], [len(direct), len(chain), len(point)]),
+        )
+        kept = first_of_each(every.receiver, self._options.max_paths)
+        return every.take(kept), self.launch, len(kept) - int(kept.sum())
+
+    def _seen(self, targets: Any) -> Int64Array:
+        """Receivers that the transmitter sees."""
+        import drjit as dr
+        from sionna.rt.constants import MIN_SEGMENT_LENGTH
+        from sionna.rt.utils import spawn_ray_to
+
+        origins = dr.repeat(self._source, dr.width(targets))
+        free = dr.norm(targets - origins) > MIN_SEGMENT_LENGTH
+        free &= ~self._mi_scene.ray_test(spawn_ray_to(origins, targets), active=free)
+        seen: Int64Array = np.flatnonzero(free.numpy())
+        return seen
+
+    def _reached(self, targets: Any) -> tuple[Int64Array, Int64Array]:
+        """Scattering points and the receivers that each of them reaches, on the side that was lit."""
+        import drjit as dr
+        import mitsuba as mi
+
+        ray, depth = self._scattered
+        if not len(ray):
+            return ray, ray
+        parts: list[tuple[Int64Array, Int64Array]] = []
+        receivers = dr.width(targets)
+        per_point = dr.opaque(mi.UInt, receivers)
+        for d, bounce in enumerate(self.launch.bounces):
+            first = int(np.searchsorted(depth, d + 1))
+            rays = ray[first : int(np.searchsorted(depth, d + 1, side="right"))]
+            if not len(rays):
+                continue
+            lane = dr.arange(mi.UInt, len(rays) * receivers)
+            of_ray = dr.gather(mi.UInt, mi.UInt(aligned_indices(rays)), lane // per_point)
+            target = dr.gather(mi.Point3f, targets, lane % per_point)
+            hit = dr.zeros(mi.Interaction3f, len(rays) * receivers)
+            hit.p = dr.gather(mi.Point3f, bounce.point, of_ray)
+            hit.n = dr.gather(mi.Normal3f, bounce.normal, of_ray)
+            back = hit.spawn_ray_to(target)
+            lit = dr.dot(mi.Vector3f(hit.n), back.d) > 0.0
+            lit &= ~self._mi_scene.ray_test(back, active=lit)
+            kept: Any = dr.compress(lit)
+            lanes = kept.numpy().astype(np.int64)
+            parts.append((first + lanes // receivers, lanes % receivers))
+        return np.concatenate([point for point, _ in parts]), np.concatenate([rx for _, rx in parts])
 
 
 class Planes:
@@ -214,13 +230,6 @@ def first_of_each(receiver: Int64Array, count: int) -> BoolArray:
     place[order] = np.arange(len(receiver)) - np.searchsorted(ranked, ranked)
     kept: BoolArray = place < count
     return kept
-
-
-def scattered_of(launch: Launch) -> tuple[Int64Array, Int64Array]:
-    """Ray and depth of every interaction of a launch that is a diffuse reflection."""
-    rays = [np.flatnonzero(bounce.kind.numpy() == SCATTERED) for bounce in launch.bounces]
-    depths = [np.full(len(ray), d + 1, np.int64) for d, ray in enumerate(rays)]
-    return _stacked(rays, (0,)), _stacked(depths, (0,))
 
 
 def positions(points: Float64Array) -> Any:

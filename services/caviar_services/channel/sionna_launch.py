@@ -87,6 +87,8 @@ class Launcher:
         import drjit as dr
         import mitsuba as mi
 
+        if not self._enabled:
+            return Launch((), None)
         number, parts = part
         samples = len(range(number, self._options.samples, parts))
         self._sampler.seed(self._options.seed + number, samples)

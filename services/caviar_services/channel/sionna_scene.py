@@ -217,6 +217,16 @@ class SionnaScene:
         start = self._first_triangles[moved[piece]] + triangles - self._first_triangles[piece]
         return np.where(moved[piece] >= 0, start, -1)
 
+    def mesh_plane(self, triangles: Int64Array) -> Int64Array:
+        """What triangles by number have in common with those of other bodies of the same mesh: a number for
+        the mesh and plane."""
+        first = len(self._names) - len(self._bodies)
+        assets = sorted({asset for asset, _ in self._bodies})
+        rank = np.array([0] * first + [assets.index(asset) for asset, _ in self._bodies], np.int64)
+        piece = np.searchsorted(self._first_triangles, triangles, side="right") - 1
+        numbers: Int64Array = rank[piece] * len(self._face_of) + self._face_of[triangles]
+        return numbers
+
     def is_of_body(self, triangles: Int64Array) -> BoolArray:
         """Whether triangles by number are of moving bodies."""
         first = len(self._names) - len(self._bodies)
@@ -235,8 +245,11 @@ class SionnaScene:
         which, found = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
         for asset in sorted(set(assets)):
             mine = np.flatnonzero([asset == assets[p - first] for p in piece.tolist()])
-            there = [number for number, body in enumerate(self._bodies, start=first)
-                     if body[0] == asset and body in self._standing]
+            there = [
+                number
+                for number, body in enumerate(self._bodies, start=first)
+                if body[0] == asset and body in self._standing
+            ]
             starts = self._first_triangles[np.array(there, np.int64)]
             which.append(np.repeat(mine, len(there)))
             found.append((local[mine][:, None] + starts).ravel())

@@ -18,20 +18,12 @@ from caviar_protocol.arrays import (
     BoolArray,
     Complex128Array,
     Float64Array,
-    Int32Array,
     Int64Array,
     UInt8Array,
 )
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.patterns import spherical_basis
-from caviar_services.channel.sionna_candidates import (
-    Chains,
-    Planes,
-    chains_of,
-    first_of_each,
-    positions,
-    scattered_of,
-)
+from caviar_services.channel.sionna_candidates import Candidates, Offer, positions
 from caviar_services.channel.sionna_follow import Followed
 from caviar_services.channel.sionna_launch import Launch, Launcher, LaunchOptions
 from caviar_services.channel.sionna_scene import SionnaScene
@@ -91,22 +83,6 @@ class Traced:
         return replace(self, receiver=self.receiver + first)
 
 
-@dataclass(frozen=True, eq=False)
-class _Candidates:
-    """P candidates of one transmitter, in the order: direct paths, chains, scattering points."""
-
-    ray: Int64Array
-    """Ray of the launch whose first interactions they take, Shape ``[P]``."""
-    depth: Int64Array
-    """How many, Shape ``[P]``."""
-    receiver: Int64Array
-    """Shape ``[P]``."""
-    planes: Int32Array
-    """Plane that has to reflect at each interaction, −1 where any may, Shape ``[P, D]``."""
-    found: BoolArray
-    """Known to be a path; of the others the image method finds out, Shape ``[P]``."""
-
-
 class Tracer:
     """The stages of the solver, bound to a scene and a set of options.
 
@@ -158,133 +134,48 @@ class Tracer:
         With ``followed``, what the transmitter's last launches met, a part of the rays is launched; ``names``
         is what `SionnaScene.place` returned.
         """
-        options = self._options
+        if not len(receivers):
+            return _joined([], len(self._wavelengths), self._options.max_depth)
         source = positions(transmitter[None])
-        if followed is not None and options.max_depth:
-            launch, chains = followed.step(self._launcher, source, self._scene, names)
+        if followed is None:
+            offer = Offer(self._scene, self._launcher(source), source, self._options)
         else:
-            launch = self._launcher(source) if options.max_depth else Launch((), None)
-            chains = chains_of(launch, self._scene)
-        scattered = scattered_of(launch)
+            offer = followed.offer(self._launcher, source, self._scene, names, self._options)
         if at_once is None:
-            at_once = max(1, _LANES // max(len(chains.ray), len(scattered[0]), 1))
-        table = Planes(self._scene.plane_table)
+            at_once = max(1, _LANES // max(offer.size, 1))
         parts = [
-            self._batch(
-                launch, chains, scattered, table, transmitter, begin, receivers[begin : begin + at_once]
-            )
+            self._batch(offer, transmitter, begin, receivers[begin : begin + at_once])
             for begin in range(0, len(receivers), at_once)
         ]
-        return _joined(parts, len(self._wavelengths), options.max_depth)
+        return _joined(parts, len(self._wavelengths), self._options.max_depth)
 
-    def _batch(
-        self,
-        launch: Launch,
-        chains: Chains,
-        scattered: tuple[Int64Array, Int64Array],
-        table: Planes,
-        transmitter: Float64Array,
-        begin: int,
-        receivers: Float64Array,
-    ) -> Traced:
+    def _batch(self, offer: Offer, transmitter: Float64Array, begin: int, receivers: Float64Array) -> Traced:
+        import mitsuba as mi
+
         source, targets = positions(transmitter[None]), positions(receivers)
-        candidates, lost = self._candidates(launch, chains, scattered, table, source, targets)
+        candidates, launch, lost = offer.candidates(targets)
         if not len(candidates.ray):
             return _nothing(len(self._wavelengths), self._options.max_depth, lost)
-        buffer = self._buffer(launch, candidates)
         buffer = self._images(
             scene=self._scene.mi_scene,
-            paths=buffer,
+            paths=self._buffer(launch, candidates.take(_several(len(candidates.ray)))),
             src_positions=source,
             tgt_positions=targets,
             diffraction=self._options.diffraction,
             diffraction_lit_region=True,
         )
-        kept = np.flatnonzero(buffer.valid.numpy())
-        buffer.discard_invalid()
-        if not len(kept):
+        valid = np.flatnonzero(buffer.valid.numpy()[: len(candidates.ray)])
+        if not len(valid):
             return _nothing(len(self._wavelengths), self._options.max_depth, lost)
-        self._settle(buffer, candidates, kept, transmitter, receivers)
+        kept = valid[_several(len(valid))]
+        buffer = buffer.gather(mi.UInt(aligned_indices(kept)))
+        self._settle(buffer, candidates.take(kept), transmitter, receivers)
         self._compute_fields(buffer, source, targets)
         traced = _read(buffer, len(self._wavelengths), transmitter, receivers, lost)
-        return traced.take(buffer.valid.numpy()).seen_from(begin)
+        found = buffer.valid.numpy() & (np.arange(len(kept)) < len(valid))
+        return traced.take(found).seen_from(begin)
 
-    def _candidates(
-        self,
-        launch: Launch,
-        chains: Chains,
-        scattered: tuple[Int64Array, Int64Array],
-        table: Planes,
-        source: Any,
-        targets: Any,
-    ) -> tuple[_Candidates, int]:
-        """All candidates of these receivers, and how many more were found than ``max_paths`` of each."""
-        depth = len(chains.planes.T)
-        direct = self._seen(source, targets)
-        chain, receiver = table.possible(chains, source, targets)
-        point, reached = self._reached(launch, *scattered, targets)
-        none = np.zeros(len(direct), np.int64)
-        whole = _Candidates(
-            np.concatenate([none, chains.ray[chain], scattered[0][point]]),
-            np.concatenate([none, chains.depth[chain], scattered[1][point]]),
-            np.concatenate([direct, receiver, reached]),
-            np.concatenate(
-                [np.full((len(direct), depth), -1), chains.planes[chain], np.full((len(point), depth), -1)]
-            ).astype(np.int32),
-            np.repeat([True, False, True], [len(direct), len(chain), len(point)]),
-        )
-        kept = first_of_each(whole.receiver, self._options.max_paths)
-        lost = len(kept) - int(kept.sum())
-        if not lost:
-            return whole, 0
-        return _Candidates(
-            whole.ray[kept], whole.depth[kept], whole.receiver[kept], whole.planes[kept], whole.found[kept]
-        ), lost
-
-    def _seen(self, source: Any, targets: Any) -> Int64Array:
-        """Receivers that the transmitter sees."""
-        import drjit as dr
-        from sionna.rt.constants import MIN_SEGMENT_LENGTH
-        from sionna.rt.utils import spawn_ray_to
-
-        origins = dr.repeat(source, dr.width(targets))
-        free = dr.norm(targets - origins) > MIN_SEGMENT_LENGTH
-        free &= ~self._scene.mi_scene.ray_test(spawn_ray_to(origins, targets), active=free)
-        seen: Int64Array = np.flatnonzero(free.numpy())
-        return seen
-
-    def _reached(
-        self, launch: Launch, ray: Int64Array, depth: Int64Array, targets: Any
-    ) -> tuple[Int64Array, Int64Array]:
-        """Scattering points and the receivers that each of them reaches, on the side that was lit."""
-        import drjit as dr
-        import mitsuba as mi
-
-        if not len(ray):
-            return ray, ray
-        parts: list[tuple[Int64Array, Int64Array]] = []
-        receivers = dr.width(targets)
-        per_point = dr.opaque(mi.UInt, receivers)
-        for d, bounce in enumerate(launch.bounces):
-            first = int(np.searchsorted(depth, d + 1))
-            rays = ray[first : int(np.searchsorted(depth, d + 1, side="right"))]
-            if not len(rays):
-                continue
-            lane = dr.arange(mi.UInt, len(rays) * receivers)
-            of_ray = dr.gather(mi.UInt, mi.UInt(aligned_indices(rays)), lane // per_point)
-            target = dr.gather(mi.Point3f, targets, lane % per_point)
-            hit = dr.zeros(mi.Interaction3f, len(rays) * receivers)
-            hit.p = dr.gather(mi.Point3f, bounce.point, of_ray)
-            hit.n = dr.gather(mi.Normal3f, bounce.normal, of_ray)
-            back = hit.spawn_ray_to(target)
-            lit = dr.dot(mi.Vector3f(hit.n), back.d) > 0.0
-            lit &= ~self._scene.mi_scene.ray_test(back, active=lit)
-            kept: Any = dr.compress(lit)
-            lanes = kept.numpy().astype(np.int64)
-            parts.append((first + lanes // receivers, lanes % receivers))
-        return np.concatenate([point for point, _ in parts]), np.concatenate([rx for _, rx in parts])
-
-    def _buffer(self, launch: Launch, candidates: _Candidates) -> Any:
+    def _buffer(self, launch: Launch, candidates: Candidates) -> Any:
         """The solver's buffer with these candidates."""
         import drjit as dr
         import mitsuba as mi
@@ -319,8 +210,7 @@ class Tracer:
     def _settle(
         self,
         buffer: Any,
-        candidates: _Candidates,
-        kept: Int64Array,
+        candidates: Candidates,
         transmitter: Float64Array,
         receivers: Float64Array,
     ) -> None:
@@ -331,20 +221,20 @@ class Tracer:
         import mitsuba as mi
 
         types, shapes, primitives, points = _geometry(buffer)
-        wanted = candidates.planes[kept][:, : types.shape[1]]
+        wanted = candidates.planes
         triangles = self._scene.triangle_numbers(shapes, primitives)
         own = ((wanted < 0) | (wanted == self._scene.plane_of[triangles])).all(1)
         buffer.valid = mi.UInt(aligned_indices(own)) != 0
         met = (types == Interaction.REFLECTION) | (types == Interaction.TRANSMISSION)
-        met &= (own & ~candidates.found[kept])[:, None]
+        met &= (own & ~candidates.found)[:, None]
         if not met.any():
             return
         first = self._scene.plane_table.first_holding(triangles[met], points[met])
         shapes[met], primitives[met] = self._scene.shapes_of(first)
         buffer._shapes = _tensor(mi.TensorXu, mi.UInt(aligned_indices(shapes.ravel())), shapes)
         buffer._primitives = _tensor(mi.TensorXu, mi.UInt(aligned_indices(primitives.ravel())), shapes)
-        start = np.broadcast_to(transmitter, (len(kept), 3))
-        end = receivers[candidates.receiver[kept]]
+        start = np.broadcast_to(transmitter, (len(types), 3))
+        end = receivers[candidates.receiver]
         exact = refined_points(start, points, end, types, self._scene.planes(shapes, primitives))
         for axis, column in zip("xyz", aligned_columns(exact.reshape(-1, 3).T), strict=True):
             setattr(buffer, f"_vertices_{axis}", _tensor(mi.TensorXf, mi.Float(column), shapes))
@@ -379,6 +269,11 @@ class Tracer:
             dr.eval(amplitudes, carried)  # before the materials change again
             self._scene.tune(0)
             buffer.valid, buffer.a = carried, amplitudes
+
+
+def _several(count: int) -> Int64Array:
+    """Indices of so many, a single one twice: an array of one element is another kernel."""
+    return np.arange(count) if count > 1 else np.zeros(2 * count, np.int64)
 
 
 def _tensor(kind: Any, values: Any, like: Int64Array) -> Any:
