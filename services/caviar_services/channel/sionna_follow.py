@@ -3,8 +3,7 @@
 What takes longest is to find out which planes a transmitter's rays go along; from one frame to the next that
 hardly changes. So each frame launches a part of the rays, and offers the receivers what any of the
 last launches met: the image method and the test for occlusion, with everything where it is now, decide
-which of that is a path. What one moving object was seen to reflect, all others of the same mesh are
-taken to reflect too: as traffic drives on, nobody has to be found twice.
+which of that is a path.
 """
 
 from __future__ import annotations
@@ -100,30 +99,14 @@ class Followed:
 
 
 class _FollowedOffer(Offer):
-    """Known chains in place of those of a launch, with twins: chains with one moving object in them, for each
-    other object of the same mesh."""
+    """Known chains in place of those of a launch."""
 
     def __init__(self, table: _Table, scene: SionnaScene, source: Any, options: LaunchOptions) -> None:
         super().__init__(scene, Launch((), None), source, options)
         self._scene, self._table = scene, table
-        planes = _planes(table, scene).astype(np.int32)
-        moving = scene.is_of_body(table.triangle) & (table.kind == REFLECTED)
-        single = moving.sum(1) == 1
-        templates = np.flatnonzero(single)
-        where = moving[templates].argmax(1)
-        _, first = np.unique(_keys(table, scene, moving)[templates], return_index=True)
-        templates, where = templates[first], where[first]
-        which, triangle = scene.twins(table.triangle[templates, where])
-        rest = np.flatnonzero(~single)
-        self._row = np.concatenate([rest, templates[which]])
-        self._place = np.concatenate([np.full(len(rest), -1), where[which]])
-        self._triangle = np.concatenate([np.zeros(len(rest), np.int64), triangle])
-        planes = planes[self._row]
-        twins = np.arange(len(rest), len(planes))
-        planes[twins, where[which]] = scene.plane_of[triangle]
         straight = (table.kind == 0) | (table.kind == REFLECTED) | (table.kind == REFRACTED)
-        number = np.arange(len(self._row))
-        self._chains = Chains(number, table.depth[self._row], planes, straight.all(1)[self._row])
+        planes = _planes(table, scene).astype(np.int32)
+        self._chains = Chains(np.arange(len(table.depth)), table.depth, planes, straight.all(1))
 
     def candidates(self, targets: Any) -> tuple[Candidates, Launch, int]:
         """As `Offer.candidates`, with a launch that has one ray for each candidate."""
@@ -134,26 +117,23 @@ class _FollowedOffer(Offer):
         """Rays that met what these of the chains on offer meet."""
         import mitsuba as mi
 
-        if not len(self._row):
+        if not len(self._table.depth):
             return Launch((), None)
-        row, place = self._row[chains], self._place[chains]
-        triangle = self._table.triangle[row]
-        twin = np.flatnonzero(place >= 0)
-        triangle[twin, place[twin]] = self._triangle[chains[twin]]
+        table = self._table.take(chains)
         bounces = []
-        for d in range(triangle.shape[1]):
-            shape, primitive = self._scene.shapes_of(triangle[:, d])
+        for d in range(table.kind.shape[1]):
+            shape, primitive = self._scene.shapes_of(table.triangle[:, d])
             # The image method mirrors at the plane through this point, which has moved with its object.
             corner, _ = self._scene.planes(shape, primitive)
-            point, probability = aligned_columns(corner.T), self._table.probability[row, d]
+            point, probability = aligned_columns(corner.T), aligned_columns(table.probability[None, :, d])
             bounces.append(
                 Bounce(
-                    kind=mi.UInt(aligned_indices(self._table.kind[row, d])),
+                    kind=mi.UInt(aligned_indices(table.kind[:, d])),
                     shape=mi.UInt(aligned_indices(shape)),
                     primitive=mi.UInt(aligned_indices(primitive)),
                     point=mi.Point3f(*map(mi.Float, point)),
                     normal=None,
-                    probability=mi.Float(aligned_columns(probability[None])[0]),
+                    probability=mi.Float(probability[0]),
                 )
             )
         return Launch(tuple(bounces), None)
@@ -179,16 +159,10 @@ def _planes(table: _Table, scene: SionnaScene) -> Int64Array:
     return np.where(table.kind == REFLECTED, scene.plane_of[table.triangle], -1)
 
 
-def _keys(table: _Table, scene: SionnaScene, moving: BoolArray | None = None) -> UInt64Array:
-    """What tells chains apart, as one number each: the kinds of their interactions and reflecting planes.
-
-    Where they are ``moving``, Shape ``[K, D]``, the plane of the mesh counts, whichever object has it.
-    """
-    planes = _planes(table, scene)
-    if moving is not None:
-        planes = np.where(moving, len(scene.plane_of) + scene.mesh_plane(table.triangle), planes)
+def _keys(table: _Table, scene: SionnaScene) -> UInt64Array:
+    """What tells chains apart, as one number each: the kinds of their interactions and reflecting planes."""
     keys = np.zeros(len(table.depth), np.uint64)
-    for kind, plane in zip(table.kind.T, planes.T, strict=True):
+    for kind, plane in zip(table.kind.T, _planes(table, scene).T, strict=True):
         keys ^= (kind + 16 * (plane + 1)).astype(np.uint64)
         # Finaliser of SplitMix64 (Steele, Lea, Flood 2014): a bijection that spreads every bit.
         keys = (keys ^ (keys >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)

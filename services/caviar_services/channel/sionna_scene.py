@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
+from caviar_protocol.arrays import Float64Array, Int32Array, Int64Array
 from caviar_protocol.errors import AssetError, PayloadError
 from caviar_protocol.scene import object_pose
 from caviar_protocol.topics import Scene
@@ -216,44 +216,6 @@ class SionnaScene:
             moved[number] = there if is_same else -1
         start = self._first_triangles[moved[piece]] + triangles - self._first_triangles[piece]
         return np.where(moved[piece] >= 0, start, -1)
-
-    def mesh_plane(self, triangles: Int64Array) -> Int64Array:
-        """What triangles by number have in common with those of other bodies of the same mesh: a number for
-        the mesh and plane."""
-        first = len(self._names) - len(self._bodies)
-        assets = sorted({asset for asset, _ in self._bodies})
-        rank = np.array([0] * first + [assets.index(asset) for asset, _ in self._bodies], np.int64)
-        piece = np.searchsorted(self._first_triangles, triangles, side="right") - 1
-        numbers: Int64Array = rank[piece] * len(self._face_of) + self._face_of[triangles]
-        return numbers
-
-    def is_of_body(self, triangles: Int64Array) -> BoolArray:
-        """Whether triangles by number are of moving bodies."""
-        first = len(self._names) - len(self._bodies)
-        moving: BoolArray = triangles >= self._first_triangles[first] if self._bodies else triangles < 0
-        return moving
-
-    def twins(self, triangles: Int64Array) -> tuple[Int64Array, Int64Array]:
-        """Triangles of bodies, by number, on all bodies of the same mesh that stand for an object now.
-
-        Returns which of those given each belongs to, and its number, each of Shape ``[L]``.
-        """
-        first = len(self._names) - len(self._bodies)
-        piece = np.searchsorted(self._first_triangles, triangles, side="right") - 1
-        local = triangles - self._first_triangles[piece]
-        assets = [asset for asset, _ in self._bodies]
-        which, found = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
-        for asset in sorted(set(assets)):
-            mine = np.flatnonzero([asset == assets[p - first] for p in piece.tolist()])
-            there = [
-                number
-                for number, body in enumerate(self._bodies, start=first)
-                if body[0] == asset and body in self._standing
-            ]
-            starts = self._first_triangles[np.array(there, np.int64)]
-            which.append(np.repeat(mine, len(there)))
-            found.append((local[mine][:, None] + starts).ravel())
-        return np.concatenate(which), np.concatenate(found)
 
     def object_index(self, shapes: Int64Array, primitives: Int64Array) -> Int32Array:
         """Index into the names of `place` of triangles of process-local shapes; −1 for no shape."""
