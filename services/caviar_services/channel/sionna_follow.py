@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt64Array
-from caviar_services.channel.sionna_candidates import Candidates, Offer
+from caviar_services.channel.sionna_candidates import Candidates, Offer, positions
 from caviar_services.channel.sionna_chains import Chains, chains_of
 from caviar_services.channel.sionna_launch import (
     REFLECTED,
@@ -26,6 +26,12 @@ from caviar_services.channel.sionna_launch import (
 )
 from caviar_services.channel.sionna_scene import SionnaScene
 from caviar_services.columns import aligned_columns, aligned_indices
+
+_JUMP = 20.0
+"""[m] A transmitter that has moved farther since the frame before is looked for anew."""
+
+_BESIDE = 8
+"""Rays to both sides of one on a moving object that are launched with it."""
 
 _KEPT = 5
 """Rounds of launches after which a chain that none of them met is forgotten."""
@@ -62,7 +68,8 @@ class _Table:
 class Followed:
     """The chains of one transmitter, from the beginning of an episode on.
 
-    The first frame launches all rays. After that, each launches every ``parts``-th of them, in turn.
+    The first frame launches all rays, and so does one in which the transmitter has jumped. All others launch
+    every ``parts``-th of them, in turn, and those on or beside moving objects: there paths come and go.
 
     Parameters
     ----------
@@ -75,27 +82,53 @@ class Followed:
         self._number = 0
         self._known: _Table | None = None
         self._names: tuple[str, ...] = ()
+        self._from = np.zeros(3)
+        """Where the last launch came from [m]."""
+        self._on_object: BoolArray = np.zeros(0, np.bool_)
+        """Which rays met a moving object when they were launched last."""
 
     def offer(
         self,
         launcher: Launcher,
-        source: Any,
+        transmitter: Float64Array,
         scene: SionnaScene,
         names: tuple[str, ...],
         options: LaunchOptions,
     ) -> Offer:
         """What there is to offer to the receivers of the next frame; ``names`` is what `SionnaScene.place`
         returned for it."""
-        known, number = self._known, self._number
-        launch = launcher(source, (0, 1) if known is None else (number % self._parts, self._parts))
+        jumped = self._known is not None and np.linalg.norm(transmitter - self._from) > _JUMP
+        known, number, source = None if jumped else self._known, self._number, positions(transmitter[None])
+        rays = None if known is None else self._rays(number % self._parts)
+        launch = launcher(source, rays, number)
+        self._note(launch, rays, scene, options.samples)
         met = _met(launch, chains_of(launch, scene, options.max_depth), scene, number)
         if known is not None:
             triangle = scene.moved_triangles(known.triangle, self._names, names)
             recent = known.seen > number - _KEPT * self._parts
             known = replace(known, triangle=triangle).take((triangle >= 0).all(1) & recent)
             met = met.with_those(known.take(~np.isin(_keys(known, scene), _keys(met, scene))))
-        self._known, self._names, self._number = met, names, number + 1
+        self._known, self._names, self._number, self._from = met, names, number + 1, transmitter
         return _FollowedOffer(met, scene, source, options)
+
+    def _rays(self, part: int) -> Int64Array:
+        """Numbers of the rays of a part, and of those on or beside moving objects."""
+        # Neighbours in the lattice's order point into neighbouring directions.
+        count = np.cumsum(np.pad(self._on_object, _BESIDE))
+        chosen: BoolArray = count[2 * _BESIDE :] - np.pad(count, (1, 0))[: -2 * _BESIDE - 1] > 0
+        chosen[part :: self._parts] = True
+        return np.flatnonzero(chosen)
+
+    def _note(self, launch: Launch, rays: Int64Array | None, scene: SionnaScene, samples: int) -> None:
+        """Remember which of these rays met moving objects."""
+        if rays is None:
+            self._on_object = np.zeros(samples, np.bool_)
+            rays = np.arange(samples)
+        met = np.zeros(len(rays), np.bool_)
+        for bounce in launch.bounces:
+            met |= (bounce.kind.numpy() != 0) & scene.is_body(bounce.shape.numpy())
+        if launch.bounces:
+            self._on_object[rays] = met
 
 
 class _FollowedOffer(Offer):

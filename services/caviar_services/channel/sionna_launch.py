@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array
+from caviar_services.columns import aligned_indices
 
 REFLECTED, SCATTERED, REFRACTED, DIFFRACTED = 1, 2, 4, 8
 """Flags of `sionna.rt.constants.InteractionType`; 0 is none."""
@@ -79,24 +80,22 @@ class Launcher:
             | DIFFRACTED * options.diffraction
         )
 
-    def __call__(self, source: Any, part: tuple[int, int] = (0, 1)) -> Launch:
-        """Launch from one position, a `mitsuba.Point3f` of width 1.
+    def __call__(self, source: Any, rays: Int64Array | None = None, seed: int = 0) -> Launch:
+        """Launch from one position, a `mitsuba.Point3f` of width 1: all rays, or those of these numbers.
 
-        Of ``part = (k, n)`` every n-th ray, from the k-th on: neighbours go with different parts.
+        ``seed`` varies what is drawn where a ray may go on in several ways.
         """
         import drjit as dr
         import mitsuba as mi
 
         if not self._enabled:
             return Launch((), None)
-        number, parts = part
-        samples = len(range(number, self._options.samples, parts))
-        self._sampler.seed(self._options.seed + number, samples)
+        samples = self._options.samples if rays is None else len(rays)
+        self._sampler.seed(self._options.seed + seed, samples)
         origin = dr.repeat(source, samples)
         direction = mi.Vector3f(self._directions)
-        if parts > 1:
-            ray = dr.arange(mi.UInt, samples) * dr.opaque(mi.UInt, parts) + dr.opaque(mi.UInt, number)
-            direction = dr.gather(mi.Vector3f, self._directions, ray)
+        if rays is not None:
+            direction = dr.gather(mi.Vector3f, self._directions, mi.UInt(aligned_indices(rays)))
         active, enabled = dr.full(mi.Bool, True, samples), dr.full(mi.UInt, self._enabled, samples)
         wedges = self._no_wedges(samples)
         dr.make_opaque(origin, direction, active, enabled, wedges)

@@ -30,7 +30,7 @@ from caviar_services.channel.sionna_scene import SceneSettings, SionnaScene
 from caviar_services.channel.sionna_tracer import Traced, Tracer
 from caviar_services.channel.specular import refined_points
 from caviar_services.llvm import activate_llvm, choose_variant
-from caviar_services.service import Preparation, RunInfo
+from caviar_services.service import Frame, Preparation, RunInfo, StepResult
 
 Array = NDArray[Any]
 
@@ -56,8 +56,9 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
         Annotated[int, quantity("1", "frames in which all rays are launched, a part in each", ge=2, le=1000)]
         | None
     ) = None
-    """Chains of reflections are followed from frame to frame instead of being looked for with all rays in
-    each: new ones are found within this many frames. Absent: each frame stands on its own."""
+    """Reflections and transmissions are followed from frame to frame, not looked for with all rays in each:
+    new ones are found within this many frames, and a channel that is started again in the middle of an
+    episode cannot go on. Absent: each frame stands on its own."""
     receivers_at_once: Annotated[
         int | None, quantity("1", "receivers looked at together; absent: as many as fit")
     ] = None
@@ -74,6 +75,13 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     outside_itu_range: OutsideRange = "error"
     """Where ITU-R P.2040 does not define a material at a carrier: ``error``; ``nearest``, the constants of
     the nearest end of a range; ``extrapolate``, the power law of that range."""
+
+    def __post_init__(self) -> None:
+        if self.follow is not None and (self.diffraction or self.scattering):
+            raise ValueError(
+                "follow knows reflections and transmissions only; leave it out, or set diffraction and "
+                "scattering to false"
+            )
 
 
 class SionnaChannel(PathModel[SionnaSettings]):
@@ -148,6 +156,19 @@ class SionnaChannel(PathModel[SionnaSettings]):
         wavelengths = [SPEED_OF_LIGHT / frequency for frequency in frequencies]
         self._tracer = Tracer(self._scene, wavelengths, launch)
         return (*notes, *self._warm_up())
+
+    def reset(self, episode: int, seed: int, t0_ns: int) -> None:
+        """Forget the paths of the episode before."""
+        self._followed.clear()
+
+    def step(self, frame: Frame) -> StepResult:
+        """Raises `PayloadError` where paths that shall be followed are not known."""
+        if self.settings.follow is not None and frame.previous < 0 < frame.number:
+            raise PayloadError(
+                f"{self.run.name} follows paths from the beginning of an episode and was started again in "
+                f"frame {frame.number}, where it knows none; without its setting `follow` the run goes on"
+            )
+        return super().step(frame)
 
     def release_memory(self) -> None:
         """Dr.Jit keeps freed buffers, some of each size that it has seen; sizes vary with the paths."""
@@ -259,8 +280,11 @@ class SionnaChannel(PathModel[SionnaSettings]):
         middle = (self._scene.low + self._scene.high) / 2
         above = np.array([middle[0], middle[1], self._scene.high[2] + 10.0])
         receivers = above + np.arange(1, 9)[:, None] * np.array([1.3, 0.7, -0.1])
-        self._tracer.trace(above, receivers)
-        self._tracer.trace(above + 0.5, receivers + 0.25)
+        followed = None if self.settings.follow is None else Followed(self.settings.follow)
+        for shift in (0.0, 0.5, 1.0):
+            self._tracer.trace(
+                above + shift, receivers + shift / 2, followed=followed, names=self._scene.names
+            )
         self.run.progress("kernels compiled", 0.0)
         return (f"kernels compiled in {time.monotonic() - begin:.1f} s",)
 

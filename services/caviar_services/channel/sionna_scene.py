@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from caviar_protocol.arrays import Float64Array, Int32Array, Int64Array
+from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
 from caviar_protocol.errors import AssetError, PayloadError
 from caviar_protocol.scene import object_pose
 from caviar_protocol.topics import Scene
@@ -94,6 +95,8 @@ class SionnaScene:
         self._meshes = {asset: _unit_mesh(asset, assets) for asset in pool}
         self._bodies: list[Body] = [(asset, slot) for asset in sorted(pool) for slot in range(pool[asset])]
         self._standing: frozenset[Body] = frozenset()
+        self.version = 0
+        """Counts how often anything has moved."""
         moving = self._moving_shapes(skins[0].constants if skins else None, settings.body_material == "metal")
         moved = sum(len(mesh.vertices) for mesh in moving[-1].meshes)
         self._replace_shapes([*_by_material(self._scene), *moving])
@@ -151,9 +154,10 @@ class SionnaScene:
         # A new assignment each frame: the product follows from this frame alone, also after a restart.
         taken = BodyPool(self._pool).assign((scene.names[i], scene.assets[i]) for i in solid)
         standing = {body: index[name] for name, body in taken.items()}
-        names, velocity = list(self._names), np.zeros((len(self._names), 3))
+        names, velocity = list(self.names), np.zeros((len(self.names), 3))
         first = len(names) - len(self._bodies)
         begin = len(self._vertices) - sum(len(self._meshes[asset].vertices) for asset, _ in self._bodies)
+        before = self._vertices.copy()
         for number, body in enumerate(self._bodies, start=first):
             mesh = self._meshes[body[0]]
             rows = slice(begin, begin + len(mesh.vertices))
@@ -164,7 +168,8 @@ class SionnaScene:
                 names[number], velocity[number] = scene.names[i], scene.velocity[i]
             elif body in self._standing:
                 self._vertices[rows] = self._middle
-        if standing or self._standing:
+        if not np.array_equal(before, self._vertices):
+            self.version += 1
             params = self._scene.mi_scene_params
             params[f"{_SKIN}.vertex_positions"] = _floats(self._vertices)
             params.update()
@@ -217,6 +222,10 @@ class SionnaScene:
         start = self._first_triangles[moved[piece]] + triangles - self._first_triangles[piece]
         return np.where(moved[piece] >= 0, start, -1)
 
+    def is_body(self, shapes: NDArray[np.uint32]) -> BoolArray:
+        """Whether process-local shapes are of moving bodies."""
+        return shapes == self._body_id
+
     def object_index(self, shapes: Int64Array, primitives: Int64Array) -> Int32Array:
         """Index into the names of `place` of triangles of process-local shapes; −1 for no shape."""
         where = self._where(shapes)
@@ -260,6 +269,7 @@ class SionnaScene:
         counts = [[len(mesh.faces) for mesh in shape.meshes] for shape in shapes]
         totals = np.array([sum(count) for count in counts], np.int64)
         ids = np.array([item.object_id for item in added], np.int64)
+        self._body_id = int(ids[-1]) if self._bodies else -1
         order = np.argsort(ids)
         self._ids = ids[order]
         self._offsets = (np.cumsum(totals) - totals)[order]
@@ -270,7 +280,8 @@ class SionnaScene:
         before = np.cumsum(corners) - corners
         self._corners = np.concatenate([mesh.vertices for mesh in meshes])
         self._faces = np.concatenate([mesh.faces + b for mesh, b in zip(meshes, before, strict=True)])
-        self._names = tuple(name for shape in shapes for name in shape.names)
+        self.names = tuple(name for shape in shapes for name in shape.names)
+        """What the indices of `object_index` stand for while no body stands for an object."""
         self._number_planes(meshes)
 
     def _number_planes(self, meshes: Sequence[Mesh]) -> None:

@@ -33,6 +33,9 @@ from caviar_services.columns import aligned_columns, aligned_indices
 _POLE = 1.2e-5
 """Below this horizontal part of a direction Sionna RT sets its azimuth to 0 (100 float32 epsilons)."""
 
+_REMEMBERED = 4
+"""Transmitters whose last launch is kept, in case nothing moves."""
+
 _LANES = 8_000_000
 """Candidates to be looked at together at most."""
 
@@ -83,6 +86,18 @@ class Traced:
         return replace(self, receiver=self.receiver + first)
 
 
+@dataclass(frozen=True, eq=False)
+class _Last:
+    """What was traced last from a position."""
+
+    version: int
+    """Of the scene."""
+    offer: Offer
+    receivers: Float64Array
+    """[m], Shape ``[R, 3]``."""
+    traced: Traced
+
+
 class Tracer:
     """The stages of the solver, bound to a scene and a set of options.
 
@@ -119,6 +134,7 @@ class Tracer:
         self._launcher = Launcher(scene.mi_scene, options)
         self._images = ImageMethod()
         self._fields = FieldCalculator()
+        self._last: dict[bytes, _Last] = {}
 
     def trace(
         self,
@@ -136,11 +152,39 @@ class Tracer:
         """
         if not len(receivers):
             return _joined([], len(self._wavelengths), self._options.max_depth)
-        source = positions(transmitter[None])
-        if followed is None:
-            offer = Offer(self._scene, self._launcher(source), source, self._options)
+        last = self._last.get(transmitter.tobytes())
+        if last is None or last.version != self._scene.version:
+            if followed is None:
+                source = positions(transmitter[None])
+                offer = Offer(self._scene, self._launcher(source), source, self._options)
+            else:
+                offer = followed.offer(self._launcher, transmitter, self._scene, names, self._options)
+            traced = self._offered(offer, transmitter, receivers, at_once)
         else:
-            offer = followed.offer(self._launcher, source, self._scene, names, self._options)
+            offer = last.offer
+            traced = self._since(last, transmitter, receivers, at_once)
+        self._last[transmitter.tobytes()] = _Last(self._scene.version, offer, receivers, traced)
+        while len(self._last) > _REMEMBERED:
+            del self._last[next(iter(self._last))]
+        return traced
+
+    def _since(
+        self, last: _Last, transmitter: Float64Array, receivers: Float64Array, at_once: int | None
+    ) -> Traced:
+        """Paths where nothing but receivers has moved: those of the others are what they were."""
+        known = {position.tobytes(): index for index, position in enumerate(last.receivers)}
+        before = np.array([known.get(position.tobytes(), -1) for position in receivers], np.int64)
+        new = np.flatnonzero(before < 0)
+        parts = [self._offered(last.offer, transmitter, receivers[new], at_once)] if len(new) else []
+        parts = [replace(part, receiver=new[part.receiver]) for part in parts]
+        for receiver in np.flatnonzero(before >= 0).tolist():
+            same = last.traced.take(last.traced.receiver == before[receiver])
+            parts.append(replace(same, receiver=np.full(len(same.receiver), receiver), lost=0))
+        return _joined(parts, len(self._wavelengths), self._options.max_depth)
+
+    def _offered(
+        self, offer: Offer, transmitter: Float64Array, receivers: Float64Array, at_once: int | None
+    ) -> Traced:
         if at_once is None:
             at_once = max(1, _LANES // max(offer.size, 1))
         parts = [

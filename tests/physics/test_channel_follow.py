@@ -1,0 +1,144 @@
+"""Paths that are followed from frame to frame, beside those that each frame looks for anew."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from channel_lab import Thing, antenna, scene
+from same_paths import model
+
+from caviar_protocol.errors import PayloadError
+from caviar_protocol.messages import GrantInput, Status
+from caviar_protocol.topics import AntennaArray, Channel, Scene
+from caviar_services.channel.base import ChannelModel
+from caviar_services.channel.sionna_rt import SionnaSettings
+from caviar_services.service import Frame, FrameInput
+
+CANYON = "simple_street_canyon_with_cars"
+SAMPLES = 40_000
+
+
+def street(frame: int, cars: int = 6, leaving: int = 0) -> Scene:
+    """Boxes that drive along the canyon, of which the first ``leaving`` have left; receivers on two."""
+    x = np.linspace(-40, 40, cars) + 0.8 * frame * (-1.0) ** np.arange(cars)
+    things = [
+        Thing(f"car-{i}", np.array((x[i], 2.5 * (-1.0) ** i, 0.8)), np.array((4.5, 1.8, 1.6)))
+        for i in range(leaving, cars)
+    ]
+    devices = [antenna("bs", "tx", np.array((-31.0, 5.0, 12.0)), AntennaArray())]
+    places = {"near": (-12.0 + 0.5 * frame, 0.3, 1.7), "far": (35.0 - 0.4 * frame, -1.1, 2.1)}
+    devices += [antenna(name, "rx", np.array(place), AntennaArray()) for name, place in places.items()]
+    return scene(devices, things)
+
+
+def stepped(channel: ChannelModel[Any], number: int, what: Scene, previous: int | None = None) -> Channel:
+    """The product of a frame."""
+    provenance = GrantInput(topic="scene", source="world", status=Status.FRESH, frame=number)
+    before = number - 1 if previous is None else previous
+    inputs = (FrameInput(provenance, payload=what),)
+    result = channel.step(Frame(episode=0, number=number, t_ns=0, previous=before, inputs=inputs))
+    product = result.products["channel"]
+    assert isinstance(product, Channel)
+    return product
+
+
+def share_found(followed: Channel, anew: Channel) -> float:
+    """Share of the power of paths found anew, those of reflections, that following has too."""
+    power = np.abs(anew.a[0]) ** 2 * (anew.interactions != 0).any(1)
+    pair = np.repeat(np.arange(len(anew.offsets) - 1), np.diff(anew.offsets))
+    known = np.repeat(np.arange(len(followed.offsets) - 1), np.diff(followed.offsets))
+    names = set(zip(known.tolist(), followed.id.tolist(), strict=True))
+    hit = [name in names for name in zip(pair.tolist(), anew.id.tolist(), strict=True)]
+    return float((power * hit).sum() / power.sum())
+
+
+def test_followed_paths_are_those_that_all_rays_find_and_where_they_are_now() -> None:
+    """Cars drive by; what both have agrees bit by bit in delay and amplitude."""
+    followed, anew = model(CANYON, follow=5, samples=SAMPLES), model(CANYON, samples=SAMPLES)
+    shares = []
+    for frame in range(12):
+        known, all_rays = stepped(followed, frame, street(frame)), stepped(anew, frame, street(frame))
+        shares.append(share_found(known, all_rays))
+        of_known = {
+            (i, t): a for i, t, a in zip(known.id.tolist(), known.tau.tolist(), known.a[0], strict=True)
+        }
+        both = [
+            (of_known[i, t], a)
+            for i, t, a in zip(all_rays.id.tolist(), all_rays.tau.tolist(), all_rays.a[0], strict=True)
+            if (i, t) in of_known
+        ]
+        assert len(both) > 4
+        np.testing.assert_allclose(*np.array(both).T, rtol=1e-5)
+        np.testing.assert_array_equal(known.los, all_rays.los)
+    assert shares[0] == 1.0
+    assert np.percentile(shares, 5) > 0.99
+
+
+def test_chains_follow_their_objects_to_other_bodies() -> None:
+    """Two cars leave, so that the others are given their bodies: paths off them go on."""
+    followed, anew = model(CANYON, follow=50, samples=SAMPLES), model(CANYON, samples=SAMPLES)
+    for frame in range(2):
+        stepped(followed, frame, street(frame))
+    known, all_rays = stepped(followed, 2, street(2, leaving=2)), stepped(anew, 2, street(2, leaving=2))
+    off_cars = [name for name in all_rays.object_names if name.startswith("car-")]
+    assert off_cars
+    assert set(off_cars) <= set(known.object_names)
+    assert share_found(known, all_rays) > 0.99
+
+
+def test_a_transmitter_that_jumps_is_looked_for_anew() -> None:
+    followed, anew = model(CANYON, follow=50, samples=SAMPLES), model(CANYON, samples=SAMPLES)
+    stepped(followed, 0, street(0))
+    devices = tuple(
+        msgspec.structs.replace(d, position=(30.0, -4.0, 9.0)) if d.name == "bs" else d
+        for d in street(1).devices
+    )
+    jumped = msgspec.structs.replace(street(1), devices=devices)
+    assert share_found(stepped(followed, 1, jumped), stepped(anew, 1, jumped)) == 1.0
+
+
+def test_an_episode_begins_without_what_the_one_before_knew() -> None:
+    channel = model(CANYON, follow=5, samples=SAMPLES)
+    first = [stepped(channel, frame, street(frame)) for frame in range(3)]
+    channel.reset(1, 0, 0)
+    again = [stepped(channel, frame, street(frame)) for frame in range(3)]
+    for one, other in zip(first, again, strict=True):
+        assert one == other
+
+
+def test_who_was_started_again_within_an_episode_says_that_it_knows_nothing() -> None:
+    channel = model(CANYON, follow=5, samples=SAMPLES)
+    with pytest.raises(PayloadError, match=r"started again in frame 7.*without its setting `follow`"):
+        stepped(channel, 7, street(7), previous=-1)
+
+
+@pytest.mark.parametrize("option", ["diffraction", "scattering"])
+def test_what_cannot_be_followed_is_refused(option: str) -> None:
+    with pytest.raises(msgspec.ValidationError, match="follow knows reflections and transmissions only"):
+        msgspec.convert({"follow": 5, option: True}, SionnaSettings)
+
+
+def test_where_nothing_moves_but_receivers_the_rays_are_launched_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Bit by bit what a new channel computes, and receivers that stand still are not traced again."""
+    channel = model(CANYON, samples=SAMPLES)
+    launched: list[int] = []
+    launcher = channel._tracer._launcher  # type: ignore[attr-defined]  # counted on its way
+    monkeypatch.setattr(channel._tracer, "_launcher", lambda *a: launched.append(1) or launcher(*a))  # type: ignore[attr-defined]
+    still = street(0)
+    first = stepped(channel, 0, still)
+    assert launched == [1]
+    assert stepped(channel, 1, still) == first
+    devices = tuple(
+        msgspec.structs.replace(d, position=(20.0, 1.0, 1.5)) if d.name == "far" else d for d in still.devices
+    )
+    moved = msgspec.structs.replace(still, devices=devices)
+    found = stepped(channel, 2, moved)
+    assert launched == [1]
+    assert found == stepped(model(CANYON, samples=SAMPLES), 2, moved)
+    stepped(channel, 3, street(1))
+    assert launched == [1, 1]
