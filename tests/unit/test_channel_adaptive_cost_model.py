@@ -46,14 +46,14 @@ def test_persistent_load_shifts_all_rungs_and_goes_again() -> None:
 
 
 def test_the_stated_quantile_bounds_as_many_frames_as_it_says() -> None:
-    """Log-normal scatter of 30 %: what is stated holds in so many of 2,000 frames, within 3 points."""
+    """Log-normal scatter of 30 %: what is stated holds in so many of 2,000 frames, within 4 points."""
     for quantile in (0.95, 0.9):
         rng = np.random.default_rng(5)
         costs, held = model(10, quantile=quantile), 0
         for duration in 10 * np.exp(rng.normal(0, 0.3, 2000)):
             held += duration <= in_ms(costs)[0]
             costs.observe(0, WORK, round(duration * MS))
-        assert held / 2000 == pytest.approx(quantile, abs=0.03)
+        assert held / 2000 == pytest.approx(quantile, abs=0.04)
 
 
 def test_cost_grows_with_pairs_and_objects_as_it_was_seen_to() -> None:

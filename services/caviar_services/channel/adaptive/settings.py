@@ -27,9 +27,9 @@ class LadderRung(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     """Any registered channel model."""
     settings: dict[str, Any] = msgspec.field(default_factory=dict)
     """Its own, beside and before those in ``common``."""
-    expected_error_db: Annotated[
-        float | None, quantity("dB", "NMSE of H against the highest rung, until it is measured")
-    ] = None
+    expected_error_db: (
+        Annotated[float, quantity("dB", "NMSE of H against the highest rung, until it is measured")] | None
+    ) = None
 
 
 class AdaptiveSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -42,9 +42,9 @@ class AdaptiveSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     fixed: str = ""
     """Label of the rung that every frame is computed on; empty: what fits the budget. A run whose rung
     follows from durations cannot be repeated, unless its decisions are imposed."""
-    budget_ms: Annotated[
-        float | None, quantity("ms", "for a frame, in place of the service's own budget", gt=0)
-    ] = None
+    budget_ms: (
+        Annotated[float, quantity("ms", "for a frame, in place of the service's own budget", gt=0)] | None
+    ) = None
     quantile: Annotated[float, quantity("1", "of a frame's duration that must fit", gt=0, lt=1)] = 0.95
     share: Annotated[float, quantity("1", "of the budget that it may take", gt=0, le=1)] = 0.8
     margin: Annotated[float, quantity("1", "of that which is spare before going up", ge=0, lt=1)] = 0.1
