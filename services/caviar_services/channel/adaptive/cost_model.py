@@ -46,8 +46,9 @@ _LOAD_STEP = 0.06
 """Standard deviation of what load changes from one frame to the next."""
 _SCATTER = 0.1
 """Standard deviation of a frame."""
-_SURPRISE = 0.4
-"""Beyond this a frame says only that it was slower or faster, not how much."""
+_SURPRISE = 0.5
+"""One frame that is so far from what was expected says only that it was slower or faster, not how much; the
+second in a row, that something has changed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,6 +85,11 @@ class CostModel:
         self._kept = np.concatenate([[1.0], np.full(3 * count, kept)])
         # What makes the prior the spread that a rung goes back to.
         self._drift = np.diag(np.concatenate([[_LOAD_STEP], deviation * math.sqrt(1 - kept**2)]) ** 2)
+        self._side = 0
+        """Of the last frame: 1 slower than expected by far, −1 faster by far."""
+        self._changed = 0
+        """What has changed if the next one is so, too: the load, or the bias of the rung that came with it."""
+        self._rung: int | None = None
         nothing = Workload(pairs=pairs, objects=0)
         # As if as many frames had gone by already: the first one alone decides nothing.
         timed = [
@@ -124,9 +130,17 @@ class CostModel:
         covariance = self._kept[:, None] * self._covariance * self._kept + self._drift
         row, measured = self._row(rung, work), math.log(max(duration_ns, 1)) - float(self._timing[rung])
         expected = float(row @ self._mean)
+        surprise = measured - expected
+        side = 0 if abs(surprise) < _SURPRISE else 1 if surprise > 0 else -1
+        if side and side == self._side:
+            covariance[self._changed, self._changed] += surprise**2
+        else:
+            surprise = min(max(surprise, -_SURPRISE), _SURPRISE)
+            self._changed = 0 if self._rung in (None, rung) else 1 + 3 * rung
+        self._side, self._rung = side, rung
         gain = covariance @ row
         gain /= _SCATTER**2 + float(row @ gain)
-        self._mean = self._mean + gain * min(max(measured - expected, -_SURPRISE), _SURPRISE)
+        self._mean = self._mean + gain * surprise
         covariance = covariance - np.outer(gain, row @ covariance)
         self._covariance = (covariance + covariance.T) / 2
         self._rows.append(row)

@@ -9,13 +9,11 @@ from typing import Annotated, Any
 import msgspec
 
 from caviar_protocol.arrays import quantity
-from caviar_protocol.errors import ScenarioError
+from caviar_protocol.errors import DeclarationError, ScenarioError
 from caviar_protocol.tables import Place, convert_settings, suggestion
 from caviar_services.channel.base import ChannelModel
 from caviar_services.registry import load
 from caviar_services.service import RunInfo
-
-ITSELF = "adaptive"
 
 
 class LadderRung(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -73,7 +71,7 @@ def built(settings: AdaptiveSettings, run: RunInfo) -> tuple[Rung, ...]:
     """The ladder of a scenario. Raises `ScenarioError` naming the key for whatever cannot be."""
     place = Place("services").at(run.name).at("settings")
     _check(settings, place)
-    found = [load("channel", rung.use) for rung in settings.ladder]
+    found = [_model(rung.use, place.at("ladder").at(index)) for index, rung in enumerate(settings.ladder)]
     known = [frozenset(cls.Settings.__struct_fields__) for cls in found]
     for name in settings.common:
         if not any(name in fields for fields in known):
@@ -89,15 +87,19 @@ def built(settings: AdaptiveSettings, run: RunInfo) -> tuple[Rung, ...]:
         where = place.at("ladder").at(index).at("settings")
         own = convert_settings(cls.Settings, {**shared, **rung.settings}, where)
         model = cls(own, run)
-        if not isinstance(model, ChannelModel):
-            raise (
-                place.at("ladder")
-                .at(index)
-                .at("use")
-                .error(f"{rung.use!r} is no ChannelModel, so it cannot be a rung")
-            )
         rungs.append(Rung(label=rung.label, model=model, expected_error_db=rung.expected_error_db))
     return tuple(rungs)
+
+
+def _model(use: str, place: Place) -> type[ChannelModel[Any]]:
+    """The channel model that a rung names."""
+    try:
+        cls = load("channel", use)
+    except DeclarationError as error:
+        raise place.at("use").error(str(error)) from error
+    if not issubclass(cls, ChannelModel):
+        raise place.at("use").error(f"is {use!r}, which is no ChannelModel and cannot be a rung")
+    return cls
 
 
 def rung_of(labels: tuple[str, ...], label: str, what: str) -> int:
@@ -114,9 +116,6 @@ def _check(settings: AdaptiveSettings, place: Place) -> None:
     for label, count in Counter(settings.labels).items():
         if count > 1:
             raise ladder.error(f"has {count} rungs with the label {label!r}; give each its own")
-    for index, rung in enumerate(settings.ladder):
-        if rung.use == ITSELF:
-            raise ladder.at(index).at("use").error("is 'adaptive', which cannot be a rung of itself")
     if settings.fixed and settings.fixed not in settings.labels:
         hint = suggestion(settings.fixed, settings.labels)
         raise place.at("fixed").error(f"is {settings.fixed!r}, which is no rung; {hint}")
