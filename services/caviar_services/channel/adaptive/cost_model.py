@@ -88,7 +88,7 @@ class CostModel:
         self._side = 0
         """Of the last frame: 1 slower than expected by far, −1 faster by far."""
         self._changed = 0
-        """What has changed if the next one is so, too: the load, or the bias of the rung that came with it."""
+        """What has changed if the next one is so, too: the load, or the bias of the rung that came."""
         self._rung: int | None = None
         nothing = Workload(pairs=pairs, objects=0)
         # As if as many frames had gone by already: the first one alone decides nothing.
