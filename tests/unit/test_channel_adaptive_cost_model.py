@@ -21,14 +21,20 @@ def in_ms(costs: CostModel, work: Workload = WORK) -> list[float]:
     return [predicted / MS for predicted in costs.predict(work)]
 
 
-def test_before_the_first_frame_predictions_are_the_timings_with_their_scatter() -> None:
-    assert in_ms(model(10, 100)) == pytest.approx([10.2, 102], rel=1e-3)
+def test_before_the_first_frame_predictions_are_the_timings_and_some_scatter() -> None:
+    """A p95 of 15 % scatter is 28 % more than the median."""
+    low, high = in_ms(model(10, 100))
+    assert low == pytest.approx(12.8, rel=0.05)
+    assert high / low == pytest.approx(10)
 
 
 def test_one_slow_frame_moves_predictions_little_and_two_do() -> None:
     costs = model(10, 100)
+    for _ in range(20):
+        costs.observe(0, WORK, 10 * MS)
+    before = in_ms(costs)[1]
     costs.observe(0, WORK, 50 * MS)
-    assert in_ms(costs)[1] < 130
+    assert in_ms(costs)[1] < 1.4 * before
     costs.observe(0, WORK, 50 * MS)
     assert in_ms(costs)[0] > 40
     assert in_ms(costs)[1] > 250
@@ -43,11 +49,11 @@ def test_persistent_load_shifts_all_rungs_and_goes_again() -> None:
         for frame in range(frames):
             costs.observe(0, WORK, round(10 * times * MS))
             if frame >= 2:
-                assert in_ms(costs) == pytest.approx([10 * times, 100 * times], rel=0.3)
+                assert in_ms(costs) == pytest.approx([10 * times, 100 * times], rel=0.5)
         for frame in range(20):
             costs.observe(0, WORK, 10 * MS)
             if frame >= 2:
-                assert in_ms(costs) == pytest.approx([10, 100], rel=0.3)
+                assert in_ms(costs) == pytest.approx([10, 100], rel=0.6)
 
 
 def test_the_stated_quantile_bounds_as_many_frames_as_it_says() -> None:
@@ -112,6 +118,17 @@ def test_constant_work_for_long_leaves_the_model_finite_and_quick() -> None:
     for _ in range(60):
         costs.observe(0, Workload(pairs=20, objects=5), 15 * MS)
     assert in_ms(costs, Workload(pairs=20, objects=5))[0] == pytest.approx(15, rel=0.2)
+
+
+def test_bursts_of_slow_frames_are_covered_as_well() -> None:
+    """Five slow frames in every fifty: a quantile of what was lately would be short in all of them."""
+    rng = np.random.default_rng(8)
+    costs, held, frames = model(10), 0, 3000
+    for frame in range(frames):
+        duration = 10 * np.exp(rng.normal(0, 0.05)) * (1.5 if frame % 50 >= 45 else 1)
+        held += duration <= in_ms(costs)[0]
+        costs.observe(0, WORK, round(duration * MS))
+    assert held / frames == pytest.approx(0.95, abs=0.03)
 
 
 def test_equal_durations_give_equal_predictions() -> None:

@@ -9,7 +9,9 @@ Approach to Linear Filtering and Prediction Problems", 1960) tells these apart: 
 to frame, and what changes with the rung is the rung's. What a rung has learned goes back towards its
 prior in time, so that one that was slow once is tried again.
 
-Stated is a quantile: the expected duration times that quantile of the recent ratios measured / expected.
+Stated is a quantile: the expected duration times that quantile of the recent ratios measured / expected,
+raised as long as more frames than that take longer (the quantile tracking of Angelopoulos, Candès and
+Tibshirani, "Conformal PID Control for Time Series Prediction", 2023): slow frames come in bursts.
 """
 
 from __future__ import annotations
@@ -18,14 +20,17 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array
 
 HALF_LIFE = 32
-"""Frames after which a ratio counts half. One slow frame is then 2 % of all, and does not move a p95; two are
-4 %, and do."""
+"""Frames after which a ratio counts half. One slow frame is then 2 to 4 % of all, and leaves a p95 alone."""
+
+TRACKING = 0.1
+"""How much the stated quantile is raised by a frame that exceeds it, in the logarithm."""
 
 REVERSION = 128
 """Frames after which half of what is not seen again of a rung is gone."""
@@ -36,6 +41,11 @@ OBJECTS = 10.0
 _WINDOW = 6 * HALF_LIFE
 """Older ratios weigh less than two percent together."""
 
+_ASSUMED = 32
+"""Frames that are taken to have gone by before the first, so that it alone decides little."""
+_ASSUMED_SCATTER = 0.15
+"""Their standard deviation: what a machine with other things to do showed."""
+
 _PRIOR = np.array([0.0, 0.5, 0.1])
 _PRIOR_DEVIATION = np.array([0.2, 0.3, 0.2])
 """Of bias, α and β: half of a frame grows with its pairs, a little with its objects."""
@@ -45,7 +55,7 @@ _LOAD_DEVIATION = 0.3
 _LOAD_STEP = 0.06
 """Standard deviation of what load changes from one frame to the next."""
 _SCATTER = 0.1
-"""Standard deviation of a frame."""
+"""Standard deviation of a frame, as far as it decides how fast is learned."""
 _SURPRISE = 0.5
 """One frame that is so far from what was expected says only that it was slower or faster, not how much; the
 second in a row, that something has changed."""
@@ -90,17 +100,29 @@ class CostModel:
         self._changed = 0
         """What has changed if the next one is so, too: the load, or the bias of the rung that came."""
         self._rung: int | None = None
-        nothing = Workload(pairs=pairs, objects=0)
-        # As if as many frames had gone by already: the first one alone decides nothing.
+        self._raised = 0.0
+        """Logarithm of what the stated quantile is raised by."""
+        self._rows: deque[Float64Array] = deque(maxlen=_WINDOW)
+        self._measured: deque[float] = deque(maxlen=_WINDOW)
+        self._expected: deque[float] = deque(maxlen=_WINDOW)
+        self._assume(timings_ns)
+
+    def _assume(self, timings_ns: Sequence[Sequence[int]]) -> None:
+        """Frames as those timings, with the scatter that frames are assumed to have."""
+        rows = [self._row(rung, Workload(pairs=self._pairs, objects=0)) for rung in range(len(timings_ns))]
         timed = [
-            (self._row(rung, nothing), math.log(max(duration, 1)) - self._timing[rung])
+            (rung, math.log(max(duration, 1)) - float(self._timing[rung]))
             for rung, timings in enumerate(timings_ns)
             for duration in timings
         ]
-        rows = [timed[index % len(timed)] for index in range(_WINDOW)]
-        self._rows = deque([row for row, _ in rows], maxlen=_WINDOW)
-        self._measured = deque([value for _, value in rows], maxlen=_WINDOW)
-        self._expected = deque([float(row @ self._mean) for row, _ in rows], maxlen=_WINDOW)
+        scatter = NormalDist(0.0, _ASSUMED_SCATTER)
+        for index in range(_ASSUMED):
+            rung, measured = timed[index % len(timed)]
+            # 7 and the count have no common factor, so every share comes once, and high and low by turns.
+            share = (index * 7 % _ASSUMED + 0.5) / _ASSUMED
+            self._rows.append(rows[rung])
+            self._measured.append(measured + scatter.inv_cdf(share))
+            self._expected.append(0.0)
 
     @property
     def load(self) -> float:
@@ -116,13 +138,17 @@ class CostModel:
 
     def predict(self, work: Workload) -> list[float]:
         """The stated quantile of the duration of a frame on each rung [ns]."""
+        factor = math.exp(self._log_factor())
+        return [factor * expected for expected in self.expect(work)]
+
+    def _log_factor(self) -> float:
+        """Logarithm of the ratio of the stated quantile to what is expected."""
         measured = np.array(self._measured)
         # Against what was expected then, a rise is remembered for long after it was understood; against
         # what would be expected now, a fall. The smaller one has understood both.
         then = _weighted_quantile(measured - np.array(self._expected), self._quantile)
         now = _weighted_quantile(measured - np.array(self._rows) @ self._mean, self._quantile)
-        factor = math.exp(min(then, now))
-        return [factor * expected for expected in self.expect(work)]
+        return min(then, now) + self._raised
 
     def observe(self, rung: int, work: Workload, duration_ns: int) -> None:
         """A frame on this rung took so long."""
@@ -131,6 +157,8 @@ class CostModel:
         row, measured = self._row(rung, work), math.log(max(duration_ns, 1)) - float(self._timing[rung])
         expected = float(row @ self._mean)
         surprise = measured - expected
+        missed = surprise > self._log_factor()
+        self._raised = max(0.0, self._raised + TRACKING * (missed - (1 - self._quantile)))
         side = 0 if abs(surprise) < _SURPRISE else 1 if surprise > 0 else -1
         if side and side == self._side:
             covariance[self._changed, self._changed] += surprise**2
@@ -160,11 +188,8 @@ class CostModel:
 
 
 def _weighted_quantile(values: Float64Array, quantile: float) -> float:
-    """What a further value exceeds with probability 1 − quantile; the last value counts most."""
+    """Quantile of values of which the last one counts most."""
     order = np.argsort(values, kind="stable")
-    weights = 0.5 ** (np.arange(len(values))[::-1] / HALF_LIFE)
-    total = float(weights.sum())
-    effective = total**2 / float((weights**2).sum())
-    rank = quantile * (1 + 1 / effective) * total  # the (n + 1)·q-th of n equal weights
-    index = int(np.searchsorted(np.cumsum(weights[order]), rank))
+    share = np.cumsum(0.5 ** (np.arange(len(values))[::-1] / HALF_LIFE)[order])
+    index = int(np.searchsorted(share, quantile * share[-1]))
     return float(values[order[min(index, len(values) - 1)]])
