@@ -21,6 +21,7 @@ BUILT_IN: dict[str, str] = {
     "world:sumo": "caviar_services.world.sumo:SumoWorld",
     "world:trajectory": "caviar_services.world.trajectory:TrajectoryWorld",
     "world:flight": "caviar_services.world.flight:FlightWorld",
+    "channel:adaptive": "caviar_services.channel.adaptive.channel:AdaptiveChannel",
     "channel:free-space": "caviar_services.channel.free_space:FreeSpaceChannel",
     "channel:geometric": "caviar_services.channel.geometric:GeometricChannel",
     "channel:sionna-rt": "caviar_services.channel.sionna_rt:SionnaChannel",

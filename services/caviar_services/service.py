@@ -134,7 +134,11 @@ class Frame(msgspec.Struct, frozen=True, kw_only=True):
     """The frame this service last completed; −1: none. A world steps the whole gap."""
     final: bool = False
     """The agent's extra grant behind the last frame (clause 16)."""
+    budget_ns: int = 0
+    """Wall time that this service has for the frame [ns]; 0: no limit."""
     inputs: tuple[FrameInput, ...] = ()
+    imposed: Mapping[str, str] = {}
+    """Decisions of the run that is replayed (clause 6); they go before what the service would decide."""
     reports: tuple[Report, ...] = ()
     """Recorders: what the services of this frame reported beside their products."""
     service: str = ""

@@ -20,6 +20,7 @@ from caviar_services.testing import CONFORMANCE, ServiceConformance
 SCENARIOS = Path(__file__).resolve().parents[2] / "deploy" / "scenarios"
 
 EXTRAS = {
+    "channel:adaptive": "sionna",
     "world:sumo": "libsumo",
     "sensors:camera": "mitsuba",
     "world:flight": "sionna",
@@ -29,6 +30,14 @@ EXTRAS = {
 """Package without which an implementation cannot run; a base install skips it."""
 
 OVERRIDES: dict[str, dict[str, object]] = {
+    "channel:adaptive": {
+        "ladder": [
+            {"label": label, "settings": {"samples": samples}}
+            for label, samples in (("2e2", 200), ("2e3", 2000))
+        ],
+        "common": {"max_depth": 2, "pool": {}, "bodies": 2},
+        "calibrate_every": 2,
+    },
     "channel:sionna-rt": {"samples": 2000, "pool": {}, "bodies": 2},
     "sensors:lidar": {"grid": {"minimum_m": [-60, -40, 0], "maximum_m": [80, 30, 12], "cells": [28, 14, 6]}},
 }

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from caviar_clients.cli.decided import Decided, Decisions, decided_lines
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.messages import Status
@@ -64,6 +65,7 @@ class RunSummary(msgspec.Struct, kw_only=True):
     bytes: Annotated[int, quantity("B", "size of the segments")]
     sources: list[SourceSummary]
     link: LinkSummary | None
+    decided: list[Decided]
     versions: dict[str, str]
     machine: dict[str, str]
     notes: tuple[str, ...]
@@ -83,10 +85,11 @@ def summarise(recording: Recording) -> RunSummary:
     """The summary of a recording. Damaged frames are listed and count as if they had no products."""
     metadata, damage = recording.metadata, []
     sources: dict[tuple[str, str], SourceSummary] = {}
-    totals = _LinkTotals()
+    totals, decisions = _LinkTotals(), Decisions()
     episodes: dict[int, int] = {}  # to the last instant [ns]
     for frame in recording.frames():
         episodes[frame.episode] = max(frame.t_ns, episodes.get(frame.episode, 0))
+        decisions.add(frame.episode, frame.reports)
         for entry in frame.inputs:
             key = (entry.topic, entry.source)
             source = sources.setdefault(key, SourceSummary(topic=entry.topic, source=entry.source))
@@ -109,6 +112,7 @@ def summarise(recording: Recording) -> RunSummary:
         bytes=sum(file.stat().st_size for file in recording.files),
         sources=[sources[key] for key in sorted(sources)],
         link=totals.summary(),
+        decided=decisions.summary(),
         versions=metadata.versions,
         machine=metadata.machine,
         notes=metadata.notes,
@@ -211,6 +215,8 @@ def _facts(summary: RunSummary) -> Table:
         )
     if link is not None:
         table.add_row("no path", f"{link.no_path_share:.2%} of {_count(link.users, 'user')} over all frames")
+    for line in decided_lines(summary.decided):
+        table.add_row("decided", escape(line))
     machine = summary.machine
     table.add_row("machine", escape(", ".join(f"{key} {value}" for key, value in sorted(machine.items()))))
     table.add_row("versions", escape(", ".join(f"{k} {v}" for k, v in summary.versions.items())))

@@ -18,7 +18,7 @@ from rich.text import Text
 from caviar_clients.cli.inside import EmbeddedLauncher
 from caviar_clients.cli.launch import Launcher
 from caviar_clients.cli.remote import reachable, start_command, waiting_text
-from caviar_clients.cli.summary import link_figures, summary_of, summary_table
+from caviar_clients.cli.summary import recorded_figures, summary_of, summary_table
 from caviar_clients.sessions.checking import checked_scenario
 from caviar_protocol.errors import RunError
 from caviar_protocol.scenario import Scenario
@@ -81,8 +81,8 @@ def run_scenario(
             watcher.take(event)
             if event["event"] == "finished":
                 outcome = event
-    figures = link_figures(directory) if outcome["frames"] else None
-    summary = summary_of(outcome, figures, scenario.run.name, directory, scenario.run.seed)
+    recorded = recorded_figures(directory) if outcome["frames"] else None
+    summary = summary_of(outcome, recorded, scenario.run.name, directory, scenario.run.seed)
     text = json.dumps(summary, indent=2, ensure_ascii=False) + "\n"
     _write(directory / "summary.json", text)
     if json_file is not None:

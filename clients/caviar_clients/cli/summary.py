@@ -6,27 +6,30 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from caviar_clients.cli.inspect import LinkSummary, summarise
+from caviar_clients.cli.decided import Decided, decided_lines
+from caviar_clients.cli.inspect import RunSummary, summarise
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.recording import Recording
 
 
-def link_figures(directory: Path) -> LinkSummary | None:
-    """Means over the link products of a run's recording; None where it has none."""
+def recorded_figures(directory: Path) -> RunSummary | None:
+    """What a run's recording comes to; None where it has none."""
     try:
-        return summarise(Recording(directory)).link
+        return summarise(Recording(directory))
     except RecordingError:
         return None
 
 
 def summary_of(
-    outcome: Mapping[str, Any], figures: LinkSummary | None, scenario: str, directory: Path, seed: int
+    outcome: Mapping[str, Any], recorded: RunSummary | None, scenario: str, directory: Path, seed: int
 ) -> dict[str, Any]:
     """Everything `--json` writes."""
+    figures = recorded.link if recorded else None
     return {
         "run": directory.name,
         "scenario": scenario,
@@ -42,6 +45,7 @@ def summary_of(
         "mean_abs_y_best": figures.mean_abs_y_best if figures else None,
         "mean_abs_y_baseline": figures.mean_abs_y_baseline if figures else None,
         "no_path_share": figures.no_path_share if figures else None,
+        "decided": msgspec.to_builtins(recorded.decided) if recorded else [],
     }
 
 
@@ -73,4 +77,5 @@ def _caption(summary: Mapping[str, Any]) -> str:
         )
     if summary["no_path_share"]:
         parts.append(f"{summary['no_path_share']:.1%} of users without a path")
+    parts += decided_lines(msgspec.convert(summary["decided"], list[Decided]))
     return "\n".join(parts)

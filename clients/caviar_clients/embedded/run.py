@@ -26,6 +26,7 @@ from caviar_clients.embedded.place import Place, Seat
 from caviar_protocol import messages as m
 from caviar_protocol.assets import AssetStore
 from caviar_protocol.errors import RunError
+from caviar_protocol.replay import Imposed
 from caviar_protocol.scenario import Scenario
 from caviar_services.registry import load
 from caviar_services.service import Service
@@ -45,6 +46,9 @@ class EmbeddedRun:
         Told what the user should know, and of each finished frame.
     seats
         By name, services that decide outside of the run (`Seat`), with the class that declares them.
+    imposed
+        Decisions that services take over in place of their own, as
+        `caviar_protocol.replay.recorded_decisions` finds them.
     """
 
     def __init__(
@@ -54,6 +58,7 @@ class EmbeddedRun:
         on_notice: Callable[[ev.Notice], None] = lambda notice: None,
         on_frame: Callable[[ev.FrameFinished], None] = lambda frame: None,
         seats: Mapping[str, type[Service[Any]]] | None = None,
+        imposed: Imposed | None = None,
     ) -> None:
         if directory is None:
             scenario = _without_recorders(scenario)
@@ -65,7 +70,7 @@ class EmbeddedRun:
         folder = (directory or Path()).resolve()
         plan = plan_run(scenario, folder.name, briefings(scenario, folder))
         # Whoever runs ahead gains nothing in one process, and works in vain where an agent ends the episode.
-        plan = replace(plan, frames_in_flight=1, ephemeral=directory is None)
+        plan = replace(plan, frames_in_flight=1, ephemeral=directory is None, imposed=imposed or {})
         self.statistics = Statistics({s.name: s.budget_ns for s in plan.services})
         self._now = 0
         self._clock = FrameClock(plan, self._now)

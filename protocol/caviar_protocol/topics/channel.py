@@ -98,7 +98,7 @@ class Channel(Payload, frozen=True, kw_only=True, omit_defaults=True):
     options: ChannelOptions = ChannelOptions()
     """What was modelled."""
     expected_error_db: Annotated[
-        float | None, quantity("dB", "expected NMSE of H against the next rung; absent: unknown")
+        float | None, quantity("dB", "expected NMSE of H against the ladder's highest rung; absent: unknown")
     ] = None
     carriers: tuple[Carrier, ...]
     """The carriers that axis C counts."""

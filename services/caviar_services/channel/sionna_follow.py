@@ -115,7 +115,8 @@ class Followed:
         """Numbers of the rays of a part, and of those on or beside moving objects."""
         # Neighbours in the lattice's order point into neighbouring directions.
         count = np.cumsum(np.pad(self._on_object, _BESIDE))
-        chosen: BoolArray = count[2 * _BESIDE :] - np.pad(count, (1, 0))[: -2 * _BESIDE - 1] > 0
+        beside = count[2 * _BESIDE :] - np.pad(count, (1, 0))[: -2 * _BESIDE - 1]
+        chosen: BoolArray = np.greater(beside, 0)
         chosen[part :: self._parts] = True
         return np.flatnonzero(chosen)
 

@@ -27,6 +27,7 @@ from caviar_services.channel.sionna_materials import (
     OutsideUse,
 )
 from caviar_services.channel.sionna_scene import SceneSettings, SionnaScene
+from caviar_services.channel.sionna_sharing import scene_of
 from caviar_services.channel.sionna_tracer import Traced, Tracer
 from caviar_services.channel.specular import refined_points
 from caviar_services.llvm import activate_llvm, choose_variant
@@ -124,7 +125,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         notes = self._start()
         self.run.progress("loading the scene", _COMPILE_GRACE_S)
         frequencies = tuple(carrier.frequency_hz for carrier in self.run.carriers)
-        self._scene = SionnaScene(
+        self._scene = scene_of(
             preparation.assets,
             self._pool_sizes(preparation.assets),
             SceneSettings(

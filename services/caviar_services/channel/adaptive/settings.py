@@ -1,0 +1,121 @@
+"""Settings of the adaptive channel, and the models that they name."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import msgspec
+
+from caviar_protocol.arrays import quantity
+from caviar_protocol.errors import DeclarationError, ScenarioError
+from caviar_protocol.tables import Place, convert_settings, suggestion
+from caviar_services.channel.base import ChannelModel
+from caviar_services.registry import load
+from caviar_services.service import RunInfo
+
+
+class LadderRung(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One rung: a channel model with its settings."""
+
+    label: str
+    """Its name in decisions and products."""
+    use: str = "sionna-rt"
+    """Any registered channel model."""
+    settings: dict[str, Any] = msgspec.field(default_factory=dict)
+    """Its own, beside and before those in ``common``."""
+    expected_error_db: (
+        Annotated[float, quantity("dB", "NMSE of H against the highest rung, until it is measured")] | None
+    ) = None
+
+
+class AdaptiveSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A ladder, and when to stand on which of its rungs."""
+
+    ladder: tuple[LadderRung, ...] = ()
+    """From the fastest to the most accurate."""
+    common: dict[str, Any] = msgspec.field(default_factory=dict)
+    """Settings of every rung whose model has them."""
+    fixed: str = ""
+    """Label of the rung that every frame is computed on; empty: what fits the budget. A run whose rung
+    follows from durations cannot be repeated, unless its decisions are imposed."""
+    budget_ms: (
+        Annotated[float, quantity("ms", "for a frame, in place of the service's own budget", gt=0)] | None
+    ) = None
+    quantile: Annotated[float, quantity("1", "of a frame's duration that must fit", gt=0, lt=1)] = 0.95
+    share: Annotated[float, quantity("1", "of the budget that it may take", gt=0, le=1)] = 0.8
+    margin: Annotated[float, quantity("1", "of that which is spare before going up", ge=0, lt=1)] = 0.1
+    patience: Annotated[int, quantity("frame", "that must have it in a row", ge=1)] = 10
+    calibrate_every: Annotated[
+        int,
+        quantity("frame", "from one that the highest rung computes too to the next; 0: none", ge=0),
+    ] = 0
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Of the rungs, lowest first."""
+        return tuple(rung.label for rung in self.ladder)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rung:
+    """A rung that is built."""
+
+    label: str
+    model: ChannelModel[Any]
+    expected_error_db: float | None
+
+
+def built(settings: AdaptiveSettings, run: RunInfo) -> tuple[Rung, ...]:
+    """The ladder of a scenario. Raises `ScenarioError` naming the key for whatever cannot be."""
+    place = Place("services").at(run.name).at("settings")
+    _check(settings, place)
+    found = [_model(rung.use, place.at("ladder").at(index)) for index, rung in enumerate(settings.ladder)]
+    known = [frozenset(cls.Settings.__struct_fields__) for cls in found]
+    for name in settings.common:
+        if not any(name in fields for fields in known):
+            everything = frozenset[str]().union(*known)
+            raise (
+                place.at("common")
+                .at(name)
+                .error(f"no rung has a setting {name!r}; {suggestion(name, everything)}")
+            )
+    rungs = []
+    for index, (rung, cls, fields) in enumerate(zip(settings.ladder, found, known, strict=True)):
+        shared = {name: value for name, value in settings.common.items() if name in fields}
+        where = place.at("ladder").at(index).at("settings")
+        own = convert_settings(cls.Settings, {**shared, **rung.settings}, where)
+        model = cls(own, run)
+        rungs.append(Rung(label=rung.label, model=model, expected_error_db=rung.expected_error_db))
+    return tuple(rungs)
+
+
+def _model(use: str, place: Place) -> type[ChannelModel[Any]]:
+    """The channel model that a rung names."""
+    try:
+        cls = load("channel", use)
+    except DeclarationError as error:
+        raise place.at("use").error(str(error)) from error
+    if not issubclass(cls, ChannelModel):
+        raise place.at("use").error(f"is {use!r}, which is no ChannelModel and cannot be a rung")
+    return cls
+
+
+def rung_of(labels: tuple[str, ...], label: str, what: str) -> int:
+    """Index of a label. Raises `ScenarioError` naming ``what`` asked for it, and the labels."""
+    if label not in labels:
+        raise ScenarioError(f"{what} is {label!r}, which is no rung; {suggestion(label, labels)}")
+    return labels.index(label)
+
+
+def _check(settings: AdaptiveSettings, place: Place) -> None:
+    ladder = place.at("ladder")
+    if not settings.ladder:
+        raise ladder.error(f"has no rung; write [[{ladder.key}]] with label, use and settings for each")
+    for label, count in Counter(settings.labels).items():
+        if count > 1:
+            raise ladder.error(f"has {count} rungs with the label {label!r}; give each its own")
+    if settings.fixed and settings.fixed not in settings.labels:
+        hint = suggestion(settings.fixed, settings.labels)
+        raise place.at("fixed").error(f"is {settings.fixed!r}, which is no rung; {hint}")

@@ -1,0 +1,175 @@
+"""The adaptive channel on a clock that stands still but for its rungs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from adaptive_rungs import LADDER, MS, Time, adaptive, channel_of, frame, labels, rung
+
+from caviar_protocol.codec import encode_payload
+from caviar_protocol.errors import ScenarioError
+from caviar_services.channel.adaptive.channel import AdaptiveChannel
+from caviar_services.registry import load
+from caviar_services.service import Preparation
+
+
+class TestLadder:
+    """What a scenario may say, and what is refused by key."""
+
+    @pytest.mark.parametrize(
+        ("settings", "expected"),
+        [
+            ({"ladder": []}, r"ladder: has no rung; write \[\[services.channel.settings.ladder\]\]"),
+            ({"ladder": [rung("a", 1), rung("a", 2)]}, "has 2 rungs with the label 'a'"),
+            ({"fixed": "hihg"}, "fixed: is 'hihg', which is no rung; did you mean 'high'"),
+            ({"common": {"takes_m": 3}}, "common.takes_m: no rung has a setting 'takes_m'; did you mean"),
+            (
+                {"ladder": [{"label": "a", "use": "free-space", "settings": {"sampls": 3}}]},
+                r"ladder\[0\].settings.sampls: unknown key",
+            ),
+            (
+                {"ladder": [{"label": "a", "use": "free-spac"}]},
+                r"ladder\[0\].use: .*did you mean 'free-space'",
+            ),
+            (
+                {"ladder": [{"label": "a", "use": "adaptive"}]},
+                "which is no ChannelModel and cannot be a rung",
+            ),
+        ],
+    )
+    def test_what_is_wrong_is_named(self, settings: dict[str, Any], expected: str) -> None:
+        with pytest.raises(ScenarioError, match=expected):
+            adaptive(**settings)
+
+    def test_common_settings_go_to_the_rungs_that_have_them_and_own_ones_go_before(self) -> None:
+        ladder = [
+            {"label": "free", "use": "free-space"},
+            rung("timed", 5),
+            {**rung("plain", 1), "settings": {}},
+        ]
+        made = adaptive(ladder=ladder, common={"takes_ms": 7.0})
+        assert [getattr(r.model.settings, "takes_ms", None) for r in made.rungs] == [None, 5, 7]
+
+    def test_it_is_registered(self) -> None:
+        assert load("channel", "adaptive") is AdaptiveChannel
+
+
+def test_notes_say_how_long_each_rung_took() -> None:
+    notes = adaptive().prepare(Preparation(demand={})).notes
+    assert notes == tuple(
+        f"rung {label}: {taken} ms for 2 pairs"
+        for label, taken in (("low", "10.0"), ("middle", "30.0"), ("high", "100.0"))
+    )
+
+
+class TestDecisions:
+    """Which rung computes a frame."""
+
+    @pytest.mark.parametrize(
+        ("budget_ms", "expected"), [(20, "low"), (60, "middle"), (200, "high"), (0, "high"), (5, "low")]
+    )
+    def test_the_most_accurate_that_fits(self, budget_ms: float, expected: str) -> None:
+        result = adaptive().step(frame(0, budget_ms))
+        assert result.decisions == {"rung": expected}
+        assert f" {expected}" in result.fidelity
+        assert result.counts.get("no-rung-fits", 0) == (budget_ms == 5)
+
+    def test_the_setting_goes_before_the_budget_of_the_grant(self) -> None:
+        assert adaptive(budget_ms=15.0).step(frame(0, 200)).decisions == {"rung": "low"}
+
+    def test_a_slow_down_leads_down_and_its_end_up_again(self) -> None:
+        """Four times as slow from frame 20 to 59: the high rung misses twice, then the middle one fits."""
+        channel, found, missed = adaptive(), [], 0
+        for number in range(140):
+            Time.load = 4.0 if 20 <= number < 60 else 1.0
+            found.append(channel.step(frame(number, 200)))
+            missed += found[-1].measured["rung"] > 200 * MS
+        rungs = labels(found)
+        assert set(rungs[:20]) == {"high"}
+        assert set(rungs[25:60]) <= {"low", "middle"}
+        assert rungs[59] == "middle", "120 of 160 ms"
+        assert set(rungs[100:]) == {"high"}
+        assert missed <= 3
+        assert sum(result.counts.get("rung-changes", 0) for result in found) <= 4
+
+    def test_a_fixed_rung_is_fixed(self) -> None:
+        channel = adaptive(fixed="middle")
+        assert labels([channel.step(frame(n, 1)) for n in range(3)]) == ["middle"] * 3
+
+    def test_what_is_imposed_goes_before_everything(self) -> None:
+        channel = adaptive(fixed="middle")
+        assert labels([channel.step(frame(n, 1, "high")) for n in range(3)]) == ["high"] * 3
+
+    def test_an_imposed_rung_that_is_none_is_refused(self) -> None:
+        with pytest.raises(ScenarioError, match=r"rung imposed is 'hig', .* did you mean 'high'"):
+            adaptive().step(frame(0, imposed="hig"))
+
+    def test_products_are_those_of_the_rung(self) -> None:
+        """Bit by bit, where no error is stated."""
+        channel = adaptive()
+        middle = channel.rungs[1].model.step(frame(3))
+        assert encode_payload(channel_of(channel.step(frame(3, imposed="middle")))) == encode_payload(
+            channel_of(middle)
+        )
+
+    def test_imposed_decisions_give_the_same_bytes_at_any_speed(self) -> None:
+        """Errors that are stated, too."""
+        first = adaptive(calibrate_every=3)
+        results = []
+        for number in range(40):
+            Time.load = 4.0 if number % 20 > 9 else 1.0
+            results.append(first.step(frame(number, 200)))
+        assert len(set(labels(results))) > 1
+        again = adaptive(calibrate_every=3)
+        for number, (result, label) in enumerate(zip(results, labels(results), strict=True)):
+            Time.load = 0.1
+            repeated = again.step(frame(number, 200, label))
+            assert encode_payload(channel_of(repeated)) == encode_payload(channel_of(result))
+
+
+class TestStatedErrors:
+    """Errors 0.1 (−20 dB) and a tenth of it, by turns, of the low rung; 0.01 of the middle one."""
+
+    def test_the_chosen_rung_is_checked_against_the_highest(self) -> None:
+        channel = adaptive(calibrate_every=1)
+        found = [channel.step(frame(number, 20)) for number in range(20)]
+        assert set(labels(found)) == {"low"}
+        stated = [channel_of(result).expected_error_db for result in found]
+        assert stated[:3] == [None, None, None]
+        assert stated[-1] == pytest.approx(-20, abs=0.11)
+        checks = sum(result.counts.get("error-checks", 0) for result in found)
+        covered = sum(result.counts.get("error-covered", 0) for result in found)
+        assert (checks, covered) == (17, 17)
+        assert found[-1].fidelity == f"free-space low, NMSE ≤ {stated[-1]:.1f} dB"
+        assert found[-1].measured["calibrate"] == 100 * MS
+
+    def test_while_the_highest_is_chosen_the_others_take_turns(self) -> None:
+        channel = adaptive(calibrate_every=1)
+        for number in range(12):
+            assert channel.step(frame(number)).decisions == {"rung": "high"}
+        assert [error.measured for error in channel.errors] == [6, 6, 0]
+        assert channel_of(channel.step(frame(12))).expected_error_db is None
+
+    def test_only_the_frames_asked_for_are_checked(self) -> None:
+        channel = adaptive(calibrate_every=4)
+        found = [channel.step(frame(number, 20)) for number in range(9)]
+        assert ["calibrate" in result.measured for result in found] == [n % 4 == 0 for n in range(9)]
+        assert not any("calibrate" in adaptive().step(frame(n, 20)).measured for n in range(3))
+
+    def test_matrices_that_nobody_asked_for_are_not_sent(self) -> None:
+        """They are needed to measure the error."""
+        channel = adaptive(h=False, calibrate_every=1)
+        found = [channel.step(frame(number, 20)) for number in range(5)]
+        assert all(channel_of(result).h == () for result in found)
+        assert channel_of(found[-1]).expected_error_db is not None
+
+    def test_a_declared_error_is_stated_until_it_is_measured(self) -> None:
+        ladder = [{**LADDER[0], "expected_error_db": -15.0}, *LADDER[1:]]
+        assert channel_of(adaptive(ladder=ladder).step(frame(0, 20))).expected_error_db == -15.0
+
+    def test_a_new_episode_begins_without_errors(self) -> None:
+        channel = adaptive(calibrate_every=1)
+        first = [encode_payload(channel_of(channel.step(frame(number, 20)))) for number in range(6)]
+        channel.reset(0, 1, 0)
+        assert [encode_payload(channel_of(channel.step(frame(n, 20)))) for n in range(6)] == first

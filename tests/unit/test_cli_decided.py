@@ -1,0 +1,38 @@
+"""What a summary says about decisions."""
+
+from __future__ import annotations
+
+from caviar_clients.cli.decided import Decisions, decided_lines
+from caviar_protocol.messages import Report
+
+
+def report(rung: str, **counts: int) -> Report:
+    told = {name.replace("_", "-"): count for name, count in counts.items()}
+    return Report(source="channel", decisions={"rung": rung}, counts=told)
+
+
+def test_shares_changes_and_coverage_are_counted() -> None:
+    decisions = Decisions()
+    for rung in ("low", "low", "high", "low"):
+        decisions.add(0, [report(rung), Report(source="link", counts={"error-checks": 9})])
+    decisions.add(0, [report("low", error_checks=1, error_covered=1)])
+    decisions.add(0, [report("low", error_checks=1, error_covered=0)])
+    (found,) = decisions.summary()
+    assert found.frames == {"low": 5, "high": 1}
+    assert (found.changes, found.error_checks, found.error_covered) == (2, 2, 1)
+    assert decided_lines([found]) == [
+        "channel: rung low 83%, high 17%; 2 changes; stated error held in 1 of 2 checks"
+    ]
+
+
+def test_a_new_episode_is_no_change() -> None:
+    decisions = Decisions()
+    decisions.add(0, [report("low")])
+    decisions.add(1, [report("high")])
+    assert decisions.summary()[0].changes == 0
+
+
+def test_without_decisions_nothing_is_said() -> None:
+    decisions = Decisions()
+    decisions.add(0, [Report(source="link", measured={"step": 3})])
+    assert decided_lines(decisions.summary()) == []
