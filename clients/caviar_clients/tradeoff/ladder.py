@@ -1,4 +1,4 @@
-"""The settings that are compared: one line each. A line whose channel does not know it is skipped, and said so.
+"""The settings that are compared: one line each. What a channel does not know is skipped, and said so.
 
 To add a setting, add a line to `LADDER` (or to a table's columns, `TABLE_RUNGS`).
 """
@@ -112,6 +112,9 @@ TABLE_RUNGS: Mapping[str, Mapping[str, Any]] = {
 }
 """Columns of both tables, and what each adds to the settings of sionna-rt."""
 
+FEW = frozenset({"mimo-rt"})
+"""Rungs that are measured on one scene and few receivers, since each takes minutes."""
+
 SPACINGS_DEG = (1.0, 0.5, 0.25, 0.1)
 """Ray spacings of the paper's Table 3."""
 DIFFUSE_DEG = 0.5
@@ -139,7 +142,7 @@ def spacing_settings() -> tuple[Setting, ...]:
     """The lines of the paper's Table 3."""
     made = []
     for rung, extra in TABLE_RUNGS.items():
-        few = {"most_scenes": 1, "most_receivers": CHEAP} if rung == "mimo-rt" else {}
+        few = rung in FEW
         for spacing, diffuse in [*((s, False) for s in SPACINGS_DEG), (DIFFUSE_DEG, True)]:
             row = f"{spacing:g}" + (" (diffuse)" if diffuse else "")
             options: dict[str, Any] = {"scattering": diffuse, **extra}
@@ -154,7 +157,8 @@ def spacing_settings() -> tuple[Setting, ...]:
                     column=rung,
                     row=row,
                     scattering=diffuse,
-                    **few,
+                    most_scenes=1 if few else None,
+                    most_receivers=CHEAP if few else None,
                 )
             )
     return tuple(made)
@@ -164,8 +168,8 @@ def array_settings() -> tuple[Setting, ...]:
     """The lines of the paper's Table 4."""
     made = []
     for rung, extra in TABLE_RUNGS.items():
-        few = {"most_scenes": 1, "most_receivers": 1} if rung == "mimo-rt" else {}
-        samples = 10_000 if rung == "mimo-rt" else 100_000
+        few = rung in FEW
+        samples = 10_000 if few else 100_000
         for elements in ELEMENTS:
             size = f"{elements[0]}×{elements[1]}"
             made.append(
@@ -177,7 +181,8 @@ def array_settings() -> tuple[Setting, ...]:
                     column=rung,
                     row=size,
                     elements=elements,
-                    **few,
+                    most_scenes=1 if few else None,
+                    most_receivers=1 if few else None,
                 )
             )
     return tuple(made)
@@ -205,9 +210,7 @@ def convergence_settings(seeds: int) -> tuple[Setting, ...]:
                 Setting(
                     label=f"siso-rt {_power(samples)} d3 diffuse seed {seed}",
                     use=_SIONNA,
-                    settings=_traced(
-                        samples, 3, launch_seed=seed, scattering=True, max_paths=_DIFFUSE_PATHS
-                    ),
+                    settings=_traced(samples, 3, launch_seed=seed, scattering=True, max_paths=_DIFFUSE_PATHS),
                     block="diffuse convergence",
                     column="diffuse",
                     row=str(samples),
