@@ -117,7 +117,7 @@ class Campaign:
         """Label of what factors are against."""
         return self._named(self._baseline).label
 
-    def first_block(self, settings: Sequence[Setting], share: float) -> list[Measured]:
+    def first(self, settings: Sequence[Setting], share: float) -> list[Measured]:
         """The block that has reference and baseline in it; raises `RunError` where they cannot be loaded."""
         with ExitStack() as stack:
             begun = time.monotonic()
@@ -137,7 +137,7 @@ class Campaign:
             around = [self._named(self._baseline), *settings]
             entries = self._prepared(name, around, share, stack)
             self._measure(name, entries, None, begun + share * self._left_s(begun))
-        return [entry.measured for entry in entries[1:]]
+        return [entry.measured for entry in entries if entry.measured.setting in settings]
 
     def _left_s(self, now: float) -> float:
         return max(0.0, self._until - now)

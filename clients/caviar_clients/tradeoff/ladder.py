@@ -122,6 +122,8 @@ DIFFUSE_DEG = 0.5
 ELEMENTS = ((64, 2), (64, 8), (64, 64))
 """(Nt, Nr) of the paper's Table 4."""
 
+CONVERGENCE_SCENES = 4
+"""Scenes over which convergence is measured: each has as many users as it has receivers."""
 CONVERGENCE_SAMPLES = (10_000, 30_000, 100_000, 300_000, 1_000_000)
 DIFFUSE_SAMPLES = (10_000, 30_000, 100_000, 300_000)
 TRUTH_SAMPLES = 3_000_000
@@ -191,13 +193,16 @@ def array_settings() -> tuple[Setting, ...]:
 def convergence_settings(seeds: int) -> tuple[Setting, ...]:
     """Specular and diffuse paths over samples and seeds of the launch; the first one is the truth."""
     truth = _traced(TRUTH_SAMPLES, 3, launch_seed=0)
-    made = [Setting(label=TRUTH, use=_SIONNA, settings=truth, block="convergence")]
+    made = [
+        Setting(label=TRUTH, use=_SIONNA, settings=truth, block="convergence", most_scenes=CONVERGENCE_SCENES)
+    ]
     for samples in CONVERGENCE_SAMPLES:
         for seed in range(1, seeds + 1):
             made.append(
                 Setting(
                     label=f"siso-rt {_power(samples)} d3 seed {seed}",
                     use=_SIONNA,
+                    most_scenes=CONVERGENCE_SCENES,
                     settings=_traced(samples, 3, launch_seed=seed),
                     block="convergence",
                     column="specular",
@@ -210,6 +215,7 @@ def convergence_settings(seeds: int) -> tuple[Setting, ...]:
                 Setting(
                     label=f"siso-rt {_power(samples)} d3 diffuse seed {seed}",
                     use=_SIONNA,
+                    most_scenes=CONVERGENCE_SCENES,
                     settings=_traced(samples, 3, launch_seed=seed, scattering=True, max_paths=_DIFFUSE_PATHS),
                     block="diffuse convergence",
                     column="diffuse",
