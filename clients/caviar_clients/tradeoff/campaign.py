@@ -4,25 +4,28 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 
 import msgspec
+import numpy as np
 
-from caviar_clients.tradeoff import ladder
 from caviar_clients.tradeoff.ladder import Block, Setting
-from caviar_clients.tradeoff.measure import Rung, Step
-from caviar_clients.tradeoff.rows import Timing
 from caviar_clients.tradeoff.scenes import Scenes
 from caviar_clients.tradeoff.schedule import Cost, predicted_s, shares, spread_order
-from caviar_clients.tradeoff.users import Difference, Key, Noise, UserChannel, differences, user_channels
-from caviar_protocol.errors import CaviarError, RunError
+from caviar_clients.tradeoff.users import Key, Noise, UserChannel
+from caviar_clients.tradeoff.worker import Sample, Worker
+from caviar_protocol.errors import RunError
+from caviar_protocol.tables import suggestion
 
 ROUNDS = 3
 """Times that each scene is measured, where time allows: for the 99th percentile."""
-
-LIMIT = 0.7
-"""Share of what is left of its block's time that the first scene of a setting may be expected to take."""
+TOGETHER = 3
+"""Settings that are loaded at a time, beside the baseline: each holds a scene of its own in memory."""
+PATIENCE = 3.0
+"""What takes this many times longer than the time that is left of its block is ended."""
+AT_LEAST_S = 20.0
+"""[s] that loading gets, however little time is left: else a short comparison would measure nothing."""
 
 
 class Skipped(msgspec.Struct, frozen=True, kw_only=True):
@@ -33,7 +36,7 @@ class Skipped(msgspec.Struct, frozen=True, kw_only=True):
     reason: str
 
 
-@dataclass(kw_only=True)
+@dataclass(kw_only=True, eq=False)
 class Measured:
     """What was found of one setting."""
 
@@ -41,11 +44,48 @@ class Measured:
     rung: str
     prepare_s: float
     loaded_mib: float | None
-    timing: Timing = field(default_factory=Timing)
+    times_ms: list[float] = field(default_factory=list)
+    memory_mib: list[float] = field(default_factory=list)
+    frames: list[int] = field(default_factory=list)
+    """Of the scenes that were measured, each once."""
+    receivers: list[int] = field(default_factory=list)
+    """Of each of these scenes; likewise the paths."""
+    paths: list[int] = field(default_factory=list)
+    lost: int = 0
+    """Measurements in which paths were lost."""
+    users: dict[Key, UserChannel] = field(default_factory=dict)
     baseline_ms: float = 0.0
     """Median time of the baseline, measured by turns with this one."""
-    differences: list[Difference] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+
+    def take(self, frame: int, sample: Sample) -> None:
+        """Note a measurement; if its scene is new, what users got too."""
+        self.times_ms.append(sample.time_ms)
+        self.lost += sample.lost_paths
+        if sample.memory_mib is not None:
+            self.memory_mib.append(sample.memory_mib)
+        if frame not in self.frames:
+            self.frames.append(frame)
+            self.receivers.append(sample.receivers)
+            self.paths.append(sample.paths)
+            self.users.update(sample.users)
+
+    def absorb(self, other: Measured) -> None:
+        """Note what was measured of the same setting elsewhere."""
+        self.times_ms += other.times_ms
+        self.memory_mib += other.memory_mib
+        self.lost += other.lost
+        for frame, receivers, paths in zip(other.frames, other.receivers, other.paths, strict=True):
+            if frame not in self.frames:
+                self.frames.append(frame)
+                self.receivers.append(receivers)
+                self.paths.append(paths)
+        self.users.update(other.users)
+
+    @property
+    def median_ms(self) -> float:
+        """Time of all measurements; 0 where there is none."""
+        return float(np.median(self.times_ms)) if self.times_ms else 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,30 +94,36 @@ class Told:
 
     text: str
     done: float
-    """Share of the present block."""
+    """Share of the whole."""
     left_s: float
-    """[s] of the whole, at most, as far as can be said."""
+    """[s] that it may still take."""
 
 
-@dataclass(kw_only=True)
+@dataclass(eq=False)
 class _Entry:
-    """A setting of the block that is being measured."""
+    """A setting that is loaded."""
 
-    rung: Rung
+    worker: Worker
     measured: Measured
     count: int = 0
+    """Measurements that it gets."""
+
+    @property
+    def cost_s(self) -> float:
+        return self.worker.loaded.first.time_ms / 1e3
 
 
 class Campaign:
-    """Measures blocks of settings over the same scenes.
+    """Measures blocks of settings over the same scenes, each setting by turns with the baseline.
 
     Parameters
     ----------
     scenes
         What is measured on.
-    reference, baseline
-        What errors and factors are against. None: the first that can be loaded of `ladder.REFERENCES`
-        and `ladder.BASELINES`.
+    baseline
+        Labels of what factors are against: the first that can be loaded.
+    whole
+        Labels of settings that see every scene, whatever that takes: the reference.
     seconds
         For everything.
     receivers
@@ -90,178 +136,137 @@ class Campaign:
         self,
         scenes: Scenes,
         *,
-        reference: Setting | None,
-        baseline: Setting | None,
+        baseline: Sequence[Setting],
+        whole: Sequence[str],
         seconds: float,
         receivers: int | None,
         told: Callable[[Told], None],
     ) -> None:
-        self._scenes, self._receivers, self._told = scenes, receivers, told
-        self._until = time.monotonic() + seconds
+        self._scenes, self._receivers, self._told, self._whole = scenes, receivers, told, whole
+        self._seconds, self._begun = seconds, time.monotonic()
         self._order = spread_order(len(scenes.instants))
         self._noise = Noise.of(scenes)
         self.skipped: list[Skipped] = []
-        self._reference, self._baseline = reference, baseline
-        self._truth: dict[Key, UserChannel] = {}
-        """Channels of the reference."""
-        self.channels: dict[str, dict[Key, UserChannel]] = {}
-        """Channels by label, of settings whose seeds are compared with each other."""
+        self._baseline = self._first_loaded(baseline)
 
     @property
-    def reference(self) -> str:
-        """Label of what errors are against."""
-        return self._named(self._reference).label
+    def baseline(self) -> Setting:
+        """What factors are against."""
+        return self._baseline.setting
 
-    @property
-    def baseline(self) -> str:
-        """Label of what factors are against."""
-        return self._named(self._baseline).label
-
-    def first(self, settings: Sequence[Setting], share: float) -> list[Measured]:
-        """The block that has reference and baseline in it; raises `RunError` where they cannot be loaded."""
-        with ExitStack() as stack:
-            begun = time.monotonic()
-            entries = self._prepared("ladder", settings, share, stack)
-            by_label = {entry.measured.setting.label: entry for entry in entries}
-            self._reference = self._chosen(self._reference, ladder.REFERENCES, by_label, "--reference")
-            self._baseline = self._chosen(self._baseline, ladder.BASELINES, by_label, "--baseline")
-            reference = by_label[self._reference.label]
-            entries.sort(key=lambda entry: entry is not reference)  # its channels are needed first
-            self._measure("ladder", entries, reference, begun + share * self._left_s(begun))
-        return [entry.measured for entry in sorted(entries, key=lambda e: settings.index(e.measured.setting))]
+    def close(self) -> None:
+        """End what is loaded."""
+        self._baseline.close()
 
     def block(self, name: Block, settings: Sequence[Setting], share: float) -> list[Measured]:
-        """Another block, in which the baseline takes part."""
-        with ExitStack() as stack:
-            begun = time.monotonic()
-            around = [self._named(self._baseline), *settings]
-            entries = self._prepared(name, around, share, stack)
-            self._measure(name, entries, None, begun + share * self._left_s(begun))
-        return [entry.measured for entry in entries if entry.measured.setting in settings]
+        """Measure settings within a share of the time that is left."""
+        begun = time.monotonic()
+        until, costs, found = begun + share * self._left_s, list[Cost](), dict[Setting, Measured]()
+        own = self._entry(self._baseline).measured
+        waves = [settings[i : i + TOGETHER] for i in range(0, len(settings), TOGETHER)]
+        for number, wave in enumerate(waves):
+            now = time.monotonic()
+            with ExitStack() as stack:
+                entries = self._loaded(name, wave, costs, until, stack)
+                self._by_turns(name, entries, now + max(0.0, until - now) / (len(waves) - number))
+            baseline, *others = entries
+            own.absorb(baseline.measured)
+            for entry in others:
+                entry.measured.baseline_ms = baseline.measured.median_ms
+                if self._is_of_use(entry.measured, name):
+                    found[entry.measured.setting] = entry.measured
+        own.baseline_ms = own.median_ms
+        found[self.baseline] = own
+        return [found[setting] for setting in settings if setting in found]
 
-    def _left_s(self, now: float) -> float:
-        return max(0.0, self._until - now)
+    @property
+    def _left_s(self) -> float:
+        return max(0.0, self._begun + self._seconds - time.monotonic())
 
-    def _named(self, setting: Setting | None) -> Setting:
-        if setting is None:
-            raise RunError("the first block has not been measured")
-        return setting
-
-    def _chosen(
-        self, wanted: Setting | None, order: Sequence[str], loaded: dict[str, _Entry], option: str
-    ) -> Setting:
-        labels = list(order) if wanted is None else [wanted.label]
-        for label in labels:
-            if label in loaded:
-                return loaded[label].measured.setting
-        reasons = [s.reason for s in self.skipped if s.setting in labels]
+    def _first_loaded(self, settings: Sequence[Setting]) -> Worker:
+        for setting in settings:
+            self._tell(f"loading {setting.label}")
+            try:
+                return self._start(setting, max(AT_LEAST_S, self._left_s))
+            except RunError as error:
+                self._skip(setting, "ladder", str(error))
+        reasons = dict.fromkeys(s.reason for s in self.skipped)
         raise RunError(
-            f"none of {', '.join(labels)} can be measured ({'; '.join(dict.fromkeys(reasons))}); "
-            f"name another setting with {option}"
+            f"no baseline can be measured, of {', '.join(s.label for s in settings)}: {'; '.join(reasons)}"
         )
 
-    def _prepared(
-        self, name: Block, settings: Sequence[Setting], share: float, stack: ExitStack
+    def _start(self, setting: Setting, seconds: float) -> Worker:
+        return Worker(setting, self._scenes, self._receivers, self._noise, seconds)
+
+    def _loaded(
+        self, name: Block, wave: Sequence[Setting], costs: list[Cost], until: float, stack: ExitStack
     ) -> list[_Entry]:
-        """Load and warm up what can be."""
-        entries, costs = list[_Entry](), list[Cost]()
-        begun = time.monotonic()
-        until = begun + share * self._left_s(begun)
-        for number, setting in enumerate(settings):
-            self._tell(f"{name}: loading {setting.label}", number / len(settings) / 3)
+        """The baseline, and of a wave what can be loaded in time."""
+        entries = [self._entry(self._baseline)]
+        for setting in wave:
+            if setting == self.baseline:
+                continue
+            self._tell(f"{name}: loading {setting.label}")
             expected, left = predicted_s(setting, costs), until - time.monotonic()
-            if entries and (left <= 0 or (expected or 0.0) > LIMIT * left):
+            if (left <= 0 and setting.label not in self._whole) or (expected or 0.0) > PATIENCE * left:
                 self._skip(setting, name, _no_time(expected, left))
                 continue
             try:
-                rung = Rung(setting, self._scenes, self._receivers)
-            except (CaviarError, RuntimeError, MemoryError) as error:  # Dr.Jit raises RuntimeError
-                self._skip(setting, name, str(error) or type(error).__name__)
+                worker = self._start(setting, max(AT_LEAST_S, PATIENCE * left))
+            except RunError as error:
+                self._skip(setting, name, str(error))
                 continue
-            stack.callback(rung.close)
-            costs.append(Cost(setting, rung.first.time_ms / 1e3))
-            measured = Measured(
-                setting=setting,
-                rung=rung.first.channel.rung,
-                prepare_s=rung.prepare_s,
-                loaded_mib=rung.loaded_mib,
-            )
-            entries.append(_Entry(rung=rung, measured=measured))
+            stack.enter_context(closing(worker))
+            entries.append(self._entry(worker))
+            costs.append(Cost(setting, entries[-1].cost_s))
         return entries
 
-    def _measure(self, name: Block, entries: list[_Entry], reference: _Entry | None, until: float) -> None:
-        """By turns, each as often as its share allows."""
-        seconds = until - time.monotonic()
-        cold = [entry for entry in entries if entry.rung.first.time_ms / 1e3 > LIMIT * max(seconds, 1.0)]
-        warm = [entry for entry in entries if entry not in cold]
-        for entry in cold:
-            entry.measured.notes.append("timed on the scene that warmed it up: another would take too long")
-            self._take(entry, 0, entry.rung.first, is_reference=entry is reference)
-        scenes = [self._scenes_of(entry.measured.setting) for entry in warm]
-        costs = [entry.rung.first.time_ms / 1e3 for entry in warm]
-        for entry, count in zip(warm, shares(costs, [ROUNDS * s for s in scenes], seconds), strict=True):
-            entry.count = count
-        if reference is not None and reference.count:  # every scene, before others see one twice
-            reference.count = max(reference.count, self._scenes_of(reference.measured.setting))
-        turns = max((entry.count for entry in warm), default=0)
-        for turn in range(turns):
-            for entry in warm:
-                if entry.count > turn and (turn == 0 or entry is reference or time.monotonic() < until):
-                    self._tell(f"{name}: {entry.measured.setting.label}", (1 + 2 * turn / turns) / 3)
-                    self._turn(name, entry, turn, is_reference=entry is reference)
-        self._finish(entries)
+    def _by_turns(self, name: Block, entries: Sequence[_Entry], until: float) -> None:
+        """Each as often as its share of the time allows; once at least."""
+        seconds = max(0.0, until - time.monotonic())
+        most = [ROUNDS * self._scenes_of(entry.measured.setting) for entry in entries]
+        for entry, count in zip(entries, shares([e.cost_s for e in entries], most, seconds), strict=True):
+            whole = entry.measured.setting.label in self._whole
+            entry.count = max(count, self._scenes_of(entry.measured.setting)) if whole else count
+        for turn in range(max(entry.count for entry in entries)):
+            for entry in entries:
+                if entry.count > turn:
+                    self._tell(f"{name}: {entry.measured.setting.label}")
+                    self._turn(entry, turn, until)
 
-    def _turn(self, name: Block, entry: _Entry, turn: int, *, is_reference: bool) -> None:
-        index = self._order[turn % self._scenes_of(entry.measured.setting)]
-        try:
-            entry.rung.release()
-            step = entry.rung.step(self._scenes.instants[index])
-        except (CaviarError, RuntimeError, MemoryError) as error:
+    def _turn(self, entry: _Entry, turn: int, until: float) -> None:
+        measured = entry.measured
+        whole = measured.setting.label in self._whole and turn < len(self._order)
+        if turn and not whole and time.monotonic() > until:
+            return
+        if entry.cost_s > PATIENCE * max(AT_LEAST_S, until - time.monotonic()) and not whole:
+            measured.take(self._scenes.instants[0].frame, entry.worker.loaded.first)
+            measured.notes.append("timed on the scene that warmed it up: another would take too long")
             entry.count = 0
-            entry.measured.notes.append(f"ended early: {error}")
             return
-        self._take(entry, index, step, is_reference=is_reference)
-
-    def _take(self, entry: _Entry, index: int, step: Step, *, is_reference: bool) -> None:
-        """Note what a step took; if its scene is new to the setting, what users got too."""
-        timing, setting = entry.measured.timing, entry.measured.setting
-        timing.times_ms.append(step.time_ms)
-        timing.lost += step.lost_paths
-        if step.memory_mib is not None:
-            timing.memory_mib.append(step.memory_mib)
-        frame = self._scenes.instants[index].frame
-        if frame in timing.frames:
+        index = self._order[turn % self._scenes_of(measured.setting)]
+        try:
+            sample = entry.worker.step(index, PATIENCE * max(AT_LEAST_S, self._left_s))
+        except RunError as error:
+            entry.count = 0
+            measured.notes.append(f"ended early: {error}")
             return
-        timing.frames.append(frame)
-        timing.receivers.append(len(step.channel.rx))
-        timing.paths.append(len(step.channel.tau))
-        if setting.elements is not None:
-            return  # other arrays than the reference's
-        found = user_channels(frame, step, self._noise)
-        if is_reference:
-            self._truth.update(found)
-        if setting.block in ("convergence", "diffuse convergence"):
-            self.channels.setdefault(setting.label, {}).update(found)
-        entry.measured.differences += differences(found, self._truth)
+        measured.take(self._scenes.instants[index].frame, sample)
 
-    def _finish(self, entries: list[_Entry]) -> None:
-        entries[:] = [entry for entry in entries if entry.measured.timing.times_ms or self._failed(entry)]
-        baseline = next((e for e in entries if e.measured.setting == self._baseline), None)
-        for entry in entries:
-            measured = entry.measured
-            if baseline is not None:
-                measured.baseline_ms = baseline.measured.timing.median_ms
-            scenes, limit = len(measured.timing.frames), len(self._scenes.instants)
-            if scenes < limit:
-                measured.notes.append(f"{scenes} of {limit} scenes")
-            if measured.setting.most_receivers is not None:
-                measured.notes.append(f"{measured.timing.receivers[0]} receivers")
-            if measured.timing.lost:
-                measured.notes.append(f"paths lost in {measured.timing.lost} measurements")
-
-    def _failed(self, entry: _Entry) -> bool:
-        self._skip(entry.measured.setting, entry.measured.setting.block, "; ".join(entry.measured.notes))
-        return False
+    def _is_of_use(self, measured: Measured, name: Block) -> bool:
+        """Whether it was measured at all; notes what a reader should know."""
+        if not measured.times_ms:
+            self._skip(measured.setting, name, "; ".join(measured.notes))
+            return False
+        scenes, limit = len(measured.frames), self._scenes_of(measured.setting)
+        if scenes < len(self._scenes.instants):
+            why = "" if scenes == limit else ", for want of time"
+            measured.notes.append(f"{scenes} of {len(self._scenes.instants)} scenes{why}")
+        if measured.setting.most_receivers is not None:
+            measured.notes.append(f"{measured.receivers[0]} receivers")
+        if measured.lost:
+            measured.notes.append(f"paths lost in {measured.lost} of {len(measured.times_ms)} measurements")
+        return True
 
     def _scenes_of(self, setting: Setting) -> int:
         return min(len(self._scenes.instants), setting.most_scenes or len(self._scenes.instants))
@@ -269,8 +274,21 @@ class Campaign:
     def _skip(self, setting: Setting, block: Block, reason: str) -> None:
         self.skipped.append(Skipped(setting=setting.label, block=block, reason=reason))
 
-    def _tell(self, text: str, done: float) -> None:
-        self._told(Told(text=text, done=done, left_s=self._left_s(time.monotonic())))
+    def _tell(self, text: str) -> None:
+        left = self._left_s
+        self._told(Told(text=text, done=1 - left / self._seconds, left_s=left))
+
+    def _entry(self, worker: Worker) -> _Entry:
+        loaded = worker.loaded
+        return _Entry(
+            worker,
+            Measured(
+                setting=worker.setting,
+                rung=loaded.first.rung,
+                prepare_s=loaded.seconds,
+                loaded_mib=loaded.memory_mib,
+            ),
+        )
 
 
 def _no_time(expected_s: float | None, left_s: float) -> str:
@@ -280,3 +298,18 @@ def _no_time(expected_s: float | None, left_s: float) -> str:
         f"one scene is expected to take {expected_s:.0f} s, of the {left_s:.0f} s left for its block; "
         "give more with --minutes"
     )
+
+
+def candidates(
+    label: str | None, order: Sequence[str], known: Sequence[Setting], option: str
+) -> list[Setting]:
+    """The setting with a label, or where there is none those of a list, in its order.
+
+    Raises `RunError` with near labels for a label that does not exist.
+    """
+    by_label = {setting.label: setting for setting in known}
+    if label is None:
+        return [by_label[name] for name in order]
+    if label not in by_label:
+        raise RunError(f"{option} {label!r} is no setting of the ladder; {suggestion(label, by_label)}")
+    return [by_label[label]]

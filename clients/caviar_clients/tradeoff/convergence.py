@@ -12,7 +12,7 @@ import numpy as np
 from caviar_clients.tradeoff.campaign import Measured
 from caviar_clients.tradeoff.ladder import TRUTH
 from caviar_clients.tradeoff.rows import error_fields
-from caviar_clients.tradeoff.users import Difference, Key, UserChannel, differences
+from caviar_clients.tradeoff.users import Key, UserChannel, differences
 from caviar_protocol.arrays import quantity
 
 
@@ -32,36 +32,29 @@ class Point(msgspec.Struct, frozen=True, kw_only=True):
     users: Annotated[int, quantity("1", "user pairs compared")]
 
 
-def points(measured: Sequence[Measured], channels: Mapping[str, Mapping[Key, UserChannel]]) -> list[Point]:
+def points(measured: Sequence[Measured]) -> list[Point]:
     """One point for each kind of path and number of samples."""
     groups: dict[tuple[str, str], list[Measured]] = {}
+    truth: dict[Key, UserChannel] = {}
     for entry in measured:
-        if entry.setting.row:
+        if entry.setting.label == TRUTH:
+            truth = entry.users
+        else:
             groups.setdefault((entry.setting.column, entry.setting.row), []).append(entry)
-    truth = channels.get(TRUTH, {})
-    return [_point(kind, int(row), group, channels, truth) for (kind, row), group in groups.items()]
+    return [_point(kind, int(row), group, truth) for (kind, row), group in groups.items()]
 
 
-def _point(
-    kind: str,
-    samples: int,
-    group: Sequence[Measured],
-    channels: Mapping[str, Mapping[Key, UserChannel]],
-    truth: Mapping[Key, UserChannel],
-) -> Point:
-    seeds = [channels[entry.setting.label] for entry in group]
-    pairs: list[Difference] = []
-    for one, other in combinations(seeds, 2):
-        pairs += differences(one, other)
+def _point(kind: str, samples: int, group: Sequence[Measured], truth: Mapping[Key, UserChannel]) -> Point:
+    pairs = [d for one, other in combinations(group, 2) for d in differences(one.users, other.users)]
     between = error_fields(pairs)
-    against = [error_fields(differences(seed, truth))["nmse_db"] for seed in seeds if kind == "specular"]
-    times = [ms for entry in group for ms in entry.timing.times_ms]
+    against = [error_fields(differences(entry.users, truth))["nmse_db"] for entry in group]
     return Point(
         paths=kind,
         samples=samples,
-        seeds=len(seeds),
-        time_ms_median=float(np.median(times)),
-        nmse_db=tuple(float(value) for value in against if value is not None),
+        seeds=len(group),
+        time_ms_median=float(np.median([ms for entry in group for ms in entry.times_ms])),
+        # Specular paths become more and more the same; diffuse ones are drawn anew with each seed.
+        nmse_db=tuple(v for v in against if v is not None) if kind == "specular" else (),
         pair_nmse_db=between["nmse_db"],
         pair_gain_db_p95=between["path_gain_error_db_p95"],
         pair_beam_top1=between["beam_top1"],

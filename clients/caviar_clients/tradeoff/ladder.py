@@ -6,18 +6,16 @@ To add a setting, add a line to `LADDER` (or to a table's columns, `TABLE_RUNGS`
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any, Literal
-
-from caviar_protocol.errors import RunError
-from caviar_protocol.tables import suggestion
 
 Block = Literal["ladder", "ray spacing", "arrays", "convergence", "diffuse convergence"]
 """What a setting is measured for. Settings of a block take turns, so that noise hits all alike."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Setting:
     """One channel model with its settings."""
 
@@ -40,11 +38,6 @@ class Setting:
     """Scenes at most, for what takes minutes each."""
     most_receivers: int | None = None
     """Receivers at most, likewise."""
-
-    @property
-    def launch_seed(self) -> int | None:
-        """Seed of the ray launch; None: from the run's."""
-        return self.settings.get("launch_seed")
 
 
 SCATTERING = 0.4
@@ -140,6 +133,7 @@ def samples_of(spacing_deg: float) -> int:
     return round(4 * math.pi / math.radians(spacing_deg) ** 2)
 
 
+@cache
 def spacing_settings() -> tuple[Setting, ...]:
     """The lines of the paper's Table 3."""
     made = []
@@ -234,11 +228,3 @@ def _power(number: int) -> str:
 
 TRUTH = f"siso-rt {_power(TRUTH_SAMPLES)} d3 seed 0"
 """Label of what the convergence is measured against."""
-
-
-def find(label: str, settings: Iterable[Setting], option: str) -> Setting:
-    """The setting with this label. Raises `RunError` with near labels where there is none."""
-    known = {setting.label: setting for setting in settings}
-    if label not in known:
-        raise RunError(f"{option} {label!r} is no setting of the ladder; {suggestion(label, known)}")
-    return known[label]

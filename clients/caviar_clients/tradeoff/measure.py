@@ -6,13 +6,15 @@ import re
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from msgspec.structs import replace
 
 from caviar_clients.tradeoff.ladder import SCATTERING, Setting
 from caviar_clients.tradeoff.scenes import Instant, Scenes
-from caviar_protocol.errors import RunError, ScenarioError
+from caviar_clients.tradeoff.users import Noise, user_channels
+from caviar_clients.tradeoff.worker import Loaded, Sample
+from caviar_protocol.errors import CaviarError, RunError, ScenarioError
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.scene import antennas
 from caviar_protocol.tables import convert_settings
@@ -28,17 +30,14 @@ _STATUS = Path("/proc/self/status")
 _CLEAR = Path("/proc/self/clear_refs")
 
 
-class Step(NamedTuple):
-    """One scene measured."""
-
-    scene: Scene
-    """As the model saw it: with the setting's arrays and receivers."""
-    channel: Channel
-    time_ms: float
-    memory_mib: float | None
-    """Growth of the resident memory at its peak; None where the system does not tell."""
-    lost_paths: bool
-    """Whether more paths were found than the setting allows."""
+def is_known(setting: Setting, scenes: Scenes) -> bool:
+    """Whether the channel knows a setting; nothing is loaded."""
+    try:
+        cls = load("channel", setting.use)
+        convert_settings(cls.Settings, {**scenes.settings_of("channel", setting.use), **setting.settings})
+    except CaviarError:
+        return False
+    return True
 
 
 class Rung:
@@ -47,11 +46,11 @@ class Rung:
     Raises `CaviarError` where the setting is unknown to the model or it cannot be loaded.
     """
 
-    def __init__(self, setting: Setting, scenes: Scenes, receivers: int | None = None) -> None:
+    def __init__(self, setting: Setting, scenes: Scenes, receivers: int | None, noise: Noise) -> None:
         self.setting = setting
+        self._noise = noise
         limits = [n for n in (receivers, setting.most_receivers) if n is not None]
         self._receivers = min(limits, default=None)
-        self._sampling_period_ns = scenes.sampling_period_ns
         cls = load("channel", setting.use)
         settings = {**scenes.settings_of("channel", setting.use), **setting.settings}
         if setting.scattering:
@@ -72,18 +71,17 @@ class Rung:
             raise ScenarioError("the scenes have no scenery to trace rays in")
         assets = scenes.assets if cls.uses_scenery else {}
         self._model.prepare(Preparation(demand={"channel": frozenset({"h"})}, assets=assets))
-        self._model.reset(0, scenes.seed, 0)
         self._seed = scenes.seed
-        warm = self.step(scenes.instants[0])
-        self.prepare_s = time.perf_counter() - begin
-        """Loading, compilation and the first scene, which is not timed."""
-        self.first = warm
-        """The scene it was warmed up with."""
+        self._model.reset(0, self._seed, 0)
+        first = self.sample(scenes.instants[0])
         after = resident_mib()
-        self.loaded_mib = None if before is None or after is None else after - before
-        """Growth of the resident memory until here."""
+        self.loaded = Loaded(
+            seconds=time.perf_counter() - begin,
+            memory_mib=None if before is None or after is None else after - before,
+            first=first,
+        )
 
-    def step(self, instant: Instant) -> Step:
+    def sample(self, instant: Instant) -> Sample:
         """The channels of a scene, timed: what a run waits for, H included."""
         scene = seen(instant.scene, self._receivers, self.setting.elements)
         entry = GrantInput(topic="scene", source="recorded", status=Status.FRESH, frame=instant.frame)
@@ -95,6 +93,7 @@ class Rung:
             service=SERVICE,
             seed=self._seed,
         )
+        self._model.release_memory()
         before = reset_peak()
         begin = time.perf_counter()
         result = self._model.step(frame)
@@ -103,13 +102,15 @@ class Rung:
         channel = result.products["channel"]
         if not isinstance(channel, Channel):
             raise RunError(f"{self.setting.use} made no channel of frame {instant.frame}")
-        lost = channel.dropped > 0 or result.counts.get("path_limit_reached", 0) > 0
-        growth = None if before is None or peak is None else peak - before
-        return Step(scene, channel, time_ms, growth, lost)
-
-    def release(self) -> None:
-        """Give back what is kept for reuse, so that the next one's memory is its own."""
-        self._model.release_memory()
+        return Sample(
+            time_ms=time_ms,
+            memory_mib=None if before is None or peak is None else peak - before,
+            rung=channel.rung,
+            receivers=len(channel.rx),
+            paths=len(channel.tau),
+            lost_paths=channel.dropped > 0 or result.counts.get("path_limit_reached", 0) > 0,
+            users=user_channels(instant.frame, scene, channel, self._noise),
+        )
 
     def close(self) -> None:
         """Release everything."""

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from typing import Annotated, Literal, get_args
 
 import msgspec
+import numpy as np
 
 from caviar_clients.tradeoff import ladder
-from caviar_clients.tradeoff.campaign import Campaign, Measured, Skipped, Told
+from caviar_clients.tradeoff.campaign import Campaign, Measured, Skipped, Told, candidates
 from caviar_clients.tradeoff.convergence import Point, points
 from caviar_clients.tradeoff.ladder import Block, Setting
-from caviar_clients.tradeoff.measure import seen
+from caviar_clients.tradeoff.measure import is_known, seen
 from caviar_clients.tradeoff.rows import Row, error_fields
 from caviar_clients.tradeoff.scenes import Scenes
+from caviar_clients.tradeoff.users import differences
 from caviar_protocol.arrays import quantity
+from caviar_protocol.errors import RunError
 from caviar_protocol.scene import antennas
 
 Part = Literal["ladder", "spacing", "arrays", "convergence"]
@@ -72,23 +76,25 @@ def compare(
     """
     begun = time.monotonic()
     known = (*ladder.LADDER, *ladder.spacing_settings())
-    reference, baseline = (
-        None if label is None else ladder.find(label, known, option)
-        for label, option in ((options.reference, "--reference"), (options.baseline, "--baseline"))
-    )
+    references = candidates(options.reference, ladder.REFERENCES, known, "--reference")
+    references = [s for s in references if is_known(s, scenes)] or references
+    baselines = candidates(options.baseline, ladder.BASELINES, known, "--baseline")
     campaign = Campaign(
         scenes,
-        reference=reference,
-        baseline=baseline,
+        baseline=baselines,
+        whole=[references[0].label],
         seconds=options.seconds,
         receivers=options.receivers,
         told=told,
     )
-    measured = list[Measured]()
-    plan = _plan(options, [setting for setting in (reference, baseline) if setting is not None])
-    for number, (block, settings) in enumerate(plan):
-        share = _WEIGHTS[block] / sum(_WEIGHTS[name] for name, _ in plan[number:])
-        measured += campaign.block(block, settings, share) if number else campaign.first(settings, share)
+    with closing(campaign):
+        needed = references if "ladder" in options.parts else references[:1]
+        plan = _plan(options, list(dict.fromkeys([*needed, campaign.baseline])))
+        measured = list[Measured]()
+        for number, (block, settings) in enumerate(plan):
+            share = _WEIGHTS[block] / sum(_WEIGHTS[name] for name, _ in plan[number:])
+            measured += campaign.block(block, settings, share)
+    reference = _reference(references, measured, campaign.skipped)
     receivers = [len(antennas(seen(i.scene, options.receivers, None), "rx")) for i in scenes.instants]
     return Report(
         scenario=scenes.name,
@@ -96,24 +102,22 @@ def compare(
         carriers_hz=tuple(carrier.frequency_hz for carrier in scenes.carriers),
         scenes=len(scenes.instants),
         receivers=sum(receivers) / len(receivers),
-        reference=campaign.reference,
-        baseline=campaign.baseline,
+        reference=reference.setting.label,
+        baseline=campaign.baseline.label,
         elapsed_s=time.monotonic() - begun,
         machine=dict(machine),
-        rows=tuple(_row(entry, campaign.reference) for entry in measured if not _is_of_a_curve(entry)),
-        convergence=tuple(points([e for e in measured if _is_of_a_curve(e)], campaign.channels)),
+        rows=tuple(_row(entry, reference) for entry in measured if not _is_of_a_curve(entry)),
+        convergence=tuple(points([entry for entry in measured if _is_of_a_curve(entry)])),
         skipped=tuple(campaign.skipped),
     )
 
 
-def _plan(options: Options, chosen: Sequence[Setting]) -> list[tuple[Block, list[Setting]]]:
-    """Blocks in order; the first one has what may become reference and baseline."""
-    needed = {*ladder.REFERENCES, *ladder.BASELINES} if not chosen else {s.label for s in chosen}
-    first = [s for s in ladder.LADDER if "ladder" in options.parts or s.label in needed]
-    plan: list[tuple[Block, list[Setting]]] = [("ladder", first + [s for s in chosen if s not in first])]
+def _plan(options: Options, needed: Sequence[Setting]) -> list[tuple[Block, list[Setting]]]:
+    """Blocks in order; the first one has reference and baseline, which the others need."""
+    first = [s for s in ladder.LADDER if "ladder" in options.parts or s in needed]
+    plan: list[tuple[Block, list[Setting]]] = [("ladder", [*first, *(s for s in needed if s not in first)])]
     if "spacing" in options.parts:
-        others = [s for s in ladder.spacing_settings() if s not in chosen]
-        plan.append(("ray spacing", others))
+        plan.append(("ray spacing", [s for s in ladder.spacing_settings() if s not in needed]))
     if "arrays" in options.parts:
         plan.append(("arrays", list(ladder.array_settings())))
     if "convergence" in options.parts:
@@ -123,29 +127,43 @@ def _plan(options: Options, chosen: Sequence[Setting]) -> list[tuple[Block, list
     return plan
 
 
+def _reference(
+    references: Sequence[Setting], measured: Sequence[Measured], skipped: Sequence[Skipped]
+) -> Measured:
+    by_label = {entry.setting.label: entry for entry in measured}
+    for setting in references:
+        if setting.label in by_label:
+            return by_label[setting.label]
+    labels = [setting.label for setting in references]
+    reasons = dict.fromkeys(entry.reason for entry in skipped if entry.setting in labels)
+    raise RunError(f"no reference can be measured, of {', '.join(labels)}: {'; '.join(reasons)}")
+
+
 def _is_of_a_curve(entry: Measured) -> bool:
     return entry.setting.block in ("convergence", "diffuse convergence")
 
 
-def _row(entry: Measured, reference: str) -> Row:
-    timing, setting = entry.timing, entry.setting
-    notes = (["the reference"] if setting.label == reference else []) + entry.notes
+def _row(entry: Measured, reference: Measured) -> Row:
+    setting = entry.setting
+    # Users of other arrays have other channels.
+    found = differences(entry.users, reference.users) if setting.elements is None else []
+    notes = (["the reference"] if entry is reference else []) + entry.notes
     return Row(
         setting=setting.label,
         block=setting.block,
         column=setting.column,
         row=setting.row,
         rung=entry.rung,
-        time_ms_median=timing.median_ms,
-        time_ms_p99=timing.p99_ms,
-        factor=timing.median_ms / entry.baseline_ms,
-        memory_mib=max(timing.memory_mib, default=None),
+        time_ms_median=entry.median_ms,
+        time_ms_p99=float(np.percentile(entry.times_ms, 99)),
+        factor=entry.median_ms / entry.baseline_ms,
+        memory_mib=max(entry.memory_mib, default=None),
         loaded_mib=entry.loaded_mib,
         prepare_s=entry.prepare_s,
-        measurements=len(timing.times_ms),
-        scenes=len(timing.frames),
-        receivers=sum(timing.receivers) / len(timing.receivers),
-        paths=sum(timing.paths) / len(timing.paths),
+        measurements=len(entry.times_ms),
+        scenes=len(entry.frames),
+        receivers=sum(entry.receivers) / len(entry.receivers),
+        paths=sum(entry.paths) / len(entry.paths),
         note="; ".join(notes),
-        **error_fields(entry.differences),  # type: ignore[arg-type]  # fields of a row, by name
+        **error_fields(found),  # type: ignore[arg-type]  # fields of a row, by name
     )

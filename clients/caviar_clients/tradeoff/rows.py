@@ -57,29 +57,6 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     note: str = ""
 
 
-class Timing(msgspec.Struct, kw_only=True):
-    """What was measured of a setting, scene by scene."""
-
-    times_ms: list[float] = []
-    memory_mib: list[float] = []
-    frames: list[int] = []
-    """Of the scenes that count for errors."""
-    receivers: list[int] = []
-    paths: list[int] = []
-    lost: int = 0
-    """Measurements in which paths were lost to a limit."""
-
-    @property
-    def median_ms(self) -> float:
-        """Of all measurements."""
-        return float(np.median(self.times_ms))
-
-    @property
-    def p99_ms(self) -> float:
-        """Of all measurements; of fewer than a hundred near the greatest."""
-        return float(np.percentile(self.times_ms, 99))
-
-
 def error_fields(found: Sequence[Difference]) -> dict[str, float | int | None]:
     """The fields of a `Row` that say how far off a setting is."""
     gains = _values(found, lambda d: d.path_gain_db)

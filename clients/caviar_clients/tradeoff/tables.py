@@ -154,14 +154,14 @@ def _spacing(report: Report) -> list[str]:
     return [
         "## Ray spacing, single antennas and arrays, diffuse scattering (the paper's Table 3)",
         (
-            f"Factor of time to {DIFFUSE_DEG:g}° of the same column, and NMSE against the reference. Here "
-            f"{DIFFUSE_DEG:g}° takes {', '.join(times)}; the paper's baselines are 11.749 s and 39.654 s (64×8)."
+            f"Factor of time to {DIFFUSE_DEG:g}° of the same column, and NMSE against the reference. "
+            f"{DIFFUSE_DEG:g}° takes {', '.join(times)} here, and in the paper 11.749 s and 39.654 s (64×8)."
         ),
         _table(header, body),
         (
             f"The paper: {_PAPER}. Here: {report.scenario} as above, Sionna RT, with the arrays of the "
-            "scenario in every column; N = 4π/Δ² rays for a spacing of Δ rad. Diffuse paths are no part of the "
-            "reference, so that the NMSE of that line says what they add."
+            "scenario in every column; N = 4π/Δ² rays for a spacing of Δ rad. Diffuse paths are no part of "
+            "the reference, so that the NMSE of that line says what they add."
         ),
         _notes(list(rows.values())),
     ]
@@ -223,8 +223,8 @@ def _convergence(report: Report) -> list[str]:
         "## Convergence over samples and seeds",
         (
             "NMSE: of each seed against 3e6 samples with a seed of its own (best … worst seed), for specular "
-            "paths. Between seeds: 95 % of users differ by less in path gain; top-1 is the share whose best pair "
-            "of beams is the same."
+            "paths. Between seeds: 95 % of users differ by less in path gain; top-1 is the share whose best "
+            "pair of beams is the same."
         ),
         _table(header, body),
     ]

@@ -12,11 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from caviar_clients.tradeoff import errors
-from caviar_clients.tradeoff.measure import Step
 from caviar_clients.tradeoff.scenes import Scenes
 from caviar_protocol.arrays import Complex128Array, Float64Array
 from caviar_protocol.tables import convert_settings
-from caviar_protocol.topics import Channel
+from caviar_protocol.topics import Channel, Scene
 from caviar_services.link.beams import BeamLinkSettings, noise_power, transmit_power
 from caviar_services.link.sweep import sweep
 from caviar_services.link.users import User, channels_of, users_of
@@ -59,15 +58,15 @@ class UserChannel:
     """The five best pairs, best first; none without a path."""
 
 
-def user_channels(frame: int, step: Step, noise: Noise) -> dict[Key, UserChannel]:
+def user_channels(frame: int, scene: Scene, channel: Channel, noise: Noise) -> dict[Key, UserChannel]:
     """The channels of all users of a scene."""
-    users = users_of(step.scene, step.channel.carriers)
-    known = channels_of(step.channel, users)
+    users = users_of(scene, channel.carriers)
+    known = channels_of(channel, users)
     found: dict[Key, UserChannel] = {}
     for index, user in enumerate(users):
         if known.known[index]:
             key = (frame, user.tx.name, user.rx.name, user.carrier.name)
-            found[key] = _user_channel(user, step.channel, bool(known.los[index]), known.h[index], noise)
+            found[key] = _user_channel(user, channel, bool(known.los[index]), known.h[index], noise)
     return found
 
 
