@@ -50,6 +50,7 @@ CHEAP = 2
 _SIONNA = "sionna-rt"
 _COMPARABLE = {"normalization": "path-loss", "nlos": "geometry"}
 """Settings of ``geometric`` with which its gains mean the same as those of the others."""
+_DIFFUSE_PATHS = 2_000_000
 _ALL = {"refraction": True, "diffraction": True}
 
 
@@ -72,7 +73,7 @@ LADDER: tuple[Setting, ...] = (
     Setting(
         label="siso-rt 1e5 d3 +scattering",
         use=_SIONNA,
-        settings=_traced(100_000, 3, scattering=True),
+        settings=_traced(100_000, 3, scattering=True, max_paths=_DIFFUSE_PATHS),
         scattering=True,
     ),
     Setting(label="siso-rt 1e6 d5 +r+d", use=_SIONNA, settings=_traced(1_000_000, 5, **_ALL)),
@@ -121,7 +122,6 @@ CONVERGENCE_SAMPLES = (10_000, 30_000, 100_000, 300_000, 1_000_000)
 DIFFUSE_SAMPLES = (10_000, 30_000, 100_000, 300_000)
 TRUTH_SAMPLES = 3_000_000
 """Samples of what the convergence of specular paths is measured against."""
-_DIFFUSE_PATHS = 2_000_000
 
 
 def samples_of(spacing_deg: float) -> int:
