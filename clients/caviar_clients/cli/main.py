@@ -162,8 +162,8 @@ def tradeoff(
         str | None, typer.Option(help="setting that errors are against; by default the finest")
     ] = None,
     baseline: Annotated[str | None, typer.Option(help="setting that factors of time are against")] = None,
-    seeds: Annotated[int, typer.Option(min=2, max=20, help="seeds of the convergence")] = 3,
-    minutes: Annotated[float, typer.Option(min=0.1, help="time for measuring")] = 10.0,
+    seeds: Annotated[int, typer.Option(min=2, max=20, help="seeds of the convergence")] = 2,
+    minutes: Annotated[float, typer.Option(min=0.1, help="time for measuring")] = 12.0,
     part: Annotated[
         list[str] | None, typer.Option(help="ladder, spacing, arrays or convergence; by default all")
     ] = None,

@@ -23,9 +23,12 @@ ROUNDS = 3
 TOGETHER = 3
 """Settings that are loaded at a time, beside the baseline: each holds a scene of its own in memory."""
 PATIENCE = 3.0
-"""What takes this many times longer than the time that is left of its block is ended."""
+"""What is loading this many times longer than the time that is left of its block is ended."""
 AT_LEAST_S = 20.0
-"""[s] that loading gets, however little time is left: else a short comparison would measure nothing."""
+"""[s] that loading and a scene get, however little time is left: else a short comparison would measure
+nothing."""
+WORTH_S = 5.0
+"""[s] A scene that takes longer, and longer than there is time, is not measured again after the warm-up."""
 
 
 class Skipped(msgspec.Struct, frozen=True, kw_only=True):
@@ -212,7 +215,7 @@ class Campaign:
                 self._skip(setting, name, _no_time(expected, left))
                 continue
             try:
-                worker = self._start(setting, max(AT_LEAST_S, PATIENCE * left))
+                worker = self._start(setting, max(AT_LEAST_S, min(PATIENCE * left, self._left_s)))
             except RunError as error:
                 self._skip(setting, name, str(error))
                 continue
@@ -239,14 +242,14 @@ class Campaign:
         whole = measured.setting.label in self._whole and turn < len(self._order)
         if turn and not whole and time.monotonic() > until:
             return
-        if entry.cost_s > PATIENCE * max(AT_LEAST_S, until - time.monotonic()) and not whole:
+        if not turn and not whole and entry.cost_s > max(WORTH_S, until - time.monotonic()):
             measured.take(self._scenes.instants[0].frame, entry.worker.loaded.first)
             measured.notes.append("timed on the scene that warmed it up: another would take too long")
             entry.count = 0
             return
         index = self._order[turn % self._scenes_of(measured.setting)]
         try:
-            sample = entry.worker.step(index, PATIENCE * max(AT_LEAST_S, self._left_s))
+            sample = entry.worker.step(index, max(AT_LEAST_S, self._left_s))
         except RunError as error:
             entry.count = 0
             measured.notes.append(f"ended early: {error}")

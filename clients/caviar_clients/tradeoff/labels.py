@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 from caviar_clients.plots.style import GREY
@@ -11,7 +12,7 @@ from caviar_clients.plots.style import GREY
 DISTANCES_PT = (9.0, 16.0, 26.0, 38.0, 52.0, 68.0)
 DIRECTIONS = 16
 GAP_PX = 3.0
-LEADER_PT = 20.0
+LEADER_PT = 12.0
 """A label farther away than this is tied to its point by a line."""
 
 
@@ -62,8 +63,14 @@ def spots(x: float, y: float, width: float, height: float, pixels_per_point: flo
             yield Spot(dx / pixels_per_point, dy / pixels_per_point, distance, box)
 
 
-def place(axes: Any, points: Sequence[tuple[float, float]], texts: Sequence[str], size: float = 9.0) -> None:
-    """Label points of ``axes``, in data coordinates. Their limits must be final."""
+def place(
+    axes: Any,
+    points: Sequence[tuple[float, float]],
+    texts: Sequence[str],
+    line: Sequence[tuple[float, float]] = (),
+    size: float = 9.0,
+) -> None:
+    """Label points of ``axes``, off a staircase too, all in data coordinates. The limits must be final."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     drawn = axes.figure
@@ -74,6 +81,11 @@ def place(axes: Any, points: Sequence[tuple[float, float]], texts: Sequence[str]
     pixels = [tuple(axes.transData.transform(point)) for point in points]
     radius = 5 * pixels_per_point
     taken = [Box(x - radius, y - radius, x + radius, y + radius) for x, y in pixels]
+    corners = [tuple(axes.transData.transform(point)) for point in line]
+    taken += [
+        Box(min(x0, x1) - 1, min(y0, y1) - 1, max(x0, x1) + 1, max(y0, y1) + 1)
+        for (x0, y0), (x1, y1) in pairwise(corners)
+    ]
     for text, (x, y), point in sorted(zip(texts, pixels, points, strict=True), key=lambda e: -e[1][1]):
         label = axes.annotate(
             text,
@@ -84,6 +96,7 @@ def place(axes: Any, points: Sequence[tuple[float, float]], texts: Sequence[str]
             va="center",
             fontsize=size,
             zorder=5,
+            bbox={"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8},
         )
         extent = label.get_window_extent(canvas.get_renderer())
         found = min(

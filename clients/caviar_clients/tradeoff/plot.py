@@ -48,7 +48,8 @@ def draw_pareto(report: Report, file: Path) -> Path:
         drawn.legend(handles, names, loc="outside lower center", ncols=4)
         for axes, value in ((upper, _nmse), (lower, _gain)):
             shown = _points(rows, report.reference, value)
-            place(axes, [(row.time_ms_median, error) for row, error in shown], [r.setting for r, _ in shown])
+            points = [(row.time_ms_median, error) for row, error in shown]
+            place(axes, points, [row.setting for row, _ in shown], pareto_front(points))
     return file
 
 
@@ -95,7 +96,7 @@ def _panel(axes: Any, rows: Sequence[Row], reference: str, value: Callable[[Row]
 def _widen(axes: Any) -> None:
     """Room for labels beside the outermost points."""
     left, right = axes.get_xlim()
-    axes.set_xlim(left / (right / left) ** _MARGIN, right * (right / left) ** _MARGIN)
+    axes.set_xlim(left / (right / left) ** (_MARGIN / 3), right * (right / left) ** _MARGIN)
     bottom, top = axes.get_ylim()
     axes.set_ylim(bottom - _MARGIN * (top - bottom), top + _MARGIN * (top - bottom))
 
@@ -141,12 +142,14 @@ def draw_convergence(report: Report, file: Path) -> Path:
 
 def _curves(error: Any, gain: Any, beams: Any, kind: str, points: Sequence[Point], colour: str) -> None:
     samples = [point.samples for point in points]
-    between = [point.pair_nmse_db for point in points]
-    if all(value is not None for value in between):
+    between = [value for point in points if (value := point.pair_nmse_db) is not None and value > EQUAL_DB]
+    if len(between) == len(points):
         error.plot(samples, between, "s--", color=colour, label=f"{kind}, between seeds")
     if all(point.nmse_db for point in points):
         middle = [sorted(point.nmse_db)[len(point.nmse_db) // 2] for point in points]
         error.plot(samples, middle, "-", color=colour, label=f"{kind}, against 3e6 samples")
+        if not between:
+            error.plot([], [], "s--", color=colour, label=f"{kind}, between seeds (equal)")
         for point in points:
             error.plot([point.samples] * len(point.nmse_db), point.nmse_db, "o", color=colour)
     gain.plot(samples, [point.pair_gain_db_p95 for point in points], "s--", color=colour)

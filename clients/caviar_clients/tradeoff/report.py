@@ -52,17 +52,17 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     reference: str | None = None
     baseline: str | None = None
     receivers: int | None = None
-    seeds: int = 3
-    seconds: float = 600.0
+    seeds: int = 2
+    seconds: float = 720.0
     parts: tuple[Part, ...] = PARTS
 
 
 _WEIGHTS: Mapping[Block, float] = {
-    "ladder": 45,
+    "ladder": 40,
     "ray spacing": 22,
-    "arrays": 8,
-    "convergence": 12,
-    "diffuse convergence": 13,
+    "arrays": 14,
+    "convergence": 10,
+    "diffuse convergence": 14,
 }
 """Shares of the time."""
 
