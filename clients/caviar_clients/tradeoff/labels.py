@@ -16,6 +16,11 @@ LEADER_PT = 12.0
 """A label farther away than this is tied to its point by a line."""
 
 
+CROSSING = 100.0
+"""Area [pixels²] of overlap that is as bad as a step of such a line within something else."""
+STEPS = 12
+
+
 class Box(NamedTuple):
     """A rectangle [pixels]."""
 
@@ -102,7 +107,9 @@ def place(
         found = min(
             spots(x, y, extent.width, extent.height, pixels_per_point),
             key=lambda spot: (
-                sum(spot.box.overlap(other) for other in taken) + 10 * spot.box.outside(frame),
+                sum(spot.box.overlap(other) for other in taken)
+                + 10 * spot.box.outside(frame)
+                + CROSSING * _crossed(x, y, spot, taken),
                 spot.distance,
             ),
         )
@@ -110,6 +117,21 @@ def place(
         taken.append(found.box)
         if found.distance >= LEADER_PT:
             _tie(axes, point, found)
+
+
+def _crossed(x: float, y: float, spot: Spot, taken: Sequence[Box]) -> int:
+    """How many labels and points the line between a point and its label would cross."""
+    if spot.distance < LEADER_PT:
+        return 0
+    centre_x, centre_y = (spot.box.left + spot.box.right) / 2, (spot.box.bottom + spot.box.top) / 2
+    beside = [box for box in taken if not (box.left <= x <= box.right and box.bottom <= y <= box.top)]
+    found = 0
+    for step in range(1, STEPS):
+        along = step / STEPS
+        here_x, here_y = x + along * (centre_x - x), y + along * (centre_y - y)
+        here = Box(here_x - 1, here_y - 1, here_x + 1, here_y + 1)
+        found += any(box.overlap(here) > 0 for box in beside)
+    return found
 
 
 def _tie(axes: Any, point: tuple[float, float], spot: Spot) -> None:

@@ -224,8 +224,8 @@ def _convergence(report: Report) -> list[str]:
         (
             "NMSE: of each seed against 3e6 samples with a seed of its own (best … worst seed), for specular "
             "paths. Between seeds: 95 % of users differ by less in path gain; top-1 is the share whose best "
-            f"pair of beams is the same; {level(FLOOR_DB)} dB: equal, since rays leave in the directions of a "
-            "lattice, and the seed draws only what happens where they meet something."
+            f"pair of beams is the same; {level(FLOOR_DB)} dB: equal, since rays leave along a lattice of "
+            "directions, and the seed draws only what happens where they meet something."
         ),
         _table(header, body),
     ]
