@@ -87,7 +87,7 @@ def place(
     radius = 5 * pixels_per_point
     taken = [Box(x - radius, y - radius, x + radius, y + radius) for x, y in pixels]
     corners = [tuple(axes.transData.transform(point)) for point in line]
-    taken += [
+    lines = [
         Box(min(x0, x1) - 1, min(y0, y1) - 1, max(x0, x1) + 1, max(y0, y1) + 1)
         for (x0, y0), (x1, y1) in pairwise(corners)
     ]
@@ -107,7 +107,7 @@ def place(
         found = min(
             spots(x, y, extent.width, extent.height, pixels_per_point),
             key=lambda spot: (
-                sum(spot.box.overlap(other) for other in taken)
+                sum(spot.box.overlap(other) for other in (*taken, *lines))
                 + 10 * spot.box.outside(frame)
                 + CROSSING * _crossed(x, y, spot, taken),
                 spot.distance,

@@ -31,6 +31,8 @@ RUNG_COLOURS = {
 EQUAL_DB = -150.0
 """[dB] An NMSE below this is rounding, and not drawn."""
 _MARGIN = 0.12
+_FEW_TICKS = 8.0
+"""Ratio of greatest to least below which each tick of a logarithmic axis has a number."""
 
 
 def draw_pareto(report: Report, file: Path) -> Path:
@@ -89,6 +91,12 @@ def _panel(axes: Any, rows: Sequence[Row], reference: str, value: Callable[[Row]
     found = next((row for row in rows if row.setting == reference), None)
     if found is not None:
         axes.axvline(found.time_ms_median, color=GREY, linestyle=":", label=f"reference: {reference}")
+    errors = [error for _, error in points]
+    if errors and min(errors) > 0:
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter("{x:g}")
+        if max(errors) < _FEW_TICKS * min(errors):
+            axes.yaxis.set_minor_formatter("{x:g}")
     _widen(axes)
     axes.grid(color=LIGHT_GREY, linewidth=0.6)
 
@@ -98,7 +106,10 @@ def _widen(axes: Any) -> None:
     left, right = axes.get_xlim()
     axes.set_xlim(left / (right / left) ** (_MARGIN / 3), right * (right / left) ** _MARGIN)
     bottom, top = axes.get_ylim()
-    axes.set_ylim(bottom - _MARGIN * (top - bottom), top + _MARGIN * (top - bottom))
+    if axes.get_yscale() == "log":
+        axes.set_ylim(bottom / (top / bottom) ** _MARGIN, top * (top / bottom) ** _MARGIN)
+    else:
+        axes.set_ylim(bottom - _MARGIN * (top - bottom), top + _MARGIN * (top - bottom))
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
