@@ -86,6 +86,13 @@ def scenes_of(path: Path, frames: int) -> Scenes:
 
 def _of_recording(path: Path, frames: int) -> Scenes:
     recording = Recording(path)
+    first = recording.entry(0).episode if len(recording) else 0
+    kept = [frame for frame in recording.frames() if frame.episode == first]
+    instants = [instant for frame in _spread(kept, frames) if (instant := _instant(frame)) is not None]
+    if not instants:
+        raise RecordingError(
+            f'{path} holds no scene; record the topic: record = ["scene", …] in the table [run]'
+        )
     metadata = recording.metadata
     try:
         scenario = metadata.scenario
@@ -94,13 +101,6 @@ def _of_recording(path: Path, frames: int) -> Scenes:
         services = msgspec.convert(scenario.get("services", {}), dict[str, ServiceSpec])
     except msgspec.ValidationError as error:
         raise RecordingError(f"{path}: the scenario in its metadata cannot be read: {error}") from error
-    first = recording.entry(0).episode if len(recording) else 0
-    kept = [frame for frame in recording.frames() if frame.episode == first]
-    instants = [instant for frame in _spread(kept, frames) if (instant := _instant(frame)) is not None]
-    if not instants:
-        raise RecordingError(
-            f'{path} holds no scene; record the topic: record = ["scene", …] in the table [run]'
-        )
     return Scenes(
         name=metadata.name,
         origin=f"recording {recording.directory.name}",
