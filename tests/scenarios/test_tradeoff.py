@@ -33,13 +33,15 @@ def small_ladder(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ladder, "BASELINES", ("geometric",))
 
 
-def compared(source: Path, folder: Path, frames: int = 3, **options: Any) -> tuple[dict[str, Any], str]:
+def compared(
+    source: Path, folder: Path, frames: int = 3, seconds: float = 20.0, **options: Any
+) -> tuple[dict[str, Any], str]:
     """What the JSON says, and the screen."""
     screen = StringIO()
     trade(
         source,
         frames,
-        Options(parts=("ladder",), seconds=20.0, **options),
+        Options(parts=("ladder",), seconds=seconds, **options),
         folder / "t.json",
         folder / "pictures",
         Console(file=screen, width=160),
@@ -105,7 +107,7 @@ def test_deeper_tracing_comes_nearer_and_takes_longer(
     monkeypatch.setattr(ladder, "LADDER", tuple(lines))
     monkeypatch.setattr(ladder, "REFERENCES", ("d3",))
     monkeypatch.setattr(ladder, "BASELINES", ("d0",))
-    report, _ = compared(SCENARIOS / "street-canyon.toml", tmp_path, frames=2, receivers=4)
+    report, _ = compared(SCENARIOS / "street-canyon.toml", tmp_path, frames=2, seconds=60.0, receivers=4)
     d0, d1, d3 = report["rows"]
     assert d0["nmse_db"] > d1["nmse_db"] > d3["nmse_db"] == -200.0
     assert d0["path_gain_error_db"] > d1["path_gain_error_db"] > 0

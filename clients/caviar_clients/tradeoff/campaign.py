@@ -211,7 +211,8 @@ class Campaign:
                 continue
             self._tell(f"{name}: loading {setting.label}")
             expected, left = predicted_s(setting, costs), until - time.monotonic()
-            if (left <= 0 and setting.label not in self._whole) or (expected or 0.0) > PATIENCE * left:
+            out_of_time = left <= 0 or (expected or 0.0) > PATIENCE * left
+            if out_of_time and setting.label not in self._whole:
                 self._skip(setting, name, _no_time(expected, left))
                 continue
             try:
