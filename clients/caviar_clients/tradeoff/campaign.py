@@ -124,7 +124,7 @@ class Campaign:
     scenes
         What is measured on.
     baseline
-        Labels of what factors are against: the first that can be loaded.
+        What factors are against: the first of these that can be loaded.
     whole
         Labels of settings that see every scene, whatever that takes: the reference.
     seconds
@@ -173,6 +173,8 @@ class Campaign:
                 entries = self._loaded(name, wave, costs, until, stack)
                 self._by_turns(name, entries, now + max(0.0, until - now) / (len(waves) - number))
             baseline, *others = entries
+            if not baseline.measured.times_ms:
+                raise RunError(f"{self.baseline.label} {'; '.join(baseline.measured.notes)}")
             own.absorb(baseline.measured)
             for entry in others:
                 entry.measured.baseline_ms = baseline.measured.median_ms

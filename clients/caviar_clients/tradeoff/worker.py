@@ -69,6 +69,11 @@ class Worker:
         theirs.close()
         self.loaded: Loaded = self._answer(seconds)
 
+    @property
+    def pid(self) -> int:
+        """Of its process, which may have ended."""
+        return self._process.pid or 0
+
     def step(self, index: int, seconds: float) -> Sample:
         """The scene with this index. Raises `RunError` with the reason where it fails or takes too long."""
         self._pipe.send(index)
@@ -87,15 +92,17 @@ class Worker:
 
     def _answer(self, seconds: float) -> Any:
         try:
-            if not self._pipe.poll(seconds):
-                self._process.kill()
-                raise RunError(f"no answer within {seconds:.0f} s; give more with --minutes")
-            answer = self._pipe.recv()
+            late = not self._pipe.poll(seconds)
+            answer = None if late else self._pipe.recv()
         except (EOFError, OSError) as error:
-            self._process.join()
+            self.close()
             code = self._process.exitcode or 0
             cause = f"signal {signal.Signals(-code).name}" if code < 0 else f"status {code}"
             raise RunError(f"its process ended with {cause}; was there enough memory?") from error
+        if late:
+            self._process.kill()  # it is in the middle of a scene, and hears nothing
+            self.close()
+            raise RunError(f"no answer within {seconds:.0f} s; give more with --minutes")
         if isinstance(answer, str):
             self.close()
             raise RunError(answer)
