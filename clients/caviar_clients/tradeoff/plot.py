@@ -80,8 +80,7 @@ def _panel(axes: Any, rows: Sequence[Row], reference: str, value: Callable[[Row]
             axes.plot([], [], "o", color=colour, markersize=8, label=rung)
     front = pareto_front([(row.time_ms_median, error) for row, error in points])
     axes.plot(
-        [time for time, _ in front],
-        [error for _, error in front],
+        *_columns(front),
         color=GREY,
         linewidth=1.2,
         zorder=1,
@@ -94,9 +93,10 @@ def _panel(axes: Any, rows: Sequence[Row], reference: str, value: Callable[[Row]
     errors = [error for _, error in points]
     if errors and min(errors) > 0:
         axes.set_yscale("log")
+        few = max(errors) < _FEW_TICKS * min(errors)
+        axes.yaxis.set_minor_locator(LogLocator(subs=range(2, 10) if few else (2, 5)))
         axes.yaxis.set_major_formatter("{x:g}")
-        if max(errors) < _FEW_TICKS * min(errors):
-            axes.yaxis.set_minor_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter("{x:g}")
     _widen(axes)
     axes.grid(color=LIGHT_GREY, linewidth=0.6)
 
@@ -152,17 +152,20 @@ def draw_convergence(report: Report, file: Path) -> Path:
 
 
 def _curves(error: Any, gain: Any, beams: Any, kind: str, points: Sequence[Point], colour: str) -> None:
-    samples = [point.samples for point in points]
-    between = [value for point in points if (value := point.pair_nmse_db) is not None and value > EQUAL_DB]
-    if len(between) == len(points):
-        error.plot(samples, between, "s--", color=colour, label=f"{kind}, between seeds")
+    pairs = [point for point in points if point.seeds > 1]
+    samples = [point.samples for point in pairs]
+    between = [(p.samples, db) for p in pairs if (db := p.pair_nmse_db) is not None and db > EQUAL_DB]
+    equal = "" if between else " (equal)"
+    error.plot(*_columns(between), "s--", color=colour, label=f"{kind}, between seeds{equal}")
     if all(point.nmse_db for point in points):
-        middle = [sorted(point.nmse_db)[len(point.nmse_db) // 2] for point in points]
-        error.plot(samples, middle, "-", color=colour, label=f"{kind}, against 3e6 samples")
-        if not between:
-            error.plot([], [], "s--", color=colour, label=f"{kind}, between seeds (equal)")
+        middle = [(point.samples, sorted(point.nmse_db)[len(point.nmse_db) // 2]) for point in points]
+        error.plot(*_columns(middle), "-", color=colour, label=f"{kind}, against 3e6 samples")
         for point in points:
             error.plot([point.samples] * len(point.nmse_db), point.nmse_db, "o", color=colour)
-    gain.plot(samples, [point.pair_gain_db_p95 for point in points], "s--", color=colour)
-    shares = [None if p.pair_beam_top1 is None else 100 * p.pair_beam_top1 for p in points]
+    gain.plot(samples, [point.pair_gain_db_p95 for point in pairs], "s--", color=colour)
+    shares = [None if p.pair_beam_top1 is None else 100 * p.pair_beam_top1 for p in pairs]
     beams.plot(samples, shares, "s--", color=colour)
+
+
+def _columns(points: Sequence[tuple[float, float]]) -> tuple[list[float], list[float]]:
+    return [x for x, _ in points], [y for _, y in points]
