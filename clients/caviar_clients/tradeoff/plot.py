@@ -71,6 +71,8 @@ def _points(
 
 
 def _panel(axes: Any, rows: Sequence[Row], reference: str, value: Callable[[Row], float | None]) -> None:
+    from matplotlib.ticker import LogLocator
+
     points = _points(rows, reference, value)
     for row, error in points:
         colour = RUNG_COLOURS.get(row.rung, GREY)

@@ -193,7 +193,7 @@ def _arrays(report: Report) -> list[str]:
         body.append([str(nt), str(nr), *cells, f"{PAPER_ARRAYS[size]:g}"])
     return [
         "## Elements of the arrays (the paper's Table 4)",
-        f"Factor of time to {sizes[0]} of the same column, likewise, depth 3. The paper's baseline is 18.437 s.",
+        f"Factor of time to {sizes[0]} of the same column, likewise; depth 3. In the paper it takes 18.437 s.",
         _table(["Nt", "Nr", *columns, "paper: MIMO-RT"], body),
         "Horizontal linear arrays in place of the scenario's; all else as in the table above.",
         _notes(list(rows.values())),
