@@ -193,7 +193,7 @@ def _arrays(report: Report) -> list[str]:
         body.append([str(nt), str(nr), *cells, f"{PAPER_ARRAYS[size]:g}"])
     return [
         "## Elements of the arrays (the paper's Table 4)",
-        f"Factor of time to {sizes[0]} of the same column, likewise; depth 3. In the paper it takes 18.437 s.",
+        f"Factor of time to {sizes[0]} of the same column, likewise; depth 3. The paper: 18.437 s.",
         _table(["Nt", "Nr", *columns, "paper: MIMO-RT"], body),
         "Horizontal linear arrays in place of the scenario's; all else as in the table above.",
         _notes(list(rows.values())),
@@ -203,7 +203,8 @@ def _arrays(report: Report) -> list[str]:
 def _convergence(report: Report) -> list[str]:
     if not report.convergence:
         return []
-    header = ["paths", "samples", "seeds", "time ms", "NMSE dB", "between seeds: NMSE dB", "gain dB", "top-1"]
+    between = ["between seeds: users", "NMSE dB", "gain dB", "top-1"]
+    header = ["paths", "samples", "seeds", "time ms", "NMSE dB", *between]
     body = []
     for point in report.convergence:
         values = sorted(point.nmse_db)
@@ -215,6 +216,7 @@ def _convergence(report: Report) -> list[str]:
                 str(point.seeds),
                 significant(point.time_ms_median),
                 span,
+                str(point.users),
                 level(point.pair_nmse_db),
                 significant(point.pair_gain_db_p95),
                 percent(point.pair_beam_top1),
