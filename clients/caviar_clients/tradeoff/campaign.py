@@ -24,6 +24,8 @@ TOGETHER = 3
 """Settings that are loaded at a time, beside the baseline: each holds a scene of its own in memory."""
 PATIENCE = 3.0
 """What is loading this many times longer than the time that is left of its block is ended."""
+AFFORDABLE = 0.5
+"""Share of the time left of its block that one scene of a setting may be expected to take."""
 AT_LEAST_S = 20.0
 """[s] that loading and a scene get, however little time is left: else a short comparison would measure
 nothing."""
@@ -213,7 +215,7 @@ class Campaign:
                 continue
             self._tell(f"{name}: loading {setting.label}")
             expected, left = predicted_s(setting, costs), until - time.monotonic()
-            out_of_time = left <= 0 or (expected or 0.0) > PATIENCE * left
+            out_of_time = left <= 0 or (expected or 0.0) > AFFORDABLE * left
             if out_of_time and setting.label not in self._whole:
                 self._skip(setting, name, _no_time(expected, left))
                 continue

@@ -135,53 +135,43 @@ def samples_of(spacing_deg: float) -> int:
 
 @cache
 def spacing_settings() -> tuple[Setting, ...]:
-    """The lines of the paper's Table 3."""
-    made = []
-    for rung, extra in TABLE_RUNGS.items():
-        few = rung in FEW
-        for spacing, diffuse in [*((s, False) for s in SPACINGS_DEG), (DIFFUSE_DEG, True)]:
-            row = f"{spacing:g}" + (" (diffuse)" if diffuse else "")
-            options: dict[str, Any] = {"scattering": diffuse, **extra}
-            if diffuse:
-                options["max_paths"] = _DIFFUSE_PATHS
-            made.append(
-                Setting(
-                    label=f"{rung} {spacing:g}°" + (" diffuse" if diffuse else ""),
-                    use=_SIONNA,
-                    settings=_traced(samples_of(spacing), 3, **options),
-                    block="ray spacing",
-                    column=rung,
-                    row=row,
-                    scattering=diffuse,
-                    most_scenes=1 if few else None,
-                    most_receivers=CHEAP if few else None,
-                )
-            )
-    return tuple(made)
+    """The lines of the paper's Table 3, each row's side by side, so that they take turns."""
+    rows = [*((spacing, False) for spacing in SPACINGS_DEG), (DIFFUSE_DEG, True)]
+    return tuple(_spacing(rung, *row) for row in rows for rung in TABLE_RUNGS)
+
+
+def _spacing(rung: str, spacing_deg: float, diffuse: bool) -> Setting:
+    options: dict[str, Any] = {"max_paths": _DIFFUSE_PATHS} if diffuse else {}
+    return Setting(
+        label=f"{rung} {spacing_deg:g}°" + (" diffuse" if diffuse else ""),
+        use=_SIONNA,
+        settings=_traced(samples_of(spacing_deg), 3, scattering=diffuse, **options, **TABLE_RUNGS[rung]),
+        block="ray spacing",
+        column=rung,
+        row=f"{spacing_deg:g}" + (" (diffuse)" if diffuse else ""),
+        scattering=diffuse,
+        most_scenes=1 if rung in FEW else None,
+        most_receivers=CHEAP if rung in FEW else None,
+    )
 
 
 def array_settings() -> tuple[Setting, ...]:
-    """The lines of the paper's Table 4."""
-    made = []
-    for rung, extra in TABLE_RUNGS.items():
-        few = rung in FEW
-        samples = 10_000 if few else 100_000
-        for elements in ELEMENTS:
-            size = f"{elements[0]}×{elements[1]}"
-            made.append(
-                Setting(
-                    label=f"{rung} {size}",
-                    use=_SIONNA,
-                    settings=_traced(samples, 3, **extra),
-                    block="arrays",
-                    column=rung,
-                    row=size,
-                    elements=elements,
-                    most_scenes=1 if few else None,
-                    most_receivers=1 if few else None,
-                )
-            )
-    return tuple(made)
+    """The lines of the paper's Table 4, likewise."""
+    return tuple(_arrays(rung, *elements) for elements in ELEMENTS for rung in TABLE_RUNGS)
+
+
+def _arrays(rung: str, nt: int, nr: int) -> Setting:
+    return Setting(
+        label=f"{rung} {nt}×{nr}",
+        use=_SIONNA,
+        settings=_traced(10_000 if rung in FEW else 100_000, 3, **TABLE_RUNGS[rung]),
+        block="arrays",
+        column=rung,
+        row=f"{nt}×{nr}",
+        elements=(nt, nr),
+        most_scenes=1 if rung in FEW else None,
+        most_receivers=1 if rung in FEW else None,
+    )
 
 
 def convergence_settings(seeds: int) -> tuple[Setting, ...]:

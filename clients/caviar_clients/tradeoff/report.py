@@ -58,9 +58,9 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
 
 
 _WEIGHTS: Mapping[Block, float] = {
-    "ladder": 40,
-    "ray spacing": 22,
-    "arrays": 14,
+    "ladder": 36,
+    "ray spacing": 28,
+    "arrays": 12,
     "convergence": 10,
     "diffuse convergence": 14,
 }
