@@ -61,13 +61,13 @@ class UserChannel:
 def user_channels(frame: int, scene: Scene, channel: Channel, noise: Noise) -> dict[Key, UserChannel]:
     """The channels of all users of a scene."""
     users = users_of(scene, channel.carriers)
-    known = channels_of(channel, users)
-    found: dict[Key, UserChannel] = {}
-    for index, user in enumerate(users):
-        if known.known[index]:
-            key = (frame, user.tx.name, user.rx.name, user.carrier.name)
-            found[key] = _user_channel(user, channel, bool(known.los[index]), known.h[index], noise)
-    return found
+    looked_up = channels_of(channel, users)
+    return {
+        (frame, user.tx.name, user.rx.name, user.carrier.name): _user_channel(
+            user, channel, bool(los), h, noise
+        )
+        for user, los, h in zip(users, looked_up.los, looked_up.h, strict=True)
+    }
 
 
 def _user_channel(
