@@ -81,3 +81,14 @@ def test_labels_are_unique_and_those_of_the_defaults_exist() -> None:
     labels = [setting.label for setting in every]
     assert len(labels) == len(set(labels))
     assert {*REFERENCES, *BASELINES} <= {setting.label for setting in LADDER}
+
+
+def test_what_traces_every_pair_comes_behind_what_is_cheap() -> None:
+    labels = [setting.label for setting in spacing_settings()]
+    assert labels.index("spherical 0.25°") < labels.index("mimo-rt 1°") < labels.index("mimo-rt 0.5°")
+    assert labels[-1] == "mimo-rt 0.5° diffuse"
+    assert [setting.label for setting in array_settings()][-3:] == [
+        "mimo-rt 64×2",
+        "mimo-rt 64×8",
+        "mimo-rt 64×64",
+    ]

@@ -9,7 +9,7 @@ from rich.text import Text
 
 from caviar_clients.tradeoff.campaign import Skipped
 from caviar_clients.tradeoff.errors import FLOOR_DB
-from caviar_clients.tradeoff.ladder import DIFFUSE_DEG, ELEMENTS, SPACINGS_DEG, samples_of
+from caviar_clients.tradeoff.ladder import DIFFUSE_DEG, ELEMENTS, SPACINGS_DEG, TABLE_RUNGS, samples_of
 from caviar_clients.tradeoff.report import Report
 from caviar_clients.tradeoff.rows import Row
 
@@ -136,7 +136,7 @@ def _spacing(report: Report) -> list[str]:
     rows = {(row.column, row.row): row for row in report.rows if row.block == "ray spacing"}
     if not rows:
         return []
-    columns = list(dict.fromkeys(column for column, _ in rows))
+    columns = [rung for rung in TABLE_RUNGS if any(column == rung for column, _ in rows)]
     header = ["ray spacing °", "rays", *(f"{c} (NMSE)" for c in columns), "paper: SISO-RT", "paper: MIMO-RT"]
     body = []
     for spacing, label in [
@@ -178,7 +178,7 @@ def _arrays(report: Report) -> list[str]:
     rows = {(row.column, row.row): row for row in report.rows if row.block == "arrays"}
     if not rows:
         return []
-    columns = list(dict.fromkeys(column for column, _ in rows))
+    columns = [rung for rung in TABLE_RUNGS if any(column == rung for column, _ in rows)]
     sizes = [f"{n}×{m}" for n, m in ELEMENTS]
     body = []
     for (nt, nr), size in zip(ELEMENTS, sizes, strict=True):
