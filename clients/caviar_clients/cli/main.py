@@ -146,6 +146,35 @@ def video(
     typer.echo(f"{film.file}: {film.frames} frames of {film.size[0]}×{film.size[1]}, {pace}")
 
 
+@app.command()
+def tradeoff(
+    source: Annotated[
+        Path,
+        typer.Argument(help="scenario file, or directory of a run that recorded `scene`", show_default=False),
+    ],
+    json: Annotated[Path | None, typer.Option(help="write all figures to this file")] = None,
+    out: Annotated[Path | None, typer.Option(help="directory for tables and pictures")] = None,
+    frames: Annotated[int, typer.Option(min=1, max=10_000, help="scenes, spread over the episode")] = 12,
+    receivers: Annotated[
+        int | None, typer.Option(min=1, help="receivers of a scene at most; by default all")
+    ] = None,
+    reference: Annotated[
+        str | None, typer.Option(help="setting that errors are against; by default the finest")
+    ] = None,
+    baseline: Annotated[str | None, typer.Option(help="setting that factors of time are against")] = None,
+    seeds: Annotated[int, typer.Option(min=2, max=20, help="seeds of the convergence")] = 2,
+    minutes: Annotated[float, typer.Option(min=0.1, help="time for measuring")] = 12.0,
+    part: Annotated[
+        list[str] | None, typer.Option(help="ladder, spacing, arrays or convergence; by default all")
+    ] = None,
+) -> None:
+    """Compare channel settings: time and error of each over the same scenes."""
+    from caviar_clients.cli.tradeoff import options_of, trade
+
+    options = options_of(reference, baseline, receivers, seeds, minutes, part)
+    trade(source, frames, options, json, out, _console)
+
+
 def main() -> None:
     """Entry point: errors meant for the user become one line and status 1."""
     try:

@@ -1,0 +1,1 @@
+"""Time and error of channel settings over the same scenes."""

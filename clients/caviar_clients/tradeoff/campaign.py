@@ -1,0 +1,323 @@
+"""All settings over all scenes: what is loaded when, measured by turns, and skipped for which reason."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, field
+
+import msgspec
+import numpy as np
+
+from caviar_clients.tradeoff.ladder import Block, Setting
+from caviar_clients.tradeoff.scenes import Scenes
+from caviar_clients.tradeoff.schedule import Cost, predicted_s, shares, spread_order
+from caviar_clients.tradeoff.users import Key, Noise, UserChannel
+from caviar_clients.tradeoff.worker import Sample, Worker
+from caviar_protocol.errors import RunError
+from caviar_protocol.tables import suggestion
+
+ROUNDS = 3
+"""Times that each scene is measured, where time allows: for the 99th percentile."""
+TOGETHER = 3
+"""Settings that are loaded at a time, beside the baseline: each holds a scene of its own in memory."""
+PATIENCE = 3.0
+"""What is loading this many times longer than the time that is left of its block is ended."""
+AFFORDABLE = 0.5
+"""Share of the time left of its block that one scene of a setting may be expected to take."""
+AT_LEAST_S = 20.0
+"""[s] that loading and a scene get, however little time is left: else a short comparison would measure
+nothing."""
+WORTH_S = 5.0
+"""[s] A scene that takes longer, and longer than there is time, is not measured again after the warm-up."""
+
+
+class Skipped(msgspec.Struct, frozen=True, kw_only=True):
+    """A setting that was not measured."""
+
+    setting: str
+    block: str
+    reason: str
+
+
+@dataclass(kw_only=True, eq=False)
+class Measured:
+    """What was found of one setting."""
+
+    setting: Setting
+    rung: str
+    prepare_s: float
+    loaded_mib: float | None
+    times_ms: list[float] = field(default_factory=list)
+    memory_mib: list[float] = field(default_factory=list)
+    frames: list[int] = field(default_factory=list)
+    """Of the scenes that were measured, each once."""
+    receivers: list[int] = field(default_factory=list)
+    """Of each of these scenes; likewise the paths."""
+    paths: list[int] = field(default_factory=list)
+    lost: int = 0
+    """Measurements in which paths were lost."""
+    users: dict[Key, UserChannel] = field(default_factory=dict)
+    baseline_ms: float = 0.0
+    """Median time of the baseline, measured by turns with this one."""
+    notes: list[str] = field(default_factory=list)
+
+    def take(self, frame: int, sample: Sample) -> None:
+        """Note a measurement; if its scene is new, what users got too."""
+        self.times_ms.append(sample.time_ms)
+        self.lost += sample.lost_paths
+        if sample.memory_mib is not None:
+            self.memory_mib.append(sample.memory_mib)
+        if frame not in self.frames:
+            self.frames.append(frame)
+            self.receivers.append(sample.receivers)
+            self.paths.append(sample.paths)
+            self.users.update(sample.users)
+
+    def absorb(self, other: Measured) -> None:
+        """Note what was measured of the same setting elsewhere."""
+        self.times_ms += other.times_ms
+        self.memory_mib += other.memory_mib
+        self.lost += other.lost
+        for frame, receivers, paths in zip(other.frames, other.receivers, other.paths, strict=True):
+            if frame not in self.frames:
+                self.frames.append(frame)
+                self.receivers.append(receivers)
+                self.paths.append(paths)
+        self.users.update(other.users)
+
+    @property
+    def median_ms(self) -> float:
+        """Time of all measurements; 0 where there is none."""
+        return float(np.median(self.times_ms)) if self.times_ms else 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Told:
+    """How a campaign is getting on."""
+
+    text: str
+    done: float
+    """Share of the whole."""
+    left_s: float
+    """[s] that it may still take."""
+
+
+@dataclass(eq=False)
+class _Entry:
+    """A setting that is loaded."""
+
+    worker: Worker
+    measured: Measured
+    count: int = 0
+    """Measurements that it gets."""
+
+    @property
+    def cost_s(self) -> float:
+        return self.worker.loaded.first.time_ms / 1e3
+
+
+class Campaign:
+    """Measures blocks of settings over the same scenes, each setting by turns with the baseline.
+
+    Parameters
+    ----------
+    scenes
+        What is measured on.
+    baseline
+        What factors are against: the first of these that can be loaded.
+    whole
+        Labels of settings that see every scene, whatever that takes: the reference.
+    seconds
+        For everything.
+    receivers
+        Receivers of a scene at most; None: all.
+    told
+        Is told about progress.
+    """
+
+    def __init__(
+        self,
+        scenes: Scenes,
+        *,
+        baseline: Sequence[Setting],
+        whole: Sequence[str],
+        seconds: float,
+        receivers: int | None,
+        told: Callable[[Told], None],
+    ) -> None:
+        self._scenes, self._receivers, self._told, self._whole = scenes, receivers, told, whole
+        self._seconds, self._begun = seconds, time.monotonic()
+        self._order = spread_order(len(scenes.instants))
+        self._noise = Noise.of(scenes)
+        self.skipped: list[Skipped] = []
+        self._baseline = self._first_loaded(baseline)
+
+    @property
+    def baseline(self) -> Setting:
+        """What factors are against."""
+        return self._baseline.setting
+
+    def close(self) -> None:
+        """End what is loaded."""
+        self._baseline.close()
+
+    def block(self, name: Block, settings: Sequence[Setting], share: float) -> list[Measured]:
+        """Measure settings within a share of the time that is left."""
+        begun = time.monotonic()
+        until, costs, found = begun + share * self._left_s, list[Cost](), dict[Setting, Measured]()
+        own = self._entry(self._baseline).measured
+        waves = [settings[i : i + TOGETHER] for i in range(0, len(settings), TOGETHER)]
+        for number, wave in enumerate(waves):
+            now = time.monotonic()
+            with ExitStack() as stack:
+                entries = self._loaded(name, wave, costs, until, stack)
+                self._by_turns(name, entries, now + max(0.0, until - now) / (len(waves) - number))
+            baseline, *others = entries
+            if not baseline.measured.times_ms:
+                raise RunError(f"{self.baseline.label} {'; '.join(baseline.measured.notes)}")
+            own.absorb(baseline.measured)
+            for entry in others:
+                entry.measured.baseline_ms = baseline.measured.median_ms
+                if self._is_of_use(entry.measured, name):
+                    found[entry.measured.setting] = entry.measured
+        own.baseline_ms = own.median_ms
+        found[self.baseline] = own
+        return [found[setting] for setting in settings if setting in found]
+
+    @property
+    def _left_s(self) -> float:
+        return max(0.0, self._begun + self._seconds - time.monotonic())
+
+    def _first_loaded(self, settings: Sequence[Setting]) -> Worker:
+        for setting in settings:
+            self._tell(f"loading {setting.label}")
+            try:
+                return self._start(setting, max(AT_LEAST_S, self._left_s))
+            except RunError as error:
+                self._skip(setting, "ladder", str(error))
+        reasons = dict.fromkeys(s.reason for s in self.skipped)
+        raise RunError(
+            f"no baseline can be measured, of {', '.join(s.label for s in settings)}: {'; '.join(reasons)}"
+        )
+
+    def _start(self, setting: Setting, seconds: float) -> Worker:
+        return Worker(setting, self._scenes, self._receivers, self._noise, seconds)
+
+    def _loaded(
+        self, name: Block, wave: Sequence[Setting], costs: list[Cost], until: float, stack: ExitStack
+    ) -> list[_Entry]:
+        """The baseline, and of a wave what can be loaded in time."""
+        entries = [self._entry(self._baseline)]
+        for setting in wave:
+            if setting == self.baseline:
+                continue
+            self._tell(f"{name}: loading {setting.label}")
+            expected, left = predicted_s(setting, costs), until - time.monotonic()
+            out_of_time = left <= 0 or (expected or 0.0) > AFFORDABLE * left
+            if out_of_time and setting.label not in self._whole:
+                self._skip(setting, name, _no_time(expected, left))
+                continue
+            try:
+                worker = self._start(setting, max(AT_LEAST_S, min(PATIENCE * left, self._left_s)))
+            except RunError as error:
+                self._skip(setting, name, str(error))
+                continue
+            stack.enter_context(closing(worker))
+            entries.append(self._entry(worker))
+            costs.append(Cost(setting, entries[-1].cost_s))
+        return entries
+
+    def _by_turns(self, name: Block, entries: Sequence[_Entry], until: float) -> None:
+        """Each as often as its share of the time allows; once at least."""
+        seconds = max(0.0, until - time.monotonic())
+        most = [ROUNDS * self._scenes_of(entry.measured.setting) for entry in entries]
+        for entry, count in zip(entries, shares([e.cost_s for e in entries], most, seconds), strict=True):
+            whole = entry.measured.setting.label in self._whole
+            entry.count = max(count, self._scenes_of(entry.measured.setting)) if whole else count
+        for turn in range(max(entry.count for entry in entries)):
+            for entry in entries:
+                if entry.count > turn:
+                    self._tell(f"{name}: {entry.measured.setting.label}")
+                    self._turn(entry, turn, until)
+
+    def _turn(self, entry: _Entry, turn: int, until: float) -> None:
+        measured = entry.measured
+        whole = measured.setting.label in self._whole and turn < len(self._order)
+        if turn and not whole and time.monotonic() > until:
+            return
+        if not turn and not whole and entry.cost_s > max(WORTH_S, until - time.monotonic()):
+            measured.take(self._scenes.instants[0].frame, entry.worker.loaded.first)
+            measured.notes.append("timed on the scene that warmed it up: another would take too long")
+            entry.count = 0
+            return
+        index = self._order[turn % self._scenes_of(measured.setting)]
+        try:
+            sample = entry.worker.step(index, max(AT_LEAST_S, self._left_s))
+        except RunError as error:
+            entry.count = 0
+            measured.notes.append(f"ended early: {error}")
+            return
+        measured.take(self._scenes.instants[index].frame, sample)
+
+    def _is_of_use(self, measured: Measured, name: Block) -> bool:
+        """Whether it was measured at all; notes what a reader should know."""
+        if not measured.times_ms:
+            self._skip(measured.setting, name, "; ".join(measured.notes))
+            return False
+        scenes, limit = len(measured.frames), self._scenes_of(measured.setting)
+        if scenes < len(self._scenes.instants):
+            why = "" if scenes == limit else ", for want of time"
+            measured.notes.append(f"{scenes} of {len(self._scenes.instants)} scenes{why}")
+        if measured.setting.most_receivers is not None:
+            measured.notes.append(f"{measured.receivers[0]} receivers")
+        if measured.lost:
+            measured.notes.append(f"paths lost in {measured.lost} of {len(measured.times_ms)} measurements")
+        return True
+
+    def _scenes_of(self, setting: Setting) -> int:
+        return min(len(self._scenes.instants), setting.most_scenes or len(self._scenes.instants))
+
+    def _skip(self, setting: Setting, block: Block, reason: str) -> None:
+        self.skipped.append(Skipped(setting=setting.label, block=block, reason=reason))
+
+    def _tell(self, text: str) -> None:
+        left = self._left_s
+        self._told(Told(text=text, done=1 - left / self._seconds, left_s=left))
+
+    def _entry(self, worker: Worker) -> _Entry:
+        loaded = worker.loaded
+        return _Entry(
+            worker,
+            Measured(
+                setting=worker.setting,
+                rung=loaded.first.rung,
+                prepare_s=loaded.seconds,
+                loaded_mib=loaded.memory_mib,
+            ),
+        )
+
+
+def _no_time(expected_s: float | None, left_s: float) -> str:
+    if expected_s is None or left_s <= 0:
+        return "the time for its block was used up; give more with --minutes"
+    return (
+        f"one scene is expected to take {expected_s:.0f} s, of the {left_s:.0f} s left for its block; "
+        "give more with --minutes"
+    )
+
+
+def candidates(
+    label: str | None, order: Sequence[str], known: Sequence[Setting], option: str
+) -> list[Setting]:
+    """The setting with a label, or where there is none those of a list, in its order.
+
+    Raises `RunError` with near labels for a label that does not exist.
+    """
+    by_label = {setting.label: setting for setting in known}
+    if label is None:
+        return [by_label[name] for name in order]
+    if label not in by_label:
+        raise RunError(f"{option} {label!r} is no setting of the ladder; {suggestion(label, by_label)}")
+    return [by_label[label]]

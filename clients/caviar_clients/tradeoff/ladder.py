@@ -1,0 +1,234 @@
+"""The settings that are compared: one line each. What a channel does not know is skipped, and said so.
+
+To add a setting, add a line to `LADDER` (or to a table's columns, `TABLE_RUNGS`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any, Literal
+
+Block = Literal["ladder", "ray spacing", "arrays", "convergence", "diffuse convergence"]
+"""What a setting is measured for. Settings of a block take turns, so that noise hits all alike."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Setting:
+    """One channel model with its settings."""
+
+    label: str
+    """Unique; what tables and plots call it."""
+    use: str
+    """Registered channel."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """In place of the scenario's, where its channel is the same implementation, or of the defaults."""
+    block: Block = "ladder"
+    column: str = ""
+    """Column of the table that it belongs to."""
+    row: str = ""
+    """Row of the table that it belongs to."""
+    elements: tuple[int, int] | None = None
+    """(Nt, Nr) of horizontal linear arrays in place of the scenario's arrays."""
+    scattering: bool = False
+    """Give every material of the scenery `SCATTERING`, unless the scenario sets coefficients itself."""
+    most_scenes: int | None = None
+    """Scenes at most, for what takes minutes each."""
+    most_receivers: int | None = None
+    """Receivers at most, likewise."""
+
+
+SCATTERING = 0.4
+"""Scattering coefficient S of Degli-Esposti et al., "Measurement and modelling of scattering from buildings",
+2007, who fitted S ≈ 0.4 to brick façades."""
+
+_DIFFUSE_EFFORT = 40
+_PAIRS_EFFORT = 100
+"""How much dearer diffuse scattering and the tracing of every pair are, about."""
+
+CHEAP = 2
+"""Receivers of a setting that traces every pair of antenna elements."""
+
+_SIONNA = "sionna-rt"
+_COMPARABLE = {"normalization": "path-loss", "nlos": "geometry"}
+"""Settings of ``geometric`` with which its gains mean the same as those of the others."""
+_DIFFUSE_PATHS = 2_000_000
+_ALL = {"refraction": True, "diffraction": True}
+
+
+def _traced(samples: int, depth: int, **more: Any) -> dict[str, Any]:
+    """Settings of a ray-traced rung; what is not named is off."""
+    off = {"refraction": False, "diffraction": False, "scattering": False}
+    return {**off, "samples": samples, "max_depth": depth, **more}
+
+
+LADDER: tuple[Setting, ...] = (
+    Setting(label="free-space", use="free-space"),
+    Setting(label="geometric", use="geometric", settings=_COMPARABLE),
+    Setting(label="siso-rt 1e5 d1", use=_SIONNA, settings=_traced(100_000, 1)),
+    Setting(label="siso-rt 1e5 d2", use=_SIONNA, settings=_traced(100_000, 2)),
+    Setting(label="siso-rt 1e4 d3", use=_SIONNA, settings=_traced(10_000, 3)),
+    Setting(label="siso-rt 1e5 d3", use=_SIONNA, settings=_traced(100_000, 3)),
+    Setting(label="siso-rt 1e6 d3", use=_SIONNA, settings=_traced(1_000_000, 3)),
+    Setting(label="siso-rt 1e5 d3 +refraction", use=_SIONNA, settings=_traced(100_000, 3, refraction=True)),
+    Setting(label="siso-rt 1e5 d3 +diffraction", use=_SIONNA, settings=_traced(100_000, 3, diffraction=True)),
+    Setting(
+        label="siso-rt 1e5 d3 +scattering",
+        use=_SIONNA,
+        settings=_traced(100_000, 3, scattering=True, max_paths=_DIFFUSE_PATHS),
+        scattering=True,
+    ),
+    Setting(label="siso-rt 1e6 d5 +r+d", use=_SIONNA, settings=_traced(1_000_000, 5, **_ALL)),
+    Setting(label="spherical 1e5 d3", use=_SIONNA, settings=_traced(100_000, 3, rung="spherical")),
+    Setting(
+        label="spherical 1e6 d5 +r+d",
+        use=_SIONNA,
+        settings=_traced(1_000_000, 5, rung="spherical", **_ALL),
+    ),
+    Setting(
+        label="mimo-rt 1e4 d3",
+        use=_SIONNA,
+        settings=_traced(10_000, 3, rung="mimo-rt"),
+        most_scenes=2,
+        most_receivers=CHEAP,
+    ),
+)
+
+REFERENCES = ("spherical 1e6 d5 +r+d", "siso-rt 1e6 d5 +r+d", "siso-rt 1e6 d3", "free-space")
+"""The default reference is the first of these that the channels of this installation know and that can be
+loaded. ``mimo-rt`` is none of them: it is affordable for few scenes, receivers and samples only."""
+
+BASELINES = ("siso-rt 1e5 d3", "free-space")
+"""The default baseline of the factors, likewise."""
+
+TABLE_RUNGS: Mapping[str, Mapping[str, Any]] = {
+    "siso-rt": {},
+    "spherical": {"rung": "spherical"},
+    "mimo-rt": {"rung": "mimo-rt"},
+}
+"""Columns of both tables, and what each adds to the settings of sionna-rt."""
+
+FEW = frozenset({"mimo-rt"})
+"""Rungs that are measured on one scene and few receivers, since each takes minutes."""
+
+SPACINGS_DEG = (1.0, 0.5, 0.25, 0.1)
+"""Ray spacings of the paper's Table 3."""
+DIFFUSE_DEG = 0.5
+"""Ray spacing of its line with diffuse scattering."""
+ELEMENTS = ((64, 2), (64, 8), (64, 64))
+"""(Nt, Nr) of the paper's Table 4."""
+
+CONVERGENCE_SCENES = 4
+"""Scenes over which convergence is measured: each has as many users as it has receivers."""
+CONVERGENCE_SAMPLES = (10_000, 30_000, 100_000, 300_000, 1_000_000)
+DIFFUSE_SAMPLES = (10_000, 30_000, 100_000, 300_000)
+TRUTH_SAMPLES = 3_000_000
+"""Samples of what the convergence of specular paths is measured against."""
+
+
+def samples_of(spacing_deg: float) -> int:
+    """Rays that leave an angle of ``spacing_deg`` between neighbours.
+
+    N = 4π/Δ² with Δ in radians: each ray stands for the solid angle Δ² of a square lattice. 1° gives
+    41,253 rays, 0.1° a hundred times as many.
+    """
+    return round(4 * math.pi / math.radians(spacing_deg) ** 2)
+
+
+@cache
+def spacing_settings() -> tuple[Setting, ...]:
+    """The lines of the paper's Table 3, the cheapest first: what time is short for comes last."""
+    rows = [*((spacing, False) for spacing in SPACINGS_DEG), (DIFFUSE_DEG, True)]
+    return tuple(sorted((_spacing(rung, *row) for row in rows for rung in TABLE_RUNGS), key=_effort))
+
+
+def _spacing(rung: str, spacing_deg: float, diffuse: bool) -> Setting:
+    options: dict[str, Any] = {"max_paths": _DIFFUSE_PATHS} if diffuse else {}
+    return Setting(
+        label=f"{rung} {spacing_deg:g}°" + (" diffuse" if diffuse else ""),
+        use=_SIONNA,
+        settings=_traced(samples_of(spacing_deg), 3, scattering=diffuse, **options, **TABLE_RUNGS[rung]),
+        block="ray spacing",
+        column=rung,
+        row=f"{spacing_deg:g}" + (" (diffuse)" if diffuse else ""),
+        scattering=diffuse,
+        most_scenes=1 if rung in FEW else None,
+        most_receivers=CHEAP if rung in FEW else None,
+    )
+
+
+def array_settings() -> tuple[Setting, ...]:
+    """The lines of the paper's Table 4, likewise."""
+    made = (_arrays(rung, *elements) for elements in ELEMENTS for rung in TABLE_RUNGS)
+    return tuple(sorted(made, key=_effort))
+
+
+def _effort(setting: Setting) -> float:
+    """What a scene will cost, in rays; no more than an order."""
+    rays = float(setting.settings["samples"]) * (_DIFFUSE_EFFORT if setting.scattering else 1)
+    if setting.column not in FEW:
+        return rays
+    pairs = math.prod(setting.elements) if setting.elements else 1
+    return rays * _PAIRS_EFFORT * pairs
+
+
+def _arrays(rung: str, nt: int, nr: int) -> Setting:
+    return Setting(
+        label=f"{rung} {nt}×{nr}",
+        use=_SIONNA,
+        settings=_traced(10_000 if rung in FEW else 100_000, 3, **TABLE_RUNGS[rung]),
+        block="arrays",
+        column=rung,
+        row=f"{nt}×{nr}",
+        elements=(nt, nr),
+        most_scenes=1 if rung in FEW else None,
+        most_receivers=1 if rung in FEW else None,
+    )
+
+
+def convergence_settings(seeds: int) -> tuple[Setting, ...]:
+    """Specular and diffuse paths over samples and seeds of the launch; the first one is the truth."""
+    truth = _traced(TRUTH_SAMPLES, 3, launch_seed=0)
+    made = [
+        Setting(label=TRUTH, use=_SIONNA, settings=truth, block="convergence", most_scenes=CONVERGENCE_SCENES)
+    ]
+    for samples in CONVERGENCE_SAMPLES:
+        for seed in range(1, seeds + 1):
+            made.append(
+                Setting(
+                    label=f"siso-rt {_power(samples)} d3 seed {seed}",
+                    use=_SIONNA,
+                    most_scenes=CONVERGENCE_SCENES,
+                    settings=_traced(samples, 3, launch_seed=seed),
+                    block="convergence",
+                    column="specular",
+                    row=str(samples),
+                )
+            )
+    for samples in DIFFUSE_SAMPLES:
+        for seed in range(1, seeds + 1):
+            made.append(
+                Setting(
+                    label=f"siso-rt {_power(samples)} d3 diffuse seed {seed}",
+                    use=_SIONNA,
+                    most_scenes=CONVERGENCE_SCENES,
+                    settings=_traced(samples, 3, launch_seed=seed, scattering=True, max_paths=_DIFFUSE_PATHS),
+                    block="diffuse convergence",
+                    column="diffuse",
+                    row=str(samples),
+                    scattering=True,
+                )
+            )
+    return tuple(made)
+
+
+def _power(number: int) -> str:
+    """``3e5`` for 300,000."""
+    exponent = len(str(number)) - 1
+    return f"{number / 10**exponent:g}e{exponent}"
+
+
+TRUTH = f"siso-rt {_power(TRUTH_SAMPLES)} d3 seed 0"
+"""Label of what the convergence is measured against."""

@@ -1,0 +1,169 @@
+"""A comparison from beginning to end, and all that it found."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from typing import Annotated, Literal, get_args
+
+import msgspec
+import numpy as np
+
+from caviar_clients.tradeoff import ladder
+from caviar_clients.tradeoff.campaign import Campaign, Measured, Skipped, Told, candidates
+from caviar_clients.tradeoff.convergence import Point, points
+from caviar_clients.tradeoff.ladder import Block, Setting
+from caviar_clients.tradeoff.measure import is_known, seen
+from caviar_clients.tradeoff.rows import Row, error_fields
+from caviar_clients.tradeoff.scenes import Scenes
+from caviar_clients.tradeoff.users import differences
+from caviar_protocol.arrays import quantity
+from caviar_protocol.errors import RunError
+from caviar_protocol.scene import antennas
+
+Part = Literal["ladder", "spacing", "arrays", "convergence"]
+PARTS: tuple[Part, ...] = get_args(Part)
+
+
+class Report(msgspec.Struct, frozen=True, kw_only=True):
+    """What a comparison found."""
+
+    scenario: str
+    origin: str
+    """Where the scenes are from."""
+    carriers_hz: tuple[float, ...]
+    scenes: int
+    receivers: Annotated[float, quantity("1", "of a scene, mean")]
+    reference: str
+    """Setting that errors are against."""
+    baseline: str
+    """Setting that factors are against."""
+    elapsed_s: Annotated[float, quantity("s", "wall time of the whole")]
+    machine: dict[str, str]
+    rows: tuple[Row, ...]
+    convergence: tuple[Point, ...]
+    skipped: tuple[Skipped, ...]
+
+
+class Options(msgspec.Struct, frozen=True, kw_only=True):
+    """What can be chosen."""
+
+    reference: str | None = None
+    baseline: str | None = None
+    receivers: int | None = None
+    seeds: int = 2
+    seconds: float = 720.0
+    parts: tuple[Part, ...] = PARTS
+
+
+_WEIGHTS: Mapping[Block, float] = {
+    "ladder": 36,
+    "ray spacing": 28,
+    "arrays": 12,
+    "convergence": 10,
+    "diffuse convergence": 14,
+}
+"""Shares of the time."""
+
+
+def compare(
+    scenes: Scenes, options: Options, machine: Mapping[str, str], told: Callable[[Told], None]
+) -> Report:
+    """Measure every setting of the chosen parts.
+
+    Raises `RunError` for an unknown label, and where reference or baseline cannot be measured.
+    """
+    begun = time.monotonic()
+    known = (*ladder.LADDER, *ladder.spacing_settings())
+    references = candidates(options.reference, ladder.REFERENCES, known, "--reference")
+    references = [s for s in references if is_known(s, scenes)] or references
+    baselines = candidates(options.baseline, ladder.BASELINES, known, "--baseline")
+    campaign = Campaign(
+        scenes,
+        baseline=baselines,
+        whole=[references[0].label],
+        seconds=options.seconds,
+        receivers=options.receivers,
+        told=told,
+    )
+    with closing(campaign):
+        needed = references if "ladder" in options.parts else references[:1]
+        plan = _plan(options, list(dict.fromkeys([*needed, campaign.baseline])))
+        measured = list[Measured]()
+        for number, (block, settings) in enumerate(plan):
+            share = _WEIGHTS[block] / sum(_WEIGHTS[name] for name, _ in plan[number:])
+            measured += campaign.block(block, settings, share)
+    reference = _reference(references, measured, campaign.skipped)
+    receivers = [len(antennas(seen(i.scene, options.receivers, None), "rx")) for i in scenes.instants]
+    return Report(
+        scenario=scenes.name,
+        origin=scenes.origin,
+        carriers_hz=tuple(carrier.frequency_hz for carrier in scenes.carriers),
+        scenes=len(scenes.instants),
+        receivers=sum(receivers) / len(receivers),
+        reference=reference.setting.label,
+        baseline=campaign.baseline.label,
+        elapsed_s=time.monotonic() - begun,
+        machine=dict(machine),
+        rows=tuple(_row(entry, reference) for entry in measured if not _is_of_a_curve(entry)),
+        convergence=tuple(points([entry for entry in measured if _is_of_a_curve(entry)])),
+        skipped=tuple(campaign.skipped),
+    )
+
+
+def _plan(options: Options, needed: Sequence[Setting]) -> list[tuple[Block, list[Setting]]]:
+    """Blocks in order; the first one has reference and baseline, which the others need."""
+    first = [s for s in ladder.LADDER if "ladder" in options.parts or s in needed]
+    plan: list[tuple[Block, list[Setting]]] = [("ladder", [*first, *(s for s in needed if s not in first)])]
+    if "spacing" in options.parts:
+        plan.append(("ray spacing", [s for s in ladder.spacing_settings() if s not in needed]))
+    if "arrays" in options.parts:
+        plan.append(("arrays", list(ladder.array_settings())))
+    if "convergence" in options.parts:
+        curves = ladder.convergence_settings(options.seeds)
+        for block in ("convergence", "diffuse convergence"):
+            plan.append((block, [s for s in curves if s.block == block]))
+    return plan
+
+
+def _reference(
+    references: Sequence[Setting], measured: Sequence[Measured], skipped: Sequence[Skipped]
+) -> Measured:
+    by_label = {entry.setting.label: entry for entry in measured}
+    for setting in references:
+        if setting.label in by_label:
+            return by_label[setting.label]
+    labels = [setting.label for setting in references]
+    reasons = dict.fromkeys(entry.reason for entry in skipped if entry.setting in labels)
+    raise RunError(f"no reference can be measured, of {', '.join(labels)}: {'; '.join(reasons)}")
+
+
+def _is_of_a_curve(entry: Measured) -> bool:
+    return entry.setting.block in ("convergence", "diffuse convergence")
+
+
+def _row(entry: Measured, reference: Measured) -> Row:
+    setting = entry.setting
+    # Users of other arrays have other channels.
+    found = differences(entry.users, reference.users) if setting.elements is None else []
+    notes = (["the reference"] if entry is reference else []) + entry.notes
+    return Row(
+        setting=setting.label,
+        block=setting.block,
+        column=setting.column,
+        row=setting.row,
+        rung=entry.rung,
+        time_ms_median=entry.median_ms,
+        time_ms_p99=float(np.percentile(entry.times_ms, 99)),
+        factor=entry.median_ms / entry.baseline_ms,
+        memory_mib=max(entry.memory_mib, default=None),
+        loaded_mib=entry.loaded_mib,
+        prepare_s=entry.prepare_s,
+        measurements=len(entry.times_ms),
+        scenes=len(entry.frames),
+        receivers=sum(entry.receivers) / len(entry.receivers),
+        paths=sum(entry.paths) / len(entry.paths),
+        note="; ".join(notes),
+        **error_fields(found),  # type: ignore[arg-type]  # fields of a row, by name
+    )

@@ -1,0 +1,197 @@
+"""The scenes that all settings are measured on: those of a scenario's worlds, or of a recording."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar
+
+import msgspec
+import numpy as np
+from msgspec.structs import replace
+
+from caviar_clients.embedded.run import EmbeddedRun
+from caviar_clients.sessions.checking import checked_scenario
+from caviar_protocol.errors import RecordingError, RunError, ScenarioError
+from caviar_protocol.messages import Input, Role
+from caviar_protocol.pairs import pairs_of
+from caviar_protocol.recording import RecordedFrame, Recording
+from caviar_protocol.scenario import DeviceSpec, Scenario, ServiceSpec
+from caviar_protocol.topics import Carrier, Scene
+from caviar_services.registry import load
+from caviar_services.service import Preparation, Prepared, Service, StepResult
+
+T = TypeVar("T")
+
+KEEPER = "tradeoff-scenes"
+"""Name of the service that keeps the scenes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Instant:
+    """A scene and when it was."""
+
+    frame: int
+    t_ns: int
+    scene: Scene
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Scenes:
+    """Scenes, and what channel models need to know beside them."""
+
+    name: str
+    """Of the scenario."""
+    origin: str
+    """Where they are from, for people."""
+    instants: tuple[Instant, ...]
+    carriers: tuple[Carrier, ...]
+    devices: tuple[DeviceSpec, ...]
+    assets: Mapping[str, Path]
+    """Files of scenery by asset name."""
+    services: Mapping[str, ServiceSpec]
+    """The scenario's, for the settings of its channel and link."""
+    seed: int
+    sampling_period_ns: int
+
+    def settings_of(self, role: Role, use: str) -> dict[str, Any]:
+        """Settings of the scenario's first service that is this implementation; else none."""
+        found = (s.settings for s in self.services.values() if (s.role, s.use) == (role, use))
+        return dict(next(found, {}))
+
+
+def scenes_of(path: Path, frames: int) -> Scenes:
+    """About ``frames`` scenes, spread evenly over the first episode of a scenario or a recording.
+
+    Raises `ScenarioError` or `RecordingError` for what is wrong with it, `RunError` where the worlds fail
+    or no scene has both a transmitter and a receiver.
+    """
+    recorded = path.is_dir() or path.suffix == ".mcap"
+    found = _of_recording(path, frames) if recorded else _of_scenario(path, frames)
+    if not found.carriers:
+        raise ScenarioError(
+            "a channel needs at least one carrier; add [[carriers]] with name and frequency_hz",
+            key="carriers",
+        )
+    served = tuple(instant for instant in found.instants if pairs_of(instant.scene))
+    if not served:
+        raise RunError(
+            f"none of the {len(found.instants)} scenes of {found.origin} has a transmitter and a receiver; "
+            "there is no channel to compare"
+        )
+    return dataclasses.replace(found, instants=served)
+
+
+def _of_recording(path: Path, frames: int) -> Scenes:
+    recording = Recording(path)
+    first = recording.entry(0).episode if len(recording) else 0
+    kept = [frame for frame in recording.frames() if frame.episode == first]
+    instants = [instant for frame in _spread(kept, frames) if (instant := _instant(frame)) is not None]
+    if not instants:
+        raise RecordingError(
+            f'{path} holds no scene; record the topic: record = ["scene", …] in the table [run]'
+        )
+    metadata = recording.metadata
+    try:
+        scenario = metadata.scenario
+        carriers = msgspec.convert(scenario.get("carriers", ()), tuple[Carrier, ...])
+        devices = msgspec.convert(scenario.get("devices", ()), tuple[DeviceSpec, ...])
+        services = msgspec.convert(scenario.get("services", {}), dict[str, ServiceSpec])
+    except msgspec.ValidationError as error:
+        raise RecordingError(f"{path}: the scenario in its metadata cannot be read: {error}") from error
+    return Scenes(
+        name=metadata.name,
+        origin=f"recording {recording.directory.name}",
+        instants=tuple(instants),
+        carriers=carriers,
+        devices=devices,
+        assets=recording.assets,
+        services=services,
+        seed=metadata.seed,
+        sampling_period_ns=metadata.sampling_period_ns,
+    )
+
+
+def _instant(frame: RecordedFrame) -> Instant | None:
+    scene = frame.scene()
+    return None if scene is None else Instant(frame.number, frame.t_ns, scene)
+
+
+def _of_scenario(path: Path, frames: int) -> Scenes:
+    scenario = checked_scenario(path)
+    prepared: list[Preparation] = []
+    run = EmbeddedRun(worlds_only(scenario), None, seats={KEEPER: _keeper(prepared.append)})
+    seat, instants = run.seats[KEEPER], list[Instant]()
+    for _ in run.steps():
+        if seat.frame is not None:
+            instants.append(Instant(seat.frame.number, seat.frame.t_ns, seat.frame.scene()))
+            seat.answer(StepResult())
+    if run.outcome is None or run.outcome.error:
+        raise RunError(run.outcome.error if run.outcome else "the worlds ended without an outcome")
+    return Scenes(
+        name=scenario.run.name,
+        origin=f"scenario {path.name}, {scenario.run.frames} frames",
+        instants=tuple(_spread(instants, frames)),
+        carriers=scenario.carriers,
+        devices=scenario.devices,
+        assets=prepared[0].assets if prepared else {},
+        services=scenario.services,
+        seed=scenario.run.seed,
+        sampling_period_ns=scenario.run.sampling_period_ns,
+    )
+
+
+def worlds_only(scenario: Scenario) -> Scenario:
+    """One episode of the scenario's worlds and of the agents that need no channel, and who keeps the scenes.
+
+    An agent that takes a channel or sensors cannot decide here; what it steers stays as it starts.
+    """
+    kept = {name: spec for name, spec in scenario.services.items() if _is_kept(spec)}
+    budget_ms = 1e3  # never reached: nothing is late in an embedded run
+    kept[KEEPER] = ServiceSpec(role="sensors", use=KEEPER, budget_ms=budget_ms)
+    return replace(scenario, services=kept, run=replace(scenario.run, episodes=1, record=(), pace="fast"))
+
+
+def _is_kept(spec: ServiceSpec) -> bool:
+    if spec.role == "world":
+        return True
+    if spec.role != "agent" or spec.remote:
+        return False
+    needs = {given.topic for given in load("agent", spec.use).inputs if given.required}
+    return needs <= {"scene"}
+
+
+class KeeperSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """There is nothing to set."""
+
+
+class Keeper(Service[KeeperSettings]):
+    """Takes scenes and gives nothing."""
+
+    role: ClassVar[Role] = "sensors"
+    inputs: ClassVar[tuple[Input, ...]] = (Input(topic="scene"),)
+    uses_scenery: ClassVar[bool] = True
+    Settings = KeeperSettings
+    told: ClassVar[Callable[[Preparation], None]]
+
+    def prepare(self, preparation: Preparation) -> Prepared:
+        type(self).told(preparation)
+        return Prepared()
+
+    def step(self, frame: Any) -> StepResult:
+        """Its seat answers in its place."""
+        raise RunError(f"{KEEPER} is answered by its seat")
+
+
+def _keeper(told: Callable[[Preparation], None]) -> type[Keeper]:
+    """The class of a keeper that passes on what it is prepared with."""
+    return type("Keeper", (Keeper,), {"told": staticmethod(told)})
+
+
+def _spread(entries: Sequence[T], count: int) -> list[T]:
+    """``count`` of them, evenly spread, the first and the last among them; all where there are fewer."""
+    if len(entries) <= count:
+        return list(entries)
+    return [entries[i] for i in np.unique(np.linspace(0, len(entries) - 1, count).round().astype(int))]

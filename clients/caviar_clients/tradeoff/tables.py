@@ -1,0 +1,275 @@
+"""The tables of a comparison: on the screen, and as Markdown beside the paper's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich.table import Table
+from rich.text import Text
+
+from caviar_clients.tradeoff.campaign import Skipped
+from caviar_clients.tradeoff.errors import FLOOR_DB
+from caviar_clients.tradeoff.ladder import DIFFUSE_DEG, ELEMENTS, SPACINGS_DEG, TABLE_RUNGS, samples_of
+from caviar_clients.tradeoff.report import Report
+from caviar_clients.tradeoff.rows import Row
+
+PAPER_SPACING = {
+    "1": (1.0, 0.7),
+    "0.5": (1.0, 1.0),
+    "0.25": (2.4, 1.5),
+    "0.1": (11.0, 4.0),
+    "0.5 (diffuse)": (84.7, 412.9),
+}
+"""Table 3 of the paper: factors of SISO-RT and MIMO-RT (64×8), each to its own 0.5°."""
+PAPER_ARRAYS = {"64×2": 1.0, "64×8": 2.2, "64×64": 12.0}
+"""Table 4 of the paper: factors of MIMO-RT to its 64×2."""
+_PAPER = (
+    "Oliveira et al., “Simulation of Machine Learning-Based 6G Systems in Virtual Worlds”, 2021: Wireless "
+    "InSite on an NVIDIA RTX 2070, one scene of dataset s012 (Rosslyn, 60 GHz), 1 transmitter, 10 receivers"
+)
+_COLUMNS = (
+    "setting",
+    "time ms",
+    "p99 ms",
+    "factor",
+    "memory MiB",
+    "paths",
+    "gain dB",
+    "delay spread ns",
+    "az. spread ° dep. / arr.",
+    "NMSE dB",
+    "median",
+    "capacity bit/s/Hz",
+    "top-1",
+    "top-5",
+    "LOS",
+)
+NOTHING = "–"
+
+
+def screen_table(report: Report) -> Table:
+    """The ladder, as wide as a terminal."""
+    table = Table(title=Text(f"{report.scenario}: {report.origin}"), title_justify="left")
+    for name in ("setting", "time ms", "p99", "factor", "gain dB", "NMSE dB", "top-1", "top-5", "bit/s/Hz"):
+        table.add_column(name, justify="left" if name == "setting" else "right")
+    for row in report.rows:
+        table.add_row(
+            Text(row.setting),
+            significant(row.time_ms_median),
+            significant(row.time_ms_p99),
+            significant(row.factor),
+            significant(row.path_gain_error_db),
+            level(row.nmse_db),
+            percent(row.beam_top1),
+            percent(row.beam_top5),
+            significant(row.capacity_error_bps_hz),
+        )
+    table.caption_justify = "left"
+    table.caption = Text(_against(report))
+    return table
+
+
+def markdown(report: Report) -> str:
+    """All tables, with what differs from the paper's."""
+    ladder = [row for row in report.rows if row.block == "ladder"]
+    parts = [
+        f"# Time and error of channel settings: {report.scenario}",
+        _setting_of(report),
+        "## The ladder",
+        _meaning(),
+        _table(_COLUMNS, [_cells(row) for row in ladder]),
+        _notes(ladder),
+    ]
+    parts += _spacing(report) + _arrays(report) + _convergence(report) + _skipped(report)
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _setting_of(report: Report) -> str:
+    machine = ", ".join(f"{key} {value}" for key, value in sorted(report.machine.items()))
+    carriers = ", ".join(f"{hertz / 1e9:g} GHz" for hertz in report.carriers_hz)
+    return (
+        f"{report.scenes} scenes of {report.origin}; {report.receivers:.3g} receivers a scene; {carriers}. "
+        f"Machine: {machine}. Took {report.elapsed_s / 60:.1f} min.\n\n{_against(report)}"
+    )
+
+
+def _against(report: Report) -> str:
+    return f"Errors against {report.reference!r}; factors of time to {report.baseline!r}, measured by turns."
+
+
+def _meaning() -> str:
+    return (
+        "Time: wall time of a scene, H included; median, and 99th percentile of the measurements there are. "
+        "Memory: growth of the resident memory at the peak of a scene. Errors are means of absolute errors "
+        "over all users; NMSE is the mean of ‖H − H_ref‖²/‖H_ref‖², phases included, and its median beside "
+        f"it ({level(FLOOR_DB)}: equal). Top-1, top-5: users whose best pair of DFT beams in the reference "
+        "is the best, or among the best five, here."
+    )
+
+
+def _cells(row: Row) -> list[str]:
+    departure, arrival = row.aod_azimuth_spread_error_deg, row.aoa_azimuth_spread_error_deg
+    return [
+        row.setting,
+        significant(row.time_ms_median),
+        significant(row.time_ms_p99),
+        significant(row.factor),
+        significant(row.memory_mib),
+        significant(row.paths),
+        significant(row.path_gain_error_db),
+        significant(row.delay_spread_error_ns),
+        f"{significant(departure)} / {significant(arrival)}",
+        level(row.nmse_db),
+        level(row.nmse_db_median),
+        significant(row.capacity_error_bps_hz),
+        percent(row.beam_top1),
+        percent(row.beam_top5),
+        percent(row.los_agreement),
+    ]
+
+
+def _notes(rows: Sequence[Row]) -> str:
+    return "\n".join(f"- {row.setting}: {row.note}." for row in rows if row.note)
+
+
+def _spacing(report: Report) -> list[str]:
+    rows = {(row.column, row.row): row for row in report.rows if row.block == "ray spacing"}
+    if not rows:
+        return []
+    columns = [rung for rung in TABLE_RUNGS if any(column == rung for column, _ in rows)]
+    header = ["ray spacing °", "rays", *(f"{c} (NMSE)" for c in columns), "paper: SISO-RT", "paper: MIMO-RT"]
+    body = []
+    for spacing, label in [
+        *((s, f"{s:g}") for s in SPACINGS_DEG),
+        (DIFFUSE_DEG, f"{DIFFUSE_DEG:g} (diffuse)"),
+    ]:
+        cells = [_relative(rows.get((c, label)), rows.get((c, f"{DIFFUSE_DEG:g}"))) for c in columns]
+        paper = (f"{value:g}" for value in PAPER_SPACING[label])
+        body.append([label, f"{samples_of(spacing):,}", *cells, *paper])
+    times = [
+        f"{c} {significant(rows[c, f'{DIFFUSE_DEG:g}'].time_ms_median)} ms"
+        for c in columns
+        if (c, f"{DIFFUSE_DEG:g}") in rows
+    ]
+    return [
+        "## Ray spacing, single antennas and arrays, diffuse scattering (the paper's Table 3)",
+        (
+            f"Factor of time to {DIFFUSE_DEG:g}° of the same column, both taken as multiples of the baseline "
+            "that was measured by turns with them, and NMSE against the reference. "
+            f"{DIFFUSE_DEG:g}° takes {', '.join(times)} here, and in the paper 11.749 s and 39.654 s (64×8)."
+        ),
+        _table(header, body),
+        (
+            f"The paper: {_PAPER}. Here: {report.scenario} as above, Sionna RT, with the arrays of the "
+            "scenario in every column; N = 4π/Δ² rays for a spacing of Δ rad. Diffuse paths are no part of "
+            "the reference, so that the NMSE of that line says what they add."
+        ),
+        _notes(list(rows.values())),
+    ]
+
+
+def _relative(row: Row | None, base: Row | None) -> str:
+    if row is None or base is None:
+        return NOTHING
+    return f"{significant(row.factor / base.factor)} ({level(row.nmse_db)} dB)"
+
+
+def _arrays(report: Report) -> list[str]:
+    rows = {(row.column, row.row): row for row in report.rows if row.block == "arrays"}
+    if not rows:
+        return []
+    columns = [rung for rung in TABLE_RUNGS if any(column == rung for column, _ in rows)]
+    sizes = [f"{n}×{m}" for n, m in ELEMENTS]
+    body = []
+    for (nt, nr), size in zip(ELEMENTS, sizes, strict=True):
+        cells = []
+        for column in columns:
+            row, base = rows.get((column, size)), rows.get((column, sizes[0]))
+            if row is None or base is None:
+                cells.append(NOTHING)
+                continue
+            factor = significant(row.factor / base.factor)
+            cells.append(f"{factor} ({significant(row.time_ms_median)} ms)")
+        body.append([str(nt), str(nr), *cells, f"{PAPER_ARRAYS[size]:g}"])
+    return [
+        "## Elements of the arrays (the paper's Table 4)",
+        f"Factor of time to {sizes[0]} of the same column, likewise; depth 3. The paper: 18.437 s.",
+        _table(["Nt", "Nr", *columns, "paper: MIMO-RT"], body),
+        "Horizontal linear arrays in place of the scenario's; all else as in the table above.",
+        _notes(list(rows.values())),
+    ]
+
+
+def _convergence(report: Report) -> list[str]:
+    if not report.convergence:
+        return []
+    between = ["between seeds: users", "NMSE dB", "gain dB", "top-1"]
+    header = ["paths", "samples", "seeds", "time ms", "NMSE dB", *between]
+    body = []
+    for point in report.convergence:
+        values = sorted(point.nmse_db)
+        span = f"{level(values[0])} … {level(values[-1])}" if values else NOTHING
+        body.append(
+            [
+                point.paths,
+                f"{point.samples:,}",
+                str(point.seeds),
+                significant(point.time_ms_median),
+                span,
+                str(point.users),
+                level(point.pair_nmse_db),
+                significant(point.pair_gain_db_p95),
+                percent(point.pair_beam_top1),
+            ]
+        )
+    return [
+        "## Convergence over samples and seeds",
+        (
+            "NMSE: of each seed against 3e6 samples with a seed of its own (best … worst seed), for specular "
+            "paths. Between seeds: 95 % of users differ by less in path gain; top-1 is the share whose best "
+            f"pair of beams is the same; {level(FLOOR_DB)} dB: equal, since rays leave along a lattice of "
+            "directions, and the seed draws only what happens where they meet something."
+        ),
+        _table(header, body),
+    ]
+
+
+def _skipped(report: Report) -> list[str]:
+    if not report.skipped:
+        return []
+    lines = [f"- {', '.join(labels)}: {reason}" for reason, labels in by_reason(report.skipped).items()]
+    return ["## Not measured", "\n".join(lines)]
+
+
+def by_reason(skipped: Sequence[Skipped]) -> dict[str, list[str]]:
+    """Labels of what was skipped, by the reason."""
+    found: dict[str, list[str]] = {}
+    for entry in skipped:
+        found.setdefault(entry.reason, []).append(entry.setting)
+    return found
+
+
+def _table(header: Sequence[str], body: Sequence[Sequence[str]]) -> str:
+    lines = [header, ["---"] + ["---:"] * (len(header) - 1), *body]
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
+
+
+def significant(value: float | None) -> str:
+    """Three significant digits, without exponents."""
+    if value is None:
+        return NOTHING
+    if value == 0:
+        return "0"
+    if abs(value) >= 100:
+        return f"{value:.0f}"
+    return f"{value:.2g}" if abs(value) < 1 else f"{value:.3g}"
+
+
+def level(value: float | None) -> str:
+    """A ratio in dB, to a tenth."""
+    return NOTHING if value is None else f"{value:.1f}".replace("-", "−")
+
+
+def percent(share: float | None) -> str:
+    """A share, to a tenth of a percent."""
+    return NOTHING if share is None else f"{100 * share:.1f} %"
