@@ -114,8 +114,8 @@ class Followed:
     def _rays(self, part: int) -> Int64Array:
         """Numbers of the rays of a part, and of those on or beside moving objects."""
         # Neighbours in the lattice's order point into neighbouring directions.
-        count = np.cumsum(np.pad(self._on_object, _BESIDE))
-        beside = count[2 * _BESIDE :] - np.pad(count, (1, 0))[: -2 * _BESIDE - 1]
+        count: Int64Array = np.cumsum(np.pad(self._on_object, (_BESIDE + 1, _BESIDE)))
+        beside = count[2 * _BESIDE + 1 :] - count[: -2 * _BESIDE - 1]
         chosen: BoolArray = np.greater(beside, 0)
         chosen[part :: self._parts] = True
         return np.flatnonzero(chosen)

@@ -224,7 +224,8 @@ class SionnaScene:
 
     def is_body(self, shapes: NDArray[np.uint32]) -> BoolArray:
         """Whether process-local shapes are of moving bodies."""
-        return shapes == self._body_id
+        body: BoolArray = shapes == self._body_id
+        return body
 
     def object_index(self, shapes: Int64Array, primitives: Int64Array) -> Int32Array:
         """Index into the names of `place` of triangles of process-local shapes; −1 for no shape."""
