@@ -21,7 +21,7 @@ from caviar_services.channel.base import Found, PathModel
 from caviar_services.channel.sionna_materials import MaterialSettings, OutsideRange
 from caviar_services.channel.sionna_scene import SceneSettings, SionnaScene
 from caviar_services.channel.sionna_tracer import LaunchOptions, Traced, Tracer
-from caviar_services.channel.specular import refined_points
+from caviar_services.channel.specular import distinct, refined_points
 from caviar_services.llvm import activate_llvm, choose_variant
 from caviar_services.service import Preparation, RunInfo
 
@@ -128,7 +128,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
             scattering=s.scattering,
         )
         wavelengths = [SPEED_OF_LIGHT / frequency for frequency in frequencies]
-        self._tracer = Tracer(self._scene.mi_scene, wavelengths, self._scene.tune, launch)
+        self._tracer = Tracer(self._scene.mi_scene, wavelengths, self._scene.tune, launch, self._scene.centre)
         self._at_once = self._receivers_at_once()
         return (*notes, *self._warm_up())
 
@@ -182,9 +182,9 @@ class SionnaChannel(PathModel[SionnaSettings]):
             _joined([part.points for _, part in parts], (0, depth, 3), np.float64),
             np.array([antenna.position for antenna in receivers]).reshape(-1, 3)[rx],
             types,
-            self._scene.planes(shapes, primitives),
+            self._scene.triangles(shapes, primitives),
         )
-        return PathTable(
+        table = PathTable(
             pair=pair,
             transfer=np.concatenate(
                 [np.zeros((len(self.run.carriers), 0, 3, 3), np.complex128), *(p.transfer for _, p in parts)],
@@ -196,6 +196,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
             object_names=names,
             object_velocity=velocity,
         )
+        return table.take(distinct(pair, types, points))
 
     def _launch(
         self, t: int, transmitter: Antenna, begin: int, receivers: Sequence[Antenna]

@@ -3,6 +3,10 @@
 Every further shape makes each trace a millisecond longer, whatever its size. So there is one
 shape for each material, and a table that says which triangles belong to what; paths still name the
 single building and vehicle.
+
+The ray tracer counts in float32, whose step is 1 mm at 10 km. So it is given the scene relative to
+`SionnaScene.centre`, and what its paths meet is told to callers in float64 and in world coordinates: the
+scenery's corners as they stand in the files, and those of moving bodies from their poses.
 """
 
 from __future__ import annotations
@@ -28,6 +32,7 @@ from caviar_services.channel.sionna_materials import (
 )
 from caviar_services.columns import aligned_columns
 from caviar_services.meshes import BodyPool, Mesh, box, placed, unit_box
+from caviar_services.ply import ply_vertices
 from caviar_services.scenery import find_scenery, read_scenery
 
 _Tuning = tuple[float, list[tuple[Any, Constants]]]
@@ -41,6 +46,12 @@ PARKING_DEPTH = 2000.0
 
 _HALF_BOX = 4.0
 """[m]; more than the part of a shadow ray near its end that is not tested (9e-4 of its length)."""
+
+_CENTRE_STEP = 128.0
+"""[m]; the centre is a multiple of it, so that a scene about the origin stays as it is."""
+
+_SAME_VERTEX = 1e-5
+"""By how much of its size a mesh in float32 may differ from its file."""
 
 _PARKING = "caviar-parking"
 _SKIN = "caviar-body"
@@ -80,16 +91,20 @@ class SionnaScene:
             itu_constants("body_material", settings.body_material, frequency, settings.outside_itu_range)
             for frequency in settings.frequencies_hz
         ]
-        self._scene = _load(find_scenery(assets), settings.weld)
+        description = find_scenery(assets)
+        self._scene = _load(description)
         self._scenery = frozenset(self._scene.objects)
-        self.low, self.high = _bounds(self._scene) if self._scenery else (np.zeros(3), np.zeros(3))
+        shapes = _by_material(self._scene, _file_meshes(self._scene, description, settings.weld))
+        self.low, self.high = _bounds(shapes)
+        self.centre: Float64Array = np.round((self.low + self.high) / (2 * _CENTRE_STEP)) * _CENTRE_STEP
+        """What the ray tracer's coordinates are relative to [m], Shape ``[3]``."""
         self._pool = dict(pool)
         self._meshes = {asset: _unit_mesh(asset, assets) for asset in pool}
         self._bodies: list[Body] = [(asset, slot) for asset in sorted(pool) for slot in range(pool[asset])]
         self._standing: frozenset[Body] = frozenset()
         moving = self._moving_shapes(skins[0], settings.body_material == "metal")
         moved = sum(len(mesh.vertices) for mesh in moving[-1].meshes)
-        self._replace_shapes([*_by_material(self._scene), *moving])
+        self._replace_shapes([*shapes, *moving])
         self._vertices = self._corners[len(self._corners) - moved :]
         first, outside = settings.frequencies_hz[0], settings.outside_itu_range
         set_materials(self._scene, first, settings.materials, outside)
@@ -102,7 +117,7 @@ class SionnaScene:
 
     @property
     def mi_scene(self) -> Any:
-        """The Mitsuba scene."""
+        """The Mitsuba scene, in metres relative to `centre`."""
         return self._scene.mi_scene
 
     def tune(self, carrier: int) -> None:
@@ -149,7 +164,7 @@ class SionnaScene:
                 self._vertices[rows] = self._middle
         if standing or self._standing:
             params = self._scene.mi_scene_params
-            params[f"{_SKIN}.vertex_positions"] = _floats(self._vertices)
+            params[f"{_SKIN}.vertex_positions"] = _floats(self._vertices - self.centre)
             params.update()
         self._standing = frozenset(standing)
         return tuple(names), velocity
@@ -159,9 +174,15 @@ class SionnaScene:
 
         Anything for no shape.
         """
-        triangle = np.clip(self._offsets[self._where(shapes)] + primitives, 0, len(self._faces) - 1)
-        a, b, c = np.moveaxis(self._corners[self._faces[triangle]], -2, 0)
+        a, b, c = np.moveaxis(self.triangles(shapes, primitives), -2, 0)
         return a, np.cross(b - a, c - a)
+
+    def triangles(self, shapes: Int64Array, primitives: Int64Array) -> Float64Array:
+        """The corners [m] of triangles, Shape ``[..., 3, 3]``, in float64: those of scenery as they stand in
+        its files, those of moving bodies where `place` put them last. Anything for no shape."""
+        triangle = np.clip(self._offsets[self._where(shapes)] + primitives, 0, len(self._faces) - 1)
+        corners: Float64Array = self._corners[self._faces[triangle]]
+        return corners
 
     def object_index(self, shapes: Int64Array, primitives: Int64Array) -> Int32Array:
         """Index into the names of `place` of triangles of process-local shapes; −1 for no shape."""
@@ -199,7 +220,10 @@ class SionnaScene:
         """Put these shapes in place of what was loaded, and number their triangles."""
         from sionna.rt import SceneObject
 
-        added = [SceneObject(mi_mesh=_mi_mesh(shape), radio_material=shape.material) for shape in shapes]
+        added = [
+            SceneObject(mi_mesh=_mi_mesh(shape, self.centre), radio_material=shape.material)
+            for shape in shapes
+        ]
         self._scene.edit(add=added, remove=list(self._scene.objects))
         counts = [[len(mesh.faces) for mesh in shape.meshes] for shape in shapes]
         totals = np.array([sum(count) for count in counts], np.int64)
@@ -217,34 +241,60 @@ class SionnaScene:
         self._names = tuple(name for shape in shapes for name in shape.names)
 
 
-def _load(description: Path | None, weld: bool) -> Any:
+def _load(description: Path | None) -> Any:
     from sionna.rt import load_scene
 
     if description is not None:
         read_scenery(description)  # says what is wrong with a file before the renderer does
     try:
-        return load_scene(
-            None if description is None else str(description),
-            merge_shapes=False,
-            remove_duplicate_vertices=weld,
-        )
+        return load_scene(None if description is None else str(description), merge_shapes=False)
     except (ValueError, TypeError, RuntimeError) as error:
         raise AssetError(f"{description}: the ray tracer cannot load it: {error}") from error
 
 
-def _bounds(scene: Any) -> tuple[Float64Array, Float64Array]:
-    bounds = scene.mi_scene.bbox()
-    return np.array(bounds.min, np.float64).reshape(3), np.array(bounds.max, np.float64).reshape(3)
+def _bounds(shapes: Sequence[_Shape]) -> tuple[Float64Array, Float64Array]:
+    """Lowest and highest corner [m] of all shapes; the origin where there are none."""
+    if not shapes:
+        return np.zeros(3), np.zeros(3)
+    corners = np.concatenate([mesh.vertices for shape in shapes for mesh in shape.meshes])
+    return corners.min(0), corners.max(0)
 
 
-def _by_material(scene: Any) -> list[_Shape]:
+def _file_meshes(scene: Any, description: Path | None, weld: bool) -> dict[str, Mesh]:
+    """The meshes of what was loaded, by name, in world coordinates."""
+    files = {} if description is None else {s.name: s for s in read_scenery(description).shapes}
+    meshes = {}
+    for name, item in scene.objects.items():
+        mesh, shape = _mesh_of(item.mi_mesh), files.get(name)
+        if shape is not None:
+            turned, moved = shape.to_world[:3, :3], shape.to_world[:3, 3]
+            mesh = _as_in_file(mesh, ply_vertices(shape.file) @ turned.T + moved)
+        meshes[name] = _welded(mesh) if weld else mesh
+    return meshes
+
+
+def _as_in_file(mesh: Mesh, vertices: Float64Array) -> Mesh:
+    """A mesh with its vertices in float64, unless the ray tracer took others than the file's."""
+    same = vertices.shape == mesh.vertices.shape
+    if same and len(vertices):
+        same = bool(np.abs(vertices - mesh.vertices).max() <= _SAME_VERTEX * max(np.abs(vertices).max(), 1.0))
+    return Mesh(vertices, mesh.faces) if same else mesh
+
+
+def _welded(mesh: Mesh) -> Mesh:
+    """A mesh whose vertices at one place are one vertex."""
+    vertices, first = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    return Mesh(vertices, first.reshape(-1)[mesh.faces].astype(np.int32))
+
+
+def _by_material(scene: Any, meshes: Mapping[str, Mesh]) -> list[_Shape]:
     """What was loaded, joined to one shape a material."""
     groups: dict[str, _Shape] = {}
     for name, item in scene.objects.items():
         material = item.radio_material
         group = groups.setdefault(material.name, _Shape(f"caviar-scenery-{material.name}", material, [], []))
         group.names.append(name)
-        group.meshes.append(_mesh_of(item.mi_mesh))
+        group.meshes.append(meshes[name])
     return list(groups.values())
 
 
@@ -258,9 +308,10 @@ def _unit_mesh(asset: str, assets: Mapping[str, Path]) -> Mesh:
         known = ", ".join(sorted(name for name in assets if name.startswith("objects/"))) or "none"
         raise AssetError(f"there is no mesh {asset!r} among the assets; object meshes: {known}")
     try:
-        return _mesh_of(mi.load_dict({"type": "ply", "filename": str(path), "face_normals": True}))
+        loaded = _mesh_of(mi.load_dict({"type": "ply", "filename": str(path), "face_normals": True}))
     except RuntimeError as error:
         raise AssetError(f"mesh {asset!r} ({path}) cannot be read: {error}") from error
+    return _as_in_file(loaded, ply_vertices(path))
 
 
 def _mesh_of(shape: Any) -> Mesh:
@@ -273,7 +324,7 @@ def _mesh_of(shape: Any) -> Mesh:
     )
 
 
-def _mi_mesh(shape: _Shape) -> Any:
+def _mi_mesh(shape: _Shape, centre: Float64Array) -> Any:
     import mitsuba as mi
 
     counts = np.array([len(mesh.vertices) for mesh in shape.meshes])
@@ -284,7 +335,7 @@ def _mi_mesh(shape: _Shape) -> Any:
     properties["face_normals"] = True
     made = mi.Mesh(shape.id, int(counts.sum()), len(faces), props=properties)
     params = mi.traverse(made)
-    params["vertex_positions"] = _floats(np.concatenate([mesh.vertices for mesh in shape.meshes]))
+    params["vertex_positions"] = _floats(np.concatenate([mesh.vertices for mesh in shape.meshes]) - centre)
     params["faces"] = mi.UInt(np.ascontiguousarray(faces, np.uint32).ravel())
     params.update()
     return made

@@ -9,7 +9,7 @@ with positions as arrays instead of one device object each, and their flat buffe
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -99,13 +99,15 @@ class Tracer:
     Parameters
     ----------
     mi_scene
-        The scene, tuned to the first carrier.
+        The scene in metres relative to ``centre``, tuned to the first carrier.
     wavelengths
         Of the carriers [m].
     tune
         Called with the index of a carrier: sets the scene's frequency and materials.
     options
         What is traced.
+    centre
+        What the scene's coordinates are relative to [m], Shape ``[3]``.
     """
 
     def __init__(
@@ -114,6 +116,7 @@ class Tracer:
         wavelengths: Sequence[float],
         tune: Callable[[int], None],
         options: LaunchOptions,
+        centre: Float64Array,
     ) -> None:
         import drjit as dr
         import mitsuba as mi
@@ -125,6 +128,7 @@ class Tracer:
         self._options = options
         self._wavelengths = [dr.opaque(mi.Float, wavelength) for wavelength in wavelengths]
         self._tune = tune
+        self._centre = centre
         # The two orthogonal isotropic fields at both ends give the whole polarisation transfer, to
         # which any element pattern in any orientation is applied afterwards.
         self._patterns = antenna_pattern_registry.get("iso")(polarization="VH").patterns
@@ -133,7 +137,11 @@ class Tracer:
         self._fields = FieldCalculator()
 
     def trace(self, transmitter: Float64Array, receivers: Float64Array) -> Traced:
-        """Paths from one transmitter [3] to all receivers [R, 3], positions in metres."""
+        """Paths from one transmitter [3] to all receivers [R, 3], positions in metres in the world."""
+        traced = self._trace(transmitter - self._centre, receivers - self._centre)
+        return replace(traced, points=traced.points + self._centre)
+
+    def _trace(self, transmitter: Float64Array, receivers: Float64Array) -> Traced:
         import drjit as dr
 
         options = self._options
