@@ -188,7 +188,9 @@ def distinct(pair: Int64Array, types: UInt8Array, points: Float64Array) -> BoolA
     scattering are samples, and each counts.
     """
     used = (types != 0)[..., None]
-    cells = np.where(used, np.floor(points / _SAME_PLACE + 0.271828), 0.0).reshape(len(points), -1)
+    cells = np.where(used, np.floor(points / _SAME_PLACE + 0.271828), 0.0).reshape(
+        len(points), 3 * types.shape[1]
+    )
     keys = np.concatenate([pair[:, None], types, cells], axis=1)
     first = np.zeros(len(keys), bool)
     first[np.unique(keys, axis=0, return_index=True)[1]] = True
