@@ -36,16 +36,22 @@ def ply_vertices(file: Path) -> Float64Array:
 
     Numbers of an ASCII file that calls them ``float`` are read as they are written.
 
-    Raises `AssetError` naming the file where it is no PLY file, or breaks off.
+    Raises `AssetError` naming the file where it is no PLY file, breaks off, or a vertex is not finite.
     """
     data = file.read_bytes()
     try:
         form, elements, begin = _header(data)
         if form == "ascii":
-            return _ascii(elements, data[begin:])
-        return _binary(elements, data, begin, _ORDERS[form])
+            vertices = _ascii(elements, data[begin:])
+        else:
+            vertices = _binary(elements, data, begin, _ORDERS[form])
     except (ValueError, KeyError, IndexError, StopIteration) as error:
         raise AssetError(f"{file}: not a PLY file that can be read ({error!r}); export it again") from error
+    bad = np.flatnonzero(~np.isfinite(vertices).all(1))
+    if len(bad):
+        where = vertices[bad[0]].tolist()
+        raise AssetError(f"{file}: vertex {bad[0]} is at {where}; give every vertex finite coordinates")
+    return vertices
 
 
 def _header(data: bytes) -> tuple[str, Sequence[_Element], int]:

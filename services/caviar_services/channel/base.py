@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -9,9 +10,10 @@ from dataclasses import dataclass, field
 from typing import ClassVar, TypeVar
 
 import msgspec
+import numpy as np
 
 from caviar_protocol.arrays import BoolArray
-from caviar_protocol.errors import ScenarioError
+from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.scene import antennas
 from caviar_protocol.topics import AntennaDevice, Channel, ChannelOptions, Scene
@@ -60,6 +62,12 @@ class ChannelModel(Service[S]):
                 "a channel needs at least one carrier; add [[carriers]] with name and frequency_hz",
                 key="carriers",
             )
+        for carrier in run.carriers:
+            if not (math.isfinite(carrier.frequency_hz) and carrier.frequency_hz > 0):
+                raise ScenarioError(
+                    f"carrier {carrier.name!r} is at {carrier.frequency_hz} Hz; write a finite frequency > 0",
+                    key="carriers",
+                )
         self.with_h = False
         """Whether somebody asks for the matrices."""
 
@@ -88,6 +96,7 @@ class ChannelModel(Service[S]):
 
     def step(self, frame: Frame) -> StepResult:
         scene = frame.scene()
+        _require_finite(scene)
         made = self.model(frame, scene, antennas(scene, "tx"), antennas(scene, "rx"))
         channel = made.channel
         return StepResult(
@@ -96,6 +105,25 @@ class ChannelModel(Service[S]):
             counts={"paths": len(channel.tau), "dropped": channel.dropped, **made.counts},
             measured=made.measured,
         )
+
+
+def _require_finite(scene: Scene) -> None:
+    """Raise `PayloadError` naming a NaN or an infinity of a scene: no channel follows from one."""
+    arrays = (scene.position, scene.orientation, scene.velocity, scene.dimensions)
+    numbers = [number for device in scene.devices for number in (*device.position, *device.orientation)]
+    if math.isfinite(sum(float(values.sum()) for values in arrays) + sum(numbers)):
+        return
+    for name, values in zip(("position", "orientation", "velocity", "dimensions"), arrays, strict=True):
+        for i in np.flatnonzero(~np.isfinite(values).all(-1))[:1].tolist():
+            raise PayloadError(
+                f"object {scene.names[i]!r} has the {name} {values[i].tolist()}; give finite numbers"
+            )
+    for device in scene.devices:
+        for name in ("position", "orientation"):
+            if not all(math.isfinite(number) for number in getattr(device, name)):
+                raise PayloadError(
+                    f"device {device.name!r} has the {name} {getattr(device, name)}; give finite numbers"
+                )
 
 
 class PathModel(ChannelModel[S]):

@@ -18,10 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from caviar_protocol.arrays import Float64Array, Int32Array, Int64Array
+from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
 from caviar_protocol.errors import AssetError, PayloadError
 from caviar_protocol.scene import object_pose
 from caviar_protocol.topics import Scene
+from caviar_services.channel.clearance import Surfaces
 from caviar_services.channel.sionna_materials import (
     Constants,
     MaterialSettings,
@@ -30,9 +31,9 @@ from caviar_services.channel.sionna_materials import (
     itu_materials,
     set_materials,
 )
+from caviar_services.channel.sionna_meshes import file_meshes, unit_mesh
 from caviar_services.columns import aligned_columns
-from caviar_services.meshes import BodyPool, Mesh, box, placed, unit_box
-from caviar_services.ply import ply_vertices
+from caviar_services.meshes import BodyPool, Mesh, box, placed
 from caviar_services.scenery import find_scenery, read_scenery
 
 _Tuning = tuple[float, list[tuple[Any, Constants]]]
@@ -50,8 +51,8 @@ _HALF_BOX = 4.0
 _CENTRE_STEP = 128.0
 """[m]; the centre is a multiple of it, so that a scene about the origin stays as it is."""
 
-_SAME_VERTEX = 1e-5
-"""By how much of its size a mesh in float32 may differ from its file."""
+_LYING = 0.5
+"""Vertical part of the normal of grounds and roofs, at least."""
 
 _PARKING = "caviar-parking"
 _SKIN = "caviar-body"
@@ -94,18 +95,21 @@ class SionnaScene:
         description = find_scenery(assets)
         self._scene = _load(description)
         self._scenery = frozenset(self._scene.objects)
-        shapes = _by_material(self._scene, _file_meshes(self._scene, description, settings.weld))
+        shapes = _by_material(self._scene, file_meshes(self._scene, description, settings.weld))
         self.low, self.high = _bounds(shapes)
         self.centre: Float64Array = np.round((self.low + self.high) / (2 * _CENTRE_STEP)) * _CENTRE_STEP
         """What the ray tracer's coordinates are relative to [m], Shape ``[3]``."""
         self._pool = dict(pool)
-        self._meshes = {asset: _unit_mesh(asset, assets) for asset in pool}
+        self._meshes = {asset: unit_mesh(asset, assets) for asset in pool}
         self._bodies: list[Body] = [(asset, slot) for asset in sorted(pool) for slot in range(pool[asset])]
         self._standing: frozenset[Body] = frozenset()
         moving = self._moving_shapes(skins[0], settings.body_material == "metal")
         moved = sum(len(mesh.vertices) for mesh in moving[-1].meshes)
         self._replace_shapes([*shapes, *moving])
         self._vertices = self._corners[len(self._corners) - moved :]
+        self._first_moving = len(self._faces) - sum(len(mesh.faces) for mesh in moving[-1].meshes)
+        self.surfaces = Surfaces(self._corners[self._faces], self._points_outside)
+        """All triangles, in world coordinates."""
         first, outside = settings.frequencies_hz[0], settings.outside_itu_range
         set_materials(self._scene, first, settings.materials, outside)
         self._carriers: list[_Tuning] = []
@@ -166,6 +170,7 @@ class SionnaScene:
             params = self._scene.mi_scene_params
             params[f"{_SKIN}.vertex_positions"] = _floats(self._vertices - self.centre)
             params.update()
+            self.surfaces.move(self._first_moving, self._corners[self._faces[self._first_moving :]])
         self._standing = frozenset(standing)
         return tuple(names), velocity
 
@@ -189,6 +194,27 @@ class SionnaScene:
         where = self._where(shapes)
         piece = np.searchsorted(self._first_triangles, self._offsets[where] + primitives, side="right") - 1
         return np.where(self._ids[where] == shapes, piece, -1).astype(np.int32)
+
+    def is_parking(self, names: tuple[str, ...], objects: Int32Array) -> BoolArray:
+        """Which of the objects of paths, Shape ``[P, D]``, are the box around parked receivers.
+
+        Paths by way of it are none: it is not in the world.
+        """
+        parking: BoolArray = objects == names.index(_PARKING)
+        return parking
+
+    def _points_outside(self, triangle: int, normal: Float64Array) -> bool:
+        """Whether a triangle's normal points away from its piece, or up from one that lies.
+
+        Scenery has faces of either sense, so their order of corners says nothing.
+        """
+        piece = int(np.searchsorted(self._first_triangles, triangle, side="right")) - 1
+        if triangle < self._first_moving and abs(normal[2]) > _LYING:
+            return bool(normal[2] > 0)
+        ends = [*self._first_triangles.tolist(), len(self._faces)]
+        corners = self._corners[self._faces[ends[piece] : ends[piece + 1]]].reshape(-1, 3)
+        middle = (corners.min(0) + corners.max(0)) / 2
+        return bool((self._corners[self._faces[triangle, 0]] - middle) @ normal >= 0)
 
     def _where(self, shapes: Int64Array) -> Int64Array:
         return np.minimum(np.searchsorted(self._ids, shapes), len(self._ids) - 1)
@@ -260,33 +286,6 @@ def _bounds(shapes: Sequence[_Shape]) -> tuple[Float64Array, Float64Array]:
     return corners.min(0), corners.max(0)
 
 
-def _file_meshes(scene: Any, description: Path | None, weld: bool) -> dict[str, Mesh]:
-    """The meshes of what was loaded, by name, in world coordinates."""
-    files = {} if description is None else {s.name: s for s in read_scenery(description).shapes}
-    meshes = {}
-    for name, item in scene.objects.items():
-        mesh, shape = _mesh_of(item.mi_mesh), files.get(name)
-        if shape is not None:
-            turned, moved = shape.to_world[:3, :3], shape.to_world[:3, 3]
-            mesh = _as_in_file(mesh, ply_vertices(shape.file) @ turned.T + moved)
-        meshes[name] = _welded(mesh) if weld else mesh
-    return meshes
-
-
-def _as_in_file(mesh: Mesh, vertices: Float64Array) -> Mesh:
-    """A mesh with its vertices in float64, unless the ray tracer took others than the file's."""
-    same = vertices.shape == mesh.vertices.shape
-    if same and len(vertices):
-        same = bool(np.abs(vertices - mesh.vertices).max() <= _SAME_VERTEX * max(np.abs(vertices).max(), 1.0))
-    return Mesh(vertices, mesh.faces) if same else mesh
-
-
-def _welded(mesh: Mesh) -> Mesh:
-    """A mesh whose vertices at one place are one vertex."""
-    vertices, first = np.unique(mesh.vertices, axis=0, return_inverse=True)
-    return Mesh(vertices, first.reshape(-1)[mesh.faces].astype(np.int32))
-
-
 def _by_material(scene: Any, meshes: Mapping[str, Mesh]) -> list[_Shape]:
     """What was loaded, joined to one shape a material."""
     groups: dict[str, _Shape] = {}
@@ -296,32 +295,6 @@ def _by_material(scene: Any, meshes: Mapping[str, Mesh]) -> list[_Shape]:
         group.names.append(name)
         group.meshes.append(meshes[name])
     return list(groups.values())
-
-
-def _unit_mesh(asset: str, assets: Mapping[str, Path]) -> Mesh:
-    import mitsuba as mi
-
-    if not asset:
-        return unit_box()
-    path = assets.get(asset)
-    if path is None:
-        known = ", ".join(sorted(name for name in assets if name.startswith("objects/"))) or "none"
-        raise AssetError(f"there is no mesh {asset!r} among the assets; object meshes: {known}")
-    try:
-        loaded = _mesh_of(mi.load_dict({"type": "ply", "filename": str(path), "face_normals": True}))
-    except RuntimeError as error:
-        raise AssetError(f"mesh {asset!r} ({path}) cannot be read: {error}") from error
-    return _as_in_file(loaded, ply_vertices(path))
-
-
-def _mesh_of(shape: Any) -> Mesh:
-    import mitsuba as mi
-
-    params = mi.traverse(shape)
-    return Mesh(
-        np.array(params["vertex_positions"], np.float64).reshape(-1, 3),
-        np.array(params["faces"], np.int32).reshape(-1, 3),
-    )
 
 
 def _mi_mesh(shape: _Shape, centre: Float64Array) -> Any:

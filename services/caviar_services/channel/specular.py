@@ -32,6 +32,9 @@ a rounding moves the point far and the length not at all."""
 _SAME_LENGTH = 2e-3
 """[m]; what rounding changes of a path's length at most, in scenes of some kilometres."""
 
+_BIT = 1e-8
+"""[m]; a segment needs a length to have a direction, and this is 1e-4 rad at 300 GHz."""
+
 _SAME_PLACE = 1e-4
 """[m]; points of one type and pair that are nearer than this are one."""
 
@@ -42,6 +45,7 @@ def refined_points(
     end: Float64Array,
     types: UInt8Array,
     triangles: Float64Array,
+    traced_ends: tuple[Float64Array, Float64Array] | None = None,
 ) -> Float64Array:
     """Points of the paths start → points → end, computed anew.
 
@@ -59,17 +63,34 @@ def refined_points(
     triangles
         Corners [m] of the triangle at each interaction, Shape ``[P, D, 3, 3]``; at a diffraction, one
         that has the edge.
+    traced_ends
+        From where and to where the points were traced, where that was not from start to end.
     """
     some = np.flatnonzero((types != 0).any(1))
     if not len(some):
         return points
     kind, traced = types[some], points[some]
     with np.errstate(invalid="ignore", divide="ignore"):  # such paths stay as traced
-        found = _found(start[some], traced, end[some], kind, triangles[some])
-        good = _same(start[some], traced, found, end[some], kind)
+        one, other = (start, end) if traced_ends is None else traced_ends
+        found = _found(one[some], traced, other[some], kind, triangles[some])
+        good = _same(one[some], traced, found, other[some], kind)
+        moved = good & ((one != start) | (other != end)).any(1)[some]
+        there = some[moved]
+        found[moved] = _found(start[there], found[moved], end[there], kind[moved], triangles[there])
+        good &= np.isfinite(found).all((1, 2))
     refined = points.copy()
     refined[some[good]] = found[good]
     return refined
+
+
+def path_lengths(
+    start: Float64Array, points: Float64Array, end: Float64Array, types: UInt8Array
+) -> Float64Array:
+    """Lengths [m] of the paths start → points → end, Shape ``[P]``."""
+    unused = (types == 0)[..., None]
+    corners = np.concatenate([start[:, None], np.where(unused, end[:, None], points), end[:, None]], axis=1)
+    length: Float64Array = np.sqrt((np.diff(corners, axis=1) ** 2).sum(-1)).sum(-1)
+    return length
 
 
 def _found(
@@ -113,12 +134,17 @@ def _traced_back(
     normal: Float64Array,
 ) -> Float64Array:
     found = np.zeros(fixed.shape)
-    here = end
+    here, start = end, images[0]
     for d in reversed(range(types.shape[1])):
         kind = types[:, d, None]
         line = images[d + 1] - here
         along = ((origin[:, d] - here) * normal[:, d]).sum(-1) / (line * normal[:, d]).sum(-1)
-        met = np.where(_is_fixed(kind), fixed[:, d], here + along[:, None] * line)
+        met = here + _not_nothing(along[:, None] * line, line)
+        met = np.where(_is_fixed(kind), fixed[:, d], met)
+        if d == 0:
+            out = here - met
+            in_ = out - 2 * (out * normal[:, 0]).sum(-1, keepdims=True) / _square(normal[:, 0]) * normal[:, 0]
+            met = np.where(kind == Interaction.REFLECTION, start + _not_nothing(met - start, in_), met)
         found[:, d] = np.where(kind != 0, met, 0.0)
         here = np.where(kind != 0, met, here)
     return found
@@ -129,17 +155,10 @@ def _same(
 ) -> BoolArray:
     """Whether what was found is the path that was traced, but for rounding."""
     shift = np.where(types != 0, np.abs(found - traced).max(-1), 0.0).max(-1)
-    length = _lengths(start, traced, end, types)
-    longer = np.abs(_lengths(start, found, end, types) - length)
+    length = path_lengths(start, traced, end, types)
+    longer = np.abs(path_lengths(start, found, end, types) - length)
     same: BoolArray = (shift < _NEAR) | ((shift < _FAR * length) & (longer < _SAME_LENGTH))
     return same
-
-
-def _lengths(start: Float64Array, points: Float64Array, end: Float64Array, types: UInt8Array) -> Float64Array:
-    unused = (types == 0)[..., None]
-    corners = np.concatenate([start[:, None], np.where(unused, end[:, None], points), end[:, None]], axis=1)
-    length: Float64Array = np.sqrt((np.diff(corners, axis=1) ** 2).sum(-1)).sum(-1)
-    return length
 
 
 def _is_fixed(kind: UInt8Array) -> BoolArray:
@@ -153,9 +172,22 @@ def _mirrored(point: Float64Array, origin: Float64Array, normal: Float64Array) -
 
 def _onto(point: Float64Array, origin: Float64Array, normal: Float64Array) -> Float64Array:
     """Foot of the perpendicular on a plane."""
-    offset = ((point - origin) * normal).sum(-1, keepdims=True) / (normal**2).sum(-1, keepdims=True)
+    offset = ((point - origin) * normal).sum(-1, keepdims=True) / _square(normal)
     foot: Float64Array = point - offset * normal
     return foot
+
+
+def _not_nothing(segment: Float64Array, direction: Float64Array) -> Float64Array:
+    """A segment; where an antenna is on the surface, so that it has no length, a bit of its direction."""
+    length = np.sqrt(_square(segment))
+    bit = _BIT * direction / np.sqrt(_square(direction))
+    kept: Float64Array = np.where(length < _BIT, bit, segment)
+    return kept
+
+
+def _square(vectors: Float64Array) -> Float64Array:
+    square: Float64Array = (vectors**2).sum(-1, keepdims=True)
+    return square
 
 
 def _nearest_edges(triangles: Float64Array, points: Float64Array) -> tuple[Float64Array, Float64Array]:
