@@ -111,6 +111,9 @@ def _require_finite(scene: Scene) -> None:
     """Raise `PayloadError` naming a NaN or an infinity of a scene: no channel follows from one."""
     arrays = (scene.position, scene.orientation, scene.velocity, scene.dimensions)
     numbers = [number for device in scene.devices for number in (*device.position, *device.orientation)]
+    for device in scene.devices:
+        if isinstance(device, AntennaDevice):
+            numbers += (device.array.vertical_spacing, device.array.horizontal_spacing)
     if math.isfinite(sum(float(values.sum()) for values in arrays) + sum(numbers)):
         return
     for name, values in zip(("position", "orientation", "velocity", "dimensions"), arrays, strict=True):
@@ -119,11 +122,12 @@ def _require_finite(scene: Scene) -> None:
                 f"object {scene.names[i]!r} has the {name} {values[i].tolist()}; give finite numbers"
             )
     for device in scene.devices:
-        for name in ("position", "orientation"):
-            if not all(math.isfinite(number) for number in getattr(device, name)):
-                raise PayloadError(
-                    f"device {device.name!r} has the {name} {getattr(device, name)}; give finite numbers"
-                )
+        parts = {"position": device.position, "orientation": device.orientation}
+        if isinstance(device, AntennaDevice):
+            parts["element spacing"] = (device.array.vertical_spacing, device.array.horizontal_spacing)
+        for name, part in parts.items():
+            if not all(map(math.isfinite, part)):
+                raise PayloadError(f"device {device.name!r} has the {name} {part}; give finite numbers")
 
 
 class PathModel(ChannelModel[S]):
