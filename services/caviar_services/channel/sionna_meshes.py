@@ -18,15 +18,25 @@ _SAME_VERTEX = 1e-5
 """By how much of its size a mesh in float32 may differ from its file."""
 
 
-def file_meshes(scene: Any, description: Path | None, weld: bool) -> dict[str, Mesh]:
+def file_vertices(description: Path) -> dict[str, Float64Array]:
+    """World vertices [m] of a scenery's shapes as they stand in its files, by name.
+
+    Raises `AssetError` naming what is wrong with the description or with a mesh.
+    """
+    vertices = {}
+    for shape in read_scenery(description).shapes:
+        turned, moved = shape.to_world[:3, :3], shape.to_world[:3, 3]
+        vertices[shape.name] = ply_vertices(shape.file) @ turned.T + moved
+    return vertices
+
+
+def file_meshes(scene: Any, vertices: Mapping[str, Float64Array], weld: bool) -> dict[str, Mesh]:
     """The meshes of what was loaded, by name, in world coordinates."""
-    files = {} if description is None else {s.name: s for s in read_scenery(description).shapes}
     meshes = {}
     for name, item in scene.objects.items():
-        mesh, shape = _mesh_of(item.mi_mesh), files.get(name)
-        if shape is not None:
-            turned, moved = shape.to_world[:3, :3], shape.to_world[:3, 3]
-            mesh = _as_in_file(mesh, ply_vertices(shape.file) @ turned.T + moved)
+        mesh = _mesh_of(item.mi_mesh)
+        if name in vertices:
+            mesh = _as_in_file(mesh, vertices[name])
         meshes[name] = _welded(mesh) if weld else mesh
     return meshes
 

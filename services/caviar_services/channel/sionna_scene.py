@@ -31,10 +31,10 @@ from caviar_services.channel.sionna_materials import (
     itu_materials,
     set_materials,
 )
-from caviar_services.channel.sionna_meshes import file_meshes, unit_mesh
+from caviar_services.channel.sionna_meshes import file_meshes, file_vertices, unit_mesh
 from caviar_services.columns import aligned_columns
 from caviar_services.meshes import BodyPool, Mesh, box, placed
-from caviar_services.scenery import find_scenery, read_scenery
+from caviar_services.scenery import find_scenery
 
 _Tuning = tuple[float, list[tuple[Any, Constants]]]
 """Frequency [Hz] of a carrier, and what is to be set at materials."""
@@ -93,9 +93,10 @@ class SionnaScene:
             for frequency in settings.frequencies_hz
         ]
         description = find_scenery(assets)
+        files = {} if description is None else file_vertices(description)  # says what is wrong with a file
         self._scene = _load(description)
         self._scenery = frozenset(self._scene.objects)
-        shapes = _by_material(self._scene, file_meshes(self._scene, description, settings.weld))
+        shapes = _by_material(self._scene, file_meshes(self._scene, files, settings.weld))
         self.low, self.high = _bounds(shapes)
         self.centre: Float64Array = np.round((self.low + self.high) / (2 * _CENTRE_STEP)) * _CENTRE_STEP
         """What the ray tracer's coordinates are relative to [m], Shape ``[3]``."""
@@ -270,8 +271,6 @@ class SionnaScene:
 def _load(description: Path | None) -> Any:
     from sionna.rt import load_scene
 
-    if description is not None:
-        read_scenery(description)  # says what is wrong with a file before the renderer does
     try:
         return load_scene(None if description is None else str(description), merge_shapes=False)
     except (ValueError, TypeError, RuntimeError) as error:

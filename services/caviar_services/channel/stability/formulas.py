@@ -31,29 +31,30 @@ def doppler(closing_speed: float, frequency: float) -> float:
 
 
 def permittivity(relative: float, conductivity: float, frequency: float) -> complex:
-    """Complex relative permittivity ε_r − jσ/(2πfε₀) (ITU-R P.2040, eq. 9b)."""
+    """Complex relative permittivity ε_r − jσ/(2πfε₀)."""
     return complex(relative, -conductivity / (2 * math.pi * frequency * EPSILON_0))
 
 
 def fresnel(cosine: float, eta: complex) -> tuple[complex, complex]:
-    """Reflection coefficients of a half-space for the field across and in the plane of incidence, from the
-    cosine of the angle with the normal (Balanis, Advanced Engineering Electromagnetics, eqs. 5-17a and 5-24c, with
-    the sign of the second that leaves a field along the surface's normal unturned at grazing's other end)."""
+    """Reflection coefficients of a half-space, from the cosine of the angle with the normal.
+
+    For the field across the plane of incidence and within it (ITU-R P.2040-3, eqs. 31a and 31b: the second is
+    +1 at a perfect conductor).
+    """
     root = cmath.sqrt(eta - (1 - cosine**2))
     return (cosine - root) / (cosine + root), (eta * cosine - root) / (eta * cosine + root)
 
 
 def slab(cosine: float, eta: complex, thickness: float, frequency: float) -> tuple[complex, complex]:
-    """Reflection coefficients of a layer in air, as `fresnel` (ITU-R P.2040, eq. 43a)."""
+    """Reflection coefficients of a layer in air, as `fresnel` (ITU-R P.2040-3, eq. 43a)."""
     root = cmath.sqrt(eta - (1 - cosine**2))
     turn = cmath.exp(-2j * 2 * math.pi * frequency * thickness / C * root)
     across, along = fresnel(cosine, eta)
-    return tuple(r * (1 - turn) / (1 - r * r * turn) for r in (across, along))  # type: ignore[return-value]
+    return across * (1 - turn) / (1 - across**2 * turn), along * (1 - turn) / (1 - along**2 * turn)
 
 
 def over_ground(height_tx: float, height_rx: float, distance: float) -> tuple[float, float, float]:
-    """Lengths of the direct and the reflected path over flat ground [m], and the cosine of the angle of incidence
-    with the vertical."""
+    """Lengths of the direct and the reflected path over flat ground [m], and the cosine of incidence."""
     direct = math.hypot(distance, height_tx - height_rx)
     bounced = math.hypot(distance, height_tx + height_rx)
     return direct, bounced, (height_tx + height_rx) / bounced
@@ -68,7 +69,7 @@ def mirrored(point: Float64Array, origin: Float64Array, normal: Float64Array) ->
 def room_images(
     size: tuple[float, float, float], source: Float64Array, target: Float64Array, order: int
 ) -> list[tuple[int, float]]:
-    """Order and length [m] of every path of at most ``order`` reflections in a box with a corner at the origin.
+    """Order and length [m] of every path of at most ``order`` reflections in a box from the origin on.
 
     Image (i, j, k) has |i| + |j| + |k| reflections and stands at 2⌈i/2⌉·L + (−1)^i·x on each axis (Allen and
     Berkley, 1979); there are 4n² + 2 of order n.

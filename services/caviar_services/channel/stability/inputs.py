@@ -87,23 +87,31 @@ def _mesh(bad: float, bench: Bench) -> object:
     return link(model, (0, 0, 9), (20, 3, 1))
 
 
+def _carrier(bad: float, bench: Bench) -> object:
+    return bench.free_space(bad)
+
+
+def _drawn(bad: float, bench: Bench) -> object:
+    return bench.geometric(F, delay_spread_ns=bad)
+
+
+def _permittivity(bad: float, bench: Bench) -> object:
+    return bench.traced(F, [Plate("ground", square(50.0))], {"surface": Material(bad, 0.1)})
+
+
+def _conductivity(bad: float, bench: Bench) -> object:
+    return bench.traced(F, [Plate("ground", square(50.0))], {"surface": Material(3.0, bad)})
+
+
+SETTINGS: dict[str, tuple[type[CaviarError], str, Callable[[float, Bench], object], bool]] = {
+    "the carrier frequency": (ScenarioError, "carrier 'c0' is at", _carrier, False),
+    "a setting of the drawn channel": (ScenarioError, "delay_spread_ns", _drawn, False),
+    "a material's permittivity": (ScenarioError, "relative_permittivity", _permittivity, True),
+    "a material's conductivity": (ScenarioError, "conductivity_s_per_m", _conductivity, True),
+    "a vertex of the scenery": (AssetError, "ground.ply: vertex 3 is at", _mesh, True),
+}
 for _bad in BAD:
-    for _name, _error, _words, _make, _traced in (
-        ("the carrier frequency", ScenarioError, "c0", lambda bad, bench: bench.free_space(bad), False),
-        (
-            "a setting of the drawn channel", ScenarioError, "delay_spread_ns",
-            lambda bad, bench: bench.geometric(F, delay_spread_ns=bad), False,
-        ),
-        (
-            "a material's permittivity", ScenarioError, "relative_permittivity",
-            lambda bad, bench: bench.traced(F, [Plate("g", square(9.0))], {"surface": Material(bad, 0.1)}), True,
-        ),
-        (
-            "a material's conductivity", ScenarioError, "conductivity_s_per_m",
-            lambda bad, bench: bench.traced(F, [Plate("g", square(9.0))], {"surface": Material(3.0, bad)}), True,
-        ),
-        ("a vertex of the scenery", AssetError, "ground.ply", _mesh, True),
-    ):  # fmt: skip
-        case("input", f"{_bad} in {_name}", traced=_traced)(
+    for _what, (_error, _words, _make, _traced) in SETTINGS.items():
+        case("input", f"{_bad} in {_what}", traced=_traced)(
             partial(_setting, _error, _words, partial(_make, _bad))
         )

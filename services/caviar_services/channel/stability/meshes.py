@@ -19,7 +19,8 @@ def _ground_and(plates: list[Plate], bench: Bench, **settings: object) -> Outcom
     model = bench.traced(F, plates, {"surface": LOSSY}, max_depth=2, **settings)
     channel = link(model, (0, 0, 10), (20, 0, 4))
     return all_of(
-        equal(2, len(channel.tau), "paths"), close("(H)", two_rays((10, 4), 20.0), total(channel), relative=2e-3)
+        equal(2, len(channel.tau), "paths"),
+        close("(H)", two_rays((10, 4), 20.0), total(channel), relative=2e-3),
     )
 
 

@@ -35,9 +35,7 @@ def _shift(speed: float, traced: bool, bench: Bench) -> Outcome:
 
 for _kmh in (0, 3, 120, 1000):
     for _traced, _rung in ((False, "free-space"), (True, "siso-rt")):
-        case("speed", f"{_kmh} km/h, straight, {_rung}", traced=_traced)(
-            partial(_shift, _kmh / 3.6, _traced)
-        )
+        case("speed", f"{_kmh} km/h, straight, {_rung}", traced=_traced)(partial(_shift, _kmh / 3.6, _traced))
 
 
 @case("speed", "1,000 km/h, two that pass each other, drawn channel", traced=False)
@@ -86,7 +84,10 @@ def _(bench: Bench) -> Outcome:
     """What a frame says follows from that frame: no path by way of where the vehicle was."""
     model = bench.traced(F)
     tx, rx = (-40.0, 0.0, 2.0), (40.0, 1.0, 1.5)
-    there, away = Thing("bus", (3.0, 0.5, 1.5), (2.0, 9.0, 9.0)), Thing("bus", (703.0, 44.0, 1.5), (2.0, 9.0, 9.0))
+    there, away = (
+        Thing("bus", (3.0, 0.5, 1.5), (2.0, 9.0, 9.0)),
+        Thing("bus", (703.0, 44.0, 1.5), (2.0, 9.0, 9.0)),
+    )
     seen = [bool(link(model, tx, rx, bus).los[0, 0]) for bus in (away, there, away, there)]
     return equal([True, False, True, False], seen, "line of sight")
 

@@ -24,13 +24,17 @@ def cases() -> Sequence[Case]:
     return tuple(CASES)
 
 
-def run(chosen: Sequence[Case], progress: Callable[[int, Case], None] = lambda number, case: None) -> list[Result]:
-    """Ask the chosen cases, one after the other; one that raises an error of its own is wrong."""
-    results = []
+def run(chosen: Sequence[Case], progress: Callable[[int, Case], None] | None = None) -> list[Result]:
+    """Ask the chosen cases, one after the other; one that raises an error of its own is wrong.
+
+    ``progress`` is called with number and case before each.
+    """
+    results: list[Result] = []
     with TemporaryDirectory(prefix="caviar-stability-") as folder:
         bench = Bench(Path(folder))
         for number, case in enumerate(chosen):
-            progress(number, case)
+            if progress is not None:
+                progress(number, case)
             begin = time.perf_counter()
             outcome = _asked(case, bench)
             results.append(
@@ -38,7 +42,7 @@ def run(chosen: Sequence[Case], progress: Callable[[int, Case], None] = lambda n
                     group=case.group,
                     case=case.name,
                     expected=outcome.expected,
-                    got=outcome.got,
+                    got=outcome.got.replace(f"{folder}/", "…/"),
                     verdict="right" if outcome.right else "wrong",
                     seconds=round(time.perf_counter() - begin, 3),
                 )
@@ -52,6 +56,11 @@ def _asked(case: Case, bench: Bench) -> Outcome:
             return case.ask(bench)
     except Exception as error:  # whatever goes wrong in a case is its answer
         return Outcome(expected="an answer", got=f"{type(error).__name__}: {error}", right=False)
+
+
+def wrong(results: Sequence[Result]) -> list[Result]:
+    """Those with another answer than expected."""
+    return [result for result in results if result.verdict != "right"]
 
 
 def markdown(results: Sequence[Result]) -> str:

@@ -81,7 +81,9 @@ def _apart(distance: float, frequency: float, traced: bool, bench: Bench) -> Out
     channel = link(model, tx.tolist(), (tx + distance * np.array([0.6, 0.0, 0.8])).tolist())
     slowest = 60e9 if traced else frequency
     if distance < formulas.C / slowest:
-        return all_of(equal(0, len(channel.tau), "paths"), equal(True, bool(channel.los[0, 0]), "line of sight"))
+        return all_of(
+            equal(0, len(channel.tau), "paths"), equal(True, bool(channel.los[0, 0]), "line of sight")
+        )
     expected = formulas.friis(distance, frequency) * formulas.phase(distance, frequency)
     got = total(channel, carrier)
     return close("(H)", expected, got, relative=1e-3)
