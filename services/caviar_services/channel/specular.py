@@ -219,12 +219,12 @@ def distinct(pair: Int64Array, types: UInt8Array, points: Float64Array) -> BoolA
     A ray tracer that takes two triangles of one wall for two planes finds one reflection twice. Paths with
     scattering are samples, and each counts.
     """
-    used = (types != 0)[..., None]
-    cells = np.where(used, np.floor(points / _SAME_PLACE + 0.271828), 0.0).reshape(
-        len(points), 3 * types.shape[1]
+    kept: BoolArray = (types == Interaction.SCATTERING).any(1)
+    some = np.flatnonzero(~kept)
+    used = (types[some] != 0)[..., None]
+    cells = np.where(used, np.floor(points[some] / _SAME_PLACE + 0.271828), 0.0)
+    keys = np.concatenate(
+        [pair[some, None], types[some], cells.reshape(len(some), 3 * types.shape[1])], axis=1
     )
-    keys = np.concatenate([pair[:, None], types, cells], axis=1)
-    first = np.zeros(len(keys), bool)
-    first[np.unique(keys, axis=0, return_index=True)[1]] = True
-    kept: BoolArray = first | (types == Interaction.SCATTERING).any(1)
+    kept[some[np.unique(keys, axis=0, return_index=True)[1]]] = True
     return kept
