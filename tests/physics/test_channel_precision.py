@@ -54,7 +54,7 @@ def phase_of(channel: Channel, path: int, length: float, frequency: float) -> fl
 
 def slope(centre: Array, half: float) -> tuple[list[Any], Array]:
     """Corners of a tilted square, and its normal."""
-    turned = turn(0.5, 0.02, -0.03)
+    turned = turn(0.5, 0.35, -0.4)
     corners = [
         centre + turned @ np.array([x, y, 0.0]) * half for x, y in [(-1, -1), (1, -1), (1, 1), (-1, 1)]
     ]
@@ -67,9 +67,9 @@ def test_two_rays(tmp_path: Path, frequency: float, distance: float, offset: Arr
     corners, normal = slope(offset, distance)
     assets = write_scenery(tmp_path, [Plate("ground", corners, "metal")])
     model = sionna(frequency, assets, max_depth=1, outside_itu_range="nearest")
-    along = turn(0.5, 0.02, -0.03)
-    tx = offset + along @ [-0.4931 * distance, 0.0213 * distance, 31.71]
-    rx = offset + along @ [0.5069 * distance, -0.0137 * distance, 22.93]
+    along = turn(0.5, 0.35, -0.4)
+    tx = offset + along @ [-0.4931 * distance, 0.0213 * distance, 0.1571 * distance]
+    rx = offset + along @ [0.5069 * distance, -0.0137 * distance, 0.1193 * distance]
     channel = measure(model, scene([antenna("t", "tx", tx), antenna("r", "rx", rx)]))
     assert channel.interactions[:, 0].tolist() == [0, 1]
     direct = float(np.linalg.norm(rx - tx))

@@ -106,7 +106,7 @@ def _phase(frequency: float, distance: float, origin: Point, bench: Bench) -> Ou
     out = np.array(origin, np.float64)
     plate = Plate("ground", [(out + corner).tolist() for corner in square(distance)])
     model = bench.traced(frequency, [plate], {"surface": CONDUCTOR})
-    tx, rx = np.array([-0.493 * distance, 21.3, 31.71]), np.array([0.507 * distance, -13.7, 22.93])
+    tx, rx = np.array([-0.493, 0.0213, 0.1571]) * distance, np.array([0.507, -0.0137, 0.1193]) * distance
     channel = link(model, (out + tx).tolist(), (out + rx).tolist())
     flat = math.hypot(rx[0] - tx[0], rx[1] - tx[1])
     lengths = formulas.over_ground(tx[2], rx[2], flat)[:2]
