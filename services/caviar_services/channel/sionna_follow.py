@@ -158,7 +158,7 @@ class _FollowedOffer(Offer):
         for d in range(table.kind.shape[1]):
             shape, primitive = self._scene.shapes_of(table.triangle[:, d])
             # The image method mirrors at the plane through this point, which has moved with its object.
-            corner, _ = self._scene.planes(shape, primitive)
+            corner = self._scene.planes(shape, primitive)[0] - self._scene.centre
             point, probability = aligned_columns(corner.T), aligned_columns(table.probability[None, :, d])
             bounces.append(
                 Bounce(

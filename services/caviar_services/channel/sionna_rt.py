@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, ClassVar
 
@@ -15,9 +16,10 @@ from caviar_protocol.arrays import Float64Array, Int64Array, quantity
 from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.errors import PayloadError, ScenarioError, SetupError
 from caviar_protocol.seeding import derive_seed
-from caviar_protocol.topics import AntennaDevice, ChannelOptions, Scene
+from caviar_protocol.topics import AntennaDevice, ChannelOptions, Interaction, Scene
 from caviar_services.channel.assemble import Antenna, PathTable
 from caviar_services.channel.base import ChannelSettings, Found, PathModel
+from caviar_services.channel.clearance import spread_anew, with_near_pairs
 from caviar_services.channel.sionna_follow import Followed
 from caviar_services.channel.sionna_launch import LaunchOptions
 from caviar_services.channel.sionna_materials import (
@@ -29,7 +31,7 @@ from caviar_services.channel.sionna_materials import (
 from caviar_services.channel.sionna_scene import SceneSettings, SionnaScene
 from caviar_services.channel.sionna_sharing import scene_of
 from caviar_services.channel.sionna_tracer import Traced, Tracer
-from caviar_services.channel.specular import refined_points
+from caviar_services.channel.specular import distinct, path_lengths, refined_points
 from caviar_services.llvm import activate_llvm, choose_variant
 from caviar_services.service import Frame, Preparation, RunInfo, StepResult
 
@@ -154,8 +156,9 @@ class SionnaChannel(PathModel[SionnaSettings]):
             diffraction=s.diffraction,
             scattering=s.scattering,
         )
-        wavelengths = [SPEED_OF_LIGHT / frequency for frequency in frequencies]
-        self._tracer = Tracer(self._scene, wavelengths, launch)
+        self._wavelengths = SPEED_OF_LIGHT / np.array(frequencies)
+        self._no_transfer = np.zeros((len(frequencies), 0, 3, 3), np.complex128)
+        self._tracer = Tracer(self._scene, self._wavelengths.tolist(), launch)
         return (*notes, *self._warm_up())
 
     def reset(self, episode: int, seed: int, t0_ns: int) -> None:
@@ -184,17 +187,24 @@ class SionnaChannel(PathModel[SionnaSettings]):
             mi.set_variant(self._variant)
         _refuse_buried(scene, self.settings.without_body)
         names, velocity = self._scene.place(scene, frozenset(self.settings.without_body))
-        parts = [self._launch(t, transmitter, receivers, names) for t, transmitter in enumerate(transmitters)]
-        table = self._table(parts, names, velocity, transmitters, receivers)
-        straight = (table.types == 0).all(1)
+        clear = [self._cleared(antenna) for antenna in (*transmitters, *receivers)]
+        sources, targets = clear[: len(transmitters)], clear[len(transmitters) :]
+        parts = [self._launch(t, source, targets, names) for t, source in enumerate(sources)]
+        table = self._table(parts, names, velocity, (transmitters, receivers), (sources, targets))
         los = np.zeros(len(transmitters) * len(receivers), bool)
-        los[table.pair[straight]] = True
+        los[table.pair[(table.types == 0).all(1)]] = True
+        table, too_close = with_near_pairs(
+            table, los, transmitters, receivers, self._wavelengths, self._scene.surfaces
+        )
         if not self.settings.los:
-            table = table.take(~straight)
+            table = table.take((table.types != 0).any(1))
         return Found(
             table=table,
             los=los.reshape(len(transmitters), len(receivers)),
-            counts={"path_limit_reached": sum(part.lost for _, part in parts)},
+            counts={
+                "path_limit_reached": sum(part.lost for _, part in parts),
+                "too_close": too_close,
+            },
         )
 
     def _table(
@@ -202,36 +212,45 @@ class SionnaChannel(PathModel[SionnaSettings]):
         parts: Sequence[tuple[Int64Array, Traced]],
         names: tuple[str, ...],
         velocity: Float64Array,
-        transmitters: Sequence[Antenna],
-        receivers: Sequence[Antenna],
+        antennas: tuple[Sequence[Antenna], Sequence[Antenna]],
+        traced_from: tuple[Sequence[Antenna], Sequence[Antenna]],
     ) -> PathTable:
-        """What all launches found, with names, and specular points in float64."""
+        """What all launches found, with names, points in float64 and each path once.
+
+        Antennas are TX and RX where they are, and where they were traced from.
+        """
         depth = self.settings.max_depth
         pair = _joined([pair for pair, _ in parts], (0,), np.int64)
         types = _joined([part.types for _, part in parts], (0, depth), np.uint8)
         shapes = _joined([part.shapes for _, part in parts], (0, depth), np.int64)
         primitives = _joined([part.primitives for _, part in parts], (0, depth), np.int64)
-        tx, rx = np.divmod(pair, max(len(receivers), 1))
-        points = refined_points(
-            np.array([antenna.position for antenna in transmitters]).reshape(-1, 3)[tx],
-            _joined([part.points for _, part in parts], (0, depth, 3), np.float64),
-            np.array([antenna.position for antenna in receivers]).reshape(-1, 3)[rx],
-            types,
-            self._scene.planes(shapes, primitives),
-        )
-        return PathTable(
+        (start, end), ends = _ends(pair, *antennas), _ends(pair, *traced_from)
+        traced = _joined([part.points for _, part in parts], (0, depth, 3), np.float64)
+        triangles = self._scene.triangles(shapes, primitives)
+        points = refined_points(start, traced, end, types, triangles, ends)
+        specular = ((types != Interaction.DIFFRACTION) & (types != Interaction.SCATTERING)).all(1)
+        objects = self._scene.object_index(shapes, primitives)
+        table = PathTable(
             pair=pair,
-            transfer=np.concatenate(
-                [np.zeros((len(self.run.carriers), 0, 3, 3), np.complex128), *(p.transfer for _, p in parts)],
-                1,
+            transfer=spread_anew(
+                np.concatenate([self._no_transfer, *(part.transfer for _, part in parts)], axis=1),
+                specular,
+                path_lengths(ends[0], traced, ends[1], types),
+                path_lengths(start, points, end, types),
             ),
             types=types,
-            objects=self._scene.object_index(shapes, primitives),
+            objects=objects,
             points=points,
             object_names=names,
             object_velocity=velocity,
             faces=self._scene.face_number(shapes, primitives),
         )
+        there = ~(self._scene.is_parking(names, objects) & (types != 0)).any(1)
+        return table.take(there & distinct(pair, types, points))
+
+    def _cleared(self, antenna: Antenna) -> Antenna:
+        """An antenna where it is traced from."""
+        return replace(antenna, position=self._scene.surfaces.cleared(antenna.position))
 
     def _launch(
         self, t: int, transmitter: Antenna, receivers: Sequence[Antenna], names: tuple[str, ...]
@@ -292,6 +311,16 @@ class SionnaChannel(PathModel[SionnaSettings]):
 
 def _joined(arrays: Sequence[Array], empty: tuple[int, ...], dtype: type[np.generic]) -> Array:
     return np.concatenate([np.zeros(empty, dtype), *arrays])
+
+
+def _ends(
+    pair: Int64Array, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]
+) -> tuple[Float64Array, Float64Array]:
+    """Positions [m] of TX and RX of paths, each of Shape ``[P, 3]``."""
+    tx, rx = np.divmod(pair, max(len(receivers), 1))
+    start = np.array([antenna.position for antenna in transmitters]).reshape(-1, 3)
+    end = np.array([antenna.position for antenna in receivers]).reshape(-1, 3)
+    return start[tx], end[rx]
 
 
 def _refuse_buried(scene: Scene, without_body: Sequence[str]) -> None:

@@ -111,7 +111,7 @@ class Tracer:
     Parameters
     ----------
     scene
-        The scene, tuned to the first carrier.
+        The scene, tuned to the first carrier. Its ray tracer counts relative to ``scene.centre``.
     wavelengths
         Of the carriers [m].
     options
@@ -144,7 +144,7 @@ class Tracer:
         followed: Followed | None = None,
         names: tuple[str, ...] = (),
     ) -> Traced:
-        """Paths from one transmitter [3] to all receivers [R, 3], positions in metres.
+        """Paths from one transmitter [3] to all receivers [R, 3], positions in metres in the world.
 
         ``at_once`` receivers are handled together, or as many as fit: to the paths it makes no difference.
         With ``followed``, what the transmitter's last launches met, a part of the rays is launched; ``names``
@@ -152,6 +152,8 @@ class Tracer:
         """
         if not len(receivers):
             return _joined([], len(self._wavelengths), self._options.max_depth)
+        centre = self._scene.centre
+        transmitter, receivers = transmitter - centre, receivers - centre
         last = self._last.get(transmitter.tobytes())
         if last is None or last.version != self._scene.version:
             if followed is None:
@@ -191,7 +193,8 @@ class Tracer:
             self._batch(offer, transmitter, begin, receivers[begin : begin + at_once])
             for begin in range(0, len(receivers), at_once)
         ]
-        return _joined(parts, len(self._wavelengths), self._options.max_depth)
+        joined = _joined(parts, len(self._wavelengths), self._options.max_depth)
+        return replace(joined, points=joined.points + self._scene.centre)
 
     def _batch(self, offer: Offer, transmitter: Float64Array, begin: int, receivers: Float64Array) -> Traced:
         import mitsuba as mi
@@ -279,7 +282,8 @@ class Tracer:
         buffer._primitives = _tensor(mi.TensorXu, mi.UInt(aligned_indices(primitives.ravel())), shapes)
         start = np.broadcast_to(transmitter, (len(types), 3))
         end = receivers[candidates.receiver]
-        exact = refined_points(start, points, end, types, self._scene.planes(shapes, primitives))
+        corners = self._scene.triangles(shapes, primitives) - self._scene.centre
+        exact = refined_points(start, points, end, types, corners)
         for axis, column in zip("xyz", aligned_columns(exact.reshape(-1, 3).T), strict=True):
             setattr(buffer, f"_vertices_{axis}", _tensor(mi.TensorXf, mi.Float(column), shapes))
 
