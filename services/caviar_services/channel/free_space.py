@@ -30,7 +30,7 @@ class FreeSpaceChannel(PathModel[FreeSpaceSettings]):
     """
 
     Settings: ClassVar[type[msgspec.Struct]] = FreeSpaceSettings
-    rung: ClassVar[str] = "free-space"
+    rung = "free-space"
 
     def paths(self, scene: Scene, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]) -> Found:
         start = np.array([antenna.position for antenna in transmitters]).reshape(-1, 1, 3)

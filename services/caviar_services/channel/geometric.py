@@ -73,7 +73,7 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
     """
 
     Settings = GeometricSettings
-    rung: ClassVar[str] = "geometric"
+    rung = "geometric"
 
     def __init__(self, settings: GeometricSettings, run: RunInfo) -> None:
         super().__init__(settings, run)

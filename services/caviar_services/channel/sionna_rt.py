@@ -1,11 +1,16 @@
-"""Rung ``siso-rt``: Sionna RT traces between reference points, arrays are applied as plane waves."""
+"""The ray-traced rungs: Sionna RT finds the paths; ``rung`` says what becomes of the arrays.
+
+``siso-rt`` traces between the arrays' centres and applies the arrays as plane waves, ``spherical`` gives each
+antenna pair its own length of the same paths (`spherical`), ``mimo-rt`` traces every pair (`mimo_rt`). They are
+one implementation with one scene and one set of options, so a rung is a setting like any other.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
 import numpy as np
@@ -16,12 +21,15 @@ from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.errors import PayloadError, ScenarioError, SetupError
 from caviar_protocol.seeding import derive_seed
 from caviar_protocol.topics import AntennaDevice, ChannelOptions, Scene
-from caviar_services.channel.assemble import Antenna, PathTable
+from caviar_services.channel.assemble import Antenna, Matrices, PathTable
 from caviar_services.channel.base import Found, PathModel
+from caviar_services.channel.mimo_rt import ElementTracer, targets_at_once
 from caviar_services.channel.sionna_materials import MaterialSettings, OutsideRange
 from caviar_services.channel.sionna_scene import SceneSettings, SionnaScene
 from caviar_services.channel.sionna_tracer import LaunchOptions, Traced, Tracer
 from caviar_services.channel.specular import refined_points
+from caviar_services.channel.spherical import SphericalWaves, nearest_in
+from caviar_services.channel.traced_surfaces import traced_surfaces
 from caviar_services.llvm import activate_llvm, choose_variant
 from caviar_services.service import Preparation, RunInfo
 
@@ -30,6 +38,8 @@ Array = NDArray[Any]
 _LANES = 20_000_000
 """Samples · depth · receivers of one launch at most: 40 B each in the solver."""
 
+_SAMPLES = 100_000
+
 _COMPILE_GRACE_S = 120.0
 
 
@@ -37,7 +47,18 @@ class SionnaSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     """What is modelled, and how finely."""
 
     max_depth: Annotated[int, quantity("1", "interactions of a path at most", ge=0, le=16)] = 3
-    samples: Annotated[int, quantity("1", "rays launched per transmitter", ge=1, le=100_000_000)] = 100_000
+    rung: Literal["siso-rt", "spherical", "mimo-rt"] = "siso-rt"
+    """How arrays are treated: plane waves, spherical waves, or every antenna pair traced."""
+    samples: (
+        Annotated[
+            int, quantity("1", "rays launched per transmitter; absent: 100,000", ge=1, le=100_000_000)
+        ]
+        | None
+    ) = None
+    ray_spacing_deg: (
+        Annotated[float, quantity("°", "mean angle between rays, in place of samples", ge=0.03, le=90)] | None
+    ) = None
+    """N rays that share the sphere's 4π sr have a mean spacing Δ [rad] with N = 4π/Δ²."""
     los: bool = True
     reflection: bool = True
     refraction: bool = False
@@ -51,6 +72,7 @@ class SionnaSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     receivers_at_once: Annotated[
         int | None, quantity("1", "receivers of one launch; absent: as the scenario has")
     ] = None
+    memory_gib: Annotated[float, quantity("GiB", "of one launch of the rung mimo-rt at most", gt=0, le=1024)] = 4.0
     bodies: Annotated[int, quantity("1", "moving objects of one mesh at most", ge=0, le=4096)] = 32
     pool: dict[str, int] = {}
     """Bodies of single meshes where ``bodies`` does not fit, by file name without ending: ``car = 64``;
@@ -74,11 +96,13 @@ class SionnaChannel(PathModel[SionnaSettings]):
     """
 
     Settings: ClassVar[type[msgspec.Struct]] = SionnaSettings
-    rung: ClassVar[str] = "siso-rt"
+    rung = "siso-rt"
     uses_scenery: ClassVar[bool] = True
 
     def __init__(self, settings: SionnaSettings, run: RunInfo) -> None:
         super().__init__(settings, run)
+        self.rung = settings.rung
+        self._samples = _samples(settings, run.name)
         self._variant = ""
         self._scene: SionnaScene
         self._tracer: Tracer
@@ -94,7 +118,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
             diffraction=s.diffraction,
             scattering=s.scattering,
             max_depth=s.max_depth,
-            samples=s.samples,
+            samples=self._samples,
         )
 
     def load(self, preparation: Preparation) -> tuple[str, ...]:
@@ -119,7 +143,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
             seed = derive_seed(self.run.seed, 0, f"{self.run.name}/launch")
         launch = LaunchOptions(
             max_depth=s.max_depth,
-            samples=s.samples,
+            samples=self._samples,
             max_paths=s.max_paths,
             seed=seed,
             reflection=s.reflection,
@@ -154,13 +178,25 @@ class SionnaChannel(PathModel[SionnaSettings]):
         straight = (table.types == 0).all(1)
         los = np.zeros(len(transmitters) * len(receivers), bool)
         los[table.pair[straight]] = True
+        traced = [part for _, part in parts]
         if not self.settings.los:
             table = table.take(~straight)
+            traced = [part.take((part.types != 0).any(1)) for part in traced]
         return Found(
             table=table,
             los=los.reshape(len(transmitters), len(receivers)),
             counts={"path_limit_reached": sum(part.limit_reached for _, part in parts)},
+            matrices=self._matrices(traced, table),
         )
+
+    def _matrices(self, traced: Sequence[Traced], table: PathTable) -> Matrices | None:
+        """How the rung makes H; `plane_waves` where it has no way of its own."""
+        if self.rung == "spherical":
+            surfaces = traced_surfaces(traced, table.types, table.points, self._scene)
+            return SphericalWaves(surfaces, nearest_in(self._scene.mi_scene))
+        if self.rung == "mimo-rt":
+            return ElementTracer(self._tracer, self._scene, self._elements_at_once(), self.settings.los)
+        return None
 
     def _table(
         self,
@@ -240,12 +276,19 @@ class SionnaChannel(PathModel[SionnaSettings]):
             )
         return {name: self.settings.pool.get(stem, self.settings.bodies) for stem, name in by_stem.items()}
 
+    def _elements_at_once(self) -> int:
+        s = self.settings
+        announced = sum(
+            d.count * d.array.size for d in self.run.devices if d.kind == "antenna" and d.role in ("rx", "both")
+        )
+        return targets_at_once(s.memory_gib, self._samples, s.max_depth, max(announced, self._at_once))
+
     def _receivers_at_once(self) -> int:
         s = self.settings
         if s.receivers_at_once is not None:
             return s.receivers_at_once
         announced = sum(d.count for d in self.run.devices if d.kind == "antenna" and d.role in ("rx", "both"))
-        return max(1, min(announced, _LANES // (s.samples * max(s.max_depth, 1))))
+        return max(1, min(announced, _LANES // (self._samples * max(s.max_depth, 1))))
 
     def _warm_up(self) -> tuple[str, ...]:
         """Compile every kernel that frames need: move the bodies, and trace what finds paths."""
@@ -256,8 +299,26 @@ class SionnaChannel(PathModel[SionnaSettings]):
         receivers = above + np.arange(1, self._at_once + 1)[:, None] * np.array([1.3, 0.7, -0.1])
         self._tracer.trace(above, receivers)
         self._tracer.trace(above + 0.5, receivers + 0.25)
+        if self.rung == "spherical":
+            nearest_in(self._scene.mi_scene)(receivers, np.tile([0.0, 0.0, -1.0], (len(receivers), 1)))
+        if self.rung == "mimo-rt":
+            targets = above + np.arange(1, self._elements_at_once() + 1)[:, None] * np.array([0.3, 0.7, -0.1])
+            self._tracer.trace(above, targets)
         self.run.progress("kernels compiled", 0.0)
         return (f"kernels compiled in {time.monotonic() - begin:.1f} s",)
+
+
+def _samples(settings: SionnaSettings, service: str) -> int:
+    """Rays of a launch, however they were given."""
+    if settings.ray_spacing_deg is None:
+        return _SAMPLES if settings.samples is None else settings.samples
+    if settings.samples is not None:
+        raise ScenarioError(
+            f"samples = {settings.samples} and ray_spacing_deg = {settings.ray_spacing_deg} both say how many "
+            "rays are launched; leave one out",
+            key=f"services.{service}.settings.ray_spacing_deg",
+        )
+    return round(4 * np.pi / np.radians(settings.ray_spacing_deg) ** 2)
 
 
 def _joined(arrays: Sequence[Array], empty: tuple[int, ...], dtype: type[np.generic]) -> Array:

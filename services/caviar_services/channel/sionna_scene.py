@@ -159,9 +159,14 @@ class SionnaScene:
 
         Anything for no shape.
         """
-        triangle = np.clip(self._offsets[self._where(shapes)] + primitives, 0, len(self._faces) - 1)
-        a, b, c = np.moveaxis(self._corners[self._faces[triangle]], -2, 0)
+        a, b, c = np.moveaxis(self.triangles(shapes, primitives), -2, 0)
         return a, np.cross(b - a, c - a)
+
+    def triangles(self, shapes: Int64Array, primitives: Int64Array) -> Float64Array:
+        """Corners [m] of triangles, Shape ``[..., 3, 3]``, in float64. Anything for no shape."""
+        triangle = np.clip(self._offsets[self._where(shapes)] + primitives, 0, len(self._faces) - 1)
+        corners: Float64Array = self._corners[self._faces[triangle]]
+        return corners
 
     def object_index(self, shapes: Int64Array, primitives: Int64Array) -> Int32Array:
         """Index into the names of `place` of triangles of process-local shapes; −1 for no shape."""

@@ -54,6 +54,16 @@ class LaunchOptions:
 
 
 @dataclass(frozen=True, eq=False)
+class Wedges:
+    """The wedge at which each of P paths is diffracted; anything for paths that are not."""
+
+    ends: Float64Array
+    """Both ends [m] of the edge, Shape ``[P, 2, 3]``."""
+    outward: Float64Array
+    """Unit vector between the normals of both faces, Shape ``[P, 3]``; 0 for the edge of a single face."""
+
+
+@dataclass(frozen=True, eq=False)
 class Traced:
     """P paths from one transmitter, of at most D interactions."""
 
@@ -70,6 +80,8 @@ class Traced:
     """Triangle of that shape, Shape ``[P, D]``."""
     points: Float64Array
     """Interaction points [m], Shape ``[P, D, 3]``."""
+    wedge: Wedges | None
+    """Where paths are diffracted; None where diffraction is not modelled."""
     limit_reached: bool
     """Whether more candidates were found than ``max_paths``; the surplus is lost."""
 
@@ -82,6 +94,7 @@ class Traced:
             shapes=self.shapes[which],
             primitives=self.primitives[which],
             points=self.points[which],
+            wedge=self.wedge and Wedges(self.wedge.ends[which], self.wedge.outward[which]),
             limit_reached=self.limit_reached,
         )
 
@@ -227,6 +240,7 @@ def _read(
             shapes=np.zeros((0, max_depth), np.int64),
             primitives=np.zeros((0, max_depth), np.int64),
             points=np.zeros((0, max_depth, 3)),
+            wedge=None,
             limit_reached=limit_reached,
         )
     vertices = (buffer.vertices_x, buffer.vertices_y, buffer.vertices_z)
@@ -246,8 +260,19 @@ def _read(
         shapes=buffer.shapes.numpy()[:, :max_depth].astype(np.int64),
         primitives=buffer.primitives.numpy()[:, :max_depth].astype(np.int64),
         points=points,
+        wedge=None if buffer.diffracting_wedges is None else _wedges(buffer.diffracting_wedges),
         limit_reached=limit_reached,
     )
+
+
+def _wedges(wedges: Any) -> Wedges:
+    import drjit as dr
+
+    dr.eval(wedges)
+    o, e, n0, nn = (v.numpy().T.astype(np.float64) for v in (wedges.o, wedges.e_hat, wedges.n0, wedges.nn))
+    single = wedges.prim0.numpy() == wedges.primn.numpy()
+    far = o + e * wedges.length.numpy()[:, None]
+    return Wedges(np.stack([o, far], axis=1), np.where(single[:, None], 0.0, _unit(n0 + nn)))
 
 
 def _dyad(
