@@ -2,10 +2,10 @@
 
     python tests/bench/bench_ladder.py --json ladder.json
 
-Takes frames of ``deploy/scenarios/street-canyon.toml`` with more receivers and arrays of other sizes, and gives
-the same frames to every rung. Prints the time of ``spherical`` beyond ``siso-rt`` as a part of the time of
-``mimo-rt``, the NMSE of H of both against ``mimo-rt`` for receivers of which all elements see all paths and for the
-rest, and the time of a whole ``spherical`` frame with 64×64 elements in ratio to 64×2.
+Takes frames of ``deploy/scenarios/street-canyon.toml`` with more receivers and arrays of other sizes, and
+gives the same frames to every rung. Prints the time of ``spherical`` beyond ``siso-rt`` as a part of the time of
+``mimo-rt``, the NMSE of H of both against ``mimo-rt`` for receivers of which all elements see all paths and
+for the rest, and the time of a whole ``spherical`` frame with 64×64 elements in ratio to 64×2.
 """
 
 # ruff: noqa: T201 - what it measures is printed
@@ -172,5 +172,12 @@ if __name__ == "__main__":
 
     sys.path.insert(0, str(Path(__file__).parent))
     from bench_ladder import *  # noqa: F403
+
     at = world(140, 3, 24)
-    print(at.run.name, len(at.scenes), at.settings, [len(s.devices) for s in at.scenes], [len(s.names) for s in at.scenes])
+    print(
+        at.run.name,
+        len(at.scenes),
+        at.settings,
+        [len(s.devices) for s in at.scenes],
+        [len(s.names) for s in at.scenes],
+    )

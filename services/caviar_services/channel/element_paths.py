@@ -5,12 +5,14 @@ length of the path is then that of a straight line to the receiver. That holds f
 with the same planes, so each element pair's length is exact, however near the arrays are.
 
 Two kinds of path bend at a place that no plane gives. A diffracted path goes over the point of its edge
-where it is shortest (Keller 1962: incident and diffracted ray make the same angle with the edge), so turned about the edge
-into one plane it is straight again. A scattered path keeps the points where it was scattered.
+where it is shortest (Keller 1962: incident and diffracted ray make the same angle with the edge), so
+turned about the edge into one plane it is straight again. A scattered path keeps the points where it
+was scattered.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -90,7 +92,7 @@ class ElementPaths:
         self._taken = self._map(mirror & (place > self.last[:, None]), reversed(range(depth)))
         self._straight = bool((self.bend == Bend.NONE).all())
 
-    def _map(self, mirror: BoolArray, order: range | reversed[int]) -> tuple[Float64Array, Float64Array]:
+    def _map(self, mirror: BoolArray, order: Iterable[int]) -> tuple[Float64Array, Float64Array]:
         """Linear part and offset of mirroring at planes one after the other; ``[P, 3, 3]`` and ``[P, 3]``."""
         linear = np.tile(np.eye(3), (len(mirror), 1, 1))
         offset = np.zeros((len(mirror), 3))
@@ -104,7 +106,7 @@ class ElementPaths:
         return linear, offset
 
     def lengths(self, rows: slice, transmit: Float64Array, receive: Float64Array) -> Lengths:
-        """Of some of the paths, between elements at ``transmit`` ``[p, N, 3]`` and ``receive`` ``[p, M, 3]``."""
+        """Of some of the paths; ``transmit`` ``[p, N, 3]``, ``receive`` ``[p, M, 3]`` are the elements [m]."""
         sent = _mapped(self._sent, rows, transmit)
         if self._straight:
             length = _distances(receive, sent)
@@ -130,7 +132,7 @@ class ElementPaths:
         return length, 1 / np.sqrt(legs * length)
 
     def _around_edge(self, paths: Int64Array, ends: Float64Array) -> tuple[Float64Array, Float64Array]:
-        """Place along the edge and distance from it [m], each of the shape of ``ends`` without its last axis."""
+        """Place along the edge and distance from it [m] of ends ``[p, N, 3]``, each of Shape ``[p, N]``."""
         edge = self.surfaces.edge[paths]
         axis = edge[:, 1] - edge[:, 0]
         length = np.sqrt((axis**2).sum(-1))

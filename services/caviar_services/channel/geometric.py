@@ -31,7 +31,6 @@ import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise, product
-from typing import ClassVar
 
 import numpy as np
 

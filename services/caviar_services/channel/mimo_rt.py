@@ -1,8 +1,8 @@
 """Rung ``mimo-rt``: every antenna pair traced.
 
 Each transmitting element is a source, each receiving element a target of the same tracer that finds the
-paths between the arrays' centres. So every pair has rays, reflection coefficients, element patterns and visibility of its own:
-the reference for the rungs below, at the price of one trace for each transmitting element.
+paths between the arrays' centres. So every pair has reflection coefficients, element patterns and visibility
+of its own: the reference for the rungs below, at the price of one trace for each transmitting element.
 """
 
 from __future__ import annotations

@@ -1,12 +1,13 @@
 """The ray-traced rungs: Sionna RT finds the paths; ``rung`` says what becomes of the arrays.
 
-``siso-rt`` traces between the arrays' centres and applies the arrays as plane waves, ``spherical`` gives each
-antenna pair its own length of the same paths (`spherical`), ``mimo-rt`` traces every pair (`mimo_rt`). They are
-one implementation with one scene and one set of options, so a rung is a setting like any other.
+``siso-rt`` traces between the arrays' centres and applies the arrays as plane waves, ``spherical`` gives
+each antenna pair its own length of the same paths (`spherical`), ``mimo-rt`` traces every pair (`mimo_rt`).
+They are one implementation with one scene and one set of options, so a rung is a setting like any other.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
@@ -50,9 +51,7 @@ class SionnaSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     rung: Literal["siso-rt", "spherical", "mimo-rt"] = "siso-rt"
     """How arrays are treated: plane waves, spherical waves, or every antenna pair traced."""
     samples: (
-        Annotated[
-            int, quantity("1", "rays launched per transmitter; absent: 100,000", ge=1, le=100_000_000)
-        ]
+        Annotated[int, quantity("1", "rays launched per transmitter; absent: 100,000", ge=1, le=100_000_000)]
         | None
     ) = None
     ray_spacing_deg: (
@@ -72,7 +71,9 @@ class SionnaSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     receivers_at_once: Annotated[
         int | None, quantity("1", "receivers of one launch; absent: as the scenario has")
     ] = None
-    memory_gib: Annotated[float, quantity("GiB", "of one launch of the rung mimo-rt at most", gt=0, le=1024)] = 4.0
+    memory_gib: Annotated[
+        float, quantity("GiB", "of one launch of the rung mimo-rt at most", gt=0, le=1024)
+    ] = 4.0
     bodies: Annotated[int, quantity("1", "moving objects of one mesh at most", ge=0, le=4096)] = 32
     pool: dict[str, int] = {}
     """Bodies of single meshes where ``bodies`` does not fit, by file name without ending: ``car = 64``;
@@ -278,9 +279,8 @@ class SionnaChannel(PathModel[SionnaSettings]):
 
     def _elements_at_once(self) -> int:
         s = self.settings
-        announced = sum(
-            d.count * d.array.size for d in self.run.devices if d.kind == "antenna" and d.role in ("rx", "both")
-        )
+        sizes = [d.count * d.array.size for d in self.run.devices if d.array and d.role in ("rx", "both")]
+        announced = sum(sizes)
         return targets_at_once(s.memory_gib, self._samples, s.max_depth, max(announced, self._at_once))
 
     def _receivers_at_once(self) -> int:
@@ -314,11 +314,11 @@ def _samples(settings: SionnaSettings, service: str) -> int:
         return _SAMPLES if settings.samples is None else settings.samples
     if settings.samples is not None:
         raise ScenarioError(
-            f"samples = {settings.samples} and ray_spacing_deg = {settings.ray_spacing_deg} both say how many "
-            "rays are launched; leave one out",
+            f"samples = {settings.samples} and ray_spacing_deg = {settings.ray_spacing_deg} both say "
+            "how many rays are launched; leave one out",
             key=f"services.{service}.settings.ray_spacing_deg",
         )
-    return round(4 * np.pi / np.radians(settings.ray_spacing_deg) ** 2)
+    return round(4 * math.pi / math.radians(settings.ray_spacing_deg) ** 2)
 
 
 def _joined(arrays: Sequence[Array], empty: tuple[int, ...], dtype: type[np.generic]) -> Array:

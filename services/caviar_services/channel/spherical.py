@@ -1,13 +1,15 @@
 """Rung ``spherical``: the paths of ``siso-rt``, with the exact length of each between any two elements.
 
-H[m, n] = Σ_p a_p · (s_p[m, n] / s_p) · exp(−j2πf(d_p[m, n] − d_p)/c), over the paths that elements m and n have,
-with the length d and the spreading s between the elements (s = 1/d but for diffraction and scattering,
+H[m, n] = Σ_p a_p · (s_p[m, n] / s_p) · exp(−j2πf(d_p[m, n] − d_p)/c), over the paths that elements m and n
+have, with the length d and the spreading s between the elements (s = 1/d but for diffraction and scattering,
 see `element_paths`) and d_p, s_p those between the arrays' centres, which a_p belongs to.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -80,82 +82,97 @@ class SphericalWaves:
         located: Located,
     ) -> tuple[ChannelMatrix, ...]:
         paths = ElementPaths(self._surfaces.take(located.row))
+        tx, rx = np.divmod(located.pair, max(len(receivers), 1))
+        centres = paths.lengths(
+            slice(0, len(tx)), _positions(transmitters)[tx, None], _positions(receivers)[rx, None]
+        )
         made: list[ChannelMatrix] = []
         for carrier, properties in enumerate(carriers):
             wavelength = SPEED_OF_LIGHT / properties.frequency_hz
             transmit, receive = elements(transmitters, wavelength), elements(receivers, wavelength)
-            tx, rx = np.divmod(located.pair, max(len(receivers), 1))
-            seen = visibility(paths, tx, rx, transmit, receive, self._nearest)
-            centres = _positions(transmitters)[tx], _positions(receivers)[rx]
+            field = _Field(
+                paths=paths,
+                seen=visibility(paths, tx, rx, transmit, receive, self._nearest),
+                transmit=transmit,
+                receive=receive,
+                transmitter=tx,
+                receiver=rx,
+                amplitude=located.a[carrier] / centres.spreading[:, 0, 0],
+                length=located.geometry.tau * SPEED_OF_LIGHT,
+                wavelength=wavelength,
+            )
             made += [
                 ChannelMatrix(carrier=carrier, tx=pair // len(receivers), rx=pair % len(receivers), h=h)
-                for pair, h in enumerate(
-                    _matrices(paths, located, located.a[carrier], wavelength, transmit, receive, seen, centres)
-                )
+                for pair, h in enumerate(field.matrices(located.offsets))
             ]
         return tuple(made)
+
+
+@dataclass(frozen=True, eq=False)
+class _Field:
+    """All paths of a frame on one carrier, between elements."""
+
+    paths: ElementPaths
+    seen: Visibility
+    transmit: Elements
+    receive: Elements
+    transmitter: Int64Array
+    """Antenna that each path starts at, Shape ``[P]``."""
+    receiver: Int64Array
+    amplitude: Complex128Array
+    """Of a path over its spreading at length 0, without carrier phase, Shape ``[P]``."""
+    length: Float64Array
+    """That the phase in ``amplitude`` stands for [m], Shape ``[P]``."""
+    wavelength: float
+
+    def matrices(self, offsets: Int64Array) -> Iterator[Complex128Array]:
+        """H of each pair of antennas, in order."""
+        for pairs, sizes in _groups(offsets, self.transmit, self.receive):
+            begin, end = int(offsets[pairs.start]), int(offsets[pairs.stop])
+            at_once = max(1, _LANES // (sizes[0] * sizes[1]))
+            if pairs.stop - pairs.start == 1:
+                h = np.zeros(sizes, np.complex128)
+                for row in range(begin, end, at_once):
+                    h += self._waves(slice(row, min(row + at_once, end)), sizes).sum(0)
+                yield h
+            else:
+                waves = self._waves(slice(begin, end), sizes)
+                for first, last in pairwise((offsets[pairs.start : pairs.stop + 1] - begin).tolist()):
+                    yield waves[first:last].sum(0)
+
+    def _waves(self, rows: slice, sizes: tuple[int, int]) -> Complex128Array:
+        """What each of some paths adds to H, Shape ``[p, M, N]``."""
+        transmit = self.transmit.first[self.transmitter[rows], None] + np.arange(sizes[1])
+        receive = self.receive.first[self.receiver[rows], None] + np.arange(sizes[0])
+        between = self.paths.lengths(rows, self.transmit.positions[transmit], self.receive.positions[receive])
+        turns = self.length[rows, None, None] - between.length
+        turns *= 1 / self.wavelength
+        turns -= np.round(turns)
+        turns *= 2 * np.pi
+        waves = np.empty(turns.shape, np.complex128)
+        np.cos(turns, out=waves.real)
+        np.sin(turns, out=waves.imag)
+        waves *= self.amplitude[rows, None, None]
+        waves *= between.spreading
+        for path in np.flatnonzero(~self.seen.every[rows]).tolist():
+            waves[path] *= self.seen.some.get(rows.start + path, False)
+        return waves
 
 
 def _positions(antennas: Sequence[Antenna]) -> Float64Array:
     return np.array([antenna.position for antenna in antennas]).reshape(-1, 3)
 
 
-def _matrices(
-    paths: ElementPaths,
-    located: Located,
-    a: Complex128Array,
-    wavelength: float,
-    transmit: Elements,
-    receive: Elements,
-    seen: Visibility,
-    centres: tuple[Float64Array, Float64Array],
-) -> Iterator[Complex128Array]:
-    """H of each pair of antennas, in order."""
-    reference = paths.lengths(slice(0, len(a)), centres[0][:, None], centres[1][:, None])
-    amplitude = a / reference.spreading[:, 0, 0]
-    for group in _groups(located.offsets, transmit, receive):
-        begin, end = int(located.offsets[group.start]), int(located.offsets[group.stop])
-        rows = slice(begin, end)
-        tx, rx = np.divmod(located.pair[rows], max(len(receive.arrays), 1))
-        sizes = _sizes(group.start, transmit, receive)
-        if begin == end:
-            for _ in range(group.start, group.stop):
-                yield np.zeros(sizes, np.complex128)
-            continue
-        lengths = paths.lengths(
-            rows,
-            transmit.positions[transmit.first[tx][:, None] + np.arange(sizes[1])],
-            receive.positions[receive.first[rx][:, None] + np.arange(sizes[0])],
-        )
-        turns = ((located.geometry.tau[rows] * SPEED_OF_LIGHT)[:, None, None] - lengths.length) / wavelength
-        turns -= np.round(turns)
-        turns *= 2 * np.pi
-        waves = np.empty(turns.shape, np.complex128)
-        np.cos(turns, out=waves.real)
-        np.sin(turns, out=waves.imag)
-        waves *= lengths.spreading
-        for path in np.flatnonzero(~seen.every[rows]).tolist():
-            waves[path] *= seen.some.get(begin + path, False)
-        waves *= amplitude[rows, None, None]
-        bounds = located.offsets[group.start : group.stop + 1] - begin
-        for first, last in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True):
-            yield waves[first:last].sum(0)
-
-
-def _sizes(pair: int, transmit: Elements, receive: Elements) -> tuple[int, int]:
-    tx, rx = divmod(pair, len(receive.arrays))
-    return receive.arrays[rx].size, transmit.arrays[tx].size
-
-
-def _groups(offsets: Int64Array, transmit: Elements, receive: Elements) -> Iterator[slice]:
-    """Consecutive pairs of arrays of the same sizes, as many as are computed at once."""
-    pairs = len(offsets) - 1
+def _groups(
+    offsets: Int64Array, transmit: Elements, receive: Elements
+) -> Iterator[tuple[range, tuple[int, int]]]:
+    """Consecutive pairs of arrays of the same sizes, as many as are computed at once, and these sizes."""
+    sizes = [(rx.size, tx.size) for tx in transmit.arrays for rx in receive.arrays]
     begin = 0
-    while begin < pairs:
-        sizes = _sizes(begin, transmit, receive)
-        most = offsets[begin] + _LANES // (sizes[0] * sizes[1])
+    while begin < len(sizes):
+        most = offsets[begin] + _LANES // (sizes[begin][0] * sizes[begin][1])
         end = begin + 1
-        while end < pairs and offsets[end + 1] <= most and _sizes(end, transmit, receive) == sizes:
+        while end < len(sizes) and offsets[end + 1] <= most and sizes[end] == sizes[begin]:
             end += 1
-        yield slice(begin, end)
+        yield range(begin, end), sizes[begin]
         begin = end

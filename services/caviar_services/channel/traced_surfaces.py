@@ -19,7 +19,7 @@ _SAME_CORNER = 0.01
 def traced_surfaces(
     launches: Sequence[Traced], types: UInt8Array, points: Float64Array, scene: SionnaScene
 ) -> Surfaces:
-    """Surfaces of the paths of all launches; ``types`` and ``points`` are theirs, one launch after the other."""
+    """Surfaces of the paths of all launches, one after the other; ``types`` and ``points`` are theirs."""
     depth = types.shape[1]
     shapes = np.concatenate([np.zeros((0, depth), np.int64), *(launch.shapes for launch in launches)])
     primitives = np.concatenate([np.zeros((0, depth), np.int64), *(launch.primitives for launch in launches)])

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
+from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt8Array
 from caviar_protocol.topics import AntennaArray, Interaction
 from caviar_services.channel.element_paths import Bend, ElementPaths
 
@@ -78,11 +78,12 @@ def visibility(
         ends = np.array([(array.rows - 1, array.columns - 1) for array in elements.arrays]).reshape(-1, 2)
         whole[:, 2 * side : 2 * side + 2, 1] = ends[which]
     cells, owner = whole, np.arange(count)
-    every = np.zeros(count, bool)
+    every: BoolArray = np.zeros(count, bool)
     some: dict[int, BoolArray] = {}
     while len(cells):
         seen = test.corners(cells, owner)
-        full, mixed = seen.all(1), seen.any(1) & ~seen.all(1)
+        full: BoolArray = seen.all(1)
+        mixed: BoolArray = seen.any(1) & ~full
         if cells is whole:
             every = full
             some = {p: test.empty(p) for p in np.flatnonzero(mixed).tolist()}
@@ -188,7 +189,7 @@ def _sides(
     start: Float64Array,
     points: Float64Array,
     end: Float64Array,
-    types: Int64Array,
+    types: UInt8Array,
     origin: Float64Array,
     normal: Float64Array,
 ) -> BoolArray:
@@ -211,11 +212,11 @@ def _segments(
     start: Float64Array,
     points: Float64Array,
     end: Float64Array,
-    types: Int64Array,
+    types: UInt8Array,
     normal: Float64Array,
     outward: Float64Array,
 ) -> tuple[Float64Array, Float64Array, BoolArray, Int64Array]:
-    """All segments of Q paths: where a ray along each starts and ends, whether it ends on a face, whose it is."""
+    """All segments of Q paths: start and end of a ray along each, whether it ends on a face, whose it is."""
     depth = types.shape[1]
     count = (types != 0).sum(1)
     length = np.sqrt((normal**2).sum(-1, keepdims=True))
