@@ -45,7 +45,7 @@ def refined_points(
     some = np.flatnonzero(specular & (types != 0).any(1))
     if not len(some):
         return points
-    found = _by_images(start[some], end[some], types[some], plane[0][some], plane[1][some])
+    found = image_points(start[some], end[some], types[some], plane[0][some], plane[1][some])
     shift = np.abs(found - points[some]).max(-1)
     good: BoolArray = ((shift < _FARTHEST_CORRECTION) | (types[some] == 0)).all(1)
     refined = points.copy()
@@ -53,9 +53,13 @@ def refined_points(
     return refined
 
 
-def _by_images(
+def image_points(
     start: Float64Array, end: Float64Array, types: UInt8Array, origin: Float64Array, normal: Float64Array
 ) -> Float64Array:
+    """Points where paths start → end meet their planes, Shape ``[P, D, 3]``; 0 where ``types`` is.
+
+    The parameters are those of `refined_points`, with the plane in two. Not finite at a plane seen edge-on.
+    """
     depth = types.shape[1]
     images = [start]
     for d in range(depth):
