@@ -120,8 +120,8 @@ def test_far_from_the_origin_the_phase_of_a_reflection_is_exact(tmp_path: Path) 
         centre + turned @ np.array([x, y, 0.0]) for x, y in [(-70, -70), (70, -70), (70, 70), (-70, 70)]
     ]
     model = sionna(60e9, write_scenery(tmp_path, [Plate("slope", corners)]), max_depth=1)
-    # The plane is that of the corners as the file holds them: float32.
-    held = np.array(corners, np.float32).astype(np.float64)
+    # The plane is that of the corners as they are written in the file.
+    held = np.array(corners)
     normal = unit(np.cross(held[1] - held[0], held[2] - held[0]))
     tx, rx = centre + turned @ [-31.3, 4.2, 11.7], centre + turned @ [24.9, -17.4, 6.1]
     channel = measure(model, scene([antenna("t", "tx", tx), antenna("r", "rx", rx)]))

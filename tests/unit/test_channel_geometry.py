@@ -10,10 +10,10 @@ import pytest
 from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.geometry import path_geometry
-from caviar_services.channel.specular import refined_points
+from caviar_services.channel.specular import distinct, refined_points
 
 R, S, T = Interaction.REFLECTION, Interaction.SCATTERING, Interaction.TRANSMISSION
-UP = np.array([0.0, 0.0, 1.0])
+D = Interaction.DIFFRACTION
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -50,8 +50,10 @@ def test_geometry_of_random_polylines(seed: int) -> None:
         assert geometry.arrival[p] @ (last - end[p]) > 0
 
 
-FLOOR_AND_WALL = (np.array([[[7.0, 7, 0], [10, -3, 9]]]), np.array([[[0.0, 0, -3], [2, 0, 0]]]))
-"""Planes z = 0 and x = 10, given by odd points and normals of odd lengths and senses."""
+FLOOR_AND_WALL = np.array(
+    [[[[7.0, 7, 0], [9, 8, 0], [7, 12, 0]], [[10, -3, 9], [10, -1, 9], [10, 30 / 7, 2 / 7]]]]
+)
+"""Triangles of odd places and senses in the planes z = 0 and x = 10."""
 
 
 def corner(noise: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # type: ignore[type-arg]
@@ -71,18 +73,54 @@ def test_a_corner_reflector_by_hand() -> None:
 def test_transmission_does_not_bend() -> None:
     """Through z = 3, then off the floor: the floor is met where it would be without the sheet."""
     start, end = np.array([[0.0, 0, 4]]), np.array([[8.0, 0, 4]])
-    planes = (np.array([[[9.0, 1, 3], [5, 5, 0]]]), np.tile(UP, (1, 2, 1)))
+    sheets = np.array([[[[9.0, 1, 3], [9, 2, 3], [7, 1, 3]], [[5, 5, 0], [6, 5, 0], [5, 6, 0]]]])
     exact = np.array([[[1.0, 0, 3], [4.0, 0, 0]]])
-    found = refined_points(start, exact + 1e-4, end, np.array([[T, R]], np.uint8), planes)
+    found = refined_points(start, exact + 1e-4, end, np.array([[T, R]], np.uint8), sheets)
     assert found == pytest.approx(exact, abs=1e-12)
 
 
-@pytest.mark.parametrize("types", [[S, R], [R, Interaction.DIFFRACTION]])
-def test_what_is_not_specular_stays(types: list[int]) -> None:
-    start, noisy, end, _ = corner(1e-3)
-    assert np.array_equal(
-        refined_points(start, noisy, end, np.array([types], np.uint8), FLOOR_AND_WALL), noisy
+def test_a_scattering_point_stays_in_its_plane_and_the_rest_is_specular() -> None:
+    """The traced point is moved along the normal only; from there the wall is met by the image."""
+    start, end = np.array([[0.0, 0, 4]]), np.array([[6.0, 6, 2]])
+    drawn, wall = [3.0, 1.0, 0.0], [10.0, 46 / 11, 14 / 11]  # image of RX at (14, 6, 2): 7 of 11 m in x
+    noisy = np.add([[drawn, wall]], [[[0, 0, 1e-3], [1e-3, -2e-3, 1e-3]]])
+    found = refined_points(start, noisy, end, np.array([[S, R]], np.uint8), FLOOR_AND_WALL)
+    assert found == pytest.approx(np.array([[drawn, wall]]), abs=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_diffracted_path_behind_a_reflection_is_the_shortest(seed: int) -> None:
+    """Floor, edge, wall: the point on the edge, an odd one of its triangle's, makes the length stationary."""
+    rng = np.random.default_rng(seed)
+    start, end = np.add(rng.uniform(-3, 3, (2, 1, 3)), [[[0, 0, 6]], [[4, 1, 7]]])
+    o, along = np.array([3.0, -2.0, 5.0]), np.array([0.6, 0.8, 0.0])
+    floor, wall = FLOOR_AND_WALL[0]
+    edge = np.roll([o - 30 * along, o + 30 * along, np.add(o, [0, 0, -9])], seed, axis=0)
+
+    def unfolded(t: float) -> float:
+        point = o + t * along
+        first = start[0] * [1, 1, -1] - point
+        return float(np.linalg.norm(first) + np.linalg.norm(end[0] * [-1, 1, 1] + [20, 0, 0] - point))
+
+    ts = np.linspace(-25, 25, 500_001)
+    shortest = ts[np.argmin([unfolded(t) for t in ts[::100]]) * 100]
+    fine = shortest + np.linspace(-0.02, 0.02, 40_001)
+    best = float(min(fine, key=unfolded))
+    point = o + best * along
+    at_floor = point + (start[0] * [1, 1, -1] - point) * point[2] / (point[2] + start[0, 2])
+    image = end[0] * [-1, 1, 1] + [20, 0, 0]
+    at_wall = point + (image - point) * (10 - point[0]) / (image[0] - point[0])
+    exact = np.array([[at_floor, point, at_wall]])
+    noisy = exact + rng.uniform(-1e-3, 1e-3, exact.shape)
+    found = refined_points(
+        start, noisy, end, np.array([[R, D, R]], np.uint8), np.array([[floor, edge, wall]])
     )
+    assert found[0, 1] == pytest.approx(point, abs=2e-5)
+    assert np.cross(found[0, 1] - o, along) == pytest.approx(0, abs=1e-12)
+    assert found == pytest.approx(exact, abs=1e-4)
+    corners = np.concatenate([start, found[0], end])
+    lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+    assert lengths.sum() == pytest.approx(unfolded(best), abs=1e-9)
 
 
 def test_a_point_far_from_where_it_was_traced_stays() -> None:
@@ -93,8 +131,34 @@ def test_a_point_far_from_where_it_was_traced_stays() -> None:
 
 
 def test_a_line_along_the_plane_stays() -> None:
-    """No crossing, no warning, no NaN."""
+    """No crossing, no warning, no NaN; nor by a triangle that has no plane."""
     start, end = np.array([[0.0, 0, 0]]), np.array([[8.0, 0, 0]])
-    traced = np.array([[[4.0, 0, 0]]])
-    found = refined_points(start, traced, end, np.array([[T]], np.uint8), (traced, UP[None, None]))
+    traced, flat = np.array([[[4.0, 0, 0]]]), np.array([[[[4.0, 0, 0], [5, 0, 0], [4, 1, 0]]]])
+    found = refined_points(start, traced, end, np.array([[T]], np.uint8), flat)
     assert np.array_equal(found, traced)
+    found = refined_points(start + 1, traced, end, np.array([[R]], np.uint8), flat[..., :1, :].repeat(3, -2))
+    assert np.array_equal(found, traced)
+
+
+def test_at_grazing_incidence_a_point_moves_far_where_the_length_does_not() -> None:
+    """1.5 m above ground over 2 km: the ray tracer's rounding moves the point by decimetres."""
+    start, end = np.array([[0.0, 0, 1.5]]), np.array([[2000.0, 0, 1.5]])
+    floor = np.array([[[[-9.0, -9, 0], [3000, -9, 0], [-9, 3000, 0]]]])
+    traced = np.array([[[1000.4, 0, 1e-5]]])
+    found = refined_points(start, traced, end, np.array([[R]], np.uint8), floor)
+    assert found == pytest.approx(np.array([[[1000.0, 0, 0]]]), abs=1e-9)
+
+
+def test_a_path_found_twice_is_one() -> None:
+    """Same pair, types and points but for rounding; scattered samples and other pairs are left alone."""
+    points = np.array([[[1.0, 2, 3], [4, 5, 6]]] * 6)
+    points[1] += 1e-9
+    points[2, 0, 1] += 1e-3
+    points[3:5, 1] = [7.0, 8, 9]  # behind the last interaction anything may stand
+    types = np.array([[R, R], [R, R], [R, R], [R, 0], [R, 0], [R, S]], np.uint8)
+    points[4, 1] = 0.0
+    pair = np.array([3, 3, 3, 3, 3, 3])
+    assert distinct(pair, types, points).tolist() == [True, False, True, True, False, True]
+    again = distinct(np.array([3, 4]), types[:2], points[:2])
+    assert again.tolist() == [True, True]
+    assert distinct(pair[:2], types[[5, 5]], points[[5, 5]]).tolist() == [True, True]

@@ -97,6 +97,19 @@ def doctor() -> None:
 
 
 @app.command()
+def stability(
+    group: Annotated[list[str] | None, typer.Option(help="only this group of cases; may be repeated")] = None,
+    json: Annotated[Path | None, typer.Option(help="write the results to this file")] = None,
+    markdown: Annotated[Path | None, typer.Option(help="write the table of the docs to this file")] = None,
+    traced: Annotated[bool, typer.Option(help="also the cases that need the ray tracer")] = True,
+) -> None:
+    """Ask the channel models at their extremes, and compare with formulas; status 1 where one is wrong."""
+    from caviar_clients.cli.stability import stability as ask
+
+    raise typer.Exit(ask(_console, group or (), json, markdown, traced))
+
+
+@app.command()
 def inspect(
     run: RunDirectory,
     digest: Annotated[bool, typer.Option("--digest", help="only the digest, from the payloads")] = False,

@@ -86,6 +86,9 @@ class PathTable:
     hidden: BoolArray | None = None
     """Paths that only elements beside the arrays' centres have: they are in H alone, Shape ``[P]``; absent:
     none is."""
+    traced: Int64Array | None = None
+    """Number of each among the paths of all launches, Shape ``[P]``; −1 for paths by formula; absent:
+    unknown."""
     faces: Int32Array | None = None
     """Number of the plane of each point within its object, the same in every frame, Shape ``[P, D]``;
     absent: unknown."""
@@ -102,6 +105,7 @@ class PathTable:
             object_velocity=self.object_velocity,
             faces=None if self.faces is None else self.faces[which],
             hidden=None if self.hidden is None else self.hidden[which],
+            traced=None if self.traced is None else self.traced[which],
         )
 
 

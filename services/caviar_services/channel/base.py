@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -13,7 +14,7 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array
-from caviar_protocol.errors import ScenarioError
+from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.paths import changes
 from caviar_protocol.scene import antennas
@@ -76,6 +77,12 @@ class ChannelModel(Service[S]):
                 "a channel needs at least one carrier; add [[carriers]] with name and frequency_hz",
                 key="carriers",
             )
+        for carrier in run.carriers:
+            if not (math.isfinite(carrier.frequency_hz) and carrier.frequency_hz > 0):
+                raise ScenarioError(
+                    f"carrier {carrier.name!r} is at {carrier.frequency_hz} Hz; write a finite frequency > 0",
+                    key="carriers",
+                )
         self.absorption_db_per_km = self._absorption()
         """Specific attenuation of the air on each carrier, Shape ``[C]``; None: no atmosphere."""
         self.with_h = False
@@ -114,6 +121,7 @@ class ChannelModel(Service[S]):
 
     def step(self, frame: Frame) -> StepResult:
         scene = frame.scene()
+        _require_finite(scene)
         made = self.model(frame, scene, antennas(scene, "tx"), antennas(scene, "rx"))
         channel = made.channel
         return StepResult(
@@ -144,6 +152,29 @@ class ChannelModel(Service[S]):
         )
         state = f"{air.temperature_k:g} K, {air.pressure_hpa:g} hPa, {air.water_vapour_g_m3:g} g/m³"
         return (f"atmosphere (ITU-R P.676) at {state}: {of_carriers}",)
+
+
+def _require_finite(scene: Scene) -> None:
+    """Raise `PayloadError` naming a NaN or an infinity of a scene: no channel follows from one."""
+    arrays = (scene.position, scene.orientation, scene.velocity, scene.dimensions)
+    numbers = [number for device in scene.devices for number in (*device.position, *device.orientation)]
+    for device in scene.devices:
+        if isinstance(device, AntennaDevice):
+            numbers += (device.array.vertical_spacing, device.array.horizontal_spacing)
+    if math.isfinite(sum(float(values.sum()) for values in arrays) + sum(numbers)):
+        return
+    for name, values in zip(("position", "orientation", "velocity", "dimensions"), arrays, strict=True):
+        for i in np.flatnonzero(~np.isfinite(values).all(-1))[:1].tolist():
+            raise PayloadError(
+                f"object {scene.names[i]!r} has the {name} {values[i].tolist()}; give finite numbers"
+            )
+    for device in scene.devices:
+        parts = {"position": device.position, "orientation": device.orientation}
+        if isinstance(device, AntennaDevice):
+            parts["element spacing"] = (device.array.vertical_spacing, device.array.horizontal_spacing)
+        for name, part in parts.items():
+            if not all(map(math.isfinite, part)):
+                raise PayloadError(f"device {device.name!r} has the {name} {part}; give finite numbers")
 
 
 class PathModel(ChannelModel[S]):

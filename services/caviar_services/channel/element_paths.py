@@ -20,6 +20,7 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt8Array
 from caviar_protocol.topics import Interaction
+from caviar_services.channel.clearance import CLEARANCE
 from caviar_services.channel.specular import image_points
 
 
@@ -74,7 +75,8 @@ class Lengths:
     """[m], Shape ``[P, M, N]``."""
     spreading: Float64Array
     """What the amplitude of the wave is proportional to [1/m], Shape ``[P, M, N]``: one over the length;
-    over the root of s·s'·(s + s') behind an edge; over both legs behind scattering."""
+    over the root of s·s'·(s + s') behind an edge; over both legs behind scattering. Such legs count as
+    `CLEARANCE` at least, which antennas are traced with. Elements at one place send each other nothing."""
 
 
 class ElementPaths:
@@ -133,10 +135,10 @@ class ElementPaths:
         sent = _mapped(self._sent, rows, transmit)
         if self._straight:
             length = _distances(receive, sent)
-            return Lengths(length, 1 / length)
+            return Lengths(length, _one_over(length))
         taken = _mapped(self._taken, rows, receive)
         length = _distances(taken, sent)
-        spreading = 1 / length
+        spreading = _one_over(length)
         bend = self.bend[rows]
         for which, kind in ((bend == Bend.EDGE, self._over_edge), (bend == Bend.POINTS, self._by_points)):
             some = np.flatnonzero(which)
@@ -151,8 +153,10 @@ class ElementPaths:
         across = radius[:, :, None] + rho[:, None]
         length = np.hypot(across, height[:, :, None] - z[:, None])
         # s and s' share the length as the distances from the edge do
-        legs = radius[:, :, None] * rho[:, None] * (length / across) ** 2
-        return length, 1 / np.sqrt(legs * length)
+        share = length / np.where(across > 0, across, 1.0)
+        sent_leg = np.maximum(rho[:, None] * share, CLEARANCE)
+        taken_leg = np.maximum(radius[:, :, None] * share, CLEARANCE)
+        return length, 1 / np.sqrt(sent_leg * taken_leg * (sent_leg + taken_leg))
 
     def _around_edge(self, paths: Int64Array, ends: Float64Array) -> tuple[Float64Array, Float64Array]:
         """Place along the edge and distance from it [m] of ends ``[p, N, 3]``, each of Shape ``[p, N]``."""
@@ -177,7 +181,8 @@ class ElementPaths:
         between = np.where(inner, steps, 0.0).sum(-1)
         out = np.sqrt(((sent - points[rows, first][:, None]) ** 2).sum(-1))[:, None]
         back = np.sqrt(((taken - points[rows, last][:, None]) ** 2).sum(-1))[:, :, None]
-        return out + back + between[:, None, None], 1 / (out * back)
+        spreading = 1 / (np.maximum(out, CLEARANCE) * np.maximum(back, CLEARANCE))
+        return out + back + between[:, None, None], spreading
 
     def corners(self, paths: Int64Array, start: Float64Array, end: Float64Array) -> Float64Array:
         """Interaction points [m] of paths between single elements, Shape ``[Q, D, 3]``.
@@ -211,7 +216,8 @@ class ElementPaths:
         sent = _mapped(self._sent, paths, start[:, None])
         taken = _mapped(self._taken, paths, end[:, None])
         (z, rho), (height, radius) = (self._around_edge(paths, ends) for ends in (sent, taken))
-        along = ((z * radius + height * rho) / (rho + radius))[:, 0]
+        apart = rho + radius
+        along = ((z * radius + height * rho) / np.where(apart > 0, apart, 1.0))[:, 0]
         edge = self.surfaces.edge[paths]
         axis = edge[:, 1] - edge[:, 0]
         length = np.sqrt((axis**2).sum(-1))
@@ -231,6 +237,11 @@ def _unmapped(affine: tuple[Float64Array, Float64Array], points: Float64Array) -
     """Where points came from; the maps are reflections, so the transpose of each is its inverse."""
     back: Float64Array = np.einsum("pij,pi->pj", affine[0], points - affine[1])
     return back
+
+
+def _one_over(length: Float64Array) -> Float64Array:
+    """0 for no length."""
+    return np.divide(1.0, length, out=np.zeros_like(length), where=length > 0)
 
 
 def _distances(receive: Float64Array, transmit: Float64Array) -> Float64Array:

@@ -89,9 +89,10 @@ class Offer:
         """Candidates for each receiver, those that cannot be included."""
         return max(len(self._chains.ray), len(self._scattered[0]))
 
-    def candidates(self, targets: Any) -> tuple[Candidates, Launch, int]:
-        """Direct paths, chains and scattering points for receivers, a `mitsuba.Point3f`, that could be paths;
-        the launch that their rays are of; and how many more there are than ``max_paths`` of each.
+    def candidates(self, targets: Any, count: int) -> tuple[Candidates, Launch, int]:
+        """Direct paths, chains and scattering points that could be paths to the first ``count`` of receivers,
+        a `mitsuba.Point3f`; the launch that their rays are of; and how many more there are than ``max_paths``
+        of each.
         """
         import drjit as dr
 
@@ -112,6 +113,7 @@ class Offer:
             np.concatenate([any_plane[: len(direct)], chains.planes[chain], any_plane[len(direct) :]]),
             np.concatenate([seen, np.repeat([False, True], [len(chain), len(point)])]),
         )
+        every = every.take(every.receiver < count)
         kept = first_of_each(every.receiver, self._options.max_paths)
         return every.take(kept), self.launch, len(kept) - int(kept.sum())
 

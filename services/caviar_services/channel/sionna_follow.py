@@ -142,9 +142,9 @@ class _FollowedOffer(Offer):
         planes = _planes(table, scene).astype(np.int32)
         self._chains = Chains(np.arange(len(table.depth)), table.depth, planes, straight.all(1))
 
-    def candidates(self, targets: Any) -> tuple[Candidates, Launch, int]:
+    def candidates(self, targets: Any, count: int) -> tuple[Candidates, Launch, int]:
         """As `Offer.candidates`, with a launch that has one ray for each candidate."""
-        found, _, lost = super().candidates(targets)
+        found, _, lost = super().candidates(targets, count)
         return replace(found, ray=np.arange(len(found.ray))), self._launch_of(found.ray), lost
 
     def _launch_of(self, chains: Int64Array) -> Launch:
@@ -158,7 +158,7 @@ class _FollowedOffer(Offer):
         for d in range(table.kind.shape[1]):
             shape, primitive = self._scene.shapes_of(table.triangle[:, d])
             # The image method mirrors at the plane through this point, which has moved with its object.
-            corner, _ = self._scene.planes(shape, primitive)
+            corner = self._scene.planes(shape, primitive)[0] - self._scene.centre
             point, probability = aligned_columns(corner.T), aligned_columns(table.probability[None, :, d])
             bounces.append(
                 Bounce(

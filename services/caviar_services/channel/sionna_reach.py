@@ -15,7 +15,7 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
 from caviar_services.channel.sionna_candidates import Candidates, Planes, positions
 from caviar_services.channel.sionna_scene import SionnaScene
-from caviar_services.columns import aligned_indices
+from caviar_services.columns import aligned_indices, several
 
 _OFF_SURFACE = 2e-4
 """[m]; rays from face to face start this far from the first, whose points are known to some 1e-5 m. From and
@@ -42,7 +42,8 @@ class Faces:
 
         line = end - start
         length = dr.norm(line)
-        ray = mi.Ray3f(start, line / length)
+        active &= length > 0.0
+        ray = mi.Ray3f(start, line / dr.select(length > 0.0, length, 1.0))
         met = self._scene.mi_scene.ray_intersect_preliminary(ray, coherent=False, active=active)
         hit = active & met.is_valid()
         offset = dr.gather(mi.UInt, self._offset, mi.UInt(dr.reinterpret_array(mi.UInt, met.shape)), hit)
@@ -53,9 +54,13 @@ class Faces:
         import drjit as dr
         import mitsuba as mi
 
-        behind, plane = self.along(positions(start), positions(end), dr.full(mi.Bool, True, len(start)))
+        lanes = several(len(start))
+        behind, plane = self.along(
+            positions(start[lanes]), positions(end[lanes]), dr.full(mi.Bool, True, len(lanes))
+        )
         dr.eval(behind, plane)
-        return behind.numpy().astype(np.float64), plane.numpy().astype(np.int64)
+        behind, plane = behind.numpy()[: len(start)], plane.numpy()[: len(start)]
+        return behind.astype(np.float64), plane.astype(np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +71,10 @@ class Corners:
     """Shape ``[K, 3]``."""
     receivers: Float64Array
     """Shape ``[R, L, 3]``."""
+
+    def relative_to(self, centre: Float64Array) -> Corners:
+        """The same, counted from there."""
+        return Corners(self.transmitter - centre, self.receivers - centre)
 
     def take(self, which: slice) -> Corners:
         """Those of some receivers."""
@@ -118,8 +127,10 @@ def reached(
     import drjit as dr
     import mitsuba as mi
 
+    lanes = several(len(chains))
+    shape = (len(chains), targets.shape[1], len(sources))
+    chains, receiver = chains[lanes], receiver[lanes]
     count, corners = len(chains), targets.shape[1]
-    shape = (count, corners, len(sources))
     lane = dr.arange(mi.UInt, count * corners * len(sources))
     per_chain, per_corner = (dr.opaque(mi.UInt, n) for n in (corners * len(sources), len(sources)))
     chain, rest = lane // per_chain, lane % per_chain
@@ -132,7 +143,7 @@ def reached(
     start = dr.gather(mi.Point3f, positions(sources), source)
     here = dr.gather(mi.Point3f, positions(targets.reshape(-1, 3)), first + corner)
     found: BoolArray = _exists(faces, planes, number, start, here).numpy()
-    return found.reshape(shape)
+    return found.reshape(-1, *shape[1:])[: shape[0]]
 
 
 def reflected(
@@ -141,9 +152,10 @@ def reflected(
     """Whether chains of reflections ``[Q, D]`` are paths between positions ``[Q, 3]`` [m], Shape ``[Q]``."""
     import mitsuba as mi
 
-    number = [mi.UInt(aligned_indices(column + 1)) for column in chains.T]
-    found: BoolArray = _exists(faces, planes, number, positions(start), positions(end)).numpy()
-    return found
+    lanes = several(len(chains))
+    number = [mi.UInt(aligned_indices(column + 1)) for column in chains[lanes].T]
+    found: BoolArray = _exists(faces, planes, number, positions(start[lanes]), positions(end[lanes])).numpy()
+    return found[: len(chains)]
 
 
 def _exists(faces: Faces, planes: Planes, number: list[Any], start: Any, end: Any) -> Any:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -17,13 +18,14 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from caviar_protocol.arrays import Float64Array, Int64Array, quantity
+from caviar_protocol.arrays import Int64Array, quantity
 from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.errors import PayloadError, ScenarioError, SetupError
 from caviar_protocol.seeding import derive_seed
 from caviar_protocol.topics import AntennaDevice, ChannelOptions, Scene
 from caviar_services.channel.assemble import Antenna, Matrices, PathTable
 from caviar_services.channel.base import ChannelSettings, Found, PathModel
+from caviar_services.channel.clearance import with_near_pairs
 from caviar_services.channel.mimo_rt import ElementTracer
 from caviar_services.channel.sionna_follow import Followed
 from caviar_services.channel.sionna_launch import LaunchOptions
@@ -36,8 +38,8 @@ from caviar_services.channel.sionna_materials import (
 from caviar_services.channel.sionna_reach import Corners
 from caviar_services.channel.sionna_scene import SceneSettings, SionnaScene
 from caviar_services.channel.sionna_sharing import scene_of
+from caviar_services.channel.sionna_table import Ends, path_table
 from caviar_services.channel.sionna_tracer import LANE_BYTES, Traced, Tracer
-from caviar_services.channel.specular import refined_points
 from caviar_services.channel.spherical import SphericalWaves
 from caviar_services.channel.traced_surfaces import traced_surfaces
 from caviar_services.channel.visibility import outermost
@@ -181,8 +183,8 @@ class SionnaChannel(PathModel[SionnaSettings]):
             diffraction=s.diffraction,
             scattering=s.scattering,
         )
-        wavelengths = [SPEED_OF_LIGHT / frequency for frequency in frequencies]
-        self._tracer = Tracer(self._scene, wavelengths, launch)
+        self._wavelengths = SPEED_OF_LIGHT / np.array(frequencies)
+        self._tracer = Tracer(self._scene, self._wavelengths.tolist(), launch)
         return (*notes, *self._warm_up())
 
     def reset(self, episode: int, seed: int, t0_ns: int) -> None:
@@ -211,72 +213,46 @@ class SionnaChannel(PathModel[SionnaSettings]):
             mi.set_variant(self._variant)
         _refuse_buried(scene, self.settings.without_body)
         names, velocity = self._scene.place(scene, frozenset(self.settings.without_body))
-        parts = [self._launch(t, transmitter, receivers, names) for t, transmitter in enumerate(transmitters)]
-        table = self._table(parts, names, velocity, transmitters, receivers)
-        straight = (table.types == 0).all(1)
-        free = straight if table.hidden is None else straight & ~table.hidden
+        clear = [self._cleared(antenna) for antenna in (*transmitters, *receivers)]
+        sources, targets = clear[: len(transmitters)], clear[len(transmitters) :]
+        parts = [self._launch(t, source, targets, names) for t, source in enumerate(sources)]
+        parts = parts or [(np.zeros(0, np.int64), self._tracer.nothing)]
+        antennas = transmitters, receivers
+        table = path_table(self._scene, parts, names, velocity, antennas, (sources, targets))
         los = np.zeros(len(transmitters) * len(receivers), bool)
-        los[table.pair[free]] = True
-        traced = [part for _, part in parts]
+        straight = (table.types == 0).all(1)
+        los[table.pair[straight if table.hidden is None else straight & ~table.hidden]] = True
+        table, too_close = with_near_pairs(table, los, *antennas, self._wavelengths, self._scene.surfaces)
         if not self.settings.los:
-            table = table.take(~straight)
-            traced = [part.take((part.types != 0).any(1)) for part in traced]
+            table = table.take((table.types != 0).any(1))
         return Found(
             table=table,
             los=los.reshape(len(transmitters), len(receivers)),
-            counts={"path_limit_reached": sum(part.lost for _, part in parts)},
-            matrices=self._matrices(traced, table),
+            counts={
+                "path_limit_reached": sum(part.lost for _, part in parts),
+                "too_close": too_close,
+            },
+            matrices=self._matrices([part for _, part in parts], table, (sources, targets)),
         )
 
-    def _matrices(self, traced: Sequence[Traced], table: PathTable) -> Matrices | None:
+    def _matrices(self, launches: Sequence[Traced], table: PathTable, traced_from: Ends) -> Matrices | None:
         """How the rung makes H; `plane_waves` where it has no way of its own."""
-        if self.rung == "spherical":
-            surfaces = traced_surfaces(traced, table.types, table.points, self._scene)
-            return SphericalWaves(surfaces, self._tracer.look)
+        if self.rung == "spherical" and table.traced is not None:
+            surfaces = traced_surfaces(launches, table.traced, table.types, table.points, self._scene)
+            return SphericalWaves(surfaces, self._tracer.look, traced_from)
         if self.rung == "mimo-rt":
             # The rays of a launch are kept whole; the rest is for the candidates of some receivers at a time.
             lanes = (
                 int(self.settings.memory_gib * 2**30 / LANE_BYTES) - self._samples * self.settings.max_depth
             )
-            return ElementTracer(self._tracer, self._scene, max(1, lanes), self.settings.los)
+            return ElementTracer(
+                self._tracer, self._scene, self._wavelengths, max(1, lanes), self.settings.los
+            )
         return None
 
-    def _table(
-        self,
-        parts: Sequence[tuple[Int64Array, Traced]],
-        names: tuple[str, ...],
-        velocity: Float64Array,
-        transmitters: Sequence[Antenna],
-        receivers: Sequence[Antenna],
-    ) -> PathTable:
-        """What all launches found, with names, and specular points in float64."""
-        depth = self.settings.max_depth
-        pair = _joined([pair for pair, _ in parts], (0,), np.int64)
-        types = _joined([part.types for _, part in parts], (0, depth), np.uint8)
-        shapes = _joined([part.shapes for _, part in parts], (0, depth), np.int64)
-        primitives = _joined([part.primitives for _, part in parts], (0, depth), np.int64)
-        tx, rx = np.divmod(pair, max(len(receivers), 1))
-        points = refined_points(
-            np.array([antenna.position for antenna in transmitters]).reshape(-1, 3)[tx],
-            _joined([part.points for _, part in parts], (0, depth, 3), np.float64),
-            np.array([antenna.position for antenna in receivers]).reshape(-1, 3)[rx],
-            types,
-            self._scene.planes(shapes, primitives),
-        )
-        return PathTable(
-            pair=pair,
-            transfer=np.concatenate(
-                [np.zeros((len(self.run.carriers), 0, 3, 3), np.complex128), *(p.transfer for _, p in parts)],
-                1,
-            ),
-            types=types,
-            objects=self._scene.object_index(shapes, primitives),
-            points=points,
-            hidden=_joined([part.hidden for _, part in parts], (0,), np.bool_),
-            object_names=names,
-            object_velocity=velocity,
-            faces=self._scene.face_number(shapes, primitives),
-        )
+    def _cleared(self, antenna: Antenna) -> Antenna:
+        """An antenna where it is traced from."""
+        return replace(antenna, position=self._scene.surfaces.cleared(antenna.position))
 
     def _launch(
         self, t: int, transmitter: Antenna, receivers: Sequence[Antenna], names: tuple[str, ...]
@@ -339,9 +315,10 @@ class SionnaChannel(PathModel[SionnaSettings]):
             self._tracer.trace(
                 above + shift, receivers + shift / 2, followed=followed, names=self._scene.names
             )
-        if self.rung == "spherical":
+        if self.rung != "siso-rt":
             corners = Corners(above[None] + [[0, 0, 0.1], [0, 0.1, 0]], receivers[:, None] + np.eye(3)[:2])
             self._tracer.trace(above, receivers, corners=corners)
+        if self.rung == "spherical":
             look = self._tracer.look
             look.nearest(receivers, receivers - 1.0)
             chains = np.full((len(receivers), self.settings.max_depth), -1)
@@ -361,10 +338,6 @@ def _samples(settings: SionnaSettings, service: str) -> int:
             key=f"services.{service}.settings.ray_spacing_deg",
         )
     return round(4 * math.pi / math.radians(settings.ray_spacing_deg) ** 2)
-
-
-def _joined(arrays: Sequence[Array], empty: tuple[int, ...], dtype: type[np.generic]) -> Array:
-    return np.concatenate([np.zeros(empty, dtype), *arrays])
 
 
 def _refuse_buried(scene: Scene, without_body: Sequence[str]) -> None:

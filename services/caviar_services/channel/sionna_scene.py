@@ -3,6 +3,10 @@
 Every further shape makes each trace a millisecond longer, whatever its size. So there is one
 shape for each material, and a table that says which triangles belong to what; paths still name the
 single building and vehicle.
+
+The ray tracer counts in float32, whose step is 1 mm at 10 km. So it is given the scene relative to
+`SionnaScene.centre`, and what its paths meet is told to callers in float64 and in world coordinates: the
+scenery's corners as they stand in the files, and those of moving bodies from their poses.
 """
 
 from __future__ import annotations
@@ -19,6 +23,7 @@ from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Arr
 from caviar_protocol.errors import AssetError, PayloadError
 from caviar_protocol.scene import object_pose
 from caviar_protocol.topics import Scene
+from caviar_services.channel.clearance import Surfaces
 from caviar_services.channel.sionna_materials import (
     Constants,
     MaterialPolicy,
@@ -29,10 +34,11 @@ from caviar_services.channel.sionna_materials import (
     itu_materials,
     set_materials,
 )
+from caviar_services.channel.sionna_meshes import file_meshes, file_vertices, unit_mesh
 from caviar_services.channel.sionna_planes import PlaneTable, plane_numbers, shared_planes
 from caviar_services.columns import aligned_columns
-from caviar_services.meshes import BodyPool, Mesh, box, placed, unit_box
-from caviar_services.scenery import find_scenery, read_scenery
+from caviar_services.meshes import BodyPool, Mesh, box, placed
+from caviar_services.scenery import find_scenery
 
 _Tuning = tuple[float, list[tuple[Any, Constants]]]
 """Frequency [Hz] of a carrier, and what is to be set at materials."""
@@ -45,6 +51,12 @@ PARKING_DEPTH = 2000.0
 
 _HALF_BOX = 4.0
 """[m]; more than the part of a shadow ray near its end that is not tested (9e-4 of its length)."""
+
+_CENTRE_STEP = 128.0
+"""[m]; the centre is a multiple of it, so that a scene about the origin stays as it is."""
+
+_LYING = 0.5
+"""Vertical part of the normal of grounds and roofs, at least."""
 
 _PARKING = "caviar-parking"
 _SKIN = "caviar-body"
@@ -88,19 +100,27 @@ class SionnaScene:
             for frequency in settings.frequencies_hz
             if bodied
         ]
-        self._scene = _load(find_scenery(assets), settings.weld)
+        description = find_scenery(assets)
+        files = {} if description is None else file_vertices(description)  # says what is wrong with a file
+        self._scene = _load(description)
         self._scenery = frozenset(self._scene.objects)
-        self.low, self.high = _bounds(self._scene) if self._scenery else (np.zeros(3), np.zeros(3))
+        shapes = _by_material(self._scene, file_meshes(self._scene, files, settings.weld))
+        self.low, self.high = _bounds(shapes)
+        self.centre: Float64Array = np.round((self.low + self.high) / (2 * _CENTRE_STEP)) * _CENTRE_STEP
+        """What the ray tracer's coordinates are relative to [m], Shape ``[3]``."""
         self._pool = dict(pool)
-        self._meshes = {asset: _unit_mesh(asset, assets) for asset in pool}
+        self._meshes = {asset: unit_mesh(asset, assets) for asset in pool}
         self._bodies: list[Body] = [(asset, slot) for asset in sorted(pool) for slot in range(pool[asset])]
         self._standing: frozenset[Body] = frozenset()
         self.version = 0
         """Counts how often anything has moved."""
         moving = self._moving_shapes(skins[0].constants if skins else None, settings.body_material == "metal")
         moved = sum(len(mesh.vertices) for mesh in moving[-1].meshes)
-        self._replace_shapes([*_by_material(self._scene), *moving])
+        self._replace_shapes([*shapes, *moving])
         self._vertices = self._corners[len(self._corners) - moved :]
+        self._first_moving = len(self._faces) - sum(len(mesh.faces) for mesh in moving[-1].meshes)
+        self.surfaces = Surfaces(self._corners[self._faces], self._points_outside)
+        """All triangles, in world coordinates."""
         set_materials(self._scene, settings.frequencies_hz[0], settings.materials)
         self._carriers: list[_Tuning] = []
         outside: list[OutsideUse] = []
@@ -122,7 +142,7 @@ class SionnaScene:
 
     @property
     def mi_scene(self) -> Any:
-        """The Mitsuba scene."""
+        """The Mitsuba scene, in metres relative to `centre`."""
         return self._scene.mi_scene
 
     def tune(self, carrier: int) -> None:
@@ -171,9 +191,10 @@ class SionnaScene:
         if not np.array_equal(before, self._vertices):
             self.version += 1
             params = self._scene.mi_scene_params
-            params[f"{_SKIN}.vertex_positions"] = _floats(self._vertices)
+            params[f"{_SKIN}.vertex_positions"] = _floats(self._vertices - self.centre)
             params.update()
-            self.plane_table.update(self._corners, self._moving_plane)
+            self.plane_table.update(self._corners - self.centre, self._moving_plane)
+            self.surfaces.move(self._first_moving, self._corners[self._faces[self._first_moving :]])
         self._standing = frozenset(standing)
         return tuple(names), velocity
 
@@ -182,8 +203,14 @@ class SionnaScene:
 
         Anything for no shape.
         """
-        a, b, c = np.moveaxis(self._corners[self._faces[self.triangle_numbers(shapes, primitives)]], -2, 0)
+        a, b, c = np.moveaxis(self.triangles(shapes, primitives), -2, 0)
         return a, np.cross(b - a, c - a)
+
+    def triangles(self, shapes: Int64Array, primitives: Int64Array) -> Float64Array:
+        """The corners [m] of triangles, Shape ``[..., 3, 3]``, in float64: those of scenery as they stand in
+        its files, those of moving bodies where `place` put them last. Anything for no shape."""
+        corners: Float64Array = self._corners[self._faces[self.triangle_numbers(shapes, primitives)]]
+        return corners
 
     def triangle_numbers(self, shapes: Int64Array, primitives: Int64Array) -> Int64Array:
         """Number, through all shapes, of triangles of process-local shapes; anything for no shape."""
@@ -238,6 +265,27 @@ class SionnaScene:
         piece = np.searchsorted(self._first_triangles, self._offsets[where] + primitives, side="right") - 1
         return np.where(self._ids[where] == shapes, piece, -1).astype(np.int32)
 
+    def is_parking(self, names: tuple[str, ...], objects: Int32Array) -> BoolArray:
+        """Which of the objects of paths, Shape ``[P, D]``, are the box around parked receivers.
+
+        Paths by way of it are none: it is not in the world.
+        """
+        parking: BoolArray = objects == names.index(_PARKING)
+        return parking
+
+    def _points_outside(self, triangle: int, normal: Float64Array) -> bool:
+        """Whether a triangle's normal points away from its piece, or up from one that lies.
+
+        Scenery has faces of either sense, so their order of corners says nothing.
+        """
+        piece = int(np.searchsorted(self._first_triangles, triangle, side="right")) - 1
+        if triangle < self._first_moving and abs(normal[2]) > _LYING:
+            return bool(normal[2] > 0)
+        ends = [*self._first_triangles.tolist(), len(self._faces)]
+        corners = self._corners[self._faces[ends[piece] : ends[piece + 1]]].reshape(-1, 3)
+        middle = (corners.min(0) + corners.max(0)) / 2
+        return bool((self._corners[self._faces[triangle, 0]] - middle) @ normal >= 0)
+
     def _where(self, shapes: Int64Array) -> Int64Array:
         return np.minimum(np.searchsorted(self._ids, shapes), len(self._ids) - 1)
 
@@ -270,7 +318,10 @@ class SionnaScene:
         """Put these shapes in place of what was loaded, and number their triangles."""
         from sionna.rt import SceneObject
 
-        added = [SceneObject(mi_mesh=_mi_mesh(shape), radio_material=shape.material) for shape in shapes]
+        added = [
+            SceneObject(mi_mesh=_mi_mesh(shape, self.centre), radio_material=shape.material)
+            for shape in shapes
+        ]
         self._scene.edit(add=added, remove=list(self._scene.objects))
         counts = [[len(mesh.faces) for mesh in shape.meshes] for shape in shapes]
         totals = np.array([sum(count) for count in counts], np.int64)
@@ -305,75 +356,47 @@ class SionnaScene:
         parts = np.concatenate([number + first for number, first in zip(numbers, before, strict=True)])
         faces = self._faces.astype(np.int64)
         apart = PlaneTable(parts.astype(np.int64), faces)
-        apart.update(self._corners)
+        apart.update(self._corners - self.centre)
         shared = shared_planes(apart, int(counts[:still].sum()))
         self.plane_of = shared[parts]
         """Infinite plane of each triangle, numbered through all objects."""
         self._moving_plane = len(apart.normal) and int(shared.max()) + 1 - int(counts[still:].sum())
         self.plane_table = PlaneTable(self.plane_of, faces)
-        self.plane_table.update(self._corners)
+        self.plane_table.update(self._corners - self.centre)
 
 
-def _load(description: Path | None, weld: bool) -> Any:
+def _load(description: Path | None) -> Any:
     from sionna.rt import load_scene
 
-    if description is not None:
-        read_scenery(description)  # says what is wrong with a file before the renderer does
     try:
         with any_frequency():
-            scene = load_scene(
-                None if description is None else str(description),
-                merge_shapes=False,
-                remove_duplicate_vertices=weld,
-            )
+            scene = load_scene(None if description is None else str(description), merge_shapes=False)
     except (ValueError, TypeError, RuntimeError) as error:
         raise AssetError(f"{description}: the ray tracer cannot load it: {error}") from error
     freeze(scene)
     return scene
 
 
-def _bounds(scene: Any) -> tuple[Float64Array, Float64Array]:
-    bounds = scene.mi_scene.bbox()
-    return np.array(bounds.min, np.float64).reshape(3), np.array(bounds.max, np.float64).reshape(3)
+def _bounds(shapes: Sequence[_Shape]) -> tuple[Float64Array, Float64Array]:
+    """Lowest and highest corner [m] of all shapes; the origin where there are none."""
+    if not shapes:
+        return np.zeros(3), np.zeros(3)
+    corners = np.concatenate([mesh.vertices for shape in shapes for mesh in shape.meshes])
+    return corners.min(0), corners.max(0)
 
 
-def _by_material(scene: Any) -> list[_Shape]:
+def _by_material(scene: Any, meshes: Mapping[str, Mesh]) -> list[_Shape]:
     """What was loaded, joined to one shape a material."""
     groups: dict[str, _Shape] = {}
     for name, item in scene.objects.items():
         material = item.radio_material
         group = groups.setdefault(material.name, _Shape(f"caviar-scenery-{material.name}", material, [], []))
         group.names.append(name)
-        group.meshes.append(_mesh_of(item.mi_mesh))
+        group.meshes.append(meshes[name])
     return list(groups.values())
 
 
-def _unit_mesh(asset: str, assets: Mapping[str, Path]) -> Mesh:
-    import mitsuba as mi
-
-    if not asset:
-        return unit_box()
-    path = assets.get(asset)
-    if path is None:
-        known = ", ".join(sorted(name for name in assets if name.startswith("objects/"))) or "none"
-        raise AssetError(f"there is no mesh {asset!r} among the assets; object meshes: {known}")
-    try:
-        return _mesh_of(mi.load_dict({"type": "ply", "filename": str(path), "face_normals": True}))
-    except RuntimeError as error:
-        raise AssetError(f"mesh {asset!r} ({path}) cannot be read: {error}") from error
-
-
-def _mesh_of(shape: Any) -> Mesh:
-    import mitsuba as mi
-
-    params = mi.traverse(shape)
-    return Mesh(
-        np.array(params["vertex_positions"], np.float64).reshape(-1, 3),
-        np.array(params["faces"], np.int32).reshape(-1, 3),
-    )
-
-
-def _mi_mesh(shape: _Shape) -> Any:
+def _mi_mesh(shape: _Shape, centre: Float64Array) -> Any:
     import mitsuba as mi
 
     counts = np.array([len(mesh.vertices) for mesh in shape.meshes])
@@ -384,7 +407,7 @@ def _mi_mesh(shape: _Shape) -> Any:
     properties["face_normals"] = True
     made = mi.Mesh(shape.id, int(counts.sum()), len(faces), props=properties)
     params = mi.traverse(made)
-    params["vertex_positions"] = _floats(np.concatenate([mesh.vertices for mesh in shape.meshes]))
+    params["vertex_positions"] = _floats(np.concatenate([mesh.vertices for mesh in shape.meshes]) - centre)
     params["faces"] = mi.UInt(np.ascontiguousarray(faces, np.uint32).ravel())
     params.update()
     return made

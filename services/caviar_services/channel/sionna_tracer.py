@@ -31,7 +31,7 @@ from caviar_services.channel.sionna_scene import SionnaScene
 from caviar_services.channel.sionna_wedges import Wedges
 from caviar_services.channel.specular import image_points, refined_points
 from caviar_services.channel.visibility import Look
-from caviar_services.columns import aligned_columns, aligned_indices
+from caviar_services.columns import aligned_columns, aligned_indices, several
 
 _POLE = 1.2e-5
 """Below this horizontal part of a direction Sionna RT sets its azimuth to 0 (100 float32 epsilons)."""
@@ -126,7 +126,7 @@ class Tracer:
     Parameters
     ----------
     scene
-        The scene, tuned to the first carrier.
+        The scene, tuned to the first carrier. Its ray tracer counts relative to ``scene.centre``.
     wavelengths
         Of the carriers [m].
     options
@@ -154,9 +154,19 @@ class Tracer:
 
     @property
     def look(self) -> Look:
-        """What can be asked about the scene as it is."""
-        table = self._scene.plane_table
-        return Look(self._faces.nearest, lambda *question: reflected(self._faces, Planes(table), *question))
+        """What can be asked about the scene as it is, in world coordinates."""
+        table, centre = self._scene.plane_table, self._scene.centre
+        return Look(
+            nearest=lambda start, end: self._faces.nearest(start - centre, end - centre),
+            reflected=lambda chains, start, end: reflected(
+                self._faces, Planes(table), chains, start - centre, end - centre
+            ),
+        )
+
+    @property
+    def nothing(self) -> Traced:
+        """No paths."""
+        return _nothing(len(self._wavelengths), self._options.max_depth, 0)
 
     def trace(
         self,
@@ -168,7 +178,7 @@ class Tracer:
         lanes: int = _LANES,
         corners: Corners | None = None,
     ) -> Traced:
-        """Paths from one transmitter [3] to all receivers [R, 3], positions in metres.
+        """Paths from one transmitter [3] to all receivers [R, 3], positions in metres in the world.
 
         ``at_once`` receivers are handled together, or as many as fit ``lanes``: to the paths it makes no
         difference. With ``followed``, what the transmitter's last launches met, a part of the rays is
@@ -176,7 +186,10 @@ class Tracer:
         of the arrays has; nothing is then taken from an earlier trace.
         """
         if not len(receivers):
-            return _joined([], len(self._wavelengths), self._options.max_depth)
+            return self.nothing
+        centre = self._scene.centre
+        transmitter, receivers = transmitter - centre, receivers - centre
+        corners = corners and corners.relative_to(centre)
         last = None if corners else self._last.get(transmitter.tobytes())
         if last is None or last.version != self._scene.version:
             if followed is None:
@@ -231,7 +244,9 @@ class Tracer:
             )
             for begin in range(0, len(receivers), at_once)
         ]
-        return _joined(parts, len(self._wavelengths), self._options.max_depth)
+        joined = _joined(parts, len(self._wavelengths), self._options.max_depth)
+        centre = self._scene.centre
+        return replace(joined, points=joined.points + centre, wedge=joined.wedge.moved(centre))
 
     def _batch(
         self,
@@ -243,13 +258,13 @@ class Tracer:
     ) -> Traced:
         import mitsuba as mi
 
-        source, targets = positions(transmitter[None]), positions(receivers)
-        candidates, launch, lost = offer.candidates(targets)
+        source, targets = positions(transmitter[None]), positions(receivers[several(len(receivers))])
+        candidates, launch, lost = offer.candidates(targets, len(receivers))
         if not len(candidates.ray):
             return _nothing(len(self._wavelengths), self._options.max_depth, lost)
         buffer = self._images(
             scene=self._scene.mi_scene,
-            paths=self._buffer(launch, candidates.take(_several(len(candidates.ray)))),
+            paths=self._buffer(launch, candidates.take(several(len(candidates.ray)))),
             src_positions=source,
             tgt_positions=targets,
             diffraction=self._options.diffraction,
@@ -260,7 +275,7 @@ class Tracer:
         valid = np.flatnonzero(at_centres | hidden)
         if not len(valid):
             return _nothing(len(self._wavelengths), self._options.max_depth, lost)
-        kept = valid[_several(len(valid))]
+        kept = valid[several(len(valid))]
         buffer = buffer.gather(mi.UInt(aligned_indices(kept)))
         self._settle(buffer, candidates.take(kept), hidden[kept], transmitter, receivers)
         self._compute_fields(buffer, source, targets)
@@ -322,9 +337,11 @@ class Tracer:
         start = np.broadcast_to(transmitter, (len(types), 3))
         end = receivers[candidates.receiver]
         if hidden.any():  # no ray of the centre's has been at their points
-            surfaces = self._scene.planes(shapes[hidden], primitives[hidden])
+            origin, normal = self._scene.planes(shapes[hidden], primitives[hidden])
+            surfaces = origin - self._scene.centre, normal
             points[hidden] = image_points(start[hidden], end[hidden], types[hidden], *surfaces)
             own[hidden] &= _first_of_equals(end[hidden], points[hidden])
+            own[hidden] &= np.isfinite(points[hidden]).all((1, 2))
         buffer.valid = mi.UInt(aligned_indices(own)) != 0
         met = (types == Interaction.REFLECTION) | (types == Interaction.TRANSMISSION)
         met &= (own & ~candidates.found & ~hidden)[:, None]
@@ -334,7 +351,9 @@ class Tracer:
         shapes[met], primitives[met] = self._scene.shapes_of(first)
         buffer._shapes = _tensor(mi.TensorXu, mi.UInt(aligned_indices(shapes.ravel())), shapes)
         buffer._primitives = _tensor(mi.TensorXu, mi.UInt(aligned_indices(primitives.ravel())), shapes)
-        exact = refined_points(start, points, end, types, self._scene.planes(shapes, primitives))
+        exact = refined_points(
+            start, points, end, types, self._scene.triangles(shapes, primitives) - self._scene.centre
+        )
         for axis, column in zip("xyz", aligned_columns(exact.reshape(-1, 3).T), strict=True):
             setattr(buffer, f"_vertices_{axis}", _tensor(mi.TensorXf, mi.Float(column), shapes))
 
@@ -376,11 +395,6 @@ def _first_of_equals(ends: Float64Array, points: Float64Array) -> BoolArray:
     first = np.zeros(len(ends), np.bool_)
     first[np.unique(places, axis=0, return_index=True)[1]] = True
     return first
-
-
-def _several(count: int) -> Int64Array:
-    """Indices of so many, a single one twice: an array of one element is another kernel."""
-    return np.arange(count) if count > 1 else np.zeros(2 * count, np.int64)
 
 
 def _tensor(kind: Any, values: Any, like: Int64Array) -> Any:

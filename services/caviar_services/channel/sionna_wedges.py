@@ -41,6 +41,10 @@ class Wedges:
         outward = np.where(single[:, None], 0.0, between / np.where(length > 0, length, 1.0))
         return cls(np.stack([o, o + e * wedges.length.numpy()[:, None]], axis=1), outward)
 
+    def moved(self, by: Float64Array) -> Wedges:
+        """The same elsewhere: ``by`` [m], Shape ``[3]``, is added to all places."""
+        return Wedges(self.ends + by, self.outward)
+
     def take(self, which: BoolArray) -> Wedges:
         """Those of these paths."""
         return Wedges(self.ends[which], self.outward[which])

@@ -18,7 +18,7 @@ from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Carrier, ChannelMatrix
 from caviar_services.channel.assemble import Antenna, Located
 from caviar_services.channel.element_gains import ElementGains
-from caviar_services.channel.element_paths import ElementPaths, Surfaces
+from caviar_services.channel.element_paths import Bend, ElementPaths, Surfaces
 from caviar_services.channel.visibility import Elements, Look, Visibility, elements, visibility
 
 _LANES = 1 << 15
@@ -38,11 +38,16 @@ class SphericalWaves:
         What the paths meet, in the order of the model's table.
     look
         Asks this frame's scene.
+    traced_from
+        Transmitters and receivers off the surfaces that they are at: there their elements look.
     """
 
-    def __init__(self, surfaces: Surfaces, look: Look) -> None:
+    def __init__(
+        self, surfaces: Surfaces, look: Look, traced_from: tuple[Sequence[Antenna], Sequence[Antenna]]
+    ) -> None:
         self._surfaces = surfaces
         self._look = look
+        self._sources, self._targets = traced_from
 
     def __call__(
         self,
@@ -54,15 +59,21 @@ class SphericalWaves:
         paths = ElementPaths(self._surfaces.take(located.row))
         tx, rx = np.divmod(located.pair, max(len(receivers), 1))
         start, end = _positions(transmitters)[tx], _positions(receivers)[rx]
-        spreading = paths.lengths(slice(0, len(tx)), start[:, None], end[:, None]).spreading
+        # Amplitudes of paths that bend are as traced, those of others of their true length.
+        traced = _positions(self._sources)[tx, None], _positions(self._targets)[rx, None]
+        spreading = paths.lengths(slice(0, len(tx)), *traced).spreading[:, 0, 0]
+        straight = paths.bend == Bend.NONE
+        spreading[straight] = 1 / (SPEED_OF_LIGHT * located.geometry.tau[straight])
         towards = paths.ends(start, end)
         made: list[ChannelMatrix] = []
         for carrier, properties in enumerate(carriers):
             wavelength = SPEED_OF_LIGHT / properties.frequency_hz
             transmit, receive = elements(transmitters, wavelength), elements(receivers, wavelength)
+            looking = elements(self._sources, wavelength), elements(self._targets, wavelength)
+            seen = visibility(paths, tx, rx, *looking, self._look)
             field = _Field(
                 paths=paths,
-                seen=visibility(paths, tx, rx, transmit, receive, self._look),
+                seen=_far_enough(seen, paths, (tx, rx), (transmit, receive), wavelength),
                 transmit=transmit,
                 receive=receive,
                 transmitter=tx,
@@ -71,7 +82,7 @@ class SphericalWaves:
                     (transmitters, receivers),
                     (tx, rx),
                     towards,
-                    located.transfer[carrier] / spreading,
+                    located.transfer[carrier] / spreading[:, None, None],
                     wavelength,
                 ),
                 wavelength=wavelength,
@@ -133,6 +144,28 @@ class _Field:
         for path in np.flatnonzero(~self.seen.every[rows]).tolist():
             waves[path] *= self.seen.some.get(rows.start + path, False)
         return waves
+
+
+def _far_enough(
+    seen: Visibility,
+    paths: ElementPaths,
+    antennas: tuple[Int64Array, Int64Array],
+    ends: tuple[Elements, Elements],
+    wavelength: float,
+) -> Visibility:
+    """Without direct paths of elements closer than one wavelength, which antennas have none of either."""
+    every, some = seen.every.copy(), dict(seen.some)
+    transmit, receive = ends
+    for path in np.flatnonzero((paths.surfaces.types == 0).all(1)).tolist():
+        sent, taken = transmit.of(antennas[0][path]), receive.of(antennas[1][path])
+        low = np.maximum(sent.min(0), taken.min(0))
+        high = np.minimum(sent.max(0), taken.max(0))
+        if (low - high).max() >= wavelength:
+            continue
+        far = np.sqrt(((taken[:, None] - sent) ** 2).sum(-1)) >= wavelength
+        some[path] = far if every[path] else far & some.get(path, False)
+        every[path] = False
+    return Visibility(every, some)
 
 
 def _positions(antennas: Sequence[Antenna]) -> Float64Array:

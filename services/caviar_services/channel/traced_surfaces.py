@@ -17,14 +17,24 @@ _SAME_CORNER = 0.01
 
 
 def traced_surfaces(
-    launches: Sequence[Traced], types: UInt8Array, points: Float64Array, scene: SionnaScene
+    launches: Sequence[Traced],
+    traced: Int64Array,
+    types: UInt8Array,
+    points: Float64Array,
+    scene: SionnaScene,
 ) -> Surfaces:
-    """Surfaces of the paths of all launches, one after the other; ``types`` and ``points`` are theirs."""
+    """Surfaces of some paths of all launches: ``traced`` are their numbers, −1 for paths that meet nothing.
+
+    ``types`` and ``points`` are those of the table.
+    """
     depth = types.shape[1]
-    shapes = np.concatenate([np.zeros((0, depth), np.int64), *(launch.shapes for launch in launches)])
-    primitives = np.concatenate([np.zeros((0, depth), np.int64), *(launch.primitives for launch in launches)])
-    edge = np.concatenate([np.zeros((0, 2, 3)), *(launch.wedge.ends for launch in launches)])
-    outward = np.concatenate([np.zeros((0, 3)), *(launch.wedge.outward for launch in launches)])
+    # Nothing stands at the end, where −1 finds it.
+    none = np.zeros((1, depth), np.int64)
+    shapes = np.concatenate([*(launch.shapes for launch in launches), none])[traced]
+    primitives = np.concatenate([*(launch.primitives for launch in launches), none])[traced]
+    edge = np.concatenate([*(launch.wedge.ends for launch in launches), np.zeros((1, 2, 3))])[traced]
+    outward = np.concatenate([*(launch.wedge.outward for launch in launches), np.zeros((1, 3))])[traced]
+    settled = np.concatenate([*(launch.settled for launch in launches), np.zeros(1, np.bool_)])[traced]
     triangles = scene.triangle_numbers(shapes, primitives)
     bent = types == Interaction.DIFFRACTION
     some = np.flatnonzero(bent.any(1))
@@ -32,7 +42,6 @@ def traced_surfaces(
         at = np.argmax(bent[some], axis=1)
         edge[some] = _snapped(edge[some], scene.corners(triangles[some, at]))
     origin, normal = scene.planes(shapes, primitives)
-    settled = np.concatenate([np.zeros(0, np.bool_), *(launch.settled for launch in launches)])
     return Surfaces(
         types=types,
         points=points,

@@ -1,0 +1,179 @@
+"""Antennas at surfaces and next to each other, where a ray tracer in float32 sees nothing.
+
+Sionna RT drops segments below 1 cm and lets rays leak through what is nearer than some millimetres: an
+antenna on a roof would see its line of sight or not by rounding, and never the reflection. So an
+antenna nearer than `CLEARANCE` to a surface is traced from that far off it, on its own side; exactly on
+it, from the outside. Points, lengths and directions are then those of its true position.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int64Array
+from caviar_services.channel.assemble import Antenna, PathTable
+
+CLEARANCE = 0.02
+"""[m]"""
+
+NEAR_PAIR = 0.05
+"""[m]; pairs nearer than this have their line of sight by formula, not from the ray tracer."""
+
+_ON_SURFACE = 1e-6
+"""[m]; nearer to a surface, the side that an antenna is on is not told by its position."""
+
+_MARGIN = 1e-3
+"""[m] beyond the edges of a triangle that still are at it."""
+
+
+class Surfaces:
+    """Triangles, to be asked what is near a point and what stands in the way.
+
+    Parameters
+    ----------
+    triangles
+        Corners [m], Shape ``[F, 3, 3]``.
+    outside
+        From the number of a triangle and its unit normal: whether the normal points outside.
+    """
+
+    def __init__(self, triangles: Float64Array, outside: Callable[[int, Float64Array], bool]) -> None:
+        self._triangles = triangles.copy()
+        self._outside = outside
+        self._low, self._high = np.moveaxis(_boxes(self._triangles), -1, 0)
+
+    def move(self, first: int, triangles: Float64Array) -> None:
+        """Put triangles in the place of those from number ``first`` on."""
+        rows = slice(first, first + len(triangles))
+        self._triangles[rows] = triangles
+        boxes = _boxes(triangles)
+        self._low[:, rows], self._high[:, rows] = boxes[..., 0], boxes[..., 1]
+
+    def cleared(self, position: Float64Array) -> Float64Array:
+        """The position [m], Shape ``[3]``, moved away from surfaces that it is at."""
+        for index in self._within(position, position, CLEARANCE).tolist():
+            corners = self._triangles[index]
+            normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+            norm = float(np.linalg.norm(normal))
+            if norm == 0:
+                continue
+            normal = normal / norm
+            height = float((position - corners[0]) @ normal)
+            if abs(height) >= CLEARANCE or not _covers(corners, normal, position - height * normal):
+                continue
+            side = np.sign(height)
+            if abs(height) < _ON_SURFACE:
+                side = 1.0 if self._outside(index, normal) else -1.0
+            position = position + (side * CLEARANCE - height) * normal
+        return position
+
+    def between(self, start: Float64Array, end: Float64Array) -> bool:
+        """Whether a triangle stands on the segment between two points [m], its ends left out."""
+        line = end - start
+        for index in self._within(np.minimum(start, end), np.maximum(start, end), 0.0).tolist():
+            corners = self._triangles[index]
+            normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+            across = float(line @ normal)
+            if across == 0:
+                continue
+            along = float((corners[0] - start) @ normal) / across
+            unit = normal / np.linalg.norm(normal)
+            if 0 < along < 1 and _covers(corners, unit, start + along * line):
+                return True
+        return False
+
+    def _within(self, low: Float64Array, high: Float64Array, reach: float) -> Int64Array:
+        """Triangles whose bounding box meets a box."""
+        found = np.flatnonzero((self._low[0] <= high[0] + reach) & (self._high[0] >= low[0] - reach))
+        for axis in (1, 2):
+            below = self._low[axis, found] <= high[axis] + reach
+            found = found[below & (self._high[axis, found] >= low[axis] - reach)]
+        return found
+
+
+def _boxes(triangles: Float64Array) -> Float64Array:
+    """Lowest and highest corners, Shape ``[3, F, 2]``."""
+    boxes: Float64Array = np.stack([triangles.min(1).T, triangles.max(1).T], axis=-1)
+    return boxes
+
+
+def _covers(corners: Float64Array, normal: Float64Array, foot: Float64Array) -> bool:
+    """Whether a point of its plane lies within a triangle."""
+    for i in range(3):
+        edge = corners[(i + 1) % 3] - corners[i]
+        length = float(np.linalg.norm(edge))
+        if length > 0 and float(np.cross(normal, edge / length) @ (foot - corners[i])) < -_MARGIN:
+            return False
+    return True
+
+
+def spread_anew(
+    transfer: Complex128Array, specular: BoolArray, traced: Float64Array, length: Float64Array
+) -> Complex128Array:
+    """Dyads ``[C, P, 3, 3]`` of paths that were traced with one length [m] and have another, Shape ``[P]``:
+    the field of a specular path falls as one over its length."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        factor = np.where(specular & (length > 0), traced / length, 1.0)
+    scaled: Complex128Array = transfer * factor[None, :, None, None]
+    return scaled
+
+
+def with_near_pairs(
+    table: PathTable,
+    los: BoolArray,
+    transmitters: Sequence[Antenna],
+    receivers: Sequence[Antenna],
+    wavelengths: Float64Array,
+    surfaces: Surfaces,
+) -> tuple[PathTable, int]:
+    """Paths with the lines of sight of near pairs by formula, and how many pairs are too close for one.
+
+    A pair closer than one wavelength of a carrier is outside the far field that λ/(4πd) holds in, and has
+    no direct path; what surfaces bring from one to the other stays. ``los``, Shape ``[T·R]``, is corrected
+    in place.
+    """
+    start = np.array([antenna.position for antenna in transmitters]).reshape(-1, 1, 3)
+    end = np.array([antenna.position for antenna in receivers]).reshape(1, -1, 3)
+    distance = np.sqrt(((end - start) ** 2).sum(-1)).reshape(-1)
+    near = np.flatnonzero(distance < max(NEAR_PAIR, wavelengths.max()))
+    tx, rx = np.divmod(near, max(len(receivers), 1))
+    other = [transmitters[t].name != receivers[r].name for t, r in zip(tx.tolist(), rx.tolist(), strict=True)]
+    near, tx, rx = near[other], tx[other], rx[other]
+    if not len(near):
+        return table, 0
+    los[near] = [
+        not surfaces.between(transmitters[t].position, receivers[r].position)
+        for t, r in zip(tx.tolist(), rx.tolist(), strict=True)
+    ]
+    far = distance[near] >= wavelengths.max()
+    straight = (table.types == 0).all(1)
+    free = los[near]
+    if table.hidden is not None:  # elements beside the centres may see each other where these do not
+        free |= np.isin(near, table.pair[straight & table.hidden])
+    table = table.take(~(straight & np.isin(table.pair, near)))
+    direct = near[far & free]
+    return _with_direct(table, direct, ~los[direct], distance, wavelengths), int(np.count_nonzero(~far))
+
+
+def _with_direct(
+    table: PathTable, pairs: Int64Array, hidden: BoolArray, distance: Float64Array, wavelengths: Float64Array
+) -> PathTable:
+    """The table and a direct path for each of these pairs."""
+    depth = table.types.shape[1]
+    spreading = wavelengths[:, None] / (4 * np.pi * distance[pairs])
+    made = spreading[:, :, None, None] * np.eye(3, dtype=np.complex128)
+    empty = np.zeros((len(pairs), depth), np.uint8)
+    return replace(
+        table,
+        pair=np.concatenate([table.pair, pairs]),
+        transfer=np.concatenate([table.transfer, made], axis=1),
+        types=np.concatenate([table.types, empty]),
+        objects=np.concatenate([table.objects, np.full((len(pairs), depth), -1, np.int32)]),
+        points=np.concatenate([table.points, np.zeros((len(pairs), depth, 3))]),
+        hidden=None if table.hidden is None else np.concatenate([table.hidden, hidden]),
+        traced=None if table.traced is None else np.concatenate([table.traced, np.full(len(pairs), -1)]),
+        faces=None if table.faces is None else np.concatenate([table.faces, empty.astype(np.int32)]),
+    )

@@ -1,0 +1,81 @@
+"""Meshes of scenery and objects: faces as the ray tracer has them, vertices as they stand in the files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from caviar_protocol.arrays import Float64Array
+from caviar_protocol.errors import AssetError
+from caviar_services.meshes import Mesh, unit_box
+from caviar_services.ply import ply_vertices
+from caviar_services.scenery import read_scenery
+
+_SAME_VERTEX = 1e-5
+"""By how much of its size a mesh in float32 may differ from its file."""
+
+
+def file_vertices(description: Path) -> dict[str, Float64Array]:
+    """World vertices [m] of a scenery's shapes as they stand in its files, by name.
+
+    Raises `AssetError` naming what is wrong with the description or with a mesh.
+    """
+    vertices = {}
+    for shape in read_scenery(description).shapes:
+        turned, moved = shape.to_world[:3, :3], shape.to_world[:3, 3]
+        vertices[shape.name] = ply_vertices(shape.file) @ turned.T + moved
+    return vertices
+
+
+def file_meshes(scene: Any, vertices: Mapping[str, Float64Array], weld: bool) -> dict[str, Mesh]:
+    """The meshes of what was loaded, by name, in world coordinates."""
+    meshes = {}
+    for name, item in scene.objects.items():
+        mesh = _mesh_of(item.mi_mesh)
+        if name in vertices:
+            mesh = _as_in_file(mesh, vertices[name])
+        meshes[name] = _welded(mesh) if weld else mesh
+    return meshes
+
+
+def _as_in_file(mesh: Mesh, vertices: Float64Array) -> Mesh:
+    """A mesh with its vertices in float64, unless the ray tracer took others than the file's."""
+    same = vertices.shape == mesh.vertices.shape
+    if same and len(vertices):
+        same = bool(np.abs(vertices - mesh.vertices).max() <= _SAME_VERTEX * max(np.abs(vertices).max(), 1.0))
+    return Mesh(vertices, mesh.faces) if same else mesh
+
+
+def _welded(mesh: Mesh) -> Mesh:
+    """A mesh whose vertices at one place are one vertex."""
+    vertices, first = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    return Mesh(vertices, first.reshape(-1)[mesh.faces].astype(np.int32))
+
+
+def unit_mesh(asset: str, assets: Mapping[str, Path]) -> Mesh:
+    import mitsuba as mi
+
+    if not asset:
+        return unit_box()
+    path = assets.get(asset)
+    if path is None:
+        known = ", ".join(sorted(name for name in assets if name.startswith("objects/"))) or "none"
+        raise AssetError(f"there is no mesh {asset!r} among the assets; object meshes: {known}")
+    try:
+        loaded = _mesh_of(mi.load_dict({"type": "ply", "filename": str(path), "face_normals": True}))
+    except RuntimeError as error:
+        raise AssetError(f"mesh {asset!r} ({path}) cannot be read: {error}") from error
+    return _as_in_file(loaded, ply_vertices(path))
+
+
+def _mesh_of(shape: Any) -> Mesh:
+    import mitsuba as mi
+
+    params = mi.traverse(shape)
+    return Mesh(
+        np.array(params["vertex_positions"], np.float64).reshape(-1, 3),
+        np.array(params["faces"], np.int32).reshape(-1, 3),
+    )

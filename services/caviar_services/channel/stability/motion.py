@@ -1,0 +1,119 @@
+"""Speeds up to 1,000 km/h, and a vehicle that jumps."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+import numpy as np
+
+from caviar_services.channel.stability import formulas
+from caviar_services.channel.stability.bench import (
+    Bench,
+    Thing,
+    answer,
+    antenna,
+    link,
+    world,
+)
+from caviar_services.channel.stability.case import Outcome, all_of, case, close, equal, worst
+
+F = 60e9
+UNIT = np.array([0.6, 0.48, 0.64])
+"""From the transmitter."""
+
+
+def _shift(speed: float, traced: bool, bench: Bench) -> Outcome:
+    """A receiver on a vehicle that comes straight at the transmitter: f·v/c."""
+    model = bench.traced(F, without_body=["car"]) if traced else bench.free_space(F)
+    place = 80.0 * UNIT
+    car = Thing("car", place.tolist(), velocity=(-speed * UNIT).tolist())
+    ends = [antenna("t", "tx", (0, 0, 0)), antenna("car/r", "rx", (0, 0, 0), parent="car")]
+    got = float(answer(model, world(ends, [car])).doppler[0, 0])
+    return close("Hz", formulas.doppler(speed, F), got, absolute=1e-6 * F * 300 / formulas.C)
+
+
+for _kmh in (0, 3, 120, 1000):
+    for _traced, _rung in ((False, "free-space"), (True, "siso-rt")):
+        case("speed", f"{_kmh} km/h, straight, {_rung}", traced=_traced)(partial(_shift, _kmh / 3.6, _traced))
+
+
+@case("speed", "1,000 km/h, two that pass each other, drawn channel", traced=False)
+def _(bench: Bench) -> Outcome:
+    """Both ends move; the straight wave is that of the difference."""
+    model = bench.geometric(F, components=1)
+    one = Thing("a", (0, 0, 30), velocity=(277.7777777777778, 0, 0))
+    other = Thing("b", (300, 400, 30), velocity=(-277.7777777777778, 0, 0))
+    ends = [
+        antenna("a/t", "tx", (0, 0, 0), parent="a"),
+        antenna("b/r", "rx", (0, 0, 0), parent="b"),
+    ]
+    got = float(answer(model, world(ends, [one, other])).doppler[0, 0])
+    return close("Hz", formulas.doppler(2 * 1000 / 3.6 * 0.6, F), got, relative=1e-9)
+
+
+def _mirror(speed: float, bench: Bench) -> Outcome:
+    """A wall that comes closer: its image comes twice as fast."""
+    wall = Thing("wall", (30.0, 0.0, 0.0), (2.0, 60.0, 60.0), velocity=(-speed, 0.0, 0.0))
+    tx, rx = np.array([0.0, -9.0, 1.0]), np.array([4.0, 8.0, -2.0])
+    channel = link(bench.traced(F), tx.tolist(), rx.tolist(), wall)
+    image = formulas.mirrored(tx, np.array([29.0, 0.0, 0.0]), np.array([-1.0, 0.0, 0.0]))
+    along = abs((image - rx)[0]) / float(np.linalg.norm(image - rx))
+    (path,) = np.flatnonzero((channel.interactions == 1).any(1))
+    length = float(np.linalg.norm(image - rx))
+    return all_of(
+        close("Hz", formulas.doppler(2 * speed * along, F), float(channel.doppler[0, path]), absolute=0.06),
+        close("m", length, float(channel.tau[path] * formulas.C), absolute=1e-9),
+    )
+
+
+for _kmh in (0, 50, 1000):
+    case("speed", f"{_kmh} km/h, reflected by a wall that comes")(partial(_mirror, _kmh / 3.6))
+
+
+@case("speed", "sideways: no shift")
+def _(bench: Bench) -> Outcome:
+    car = Thing("car", (70.0, 0.0, 0.0), velocity=(0.0, 277.8, 0.0))
+    ends = [antenna("t", "tx", (0, 0, 0)), antenna("car/r", "rx", (0, 0, 0), parent="car")]
+    got = float(answer(bench.free_space(F), world(ends, [car])).doppler[0, 0])
+    return close("Hz", 0.0, got, absolute=1e-6)
+
+
+@case("jump", "a vehicle that jumps into the line of sight, 700 m from frame to frame, and out again")
+def _(bench: Bench) -> Outcome:
+    """What a frame says follows from that frame: no path by way of where the vehicle was."""
+    model = bench.traced(F)
+    tx, rx = (-40.0, 0.0, 2.0), (40.0, 1.0, 1.5)
+    there, away = (
+        Thing("bus", (3.0, 0.5, 1.5), (2.0, 9.0, 9.0)),
+        Thing("bus", (703.0, 44.0, 1.5), (2.0, 9.0, 9.0)),
+    )
+    seen = [bool(link(model, tx, rx, bus).los[0, 0]) for bus in (away, there, away, there)]
+    return equal([True, False, True, False], seen, "line of sight")
+
+
+@case("jump", "its reflection is where it now is, and has the shift of its velocity alone")
+def _(bench: Bench) -> Outcome:
+    model = bench.traced(F)
+    tx, rx = np.array([0.0, -9.0, 1.0]), np.array([4.0, 8.0, -2.0])
+    errors = []
+    shifts = []
+    for x in (30.0, 530.0, -420.0, 31.0):
+        near = x - math.copysign(1.0, x)
+        wall = Thing("wall", (x, 0.0, 0.0), (2.0, 60.0, 60.0))
+        channel = link(model, tx.tolist(), rx.tolist(), wall)
+        (path,) = np.flatnonzero((channel.interactions == 1).any(1))
+        image = formulas.mirrored(tx, np.array([near, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]))
+        errors.append(abs(float(channel.tau[path]) * formulas.C - float(np.linalg.norm(image - rx))))
+        shifts.append(abs(float(channel.doppler[0, path])))
+    return all_of(worst(errors, 1e-9, "m", "length"), worst(shifts, 1e-9, "Hz", "shift of 0"))
+
+
+@case("jump", "a vehicle that turns up and leaves")
+def _(bench: Bench) -> Outcome:
+    model = bench.traced(F)
+    bus = Thing("bus", (3.0, 0.5, 1.5), (2.0, 9.0, 9.0))
+    seen = [
+        len(link(model, (-40.0, 0.0, 2.0), (40.0, 1.0, 1.5), *some).tau) for some in ((), (bus,), (), (bus,))
+    ]
+    return equal([1, 0, 1, 0], seen, "paths")

@@ -1,0 +1,221 @@
+"""Frequencies, distances, grazing incidence and materials: one ray, and two over flat ground."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+import numpy as np
+
+from caviar_protocol.topics import AntennaArray, Channel
+from caviar_services.channel.stability import formulas
+from caviar_services.channel.stability.bench import (
+    CONDUCTOR,
+    Bench,
+    Material,
+    Plate,
+    Point,
+    answer,
+    antenna,
+    link,
+    square,
+    total,
+    world,
+)
+from caviar_services.channel.stability.case import Outcome, all_of, case, close, equal, worst
+
+FREQUENCIES = (0.5e9, 2.8e9, 28e9, 60e9, 100e9, 300e9)
+LOSSY = Material(5.0, 0.2)
+FAR_OUT = np.array([7931.37, -6112.83, 311.19])
+"""10 km from the origin."""
+
+
+def ground(half: float, material: str = "surface") -> Plate:
+    return Plate("ground", square(half), material)
+
+
+def amplitude(channel: Channel) -> float:
+    """Of the only path; 0 where there is none."""
+    return abs(total(channel))
+
+
+# --- frequencies ----------------------------------------------------------------------------
+
+
+def _in_free_space(frequency: float, bench: Bench) -> Outcome:
+    tx, rx = (3.7, -11.2, 24.0), (88.1, 61.9, 7.5)
+    d = math.dist(tx, rx)
+    expected = formulas.friis(d, frequency) * formulas.phase(d, frequency)
+    models = (bench.free_space(frequency), bench.traced(FREQUENCIES))
+    carrier = FREQUENCIES.index(frequency)
+    got = [total(link(model, tx, rx), number) for model, number in zip(models, (0, carrier), strict=True)]
+    return all_of(*(close("(H)", expected, h, relative=1e-4) for h in got))
+
+
+def _over_ground(frequency: float, bench: Bench) -> Outcome:
+    heights, distance = (11.3, 1.7), 74.2
+    model = bench.traced(frequency, [ground(300.0)], {"surface": LOSSY})
+    got = total(link(model, (0, 0, heights[0]), (distance, 0, heights[1])))
+    eta = formulas.permittivity(LOSSY.permittivity, LOSSY.conductivity, frequency)
+    direct, bounced, cosine = formulas.over_ground(*heights, distance)
+    expected = formulas.friis(direct, frequency) * formulas.phase(direct, frequency)
+    along = formulas.fresnel(cosine, eta)[1]
+    expected += along * formulas.friis(bounced, frequency) * formulas.phase(bounced, frequency)
+    return close("(H)", expected, got, absolute=2e-3 * formulas.friis(direct, frequency))
+
+
+for _frequency in FREQUENCIES:
+    _name = f"{_frequency / 1e9:g} GHz"
+    case("frequency", f"free space at {_name}, free-space and siso-rt")(partial(_in_free_space, _frequency))
+    case("frequency", f"two rays over ground at {_name}")(partial(_over_ground, _frequency))
+
+
+# --- distances ------------------------------------------------------------------------------
+
+
+def _apart(distance: float, frequency: float, traced: bool, bench: Bench) -> Outcome:
+    """Friis from one wavelength on; nearer, no direct path, and the pair is counted."""
+    model = bench.traced((60e9, 300e9)) if traced else bench.free_space(frequency)
+    carrier = (60e9, 300e9).index(frequency) if traced else 0
+    tx = np.array([1.5, -2.25, 10.0])
+    channel = link(model, tx.tolist(), (tx + distance * np.array([0.6, 0.0, 0.8])).tolist())
+    slowest = 60e9 if traced else frequency
+    if distance < formulas.C / slowest:
+        return all_of(
+            equal(0, len(channel.tau), "paths"), equal(True, bool(channel.los[0, 0]), "line of sight")
+        )
+    expected = formulas.friis(distance, frequency) * formulas.phase(distance, frequency)
+    got = total(channel, carrier)
+    return close("(H)", expected, got, relative=1e-3)
+
+
+for _distance in (1e-3, 4e-3, 6e-3, 0.02, 0.3, 1.0, 1e3, 5e4):
+    _far = f"{_distance * 1e3:g} mm" if _distance < 1 else f"{_distance:g} m"
+    case("distance", f"{_far} at 60 GHz, free-space", traced=False)(partial(_apart, _distance, 60e9, False))
+    case("distance", f"{_far} at 60 GHz, siso-rt")(partial(_apart, _distance, 60e9, True))
+
+
+@case("distance", "1 mm at 300 GHz, a wavelength of 0.9993 mm, free-space", traced=False)
+def _(bench: Bench) -> Outcome:
+    got = amplitude(link(bench.free_space(300e9), (0, 0, 9), (1e-3, 0, 9)))
+    return close("|H|", formulas.friis(1e-3, 300e9), got, relative=1e-9)
+
+
+def _phase(frequency: float, distance: float, origin: Point, bench: Bench) -> Outcome:
+    """Phase error of both rays [rad]."""
+    out = np.array(origin, np.float64)
+    plate = Plate("ground", [(out + corner).tolist() for corner in square(distance)])
+    model = bench.traced(frequency, [plate], {"surface": CONDUCTOR})
+    tx, rx = np.array([-0.493, 0.0213, 0.1571]) * distance, np.array([0.507, -0.0137, 0.1193]) * distance
+    channel = link(model, (out + tx).tolist(), (out + rx).tolist())
+    flat = math.hypot(rx[0] - tx[0], rx[1] - tx[1])
+    lengths = formulas.over_ground(tx[2], rx[2], flat)[:2]
+    errors = [
+        2 * math.pi * frequency * abs(tau - length / formulas.C)
+        for tau, length in zip(channel.tau.tolist(), lengths, strict=False)
+    ]
+    return all_of(equal(2, len(channel.tau), "paths"), worst(errors, 1e-3, "rad", "phase of 2 paths"))
+
+
+for _f, _d in ((60e9, 2000.0), (300e9, 1000.0)):
+    for _where, _origin in (("", np.zeros(3)), (", 10 km from the origin", FAR_OUT)):
+        case("distance", f"carrier phase over {_d / 1e3:g} km at {_f / 1e9:g} GHz{_where}")(
+            partial(_phase, _f, _d, _origin.tolist())
+        )
+
+
+# --- grazing incidence ----------------------------------------------------------------------
+
+
+def _grazing(heights: tuple[float, float], distance: float, bench: Bench) -> Outcome:
+    """Two rays that all but cancel: relative to the direct one."""
+    frequency = 2.8e9
+    model = bench.traced(frequency, [ground(1.2 * distance)], {"surface": LOSSY})
+    got = total(link(model, (-distance / 2, 1.0, heights[0]), (distance / 2, 1.0, heights[1])))
+    eta = formulas.permittivity(LOSSY.permittivity, LOSSY.conductivity, frequency)
+    direct, bounced, cosine = formulas.over_ground(*heights, distance)
+    free = formulas.friis(direct, frequency)
+    expected = free * formulas.phase(direct, frequency)
+    along = formulas.fresnel(cosine, eta)[1]
+    expected += along * formulas.friis(bounced, frequency) * formulas.phase(bounced, frequency)
+    return close("of the direct ray", abs(expected) / free, abs(got) / free, absolute=2e-3)
+
+
+for _heights, _distance in (((1.5, 1.2), 100.0), ((1.5, 2.0), 2000.0), ((12.0, 1.5), 20_000.0)):
+    _angle = math.degrees(math.atan(sum(_heights) / _distance))
+    case("grazing", f"{_angle:.2g}° over ground, {_distance:g} m")(partial(_grazing, _heights, _distance))
+
+
+@case("grazing", "antennas within the plane of a wall")
+def _(bench: Bench) -> Outcome:
+    """No reflection: the wall is seen edge-on, and hides nothing."""
+    wall = Plate("wall", [(-5, 0, 0), (5, 0, 0), (5, 0, 9), (-5, 0, 9)])
+    model = bench.traced(28e9, [wall], {"surface": LOSSY})
+    channel = link(model, (-30, 0, 3), (41, 0, 5))
+    return close("|H|", formulas.friis(math.dist((-30, 0, 3), (41, 0, 5)), 28e9), amplitude(channel), 1e-4)
+
+
+# --- materials ------------------------------------------------------------------------------
+
+
+def _reflection(
+    bench: Bench, material: Material, angle_deg: float, polarization: str, frequency: float = 10e9
+) -> tuple[complex, float]:
+    """Coefficient at flat ground, and the cosine of incidence."""
+    height = 7.0
+    reach = height * math.tan(math.radians(angle_deg))
+    model = bench.traced(frequency, [ground(400.0)], {"surface": material})
+    array = AntennaArray(polarization=polarization)  # type: ignore[arg-type]
+    ends = [antenna("t", "tx", (-reach, 2, height), array), antenna("r", "rx", (reach, 2, height), array)]
+    channel = answer(model, world(ends))
+    reflected = channel.a[0, (channel.interactions == 1).any(1)].sum()
+    length = 2 * math.hypot(reach, height)
+    free = formulas.friis(length, frequency) * formulas.phase(length, frequency)
+    # A horizontal element's field turns its sign between the two ends, as they face each other.
+    sign = -1.0 if polarization == "H" else 1.0
+    return sign * complex(reflected) / free, math.cos(math.radians(angle_deg))
+
+
+def _conductor(angle_deg: float, bench: Bench) -> Outcome:
+    across = _reflection(bench, CONDUCTOR, angle_deg, "H")[0]
+    along = _reflection(bench, CONDUCTOR, angle_deg, "V")[0]
+    return all_of(close("across", -1.0, across, absolute=0.01), close("along", 1.0, along, absolute=0.01))
+
+
+def _slab(material: Material, angle_deg: float, bench: Bench) -> Outcome:
+    eta = formulas.permittivity(material.permittivity, material.conductivity, 10e9)
+    across, cosine = _reflection(bench, material, angle_deg, "H")
+    along, _ = _reflection(bench, material, angle_deg, "V")
+    expected = formulas.slab(cosine, eta, material.thickness, 10e9)
+    return all_of(
+        close("across", expected[0], across, absolute=2e-3), close("along", expected[1], along, absolute=2e-3)
+    )
+
+
+GLASS = Material(4.0, 0.0, 0.0123)
+for _angle_deg in (5.0, 45.0, 85.0):
+    case("material", f"perfect conductor at {_angle_deg:g}°")(partial(_conductor, _angle_deg))
+    case("material", f"lossless dielectric, ε 4, 12.3 mm, at {_angle_deg:g}°")(
+        partial(_slab, GLASS, _angle_deg)
+    )
+case("material", "lossless dielectric at Brewster's angle")(
+    partial(_slab, GLASS, math.degrees(math.atan(2.0)))
+)
+case("material", "lossless dielectric of the permittivity of air")(
+    partial(_slab, Material(1.0, 0.0, 0.1), 40.0)
+)
+
+
+@case("material", "energy at a lossless dielectric: what is not reflected goes through")
+def _(bench: Bench) -> Outcome:
+    frequency, angle = 10e9, math.radians(35.0)
+    wall = Plate("wall", [(0, -90, -90), (0, 90, -90), (0, 90, 90), (0, -90, 90)])
+    model = bench.traced(frequency, [wall], {"surface": GLASS}, refraction=True)
+    tx, through = (-6.0, 0.0, 1.0), (6.0, 12 * math.tan(angle), 1.0)
+    back = (-6.0, 12 * math.tan(angle), 1.0)
+    length = math.dist(tx, through)
+    free = formulas.friis(length, frequency)
+    passed = amplitude(link(model, tx, through)) / free
+    channel = link(model, tx, back)
+    mirrored = abs(channel.a[0, (channel.interactions == 1).any(1)].sum()) / free
+    return close("(|T|² + |R|²)", 1.0, float(passed**2 + mirrored**2), absolute=2e-3)

@@ -1,0 +1,72 @@
+"""Vertices of PLY files: every form of the format, at the precision of the file."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from caviar_protocol.errors import AssetError
+from caviar_services.ply import ply_vertices
+
+VERTICES = [(10_000.123456789, -2.5, 1e-3), (1 / 3, 7.0, -8.25), (0.0, 1e6 + 1 / 7, 4.0)]
+
+
+def header(form: str, kind: str, *before: str) -> str:
+    lines = ["ply", f"format {form} 1.0", "comment made by hand", *before, "element vertex 3"]
+    # another property between, and the axes in an odd order
+    lines += [f"property {kind} z", "property uchar red", f"property {kind} x", f"property {kind} y"]
+    return "\n".join([*lines, "element face 1", "property list uchar int vertex_indices", "end_header", ""])
+
+
+@pytest.mark.parametrize(
+    ("form", "order"), [("binary_little_endian", "<"), ("binary_big_endian", ">")], ids=["little", "big"]
+)
+@pytest.mark.parametrize(("kind", "code"), [("float", "f"), ("double", "d"), ("float64", "d")])
+def test_binary_files_in_their_own_precision(
+    tmp_path: Path, form: str, order: str, kind: str, code: str
+) -> None:
+    file = tmp_path / "a.ply"
+    rows = [struct.pack(f"{order}{code}B{code}{code}", z, 200, x, y) for x, y, z in VERTICES]
+    face = struct.pack(f"{order}Biii", 3, 0, 1, 2)
+    file.write_bytes(b"".join([header(form, kind).encode(), *rows, face]))
+    expected = np.array(VERTICES, order + code).astype(np.float64)
+    assert np.array_equal(ply_vertices(file), expected)
+
+
+def test_text_is_read_as_it_is_written(tmp_path: Path) -> None:
+    """Also where the header says float: what is written is what is meant."""
+    file = tmp_path / "a.ply"
+    body = "\n".join(f"{z!r} 200 {x!r} {y!r}" for x, y, z in VERTICES)
+    file.write_text(header("ascii", "float") + body + "\n3 0 1 2\n")
+    assert np.array_equal(ply_vertices(file), VERTICES)
+
+
+def test_elements_before_the_vertices_are_passed_over(tmp_path: Path) -> None:
+    file = tmp_path / "a.ply"
+    before = ["element material 2", "property int id", "element strip 2", "property list uchar short rows"]
+    rows = struct.pack("<ii", 5, 6) + struct.pack("<Bhh", 2, 1, 2) + struct.pack("<Bh", 1, 3)
+    rows += b"".join(struct.pack("<dBdd", z, 200, x, y) for x, y, z in VERTICES)
+    file.write_bytes(header("binary_little_endian", "double", *before).encode() + rows)
+    assert np.array_equal(ply_vertices(file), VERTICES)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"solid x\nend_header\n",
+        header("ascii", "float").encode() + b"1 2 3 4\n",
+        header("binary_little_endian", "double").encode() + b"short",
+        header("ascii", "half").encode(),
+        b"ply\nformat ascii 1.0\nend_header\n",
+    ],
+    ids=["empty", "no format", "a row too few", "broken off", "unknown type", "no vertices"],
+)
+def test_what_is_no_mesh_is_named(tmp_path: Path, data: bytes) -> None:
+    file = tmp_path / "bad.ply"
+    file.write_bytes(data)
+    with pytest.raises(AssetError, match=r"bad\.ply: not a PLY file"):
+        ply_vertices(file)
