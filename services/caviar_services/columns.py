@@ -28,3 +28,8 @@ def aligned_indices(values: Int64Array | BoolArray) -> NDArray[np.uint32]:
     column: NDArray[np.uint32] = aligned_columns(np.zeros((1, len(values)))).view(np.uint32)[0]
     column[...] = values
     return column
+
+
+def several(count: int) -> Int64Array:
+    """Indices of so many, a single one twice: to Dr.Jit an array of one element is another kernel."""
+    return np.arange(count) if count > 1 else np.zeros(2 * count, np.int64)

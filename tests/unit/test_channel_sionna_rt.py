@@ -78,7 +78,34 @@ def test_it_is_registered_and_says_its_rung() -> None:
     assert load("channel", "sionna-rt") is SionnaChannel
     assert model(diffraction=True, samples=77).options.diffraction
     assert model(samples=77).options.samples == 77
-    assert SionnaChannel.rung == "siso-rt"
+    assert model().rung == SionnaChannel.rung == "siso-rt"
+
+
+@pytest.mark.parametrize("rung", ["siso-rt", "spherical", "mimo-rt"])
+def test_a_rung_is_a_setting(rung: str) -> None:
+    assert model(rung=rung).rung == rung
+
+
+def test_an_unknown_rung_is_refused_by_name() -> None:
+    with pytest.raises(msgspec.ValidationError, match="plane-waves"):
+        model(rung="plane-waves")
+
+
+@pytest.mark.parametrize(("spacing_deg", "rays"), [(1.0, 41_253), (0.25, 660_047), (57.29577951308232, 13)])
+def test_ray_spacing_is_rays_on_the_sphere(spacing_deg: float, rays: int) -> None:
+    """By hand: 4π sr are 41,253 square degrees."""
+    assert model(samples=None, ray_spacing_deg=spacing_deg).options.samples == rays
+
+
+def test_samples_and_ray_spacing_are_not_both_given() -> None:
+    with pytest.raises(ScenarioError) as caught:
+        model(samples=1000, ray_spacing_deg=1.0)
+    for part in ("samples = 1000", "ray_spacing_deg = 1.0", "services.channel.settings", "leave one out"):
+        assert part in str(caught.value)
+
+
+def test_without_either_there_are_100000_rays() -> None:
+    assert model(samples=None).options.samples == 100_000
 
 
 def test_an_unknown_setting_is_refused_by_name() -> None:

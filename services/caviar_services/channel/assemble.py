@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
@@ -83,6 +83,12 @@ class PathTable:
     object_names: tuple[str, ...]
     object_velocity: Float64Array
     """Velocity [m/s] of each named object, Shape ``[len(object_names), 3]``."""
+    hidden: BoolArray | None = None
+    """Paths that only elements beside the arrays' centres have: they are in H alone, Shape ``[P]``; absent:
+    none is."""
+    traced: Int64Array | None = None
+    """Number of each among the paths of all launches, Shape ``[P]``; −1 for paths by formula; absent:
+    unknown."""
     faces: Int32Array | None = None
     """Number of the plane of each point within its object, the same in every frame, Shape ``[P, D]``;
     absent: unknown."""
@@ -98,6 +104,8 @@ class PathTable:
             object_names=self.object_names,
             object_velocity=self.object_velocity,
             faces=None if self.faces is None else self.faces[which],
+            hidden=None if self.hidden is None else self.hidden[which],
+            traced=None if self.traced is None else self.traced[which],
         )
 
 
@@ -113,15 +121,44 @@ class Product:
     """By the air, on each carrier, Shape ``[C]``; None: no atmosphere."""
 
 
+@dataclass(frozen=True, eq=False)
+class Located:
+    """P paths in the order of the product, as matrices are made of them."""
+
+    row: Int64Array
+    """Row of each in the model's `PathTable`, Shape ``[P]``."""
+    pair: Int64Array
+    offsets: Int64Array
+    """As in `Channel`: paths of a pair are ``offsets[pair]`` to ``offsets[pair + 1]``."""
+    geometry: PathGeometry
+    a: Complex128Array
+    """As in `Channel`, Shape ``[C, P]``."""
+    transfer: Complex128Array
+    """As in `PathTable`, Shape ``[C, P, 3, 3]``, with absorption by the air."""
+    absorption_db_per_km: Float64Array | None
+    """As in `Product`."""
+
+
+Matrices = Callable[
+    [Sequence[Carrier], Sequence[Antenna], Sequence[Antenna], Located], tuple[ChannelMatrix, ...]
+]
+"""Makes the matrices of a product from its paths."""
+
+
 def assemble(
     product: Product,
     transmitters: Sequence[Antenna],
     receivers: Sequence[Antenna],
     table: PathTable,
     los: BoolArray,
+    matrices: Matrices | None = None,
 ) -> Channel:
-    """The canonical product: antennas, phase and absorption applied, non-finite paths dropped, sorted."""
+    """The canonical product: antennas, phase and absorption applied, non-finite paths dropped, sorted.
+
+    ``matrices`` makes H where somebody asks for it: `plane_waves` unless the model has a way of its own.
+    """
     table = _canonical_names(table)
+    row = np.arange(len(table.pair))
     with np.errstate(invalid="ignore"):  # what is not finite is dropped and counted below
         geometry = _geometry(table, transmitters, receivers)
         a = _amplitudes(product.carriers, table, geometry, transmitters, receivers)
@@ -130,15 +167,24 @@ def assemble(
     finite = _finite(table, geometry, a)
     dropped = len(finite) - int(np.count_nonzero(finite))
     if dropped:
-        table, geometry, a = table.take(finite), _select(geometry, finite), a[:, finite]
+        table, geometry, a, row = table.take(finite), _select(geometry, finite), a[:, finite], row[finite]
     aod, aoa = angles(geometry.departure), angles(geometry.arrival)
     if len(table.pair) > 1:
         order = _order(table, geometry, aod, aoa, a)
-        table, geometry, a = table.take(order), _select(geometry, order), a[:, order]
+        table, geometry, a, row = table.take(order), _select(geometry, order), a[:, order], row[order]
         aod, aoa = aod[order], aoa[order]
 
     pairs = len(transmitters) * len(receivers)
     offsets = np.searchsorted(table.pair, np.arange(pairs + 1)).astype(np.int64)
+    h: tuple[ChannelMatrix, ...] = ()
+    if product.with_h:
+        located = _located(product, row, table, offsets, geometry, a)
+        h = (matrices or plane_waves)(product.carriers, transmitters, receivers, located)
+    if table.hidden is not None and table.hidden.any():
+        shown = ~table.hidden
+        table, geometry, a = table.take(shown), _select(geometry, shown), a[:, shown]
+        aod, aoa = aod[shown], aoa[shown]
+        offsets = np.searchsorted(table.pair, np.arange(pairs + 1)).astype(np.int64)
     frequency = np.array([carrier.frequency_hz for carrier in product.carriers])
     depth = int((table.types != 0).sum(1).max(initial=0))
     return Channel(
@@ -159,9 +205,23 @@ def assemble(
         interactions=table.types[:, :depth],
         points=table.points[:, :depth],
         objects=table.objects[:, :depth],
-        h=_matrices(transmitters, receivers, geometry, a, offsets) if product.with_h else (),
+        h=h,
         dropped=dropped,
     )
+
+
+def _located(
+    product: Product,
+    row: Int64Array,
+    table: PathTable,
+    offsets: Int64Array,
+    geometry: PathGeometry,
+    a: Complex128Array,
+) -> Located:
+    transfer, absorption = table.transfer, product.absorption_db_per_km
+    if absorption is not None:
+        transfer = transfer * amplitude_factor(absorption, geometry.tau)[..., None, None]
+    return Located(row, table.pair, offsets, geometry, a, transfer, absorption)
 
 
 def _canonical_names(table: PathTable) -> PathTable:
@@ -183,6 +243,7 @@ def _canonical_names(table: PathTable) -> PathTable:
         object_names=tuple(table.object_names[i] for i in order),
         object_velocity=table.object_velocity[order],
         faces=None if table.faces is None else np.where(used, table.faces, 0).astype(np.int32),
+        hidden=table.hidden,
     )
 
 
@@ -319,16 +380,16 @@ def _mix(x: UInt64Array) -> UInt64Array:
     return x ^ (x >> np.uint64(31))
 
 
-def _matrices(
+def plane_waves(
+    carriers: Sequence[Carrier],
     transmitters: Sequence[Antenna],
     receivers: Sequence[Antenna],
-    geometry: PathGeometry,
-    a: Complex128Array,
-    offsets: Int64Array,
+    located: Located,
 ) -> tuple[ChannelMatrix, ...]:
     """H[m, n] = Σ_p a[p] · receive[p, m] · transmit[p, n] of every carrier and pair."""
     steered = []
-    for pair, (begin, end) in enumerate(pairwise(offsets.tolist())):
+    geometry, a = located.geometry, located.a
+    for pair, (begin, end) in enumerate(pairwise(located.offsets.tolist())):
         tx, rx = divmod(pair, len(receivers))
         mine = slice(begin, end)
         transmit = _steering(transmitters[tx], geometry.departure[mine])
@@ -336,7 +397,7 @@ def _matrices(
         steered.append((tx, rx, mine, receive, transmit))
     return tuple(
         ChannelMatrix(carrier=carrier, tx=tx, rx=rx, h=(receive * a[carrier, mine, None]).T @ transmit)
-        for carrier in range(len(a))
+        for carrier in range(len(carriers))
         for tx, rx, mine, receive, transmit in steered
     )
 

@@ -20,7 +20,7 @@ from caviar_protocol.paths import changes
 from caviar_protocol.scene import antennas
 from caviar_protocol.topics import AntennaDevice, Channel, ChannelOptions, Scene
 from caviar_protocol.topics.scene import Device
-from caviar_services.channel.assemble import Antenna, PathTable, Product, assemble
+from caviar_services.channel.assemble import Antenna, Matrices, PathTable, Product, assemble
 from caviar_services.channel.atmosphere import Atmosphere, specific_attenuation
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
 
@@ -44,6 +44,8 @@ class Found:
     los: BoolArray
     """Whether the line of sight is free, Shape ``[T, R]``."""
     counts: dict[str, int] = field(default_factory=dict)
+    matrices: Matrices | None = None
+    """How H is made where it is not of plane waves."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +68,8 @@ class ChannelModel(Service[S]):
     role: ClassVar[Role] = "channel"
     inputs: ClassVar[tuple[Input, ...]] = (Input(topic="scene"),)
     outputs: ClassVar[tuple[str, ...]] = ("channel",)
-    rung: ClassVar[str]
+    rung: str
+    """Step of the fidelity ladder."""
 
     def __init__(self, settings: S, run: RunInfo) -> None:
         super().__init__(settings, run)
@@ -218,7 +221,7 @@ class PathModel(ChannelModel[S]):
             with_h=self.with_h,
             absorption_db_per_km=self.absorption_db_per_km,
         )
-        channel = assemble(product, tx, rx, found.table, found.los)
+        channel = assemble(product, tx, rx, found.table, found.los, found.matrices)
         done = time.perf_counter_ns()
         return Modelled(
             channel=channel,

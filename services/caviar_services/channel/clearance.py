@@ -150,13 +150,16 @@ def with_near_pairs(
     ]
     far = distance[near] >= wavelengths.max()
     straight = (table.types == 0).all(1)
+    free = los[near]
+    if table.hidden is not None:  # elements beside the centres may see each other where these do not
+        free |= np.isin(near, table.pair[straight & table.hidden])
     table = table.take(~(straight & np.isin(table.pair, near)))
-    direct = _direct(table, near[far & los[near]], distance, wavelengths)
-    return direct, int(np.count_nonzero(~far))
+    direct = near[far & free]
+    return _with_direct(table, direct, ~los[direct], distance, wavelengths), int(np.count_nonzero(~far))
 
 
-def _direct(
-    table: PathTable, pairs: Int64Array, distance: Float64Array, wavelengths: Float64Array
+def _with_direct(
+    table: PathTable, pairs: Int64Array, hidden: BoolArray, distance: Float64Array, wavelengths: Float64Array
 ) -> PathTable:
     """The table and a direct path for each of these pairs."""
     depth = table.types.shape[1]
@@ -170,5 +173,7 @@ def _direct(
         types=np.concatenate([table.types, empty]),
         objects=np.concatenate([table.objects, np.full((len(pairs), depth), -1, np.int32)]),
         points=np.concatenate([table.points, np.zeros((len(pairs), depth, 3))]),
+        hidden=None if table.hidden is None else np.concatenate([table.hidden, hidden]),
+        traced=None if table.traced is None else np.concatenate([table.traced, np.full(len(pairs), -1)]),
         faces=None if table.faces is None else np.concatenate([table.faces, empty.astype(np.int32)]),
     )

@@ -29,7 +29,7 @@ class FreeSpaceChannel(PathModel[FreeSpaceSettings]):
     """
 
     Settings: ClassVar[type[ChannelSettings]] = FreeSpaceSettings
-    rung: ClassVar[str] = "free-space"
+    rung = "free-space"
 
     def paths(self, scene: Scene, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]) -> Found:
         start = np.array([antenna.position for antenna in transmitters]).reshape(-1, 1, 3)

@@ -32,7 +32,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise, product
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -83,7 +83,7 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
     """
 
     Settings = GeometricSettings
-    rung: ClassVar[str] = "geometric"
+    rung = "geometric"
 
     def __init__(self, settings: GeometricSettings, run: RunInfo) -> None:
         super().__init__(settings, run)

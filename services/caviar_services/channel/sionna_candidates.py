@@ -66,12 +66,21 @@ class Offer:
         What is traced.
     """
 
-    def __init__(self, scene: SionnaScene, launch: Launch, source: Any, options: LaunchOptions) -> None:
+    def __init__(
+        self,
+        scene: SionnaScene,
+        launch: Launch,
+        source: Any,
+        options: LaunchOptions,
+    ) -> None:
         self.launch = launch
         self._mi_scene = scene.mi_scene
         self._source = source
         self._options = options
-        self._planes = Planes(scene.plane_table)
+        self.everywhere = False
+        """Whether straight lines to receivers that are not seen are candidates too."""
+        self.planes = Planes(scene.plane_table)
+        """What chains go by."""
         self._chains = chains_of(launch, scene, options.max_depth)
         self._scattered = scattered_of(launch)
 
@@ -80,13 +89,20 @@ class Offer:
         """Candidates for each receiver, those that cannot be included."""
         return max(len(self._chains.ray), len(self._scattered[0]))
 
-    def candidates(self, targets: Any) -> tuple[Candidates, Launch, int]:
-        """Direct paths, chains and scattering points for receivers, a `mitsuba.Point3f`, that could be paths;
-        the launch that their rays are of; and how many more there are than ``max_paths`` of each.
+    def candidates(self, targets: Any, count: int) -> tuple[Candidates, Launch, int]:
+        """Direct paths, chains and scattering points that could be paths to the first ``count`` of receivers,
+        a `mitsuba.Point3f`; the launch that their rays are of; and how many more there are than ``max_paths``
+        of each.
         """
+        import drjit as dr
+
         chains, scattered = self._chains, self._scattered
         direct = self._seen(targets)
-        chain, receiver = self._planes.possible(chains, self._source, targets)
+        seen = np.ones(len(direct), np.bool_)
+        if self.everywhere:
+            every_target = np.arange(dr.width(targets))
+            seen, direct = np.isin(every_target, direct), every_target
+        chain, receiver = self.planes.possible(chains, self._source, targets)
         point, reached = self._reached(targets)
         none = np.zeros(len(direct), np.int64)
         any_plane = np.full((len(direct) + len(point), self._options.max_depth), -1, np.int32)
@@ -95,8 +111,9 @@ class Offer:
             np.concatenate([none, chains.depth[chain], scattered[1][point]]),
             np.concatenate([direct, receiver, reached]),
             np.concatenate([any_plane[: len(direct)], chains.planes[chain], any_plane[len(direct) :]]),
-            np.repeat([True, False, True], [len(direct), len(chain), len(point)]),
+            np.concatenate([seen, np.repeat([False, True], [len(chain), len(point)])]),
         )
+        every = every.take(every.receiver < count)
         kept = first_of_each(every.receiver, self._options.max_paths)
         return every.take(kept), self.launch, len(kept) - int(kept.sum())
 
@@ -190,10 +207,10 @@ class Planes:
     def _mirrored(self, point: Any, number: Any) -> Any:
         import drjit as dr
 
-        origin, normal = self._plane(number)
+        origin, normal = self.plane(number)
         return point - 2 * dr.dot(point - origin, normal) * normal
 
-    def _plane(self, number: Any) -> tuple[Any, Any]:
+    def plane(self, number: Any) -> tuple[Any, Any]:
         import drjit as dr
         import mitsuba as mi
 
@@ -209,7 +226,7 @@ class Planes:
         import mitsuba as mi
 
         used = number > 0
-        origin, normal = self._plane(number)
+        origin, normal = self.plane(number)
         line = image - here
         length, across = dr.norm(line), dr.dot(line, normal)
         grazing = dr.abs(across) < _GRAZING * length

@@ -144,9 +144,9 @@ class _FollowedOffer(Offer):
         planes = _planes(table, scene).astype(np.int32)
         self._chains = Chains(np.arange(len(table.depth)), table.depth, planes, straight.all(1))
 
-    def candidates(self, targets: Any) -> tuple[Candidates, Launch, int]:
+    def candidates(self, targets: Any, count: int) -> tuple[Candidates, Launch, int]:
         """As `Offer.candidates`, with a launch that has one ray for each candidate."""
-        found, _, lost = super().candidates(targets)
+        found, _, lost = super().candidates(targets, count)
         return replace(found, ray=np.arange(len(found.ray))), self._launch_of(found.ray), lost
 
     def _launch_of(self, chains: Int64Array) -> Launch:

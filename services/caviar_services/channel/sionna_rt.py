@@ -1,25 +1,32 @@
-"""Rung ``siso-rt``: Sionna RT traces between reference points, arrays are applied as plane waves."""
+"""The ray-traced rungs: Sionna RT finds the paths; ``rung`` says what becomes of the arrays.
+
+``siso-rt`` traces between the arrays' centres and applies the arrays as plane waves, ``spherical`` gives
+each antenna pair its own length of the same paths (`spherical`), ``mimo-rt`` traces every pair (`mimo_rt`).
+They are one implementation with one scene and one set of options, so a rung is a setting like any other.
+"""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from caviar_protocol.arrays import Float64Array, Int64Array, quantity
+from caviar_protocol.arrays import Int64Array, quantity
 from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.errors import PayloadError, ScenarioError, SetupError
 from caviar_protocol.seeding import derive_seed
-from caviar_protocol.topics import AntennaDevice, ChannelOptions, Interaction, Scene
-from caviar_services.channel.assemble import Antenna, PathTable
+from caviar_protocol.topics import AntennaDevice, ChannelOptions, Scene
+from caviar_services.channel.assemble import Antenna, Matrices, PathTable
 from caviar_services.channel.base import ChannelSettings, Found, PathModel
-from caviar_services.channel.clearance import spread_anew, with_near_pairs
+from caviar_services.channel.clearance import with_near_pairs
+from caviar_services.channel.mimo_rt import ElementTracer
 from caviar_services.channel.sionna_follow import Followed
 from caviar_services.channel.sionna_launch import LaunchOptions
 from caviar_services.channel.sionna_materials import (
@@ -28,14 +35,20 @@ from caviar_services.channel.sionna_materials import (
     OutsideRange,
     OutsideUse,
 )
+from caviar_services.channel.sionna_reach import Corners
 from caviar_services.channel.sionna_scene import SceneSettings, SionnaScene
 from caviar_services.channel.sionna_sharing import scene_of
-from caviar_services.channel.sionna_tracer import Traced, Tracer
-from caviar_services.channel.specular import distinct, path_lengths, refined_points
+from caviar_services.channel.sionna_table import Ends, path_table
+from caviar_services.channel.sionna_tracer import LANE_BYTES, Traced, Tracer
+from caviar_services.channel.spherical import SphericalWaves
+from caviar_services.channel.traced_surfaces import traced_surfaces
+from caviar_services.channel.visibility import outermost
 from caviar_services.llvm import activate_llvm, choose_variant
 from caviar_services.service import Frame, Preparation, RunInfo, StepResult
 
 Array = NDArray[Any]
+
+_SAMPLES = 100_000
 
 _COMPILE_GRACE_S = 120.0
 
@@ -44,7 +57,16 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     """What is modelled, and how finely."""
 
     max_depth: Annotated[int, quantity("1", "interactions of a path at most", ge=0, le=16)] = 3
-    samples: Annotated[int, quantity("1", "rays launched per transmitter", ge=1, le=100_000_000)] = 100_000
+    rung: Literal["siso-rt", "spherical", "mimo-rt"] = "siso-rt"
+    """How arrays are treated: plane waves, spherical waves, or every antenna pair traced."""
+    samples: (
+        Annotated[int, quantity("1", "rays launched per transmitter; absent: 100,000", ge=1, le=100_000_000)]
+        | None
+    ) = None
+    ray_spacing_deg: (
+        Annotated[float, quantity("°", "mean angle between rays, in place of samples", ge=0.03, le=90)] | None
+    ) = None
+    """N rays that share the sphere's 4π sr have a mean spacing Δ [rad] with N = 4π/Δ²."""
     los: bool = True
     reflection: bool = True
     refraction: bool = False
@@ -65,6 +87,9 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     receivers_at_once: Annotated[
         int | None, quantity("1", "receivers looked at together; absent: as many as fit")
     ] = None
+    memory_gib: Annotated[
+        float, quantity("GiB", "of a launch and its candidates at most, rung mimo-rt", gt=0, le=1024)
+    ] = 4.0
     bodies: Annotated[int, quantity("1", "moving objects of one mesh at most", ge=0, le=4096)] = 32
     pool: dict[str, int] = msgspec.field(default_factory=dict)
     """Bodies of single meshes where ``bodies`` does not fit, by file name without ending: ``car = 64``;
@@ -96,11 +121,13 @@ class SionnaChannel(PathModel[SionnaSettings]):
     """
 
     Settings: ClassVar[type[msgspec.Struct]] = SionnaSettings
-    rung: ClassVar[str] = "siso-rt"
+    rung = "siso-rt"
     uses_scenery: ClassVar[bool] = True
 
     def __init__(self, settings: SionnaSettings, run: RunInfo) -> None:
         super().__init__(settings, run)
+        self.rung = settings.rung
+        self._samples = _samples(settings, run.name)
         self._variant = ""
         self._scene: SionnaScene
         self._tracer: Tracer
@@ -117,7 +144,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
             diffraction=s.diffraction,
             scattering=s.scattering,
             max_depth=s.max_depth,
-            samples=s.samples,
+            samples=self._samples,
             materials_outside=tuple(use.brief(self.run.carriers[use.carrier].name) for use in self._outside),
         )
 
@@ -148,7 +175,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
             seed = derive_seed(self.run.seed, 0, f"{self.run.name}/launch")
         launch = LaunchOptions(
             max_depth=s.max_depth,
-            samples=s.samples,
+            samples=self._samples,
             max_paths=s.max_paths,
             seed=seed,
             reflection=s.reflection,
@@ -157,7 +184,6 @@ class SionnaChannel(PathModel[SionnaSettings]):
             scattering=s.scattering,
         )
         self._wavelengths = SPEED_OF_LIGHT / np.array(frequencies)
-        self._no_transfer = np.zeros((len(frequencies), 0, 3, 3), np.complex128)
         self._tracer = Tracer(self._scene, self._wavelengths.tolist(), launch)
         return (*notes, *self._warm_up())
 
@@ -190,12 +216,13 @@ class SionnaChannel(PathModel[SionnaSettings]):
         clear = [self._cleared(antenna) for antenna in (*transmitters, *receivers)]
         sources, targets = clear[: len(transmitters)], clear[len(transmitters) :]
         parts = [self._launch(t, source, targets, names) for t, source in enumerate(sources)]
-        table = self._table(parts, names, velocity, (transmitters, receivers), (sources, targets))
+        parts = parts or [(np.zeros(0, np.int64), self._tracer.nothing)]
+        antennas = transmitters, receivers
+        table = path_table(self._scene, parts, names, velocity, antennas, (sources, targets))
         los = np.zeros(len(transmitters) * len(receivers), bool)
-        los[table.pair[(table.types == 0).all(1)]] = True
-        table, too_close = with_near_pairs(
-            table, los, transmitters, receivers, self._wavelengths, self._scene.surfaces
-        )
+        straight = (table.types == 0).all(1)
+        los[table.pair[straight if table.hidden is None else straight & ~table.hidden]] = True
+        table, too_close = with_near_pairs(table, los, *antennas, self._wavelengths, self._scene.surfaces)
         if not self.settings.los:
             table = table.take((table.types != 0).any(1))
         return Found(
@@ -205,48 +232,23 @@ class SionnaChannel(PathModel[SionnaSettings]):
                 "path_limit_reached": sum(part.lost for _, part in parts),
                 "too_close": too_close,
             },
+            matrices=self._matrices([part for _, part in parts], table, (sources, targets)),
         )
 
-    def _table(
-        self,
-        parts: Sequence[tuple[Int64Array, Traced]],
-        names: tuple[str, ...],
-        velocity: Float64Array,
-        antennas: tuple[Sequence[Antenna], Sequence[Antenna]],
-        traced_from: tuple[Sequence[Antenna], Sequence[Antenna]],
-    ) -> PathTable:
-        """What all launches found, with names, points in float64 and each path once.
-
-        Antennas are TX and RX where they are, and where they were traced from.
-        """
-        depth = self.settings.max_depth
-        pair = _joined([pair for pair, _ in parts], (0,), np.int64)
-        types = _joined([part.types for _, part in parts], (0, depth), np.uint8)
-        shapes = _joined([part.shapes for _, part in parts], (0, depth), np.int64)
-        primitives = _joined([part.primitives for _, part in parts], (0, depth), np.int64)
-        (start, end), ends = _ends(pair, *antennas), _ends(pair, *traced_from)
-        traced = _joined([part.points for _, part in parts], (0, depth, 3), np.float64)
-        triangles = self._scene.triangles(shapes, primitives)
-        points = refined_points(start, traced, end, types, triangles, ends)
-        specular = ((types != Interaction.DIFFRACTION) & (types != Interaction.SCATTERING)).all(1)
-        objects = self._scene.object_index(shapes, primitives)
-        table = PathTable(
-            pair=pair,
-            transfer=spread_anew(
-                np.concatenate([self._no_transfer, *(part.transfer for _, part in parts)], axis=1),
-                specular,
-                path_lengths(ends[0], traced, ends[1], types),
-                path_lengths(start, points, end, types),
-            ),
-            types=types,
-            objects=objects,
-            points=points,
-            object_names=names,
-            object_velocity=velocity,
-            faces=self._scene.face_number(shapes, primitives),
-        )
-        there = ~(self._scene.is_parking(names, objects) & (types != 0)).any(1)
-        return table.take(there & distinct(pair, types, points))
+    def _matrices(self, launches: Sequence[Traced], table: PathTable, traced_from: Ends) -> Matrices | None:
+        """How the rung makes H; `plane_waves` where it has no way of its own."""
+        if self.rung == "spherical" and table.traced is not None:
+            surfaces = traced_surfaces(launches, table.traced, table.types, table.points, self._scene)
+            return SphericalWaves(surfaces, self._tracer.look, traced_from)
+        if self.rung == "mimo-rt":
+            # The rays of a launch are kept whole; the rest is for the candidates of some receivers at a time.
+            lanes = (
+                int(self.settings.memory_gib * 2**30 / LANE_BYTES) - self._samples * self.settings.max_depth
+            )
+            return ElementTracer(
+                self._tracer, self._scene, self._wavelengths, max(1, lanes), self.settings.los
+            )
+        return None
 
     def _cleared(self, antenna: Antenna) -> Antenna:
         """An antenna where it is traced from."""
@@ -258,10 +260,18 @@ class SionnaChannel(PathModel[SionnaSettings]):
         """Paths of one transmitter to the receivers, with the pair that each belongs to."""
         others = [r for r, receiver in enumerate(receivers) if receiver.name != transmitter.name]
         targets = np.array([receivers[r].position for r in others]).reshape(-1, 3)
+        corners = None
+        if self.rung == "spherical" and self.with_h:
+            longest = SPEED_OF_LIGHT / min(carrier.frequency_hz for carrier in self.run.carriers)
+            corners = Corners(
+                outermost([transmitter], longest)[0], outermost([receivers[r] for r in others], longest)
+            )
         s, followed = self.settings, None
         if s.follow is not None:
             followed = self._followed.setdefault(transmitter.name, Followed(s.follow))
-        traced = self._tracer.trace(transmitter.position, targets, s.receivers_at_once, followed, names)
+        traced = self._tracer.trace(
+            transmitter.position, targets, s.receivers_at_once, followed, names, corners=corners
+        )
         return t * len(receivers) + np.array(others, np.int64)[traced.receiver], traced
 
     def _start(self) -> tuple[str, ...]:
@@ -305,22 +315,29 @@ class SionnaChannel(PathModel[SionnaSettings]):
             self._tracer.trace(
                 above + shift, receivers + shift / 2, followed=followed, names=self._scene.names
             )
+        if self.rung != "siso-rt":
+            corners = Corners(above[None] + [[0, 0, 0.1], [0, 0.1, 0]], receivers[:, None] + np.eye(3)[:2])
+            self._tracer.trace(above, receivers, corners=corners)
+        if self.rung == "spherical":
+            look = self._tracer.look
+            look.nearest(receivers, receivers - 1.0)
+            chains = np.full((len(receivers), self.settings.max_depth), -1)
+            look.reflected(chains, receivers, receivers - 1.0)
         self.run.progress("kernels compiled", 0.0)
         return (f"kernels compiled in {time.monotonic() - begin:.1f} s",)
 
 
-def _joined(arrays: Sequence[Array], empty: tuple[int, ...], dtype: type[np.generic]) -> Array:
-    return np.concatenate([np.zeros(empty, dtype), *arrays])
-
-
-def _ends(
-    pair: Int64Array, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]
-) -> tuple[Float64Array, Float64Array]:
-    """Positions [m] of TX and RX of paths, each of Shape ``[P, 3]``."""
-    tx, rx = np.divmod(pair, max(len(receivers), 1))
-    start = np.array([antenna.position for antenna in transmitters]).reshape(-1, 3)
-    end = np.array([antenna.position for antenna in receivers]).reshape(-1, 3)
-    return start[tx], end[rx]
+def _samples(settings: SionnaSettings, service: str) -> int:
+    """Rays of a launch, however they were given."""
+    if settings.ray_spacing_deg is None:
+        return _SAMPLES if settings.samples is None else settings.samples
+    if settings.samples is not None:
+        raise ScenarioError(
+            f"samples = {settings.samples} and ray_spacing_deg = {settings.ray_spacing_deg} both say "
+            "how many rays are launched; leave one out",
+            key=f"services.{service}.settings.ray_spacing_deg",
+        )
+    return round(4 * math.pi / math.radians(settings.ray_spacing_deg) ** 2)
 
 
 def _refuse_buried(scene: Scene, without_body: Sequence[str]) -> None:

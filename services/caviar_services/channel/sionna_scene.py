@@ -218,6 +218,11 @@ class SionnaScene:
         clipped: Int64Array = np.clip(number, 0, len(self._faces) - 1)
         return clipped
 
+    def corners(self, triangles: Int64Array) -> Float64Array:
+        """Corners of triangles by number [m], Shape ``[..., 3, 3]``; float64."""
+        corners: Float64Array = self._corners[self._faces[triangles]]
+        return corners
+
     def shapes_of(self, triangles: Int64Array) -> tuple[Int64Array, Int64Array]:
         """Process-local shape of triangles by number, and their numbers within it."""
         order = np.argsort(self._offsets)
@@ -321,6 +326,9 @@ class SionnaScene:
         counts = [[len(mesh.faces) for mesh in shape.meshes] for shape in shapes]
         totals = np.array([sum(count) for count in counts], np.int64)
         ids = np.array([item.object_id for item in added], np.int64)
+        self.offset_by_shape = np.zeros(int(ids.max(initial=0)) + 1, np.int64)
+        """Number of the first triangle of each process-local shape."""
+        self.offset_by_shape[ids] = np.cumsum(totals) - totals
         self._body_id = int(ids[-1]) if self._bodies else -1
         order = np.argsort(ids)
         self._ids = ids[order]

@@ -23,12 +23,15 @@ from caviar_protocol.arrays import (
 )
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.patterns import spherical_basis
-from caviar_services.channel.sionna_candidates import Candidates, Offer, positions
+from caviar_services.channel.sionna_candidates import Candidates, Offer, Planes, positions
 from caviar_services.channel.sionna_follow import Followed
 from caviar_services.channel.sionna_launch import Launch, Launcher, LaunchOptions
+from caviar_services.channel.sionna_reach import Corners, Faces, at_corners, reflected
 from caviar_services.channel.sionna_scene import SionnaScene
-from caviar_services.channel.specular import refined_points
-from caviar_services.columns import aligned_columns, aligned_indices
+from caviar_services.channel.sionna_wedges import Wedges
+from caviar_services.channel.specular import image_points, refined_points
+from caviar_services.channel.visibility import Look
+from caviar_services.columns import aligned_columns, aligned_indices, several
 
 _POLE = 1.2e-5
 """Below this horizontal part of a direction Sionna RT sets its azimuth to 0 (100 float32 epsilons)."""
@@ -38,6 +41,9 @@ _REMEMBERED = 4
 
 _LANES = 8_000_000
 """Candidates to be looked at together at most."""
+
+LANE_BYTES = 40
+"""Memory for each of them, or each interaction of each ray."""
 
 _TYPES = np.zeros(17, np.uint8)
 _TYPES[[1, 2, 4, 8]] = (
@@ -66,6 +72,12 @@ class Traced:
     """Triangle of that shape, Shape ``[P, D]``."""
     points: Float64Array
     """Interaction points [m], Shape ``[P, D, 3]``."""
+    wedge: Wedges
+    """Where paths are diffracted."""
+    hidden: BoolArray
+    """Paths that only other elements than the centres of the arrays have, Shape ``[P]``."""
+    settled: BoolArray
+    """Paths that all corners of both arrays are known to have, Shape ``[P]``."""
     lost: int
     """How many more candidates were found than ``max_paths`` of each receiver."""
 
@@ -78,6 +90,9 @@ class Traced:
             shapes=self.shapes[which],
             primitives=self.primitives[which],
             points=self.points[which],
+            wedge=self.wedge.take(which),
+            hidden=self.hidden[which],
+            settled=self.settled[which],
             lost=self.lost,
         )
 
@@ -131,10 +146,27 @@ class Tracer:
         # The two orthogonal isotropic fields at both ends give the whole polarisation transfer, to
         # which any element pattern in any orientation is applied afterwards.
         self._patterns = antenna_pattern_registry.get("iso")(polarization="VH").patterns
+        self._faces = Faces(scene)
         self._launcher = Launcher(scene.mi_scene, options)
         self._images = ImageMethod()
         self._fields = FieldCalculator()
         self._last: dict[bytes, _Last] = {}
+
+    @property
+    def look(self) -> Look:
+        """What can be asked about the scene as it is, in world coordinates."""
+        table, centre = self._scene.plane_table, self._scene.centre
+        return Look(
+            nearest=lambda start, end: self._faces.nearest(start - centre, end - centre),
+            reflected=lambda chains, start, end: reflected(
+                self._faces, Planes(table), chains, start - centre, end - centre
+            ),
+        )
+
+    @property
+    def nothing(self) -> Traced:
+        """No paths."""
+        return _nothing(len(self._wavelengths), self._options.max_depth, 0)
 
     def trace(
         self,
@@ -143,28 +175,35 @@ class Tracer:
         at_once: int | None = None,
         followed: Followed | None = None,
         names: tuple[str, ...] = (),
+        lanes: int = _LANES,
+        corners: Corners | None = None,
     ) -> Traced:
         """Paths from one transmitter [3] to all receivers [R, 3], positions in metres in the world.
 
-        ``at_once`` receivers are handled together, or as many as fit: to the paths it makes no difference.
-        With ``followed``, what the transmitter's last launches met, a part of the rays is launched; ``names``
-        is what `SionnaScene.place` returned.
+        ``at_once`` receivers are handled together, or as many as fit ``lanes``: to the paths it makes no
+        difference. With ``followed``, what the transmitter's last launches met, a part of the rays is
+        launched; ``names`` is what `SionnaScene.place` returned. With ``corners`` also paths that only a part
+        of the arrays has; nothing is then taken from an earlier trace.
         """
         if not len(receivers):
-            return _joined([], len(self._wavelengths), self._options.max_depth)
+            return self.nothing
         centre = self._scene.centre
         transmitter, receivers = transmitter - centre, receivers - centre
-        last = self._last.get(transmitter.tobytes())
+        corners = corners and corners.relative_to(centre)
+        last = None if corners else self._last.get(transmitter.tobytes())
         if last is None or last.version != self._scene.version:
             if followed is None:
                 source = positions(transmitter[None])
                 offer = Offer(self._scene, self._launcher(source), source, self._options)
             else:
                 offer = followed.offer(self._launcher, transmitter, self._scene, names, self._options)
-            traced = self._offered(offer, transmitter, receivers, at_once)
+            offer.everywhere = corners is not None
+            traced = self._offered(offer, transmitter, receivers, at_once, lanes, corners)
         else:
             offer = last.offer
             traced = self._since(last, transmitter, receivers, at_once)
+        if corners:
+            return traced
         self._last[transmitter.tobytes()] = _Last(self._scene.version, offer, receivers, traced)
         while len(self._last) > _REMEMBERED:
             del self._last[next(iter(self._last))]
@@ -185,40 +224,63 @@ class Tracer:
         return _joined(parts, len(self._wavelengths), self._options.max_depth)
 
     def _offered(
-        self, offer: Offer, transmitter: Float64Array, receivers: Float64Array, at_once: int | None
+        self,
+        offer: Offer,
+        transmitter: Float64Array,
+        receivers: Float64Array,
+        at_once: int | None,
+        lanes: int = _LANES,
+        corners: Corners | None = None,
     ) -> Traced:
         if at_once is None:
-            at_once = max(1, _LANES // max(offer.size, 1))
+            at_once = max(1, lanes // max(offer.size, 1))
         parts = [
-            self._batch(offer, transmitter, begin, receivers[begin : begin + at_once])
+            self._batch(
+                offer,
+                transmitter,
+                begin,
+                receivers[begin : begin + at_once],
+                corners and corners.take(slice(begin, begin + at_once)),
+            )
             for begin in range(0, len(receivers), at_once)
         ]
         joined = _joined(parts, len(self._wavelengths), self._options.max_depth)
-        return replace(joined, points=joined.points + self._scene.centre)
+        centre = self._scene.centre
+        return replace(joined, points=joined.points + centre, wedge=joined.wedge.moved(centre))
 
-    def _batch(self, offer: Offer, transmitter: Float64Array, begin: int, receivers: Float64Array) -> Traced:
+    def _batch(
+        self,
+        offer: Offer,
+        transmitter: Float64Array,
+        begin: int,
+        receivers: Float64Array,
+        corners: Corners | None,
+    ) -> Traced:
         import mitsuba as mi
 
-        source, targets = positions(transmitter[None]), positions(receivers)
-        candidates, launch, lost = offer.candidates(targets)
+        source, targets = positions(transmitter[None]), positions(receivers[several(len(receivers))])
+        candidates, launch, lost = offer.candidates(targets, len(receivers))
         if not len(candidates.ray):
             return _nothing(len(self._wavelengths), self._options.max_depth, lost)
         buffer = self._images(
             scene=self._scene.mi_scene,
-            paths=self._buffer(launch, candidates.take(_several(len(candidates.ray)))),
+            paths=self._buffer(launch, candidates.take(several(len(candidates.ray)))),
             src_positions=source,
             tgt_positions=targets,
             diffraction=self._options.diffraction,
             diffraction_lit_region=True,
         )
-        valid = np.flatnonzero(buffer.valid.numpy()[: len(candidates.ray)])
+        at_centres = buffer.valid.numpy()[: len(candidates.ray)]
+        hidden, settled = at_corners(self._faces, offer.planes, candidates, at_centres, corners)
+        valid = np.flatnonzero(at_centres | hidden)
         if not len(valid):
             return _nothing(len(self._wavelengths), self._options.max_depth, lost)
-        kept = valid[_several(len(valid))]
+        kept = valid[several(len(valid))]
         buffer = buffer.gather(mi.UInt(aligned_indices(kept)))
-        self._settle(buffer, candidates.take(kept), transmitter, receivers)
+        self._settle(buffer, candidates.take(kept), hidden[kept], transmitter, receivers)
         self._compute_fields(buffer, source, targets)
         traced = _read(buffer, len(self._wavelengths), transmitter, receivers, lost)
+        traced = replace(traced, hidden=hidden[kept], settled=settled[kept])
         found = buffer.valid.numpy() & (np.arange(len(kept)) < len(valid))
         return traced.take(found).seen_from(begin)
 
@@ -258,6 +320,7 @@ class Tracer:
         self,
         buffer: Any,
         candidates: Candidates,
+        hidden: BoolArray,
         transmitter: Float64Array,
         receivers: Float64Array,
     ) -> None:
@@ -271,19 +334,26 @@ class Tracer:
         wanted = candidates.planes
         triangles = self._scene.triangle_numbers(shapes, primitives)
         own = ((wanted < 0) | (wanted == self._scene.plane_of[triangles])).all(1)
+        start = np.broadcast_to(transmitter, (len(types), 3))
+        end = receivers[candidates.receiver]
+        if hidden.any():  # no ray of the centre's has been at their points
+            origin, normal = self._scene.planes(shapes[hidden], primitives[hidden])
+            surfaces = origin - self._scene.centre, normal
+            points[hidden] = image_points(start[hidden], end[hidden], types[hidden], *surfaces)
+            own[hidden] &= _first_of_equals(end[hidden], points[hidden])
+            own[hidden] &= np.isfinite(points[hidden]).all((1, 2))
         buffer.valid = mi.UInt(aligned_indices(own)) != 0
         met = (types == Interaction.REFLECTION) | (types == Interaction.TRANSMISSION)
-        met &= (own & ~candidates.found)[:, None]
-        if not met.any():
+        met &= (own & ~candidates.found & ~hidden)[:, None]
+        if not (met.any() or hidden.any()):
             return
         first = self._scene.plane_table.first_holding(triangles[met], points[met])
         shapes[met], primitives[met] = self._scene.shapes_of(first)
         buffer._shapes = _tensor(mi.TensorXu, mi.UInt(aligned_indices(shapes.ravel())), shapes)
         buffer._primitives = _tensor(mi.TensorXu, mi.UInt(aligned_indices(primitives.ravel())), shapes)
-        start = np.broadcast_to(transmitter, (len(types), 3))
-        end = receivers[candidates.receiver]
-        corners = self._scene.triangles(shapes, primitives) - self._scene.centre
-        exact = refined_points(start, points, end, types, corners)
+        exact = refined_points(
+            start, points, end, types, self._scene.triangles(shapes, primitives) - self._scene.centre
+        )
         for axis, column in zip("xyz", aligned_columns(exact.reshape(-1, 3).T), strict=True):
             setattr(buffer, f"_vertices_{axis}", _tensor(mi.TensorXf, mi.Float(column), shapes))
 
@@ -319,9 +389,12 @@ class Tracer:
             buffer.valid, buffer.a = carried, amplitudes
 
 
-def _several(count: int) -> Int64Array:
-    """Indices of so many, a single one twice: an array of one element is another kernel."""
-    return np.arange(count) if count > 1 else np.zeros(2 * count, np.int64)
+def _first_of_equals(ends: Float64Array, points: Float64Array) -> BoolArray:
+    """Of paths with the same points to 1 mm, the first: planes of two objects may be one."""
+    places = np.round(np.concatenate([ends[:, None], points], axis=1).reshape(len(ends), -1), 3)
+    first = np.zeros(len(ends), np.bool_)
+    first[np.unique(places, axis=0, return_index=True)[1]] = True
+    return first
 
 
 def _tensor(kind: Any, values: Any, like: Int64Array) -> Any:
@@ -336,6 +409,9 @@ def _nothing(carriers: int, depth: int, lost: int) -> Traced:
         shapes=np.zeros((0, depth), np.int64),
         primitives=np.zeros((0, depth), np.int64),
         points=np.zeros((0, depth, 3)),
+        wedge=Wedges.none(0),
+        hidden=np.zeros(0, np.bool_),
+        settled=np.zeros(0, np.bool_),
         lost=lost,
     )
 
@@ -351,6 +427,12 @@ def _joined(parts: Sequence[Traced], carriers: int, depth: int) -> Traced:
         shapes=np.concatenate([part.shapes for part in parts]),
         primitives=np.concatenate([part.primitives for part in parts]),
         points=np.concatenate([part.points for part in parts]),
+        wedge=Wedges(
+            np.concatenate([part.wedge.ends for part in parts]),
+            np.concatenate([part.wedge.outward for part in parts]),
+        ),
+        hidden=np.concatenate([part.hidden for part in parts]),
+        settled=np.concatenate([part.settled for part in parts]),
         lost=sum(part.lost for part in parts),
     )
 
@@ -394,6 +476,9 @@ def _read(
         shapes=shapes,
         primitives=primitives,
         points=points,
+        wedge=Wedges.of(buffer),
+        hidden=np.zeros(len(receiver), np.bool_),
+        settled=np.zeros(len(receiver), np.bool_),
         lost=lost,
     )
 

@@ -83,6 +83,20 @@ def refined_points(
     return refined
 
 
+def image_points(
+    start: Float64Array, end: Float64Array, types: UInt8Array, origin: Float64Array, normal: Float64Array
+) -> Float64Array:
+    """Points where paths start → end meet their planes, Shape ``[P, D, 3]``; 0 where ``types`` is.
+
+    The parameters are those of `refined_points`, with a point and the normal of each plane, without
+    diffraction and scattering. Not finite at a plane seen edge-on.
+    """
+    nowhere = np.zeros((*types.shape, 3))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        images = _images(start, nowhere, types, origin, normal)
+        return _traced_back(images, nowhere, end, types, origin, normal)
+
+
 def path_lengths(
     start: Float64Array, points: Float64Array, end: Float64Array, types: UInt8Array
 ) -> Float64Array:

@@ -1,0 +1,183 @@
+"""Rung ``mimo-rt``: every antenna pair traced.
+
+Each transmitting element is a source, each receiving element a target of the same tracer that finds the
+paths between the arrays' centres. So every pair has reflection coefficients, element patterns and visibility
+of its own: the reference for the rungs below, at the price of one trace for each transmitting element.
+
+Sionna RT moves images by up to a millimetre before it asks whether a face is met, so at the edge of a face
+its answer is that of a neighbouring element. Paths of reflections alone are asked for once more, without.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from caviar_protocol.arrays import Complex128Array, Float64Array, Int64Array
+from caviar_protocol.coordinates import SPEED_OF_LIGHT
+from caviar_protocol.topics import Carrier, ChannelMatrix, Interaction
+from caviar_services.channel.assemble import Antenna, Located, PathTable
+from caviar_services.channel.atmosphere import amplitude_factor
+from caviar_services.channel.clearance import with_near_pairs
+from caviar_services.channel.geometry import path_geometry
+from caviar_services.channel.patterns import radiated_field
+from caviar_services.channel.sionna_reach import Corners
+from caviar_services.channel.sionna_scene import SionnaScene
+from caviar_services.channel.sionna_table import path_table
+from caviar_services.channel.sionna_tracer import Tracer
+from caviar_services.channel.visibility import elements
+
+
+class ElementTracer:
+    """Makes the matrices of a frame, by traces between elements.
+
+    Parameters
+    ----------
+    tracer
+        Set up for the options of the scenario.
+    scene
+        Of the frame.
+    wavelengths
+        Of the carriers [m].
+    lanes
+        Candidates looked at together at most.
+    los
+        Whether straight paths count.
+    """
+
+    def __init__(
+        self, tracer: Tracer, scene: SionnaScene, wavelengths: Float64Array, lanes: int, los: bool
+    ) -> None:
+        self._tracer = tracer
+        self._scene = scene
+        self._wavelengths = wavelengths
+        self._lanes = lanes
+        self._los = los
+        self.counts: list[Int64Array] = []
+        """Paths between elements in this frame, of each carrier and transmitter: Shape ``[M, N]``, M elements
+        of all receivers."""
+
+    def __call__(
+        self,
+        carriers: Sequence[Carrier],
+        transmitters: Sequence[Antenna],
+        receivers: Sequence[Antenna],
+        located: Located,
+    ) -> tuple[ChannelMatrix, ...]:
+        made: list[ChannelMatrix] = []
+        for carrier, properties in enumerate(carriers):
+            wavelength = SPEED_OF_LIGHT / properties.frequency_hz
+            targets = self._ends(receivers, wavelength)
+            ends = np.cumsum([antenna.array.size for antenna in receivers]).tolist()
+            for t, transmitter in enumerate(transmitters):
+                sources = self._ends([transmitter], wavelength)
+                columns = [self._column(carrier, wavelength, source, targets, located) for source in sources]
+                h = np.stack([column for column, _ in columns], axis=1)
+                self.counts.append(np.stack([count for _, count in columns], axis=1))
+                made += [
+                    ChannelMatrix(carrier=carrier, tx=t, rx=r, h=h[end - receiver.array.size : end])
+                    for r, (receiver, end) in enumerate(zip(receivers, ends, strict=True))
+                ]
+        return tuple(made)
+
+    def _ends(self, antennas: Sequence[Antenna], wavelength: float) -> list[_Element]:
+        """All elements of these antennas, in order."""
+        placed = elements(antennas, wavelength)
+        return [
+            _Element(
+                replace(antenna, position=at), replace(antenna, position=self._scene.surfaces.cleared(at))
+            )
+            for index, antenna in enumerate(antennas)
+            for at in placed.of(index)
+        ]
+
+    def _column(
+        self,
+        carrier: int,
+        wavelength: float,
+        source: _Element,
+        targets: Sequence[_Element],
+        located: Located,
+    ) -> tuple[Complex128Array, Int64Array]:
+        """H of one transmitting element and M receiving ones, Shape ``[M]``, and how many paths each has."""
+        column = np.zeros(len(targets), np.complex128)
+        others = np.flatnonzero([target.place.name != source.place.name for target in targets])
+        ends = [targets[index] for index in others.tolist()]
+        table = self._paths(source, ends)
+        a, tau = self._amplitudes(carrier, wavelength, table, source.place, [end.place for end in ends])
+        target = others[table.pair]
+        if located.absorption_db_per_km is not None:
+            per_km = located.absorption_db_per_km[carrier : carrier + 1]
+            a = a * amplitude_factor(per_km, tau)[0]
+        # The tracer's order may change with threads, and a sum with its order.
+        order = np.lexsort([a.imag, a.real, target])
+        finite = order[np.isfinite(a[order])]
+        np.add.at(column, target[finite], a[finite])
+        return column, np.bincount(target[finite], minlength=len(column))
+
+    def _paths(self, source: _Element, ends: Sequence[_Element]) -> PathTable:
+        """Between one element and others, as between antennas."""
+        from_, to = source.traced.position, np.array([end.traced.position for end in ends]).reshape(-1, 3)
+        corners = Corners(from_[None], to[:, None])
+        traced = self._tracer.trace(from_, to, lanes=self._lanes, corners=corners)
+        mirrored = ((traced.types == 0) | (traced.types == Interaction.REFLECTION)).all(1)
+        traced = traced.take(~mirrored | traced.hidden | traced.settled)
+        # Its own corner is all that an element has: what that sees, the element sees.
+        traced = replace(traced, hidden=np.zeros(len(traced.hidden), np.bool_))
+        names = self._scene.names
+        places = [source.place], [end.place for end in ends]
+        table = path_table(
+            self._scene,
+            [(traced.receiver, traced)],
+            names,
+            np.zeros((len(names), 3)),
+            places,
+            ([source.traced], [end.traced for end in ends]),
+        )
+        los = np.zeros(len(ends), np.bool_)
+        table, _ = with_near_pairs(table, los, *places, self._wavelengths, self._scene.surfaces)
+        return table if self._los else table.take((table.types != 0).any(1))
+
+    def _amplitudes(
+        self,
+        carrier: int,
+        wavelength: float,
+        table: PathTable,
+        source: Antenna,
+        targets: Sequence[Antenna],
+    ) -> tuple[Complex128Array, Float64Array]:
+        """With the phase of lengths in float64, and the delays [s], Shape ``[P]`` each."""
+        ends = np.array([target.position for target in targets]).reshape(-1, 3)[table.pair]
+        start = np.broadcast_to(source.position, ends.shape)
+        still = np.zeros_like(ends)
+        with np.errstate(invalid="ignore"):  # what is not finite is left out
+            geometry = path_geometry(
+                start,
+                table.points,
+                ends,
+                (table.types != 0).sum(1),
+                still,
+                np.zeros_like(table.points),
+                still,
+            )
+            sent = radiated_field(source.array, source.rotation, geometry.departure)
+            taken = np.zeros_like(ends)
+            names = np.array([target.name for target in targets], object)[table.pair]
+            for antenna in {target.name: target for target in targets}.values():
+                mine = names == antenna.name
+                taken[mine] = radiated_field(antenna.array, antenna.rotation, geometry.arrival[mine])
+            turns = geometry.tau * SPEED_OF_LIGHT / wavelength
+            phase = np.exp(-2j * np.pi * (turns - np.round(turns)))
+            a: Complex128Array = np.einsum("pi,pij,pj->p", taken, table.transfer[carrier], sent) * phase
+        return a, geometry.tau
+
+
+@dataclass(frozen=True, eq=False)
+class _Element:
+    """One element, as an antenna of its own."""
+
+    place: Antenna
+    traced: Antenna
+    """Off the surface that it is at."""

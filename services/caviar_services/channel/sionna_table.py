@@ -1,0 +1,83 @@
+"""Paths of all launches in one table: named, with points in float64, and each path once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from caviar_protocol.arrays import Float64Array, Int64Array
+from caviar_protocol.topics import Interaction
+from caviar_services.channel.assemble import Antenna, PathTable
+from caviar_services.channel.clearance import spread_anew
+from caviar_services.channel.sionna_scene import SionnaScene
+from caviar_services.channel.sionna_tracer import Traced
+from caviar_services.channel.specular import distinct, path_lengths, refined_points
+
+Ends = tuple[Sequence[Antenna], Sequence[Antenna]]
+"""Transmitters and receivers."""
+
+
+def path_table(
+    scene: SionnaScene,
+    parts: Sequence[tuple[Int64Array, Traced]],
+    names: tuple[str, ...],
+    velocity: Float64Array,
+    antennas: Ends,
+    traced_from: Ends,
+) -> PathTable:
+    """What launches found between antennas.
+
+    Parameters
+    ----------
+    scene
+        Where they were.
+    parts
+        Of each launch, one at least, the pair that each path belongs to, and its paths.
+    names, velocity
+        What `SionnaScene.place` returned.
+    antennas, traced_from
+        Where they are, and where they were traced from.
+    """
+    pair = np.concatenate([pair for pair, _ in parts])
+    types = np.concatenate([part.types for _, part in parts])
+    shapes = np.concatenate([part.shapes for _, part in parts])
+    primitives = np.concatenate([part.primitives for _, part in parts])
+    hidden = np.concatenate([part.hidden for _, part in parts])
+    (start, end), ends = _ends(pair, *antennas), _ends(pair, *traced_from)
+    traced = np.concatenate([part.points for _, part in parts])
+    points = refined_points(start, traced, end, types, scene.triangles(shapes, primitives), ends)
+    specular = ((types != Interaction.DIFFRACTION) & (types != Interaction.SCATTERING)).all(1)
+    objects = scene.object_index(shapes, primitives)
+    table = PathTable(
+        pair=pair,
+        transfer=spread_anew(
+            np.concatenate([part.transfer for _, part in parts], axis=1),
+            specular,
+            path_lengths(ends[0], traced, ends[1], types),
+            path_lengths(start, points, end, types),
+        ),
+        types=types,
+        objects=objects,
+        points=points,
+        hidden=hidden,
+        traced=np.arange(len(pair)),
+        object_names=names,
+        object_velocity=velocity,
+        faces=scene.face_number(shapes, primitives),
+    )
+    # What only other elements have may have its points where the centres' path has them, on another face.
+    kept = hidden.copy()
+    shown = np.flatnonzero(~hidden)
+    kept[shown] = distinct(pair[shown], types[shown], points[shown])
+    return table.take(kept & ~(scene.is_parking(names, objects) & (types != 0)).any(1))
+
+
+def _ends(
+    pair: Int64Array, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]
+) -> tuple[Float64Array, Float64Array]:
+    """Positions [m] of TX and RX of paths, each of Shape ``[P, 3]``."""
+    tx, rx = np.divmod(pair, max(len(receivers), 1))
+    start = np.array([antenna.position for antenna in transmitters]).reshape(-1, 3)
+    end = np.array([antenna.position for antenna in receivers]).reshape(-1, 3)
+    return start[tx], end[rx]

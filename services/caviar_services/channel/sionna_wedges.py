@@ -1,0 +1,50 @@
+"""Where traced paths are diffracted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from caviar_protocol.arrays import BoolArray, Float64Array
+
+
+@dataclass(frozen=True, eq=False)
+class Wedges:
+    """The wedge at which each of P paths is diffracted; anything for paths that are not."""
+
+    ends: Float64Array
+    """Both ends [m] of the edge, Shape ``[P, 2, 3]``."""
+    outward: Float64Array
+    """Unit vector between the normals of both faces, Shape ``[P, 3]``; 0 for the edge of a single face."""
+
+    @classmethod
+    def none(cls, count: int) -> Wedges:
+        """Of so many paths that are not diffracted."""
+        return cls(np.zeros((count, 2, 3)), np.zeros((count, 3)))
+
+    @classmethod
+    def of(cls, buffer: Any) -> Wedges:
+        """Of the paths in the ray tracer's buffer."""
+        import drjit as dr
+
+        wedges = buffer.diffracting_wedges
+        if wedges is None:
+            return cls.none(int(buffer.buffer_size))
+        dr.eval(wedges)
+        vectors = (wedges.o, wedges.e_hat, wedges.n0, wedges.nn)
+        o, e, n0, nn = (vector.numpy().T.astype(np.float64) for vector in vectors)
+        single = wedges.prim0.numpy() == wedges.primn.numpy()
+        between = n0 + nn
+        length = np.sqrt((between**2).sum(-1, keepdims=True))
+        outward = np.where(single[:, None], 0.0, between / np.where(length > 0, length, 1.0))
+        return cls(np.stack([o, o + e * wedges.length.numpy()[:, None]], axis=1), outward)
+
+    def moved(self, by: Float64Array) -> Wedges:
+        """The same elsewhere: ``by`` [m], Shape ``[3]``, is added to all places."""
+        return Wedges(self.ends + by, self.outward)
+
+    def take(self, which: BoolArray) -> Wedges:
+        """Those of these paths."""
+        return Wedges(self.ends[which], self.outward[which])

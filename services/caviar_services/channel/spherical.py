@@ -1,0 +1,188 @@
+"""Rung ``spherical``: the paths of ``siso-rt``, with the exact length of each between any two elements.
+
+H[m, n] = Σ_p a_p · (s_p[m, n] / s_p) · exp(−j2πf(d_p[m, n] − d_p)/c), over the paths that elements m and n
+have, with the length d and the spreading s between the elements (s = 1/d but for diffraction and scattering,
+see `element_paths`) and d_p, s_p those between the arrays' centres, which a_p belongs to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from caviar_protocol.arrays import Complex128Array, Float64Array, Int64Array
+from caviar_protocol.coordinates import SPEED_OF_LIGHT
+from caviar_protocol.topics import Carrier, ChannelMatrix
+from caviar_services.channel.assemble import Antenna, Located
+from caviar_services.channel.element_gains import ElementGains
+from caviar_services.channel.element_paths import Bend, ElementPaths, Surfaces
+from caviar_services.channel.visibility import Elements, Look, Visibility, elements, visibility
+
+_LANES = 1 << 15
+"""Element pairs times paths computed at once: what stays in a processor's cache."""
+
+
+class SphericalWaves:
+    """Makes the matrices of a frame.
+
+    Coefficients of reflection, transmission, diffraction and scattering are those of the path between the
+    arrays' centres, as in ``siso-rt``. Pattern and polarisation are each element's own, to first order in the
+    size of the arrays (`element_gains`).
+
+    Parameters
+    ----------
+    surfaces
+        What the paths meet, in the order of the model's table.
+    look
+        Asks this frame's scene.
+    traced_from
+        Transmitters and receivers off the surfaces that they are at: there their elements look.
+    """
+
+    def __init__(
+        self, surfaces: Surfaces, look: Look, traced_from: tuple[Sequence[Antenna], Sequence[Antenna]]
+    ) -> None:
+        self._surfaces = surfaces
+        self._look = look
+        self._sources, self._targets = traced_from
+
+    def __call__(
+        self,
+        carriers: Sequence[Carrier],
+        transmitters: Sequence[Antenna],
+        receivers: Sequence[Antenna],
+        located: Located,
+    ) -> tuple[ChannelMatrix, ...]:
+        paths = ElementPaths(self._surfaces.take(located.row))
+        tx, rx = np.divmod(located.pair, max(len(receivers), 1))
+        start, end = _positions(transmitters)[tx], _positions(receivers)[rx]
+        # Amplitudes of paths that bend are as traced, those of others of their true length.
+        traced = _positions(self._sources)[tx, None], _positions(self._targets)[rx, None]
+        spreading = paths.lengths(slice(0, len(tx)), *traced).spreading[:, 0, 0]
+        straight = paths.bend == Bend.NONE
+        spreading[straight] = 1 / (SPEED_OF_LIGHT * located.geometry.tau[straight])
+        towards = paths.ends(start, end)
+        made: list[ChannelMatrix] = []
+        for carrier, properties in enumerate(carriers):
+            wavelength = SPEED_OF_LIGHT / properties.frequency_hz
+            transmit, receive = elements(transmitters, wavelength), elements(receivers, wavelength)
+            looking = elements(self._sources, wavelength), elements(self._targets, wavelength)
+            seen = visibility(paths, tx, rx, *looking, self._look)
+            field = _Field(
+                paths=paths,
+                seen=_far_enough(seen, paths, (tx, rx), (transmit, receive), wavelength),
+                transmit=transmit,
+                receive=receive,
+                transmitter=tx,
+                receiver=rx,
+                gains=ElementGains(
+                    (transmitters, receivers),
+                    (tx, rx),
+                    towards,
+                    located.transfer[carrier] / spreading[:, None, None],
+                    wavelength,
+                ),
+                wavelength=wavelength,
+            )
+            made += [
+                ChannelMatrix(carrier=carrier, tx=pair // len(receivers), rx=pair % len(receivers), h=h)
+                for pair, h in enumerate(field.matrices(located.offsets))
+            ]
+        return tuple(made)
+
+
+@dataclass(frozen=True, eq=False)
+class _Field:
+    """All paths of a frame on one carrier, between elements."""
+
+    paths: ElementPaths
+    seen: Visibility
+    transmit: Elements
+    receive: Elements
+    transmitter: Int64Array
+    """Antenna that each path starts at, Shape ``[P]``."""
+    receiver: Int64Array
+    gains: ElementGains
+    wavelength: float
+
+    def matrices(self, offsets: Int64Array) -> Iterator[Complex128Array]:
+        """H of each pair of antennas, in order."""
+        for pairs, sizes in _groups(offsets, self.transmit, self.receive):
+            begin, end = int(offsets[pairs.start]), int(offsets[pairs.stop])
+            at_once = max(1, _LANES // (sizes[0] * sizes[1]))
+            if pairs.stop - pairs.start == 1:
+                h = np.zeros(sizes, np.complex128)
+                for row in range(begin, end, at_once):
+                    h += self._waves(slice(row, min(row + at_once, end)), sizes).sum(0)
+                yield h
+            else:
+                waves = self._waves(slice(begin, end), sizes)
+                for first, last in pairwise((offsets[pairs.start : pairs.stop + 1] - begin).tolist()):
+                    yield waves[first:last].sum(0)
+
+    def _waves(self, rows: slice, sizes: tuple[int, int]) -> Complex128Array:
+        """What each of some paths adds to H, Shape ``[p, M, N]``."""
+        tx, rx = self.transmitter[rows], self.receiver[rows]
+        transmit = self.transmit.first[tx, None] + np.arange(sizes[1])
+        receive = self.receive.first[rx, None] + np.arange(sizes[0])
+        between = self.paths.lengths(rows, self.transmit.positions[transmit], self.receive.positions[receive])
+        turns = between.length
+        turns *= -1 / self.wavelength
+        turns -= np.round(turns)
+        turns *= 2 * np.pi
+        waves = np.empty(turns.shape, np.complex128)
+        np.cos(turns, out=waves.real)
+        np.sin(turns, out=waves.imag)
+        if len(tx):
+            arrays = self.transmit.arrays[tx[0]], self.receive.arrays[rx[0]]
+            sent, taken = self.gains.of(rows, *arrays)
+            waves *= taken[:, :, None] + sent[:, None]
+        waves *= between.spreading
+        for path in np.flatnonzero(~self.seen.every[rows]).tolist():
+            waves[path] *= self.seen.some.get(rows.start + path, False)
+        return waves
+
+
+def _far_enough(
+    seen: Visibility,
+    paths: ElementPaths,
+    antennas: tuple[Int64Array, Int64Array],
+    ends: tuple[Elements, Elements],
+    wavelength: float,
+) -> Visibility:
+    """Without direct paths of elements closer than one wavelength, which antennas have none of either."""
+    every, some = seen.every.copy(), dict(seen.some)
+    transmit, receive = ends
+    for path in np.flatnonzero((paths.surfaces.types == 0).all(1)).tolist():
+        sent, taken = transmit.of(antennas[0][path]), receive.of(antennas[1][path])
+        low = np.maximum(sent.min(0), taken.min(0))
+        high = np.minimum(sent.max(0), taken.max(0))
+        if (low - high).max() >= wavelength:
+            continue
+        far = np.sqrt(((taken[:, None] - sent) ** 2).sum(-1)) >= wavelength
+        some[path] = far if every[path] else far & some.get(path, False)
+        every[path] = False
+    return Visibility(every, some)
+
+
+def _positions(antennas: Sequence[Antenna]) -> Float64Array:
+    return np.array([antenna.position for antenna in antennas]).reshape(-1, 3)
+
+
+def _groups(
+    offsets: Int64Array, transmit: Elements, receive: Elements
+) -> Iterator[tuple[range, tuple[int, int]]]:
+    """Consecutive pairs of the same arrays, as many as are computed at once, and these sizes."""
+    arrays = [(rx, tx) for tx in transmit.arrays for rx in receive.arrays]
+    begin = 0
+    while begin < len(arrays):
+        sizes = (arrays[begin][0].size, arrays[begin][1].size)
+        most = offsets[begin] + _LANES // (sizes[0] * sizes[1])
+        end = begin + 1
+        while end < len(arrays) and offsets[end + 1] <= most and arrays[end] == arrays[begin]:
+            end += 1
+        yield range(begin, end), sizes
+        begin = end
