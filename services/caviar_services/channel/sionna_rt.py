@@ -18,6 +18,7 @@ from caviar_protocol.seeding import derive_seed
 from caviar_protocol.topics import AntennaDevice, ChannelOptions, Scene
 from caviar_services.channel.assemble import Antenna, PathTable
 from caviar_services.channel.base import ChannelSettings, Found, PathModel
+from caviar_services.channel.contributing import contributing
 from caviar_services.channel.sionna_launch import LaunchOptions
 from caviar_services.channel.sionna_materials import (
     MaterialPolicy,
@@ -87,18 +88,30 @@ class SionnaChannel(PathModel[SionnaSettings]):
         self._scene: SionnaScene
         self._tracer: Tracer
         self._outside: tuple[OutsideUse, ...] = ()
+        seed = settings.launch_seed
+        self._asked = LaunchOptions(
+            max_depth=settings.max_depth,
+            samples=settings.samples,
+            max_paths=settings.max_paths,
+            seed=derive_seed(run.seed, 0, f"{run.name}/launch") if seed is None else seed,
+            reflection=settings.reflection,
+            refraction=settings.refraction,
+            diffraction=settings.diffraction,
+            scattering=settings.scattering,
+        )
+        self._launched = self._asked
 
     @property
     def options(self) -> ChannelOptions:
-        s = self.settings
+        launched = self._launched
         return ChannelOptions(
-            los=s.los,
-            reflection=s.reflection,
-            refraction=s.refraction,
-            diffraction=s.diffraction,
-            scattering=s.scattering,
-            max_depth=s.max_depth,
-            samples=s.samples,
+            los=self.settings.los,
+            reflection=launched.reflection,
+            refraction=launched.refraction,
+            diffraction=launched.diffraction,
+            scattering=launched.scattering,
+            max_depth=launched.max_depth,
+            samples=launched.samples,
             materials_outside=tuple(use.brief(self.run.carriers[use.carrier].name) for use in self._outside),
         )
 
@@ -124,22 +137,10 @@ class SionnaChannel(PathModel[SionnaSettings]):
         )
         self._outside = self._scene.outside
         notes += tuple(use.note(self.run.carriers[use.carrier].name) for use in self._outside)
-        seed = s.launch_seed
-        if seed is None:
-            seed = derive_seed(self.run.seed, 0, f"{self.run.name}/launch")
-        launch = LaunchOptions(
-            max_depth=s.max_depth,
-            samples=s.samples,
-            max_paths=s.max_paths,
-            seed=seed,
-            reflection=s.reflection,
-            refraction=s.refraction,
-            diffraction=s.diffraction,
-            scattering=s.scattering,
-        )
+        self._launched, switched = contributing(self._asked, self._scene.surfaces(), frequencies)
         wavelengths = [SPEED_OF_LIGHT / frequency for frequency in frequencies]
-        self._tracer = Tracer(self._scene, wavelengths, launch)
-        return (*notes, *self._warm_up())
+        self._tracer = Tracer(self._scene, wavelengths, self._launched)
+        return (*notes, *switched, *self._warm_up())
 
     def release_memory(self) -> None:
         """Dr.Jit keeps freed buffers, some of each size that it has seen; sizes vary with the paths."""
@@ -176,7 +177,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         receivers: Sequence[Antenna],
     ) -> PathTable:
         """What all launches found, with names, and specular points in float64."""
-        depth = self.settings.max_depth
+        depth = self._launched.max_depth
         pair = _joined([pair for pair, _ in parts], (0,), np.int64)
         types = _joined([part.types for _, part in parts], (0, depth), np.uint8)
         shapes = _joined([part.shapes for _, part in parts], (0, depth), np.int64)

@@ -18,6 +18,7 @@ from caviar_protocol.arrays import Float64Array, Int32Array, Int64Array
 from caviar_protocol.errors import AssetError, PayloadError
 from caviar_protocol.scene import object_pose
 from caviar_protocol.topics import Scene
+from caviar_services.channel.contributing import SurfaceMaterial, Surfaces, has_edge
 from caviar_services.channel.sionna_materials import (
     Constants,
     MaterialPolicy,
@@ -96,7 +97,8 @@ class SionnaScene:
         self._standing: frozenset[Body] = frozenset()
         moving = self._moving_shapes(skins[0].constants if skins else None, settings.body_material == "metal")
         moved = sum(len(mesh.vertices) for mesh in moving[-1].meshes)
-        self._replace_shapes([*_by_material(self._scene), *moving])
+        self._shapes = [*_by_material(self._scene), *moving]
+        self._replace_shapes(self._shapes)
         self._vertices = self._corners[len(self._corners) - moved :]
         set_materials(self._scene, settings.frequencies_hz[0], settings.materials)
         self._carriers: list[_Tuning] = []
@@ -128,6 +130,29 @@ class SionnaScene:
         for material, (permittivity, conductivity) in constants:
             material.relative_permittivity, material.conductivity = permittivity, conductivity
         self._scene.frequency = frequency
+
+    def surfaces(self) -> Surfaces:
+        """What waves can meet, at rest and moving; unwelded scenery has no edges."""
+        shapes = [shape for shape in self._shapes if shape.id != _PARKING]
+        constants = []
+        for carrier in range(len(self._carriers)):
+            self.tune(carrier)
+            constants.append([_constants(shape.material) for shape in shapes])
+        self.tune(0)
+        still = [mesh for shape in shapes if shape.id != _SKIN for mesh in shape.meshes]
+        bodies = [mesh for asset, mesh in self._meshes.items() if self._pool[asset]]
+        return Surfaces(
+            materials=tuple(
+                SurfaceMaterial(
+                    name=_SKIN_NAME if shape.id == _SKIN else shape.material.name,
+                    constants=at_carriers,
+                    thickness_m=float(shape.material.thickness[0]),
+                    scattering_coefficient=float(shape.material.scattering_coefficient[0]),
+                )
+                for shape, at_carriers in zip(shapes, zip(*constants, strict=True), strict=True)
+            ),
+            has_edges=any(has_edge(mesh) for mesh in [*still, *bodies]),
+        )
 
     @property
     def parking(self) -> Float64Array:
@@ -321,6 +346,10 @@ def _unit_mesh(asset: str, assets: Mapping[str, Path]) -> Mesh:
         return _mesh_of(mi.load_dict({"type": "ply", "filename": str(path), "face_normals": True}))
     except RuntimeError as error:
         raise AssetError(f"mesh {asset!r} ({path}) cannot be read: {error}") from error
+
+
+def _constants(material: Any) -> Constants:
+    return float(material.relative_permittivity[0]), float(material.conductivity[0])
 
 
 def _mesh_of(shape: Any) -> Mesh:
