@@ -19,6 +19,7 @@ from caviar_protocol.topics import AntennaDevice, ChannelOptions, Scene
 from caviar_services.channel.assemble import Antenna, PathTable
 from caviar_services.channel.base import ChannelSettings, Found, PathModel
 from caviar_services.channel.contributing import contributing
+from caviar_services.channel.mesh_detail import DetailSettings
 from caviar_services.channel.sionna_launch import LaunchOptions
 from caviar_services.channel.sionna_materials import (
     MaterialPolicy,
@@ -65,6 +66,8 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     """ITU-R P.2040 material of moving objects."""
     materials: dict[str, MaterialSettings] = msgspec.field(default_factory=dict)
     """Changes to materials of the scenery, by name."""
+    detail: DetailSettings = msgspec.field(default_factory=DetailSettings)
+    """What of the scenery is left out; absent, nothing is."""
     outside_itu_range: OutsideRange = "error"
     """Where ITU-R P.2040 does not define a material at a carrier: ``error``; ``nearest``, the constants of
     the nearest end of a range; ``extrapolate``, the power law of that range."""
@@ -133,10 +136,13 @@ class SionnaChannel(PathModel[SionnaSettings]):
                     key=f"services.{self.run.name}.settings",
                 ),
                 weld=s.diffraction,
+                detail=s.detail,
             ),
         )
         self._outside = self._scene.outside
         notes += tuple(use.note(self.run.carriers[use.carrier].name) for use in self._outside)
+        if self._scene.detail_effect is not None:
+            notes += (self._scene.detail_effect.note,)
         self._launched, switched = contributing(self._asked, self._scene.surfaces(), frequencies)
         wavelengths = [SPEED_OF_LIGHT / frequency for frequency in frequencies]
         self._tracer = Tracer(self._scene, wavelengths, self._launched)

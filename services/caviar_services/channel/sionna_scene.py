@@ -8,17 +8,18 @@ single building and vehicle.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int32Array, Int64Array
-from caviar_protocol.errors import AssetError, PayloadError
+from caviar_protocol.errors import AssetError, PayloadError, ScenarioError
 from caviar_protocol.scene import object_pose
 from caviar_protocol.topics import Scene
 from caviar_services.channel.contributing import SurfaceMaterial, Surfaces, has_edge
+from caviar_services.channel.mesh_detail import DetailEffect, DetailSettings, detailed
 from caviar_services.channel.sionna_materials import (
     Constants,
     MaterialPolicy,
@@ -63,6 +64,8 @@ class SceneSettings:
     materials: MaterialPolicy
     weld: bool
     """Join vertices at one place, so that edges between faces are known (diffraction)."""
+    detail: DetailSettings = field(default_factory=DetailSettings)
+    """What of the scenery is left out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +100,8 @@ class SionnaScene:
         self._standing: frozenset[Body] = frozenset()
         moving = self._moving_shapes(skins[0].constants if skins else None, settings.body_material == "metal")
         moved = sum(len(mesh.vertices) for mesh in moving[-1].meshes)
-        self._shapes = [*_by_material(self._scene), *moving]
+        still, self.detail_effect = _with_detail(_by_material(self._scene), settings)
+        self._shapes = [*still, *moving]
         self._replace_shapes(self._shapes)
         self._vertices = self._corners[len(self._corners) - moved :]
         set_materials(self._scene, settings.frequencies_hz[0], settings.materials)
@@ -331,6 +335,25 @@ def _by_material(scene: Any) -> list[_Shape]:
         group.names.append(name)
         group.meshes.append(_mesh_of(item.mi_mesh))
     return list(groups.values())
+
+
+def _with_detail(shapes: list[_Shape], settings: SceneSettings) -> tuple[list[_Shape], DetailEffect | None]:
+    """Scenery with this detail, and what that did to it; None where nothing was to be left out."""
+    if settings.detail.is_full:
+        return shapes, None
+    pieces = [piece for shape in shapes for piece in zip(shape.names, shape.meshes, strict=True)]
+    kept, effect = detailed(pieces, settings.detail)
+    if pieces and not kept:
+        raise ScenarioError(
+            f"{settings.detail} leaves out all of the scenery; leave out less",
+            key=f"{settings.materials.key}.detail",
+        )
+    left = dict(kept)
+    return [
+        _Shape(shape.id, shape.material, names, [left[name] for name in names])
+        for shape in shapes
+        if (names := [name for name in shape.names if name in left])
+    ], effect
 
 
 def _unit_mesh(asset: str, assets: Mapping[str, Path]) -> Mesh:
