@@ -30,7 +30,7 @@ from caviar_services.world.assets import scenery_assets
 
 METAL = {
     name: {"relative_permittivity": 1.0, "conductivity_s_per_m": 1e7}
-    for name in ("brick", "concrete", "marble")
+    for name in ("brick", "concrete", "glass", "marble", "wood")
 }
 """Everything is of metal."""
 
@@ -53,13 +53,18 @@ def left_on(
     return options, ()
 
 
-def measured(scenery: str, settings: dict[str, Any], frames: int) -> tuple[float, Channel, tuple[str, ...]]:
-    """Median time of a frame [ms], its product, and the notes on what was switched off."""
+def prepared(scenery: str, settings: dict[str, Any]) -> tuple[sionna_rt.SionnaChannel, tuple[str, ...]]:
+    """A model, and the notes on what was switched off."""
     named = scenery_assets(f"sionna:{scenery}") if scenery else {}
     assets = {name: file for name, file in named.items() if isinstance(file, Path)}
     run = RunInfo(name="channel", seed=1, carriers=(Carrier(name="c", frequency_hz=28e9),))
     model = sionna_rt.SionnaChannel(msgspec.convert({"bodies": 0, **settings}, sionna_rt.SionnaSettings), run)
     notes = model.prepare(Preparation(demand={"channel": frozenset()}, assets=assets)).notes
+    return model, tuple(note for note in notes if "switched off" in note)
+
+
+def standing() -> Frame:
+    """A frame with a transmitter and ten receivers."""
     places = np.random.default_rng(2).uniform((-20, -4, 1), (20, 4, 4), (10, 3)).tolist()
     antennas = [
         AntennaDevice(name=f"r{i}", role="rx", position=(x, y, z)) for i, (x, y, z) in enumerate(places)
@@ -76,14 +81,15 @@ def measured(scenery: str, settings: dict[str, Any], frames: int) -> tuple[float
         devices=(*antennas, AntennaDevice(name="t", role="tx", position=(-25.0, 1.0, 6.0))),
     )
     source = FrameInput(GrantInput(topic="scene", source="world", status=Status.FRESH), payload=scene)
-    frame = Frame(episode=0, number=0, t_ns=0, inputs=(source,))
-    times = []
-    for _ in range(frames):
-        begin = time.perf_counter()
-        channel = model.step(frame).products["channel"]
-        times.append(time.perf_counter() - begin)
+    return Frame(episode=0, number=0, t_ns=0, inputs=(source,))
+
+
+def timed(model: sionna_rt.SionnaChannel, frame: Frame) -> tuple[float, Channel]:
+    """Time [ms] and product of a frame."""
+    begin = time.perf_counter()
+    channel = model.step(frame).products["channel"]
     assert isinstance(channel, Channel)
-    return float(np.median(times) * 1e3), channel, tuple(note for note in notes if "switched off" in note)
+    return (time.perf_counter() - begin) * 1e3, channel
 
 
 def main() -> None:
@@ -95,9 +101,14 @@ def main() -> None:
     options = parser.parse_args()
     rows = []
     for case, (scenery, settings) in CASES.items():
-        off, channel, notes = measured(scenery, settings, options.frames)
+        without, notes = prepared(scenery, settings)
         with mock.patch.object(sionna_rt, "contributing", left_on):
-            on, reference, _ = measured(scenery, settings, options.frames)
+            full, _ = prepared(scenery, settings)
+        times = np.zeros((options.frames, 2))
+        for number in range(options.frames):  # in turn: what else the machine does slows both
+            times[number, 0], channel = timed(without, standing())
+            times[number, 1], reference = timed(full, standing())
+        off, on = np.median(times, axis=0).tolist()
         same = all(getattr(channel, f).tobytes() == getattr(reference, f).tobytes() for f in FIELDS)
         rows.append(
             {"case": case, "notes": notes, "on_ms": on, "off_ms": off, "factor": on / off, "same_paths": same}

@@ -12,7 +12,7 @@ from channel_lab import Plate, Thing, antenna, carriers, measure, scene, sionna,
 
 from caviar_protocol.topics import Channel, Interaction
 from caviar_services.channel import sionna_rt
-from caviar_services.channel.contributing import Surfaces
+from caviar_services.channel.contributing import SurfaceMaterial, Surfaces, contributing
 from caviar_services.channel.sionna_launch import LaunchOptions
 from caviar_services.service import Preparation, RunInfo
 
@@ -58,9 +58,9 @@ def both(
     ]
     things = [Thing("car", (4.0, 2.0, 1.5)), Thing("van", (-8.0, -1.0, 1.9), (6.0, 2.0, 2.6))]
     at = scene(devices, things if settings.get("bodies", 2) else ())
-    off = measure(sionna(CARRIERS, assets, **settings), at)
+    off = measure(sionna(frequencies, assets, **settings), at)
     monkeypatch.setattr(sionna_rt, "contributing", left_on)
-    return off, measure(sionna(CARRIERS, assets, **settings), at)
+    return off, measure(sionna(frequencies, assets, **settings), at)
 
 
 def same_paths(a: Channel, b: Channel) -> bool:
@@ -93,6 +93,42 @@ def test_what_is_switched_off_would_have_found_nothing(
     assert getattr(on.options, option)
     assert same_paths(off, on)
     assert len(off.tau) > (0 if more.get("reflection") is False else 12)
+
+
+def test_at_the_limit_of_what_is_sent_through_nothing_is_lost(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Plates just thick enough to switch refraction off, some −90 dB, and half a million rays."""
+    thin, thick = 0.05, 0.5
+    asked = LaunchOptions(
+        max_depth=1,
+        samples=1,
+        max_paths=1,
+        seed=0,
+        reflection=True,
+        refraction=True,
+        diffraction=False,
+        scattering=False,
+    )
+    permittivity, conductivity = 5.24, 0.0462 * 28**0.7822  # concrete, ITU-R P.2040-3, table 3
+    while thick - thin > 1e-5:
+        middle = (thin + thick) / 2
+        plate = SurfaceMaterial(
+            name="plate",
+            constants=((permittivity, conductivity),),
+            thickness_m=middle,
+            scattering_coefficient=0.0,
+        )
+        if contributing(asked, Surfaces(materials=(plate,), has_edges=True), (28e9,))[0].refraction:
+            thin = middle
+        else:
+            thick = middle
+    assets = write_scenery(tmp_path, slanted("concrete", thick))
+    settings: dict[str, Any] = {"refraction": True, "max_depth": 2, "samples": 500_000}
+    off, on = both(monkeypatch, assets, (28e9,), **settings)
+    assert not off.options.refraction
+    assert on.options.refraction
+    assert same_paths(off, on)
 
 
 def test_without_surfaces_nothing_is_launched(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,8 @@
 """Options of a ray-traced channel that cannot contribute in a scene are switched off, and it is said why.
 
-Each costs time in every frame, whether or not it finds a path. What is switched off here changes no path:
-a claim is made only where the ray tracer could find none, and it is kept by tests that compare both.
+Diffraction doubles the time of a frame, whether or not it finds a path; and whoever asked for an effect
+learns that there is none of it. What is switched off here changes no path: that is done only where the
+ray tracer could find none, to which tests that compare both hold it.
 """
 
 from __future__ import annotations
