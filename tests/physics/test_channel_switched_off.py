@@ -47,7 +47,10 @@ def left_on(
 
 
 def both(
-    monkeypatch: pytest.MonkeyPatch, assets: dict[str, Path], **settings: Any
+    monkeypatch: pytest.MonkeyPatch,
+    assets: dict[str, Path],
+    frequencies: Sequence[float] = CARRIERS,
+    **settings: Any,
 ) -> tuple[Channel, Channel]:
     """The products with options switched off, and with all left on."""
     rng = np.random.default_rng(5)
