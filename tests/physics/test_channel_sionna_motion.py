@@ -163,10 +163,11 @@ def test_more_receivers_than_one_launch_takes(tmp_path: Path) -> None:
     assert digest(one) == digest(two)
 
 
-def test_no_frame_compiles_a_kernel(tmp_path: Path) -> None:
+@pytest.mark.parametrize("rung", ["siso-rt", "spherical", "mimo-rt"])
+def test_no_frame_compiles_a_kernel(tmp_path: Path, rung: str) -> None:
     """Neither moving, coming and going, nor numbers of objects, receivers and paths: all was compiled while
     preparing. Kernels of single frames would also be a leak of memory."""
-    model = sionna(F, write_scenery(tmp_path, [GROUND, WALL]), bodies=6)
+    model = sionna(F, write_scenery(tmp_path, [GROUND, WALL]), bodies=6, rung=rung)
     import drjit as dr
 
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -332,3 +333,92 @@ def test_the_memory_bound_changes_nothing_but_the_chunks(tmp_path: Path) -> None
     )
     assert np.array_equal(one.h[0].h, other.h[0].h)
     assert np.abs(one.h[0].h).min() > 0
+
+
+OUT = np.array([7931.37, -6112.83, 311.19])
+"""[m]; 10 km from the origin, where the step of float32 is a quarter of a wavelength at 300 GHz."""
+
+
+def moved(plates: list[Plate], by: Array) -> list[Plate]:
+    return [replace(plate, corners=[np.array(corner) + by for corner in plate.corners]) for plate in plates]
+
+
+@pytest.mark.parametrize(
+    ("rung", "more"),
+    [
+        ("spherical", {"max_depth": 2}),
+        ("spherical", {"max_depth": 2, "refraction": True}),
+        ("mimo-rt", {"max_depth": 2}),
+    ],
+    ids=["spherical", "spherical, with transmission", "mimo-rt"],
+)
+def test_far_from_the_origin_matrices_are_the_same(
+    tmp_path: Path, rung: str, more: dict[str, object]
+) -> None:
+    """The street with its cars and antennas 10 km out, at 28 GHz: the phase of every element of H is that of
+    the street at the origin within 1e-3 rad."""
+    array, line = AntennaArray(rows=2, columns=8), AntennaArray(columns=4)
+    found = []
+    for number, offset in enumerate((np.zeros(3), OUT)):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        model = sionna(28e9, write_scenery(folder, moved(STREET, offset)), rung=rung, **more)
+        devices = [
+            antenna("t", "tx", offset + [0, -9.0, 5], array, orientation=quaternion_from_euler(1.5, 0.1, 0)),
+            antenna("r", "rx", offset + [1.5, -3.0, 1.6], line, orientation=quaternion_from_euler(1, 0.1, 0)),
+            antenna("s", "rx", offset + [-23.0, 4.0, 1.4], line),
+        ]
+        things = [replace(car, position=tuple(np.array(car.position) + offset)) for car in CARS]
+        found.append(measure(model, scene(devices, things)))
+    for here, there in zip(found[0].h, found[1].h, strict=True):
+        assert np.abs(np.angle(there.h / here.h)).max() < 1e-3
+        assert np.abs(there.h / here.h - 1).max() < 2e-3
+
+
+@pytest.mark.parametrize("rung", ["spherical", "mimo-rt"])
+@pytest.mark.parametrize("los", [True, False])
+@pytest.mark.parametrize("apart", [1e-3, 1e-2, 0.045])
+def test_arrays_next_to_each_other_and_on_surfaces(
+    tmp_path: Path, rung: str, los: bool, apart: float
+) -> None:
+    """On the ground, on the roof of a car, and millimetres from another antenna H is finite. No wave goes
+    straight between elements nearer than a wavelength, nor between antennas but where each pair is traced."""
+    assets = write_scenery(tmp_path, STREET)
+    model = sionna(28e9, assets, max_depth=1, rung=rung, los=los, diffraction=True, refraction=True)
+    array = AntennaArray(rows=2, columns=4)
+    devices = [
+        antenna("high", "tx", (0, 0, 3), array),
+        antenna("roof", "tx", (6.0, 2.0, 1.5), array),
+        antenna("above", "rx", (apart, 0, 3), array),
+        antenna("ground", "rx", (2, 1, 0), array),
+        antenna("beside", "rx", (6.0, 2.0 + apart, 1.5), array),
+    ]
+    channel = measure(model, scene(devices, CARS))
+    assert channel.dropped == 0
+    assert all(np.isfinite(matrix.h).all() for matrix in channel.h)
+    centres = [np.array([x, 0.0, 3.0]) for x in (0.0, apart)]
+    transmit, receive = (places(array, centre, np.zeros(3), 28e9) for centre in centres)
+    direct = wave(distances(receive, transmit), 28e9)
+    far = np.abs(direct) < 1 / (4 * np.pi)
+    if rung == "spherical":
+        far &= apart >= C / 28e9
+    (h,) = (m.h for m in channel.h if (channel.tx[m.tx], channel.rx[m.rx]) == ("high", "above"))
+    assert np.abs(h[~far]).max(initial=0) < 1e-3
+    if los:
+        assert np.abs(np.angle(h[far] / direct[far])).max(initial=0) < 0.05
+    else:
+        assert np.abs(h).max() < 1e-3
+
+
+@pytest.mark.parametrize("rung", ["spherical", "mimo-rt"])
+def test_a_pair_of_arrays_too_near_for_the_ray_tracer_has_its_waves(rung: str) -> None:
+    """Arrays 4 cm apart at 60 GHz, λ = 5 mm, side by side in front of each other: every pair of elements has
+    the phase of its own distance within 1e-6 rad."""
+    array = AntennaArray(columns=3)
+    devices = [antenna("t", "tx", (1, 2, 3), array), antenna("r", "rx", (1.04, 2, 3), array)]
+    channel = measure(sionna(60e9, reflection=False, samples=1000, rung=rung), scene(devices))
+    still = np.zeros(3)
+    transmit, receive = (places(array, np.array(at), still, 60e9) for at in ([1, 2, 3], [1.04, 2, 3]))
+    expected = wave(distances(receive, transmit), 60e9)
+    assert np.abs(np.angle(channel.h[0].h / expected)).max() < 1e-6
+    assert np.abs(np.abs(channel.h[0].h / expected) - 1).max() < 0.01

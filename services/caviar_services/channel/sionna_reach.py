@@ -140,8 +140,10 @@ def reached(
         for column in chains.T.astype(np.int64)
     ]
     first = dr.gather(mi.UInt, mi.UInt(aligned_indices(receiver * corners)), chain)
-    start = dr.gather(mi.Point3f, positions(sources), source)
-    here = dr.gather(mi.Point3f, positions(targets.reshape(-1, 3)), first + corner)
+    start, here = (
+        dr.gather(mi.Point3f, positions(places[several(len(places))]), index)
+        for places, index in ((sources, source), (targets.reshape(-1, 3), first + corner))
+    )
     found: BoolArray = _exists(faces, planes, number, start, here).numpy()
     return found.reshape(-1, *shape[1:])[: shape[0]]
 
