@@ -82,6 +82,8 @@ class Offer:
         self.planes = Planes(scene.plane_table)
         """What chains go by."""
         self._chains = chains_of(launch, scene, options.max_depth)
+        if options.only_scattered:
+            self._chains = self._chains.take(~self._chains.straight)
         self._scattered = scattered_of(launch)
 
     @property
@@ -97,7 +99,7 @@ class Offer:
         import drjit as dr
 
         chains, scattered = self._chains, self._scattered
-        direct = self._seen(targets)
+        direct = self._seen(targets) if not self._options.only_scattered else np.zeros(0, np.int64)
         seen = np.ones(len(direct), np.bool_)
         if self.everywhere:
             every_target = np.arange(dr.width(targets))

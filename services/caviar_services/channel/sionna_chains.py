@@ -27,6 +27,10 @@ class Chains:
     straight: BoolArray
     """Whether a chain has but reflections and transmissions, Shape ``[C]``."""
 
+    def take(self, which: BoolArray) -> Chains:
+        """These chains."""
+        return Chains(self.ray[which], self.depth[which], self.planes[which], self.straight[which])
+
 
 def chains_of(launch: Launch, scene: SionnaScene, max_depth: int) -> Chains:
     """All chains that rays of a launch went along, shortest first, then in a stable order."""

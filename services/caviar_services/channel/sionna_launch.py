@@ -32,6 +32,8 @@ class LaunchOptions:
     refraction: bool
     diffraction: bool
     scattering: bool
+    only_scattered: bool = False
+    """Whether paths without a diffuse reflection are left to another launch."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -75,6 +75,12 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     diffraction: bool = False
     scattering: bool = False
     """Diffuse reflection; needs a scattering_coefficient above 0 in ``materials``."""
+    scattering_samples: (
+        Annotated[int, quantity("1", "rays of a launch of its own for diffuse paths", ge=1, le=100_000_000)]
+        | None
+    ) = None
+    """Every point that a ray meets is a path to whoever sees it, so diffuse paths take far longer than
+    others, and their power converges far sooner. Absent: the rays of ``samples`` scatter too."""
     launch_seed: Annotated[int | None, quantity("1", "of the ray launch; absent: from the run's seed")] = None
     max_paths: Annotated[
         int, quantity("1", "candidates of a TX/RX pair; more are lost and counted", ge=1)
@@ -109,10 +115,17 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     the nearest end of a range; ``extrapolate``, the power law of that range."""
 
     def __post_init__(self) -> None:
-        if self.follow is not None and (self.diffraction or self.scattering):
+        if self.scattering_samples is not None and not self.scattering:
+            raise ValueError("scattering_samples needs scattering = true; write both or neither")
+        if self.scattering_samples is not None and self.rung == "mimo-rt":
             raise ValueError(
-                "follow knows reflections and transmissions only; leave it out, or set diffraction and "
-                "scattering to false"
+                'rung = "mimo-rt" traces all paths of an antenna pair at once; leave out scattering_samples'
+            )
+        mixed = self.scattering and self.scattering_samples is None
+        if self.follow is not None and (self.diffraction or mixed):
+            raise ValueError(
+                "follow knows reflections and transmissions only; leave it out, or set diffraction to "
+                "false and give diffuse paths a launch of their own with scattering_samples"
             )
 
 
@@ -135,6 +148,8 @@ class SionnaChannel(PathModel[SionnaSettings]):
         self._variant = ""
         self._scene: SionnaScene
         self._tracer: Tracer
+        self._diffuse: Tracer | None = None
+        """Traces diffuse paths where they have a launch of their own."""
         self._followed: dict[str, Followed] = {}
         self._outside: tuple[OutsideUse, ...] = ()
         seed = settings.launch_seed
@@ -191,7 +206,12 @@ class SionnaChannel(PathModel[SionnaSettings]):
             notes += (self._scene.detail_effect.note,)
         self._launched, switched = contributing(self._asked, self._scene.used_surfaces(), frequencies)
         self._wavelengths = SPEED_OF_LIGHT / np.array(frequencies)
-        self._tracer = Tracer(self._scene, self._wavelengths.tolist(), self._launched)
+        launched, samples = self._launched, self.settings.scattering_samples
+        if samples is not None and launched.scattering:
+            own = replace(launched, samples=samples, diffraction=False, only_scattered=True)
+            self._diffuse = Tracer(self._scene, self._wavelengths.tolist(), own)
+            launched = replace(launched, scattering=False)
+        self._tracer = Tracer(self._scene, self._wavelengths.tolist(), launched)
         return (*notes, *switched, *self._warm_up())
 
     def reset(self, episode: int, seed: int, t0_ns: int) -> None:
@@ -222,7 +242,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         names, velocity = self._scene.place(scene, frozenset(self.settings.without_body))
         clear = [self._cleared(antenna) for antenna in (*transmitters, *receivers)]
         sources, targets = clear[: len(transmitters)], clear[len(transmitters) :]
-        parts = [self._launch(t, source, targets, names) for t, source in enumerate(sources)]
+        parts = [part for t, source in enumerate(sources) for part in self._launch(t, source, targets, names)]
         parts = parts or [(np.zeros(0, np.int64), self._tracer.nothing)]
         antennas = transmitters, receivers
         table = path_table(self._scene, parts, names, velocity, antennas, (sources, targets))
@@ -263,8 +283,8 @@ class SionnaChannel(PathModel[SionnaSettings]):
 
     def _launch(
         self, t: int, transmitter: Antenna, receivers: Sequence[Antenna], names: tuple[str, ...]
-    ) -> tuple[Int64Array, Traced]:
-        """Paths of one transmitter to the receivers, with the pair that each belongs to."""
+    ) -> list[tuple[Int64Array, Traced]]:
+        """Paths of one transmitter to the receivers, with the pair that each belongs to, launch by launch."""
         others = [r for r, receiver in enumerate(receivers) if receiver.name != transmitter.name]
         targets = np.array([receivers[r].position for r in others]).reshape(-1, 3)
         corners = None
@@ -276,10 +296,15 @@ class SionnaChannel(PathModel[SionnaSettings]):
         s, followed = self.settings, None
         if s.follow is not None:
             followed = self._followed.setdefault(transmitter.name, Followed(s.follow))
-        traced = self._tracer.trace(
-            transmitter.position, targets, s.receivers_at_once, followed, names, corners=corners
-        )
-        return t * len(receivers) + np.array(others, np.int64)[traced.receiver], traced
+        found = [
+            self._tracer.trace(
+                transmitter.position, targets, s.receivers_at_once, followed, names, corners=corners
+            )
+        ]
+        if self._diffuse is not None:
+            found.append(self._diffuse.trace(transmitter.position, targets, s.receivers_at_once))
+        first, index = t * len(receivers), np.array(others, np.int64)
+        return [(first + index[traced.receiver], traced) for traced in found]
 
     def _start(self) -> tuple[str, ...]:
         """Import the ray tracer with its library and variant; notes that say which."""
@@ -322,6 +347,9 @@ class SionnaChannel(PathModel[SionnaSettings]):
             self._tracer.trace(
                 above + shift, receivers + shift / 2, followed=followed, names=self._scene.names
             )
+        if self._diffuse is not None:
+            for shift in (0.0, 0.5):
+                self._diffuse.trace(above + shift, receivers + shift / 2)
         if self.rung != "siso-rt":
             corners = Corners(above[None] + [[0, 0, 0.1], [0, 0.1, 0]], receivers[:, None] + np.eye(3)[:2])
             self._tracer.trace(above, receivers, corners=corners)
