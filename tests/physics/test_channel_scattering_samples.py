@@ -28,7 +28,7 @@ def power_db(channel: Channel, rx: int) -> float:
 
 
 def test_diffuse_paths_are_those_of_their_rays_and_others_those_of_the_others() -> None:
-    """Specular paths are equal bit by bit to those without scattering at all, and diffuse power is that of one
+    """Specular paths are equal bit by bit to those without scattering, and diffuse power is that of one
     launch of as many rays for both."""
     where = places(3, CANYON, 10)
     both = {"max_depth": 2, "samples": 20_000, "scattering": True, "scattering_samples": 10_000}

@@ -75,9 +75,9 @@ LADDER: tuple[Setting, ...] = (
     Setting(label="siso-rt 1e5 d3 +refraction", use=_SIONNA, settings=_traced(100_000, 3, refraction=True)),
     Setting(label="siso-rt 1e5 d3 +diffraction", use=_SIONNA, settings=_traced(100_000, 3, diffraction=True)),
     Setting(
-        label="siso-rt 1e5 d3 +scattering",
+        label="siso-rt 1e5 d3 +scattering 1e4",
         use=_SIONNA,
-        settings=_traced(100_000, 3, scattering=True, max_paths=_DIFFUSE_PATHS),
+        settings=_traced(100_000, 3, scattering=True, scattering_samples=10_000, max_paths=_DIFFUSE_PATHS),
         scattering=True,
     ),
     Setting(label="siso-rt 1e6 d5 +r+d", use=_SIONNA, settings=_traced(1_000_000, 5, **_ALL)),
