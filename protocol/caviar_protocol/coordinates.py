@@ -80,9 +80,14 @@ def rotated(q: Sequence[float], v: Sequence[float]) -> Vector:
 
 
 def unrotated(q: Sequence[float], v: Sequence[float]) -> Vector:
-    """Body components of a vector given in world axes: the inverse of `rotated`."""
+    """Body components of a vector given in world axes: the inverse of `rotated`, by the transposed matrix."""
     w, x, y, z = q
-    return rotated((w, -x, -y, -z), v)
+    a, b, c = v
+    return (
+        (1 - 2 * (y * y + z * z)) * a + 2 * (x * y + w * z) * b + 2 * (x * z - w * y) * c,
+        2 * (x * y - w * z) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z + w * x) * c,
+        2 * (x * z + w * y) * a + 2 * (y * z - w * x) * b + (1 - 2 * (x * x + y * y)) * c,
+    )
 
 
 def multiply(p: Sequence[float], q: Sequence[float]) -> UnitQuaternion:

@@ -82,13 +82,18 @@ def device_velocity(scene: Scene, device: Device) -> Float64Array:
     return velocity
 
 
+_antennas: dict[str, tuple[tuple[Device, ...], list[AntennaDevice]]] = {}
+"""Of the last scene, by role: the devices of one frame mostly are those of the next."""
+
+
 def antennas(scene: Scene, role: str) -> Sequence[AntennaDevice]:
     """Antenna devices that transmit (``"tx"``) or receive (``"rx"``), sorted by name."""
-    known: dict[str, list[AntennaDevice]] = scene.__dict__.setdefault("_antennas", {})
-    if role not in known:
+    known = _antennas.get(role)
+    if known is None or known[0] is not scene.devices:
         found = (d for d in scene.devices if isinstance(d, AntennaDevice) and d.role in (role, "both"))
-        known[role] = sorted(found, key=lambda device: device.name)
-    return known[role]
+        known = scene.devices, sorted(found, key=lambda device: device.name)
+        _antennas[role] = known
+    return known[1]
 
 
 def _parent_index(scene: Scene, device: Device) -> int:

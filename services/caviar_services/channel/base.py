@@ -19,6 +19,7 @@ from caviar_protocol.messages import Input, Role
 from caviar_protocol.paths import changes
 from caviar_protocol.scene import antennas
 from caviar_protocol.topics import AntennaDevice, Channel, ChannelOptions, Scene
+from caviar_protocol.topics.scene import Device
 from caviar_services.channel.assemble import Antenna, Matrices, PathTable, Product, assemble
 from caviar_services.channel.atmosphere import Atmosphere, specific_attenuation
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
@@ -85,6 +86,8 @@ class ChannelModel(Service[S]):
                 )
         self.absorption_db_per_km = self._absorption()
         """Specific attenuation of the air on each carrier, Shape ``[C]``; None: no atmosphere."""
+        self._summed: tuple[tuple[Device, ...], float] = ((), 0.0)
+        """The devices of the last scene, which mostly are those of the next, and the sum of their numbers."""
         self.with_h = False
         """Whether somebody asks for the matrices."""
 
@@ -121,7 +124,10 @@ class ChannelModel(Service[S]):
 
     def step(self, frame: Frame) -> StepResult:
         scene = frame.scene()
-        _require_finite(scene)
+        if scene.devices is not self._summed[0]:
+            self._summed = scene.devices, _numbers_of(scene.devices)
+        if not math.isfinite(self._summed[1] + _numbers_in(scene)):
+            _refuse_not_finite(scene)
         made = self.model(frame, scene, antennas(scene, "tx"), antennas(scene, "rx"))
         channel = made.channel
         return StepResult(
@@ -154,15 +160,24 @@ class ChannelModel(Service[S]):
         return (f"atmosphere (ITU-R P.676) at {state}: {of_carriers}",)
 
 
-def _require_finite(scene: Scene) -> None:
-    """Raise `PayloadError` naming a NaN or an infinity of a scene: no channel follows from one."""
+def _numbers_in(scene: Scene) -> float:
+    """The sum of all numbers of objects; most scenes are small, and each frame has a new one."""
     arrays = (scene.position, scene.orientation, scene.velocity, scene.dimensions)
-    numbers = [number for device in scene.devices for number in (*device.position, *device.orientation)]
-    for device in scene.devices:
+    return sum([sum(values.ravel().tolist()) for values in arrays])
+
+
+def _numbers_of(devices: tuple[Device, ...]) -> float:
+    """The sum of all numbers of devices."""
+    numbers = [number for device in devices for number in (*device.position, *device.orientation)]
+    for device in devices:
         if isinstance(device, AntennaDevice):
             numbers += (device.array.vertical_spacing, device.array.horizontal_spacing)
-    if math.isfinite(sum(float(values.sum()) for values in arrays) + sum(numbers)):
-        return
+    return sum(numbers)
+
+
+def _refuse_not_finite(scene: Scene) -> None:
+    """Raise `PayloadError` naming a NaN or an infinity of a scene: no channel follows from one."""
+    arrays = (scene.position, scene.orientation, scene.velocity, scene.dimensions)
     for name, values in zip(("position", "orientation", "velocity", "dimensions"), arrays, strict=True):
         for i in np.flatnonzero(~np.isfinite(values).all(-1))[:1].tolist():
             raise PayloadError(

@@ -226,6 +226,8 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         ]
         if not self._unit:
             a *= self._path_gain(waves, pairs)
+        both = waves.departure + waves.arrival
+        aod, aoa = np.array([x for wave in both for x in angles(wave)], np.float64).reshape(2, -1, 2)
         shape = (len(transmitters), len(receivers))
         constant = _constant(tuple(los), tuple(offsets), tuple(waves.id), shape)
         return Channel(
@@ -239,8 +241,8 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
             id=constant.id,
             a=a,
             tau=np.array(waves.tau, np.float64),
-            aod=np.array([angles(vector) for vector in waves.departure], np.float64).reshape(-1, 2),
-            aoa=np.array([angles(vector) for vector in waves.arrival], np.float64).reshape(-1, 2),
+            aod=aod,
+            aoa=aoa,
             doppler=self._frequency * np.array(waves.doppler_ratio, np.float64),
             interactions=constant.interactions,
             points=constant.points,

@@ -3,7 +3,8 @@
 What takes longest is to find out which planes a transmitter's rays go along; from one frame to the next that
 hardly changes. So each frame launches a part of the rays, and offers the receivers what any of the
 last launches met: the image method and the test for occlusion, with everything where it is now, decide
-which of that is a path.
+which of that is a path. No two launches are quite the same, so that in time they meet what no single one of
+them would.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ from caviar_services.columns import aligned_columns, aligned_indices
 _JUMP = 20.0
 """[m] A transmitter that has moved farther since the frame before is looked for anew."""
 
-_BESIDE = 8
-"""Rays to both sides of one on a moving object that are launched with it."""
+_BESIDE = (1, 2, 4)
+"""Steps by which rays on moving objects are widened to both sides: seven rays beside each."""
 
 _KEPT = 5
 """Rounds of launches after which a chain that none of them met is forgotten."""
@@ -99,7 +100,7 @@ class Followed:
         returned for it."""
         jumped = self._known is not None and np.linalg.norm(transmitter - self._from) > _JUMP
         known, number, source = None if jumped else self._known, self._number, positions(transmitter[None])
-        rays = None if known is None else self._rays(number % self._parts)
+        rays = None if known is None else self._rays(number)
         launch = launcher(source, rays, number)
         self._note(launch, rays, scene, options.samples)
         met = _met(launch, chains_of(launch, scene, options.max_depth), scene, number)
@@ -111,13 +112,14 @@ class Followed:
         self._known, self._names, self._number, self._from = met, names, number + 1, transmitter
         return _FollowedOffer(met, scene, source, options)
 
-    def _rays(self, part: int) -> Int64Array:
+    def _rays(self, number: int) -> Int64Array:
         """Numbers of the rays of a part, and of those on or beside moving objects."""
+        chosen = self._on_object.copy()
         # Neighbours in the lattice's order point into neighbouring directions.
-        count: Int64Array = np.cumsum(np.pad(self._on_object, (_BESIDE + 1, _BESIDE)))
-        beside = count[2 * _BESIDE + 1 :] - count[: -2 * _BESIDE - 1]
-        chosen: BoolArray = np.greater(beside, 0)
-        chosen[part :: self._parts] = True
+        for shift in _BESIDE:
+            chosen[shift:] |= chosen[:-shift].copy()
+            chosen[:-shift] |= chosen[shift:].copy()
+        chosen[number % self._parts :: self._parts] = True
         return np.flatnonzero(chosen)
 
     def _note(self, launch: Launch, rays: Int64Array | None, scene: SionnaScene, samples: int) -> None:

@@ -7,6 +7,7 @@ are launched along a space-filling curve, which halved the time of the kernel in
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -80,10 +81,11 @@ class Launcher:
             | DIFFRACTED * options.diffraction
         )
 
-    def __call__(self, source: Any, rays: Int64Array | None = None, seed: int = 0) -> Launch:
+    def __call__(self, source: Any, rays: Int64Array | None = None, number: int = 0) -> Launch:
         """Launch from one position, a `mitsuba.Point3f` of width 1: all rays, or those of these numbers.
 
-        ``seed`` varies what is drawn where a ray may go on in several ways.
+        From launch to launch, by its ``number``, other things are drawn where a ray may go on in several
+        ways, and all rays are turned by less than what lies between two of them; at 0 by nothing.
         """
         import drjit as dr
         import mitsuba as mi
@@ -91,11 +93,13 @@ class Launcher:
         if not self._enabled:
             return Launch((), None)
         samples = self._options.samples if rays is None else len(rays)
-        self._sampler.seed(self._options.seed + seed, samples)
+        self._sampler.seed(self._options.seed + number, samples)
         origin = dr.repeat(source, samples)
         direction = mi.Vector3f(self._directions)
         if rays is not None:
             direction = dr.gather(mi.Vector3f, self._directions, mi.UInt(aligned_indices(rays)))
+        turn = mi.Vector3f(*(dr.opaque(mi.Float, angle) for angle in self._turn(number)))
+        direction = dr.normalize(direction + dr.cross(turn, direction))
         active, enabled = dr.full(mi.Bool, True, samples), dr.full(mi.UInt, self._enabled, samples)
         wedges = self._no_wedges(samples)
         dr.make_opaque(origin, direction, active, enabled, wedges)
@@ -106,6 +110,13 @@ class Launcher:
             )
             bounces.append(bounce)
         return Launch(tuple(bounces), wedges)
+
+    def _turn(self, number: int) -> list[float]:
+        """Small angles [rad] about the three axes: a sequence of low discrepancy (M. Roberts, "The
+        unreasonable effectiveness of quasirandom sequences", 2018, R_3) as wide as the rays are apart."""
+        apart = math.sqrt(4 * math.pi / self._options.samples)
+        root = 1.2207440846057596  # of x⁴ = x + 1
+        return [apart * math.remainder(number / root**axis, 1.0) for axis in (1, 2, 3)]
 
     def _no_wedges(self, samples: int) -> Any:
         from sionna.rt.utils import WedgeGeometry

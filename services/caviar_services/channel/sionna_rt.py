@@ -26,6 +26,8 @@ from caviar_protocol.topics import AntennaDevice, ChannelOptions, Scene
 from caviar_services.channel.assemble import Antenna, Matrices, PathTable
 from caviar_services.channel.base import ChannelSettings, Found, PathModel
 from caviar_services.channel.clearance import with_near_pairs
+from caviar_services.channel.contributing import contributing
+from caviar_services.channel.mesh_detail import DetailSettings
 from caviar_services.channel.mimo_rt import ElementTracer
 from caviar_services.channel.sionna_follow import Followed
 from caviar_services.channel.sionna_launch import LaunchOptions
@@ -100,6 +102,8 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     """ITU-R P.2040 material of moving objects."""
     materials: dict[str, MaterialSettings] = msgspec.field(default_factory=dict)
     """Changes to materials of the scenery, by name."""
+    detail: DetailSettings = msgspec.field(default_factory=DetailSettings)
+    """What of the scenery is left out; absent, nothing is."""
     outside_itu_range: OutsideRange = "error"
     """Where ITU-R P.2040 does not define a material at a carrier: ``error``; ``nearest``, the constants of
     the nearest end of a range; ``extrapolate``, the power law of that range."""
@@ -133,18 +137,30 @@ class SionnaChannel(PathModel[SionnaSettings]):
         self._tracer: Tracer
         self._followed: dict[str, Followed] = {}
         self._outside: tuple[OutsideUse, ...] = ()
+        seed = settings.launch_seed
+        self._asked = LaunchOptions(
+            max_depth=settings.max_depth,
+            samples=self._samples,
+            max_paths=settings.max_paths,
+            seed=derive_seed(run.seed, 0, f"{run.name}/launch") if seed is None else seed,
+            reflection=settings.reflection,
+            refraction=settings.refraction,
+            diffraction=settings.diffraction,
+            scattering=settings.scattering,
+        )
+        self._launched = self._asked
 
     @property
     def options(self) -> ChannelOptions:
-        s = self.settings
+        launched = self._launched
         return ChannelOptions(
-            los=s.los,
-            reflection=s.reflection,
-            refraction=s.refraction,
-            diffraction=s.diffraction,
-            scattering=s.scattering,
-            max_depth=s.max_depth,
-            samples=self._samples,
+            los=self.settings.los,
+            reflection=launched.reflection,
+            refraction=launched.refraction,
+            diffraction=launched.diffraction,
+            scattering=launched.scattering,
+            max_depth=launched.max_depth,
+            samples=launched.samples,
             materials_outside=tuple(use.brief(self.run.carriers[use.carrier].name) for use in self._outside),
         )
 
@@ -166,26 +182,17 @@ class SionnaChannel(PathModel[SionnaSettings]):
                     key=f"services.{self.run.name}.settings",
                 ),
                 weld=s.diffraction,
+                detail=s.detail,
             ),
         )
         self._outside = self._scene.outside
         notes += tuple(use.note(self.run.carriers[use.carrier].name) for use in self._outside)
-        seed = s.launch_seed
-        if seed is None:
-            seed = derive_seed(self.run.seed, 0, f"{self.run.name}/launch")
-        launch = LaunchOptions(
-            max_depth=s.max_depth,
-            samples=self._samples,
-            max_paths=s.max_paths,
-            seed=seed,
-            reflection=s.reflection,
-            refraction=s.refraction,
-            diffraction=s.diffraction,
-            scattering=s.scattering,
-        )
+        if self._scene.detail_effect is not None:
+            notes += (self._scene.detail_effect.note,)
+        self._launched, switched = contributing(self._asked, self._scene.used_surfaces(), frequencies)
         self._wavelengths = SPEED_OF_LIGHT / np.array(frequencies)
-        self._tracer = Tracer(self._scene, self._wavelengths.tolist(), launch)
-        return (*notes, *self._warm_up())
+        self._tracer = Tracer(self._scene, self._wavelengths.tolist(), self._launched)
+        return (*notes, *switched, *self._warm_up())
 
     def reset(self, episode: int, seed: int, t0_ns: int) -> None:
         """Forget the paths of the episode before."""
@@ -243,7 +250,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         if self.rung == "mimo-rt":
             # The rays of a launch are kept whole; the rest is for the candidates of some receivers at a time.
             lanes = (
-                int(self.settings.memory_gib * 2**30 / LANE_BYTES) - self._samples * self.settings.max_depth
+                int(self.settings.memory_gib * 2**30 / LANE_BYTES) - self._samples * self._launched.max_depth
             )
             return ElementTracer(
                 self._tracer, self._scene, self._wavelengths, max(1, lanes), self.settings.los
@@ -321,7 +328,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         if self.rung == "spherical":
             look = self._tracer.look
             look.nearest(receivers, receivers - 1.0)
-            chains = np.full((len(receivers), self.settings.max_depth), -1)
+            chains = np.full((len(receivers), self._launched.max_depth), -1)
             look.reflected(chains, receivers, receivers - 1.0)
         self.run.progress("kernels compiled", 0.0)
         return (f"kernels compiled in {time.monotonic() - begin:.1f} s",)

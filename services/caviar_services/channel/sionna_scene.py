@@ -12,7 +12,7 @@ scenery's corners as they stand in the files, and those of moving bodies from th
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
-from caviar_protocol.errors import AssetError, PayloadError
+from caviar_protocol.errors import AssetError, PayloadError, ScenarioError
 from caviar_protocol.scene import object_pose
 from caviar_protocol.topics import Scene
 from caviar_services.channel.clearance import Surfaces
+from caviar_services.channel.contributing import SurfaceMaterial, UsedSurfaces, has_edge
+from caviar_services.channel.mesh_detail import DetailEffect, DetailSettings, detailed
 from caviar_services.channel.sionna_materials import (
     Constants,
     MaterialPolicy,
@@ -75,6 +77,8 @@ class SceneSettings:
     materials: MaterialPolicy
     weld: bool
     """Join vertices at one place, so that edges between faces are known (diffraction)."""
+    detail: DetailSettings = field(default_factory=DetailSettings)
+    """What of the scenery is left out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +108,8 @@ class SionnaScene:
         files = {} if description is None else file_vertices(description)  # says what is wrong with a file
         self._scene = _load(description)
         self._scenery = frozenset(self._scene.objects)
-        shapes = _by_material(self._scene, file_meshes(self._scene, files, settings.weld))
+        loaded = _by_material(self._scene, file_meshes(self._scene, files, settings.weld))
+        shapes, self.detail_effect = _with_detail(loaded, settings)
         self.low, self.high = _bounds(shapes)
         self.centre: Float64Array = np.round((self.low + self.high) / (2 * _CENTRE_STEP)) * _CENTRE_STEP
         """What the ray tracer's coordinates are relative to [m], Shape ``[3]``."""
@@ -116,7 +121,8 @@ class SionnaScene:
         """Counts how often anything has moved."""
         moving = self._moving_shapes(skins[0].constants if skins else None, settings.body_material == "metal")
         moved = sum(len(mesh.vertices) for mesh in moving[-1].meshes)
-        self._replace_shapes([*shapes, *moving])
+        self._shapes = [*shapes, *moving]
+        self._replace_shapes(self._shapes)
         self._vertices = self._corners[len(self._corners) - moved :]
         self._first_moving = len(self._faces) - sum(len(mesh.faces) for mesh in moving[-1].meshes)
         self.surfaces = Surfaces(self._corners[self._faces], self._points_outside)
@@ -151,6 +157,29 @@ class SionnaScene:
         for material, (permittivity, conductivity) in constants:
             material.relative_permittivity, material.conductivity = permittivity, conductivity
         self._scene.frequency = frequency
+
+    def used_surfaces(self) -> UsedSurfaces:
+        """What waves can meet, at rest and moving; unwelded scenery has no edges."""
+        shapes = [shape for shape in self._shapes if shape.id != _PARKING]
+        constants = []
+        for carrier in range(len(self._carriers)):
+            self.tune(carrier)
+            constants.append([_constants(shape.material) for shape in shapes])
+        self.tune(0)
+        still = [mesh for shape in shapes if shape.id != _SKIN for mesh in shape.meshes]
+        bodies = [mesh for asset, mesh in self._meshes.items() if self._pool[asset]]
+        return UsedSurfaces(
+            materials=tuple(
+                SurfaceMaterial(
+                    name=_SKIN_NAME if shape.id == _SKIN else shape.material.name,
+                    constants=at_carriers,
+                    thickness_m=float(shape.material.thickness[0]),
+                    scattering_coefficient=float(shape.material.scattering_coefficient[0]),
+                )
+                for shape, at_carriers in zip(shapes, zip(*constants, strict=True), strict=True)
+            ),
+            has_edges=any(has_edge(mesh) for mesh in [*still, *bodies]),
+        )
 
     @property
     def parking(self) -> Float64Array:
@@ -394,6 +423,29 @@ def _by_material(scene: Any, meshes: Mapping[str, Mesh]) -> list[_Shape]:
         group.names.append(name)
         group.meshes.append(meshes[name])
     return list(groups.values())
+
+
+def _with_detail(shapes: list[_Shape], settings: SceneSettings) -> tuple[list[_Shape], DetailEffect | None]:
+    """Scenery with this detail, and what that did to it; None where nothing was to be left out."""
+    if settings.detail.is_full:
+        return shapes, None
+    pieces = [piece for shape in shapes for piece in zip(shape.names, shape.meshes, strict=True)]
+    kept, effect = detailed(pieces, settings.detail)
+    if pieces and not kept:
+        raise ScenarioError(
+            f"{settings.detail} leaves out all of the scenery; leave out less",
+            key=f"{settings.materials.key}.detail",
+        )
+    left = dict(kept)
+    return [
+        _Shape(shape.id, shape.material, names, [left[name] for name in names])
+        for shape in shapes
+        if (names := [name for name in shape.names if name in left])
+    ], effect
+
+
+def _constants(material: Any) -> Constants:
+    return float(material.relative_permittivity[0]), float(material.conductivity[0])
 
 
 def _mi_mesh(shape: _Shape, centre: Float64Array) -> Any:

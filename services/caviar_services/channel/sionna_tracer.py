@@ -345,7 +345,7 @@ class Tracer:
         buffer.valid = mi.UInt(aligned_indices(own)) != 0
         met = (types == Interaction.REFLECTION) | (types == Interaction.TRANSMISSION)
         met &= (own & ~candidates.found & ~hidden)[:, None]
-        if not (met.any() or hidden.any()):
+        if not (met.any() or (hidden.any() and types.size)):
             return
         first = self._scene.plane_table.first_holding(triangles[met], points[met])
         shapes[met], primitives[met] = self._scene.shapes_of(first)

@@ -69,8 +69,9 @@ def best_pairs(abs_y: Float64Array, k: int) -> Pairs:
     tx_beam, rx_beam = order.astype(np.int32), np.zeros(order.shape, np.int32)
     if abs_y.shape[2] > 1:
         tx_beam, rx_beam = np.divmod(tx_beam, np.int32(abs_y.shape[2]))
-    first = np.arange(0, flat.size, flat.shape[1])[:, None]
-    return Pairs(tx_beam, rx_beam, flat.take(order + first))
+    if len(flat) > 1:
+        order = order + np.arange(0, flat.size, flat.shape[1])[:, None]
+    return Pairs(tx_beam, rx_beam, flat.take(order))
 
 
 def _best_of_many(flat: Float64Array, k: int) -> Int64Array:

@@ -149,10 +149,14 @@ class World(Service[W]):
 
 def _tables(states: Sequence[ObjectState]) -> tuple[Float64Array, ...]:
     """Positions, orientations, velocities and dimensions, one row an object each."""
-    fields = [(state.position, state.orientation, state.velocity, state.dimensions) for state in states]
-    columns = zip(*fields, strict=True) if fields else ()
+    position, orientation, velocity, dimensions = list[float](), list[float](), list[float](), list[float]()
+    for state in states:
+        position += state.position
+        orientation += state.orientation
+        velocity += state.velocity
+        dimensions += state.dimensions
     # One array of all numbers, cut up. + 0.0: a negative zero and a zero are equal, so must their bytes be.
-    numbers = np.array([x for column in columns for vector in column for x in vector], dtype="<f8") + 0.0
+    numbers = np.array(position + orientation + velocity + dimensions, dtype="<f8") + 0.0
     count, tables, begin = len(states), [], 0
     for width in (3, 4, 3, 3):
         tables.append(numbers[begin : begin + count * width].reshape(count, width))
