@@ -21,11 +21,12 @@ from channel_lab import (
     total,
     write_scenery,
 )
+from msgspec.structs import replace
 
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.coordinates import quaternion_from_euler
 from caviar_protocol.digest import payload_digest
-from caviar_protocol.topics import Channel, Interaction, Scene
+from caviar_protocol.topics import AntennaArray, Channel, Interaction, Scene
 from caviar_services.channel.base import ChannelModel
 
 pytestmark = pytest.mark.channel
@@ -163,17 +164,22 @@ def test_more_receivers_than_one_launch_takes(tmp_path: Path) -> None:
     assert digest(one) == digest(two)
 
 
+@pytest.mark.parametrize("everything", [False, True], ids=["reflection", "everything"])
 @pytest.mark.parametrize("rung", ["siso-rt", "spherical", "mimo-rt"])
-def test_no_frame_compiles_a_kernel(tmp_path: Path, rung: str) -> None:
-    """Neither moving, coming and going, nor numbers of objects, receivers and paths: all was compiled while
-    preparing. Kernels of single frames would also be a leak of memory."""
-    model = sionna(F, write_scenery(tmp_path, [GROUND, WALL]), bodies=6, rung=rung)
+def test_no_frame_compiles_a_kernel(tmp_path: Path, rung: str, everything: bool) -> None:
+    """Neither moving, coming and going, nor numbers of objects, receivers, elements and paths: all was
+    compiled while preparing. Kernels of single frames would also be a leak of memory."""
+    settings = {"rung": rung, "bodies": 6, **(ALL_ON if everything else {})}
+    model = sionna(F, write_scenery(tmp_path, [GROUND, WALL]), **settings)
+    arrays = AntennaArray(), AntennaArray(rows=2, columns=2), AntennaArray(columns=3)
     import drjit as dr
 
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         for seed, cars in enumerate((1, 6, 0, 3, 5, 2, 4, 6)):
-            measure(model, traffic(cars, seed))
+            at = traffic(cars, seed)
+            devices = tuple(replace(device, array=arrays[seed % 3]) for device in at.devices)
+            measure(model, replace(at, devices=devices))
         history = dr.kernel_history([dr.KernelType.JIT])
         dr.kernel_history_clear()
     assert len(history) > 40

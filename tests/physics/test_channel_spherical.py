@@ -363,22 +363,11 @@ def test_far_from_the_origin_matrices_are_the_same(
         folder = tmp_path / str(number)
         folder.mkdir()
         model = sionna(28e9, write_scenery(folder, moved(STREET, offset)), rung=rung, **more)
+        at = [offset + np.array(place) for place in ((0, -9.0, 5), (1.5, -3.0, 1.6), (-23.0, 4.0, 1.4))]
         devices = [
-            antenna(
-                "t",
-                "tx",
-                offset + np.array([0, -9.0, 5]),
-                array,
-                orientation=quaternion_from_euler(1.5, 0.1, 0),
-            ),
-            antenna(
-                "r",
-                "rx",
-                offset + np.array([1.5, -3.0, 1.6]),
-                line,
-                orientation=quaternion_from_euler(1, 0.1, 0),
-            ),
-            antenna("s", "rx", offset + np.array([-23.0, 4.0, 1.4]), line),
+            antenna("t", "tx", at[0], array, orientation=quaternion_from_euler(1.5, 0.1, 0)),
+            antenna("r", "rx", at[1], line, orientation=quaternion_from_euler(1, 0.1, 0)),
+            antenna("s", "rx", at[2], line),
         ]
         things = [replace(car, position=tuple(np.array(car.position) + offset)) for car in CARS]
         found.append(measure(model, scene(devices, things)))

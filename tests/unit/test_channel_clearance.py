@@ -115,6 +115,32 @@ def test_near_pairs_have_their_line_of_sight_by_formula() -> None:
     assert found.objects[2].tolist() == [-1]
 
 
+def test_elements_that_see_each_other_past_the_centres_keep_their_straight_path() -> None:
+    """Two pairs 4 cm apart with a wall of the box in between: what only elements beside the centres have is
+    still theirs, by formula and hidden; the pair without such elements has nothing."""
+    tx, receivers = antenna("t", -0.02, 0.5), [antenna(name, 0.02, 0.5) for name in "ab"]
+    table = PathTable(
+        pair=np.array([0]),
+        transfer=np.ones((1, 1, 3, 3), np.complex128),
+        types=np.zeros((1, 1), np.uint8),
+        objects=np.full((1, 1), -1, np.int32),
+        points=np.zeros((1, 1, 3)),
+        hidden=np.array([True]),
+        traced=np.array([7]),
+        object_names=(),
+        object_velocity=np.zeros((0, 3)),
+    )
+    los = np.zeros(2, bool)
+    found, _ = with_near_pairs(table, los, [tx], receivers, np.array([0.01]), surfaces())
+    assert not los.any()
+    assert found.pair.tolist() == [0]
+    assert found.hidden is not None
+    assert found.hidden.tolist() == [True]
+    assert found.traced is not None
+    assert found.traced.tolist() == [-1]
+    assert found.transfer[0, 0] == pytest.approx(np.eye(3) * 0.01 / (4 * np.pi * 0.04))
+
+
 def test_a_device_and_itself_are_no_pair() -> None:
     both = antenna("t", 1.0, 5.0)
     empty = PathTable(

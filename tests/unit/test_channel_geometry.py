@@ -10,7 +10,7 @@ import pytest
 from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.geometry import path_geometry
-from caviar_services.channel.specular import distinct, refined_points
+from caviar_services.channel.specular import distinct, image_points, refined_points
 
 R, S, T = Interaction.REFLECTION, Interaction.SCATTERING, Interaction.TRANSMISSION
 D = Interaction.DIFFRACTION
@@ -162,3 +162,24 @@ def test_a_path_found_twice_is_one() -> None:
     again = distinct(np.array([3, 4]), types[:2], points[:2])
     assert again.tolist() == [True, True]
     assert distinct(pair[:2], types[[5, 5]], points[[5, 5]]).tolist() == [True, True]
+
+
+def test_points_from_planes_alone_are_those_of_the_image_method() -> None:
+    """Over the floor and by the wall, as a trace near the exact path gives them; nothing for a path without
+    interactions, and no number where the line runs within the plane."""
+    start, end = np.array([[1.0, 2.0, 3.0]]), np.array([[4.0, 5.0, 2.0]])
+    planes = (
+        FLOOR_AND_WALL[..., 0, :],
+        np.cross(
+            FLOOR_AND_WALL[..., 1, :] - FLOOR_AND_WALL[..., 0, :],
+            FLOOR_AND_WALL[..., 2, :] - FLOOR_AND_WALL[..., 0, :],
+        ),
+    )
+    types = np.array([[R, R]], np.uint8)
+    found = image_points(start, end, types, *planes)
+    again = refined_points(start, found + 1e-3, end, types, FLOOR_AND_WALL)
+    assert np.abs(found - again).max() < 1e-12
+    assert image_points(start, end, np.zeros((1, 2), np.uint8), *planes).tolist() == [[[0.0] * 3] * 2]
+    along = planes[0][:, :1] * 0, np.array([[[0.0, 0.0, 1.0]]])
+    level = image_points(start, np.array([[4.0, 5.0, 3.0]]), np.array([[T]], np.uint8), *along)
+    assert not np.isfinite(level).all()

@@ -33,8 +33,10 @@ class Wedges:
         if wedges is None:
             return cls.none(int(buffer.buffer_size))
         dr.eval(wedges)
+        # A vector's own numpy() compiles a kernel for each size.
         vectors = (wedges.o, wedges.e_hat, wedges.n0, wedges.nn)
-        o, e, n0, nn = (vector.numpy().T.astype(np.float64) for vector in vectors)
+        o, e, n0, nn = (np.stack([v.x.numpy(), v.y.numpy(), v.z.numpy()], axis=-1) for v in vectors)
+        o, e, n0, nn = (vector.astype(np.float64) for vector in (o, e, n0, nn))
         single = wedges.prim0.numpy() == wedges.primn.numpy()
         between = n0 + nn
         length = np.sqrt((between**2).sum(-1, keepdims=True))
