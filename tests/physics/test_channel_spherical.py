@@ -392,6 +392,7 @@ def test_arrays_next_to_each_other_and_on_surfaces(
         antenna("roof", "tx", (6.0, 2.0, 1.5), array),
         antenna("above", "rx", (apart, 0, 3), array),
         antenna("ground", "rx", (2, 1, 0), array),
+        antenna("there", "tx", (2, 1, 0), array),
         antenna("beside", "rx", (6.0, 2.0 + apart, 1.5), array),
     ]
     channel = measure(model, scene(devices, CARS))

@@ -61,9 +61,11 @@ class SphericalWaves:
         start, end = _positions(transmitters)[tx], _positions(receivers)[rx]
         # Amplitudes of paths that bend are as traced, those of others of their true length.
         traced = _positions(self._sources)[tx, None], _positions(self._targets)[rx, None]
-        spreading = paths.lengths(slice(0, len(tx)), *traced).spreading[:, 0, 0]
-        straight = paths.bend == Bend.NONE
-        spreading[straight] = 1 / (SPEED_OF_LIGHT * located.geometry.tau[straight])
+        of_bent = paths.lengths(slice(0, len(tx)), *traced).spreading[:, 0, 0]
+        bent = paths.bend != Bend.NONE
+        without_spreading = np.where(
+            bent, 1 / np.where(bent, of_bent, 1.0), SPEED_OF_LIGHT * located.geometry.tau
+        )
         towards = paths.ends(start, end)
         made: list[ChannelMatrix] = []
         for carrier, properties in enumerate(carriers):
@@ -82,7 +84,7 @@ class SphericalWaves:
                     (transmitters, receivers),
                     (tx, rx),
                     towards,
-                    located.transfer[carrier] / spreading[:, None, None],
+                    located.transfer[carrier] * without_spreading[:, None, None],
                     wavelength,
                 ),
                 wavelength=wavelength,
