@@ -138,7 +138,7 @@ def read(
     receivers: Float64Array,
     lost: int,
 ) -> Traced:
-    """The paths of a buffer of the solver, from a transmitter [3] to receivers [R, 3], positions in metres."""
+    """The paths of a solver's buffer, from a transmitter [3] to receivers [R, 3], positions in metres."""
     import drjit as dr
 
     dr.eval(buffer.a, buffer.valid)
