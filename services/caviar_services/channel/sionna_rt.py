@@ -41,7 +41,8 @@ from caviar_services.channel.sionna_reach import Corners
 from caviar_services.channel.sionna_scene import SceneSettings, SionnaScene
 from caviar_services.channel.sionna_sharing import scene_of
 from caviar_services.channel.sionna_table import Ends, path_table
-from caviar_services.channel.sionna_tracer import LANE_BYTES, Traced, Tracer
+from caviar_services.channel.sionna_traced import Traced
+from caviar_services.channel.sionna_tracer import LANE_BYTES, Tracer
 from caviar_services.channel.spherical import SphericalWaves
 from caviar_services.channel.traced_surfaces import traced_surfaces
 from caviar_services.channel.visibility import outermost

@@ -11,7 +11,7 @@ from caviar_protocol.topics import Interaction
 from caviar_services.channel.assemble import Antenna, PathTable
 from caviar_services.channel.clearance import spread_anew
 from caviar_services.channel.sionna_scene import SionnaScene
-from caviar_services.channel.sionna_tracer import Traced
+from caviar_services.channel.sionna_traced import Traced
 from caviar_services.channel.specular import distinct, path_lengths, refined_points
 
 Ends = tuple[Sequence[Antenna], Sequence[Antenna]]

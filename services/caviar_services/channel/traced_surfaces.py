@@ -10,7 +10,7 @@ from caviar_protocol.arrays import Float64Array, Int64Array, UInt8Array
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.element_paths import Surfaces
 from caviar_services.channel.sionna_scene import SionnaScene
-from caviar_services.channel.sionna_tracer import Traced
+from caviar_services.channel.sionna_traced import Traced
 
 _SAME_CORNER = 0.01
 """[m]; a corner of a mesh this near the end of an edge is that end."""
