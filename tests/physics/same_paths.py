@@ -73,7 +73,7 @@ def asked(
     """The product for receivers of these names at these positions."""
     tx = antenna("t", "tx", SCENES[name][0], AntennaArray(polarization="VH"[seed % 2]))  # type: ignore[arg-type]
     devices = [antenna(rx, "rx", place) for rx, place in zip(names, positions, strict=True)]
-    channel._tracer._last.clear()  # type: ignore[attr-defined]  # where nothing moves it would not trace again
+    channel.reset(0, 0, 0)  # where nothing moves it would not trace again
     return measure(channel, scene([tx, *devices], things(seed, name)))
 
 

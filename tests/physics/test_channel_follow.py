@@ -109,6 +109,23 @@ def test_an_episode_begins_without_what_the_one_before_knew() -> None:
         assert one == other
 
 
+def test_an_episode_begins_with_a_launch_also_where_nothing_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All rays of the first launch: else it would begin with what the episode before had found in time."""
+    channel = model(CANYON, follow=5, samples=SAMPLES)
+    launched: list[Any] = []
+    launcher = channel._tracer._launcher  # type: ignore[attr-defined]  # counted on its way
+    monkeypatch.setattr(
+        channel._tracer,  # type: ignore[attr-defined]
+        "_launcher",
+        lambda source, rays, number: launched.append((rays, number)) or launcher(source, rays, number),
+    )
+    for _ in range(2):
+        channel.reset(0, 0, 0)
+        for frame in range(3):
+            stepped(channel, frame, street(0))
+    assert launched == [(None, 0), (None, 0)]
+
+
 def test_who_was_started_again_within_an_episode_says_that_it_knows_nothing() -> None:
     channel = model(CANYON, follow=5, samples=SAMPLES)
     with pytest.raises(PayloadError, match=r"started again in frame 7.*without its setting `follow`"):

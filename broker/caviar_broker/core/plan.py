@@ -68,7 +68,7 @@ class RunPlan:
     limits: Limits = Limits()
     epoch: int = 1
     ephemeral: bool = False
-    """Whether nothing is kept of the run: no journal, and no digest. An embedded run without files."""
+    """Whether nothing is kept of the run: no journal, digest or latencies. An embedded run without files."""
     imposed: Mapping[tuple[str, int, int], Mapping[str, str]] = field(default_factory=dict)
     """Decisions imposed in a replay, by (service, episode, frame) (clause 6)."""
 

@@ -41,7 +41,8 @@ class EmbeddedRun:
         Checked, as `caviar_protocol.scenario_loader.load_scenario` returns it.
     directory
         Where the recorder and the journal write. None: nothing is written, recorders are left out, and
-        products go from service to service as they are, so that the outcome has no digest.
+        products go from service to service as they are, so that the outcome has no digest and `statistics`
+        stay empty.
     on_notice, on_frame
         Told what the user should know, and of each finished frame.
     seats

@@ -216,8 +216,9 @@ class SionnaChannel(PathModel[SionnaSettings]):
         return (*notes, *switched, *self._warm_up())
 
     def reset(self, episode: int, seed: int, t0_ns: int) -> None:
-        """Forget the paths of the episode before."""
+        """Forget the paths of the episode before: what is followed must not begin with them."""
         self._followed.clear()
+        self._tracer.forget()
 
     def step(self, frame: Frame) -> StepResult:
         """Raises `PayloadError` where paths that shall be followed are not known."""

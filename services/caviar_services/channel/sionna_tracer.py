@@ -91,6 +91,10 @@ class Tracer:
         self._fields = FieldCalculator()
         self._last: dict[bytes, _Last] = {}
 
+    def forget(self) -> None:
+        """Trace anew, also where nothing has moved."""
+        self._last.clear()
+
     @property
     def look(self) -> Look:
         """What can be asked about the scene as it is, in world coordinates."""
