@@ -8,7 +8,8 @@ import pytest
 from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.coordinates import quaternion_from_euler, rotation_matrix
 from caviar_protocol.topics import AntennaArray, Carrier, Channel, ChannelOptions, Interaction
-from caviar_services.channel.assemble import Antenna, PathTable, Product, assemble
+from caviar_services.channel.assemble import Product, assemble
+from caviar_services.channel.paths import Antenna, PathTable
 
 CARRIERS = (Carrier(name="low", frequency_hz=3.5e9), Carrier(name="high", frequency_hz=28e9))
 NAMES = ("wall", "bridge", "car", "unused")

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from itertools import pairwise
 
 import numpy as np
 
@@ -14,99 +11,21 @@ from caviar_protocol.arrays import (
     BoolArray,
     Complex128Array,
     Float64Array,
-    Int32Array,
     Int64Array,
-    UInt8Array,
-    UInt64Array,
 )
-from caviar_protocol.coordinates import angles, rotation_matrix
-from caviar_protocol.scene import device_pose, device_velocity
+from caviar_protocol.coordinates import angles
 from caviar_protocol.topics import (
-    AntennaArray,
-    AntennaDevice,
     Carrier,
     Channel,
     ChannelMatrix,
     ChannelOptions,
-    Scene,
 )
-from caviar_services.antenna import steering_vector
 from caviar_services.channel.atmosphere import amplitude_factor
 from caviar_services.channel.geometry import PathGeometry, path_geometry
+from caviar_services.channel.matrices import Located, Matrices, plane_waves
+from caviar_services.channel.path_ids import stable_ids
+from caviar_services.channel.paths import Antenna, PathTable
 from caviar_services.channel.patterns import radiated_field
-
-
-@dataclass(frozen=True, eq=False)
-class Antenna:
-    """An antenna device where it is in this frame, in world axes."""
-
-    name: str
-    array: AntennaArray
-    position: Float64Array
-    """[m], Shape ``[3]``."""
-    rotation: Float64Array
-    """Turns device axes into world axes, Shape ``[3, 3]``."""
-    velocity: Float64Array
-    """[m/s], Shape ``[3]``."""
-
-    @classmethod
-    def of(cls, scene: Scene, device: AntennaDevice) -> Antenna:
-        """The antenna of a device, composed with its parent's pose."""
-        pose = device_pose(scene, device)
-        return cls(
-            device.name,
-            device.array,
-            np.array(pose.position),
-            rotation_matrix(pose.orientation),
-            device_velocity(scene, device),
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class PathTable:
-    """Paths as a model found them: any order, no antennas applied, no carrier phase.
-
-    P paths of at most D interactions, C carriers.
-    """
-
-    pair: Int64Array
-    """TX index · number of RX + RX index, Shape ``[P]``."""
-    transfer: Complex128Array
-    """Dyad from the field sent to the field received, with spreading λ/(4πd) and without
-    exp(−j2πfτ), in world axes; Shape ``[C, P, 3, 3]``, rows at RX, columns at TX."""
-    types: UInt8Array
-    """`Interaction` at each point, Shape ``[P, D]``; 0 behind the last."""
-    objects: Int32Array
-    """Index into ``object_names``, Shape ``[P, D]``; −1 behind the last."""
-    points: Float64Array
-    """Interaction points [m], Shape ``[P, D, 3]``."""
-    object_names: tuple[str, ...]
-    object_velocity: Float64Array
-    """Velocity [m/s] of each named object, Shape ``[len(object_names), 3]``."""
-    hidden: BoolArray | None = None
-    """Paths that only elements beside the arrays' centres have: they are in H alone, Shape ``[P]``; absent:
-    none is."""
-    traced: Int64Array | None = None
-    """Number of each among the paths of all launches, Shape ``[P]``; −1 for paths by formula; absent:
-    unknown."""
-    faces: Int32Array | None = None
-    """Number of the plane of each point within its object, the same in every frame, Shape ``[P, D]``;
-    absent: unknown."""
-
-    def take(self, which: Int64Array | BoolArray) -> PathTable:
-        """These paths, in this order."""
-        return PathTable(
-            pair=self.pair[which],
-            transfer=self.transfer[:, which],
-            types=self.types[which],
-            objects=self.objects[which],
-            points=self.points[which],
-            object_names=self.object_names,
-            object_velocity=self.object_velocity,
-            faces=None if self.faces is None else self.faces[which],
-            hidden=None if self.hidden is None else self.hidden[which],
-            traced=None if self.traced is None else self.traced[which],
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,30 +38,6 @@ class Product:
     with_h: bool
     absorption_db_per_km: Float64Array | None = None
     """By the air, on each carrier, Shape ``[C]``; None: no atmosphere."""
-
-
-@dataclass(frozen=True, eq=False)
-class Located:
-    """P paths in the order of the product, as matrices are made of them."""
-
-    row: Int64Array
-    """Row of each in the model's `PathTable`, Shape ``[P]``."""
-    pair: Int64Array
-    offsets: Int64Array
-    """As in `Channel`: paths of a pair are ``offsets[pair]`` to ``offsets[pair + 1]``."""
-    geometry: PathGeometry
-    a: Complex128Array
-    """As in `Channel`, Shape ``[C, P]``."""
-    transfer: Complex128Array
-    """As in `PathTable`, Shape ``[C, P, 3, 3]``, with absorption by the air."""
-    absorption_db_per_km: Float64Array | None
-    """As in `Product`."""
-
-
-Matrices = Callable[
-    [Sequence[Carrier], Sequence[Antenna], Sequence[Antenna], Located], tuple[ChannelMatrix, ...]
-]
-"""Makes the matrices of a product from its paths."""
 
 
 def assemble(
@@ -196,7 +91,7 @@ def assemble(
         los=los,
         offsets=offsets,
         object_names=table.object_names,
-        id=_ids(table),
+        id=stable_ids(table),
         a=a,
         tau=geometry.tau,
         aod=aod,
@@ -329,78 +224,3 @@ def _order(
     keys += [table.objects[:, d] for d in range(depth)]
     keys += [geometry.tau, aod[:, 0], aod[:, 1], aoa[:, 0], aoa[:, 1], a[0].real, a[0].imag]
     return np.lexsort(keys[::-1]).astype(np.int64)
-
-
-def _ids(table: PathTable) -> UInt64Array:
-    """Stable ids of sorted paths: hash of types, object names, faces, and rank among equals in the pair."""
-    ids = np.zeros(len(table.pair), np.uint64)
-    if not len(ids):
-        return ids
-    base, kind = _kinds(table)
-    # In a stable order, so the rank follows the sorted paths: distance to the start of the run of equals.
-    order = np.lexsort((kind, table.pair))
-    place = np.arange(len(ids))
-    first = np.ones(len(ids), np.bool_)
-    ranked, pair = kind[order], table.pair[order]
-    first[1:] = (ranked[1:] != ranked[:-1]) | (pair[1:] != pair[:-1])
-    rank = np.empty(len(ids), np.int64)
-    rank[order] = place - np.maximum.accumulate(np.where(first, place, 0))
-    return _mix(base[kind] + rank.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15))
-
-
-def _kinds(table: PathTable) -> tuple[UInt64Array, Int64Array]:
-    """Hashes of the kinds of paths that occur, and which of them each path is."""
-    depth = table.types.shape[1]
-    if not depth:
-        return np.array([_name_hash(())], np.uint64), np.zeros(len(table.pair), np.int64)
-    faces = np.zeros_like(table.objects) if table.faces is None else table.faces
-    discrete = np.concatenate([table.types.astype(np.int32), table.objects, faces], axis=1)
-    kinds, kind = np.unique(discrete, axis=0, return_inverse=True)
-    named = (
-        tuple(
-            (t, table.object_names[o], f)
-            for t, o, f in zip(row[:depth], row[depth : 2 * depth], row[2 * depth :], strict=True)
-            if t
-        )
-        for row in kinds.tolist()
-    )
-    return np.array([_name_hash(names) for names in named], np.uint64), kind.reshape(-1)
-
-
-@lru_cache(maxsize=4096)
-def _name_hash(kind: tuple[tuple[int, str, int], ...]) -> int:
-    text = "\0".join(f"{interaction}\0{name}\0{face}" for interaction, name, face in kind)
-    return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little")
-
-
-def _mix(x: UInt64Array) -> UInt64Array:
-    """Finaliser of SplitMix64 (Steele, Lea, Flood 2014): a bijection that spreads every bit."""
-    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return x ^ (x >> np.uint64(31))
-
-
-def plane_waves(
-    carriers: Sequence[Carrier],
-    transmitters: Sequence[Antenna],
-    receivers: Sequence[Antenna],
-    located: Located,
-) -> tuple[ChannelMatrix, ...]:
-    """H[m, n] = Σ_p a[p] · receive[p, m] · transmit[p, n] of every carrier and pair."""
-    steered = []
-    geometry, a = located.geometry, located.a
-    for pair, (begin, end) in enumerate(pairwise(located.offsets.tolist())):
-        tx, rx = divmod(pair, len(receivers))
-        mine = slice(begin, end)
-        transmit = _steering(transmitters[tx], geometry.departure[mine])
-        receive = _steering(receivers[rx], geometry.arrival[mine])
-        steered.append((tx, rx, mine, receive, transmit))
-    return tuple(
-        ChannelMatrix(carrier=carrier, tx=tx, rx=rx, h=(receive * a[carrier, mine, None]).T @ transmit)
-        for carrier in range(len(carriers))
-        for tx, rx, mine, receive, transmit in steered
-    )
-
-
-def _steering(antenna: Antenna, directions: Float64Array) -> Complex128Array:
-    return steering_vector(antenna.array, directions @ antenna.rotation)

@@ -20,8 +20,10 @@ from caviar_protocol.paths import changes
 from caviar_protocol.scene import antennas
 from caviar_protocol.topics import AntennaDevice, Channel, ChannelOptions, Scene
 from caviar_protocol.topics.scene import Device
-from caviar_services.channel.assemble import Antenna, Matrices, PathTable, Product, assemble
+from caviar_services.channel.assemble import Product, assemble
 from caviar_services.channel.atmosphere import Atmosphere, specific_attenuation
+from caviar_services.channel.matrices import Matrices
+from caviar_services.channel.paths import Antenna, PathTable
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
 
 

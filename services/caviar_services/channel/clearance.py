@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int64Array
-from caviar_services.channel.assemble import Antenna, PathTable
+from caviar_services.channel.paths import Antenna, PathTable
 
 CLEARANCE = 0.02
 """[m]"""

@@ -15,7 +15,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Complex128Array, Float64Array, Int64Array
 from caviar_protocol.topics import AntennaArray
-from caviar_services.channel.assemble import Antenna
+from caviar_services.channel.paths import Antenna
 from caviar_services.channel.patterns import element_amplitude, spherical_basis
 
 

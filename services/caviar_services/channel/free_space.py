@@ -13,8 +13,8 @@ import numpy as np
 
 from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Scene
-from caviar_services.channel.assemble import Antenna, PathTable
 from caviar_services.channel.base import ChannelSettings, Found, PathModel
+from caviar_services.channel.paths import Antenna, PathTable
 
 
 class FreeSpaceSettings(ChannelSettings, frozen=True, kw_only=True):

@@ -18,10 +18,11 @@ import numpy as np
 from caviar_protocol.arrays import Complex128Array, Float64Array, Int64Array
 from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Carrier, ChannelMatrix, Interaction
-from caviar_services.channel.assemble import Antenna, Located, PathTable
 from caviar_services.channel.atmosphere import amplitude_factor
 from caviar_services.channel.clearance import with_near_pairs
 from caviar_services.channel.geometry import path_geometry
+from caviar_services.channel.matrices import Located
+from caviar_services.channel.paths import Antenna, PathTable
 from caviar_services.channel.patterns import radiated_field
 from caviar_services.channel.sionna_reach import Corners
 from caviar_services.channel.sionna_scene import SionnaScene

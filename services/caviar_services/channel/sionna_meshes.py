@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +11,23 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import AssetError
+from caviar_services.columns import aligned_columns
 from caviar_services.meshes import Mesh, unit_box
 from caviar_services.ply import ply_vertices
 from caviar_services.scenery import read_scenery
 
 _SAME_VERTEX = 1e-5
 """By how much of its size a mesh in float32 may differ from its file."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """One shape of the ray tracer: pieces of one material."""
+
+    id: str
+    material: Any
+    names: list[str]
+    meshes: list[Mesh]
 
 
 def file_vertices(description: Path) -> dict[str, Float64Array]:
@@ -79,3 +91,29 @@ def _mesh_of(shape: Any) -> Mesh:
         np.array(params["vertex_positions"], np.float64).reshape(-1, 3),
         np.array(params["faces"], np.int32).reshape(-1, 3),
     )
+
+
+def mi_mesh(shape: Shape, centre: Float64Array) -> Any:
+    """A shape as the ray tracer has it, relative to ``centre`` [m]."""
+    import mitsuba as mi
+
+    counts = np.array([len(mesh.vertices) for mesh in shape.meshes])
+    before = np.cumsum(counts) - counts
+    faces = np.concatenate([mesh.faces + begin for mesh, begin in zip(shape.meshes, before, strict=True)])
+    properties = mi.Properties()
+    properties.set_id(shape.id)
+    properties["face_normals"] = True
+    made = mi.Mesh(shape.id, int(counts.sum()), len(faces), props=properties)
+    params = mi.traverse(made)
+    params["vertex_positions"] = floats(np.concatenate([mesh.vertices for mesh in shape.meshes]) - centre)
+    params["faces"] = mi.UInt(np.ascontiguousarray(faces, np.uint32).ravel())
+    params.update()
+    return made
+
+
+def floats(vertices: Float64Array) -> Any:
+    """Coordinates, Shape ``[V, 3]``, as the ray tracer has them."""
+    import mitsuba as mi
+
+    (column,) = aligned_columns(vertices.reshape(1, -1))
+    return mi.Float(column)

@@ -23,12 +23,13 @@ from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.errors import PayloadError, ScenarioError, SetupError
 from caviar_protocol.seeding import derive_seed
 from caviar_protocol.topics import AntennaDevice, ChannelOptions, Scene
-from caviar_services.channel.assemble import Antenna, Matrices, PathTable
 from caviar_services.channel.base import ChannelSettings, Found, PathModel
 from caviar_services.channel.clearance import with_near_pairs
 from caviar_services.channel.contributing import contributing
+from caviar_services.channel.matrices import Matrices
 from caviar_services.channel.mesh_detail import DetailSettings
 from caviar_services.channel.mimo_rt import ElementTracer
+from caviar_services.channel.paths import Antenna, PathTable
 from caviar_services.channel.sionna_follow import Followed
 from caviar_services.channel.sionna_launch import LaunchOptions
 from caviar_services.channel.sionna_materials import (

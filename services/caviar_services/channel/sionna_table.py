@@ -8,8 +8,8 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_protocol.topics import Interaction
-from caviar_services.channel.assemble import Antenna, PathTable
 from caviar_services.channel.clearance import spread_anew
+from caviar_services.channel.paths import Antenna, PathTable
 from caviar_services.channel.sionna_scene import SionnaScene
 from caviar_services.channel.sionna_traced import Traced
 from caviar_services.channel.specular import distinct, path_lengths, refined_points

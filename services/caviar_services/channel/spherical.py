@@ -16,9 +16,10 @@ import numpy as np
 from caviar_protocol.arrays import Complex128Array, Float64Array, Int64Array
 from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Carrier, ChannelMatrix
-from caviar_services.channel.assemble import Antenna, Located
 from caviar_services.channel.element_gains import ElementGains
 from caviar_services.channel.element_paths import Bend, ElementPaths, Surfaces
+from caviar_services.channel.matrices import Located
+from caviar_services.channel.paths import Antenna
 from caviar_services.channel.visibility import Elements, Look, Visibility, elements, visibility
 
 _LANES = 1 << 15

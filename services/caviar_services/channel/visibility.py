@@ -20,8 +20,8 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt8Array
 from caviar_protocol.topics import AntennaArray, Interaction
 from caviar_services.antenna import element_positions
-from caviar_services.channel.assemble import Antenna
 from caviar_services.channel.element_paths import Bend, ElementPaths
+from caviar_services.channel.paths import Antenna
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,203 @@
+"""Which triangle of the ray tracer's shapes is whose: numbers, pieces and planes of triangles, in float64.
+
+A shape holds many pieces of scenery or many bodies. Ray tracers tell a shape and a triangle within it; here
+triangles are numbered through all shapes, in the order of the shapes, and each belongs to a piece and lies
+in a plane of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
+from caviar_services.channel.clearance import Surfaces
+from caviar_services.channel.sionna_meshes import Shape
+from caviar_services.channel.sionna_planes import PlaneTable, plane_numbers, shared_planes
+from caviar_services.meshes import Mesh
+
+Body = tuple[str, int]
+"""Asset and slot of a body in the pool."""
+
+_LYING = 0.5
+"""Vertical part of the normal of grounds and roofs, at least."""
+
+
+class NumberedTriangles:
+    """The triangles of shapes, of which the last one may move; bodies are its last pieces.
+
+    Parameters
+    ----------
+    shapes
+        In world coordinates.
+    ids
+        Process-local number of each shape.
+    bodies
+        What may move, in the order of the pieces.
+    unit_meshes
+        Of the bodies, by asset.
+    centre
+        What the ray tracer's coordinates are relative to [m], Shape ``[3]``.
+    """
+
+    def __init__(
+        self,
+        shapes: Sequence[Shape],
+        ids: Int64Array,
+        bodies: Sequence[Body],
+        unit_meshes: Mapping[str, Mesh],
+        centre: Float64Array,
+    ) -> None:
+        self.centre = centre
+        """What the ray tracer's coordinates are relative to [m], Shape ``[3]``."""
+        self.version = 0
+        """Counts how often anything has moved."""
+        self._bodies = tuple(bodies)
+        meshes = [mesh for shape in shapes for mesh in shape.meshes]
+        self._number_shapes(shapes, ids)
+        corners = np.array([len(mesh.vertices) for mesh in meshes])
+        before = np.cumsum(corners) - corners
+        self._corners = np.concatenate([mesh.vertices for mesh in meshes])
+        self._faces = np.concatenate([mesh.faces + b for mesh, b in zip(meshes, before, strict=True)])
+        self.names = tuple(name for shape in shapes for name in shape.names)
+        """What the indices of `object_index` stand for while no body stands for an object."""
+        self._number_planes(meshes, unit_meshes)
+        last = shapes[-1].meshes
+        self._vertices = self._corners[len(self._corners) - sum(len(mesh.vertices) for mesh in last) :]
+        self._first_moving = len(self._faces) - sum(len(mesh.faces) for mesh in last)
+        self.surfaces = Surfaces(self._corners[self._faces], self._points_outside)
+        """All triangles, in world coordinates."""
+
+    @property
+    def moving_vertices(self) -> Float64Array:
+        """Vertices of the last shape [m], Shape ``[V, 3]``; a copy."""
+        return self._vertices.copy()
+
+    def move(self, vertices: Float64Array) -> bool:
+        """Put the vertices of the last shape there [m], Shape ``[V, 3]``. Returns whether any has moved."""
+        if np.array_equal(vertices, self._vertices):
+            return False
+        self._vertices[:] = vertices
+        self.version += 1
+        self.plane_table.update(self._corners - self.centre, self._moving_plane)
+        self.surfaces.move(self._first_moving, self._corners[self._faces[self._first_moving :]])
+        return True
+
+    def planes(self, shapes: Int64Array, primitives: Int64Array) -> tuple[Float64Array, Float64Array]:
+        """A corner [m] and the normal (of any length) of triangles, each of Shape ``[..., 3]``, in float64.
+
+        Anything for no shape.
+        """
+        a, b, c = np.moveaxis(self.triangles(shapes, primitives), -2, 0)
+        return a, np.cross(b - a, c - a)
+
+    def triangles(self, shapes: Int64Array, primitives: Int64Array) -> Float64Array:
+        """The corners [m] of triangles, Shape ``[..., 3, 3]``, in float64: those of scenery as they stand in
+        its files, those of moving bodies where `place` put them last. Anything for no shape."""
+        corners: Float64Array = self._corners[self._faces[self.triangle_numbers(shapes, primitives)]]
+        return corners
+
+    def triangle_numbers(self, shapes: Int64Array, primitives: Int64Array) -> Int64Array:
+        """Number, through all shapes, of triangles of process-local shapes; anything for no shape."""
+        number = self._offsets[self._where(shapes)] + primitives
+        clipped: Int64Array = np.clip(number, 0, len(self._faces) - 1)
+        return clipped
+
+    def corners(self, triangles: Int64Array) -> Float64Array:
+        """Corners of triangles by number [m], Shape ``[..., 3, 3]``; float64."""
+        corners: Float64Array = self._corners[self._faces[triangles]]
+        return corners
+
+    def shapes_of(self, triangles: Int64Array) -> tuple[Int64Array, Int64Array]:
+        """Process-local shape of triangles by number, and their numbers within it."""
+        order = np.argsort(self._offsets)
+        where = order[np.searchsorted(self._offsets[order], triangles, side="right") - 1]
+        return self._ids[where], triangles - self._offsets[where]
+
+    def face_number(self, shapes: Int64Array, primitives: Int64Array) -> Int32Array:
+        """Number of the plane of triangles within their object, the same in every frame; anything for no
+        shape."""
+        return self._face_of[self.triangle_numbers(shapes, primitives)]
+
+    def moved_triangles(
+        self, triangles: Int64Array, before: tuple[str, ...], now: tuple[str, ...]
+    ) -> Int64Array:
+        """Numbers of the same triangles of the same objects, where `place` has given bodies to others since.
+
+        ``before`` and ``now`` are what it returned; −1 where an object has left or has another mesh.
+        """
+        if before == now:
+            return triangles
+        first = len(now) - len(self._bodies)
+        place = {name: number for number, name in enumerate(now[first:], start=first)}
+        piece = np.searchsorted(self._first_triangles, triangles, side="right") - 1
+        moved = np.arange(len(now))
+        for number, name in enumerate(before[first:], start=first):
+            there = place.get(name, -1)
+            is_same = there >= 0 and self._bodies[there - first][0] == self._bodies[number - first][0]
+            moved[number] = there if is_same else -1
+        start = self._first_triangles[moved[piece]] + triangles - self._first_triangles[piece]
+        return np.where(moved[piece] >= 0, start, -1)
+
+    def is_body(self, shapes: NDArray[np.uint32]) -> BoolArray:
+        """Whether process-local shapes are of moving bodies."""
+        body: BoolArray = shapes == self._body_id
+        return body
+
+    def object_index(self, shapes: Int64Array, primitives: Int64Array) -> Int32Array:
+        """Index into the names of `place` of triangles of process-local shapes; −1 for no shape."""
+        where = self._where(shapes)
+        piece = np.searchsorted(self._first_triangles, self._offsets[where] + primitives, side="right") - 1
+        return np.where(self._ids[where] == shapes, piece, -1).astype(np.int32)
+
+    def _number_shapes(self, shapes: Sequence[Shape], ids: Int64Array) -> None:
+        """Number the triangles of shapes and of their pieces."""
+        counts = [[len(mesh.faces) for mesh in shape.meshes] for shape in shapes]
+        totals = np.array([sum(count) for count in counts], np.int64)
+        self.offset_by_shape = np.zeros(int(ids.max(initial=0)) + 1, np.int64)
+        """Number of the first triangle of each process-local shape."""
+        self.offset_by_shape[ids] = np.cumsum(totals) - totals
+        self._body_id = int(ids[-1]) if self._bodies else -1
+        order = np.argsort(ids)
+        self._ids = ids[order]
+        self._offsets = (np.cumsum(totals) - totals)[order]
+        faces = np.concatenate([np.array(count, np.int64) for count in counts])
+        self._first_triangles = np.cumsum(faces) - faces
+
+    def _number_planes(self, meshes: Sequence[Mesh], unit_meshes: Mapping[str, Mesh]) -> None:
+        """Number the planes of these pieces; bodies, each of which is a point yet, by their unit meshes."""
+        still = len(meshes) - len(self._bodies)
+        of_asset = {asset: plane_numbers(mesh) for asset, mesh in unit_meshes.items()}
+        numbers = [plane_numbers(mesh) for mesh in meshes[:still]]
+        numbers += [of_asset[asset] for asset, _ in self._bodies]
+        self._face_of = np.concatenate(numbers)
+        counts = np.array([int(number.max(initial=-1)) + 1 for number in numbers], np.int64)
+        before = np.cumsum(counts) - counts
+        parts = np.concatenate([number + first for number, first in zip(numbers, before, strict=True)])
+        faces = self._faces.astype(np.int64)
+        apart = PlaneTable(parts.astype(np.int64), faces)
+        apart.update(self._corners - self.centre)
+        shared = shared_planes(apart, int(counts[:still].sum()))
+        self.plane_of = shared[parts]
+        """Infinite plane of each triangle, numbered through all objects."""
+        self._moving_plane = len(apart.normal) and int(shared.max()) + 1 - int(counts[still:].sum())
+        self.plane_table = PlaneTable(self.plane_of, faces)
+        self.plane_table.update(self._corners - self.centre)
+
+    def _points_outside(self, triangle: int, normal: Float64Array) -> bool:
+        """Whether a triangle's normal points away from its piece, or up from one that lies.
+
+        Scenery has faces of either sense, so their order of corners says nothing.
+        """
+        piece = int(np.searchsorted(self._first_triangles, triangle, side="right")) - 1
+        if triangle < self._first_moving and abs(normal[2]) > _LYING:
+            return bool(normal[2] > 0)
+        ends = [*self._first_triangles.tolist(), len(self._faces)]
+        corners = self._corners[self._faces[ends[piece] : ends[piece + 1]]].reshape(-1, 3)
+        middle = (corners.min(0) + corners.max(0)) / 2
+        return bool((self._corners[self._faces[triangle, 0]] - middle) @ normal >= 0)
+
+    def _where(self, shapes: Int64Array) -> Int64Array:
+        return np.minimum(np.searchsorted(self._ids, shapes), len(self._ids) - 1)
