@@ -27,6 +27,7 @@ from caviar_protocol.messages import GrantInput, Input, Report, Role, Status
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.scene import merge_scenes
 from caviar_protocol.seeding import generator
+from caviar_protocol.tables import Place
 from caviar_protocol.topics import Carrier, Scene
 
 S = TypeVar("S", bound=msgspec.Struct)
@@ -215,6 +216,13 @@ class Service(ABC, Generic[S]):
     """Whether the assets of the run are fetched for this service before `prepare` (clause 4)."""
     Settings: ClassVar[type[msgspec.Struct]]
     """Settings from the scenario: a frozen struct, ``forbid_unknown_fields=True``, units in names."""
+
+    @classmethod
+    def check_settings(cls, settings: S, place: Place) -> None:  # optional hook
+        """Raise `ScenarioError` for what is wrong with settings beyond what their types say.
+
+        Called before anything starts, where the scenario is read; ``place`` is where they stand in it.
+        """
 
     def __init__(self, settings: S, run: RunInfo) -> None:
         self.settings = settings

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 from adaptive_rungs import LADDER, MS, Time, adaptive, channel_of, frame, labels, rung
 
+from caviar_clients.sessions.checking import checked_scenario
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.errors import ScenarioError
 from caviar_services.channel.adaptive.channel import AdaptiveChannel
 from caviar_services.registry import load
 from caviar_services.service import Preparation
+
+SCENARIO = Path(__file__).parents[2] / "deploy" / "scenarios" / "adaptive.toml"
 
 
 class TestLadder:
@@ -41,6 +45,35 @@ class TestLadder:
     def test_what_is_wrong_is_named(self, settings: dict[str, Any], expected: str) -> None:
         with pytest.raises(ScenarioError, match=expected):
             adaptive(**settings)
+
+    @pytest.mark.parametrize(
+        ("right", "wrong", "told"),
+        [
+            ("samples = 10_000 ", "sampels = 10_000 ", "ladder[1].settings.sampels: unknown key 'sampels'"),
+            ("samples = 10_000 ", "samples = -1 ", "ladder[1].settings.samples: is -1, write a whole number"),
+            ('label = "1e5"', 'label = "1e5"\nuse = "sionna_rt"', "ladder[2].use: "),
+            ('label = "1e5"', 'label = "1e6"', "ladder: has 2 rungs with the label '1e6'"),
+            ("max_depth = 3", "max_depth = true", "common.max_depth: is true, write a whole number"),
+            ("max_depth = 3", "max_dpth = 3", "common.max_dpth: no rung has a setting 'max_dpth'"),
+        ],
+    )
+    def test_a_mistake_inside_the_ladder_is_named_by_line_before_anything_starts(
+        self, tmp_path: Path, right: str, wrong: str, told: str
+    ) -> None:
+        text = SCENARIO.read_text()
+        assert text.count(right) == 1
+        path = tmp_path / "adaptive.toml"
+        path.write_text(text.replace(right, wrong).replace("file:", f"file:{SCENARIO.parent}/"))
+        with pytest.raises(ScenarioError) as error:
+            checked_scenario(path)
+        assert f": services.channel.settings.{told}" in str(error.value)
+        assert error.value.file == str(path)
+        assert error.value.line is not None
+        named = path.read_text().splitlines()[error.value.line - 1]
+        stands = (
+            "[[services.channel.settings.ladder]]" if told.startswith("ladder: ") else wrong.split("\n")[-1]
+        )
+        assert stands in named
 
     def test_common_settings_go_to_the_rungs_that_have_them_and_own_ones_go_before(self) -> None:
         ladder = [

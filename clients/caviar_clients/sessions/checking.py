@@ -39,7 +39,8 @@ def checked_scenario(path: Path, frames: int | None = None, seed: int | None = N
             implementation = load(spec.role, spec.use)
         except DeclarationError as error:
             raise scenario_error(scenario, f"services.{name}.use", str(error)) from error
-        convert_settings(implementation.Settings, spec.settings, settings_place(scenario, name))
+        place = settings_place(scenario, name)
+        implementation.check_settings(convert_settings(implementation.Settings, spec.settings, place), place)
         produced.update(implementation.outputs)
     for index, entry in enumerate(scenario.run.record):
         topic = entry.partition(".")[0]

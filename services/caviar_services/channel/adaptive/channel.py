@@ -17,12 +17,13 @@ from msgspec.structs import replace
 
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.scene import antennas
+from caviar_protocol.tables import Place
 from caviar_protocol.topics import AntennaDevice, Channel, Scene
 from caviar_services.channel.adaptive.controller import Choice, Controller
 from caviar_services.channel.adaptive.cost_model import CostModel, Workload
 from caviar_services.channel.adaptive.errors_stated import StatedError, nmse_db
 from caviar_services.channel.adaptive.rehearsal import rehearsal_scene
-from caviar_services.channel.adaptive.settings import AdaptiveSettings, Rung, built, rung_of
+from caviar_services.channel.adaptive.settings import AdaptiveSettings, Rung, built, models, rung_of
 from caviar_services.channel.base import Modelled
 from caviar_services.channel.sionna_sharing import shared_scenes
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
@@ -49,6 +50,11 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
     Settings: ClassVar[type[msgspec.Struct]] = AdaptiveSettings
     clock: Callable[[], int] = staticmethod(time.perf_counter_ns)
     """Wall time [ns]."""
+
+    @classmethod
+    def check_settings(cls, settings: AdaptiveSettings, place: Place) -> None:
+        """Raise `ScenarioError` for what is wrong inside the ladder."""
+        models(settings, place)
 
     def __init__(self, settings: AdaptiveSettings, run: RunInfo) -> None:
         super().__init__(settings, run)

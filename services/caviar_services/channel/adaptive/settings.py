@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -70,6 +72,17 @@ class Rung:
 def built(settings: AdaptiveSettings, run: RunInfo) -> tuple[Rung, ...]:
     """The ladder of a scenario. Raises `ScenarioError` naming the key for whatever cannot be."""
     place = Place("services").at(run.name).at("settings")
+    return tuple(
+        Rung(label=rung.label, model=cls(own, run), expected_error_db=rung.expected_error_db)
+        for rung, (cls, own) in zip(settings.ladder, models(settings, place), strict=True)
+    )
+
+
+def models(settings: AdaptiveSettings, place: Place) -> list[tuple[type[ChannelModel[Any]], Any]]:
+    """The channel model of each rung, with its settings. Errors as those of `built`.
+
+    ``place`` is where ``settings`` stand.
+    """
     _check(settings, place)
     found = [_model(rung.use, place.at("ladder").at(index)) for index, rung in enumerate(settings.ladder)]
     known = [frozenset(cls.Settings.__struct_fields__) for cls in found]
@@ -81,14 +94,26 @@ def built(settings: AdaptiveSettings, run: RunInfo) -> tuple[Rung, ...]:
                 .at(name)
                 .error(f"no rung has a setting {name!r}; {suggestion(name, everything)}")
             )
-    rungs = []
+    made: list[tuple[type[ChannelModel[Any]], Any]] = []
     for index, (rung, cls, fields) in enumerate(zip(settings.ladder, found, known, strict=True)):
-        shared = {name: value for name, value in settings.common.items() if name in fields}
+        shared = {n: v for n, v in settings.common.items() if n in fields and n not in rung.settings}
         where = place.at("ladder").at(index).at("settings")
-        own = convert_settings(cls.Settings, {**shared, **rung.settings}, where)
-        model = cls(own, run)
-        rungs.append(Rung(label=rung.label, model=model, expected_error_db=rung.expected_error_db))
-    return tuple(rungs)
+        try:
+            own = convert_settings(cls.Settings, {**shared, **rung.settings}, where)
+        except ScenarioError as error:
+            raise _where_it_stands(error, shared, where, place.at("common")) from error
+        made.append((cls, own))
+    return made
+
+
+def _where_it_stands(
+    error: ScenarioError, shared: Mapping[str, Any], where: Place, common: Place
+) -> ScenarioError:
+    """An error about a rung's settings, which names ``common`` where the value stands there."""
+    rest = error.key.removeprefix(where.key)
+    if any(re.match(rf"\.{re.escape(name)}(?![A-Za-z0-9_-])", rest) for name in shared):
+        return Place(common.key + rest, common.source).error(error.message)
+    return error
 
 
 def _model(use: str, place: Place) -> type[ChannelModel[Any]]:
