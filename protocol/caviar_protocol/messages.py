@@ -259,7 +259,7 @@ class Fault(_Message, frozen=True, kw_only=True, tag="FAULT"):
     phase: Text
     """``prepare``, ``reset``, ``step``, ``encode``, …"""
     message: Text
-    """One line for the user."""
+    """One line for the user. ``KEY: …``, where a key of the scenario is wrong, is told with file and line."""
     detail: Text = ""
     """Traceback, for the log."""
 

@@ -15,6 +15,10 @@ from caviar_protocol.errors import ScenarioError
 
 T = TypeVar("T", bound=msgspec.Struct)
 
+_NAME = r'([A-Za-z0-9_-]+|"[^"]*")'
+_KEY = re.compile(rf"{_NAME}(\.{_NAME}|\[\d+\])*")
+"""A dotted key."""
+
 _ARRAYS = (inspect.VarTupleType, inspect.ListType, inspect.TupleType)
 
 
@@ -50,6 +54,21 @@ class Place(msgspec.Struct, frozen=True):
     def error(self, message: str) -> ScenarioError:
         """A `ScenarioError` that names this place."""
         return ScenarioError(message, self.source.file, self.key, self.source.line(self.key))
+
+
+def located(text: str, service: str, source: Source) -> str:
+    """What a service says about the scenario, ``KEY: message``, with the file and the line before it.
+
+    A key that begins with ``settings`` is one of the service's own. A text that begins with no key of the
+    file comes back as it is.
+    """
+    key, separator, message = text.partition(": ")
+    if not separator or _KEY.fullmatch(key) is None:
+        return text
+    if re.match(r"settings(?![A-Za-z0-9_-])", key):
+        key = f"{Place('services').at(service).key}.{key}"
+    place = Place(key, source)
+    return str(place.error(message)) if source.file and source.line(key) is not None else text
 
 
 def convert_settings(cls: type[T], settings: Mapping[str, Any], place: Place | None = None) -> T:

@@ -241,6 +241,15 @@ def test_an_unknown_setting_of_a_service_is_named_with_file_line_and_suggestion(
     assert_blamed(run(scenario, tmp_path / "out"), f"{scenario}:{line}", "topk", "top_k")
 
 
+@pytest.mark.parametrize("how", ["", "--embedded"])
+def test_what_only_a_service_finds_wrong_is_named_with_file_and_line(tmp_path: Path, how: str) -> None:
+    scenario = scenario_file(tmp_path, [('name = "uav"', 'name = "car"')])
+    line = 1 + scenario.read_text()[: scenario.read_text().rindex("[[services.world")].count("\n")
+    key = "services.world.settings.objects[1]: a second object is named 'car'"
+    finished = run(scenario, tmp_path / "out", *filter(None, [how]))
+    assert_blamed(finished, "world 'world'", f"{scenario}:{line}: {key}")
+
+
 def test_an_unknown_implementation_is_named_with_file_line_and_suggestion(tmp_path: Path) -> None:
     scenario = scenario_file(tmp_path, [('use = "free-space"', 'use = "freespace"')])
     line = 1 + scenario.read_text()[: scenario.read_text().index("freespace")].count("\n")

@@ -9,6 +9,7 @@ from caviar_broker.core.schedule import EpisodeSchedule
 from caviar_broker.core.tasks import GrantOrder
 from caviar_broker.core.transitions import RunEvent, RunState, ServiceEvent, ServiceState, TaskState
 from caviar_protocol.messages import Cancel, Done, EpisodeEnd, Fault, Grant, Report, Reset
+from caviar_protocol.tables import located
 
 _ACTIVE, _RUNNING = ServiceState.ACTIVE, RunState.RUNNING
 
@@ -158,7 +159,7 @@ class Episodes:
     def fault(self, event: ev.FaultReceived, now: int) -> None:
         """FAULT: fatal, unless it is in a frame that the run can do without."""
         run, peer, message = self._run, self._run.peers[event.service], event.message
-        text = f"{message.phase}: {message.message}"
+        text = f"{message.phase}: {located(message.message, peer.name, run.plan.source)}"
         if message.frame < 0:
             if not run.current(peer, message.epoch, message.attempt, "FAULT"):
                 return

@@ -9,6 +9,7 @@ from typing import Any
 from caviar_protocol.instants import instants_ns
 from caviar_protocol.messages import Policy, Role
 from caviar_protocol.scenario import REMOTE_REJOIN_S, Scenario
+from caviar_protocol.tables import Source
 
 SECOND = 1_000_000_000
 """[ns]"""
@@ -69,6 +70,8 @@ class RunPlan:
     epoch: int = 1
     ephemeral: bool = False
     """Whether nothing is kept of the run: no journal, digest or latencies. An embedded run without files."""
+    source: Source = Source()
+    """Where the scenario was read from, to name the lines of what services find wrong in it."""
     imposed: Mapping[tuple[str, int, int], Mapping[str, str]] = field(default_factory=dict)
     """Decisions imposed in a replay, by (service, episode, frame) (clause 6)."""
 
@@ -107,6 +110,7 @@ def plan_run(scenario: Scenario, run: str, told: Mapping[str, Mapping[str, Any]]
         seed=scenario.run.seed,
         realtime=scenario.run.pace == "realtime",
         record=scenario.run.record,
+        source=scenario.source,
         frames_in_flight=scenario.run.frames_in_flight,
         limits=Limits(
             connect=round(t.connect_s * SECOND),

@@ -123,7 +123,8 @@ def itu_material(
     table: Mapping[tuple[float, float], tuple[float, ...]] | None = ITU_MATERIALS_PROPERTIES.get(itu_type)
     if table is None:
         raise ScenarioError(
-            f"there is no ITU material {itu_type!r}; known: {', '.join(sorted(ITU_MATERIALS_PROPERTIES))}"
+            f"there is no ITU material {itu_type!r}; known: {', '.join(sorted(ITU_MATERIALS_PROPERTIES))}",
+            key=f"{policy.key}.{name}" if remedy else f"{policy.key}.materials.{name}",
         )
     gigahertz = frequency_hz / 1e9
     taken = next((r for r in table if r[0] <= gigahertz <= r[1]), None)
@@ -185,13 +186,16 @@ def set_materials(scene: Any, frequency_hz: float, policy: MaterialPolicy) -> No
     unknown = sorted(policy.changes.keys() - materials.keys())
     if unknown:
         raise ScenarioError(
-            f"the scenery has no material {unknown[0]!r}; it has: {', '.join(sorted(materials))}"
+            f"the scenery has no material {unknown[0]!r}; it has: {', '.join(sorted(materials))}",
+            key=f"{policy.key}.materials.{unknown[0]}",
         )
     for name, material in materials.items():
         try:
             _set_material(name, material, frequency_hz, policy)
         except ValueError as error:
-            raise ScenarioError(f"material {name!r}: {error}; correct settings.materials.{name}") from error
+            raise ScenarioError(
+                f"material {name!r}: {error}; correct it", key=f"{policy.key}.materials.{name}"
+            ) from error
     scene.frequency = frequency_hz
 
 
