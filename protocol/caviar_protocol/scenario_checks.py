@@ -15,6 +15,9 @@ from caviar_protocol.tables import Place, convert_table, suggestion
 from caviar_protocol.topics import PARTS, PAYLOADS
 
 _STRICT_ROLES = ("world", "recorder")
+BEAM = "beam:"
+"""Prefix of the actuators that steer beams; the receiver's name follows. Users may be written without."""
+
 _KIND_KEYS = {
     "antenna": ("role", "array", "power_dbm"),
     "lidar": ("beams", "azimuth_steps", "elevation_deg", "range_m"),
@@ -47,6 +50,7 @@ def check_scenario(scenario: Scenario) -> None:
         _check_device(device, root.at("devices").at(index))
         world_of(scenario, index)
     _check_antennas(scenario, root.at("devices"))
+    _check_users(scenario, root.at("services"))
 
 
 def refuse_remote(scenario: Scenario) -> None:
@@ -274,6 +278,24 @@ def _check_antennas(scenario: Scenario, place: Place) -> None:
         return
     lacking = ({"tx", "rx"} - roles).pop()
     raise place.error(f'no antenna has role = "{lacking}", so the channel has no path; add one')
+
+
+def _check_users(scenario: Scenario, place: Place) -> None:
+    """Users that an agent owns are receivers of the scenario; remote worlds may bring others."""
+    if any(service.role == "world" and service.remote for service in scenario.services.values()):
+        return
+    there = [
+        f"{device.on}/{device.name}" if device.on else device.name
+        for device in scenario.devices
+        if device.kind == "antenna" and device.role in ("rx", "both")
+    ]
+    for name, service in scenario.services.items():
+        for index, text in enumerate(service.users):
+            pattern = text.removeprefix(BEAM)
+            if ":" in pattern or any(patterns_overlap(receiver, pattern) for receiver in there):
+                continue  # another actuator (``motion:uav``), or somebody
+            known = f"there are: {', '.join(there)}" if there else 'no antenna has role = "rx"'
+            raise place.at(name).at("users").at(index).error(f"no receiver is named {pattern!r}; {known}")
 
 
 def _check_ascending(

@@ -256,6 +256,17 @@ def test_an_unknown_implementation_is_named_with_file_line_and_suggestion(tmp_pa
     assert_blamed(run(scenario, tmp_path / "out"), f"{scenario}:{line}", "freespace", "'free-space'")
 
 
+def test_an_agent_that_served_nobody_is_warned_of_when_the_run_is_over(tmp_path: Path) -> None:
+    """Before that, somebody might still have come."""
+    users = ('use = "los-beam"', 'use = "los-beam"\nusers = ["car-9/rx"]')
+    scenario = scenario_file(tmp_path, [users, ('on = "car"', 'on = "car*"')])
+    finished = run(scenario, tmp_path / "out", "--embedded", "--frames", "3")
+    assert finished.status == 0, finished.output
+    (warning,) = json.loads((finished.directory / "summary.json").read_text())["warnings"]
+    assert warning.startswith("agent had nobody to serve in any frame")
+    assert "warning: agent had nobody" in finished.output
+
+
 def test_two_worlds_with_the_same_names_are_refused(tmp_path: Path) -> None:
     scenario = scenario_file(
         tmp_path,

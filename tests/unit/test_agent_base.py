@@ -149,6 +149,11 @@ def test_registered_agents_hear_scene_and_last_link_and_say_action(name: str) ->
     assert cls.outputs == ("action",)
 
 
+@pytest.mark.parametrize(("users", "counts"), [(("*",), {}), (("nobody",), {"frames-without-users": 1})])
+def test_a_frame_without_users_is_counted(users: tuple[str, ...], counts: dict[str, int]) -> None:
+    assert agent(users).step(frame_of(given("scene", SCENE))).counts == counts
+
+
 def test_an_action_without_users_is_an_action() -> None:
     """The link then knows that nobody is served by choice, not by absence."""
     assert encode_payload(action(agent(())))[1] == b""

@@ -181,7 +181,7 @@ class TestPreparing:
             prepared(scenery(tmp_path, "brick"), materials={"skim": {"thickness_m": 0.2}})
 
     def test_a_bad_value_of_a_material_is_named(self, tmp_path: Path) -> None:
-        with pytest.raises(ScenarioError, match=r"'skin'.*settings\.materials\.skin"):
+        with pytest.raises(ScenarioError, match=r"settings\.materials\.skin: material 'skin': "):
             prepared(scenery(tmp_path, "brick"), materials={"skin": {"scattering_coefficient": 2.0}})
 
     def test_an_unknown_body_material_is_named(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import msgspec
@@ -177,3 +178,49 @@ def test_users_are_matched_by_pattern() -> None:
     assert owned_by(["truck", "car.*"], "car.7/antenna")
     assert not owned_by(["car.?"], "car.17")
     assert not owned_by([], "car.1")
+
+
+SMOKE = Path(__file__).parents[2] / "deploy" / "scenarios" / "smoke.toml"
+
+
+def smoke_with(users: str, *changes: tuple[str, str]) -> str:
+    """The smoke scenario, whose receivers are car/rx and uav/rx-uav, with these users of its agent."""
+    text = SMOKE.read_text()
+    for old, new in (('use = "los-beam"', f'use = "los-beam"\nusers = {users}'), *changes):
+        assert old in text
+        text = text.replace(old, new)
+    return text
+
+
+@pytest.mark.parametrize("wrong", ["cra/rx", "car", "beam:uav/rx", "uav/rx?", "UAV/*"])
+def test_users_that_no_receiver_can_be_are_named_with_their_line(wrong: str) -> None:
+    text = smoke_with(f'["car/*", "{wrong}"]')
+    with pytest.raises(ScenarioError) as error:
+        parse_scenario(text, "smoke.toml")
+    line = 1 + text[: text.index("users = ")].count("\n")
+    assert str(error.value) == (
+        f"smoke.toml:{line}: services.agent.users[1]: no receiver is named {wrong.removeprefix('beam:')!r}; "
+        "there are: car/rx, uav/rx-uav"
+    )
+
+
+@pytest.mark.parametrize(
+    ("users", "changes"),
+    [
+        ('["car/rx", "beam:uav/*"]', ()),
+        ('["*", "motion:uav", "schedule:bs"]', ()),
+        ('["car-1?/rx"]', (('on = "car"', 'on = "car*"'),)),
+        ('["elsewhere/rx"]', (('use = "trajectory"', 'use = "remote"'),)),
+    ],
+)
+def test_users_that_may_come_are_waited_for(users: str, changes: tuple[tuple[str, str], ...]) -> None:
+    """Also those of a remote world, which may publish devices of its own."""
+    assert parse_scenario(smoke_with(users, *changes)).services["agent"].users
+
+
+def test_an_agent_without_any_receiver_is_told_so() -> None:
+    antenna = '[[devices]]\nname = "only"\nkind = "antenna"\nrole = "tx"\n'
+    text = smoke_with('["car/rx"]', ('use = "free-space"\nbudget_ms = 20', 'use = "lidar"\nbudget_ms = 20'))
+    text = text[: text.index("[[devices]]")].replace('role = "channel"', 'role = "sensors"') + antenna
+    with pytest.raises(ScenarioError, match="no receiver is named 'car/rx'; no antenna has role = \"rx\""):
+        parse_scenario(text)

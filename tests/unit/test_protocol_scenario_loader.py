@@ -57,7 +57,7 @@ samples = 1e5
 role = "agent"
 use = "los-beam"
 budget_ms = 5
-users = ["car.*"]
+users = ["bs"]
 
 [services.recorder]
 role = "recorder"

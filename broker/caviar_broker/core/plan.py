@@ -70,7 +70,7 @@ class RunPlan:
     epoch: int = 1
     ephemeral: bool = False
     """Whether nothing is kept of the run: no journal, digest or latencies. An embedded run without files."""
-    source: Source = Source()
+    source: Source = field(default_factory=Source)
     """Where the scenario was read from, to name the lines of what services find wrong in it."""
     imposed: Mapping[tuple[str, int, int], Mapping[str, str]] = field(default_factory=dict)
     """Decisions imposed in a replay, by (service, episode, frame) (clause 6)."""

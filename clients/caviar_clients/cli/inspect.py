@@ -13,6 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from caviar_clients.cli.decided import Decided, Decisions, decided_lines
+from caviar_clients.cli.unserved import Unserved
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.messages import Status
@@ -66,6 +67,8 @@ class RunSummary(msgspec.Struct, kw_only=True):
     sources: list[SourceSummary]
     link: LinkSummary | None
     decided: list[Decided]
+    warnings: list[str]
+    """What the user probably did not mean."""
     versions: dict[str, str]
     machine: dict[str, str]
     notes: tuple[str, ...]
@@ -85,11 +88,12 @@ def summarise(recording: Recording) -> RunSummary:
     """The summary of a recording. Damaged frames are listed and count as if they had no products."""
     metadata, damage = recording.metadata, []
     sources: dict[tuple[str, str], SourceSummary] = {}
-    totals, decisions = _LinkTotals(), Decisions()
+    totals, decisions, unserved = _LinkTotals(), Decisions(), Unserved()
     episodes: dict[int, int] = {}  # to the last instant [ns]
     for frame in recording.frames():
         episodes[frame.episode] = max(frame.t_ns, episodes.get(frame.episode, 0))
         decisions.add(frame.episode, frame.reports)
+        unserved.add(frame.reports)
         for entry in frame.inputs:
             key = (entry.topic, entry.source)
             source = sources.setdefault(key, SourceSummary(topic=entry.topic, source=entry.source))
@@ -113,6 +117,7 @@ def summarise(recording: Recording) -> RunSummary:
         sources=[sources[key] for key in sorted(sources)],
         link=totals.summary(),
         decided=decisions.summary(),
+        warnings=unserved.warnings(),
         versions=metadata.versions,
         machine=metadata.machine,
         notes=metadata.notes,
@@ -217,6 +222,8 @@ def _facts(summary: RunSummary) -> Table:
         table.add_row("no path", f"{link.no_path_share:.2%} of {_count(link.users, 'user')} over all frames")
     for line in decided_lines(summary.decided):
         table.add_row("decided", escape(line))
+    for line in summary.warnings:
+        table.add_row("warning", escape(line), style="yellow")
     machine = summary.machine
     table.add_row("machine", escape(", ".join(f"{key} {value}" for key, value in sorted(machine.items()))))
     table.add_row("versions", escape(", ".join(f"{k} {v}" for k, v in summary.versions.items())))

@@ -46,6 +46,7 @@ def summary_of(
         "mean_abs_y_baseline": figures.mean_abs_y_baseline if figures else None,
         "no_path_share": figures.no_path_share if figures else None,
         "decided": msgspec.to_builtins(recorded.decided) if recorded else [],
+        "warnings": recorded.warnings if recorded else [],
     }
 
 
@@ -78,4 +79,5 @@ def _caption(summary: Mapping[str, Any]) -> str:
     if summary["no_path_share"]:
         parts.append(f"{summary['no_path_share']:.1%} of users without a path")
     parts += decided_lines(msgspec.convert(summary["decided"], list[Decided]))
+    parts += [f"warning: {warning}" for warning in summary["warnings"]]
     return "\n".join(parts)

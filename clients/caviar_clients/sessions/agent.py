@@ -8,10 +8,8 @@ from typing import ClassVar
 import msgspec
 
 from caviar_protocol.messages import Input, Role
+from caviar_protocol.scenario_checks import BEAM
 from caviar_services.service import Frame, Preparation, Prepared, Service, StepResult
-
-BEAM = "beam:"
-"""Prefix of the actuators that steer beams."""
 
 PATIENCE_S = 600.0
 """[s] that a run waits for a decision before it blames the agent: learning takes time, and so does looking

@@ -15,14 +15,15 @@ import msgspec
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.pairs import Pair, pairs_of
+from caviar_protocol.scenario_checks import BEAM
 from caviar_protocol.topics import Action, BeamChoice, Scene
 from caviar_protocol.topics.action import Command
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
 
-BEAM = "beam:"
-"""Prefix of the actuators that steer beams; the receiver's name follows."""
-
 _OTHER_ACTUATORS = ("motion:", "schedule:")
+
+WITHOUT_USERS = "frames-without-users"
+"""Count of the frames in which an agent had nobody to serve."""
 
 
 class AgentSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -89,7 +90,9 @@ class Agent(Service[S]):
         pairs = [pair for pair in pairs_of(scene) if self.serves(pair.rx.name)]
         choices = sorted(self.choose(frame, scene, pairs), key=lambda c: (c.rx, c.tx, c.carrier))
         commands = (*choices, *self.other_commands(frame, scene))
-        return StepResult(products={"action": Action(commands=commands)})
+        return StepResult(
+            products={"action": Action(commands=commands)}, counts={} if pairs else {WITHOUT_USERS: 1}
+        )
 
     def serves(self, rx: str) -> bool:
         """Whether this agent serves the receiver of that name."""

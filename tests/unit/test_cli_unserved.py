@@ -1,0 +1,21 @@
+"""What a summary says about agents that served nobody."""
+
+from __future__ import annotations
+
+from caviar_clients.cli.unserved import Unserved
+from caviar_protocol.messages import Report
+
+
+def report(source: str, count: int = 1) -> Report:
+    return Report(source=source, counts={"frames-without-users": count})
+
+
+def test_only_an_agent_without_users_in_every_frame_is_warned_of() -> None:
+    unserved = Unserved()
+    unserved.add([report("pilot"), report("tower"), Report(source="link", counts={"users-without-path": 1})])
+    unserved.add([report("tower"), report("link", 0)])
+    assert [line.partition(" ")[0] for line in unserved.warnings()] == ["tower"]
+
+
+def test_a_recording_without_frames_warns_of_nobody() -> None:
+    assert Unserved().warnings() == []
