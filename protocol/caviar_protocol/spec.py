@@ -31,6 +31,7 @@ SINCE: dict[str, str] = {
     "Reset.seed_episode": "1.1",
     "ChannelOptions.materials_outside": "1.1",
     "ChannelOptions.absorption_db_per_km": "1.1",
+    "ChannelOptions.detail": "1.1",
 }
 """Minor version that brought a field (``Grant.reports``) or a class (``Grant``); 1.0 unless said here."""
 

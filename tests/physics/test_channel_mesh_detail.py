@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 import pytest
 from channel_lab import Plate, antenna, carriers, measure, scene, sionna, write_scenery
+from msgspec.structs import replace
 from same_paths import digest
 
 from caviar_protocol.errors import ScenarioError
@@ -47,7 +48,9 @@ def test_what_is_left_out_is_as_if_it_had_never_been(tmp_path: Path) -> None:
     sign's material is not even needed at 95 GHz, where it is not defined."""
     detail = {"smallest_m": 4.0, "centre_m": (0.0, 9.0), "radius_m": 60.0}
     left = traced(tmp_path / "all", [GROUND, WALL, SIGN, FAR], 95e9, detail=detail)
-    assert digest(left) == digest(traced(tmp_path / "some", [GROUND, WALL], 95e9))
+    assert left.options.detail == f"4 of 8 triangles, {32895 / (32895 + 7.5 + 4800):.1%} of the area"
+    untold = replace(left, options=replace(left.options, detail=""))
+    assert digest(untold) == digest(traced(tmp_path / "some", [GROUND, WALL], 95e9))
     whole = traced(tmp_path / "all", [GROUND, WALL, SIGN, FAR], 28e9)
     assert {"sign", "far"} <= set(whole.object_names)
     assert len(whole.tau) > len(left.tau)
@@ -61,11 +64,15 @@ def prepared(folder: Path, **detail: Any) -> tuple[str, ...]:
 
 def test_the_effect_is_a_note(tmp_path: Path) -> None:
     note = (
-        "mesh detail: 2 of 4 triangles with 98.5% of the area; of 2 pieces 1 are left out as small "
-        "and 0 as far"
+        "mesh detail: 2 of 4 triangles, 98.5% of the area; of 2 pieces 1 are left out as small and 0 as far"
     )
     assert note in prepared(tmp_path, smallest_m=4.0)
-    assert not any("mesh detail" in note for note in prepared(tmp_path))
+    assert not any("detail" in note for note in prepared(tmp_path))
+
+
+def test_a_detail_that_changes_nothing_is_told_to_be_off(tmp_path: Path) -> None:
+    assert any(note.startswith("detail is switched off: ") for note in prepared(tmp_path, smallest_m=1.0))
+    assert traced(tmp_path, [WALL, SIGN], detail={"smallest_m": 1.0}).options.detail == ""
 
 
 def test_a_detail_that_leaves_nothing_is_refused(tmp_path: Path) -> None:

@@ -96,7 +96,7 @@ def test_the_note_says_what_is_gone() -> None:
     # Two faces of 12·10, 12·12 and 10·12 m² of the house; the shed's 16 and the tower's 4,800 m² are gone.
     share = 768 / (768 + 16 + 4800)
     assert effect.note == (
-        f"mesh detail: 12 of 36 triangles with {share:.1%} of the area; "
+        f"mesh detail: 12 of 36 triangles, {share:.1%} of the area; "
         "of 3 pieces 1 are left out as small and 1 as far"
     )
 

@@ -62,6 +62,8 @@ class ChannelOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=Tr
         Annotated[float, quantity("dB/km", "specific attenuation by the air", ge=0)], ...
     ] = ()
     """By the air (ITU-R P.676), for each carrier; empty: none."""
+    detail: str = ""
+    """What is left of the scenery, as ``312 of 1240 triangles, 91.2% of the area``; empty: all of it."""
 
 
 class ChannelMatrix(Payload, frozen=True, kw_only=True, omit_defaults=True):

@@ -65,12 +65,19 @@ class DetailEffect:
     """Part of the surface's area [m²] that is left."""
 
     @property
+    def brief(self) -> str:
+        """For products: what is left, empty for all of it."""
+        before, after = self.triangles
+        return f"{after} of {before} triangles, {self.area_share:.1%} of the area" if after < before else ""
+
+    @property
     def note(self) -> str:
         """For the user, in one line."""
-        before, after = self.triangles
+        if not self.brief:
+            return "detail is switched off: no piece of the scenery is small or far, and no triangle is spare"
         return (
-            f"mesh detail: {after} of {before} triangles with {self.area_share:.1%} of the area; of "
-            f"{self.pieces} pieces {self.small} are left out as small and {self.far} as far"
+            f"mesh detail: {self.brief}; of {self.pieces} pieces {self.small} are left out as small and "
+            f"{self.far} as far"
         )
 
 

@@ -154,6 +154,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         """Traces diffuse paths where they have a launch of their own."""
         self._followed: dict[str, Followed] = {}
         self._outside: tuple[OutsideUse, ...] = ()
+        self._detail = ""
         seed = settings.launch_seed
         self._asked = LaunchOptions(
             max_depth=settings.max_depth,
@@ -179,6 +180,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
             max_depth=launched.max_depth,
             samples=launched.samples,
             materials_outside=tuple(use.brief(self.run.carriers[use.carrier].name) for use in self._outside),
+            detail=self._detail,
         )
 
     def load(self, preparation: Preparation) -> tuple[str, ...]:
@@ -206,6 +208,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         notes += tuple(use.note(self.run.carriers[use.carrier].name) for use in self._outside)
         if self._scene.detail_effect is not None:
             notes += (self._scene.detail_effect.note,)
+            self._detail = self._scene.detail_effect.brief
         self._launched, switched = contributing(self._asked, self._scene.used_surfaces(), frequencies)
         self._wavelengths = SPEED_OF_LIGHT / np.array(frequencies)
         launched, samples = self._launched, self.settings.scattering_samples
