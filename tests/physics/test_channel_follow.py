@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -19,6 +20,8 @@ from caviar_services.service import Frame, FrameInput
 
 CANYON = "simple_street_canyon_with_cars"
 SAMPLES = 40_000
+
+Channels = Callable[[int | None], ChannelModel[Any]]
 
 
 def street(frame: int, cars: int = 6, leaving: int = 0) -> Scene:
@@ -45,6 +48,20 @@ def stepped(channel: ChannelModel[Any], number: int, what: Scene, previous: int 
     return product
 
 
+@pytest.fixture(scope="module")
+def channels() -> Channels:
+    """Channels of the canyon by ``follow``, made once; each is at the beginning of an episode."""
+    made: dict[int | None, ChannelModel[Any]] = {}
+
+    def channel(follow: int | None) -> ChannelModel[Any]:
+        if follow not in made:
+            made[follow] = model(CANYON, follow=follow, samples=SAMPLES)
+        made[follow].reset(0, 0, 0)
+        return made[follow]
+
+    return channel
+
+
 def share_found(followed: Channel, anew: Channel) -> float:
     """Share of the power of paths found anew, those of reflections, that following has too."""
     power = np.abs(anew.a[0]) ** 2 * (anew.interactions != 0).any(1)
@@ -55,9 +72,9 @@ def share_found(followed: Channel, anew: Channel) -> float:
     return float((power * hit).sum() / power.sum())
 
 
-def test_followed_paths_are_those_that_all_rays_find_and_where_they_are_now() -> None:
+def test_followed_paths_are_those_that_all_rays_find_and_where_they_are_now(channels: Channels) -> None:
     """Cars drive by; what both have agrees bit by bit in delay and amplitude."""
-    followed, anew = model(CANYON, follow=5, samples=SAMPLES), model(CANYON, samples=SAMPLES)
+    followed, anew = channels(5), channels(None)
     shares = []
     for frame in range(12):
         known, all_rays = stepped(followed, frame, street(frame)), stepped(anew, frame, street(frame))
@@ -77,9 +94,9 @@ def test_followed_paths_are_those_that_all_rays_find_and_where_they_are_now() ->
     assert np.percentile(shares, 5) > 0.99
 
 
-def test_chains_follow_their_objects_to_other_bodies() -> None:
+def test_chains_follow_their_objects_to_other_bodies(channels: Channels) -> None:
     """Two cars leave, so that the others are given their bodies: paths off them go on."""
-    followed, anew = model(CANYON, follow=50, samples=SAMPLES), model(CANYON, samples=SAMPLES)
+    followed, anew = channels(50), channels(None)
     for frame in range(2):
         stepped(followed, frame, street(frame))
     known, all_rays = stepped(followed, 2, street(2, leaving=2)), stepped(anew, 2, street(2, leaving=2))
@@ -89,8 +106,8 @@ def test_chains_follow_their_objects_to_other_bodies() -> None:
     assert share_found(known, all_rays) > 0.99
 
 
-def test_a_transmitter_that_jumps_is_looked_for_anew() -> None:
-    followed, anew = model(CANYON, follow=50, samples=SAMPLES), model(CANYON, samples=SAMPLES)
+def test_a_transmitter_that_jumps_is_looked_for_anew(channels: Channels) -> None:
+    followed, anew = channels(50), channels(None)
     stepped(followed, 0, street(0))
     devices = tuple(
         msgspec.structs.replace(d, position=(30.0, -4.0, 9.0)) if d.name == "bs" else d
@@ -100,8 +117,8 @@ def test_a_transmitter_that_jumps_is_looked_for_anew() -> None:
     assert share_found(stepped(followed, 1, jumped), stepped(anew, 1, jumped)) == 1.0
 
 
-def test_an_episode_begins_without_what_the_one_before_knew() -> None:
-    channel = model(CANYON, follow=5, samples=SAMPLES)
+def test_an_episode_begins_without_what_the_one_before_knew(channels: Channels) -> None:
+    channel = channels(5)
     first = [stepped(channel, frame, street(frame)) for frame in range(3)]
     channel.reset(1, 0, 0)
     again = [stepped(channel, frame, street(frame)) for frame in range(3)]
@@ -109,9 +126,11 @@ def test_an_episode_begins_without_what_the_one_before_knew() -> None:
         assert one == other
 
 
-def test_an_episode_begins_with_a_launch_also_where_nothing_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_episode_begins_with_a_launch_also_where_nothing_moves(
+    channels: Channels, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """All rays of the first launch: else it would begin with what the episode before had found in time."""
-    channel = model(CANYON, follow=5, samples=SAMPLES)
+    channel = channels(5)
     launched: list[Any] = []
     launcher = channel._tracer._launcher  # type: ignore[attr-defined]  # counted on its way
     monkeypatch.setattr(
@@ -126,8 +145,8 @@ def test_an_episode_begins_with_a_launch_also_where_nothing_moves(monkeypatch: p
     assert launched == [(None, 0), (None, 0)]
 
 
-def test_who_was_started_again_within_an_episode_says_that_it_knows_nothing() -> None:
-    channel = model(CANYON, follow=5, samples=SAMPLES)
+def test_who_was_started_again_within_an_episode_says_that_it_knows_nothing(channels: Channels) -> None:
+    channel = channels(5)
     with pytest.raises(PayloadError, match=r"started again in frame 7.*without its setting `follow`"):
         stepped(channel, 7, street(7), previous=-1)
 
@@ -139,10 +158,11 @@ def test_what_cannot_be_followed_is_refused(option: str) -> None:
 
 
 def test_where_nothing_moves_but_receivers_the_rays_are_launched_once(
+    channels: Channels,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Bit by bit what a new channel computes, and receivers that stand still are not traced again."""
-    channel = model(CANYON, samples=SAMPLES)
+    channel = channels(None)
     launched: list[int] = []
     launcher = channel._tracer._launcher  # type: ignore[attr-defined]  # counted on its way
     monkeypatch.setattr(channel._tracer, "_launcher", lambda *a: launched.append(1) or launcher(*a))  # type: ignore[attr-defined]

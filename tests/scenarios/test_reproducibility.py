@@ -30,42 +30,56 @@ def recomputed(directory: Path) -> tuple[int, str]:
     return done.status, found[0] if found else ""
 
 
-def test_two_runs_with_one_seed_have_equal_digests_recomputed_from_the_recordings(tmp_path: Path) -> None:
-    """The random agent is the one whose choices would differ first."""
-    scenario = scenario_file(tmp_path, [('use = "los-beam"', 'use = "random"')])
-    runs = [run(scenario, tmp_path / name) for name in ("a", "b")]
+RANDOM = ('use = "los-beam"', 'use = "random"')
+"""The random agent is the one whose choices would differ first."""
+
+
+@pytest.fixture(scope="module")
+def random_run(tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    """The smoke scenario with the random agent and its own seed."""
+    folder = tmp_path_factory.mktemp("random")
+    return run(scenario_file(folder, [RANDOM]), folder / "out")
+
+
+@pytest.fixture(scope="module")
+def smoke(tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    """The smoke scenario as it is shipped."""
+    folder = tmp_path_factory.mktemp("smoke")
+    return run(scenario_file(folder), folder / "out")
+
+
+def test_two_runs_with_one_seed_have_equal_digests_recomputed_from_the_recordings(
+    random_run: Finished, tmp_path: Path
+) -> None:
+    runs = [random_run, run(scenario_file(tmp_path, [RANDOM]), tmp_path / "again")]
     digests = {digest_of(finished) for finished in runs}
     assert len(digests) == 1
     assert [recomputed(finished.directory) for finished in runs] == [(0, *digests)] * 2
 
 
-def test_another_seed_gives_another_digest(tmp_path: Path) -> None:
-    scenario = scenario_file(tmp_path, [('use = "los-beam"', 'use = "random"')])
-    first = run(scenario, tmp_path / "a")
-    second = run(scenario, tmp_path / "b", "--seed", "2")
-    assert digest_of(first) != digest_of(second)
+def test_another_seed_gives_another_digest(random_run: Finished, tmp_path: Path) -> None:
+    second = run(scenario_file(tmp_path, [RANDOM]), tmp_path / "b", "--seed", "2")
+    assert digest_of(random_run) != digest_of(second)
 
 
-def test_overlapping_frames_do_not_change_the_digest(tmp_path: Path) -> None:
-    overlapping = run(scenario_file(tmp_path), tmp_path / "a")
+def test_overlapping_frames_do_not_change_the_digest(smoke: Finished, tmp_path: Path) -> None:
     one_by_one = scenario_file(tmp_path, [("frames = 100\n", "frames = 100\nframes_in_flight = 1\n")])
-    assert digest_of(overlapping) == digest_of(run(one_by_one, tmp_path / "b"))
+    assert digest_of(smoke) == digest_of(run(one_by_one, tmp_path / "b"))
 
 
-def test_one_changed_payload_byte_gives_another_digest(tmp_path: Path) -> None:
+def test_one_changed_payload_byte_gives_another_digest(smoke: Finished, tmp_path: Path) -> None:
     """The byte is in the middle of the recorded link product of a frame in the middle of the run."""
-    finished = run(scenario_file(tmp_path), tmp_path / "a")
-    product = next(iter(p for f, p in Recording(finished.directory).of("link") if f.number == 50))
+    product = next(iter(p for f, p in Recording(smoke.directory).of("link") if f.number == 50))
     needle = bytes(product.header) + bytes(product.body)
     damaged = tmp_path / "damaged"
-    shutil.copytree(finished.directory, damaged)
+    shutil.copytree(smoke.directory, damaged)
     (segment,) = damaged.glob("*.mcap")
     data = bytearray(segment.read_bytes())
     at = data.index(needle) + len(needle) // 2
     data[at] ^= 0x01
     segment.write_bytes(data)
     status, digest = recomputed(damaged)
-    assert digest != digest_of(finished)
+    assert digest != digest_of(smoke)
     assert digest
     assert status != 0
 
