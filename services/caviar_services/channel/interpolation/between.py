@@ -12,7 +12,7 @@ from caviar_protocol.errors import PayloadError
 from caviar_protocol.topics import Channel, ChannelMatrix, Scene
 from caviar_services.antenna import element_positions, steering_vector
 from caviar_services.channel.assemble import Antenna
-from caviar_services.channel.interpolation.course import Course, Courses, first_order
+from caviar_services.channel.interpolation.course import Course, Courses
 from caviar_services.channel.interpolation.joined import Joined, carrier_phase, join
 from caviar_services.channel.interpolation.motion import Places, ends_of, places, velocities
 
@@ -90,6 +90,8 @@ class Interpolation:
 
     def at(self, t_s: float, scene: Scene | None = None, with_h: bool = False) -> Between:
         """The channel at a time [s] between both keyframes.
+
+        Points of paths are on the straight line between those at both keyframes.
 
         ``scene`` is that of the instant, where it is known: with the keyframes' own it tells how ends and
         objects moved, whatever their acceleration; and matrices need the antennas in it.
@@ -184,8 +186,8 @@ class Interpolation:
         """Doppler shift over carrier frequency, Shape ``[K]``."""
         if now is None or scene is None:
             return -course.rate / SPEED_OF_LIGHT
-        rate = first_order(now, self._points(s), velocities(scene, self._joined), self._joined)
-        return -rate / SPEED_OF_LIGHT
+        moves = velocities(scene, self._joined)
+        return -self._by_places.rates(course, now, moves, self._points(s)) / SPEED_OF_LIGHT
 
     def _points(self, s: float) -> Float64Array:
         return (1 - s) * self._joined.ends[0].points + s * self._joined.ends[1].points

@@ -93,6 +93,12 @@ class Courses:
         error = course.length_error + ROUNDING_M
         return replace(course, length=np.maximum(course.length, 0.0), length_error=error)
 
+    def rates(self, course: Course, now: Places, moves: Places, points: Float64Array) -> Float64Array:
+        """Change of the lengths [m/s] with the velocities ``moves``, where positions are known."""
+        to_end, _ = image_moves(moves, self._normals)
+        of_images = (course.departure * to_end).sum(-1)
+        return np.where(self._specular, of_images, first_order(now, points, moves, self._joined))
+
     def _rates(self) -> list[Float64Array]:
         """Change of the lengths at both keyframes [m/s]: of uniform motion from one to the other where
         positions are known, else by the Doppler shifts (τ' = −f_D/f)."""
@@ -123,13 +129,20 @@ class Courses:
         if self._at_ends is None:
             return np.zeros(len(self._kept))
         before, after = self._at_ends
-        self._normals = [
-            normals(corners(place, end.points, self._joined), self._joined)
-            for place, end in zip(self._at_ends, self._joined.ends, strict=True)
-        ]
-        to_end, _ = image_moves(after - before, self._normals[0])
+        points = self._joined.ends[0].points
+        self._normals = normals(corners(before, points, self._joined), self._joined)
+        for_born = normals(corners(after, points, self._joined), self._joined)
+        self._normals = np.where(self._joined.before[:, None, None], self._normals, for_born)
+        to_end, _ = image_moves(after - before, self._normals)
         off: Float64Array = np.linalg.norm(self._to_end[0] + to_end - self._to_end[1], axis=-1)
-        return np.where(self._specular & self._kept, off, 0.0)
+        off = np.where(self._specular & self._kept, off, 0.0)
+        # What is true of one path off an object may hold for another that shows it at neither keyframe.
+        of_object = np.zeros(len(self._joined.object_names) + 1)
+        for objects in self._joined.objects.T:
+            np.maximum.at(of_object, objects, off)
+        of_object[-1] = 0.0
+        worst: Float64Array = np.maximum(off, of_object[self._joined.objects].max(1, initial=0.0))
+        return worst
 
     def _known(self, s: float, now: Places, at_ends: tuple[Places, Places]) -> Course:
         """From where ends and objects are."""
@@ -144,15 +157,12 @@ class Courses:
         share = np.where(self._kept, s, origin)
         base = _between(before, after, share)
         moved = now - base
-        to_end, to_start = image_moves(moved, self._normals[0])
+        to_end, to_start = image_moves(moved, self._normals)
         straight = Course.of(_line(self._to_end, share) + to_end, _line(self._to_start, share) + to_start)
-        # A mirror that turns takes an image along an arc; its rise over the chord is of second order.
-        rise = np.minimum(self._mismatch, self._mismatch**2 / self._shortest)
-        bump = np.where(self._kept, 4 * s * (1 - s), 1.0)
+        # Mirrors that turn, and facets that count as one plane but lie beside it: a path may change from
+        # one to the next at any time.
         exact = replace(
-            straight,
-            length_error=bump * rise,
-            direction_error=bump * self._mismatch / self._shortest,
+            straight, length_error=self._mismatch, direction_error=self._mismatch / self._shortest
         )
         return _either(self._specular, exact, self._bent(s, now - uniform, uniform, share))
 
@@ -232,7 +242,8 @@ def _between(before: Places, after: Places, share: Float64Array) -> Places:
 
 
 def _line(vectors: list[Float64Array], share: Float64Array) -> Float64Array:
-    return (1 - share)[:, None] * vectors[0] + share[:, None] * vectors[1]
+    line: Float64Array = (1 - share)[:, None] * vectors[0] + share[:, None] * vectors[1]
+    return line
 
 
 def _unit(vectors: Float64Array) -> Float64Array:
@@ -250,20 +261,21 @@ def _angle(one: Float64Array, other: Float64Array) -> Float64Array:
 def _closest(one: Float64Array, other: Float64Array) -> Float64Array:
     """Smallest length on the straight line between two vectors, Shape ``[K]``."""
     along = other - one
-    square = (along**2).sum(-1)
-    share = np.clip(-(one * along).sum(-1) / np.where(square > 0, square, 1.0), 0.0, 1.0)
+    square: Float64Array = (along**2).sum(-1)
+    share: Float64Array = np.clip(-(one * along).sum(-1) / np.where(square > 0, square, 1.0), 0.0, 1.0)
     closest: Float64Array = np.linalg.norm(one + share[:, None] * along, axis=-1)
     return closest
 
 
 def _either(which: BoolArray, one: Course, other: Course) -> Course:
-    def chosen(field: str) -> Float64Array:
+    def of(field: str) -> Float64Array:
         a, b = getattr(one, field), getattr(other, field)
-        return np.where(which if a.ndim == 1 else which[:, None], a, b)
+        chosen: Float64Array = np.where(which if a.ndim == 1 else which[:, None], a, b)
+        return chosen
 
     return Course(
         **{
-            name: chosen(name)
+            name: of(name)
             for name in ("length", "departure", "arrival", "rate", "length_error", "direction_error")
         }
     )
