@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array
+from caviar_protocol.errors import PayloadError
 from caviar_protocol.scene import antennas
 from caviar_protocol.topics import Interaction, Scene
 from caviar_services.channel.assemble import Antenna
@@ -43,11 +44,20 @@ class Places:
 
 
 def ends_of(scene: Scene, joined: Joined) -> tuple[list[Antenna], list[Antenna]]:
-    """Transmitters and receivers of the joined paths in a scene."""
+    """Transmitters and receivers of the joined paths in a scene.
+
+    Raises `PayloadError` where it lacks one of them.
+    """
     found = []
     for role, names in (("tx", joined.tx), ("rx", joined.rx)):
         devices = {device.name: device for device in antennas(scene, role)}
-        found.append([Antenna.of(scene, devices[name]) for name in names if name in devices])
+        missing = [name for name in names if name not in devices]
+        if missing:
+            raise PayloadError(
+                f"the scene lacks {role} {missing[0]!r}, which the keyframes have; pass that of the instant, "
+                "or none"
+            )
+        found.append([Antenna.of(scene, devices[name]) for name in names])
     return found[0], found[1]
 
 
