@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -84,7 +85,6 @@ class Interpolation:
         if before.scene is not None and after.scene is not None:
             at_ends = places(before.scene, self._joined), places(after.scene, self._joined)
         self._known = at_ends is not None
-        self._by_doppler = Courses(self._joined, self._h, None)
         self._by_places = Courses(self._joined, self._h, at_ends)
         self._frequency = np.array([carrier.frequency_hz for carrier in before.channel.carriers])
 
@@ -120,6 +120,10 @@ class Interpolation:
             changed=self._per_pair(~self._joined.kept[None]).reshape(self._shape) > 0,
         )
 
+    @cached_property
+    def _by_doppler(self) -> Courses:
+        return Courses(self._joined, self._h, None)
+
     @property
     def _shape(self) -> tuple[int, int]:
         return len(self._joined.tx), len(self._joined.rx)
@@ -147,7 +151,7 @@ class Interpolation:
         most = np.maximum(first, last)
         tau = np.maximum(course.length / SPEED_OF_LIGHT, np.finfo(np.float64).tiny)
         change = np.abs(joined.ends[0].gain - joined.ends[1].gain)
-        of_gain = 2 * s * (1 - s) * (change + CURVATURE / 2 * self._by_doppler.turn**2 * most)
+        of_gain = 2 * s * (1 - s) * (change + CURVATURE / 2 * self._by_places.turn**2 * most)
         wave_number = 2 * np.pi * self._frequency[:, None] / SPEED_OF_LIGHT
         turned = wave_number * course.length_error + self._steering_error(course, ends)
         kept = (of_gain + OF_COEFFICIENTS * most) / tau + np.abs(a) * np.minimum(turned, 2.0)

@@ -161,9 +161,8 @@ class Courses:
         straight = Course.of(_line(self._to_end, share) + to_end, _line(self._to_start, share) + to_start)
         # Mirrors that turn, and facets that count as one plane but lie beside it: a path may change from
         # one to the next at any time.
-        exact = replace(
-            straight, length_error=self._mismatch, direction_error=self._mismatch / self._shortest
-        )
+        off = self._mismatch if 0 < s < 1 else 0.0 * self._mismatch
+        exact = replace(straight, length_error=off, direction_error=off / self._shortest)
         return _either(self._specular, exact, self._bent(s, now - uniform, uniform, share))
 
     def _bent(self, s: float, moved: Places, uniform: Places, share: Float64Array) -> Course:
