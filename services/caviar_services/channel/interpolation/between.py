@@ -1,4 +1,10 @@
-"""A channel between two keyframes, and the bound on its error."""
+"""A channel between two keyframes, and the bound on its error.
+
+The bound holds as long as paths of both keyframes are there all the time, and none that neither has comes and
+goes. Lengths and directions of reflected and transmitted paths are then exact where scenes are given and
+surfaces do not turn, or where all moves uniformly. What else it takes, amplitudes, acceleration that Doppler
+shifts alone tell of, surfaces that turn, edges, is estimated from what both keyframes disagree on.
+"""
 
 from __future__ import annotations
 
