@@ -208,6 +208,100 @@ def test_over_an_edge_the_remainder_holds() -> None:
             assert abs(got.channel.tau - truth.tau)[0] * C < 2e-4
 
 
+@pytest.mark.parametrize("t", [0.07, 0.2, 0.31])
+def test_a_mirror_that_accelerates_is_followed(t: float) -> None:
+    """A tilted side of a lorry that pulls out; the image of the receiver by the plane where it is then."""
+    normal = np.array([0.36, -0.8, 0.48])
+    station, user = np.array([2.0, -9.0, 7.0]), np.array([19.0, -6.0, 1.2])
+    moves = np.array([6.0, -2.0, 0.5])
+
+    def seen(t: float) -> tuple[Channel, Scene]:
+        side = np.array([9.0, 3.0, 2.0]) + moves * t + np.array([3.0, -1.0, 0.0]) * t**2
+        speed = moves + 2 * np.array([3.0, -1.0, 0.0]) * t
+        end = mirrored(user, side, normal)
+        line = end - station
+        point = station + line * ((side - station) @ normal / (line @ normal))
+        length = float(np.linalg.norm(line))
+        out, back = line / length, (point - user) / np.linalg.norm(point - user)
+        base = two_rays(user, np.zeros(3), ids=(5,))
+        fields = {
+            "tau": np.array([length / C]),
+            "a": np.array([[-0.5 * spherical_wave(length, FREQUENCY)]]),
+            "aod": angles(out[None]),
+            "aoa": angles(back[None]),
+            "doppler": np.array([[-FREQUENCY / C * 2 * (normal @ speed) * (out @ normal)]]),
+            "interactions": np.array([[1]], np.uint8),
+            "points": point[None, None],
+            "objects": np.array([[0]], np.int32),
+            "object_names": ("lorry",),
+        }
+        made = {name: getattr(base, name) for name in base.__struct_fields__ if name not in fields}
+        devices = [antenna("bs", "tx", station), antenna("rx", "rx", user)]
+        lorry = Thing("lorry", tuple(side + np.array([0.0, 1.0, 0.0])), velocity=tuple(speed))
+        return Channel(**made, **fields), scene(devices, [lorry])
+
+    between = Interpolation(*(Keyframe(at, *seen(at)) for at in (0.0, H_S)))
+    truth, now = seen(t)
+    got = between.at(t, now)
+    np.testing.assert_allclose(got.channel.tau, truth.tau, rtol=1e-13)
+    np.testing.assert_allclose(got.channel.doppler, truth.doppler, rtol=1e-9)
+    np.testing.assert_allclose(got.channel.aoa, truth.aoa, atol=1e-12)
+    error = abs(got.channel.a - truth.a).sum() / abs(truth.a).sum()
+    assert 20 * np.log10(error) <= got.bound_db[0, 0, 0] < -80
+
+
+def test_a_path_of_one_keyframe_keeps_its_phase_where_positions_are_known() -> None:
+    """Until it is gone: only its amplitude fades."""
+    ends = [
+        Keyframe(t, two_rays(braking(t), velocity(braking, t), ids), world(braking(t), velocity(braking, t)))
+        for t, ids in ((0.0, (7,)), (H_S, (7, 4)))
+    ]
+    moves = velocity(braking, 0.3)
+    got = Interpolation(*ends).at(0.3, world(braking(0.3), moves)).channel
+    truth = two_rays(braking(0.3), moves)
+    np.testing.assert_allclose(got.a[0, 1] / truth.a[0, 1], 0.75, rtol=1e-6)
+
+
+def test_devices_that_one_keyframe_lacks_are_left_out() -> None:
+    channel = two_rays(straight(0.0), velocity(straight, 0.0))
+    fields = {name: getattr(channel, name) for name in channel.__struct_fields__}
+    none = {
+        name: fields[name][:0] for name in ("tau", "id", "aod", "aoa", "interactions", "points", "objects")
+    }
+    nobody = Channel(
+        **{
+            **fields,
+            **none,
+            "a": channel.a[:, :0],
+            "doppler": channel.doppler[:, :0],
+            "rx": (),
+            "los": channel.los[:, :0],
+            "offsets": np.zeros(1, np.int64),
+        }
+    )
+    got = Interpolation(Keyframe(0.0, channel), Keyframe(1.0, nobody)).at(0.5)
+    assert (got.channel.tx, got.channel.rx, got.channel.tau.size) == (("bs",), (), 0)
+    assert got.bound_db.shape == (1, 1, 0)
+
+
+def test_keyframes_of_other_carriers_are_refused() -> None:
+    channel = two_rays(straight(0.0), velocity(straight, 0.0))
+    fields = {name: getattr(channel, name) for name in channel.__struct_fields__}
+    other = Channel(**{**fields, "carriers": carriers(28e9)[:1]})
+    with pytest.raises(PayloadError, match="the same carriers"):
+        Interpolation(Keyframe(0.0, channel), Keyframe(1.0, other))
+
+
+def test_a_scene_that_lacks_a_device_is_refused() -> None:
+    between = keyframes(braking, known=True)
+    whole = world(braking(0.2), velocity(braking, 0.2))
+    without = scene([device for device in whole.devices if device.name != "rx"])
+    with pytest.raises(PayloadError, match="lacks rx 'rx'"):
+        between.at(0.2, without)
+    with pytest.raises(PayloadError, match="lacks the device 'rx'"):
+        Keyframe(0.0, two_rays(braking(0.0), velocity(braking, 0.0)), without)
+
+
 @pytest.mark.parametrize("t", [-0.1, 0.5])
 def test_a_time_outside_is_refused(t: float) -> None:
     with pytest.raises(PayloadError, match=rf"{t} s is not between the keyframes at 0\.0 s and 0\.4 s"):

@@ -132,7 +132,7 @@ def _note_bounds(found: _Found, truth: Channel, got: Between) -> None:
         if mine is None or not matrix.h.any():
             continue
         bound = float(got.bound_db[mine.carrier, mine.tx, mine.rx])
-        found.promised.append(bool(np.isfinite(bound)))
+        found.promised.append(bound < np.inf)
         if found.promised[-1]:
             found.within.append(decibel(nmse(mine.h, matrix.h)) <= max(bound, FLOOR_DB))
 
