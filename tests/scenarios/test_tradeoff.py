@@ -41,7 +41,7 @@ def compared(
     trade(
         source,
         frames,
-        Options(parts=("ladder",), seconds=seconds, **options),
+        Options(**{"parts": ("ladder",), "seconds": seconds, **options}),
         folder / "t.json",
         folder / "pictures",
         Console(file=screen, width=160),
@@ -83,6 +83,17 @@ def test_a_recording_gives_the_figures_of_its_scenario(tmp_path: Path) -> None:
     other, _ = compared(SCENARIOS / "smoke.toml", tmp_path / "scenario")
     for mine, theirs in zip(one["rows"], other["rows"], strict=True):
         assert {key: mine[key] for key in KEYS[2:]} == {key: theirs[key] for key in KEYS[2:]}
+
+
+@pytest.mark.usefixtures("small_ladder")
+def test_keyframes_have_a_table_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("matplotlib")
+    monkeypatch.setattr(ladder, "BASELINES", ("free-space",))
+    report, _ = compared(SCENARIOS / "smoke.toml", tmp_path, parts=("ladder", "keyframes"))
+    rows = {row["setting"]: row for row in report["rows"] if row["block"] == "keyframes"}
+    assert list(rows) == ["free-space", *(f"free-space, keyframes every {n}" for n in (2, 5, 10))]
+    assert rows["free-space, keyframes every 5"]["within_bound"] == 1.0
+    assert "## Between keyframes" in (tmp_path / "pictures" / "tradeoff.md").read_text()
 
 
 @pytest.mark.usefixtures("small_ladder")

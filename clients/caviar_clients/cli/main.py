@@ -178,7 +178,8 @@ def tradeoff(
     seeds: Annotated[int, typer.Option(min=2, max=20, help="seeds of the convergence")] = 2,
     minutes: Annotated[float, typer.Option(min=0.1, help="time for measuring")] = 12.0,
     part: Annotated[
-        list[str] | None, typer.Option(help="ladder, spacing, arrays or convergence; by default all")
+        list[str] | None,
+        typer.Option(help="ladder, keyframes, spacing, arrays or convergence; by default all"),
     ] = None,
 ) -> None:
     """Compare channel settings: time and error of each over the same scenes."""

@@ -10,12 +10,14 @@ from dataclasses import dataclass, field
 import msgspec
 import numpy as np
 
+from caviar_clients.tradeoff.keyframes import keyframe_rows
 from caviar_clients.tradeoff.ladder import Block, Setting
+from caviar_clients.tradeoff.rows import Row
 from caviar_clients.tradeoff.scenes import Scenes
 from caviar_clients.tradeoff.schedule import Cost, predicted_s, shares, spread_order
 from caviar_clients.tradeoff.users import Key, Noise, UserChannel
 from caviar_clients.tradeoff.worker import Sample, Worker
-from caviar_protocol.errors import RunError
+from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.tables import suggestion
 
 ROUNDS = 3
@@ -185,6 +187,18 @@ class Campaign:
         own.baseline_ms = own.median_ms
         found[self.baseline] = own
         return [found[setting] for setting in settings if setting in found]
+
+    def keyframes(self, share: float) -> list[Row]:
+        """The baseline's channels interpolated between keyframes, within a share of the time that is left."""
+        seconds = min(self._left_s, max(AT_LEAST_S, share * self._left_s))
+        try:
+            return keyframe_rows(
+                self.baseline, self._scenes, self._receivers, self._noise, seconds, self._tell
+            )
+        except CaviarError as error:
+            label = f"{self.baseline.label}, keyframes"
+            self.skipped.append(Skipped(setting=label, block="keyframes", reason=str(error)))
+            return []
 
     @property
     def _left_s(self) -> float:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Literal
 
-Block = Literal["ladder", "ray spacing", "arrays", "convergence", "diffuse convergence"]
+Block = Literal["ladder", "keyframes", "ray spacing", "arrays", "convergence", "diffuse convergence"]
 """What a setting is measured for. Settings of a block take turns, so that noise hits all alike."""
 
 

@@ -46,8 +46,15 @@ class Rung:
     Raises `CaviarError` where the setting is unknown to the model or it cannot be loaded.
     """
 
-    def __init__(self, setting: Setting, scenes: Scenes, receivers: int | None, noise: Noise) -> None:
-        self.setting = setting
+    def __init__(
+        self,
+        setting: Setting,
+        scenes: Scenes,
+        receivers: int | None,
+        noise: Noise,
+        products: bool = False,
+    ) -> None:
+        self.setting, self._products = setting, products
         self._noise = noise
         limits = [n for n in (receivers, setting.most_receivers) if n is not None]
         self._receivers = min(limits, default=None)
@@ -110,6 +117,7 @@ class Rung:
             paths=len(channel.tau),
             lost_paths=channel.dropped > 0 or result.counts.get("path_limit_reached", 0) > 0,
             users=user_channels(instant.frame, scene, channel, self._noise),
+            channel=channel if self._products else None,
         )
 
     def close(self) -> None:

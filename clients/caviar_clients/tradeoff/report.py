@@ -22,7 +22,7 @@ from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import RunError
 from caviar_protocol.scene import antennas
 
-Part = Literal["ladder", "spacing", "arrays", "convergence"]
+Part = Literal["ladder", "keyframes", "spacing", "arrays", "convergence"]
 PARTS: tuple[Part, ...] = get_args(Part)
 
 
@@ -59,6 +59,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
 
 _WEIGHTS: Mapping[Block, float] = {
     "ladder": 36,
+    "keyframes": 4,
     "ray spacing": 28,
     "arrays": 12,
     "convergence": 10,
@@ -90,10 +91,13 @@ def compare(
     with closing(campaign):
         needed = references if "ladder" in options.parts else references[:1]
         plan = _plan(options, list(dict.fromkeys([*needed, campaign.baseline])))
-        measured = list[Measured]()
+        measured, interpolated = list[Measured](), list[Row]()
         for number, (block, settings) in enumerate(plan):
             share = _WEIGHTS[block] / sum(_WEIGHTS[name] for name, _ in plan[number:])
-            measured += campaign.block(block, settings, share)
+            if block == "keyframes":
+                interpolated += campaign.keyframes(share)
+            else:
+                measured += campaign.block(block, settings, share)
     reference = _reference(references, measured, campaign.skipped)
     receivers = [len(antennas(seen(i.scene, options.receivers, None), "rx")) for i in scenes.instants]
     return Report(
@@ -106,7 +110,10 @@ def compare(
         baseline=campaign.baseline.label,
         elapsed_s=time.monotonic() - begun,
         machine=dict(machine),
-        rows=tuple(_row(entry, reference) for entry in measured if not _is_of_a_curve(entry)),
+        rows=(
+            *(_row(entry, reference) for entry in measured if not _is_of_a_curve(entry)),
+            *interpolated,
+        ),
         convergence=tuple(points([entry for entry in measured if _is_of_a_curve(entry)])),
         skipped=tuple(campaign.skipped),
     )
@@ -116,6 +123,8 @@ def _plan(options: Options, needed: Sequence[Setting]) -> list[tuple[Block, list
     """Blocks in order; the first one has reference and baseline, which the others need."""
     first = [s for s in ladder.LADDER if "ladder" in options.parts or s in needed]
     plan: list[tuple[Block, list[Setting]]] = [("ladder", [*first, *(s for s in needed if s not in first)])]
+    if "keyframes" in options.parts:
+        plan.append(("keyframes", []))
     if "spacing" in options.parts:
         plan.append(("ray spacing", [s for s in ladder.spacing_settings() if s not in needed]))
     if "arrays" in options.parts:

@@ -54,6 +54,10 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     los_agreement: Annotated[float | None, quantity("1", "share of equal LOS states")]
     missed: Annotated[float | None, quantity("1", "share with a path in the reference alone")]
     invented: Annotated[float | None, quantity("1", "share with a path here alone")]
+    with_bound: Annotated[
+        float | None, quantity("1", "share of interpolated channels whose bound is finite")
+    ] = None
+    within_bound: Annotated[float | None, quantity("1", "of those, share whose error keeps within it")] = None
     note: str = ""
 
 

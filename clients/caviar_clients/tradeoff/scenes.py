@@ -25,6 +25,9 @@ from caviar_services.service import Preparation, Prepared, Service, StepResult
 
 T = TypeVar("T")
 
+CONSECUTIVE = 21
+"""Frames of the block that follow each other: ten, and ten, and the one before."""
+
 KEEPER = "tradeoff-scenes"
 """Name of the service that keeps the scenes."""
 
@@ -55,6 +58,12 @@ class Scenes:
     """The scenario's, for the settings of its channel and link."""
     seed: int
     sampling_period_ns: int
+    consecutive: tuple[Instant, ...] = ()
+    """Scenes of frames that follow each other, for what depends on that; none where there are no such."""
+
+    def with_instants(self, instants: tuple[Instant, ...]) -> Scenes:
+        """All else the same."""
+        return dataclasses.replace(self, instants=instants)
 
     def settings_of(self, role: Role, use: str) -> dict[str, Any]:
         """Settings of the scenario's first service that is this implementation; else none."""
@@ -81,7 +90,7 @@ def scenes_of(path: Path, frames: int) -> Scenes:
             f"none of the {len(found.instants)} scenes of {found.origin} has a transmitter and a receiver; "
             "there is no channel to compare"
         )
-    return dataclasses.replace(found, instants=served)
+    return dataclasses.replace(found, instants=served, consecutive=_run(found.consecutive))
 
 
 def _of_recording(path: Path, frames: int) -> Scenes:
@@ -89,6 +98,7 @@ def _of_recording(path: Path, frames: int) -> Scenes:
     first = recording.entry(0).episode if len(recording) else 0
     kept = [frame for frame in recording.frames() if frame.episode == first]
     instants = [instant for frame in _spread(kept, frames) if (instant := _instant(frame)) is not None]
+    block = [instant for frame in _middle(kept) if (instant := _instant(frame)) is not None]
     if not instants:
         raise RecordingError(
             f'{path} holds no scene; record the topic: record = ["scene", …] in the table [run]'
@@ -111,6 +121,7 @@ def _of_recording(path: Path, frames: int) -> Scenes:
         services=services,
         seed=metadata.seed,
         sampling_period_ns=metadata.sampling_period_ns,
+        consecutive=tuple(block),
     )
 
 
@@ -140,6 +151,7 @@ def _of_scenario(path: Path, frames: int) -> Scenes:
         services=scenario.services,
         seed=scenario.run.seed,
         sampling_period_ns=scenario.run.sampling_period_ns,
+        consecutive=tuple(_middle(instants)),
     )
 
 
@@ -195,3 +207,23 @@ def _spread(entries: Sequence[T], count: int) -> list[T]:
     if len(entries) <= count:
         return list(entries)
     return [entries[i] for i in np.unique(np.linspace(0, len(entries) - 1, count).round().astype(int))]
+
+
+def _middle(entries: Sequence[T]) -> list[T]:
+    """`CONSECUTIVE` of them from the middle; all where there are fewer."""
+    first = max(0, (len(entries) - CONSECUTIVE) // 2)
+    return list(entries[first : first + CONSECUTIVE])
+
+
+def _run(instants: Sequence[Instant]) -> tuple[Instant, ...]:
+    """The longest run of frames with successive numbers that have a transmitter and a receiver."""
+    runs: list[list[Instant]] = [[]]
+    for instant in instants:
+        if runs[-1] and instant.frame != runs[-1][-1].frame + 1:
+            runs.append([])
+        if pairs_of(instant.scene):
+            runs[-1].append(instant)
+        elif runs[-1]:
+            runs.append([])
+    longest: list[Instant] = max(runs, key=lambda run: len(run))
+    return tuple(longest)

@@ -45,6 +45,12 @@ _COLUMNS = (
     "LOS",
 )
 NOTHING = "–"
+_BETWEEN = (
+    "Traced at keyframes alone, interpolated path by path in between: the time of a scene is that of a "
+    "keyframe and of the interpolation up to it, shared out over its scenes. Errors are over all scenes, "
+    "keyframes included. With a bound: channels between keyframes whose bound on ‖H − Ĥ‖²/‖H‖² promises "
+    "anything; within it: those of them whose error is no greater."
+)
 
 
 def screen_table(report: Report) -> Table:
@@ -80,7 +86,7 @@ def markdown(report: Report) -> str:
         _table(_COLUMNS, [_cells(row) for row in ladder]),
         _notes(ladder),
     ]
-    parts += _spacing(report) + _arrays(report) + _convergence(report) + _skipped(report)
+    parts += _keyframes(report) + _spacing(report) + _arrays(report) + _convergence(report) + _skipped(report)
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
@@ -130,6 +136,23 @@ def _cells(row: Row) -> list[str]:
 
 def _notes(rows: Sequence[Row]) -> str:
     return "\n".join(f"- {row.setting}: {row.note}." for row in rows if row.note)
+
+
+def _keyframes(report: Report) -> list[str]:
+    rows = [row for row in report.rows if row.block == "keyframes"]
+    if not rows:
+        return []
+    columns = (*_COLUMNS[:4], *_COLUMNS[9:14], "with a bound", "within it")
+    body = []
+    for row in rows:
+        cells = _cells(row)
+        body.append([*cells[:4], *cells[9:14], percent(row.with_bound), percent(row.within_bound)])
+    return [
+        "## Between keyframes",
+        _BETWEEN,
+        _table(columns, body),
+        f"- {rows[0].note[0].upper()}{rows[0].note[1:]}.",
+    ]
 
 
 def _spacing(report: Report) -> list[str]:

@@ -20,6 +20,7 @@ from caviar_clients.tradeoff.ladder import Setting
 from caviar_clients.tradeoff.scenes import Scenes
 from caviar_clients.tradeoff.users import Key, Noise, UserChannel
 from caviar_protocol.errors import CaviarError, RunError
+from caviar_protocol.topics import Channel
 
 _GOODBYE_S = 2.0
 
@@ -38,6 +39,8 @@ class Sample:
     lost_paths: bool
     """Whether more paths were found than the setting allows, or some were not finite."""
     users: Mapping[Key, UserChannel]
+    channel: Channel | None = None
+    """The product, where it is asked for."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,17 +56,25 @@ class Loaded:
 class Worker:
     """A model that is loaded, and asked for one scene after the other.
 
+    With ``products`` samples hold the products too.
+
     Raises `RunError` with the reason where it cannot be loaded, or not within ``seconds``.
     """
 
     def __init__(
-        self, setting: Setting, scenes: Scenes, receivers: int | None, noise: Noise, seconds: float
+        self,
+        setting: Setting,
+        scenes: Scenes,
+        receivers: int | None,
+        noise: Noise,
+        seconds: float,
+        products: bool = False,
     ) -> None:
         context = multiprocessing.get_context("spawn")  # what is forked has no threads of Dr.Jit
         self.setting = setting
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(
-            target=_serve, args=(theirs, setting, scenes, receivers, noise), daemon=True
+            target=_serve, args=(theirs, setting, scenes, receivers, noise, products), daemon=True
         )
         self._process.start()
         theirs.close()
@@ -109,14 +120,21 @@ class Worker:
         return answer
 
 
-def _serve(pipe: Connection, setting: Setting, scenes: Scenes, receivers: int | None, noise: Noise) -> None:
+def _serve(
+    pipe: Connection,
+    setting: Setting,
+    scenes: Scenes,
+    receivers: int | None,
+    noise: Noise,
+    products: bool,
+) -> None:
     """Load, then answer until told to end or left alone; a text is the reason of a failure."""
     from caviar_clients.tradeoff.measure import Rung
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
     with suppress(EOFError, BrokenPipeError):
         try:
-            rung = Rung(setting, scenes, receivers, noise)
+            rung = Rung(setting, scenes, receivers, noise, products)
             pipe.send(rung.loaded)
             while (index := pipe.recv()) is not None:
                 pipe.send(rung.sample(scenes.instants[index]))

@@ -1,0 +1,175 @@
+"""A setting that is traced at every few frames alone, with channels interpolated in between.
+
+Over consecutive frames: each is traced, and what interpolation makes of every second, fifth, tenth of these
+channels is held against the others.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from caviar_clients.tradeoff.errors import FLOOR_DB, decibel, nmse
+from caviar_clients.tradeoff.ladder import Setting
+from caviar_clients.tradeoff.measure import seen
+from caviar_clients.tradeoff.rows import Row, error_fields
+from caviar_clients.tradeoff.scenes import Instant, Scenes
+from caviar_clients.tradeoff.users import Key, Noise, UserChannel, differences, user_channels
+from caviar_clients.tradeoff.worker import Sample, Worker
+from caviar_protocol.errors import RunError
+from caviar_protocol.topics import Channel
+from caviar_services.channel.interpolation import Between, Interpolation, Keyframe
+from caviar_services.channel.interpolation.between import PLANE_WAVES
+
+SPACINGS = (2, 5, 10)
+"""Frames from one keyframe to the next."""
+
+
+@dataclass(frozen=True, eq=False)
+class Traced:
+    """A frame, and what tracing it gave."""
+
+    instant: Instant
+    sample: Sample
+    channel: Channel
+
+    def keyframe(self) -> Keyframe:
+        """As the end of an interval."""
+        return Keyframe(self.instant.t_ns / 1e9, self.channel, self.instant.scene)
+
+
+@dataclass(eq=False)
+class _Found:
+    """What a spacing gave. Each interval counts its later keyframe and all between."""
+
+    times_ms: list[float] = field(default_factory=list)
+    """Of each frame: that of its interval, shared out."""
+    users: dict[Key, UserChannel] = field(default_factory=dict)
+    paths: list[int] = field(default_factory=list)
+    promised: list[bool] = field(default_factory=list)
+    """Whether a channel's bound is finite."""
+    within: list[bool] = field(default_factory=list)
+    """Of those, whether the error keeps within it."""
+
+
+def keyframe_rows(
+    setting: Setting,
+    scenes: Scenes,
+    receivers: int | None,
+    noise: Noise,
+    seconds: float,
+    told: Callable[[str], None],
+) -> list[Row]:
+    """A row for tracing each of the consecutive frames, then one for each of `SPACINGS`.
+
+    Raises `RunError` with the reason where that cannot be measured, or not within ``seconds``.
+    """
+    instants = scenes.consecutive
+    spacings = [spacing for spacing in SPACINGS if spacing < len(instants)]
+    if not spacings:
+        raise RunError(f"there are no {SPACINGS[0] + 1} consecutive frames with a transmitter and a receiver")
+    until = time.monotonic() + seconds
+    told(f"keyframes: loading {setting.label}")
+    block = scenes.with_instants(instants)
+    with closing(Worker(setting, block, receivers, noise, seconds, products=True)) as worker:
+        traced = []
+        for index, instant in enumerate(instants):
+            told(f"keyframes: {setting.label}")
+            sample = worker.step(index, max(1.0, until - time.monotonic()))
+            if sample.channel is None or sample.rung not in PLANE_WAVES:
+                raise RunError(f"H of {sample.rung} does not follow from paths; choose another --baseline")
+            kept = Instant(instant.frame, instant.t_ns, seen(instant.scene, receivers, None))
+            traced.append(Traced(kept, sample, sample.channel))
+        loaded = worker.loaded
+    truth = {key: user for entry in traced for key, user in entry.sample.users.items()}
+    every = _Found(
+        times_ms=[entry.sample.time_ms for entry in traced[1:]],
+        users=dict(truth),
+        paths=[entry.sample.paths for entry in traced],
+    )
+    base = float(np.median(every.times_ms))
+    first, last = instants[0].frame, instants[-1].frame
+    note = f"frames {first} to {last}, consecutive; errors against a trace of each of them"
+    rows = [_row(setting.label, 1, every, truth, base, traced[0].sample, loaded.seconds, note)]
+    for spacing in spacings:
+        told(f"keyframes: every {spacing}")
+        found = spaced(traced, spacing, noise)
+        label = f"{setting.label}, keyframes every {spacing}"
+        rows.append(_row(label, spacing, found, truth, base, traced[0].sample, loaded.seconds, note))
+    return rows
+
+
+def spaced(traced: Sequence[Traced], spacing: int, noise: Noise) -> _Found:
+    """What interpolation makes of every ``spacing``-th of the frames."""
+    found = _Found()
+    for first in range(0, len(traced) - spacing, spacing):
+        last = first + spacing
+        begin = time.perf_counter()
+        between = Interpolation(traced[first].keyframe(), traced[last].keyframe())
+        made = []
+        for entry in traced[first + 1 : last]:
+            got = between.at(entry.instant.t_ns / 1e9, entry.instant.scene, with_h=True)
+            made.append((entry, got))
+        took_ms = (time.perf_counter() - begin) * 1e3 + traced[last].sample.time_ms
+        found.times_ms += [took_ms / spacing] * spacing
+        for entry, got in made:
+            found.users.update(user_channels(entry.instant.frame, entry.instant.scene, got.channel, noise))
+            found.paths.append(len(got.channel.tau))
+            _note_bounds(found, entry.channel, got)
+        found.users.update(traced[last].sample.users)
+        found.paths.append(traced[last].sample.paths)
+    return found
+
+
+def _note_bounds(found: _Found, truth: Channel, got: Between) -> None:
+    made = {(m.carrier, got.channel.tx[m.tx], got.channel.rx[m.rx]): m for m in got.channel.h}
+    for matrix in truth.h:
+        mine = made.get((matrix.carrier, truth.tx[matrix.tx], truth.rx[matrix.rx]))
+        if mine is None or not matrix.h.any():
+            continue
+        bound = float(got.bound_db[mine.carrier, mine.tx, mine.rx])
+        found.promised.append(bound < np.inf)
+        if found.promised[-1]:
+            found.within.append(decibel(nmse(mine.h, matrix.h)) <= max(bound, FLOOR_DB))
+
+
+def _row(
+    label: str,
+    spacing: int,
+    found: _Found,
+    truth: Mapping[Key, UserChannel],
+    base_ms: float,
+    first: Sample,
+    prepare_s: float,
+    note: str,
+) -> Row:
+    median = float(np.median(found.times_ms))
+    return Row(
+        setting=label,
+        block="keyframes",
+        column="keyframes",
+        row=str(spacing),
+        rung=first.rung,
+        time_ms_median=median,
+        time_ms_p99=float(np.percentile(found.times_ms, 99)),
+        factor=median / base_ms,
+        memory_mib=None,
+        loaded_mib=None,
+        prepare_s=prepare_s,
+        measurements=len(found.times_ms),
+        scenes=len(found.paths),
+        receivers=float(first.receivers),
+        paths=sum(found.paths) / len(found.paths),
+        with_bound=_share(found.promised),
+        within_bound=_share(found.within),
+        note=note,
+        **error_fields(differences(found.users, truth)),  # type: ignore[arg-type]  # fields of a row, by name
+    )
+
+
+def _share(values: Sequence[bool]) -> float | None:
+    return sum(values) / len(values) if values else None

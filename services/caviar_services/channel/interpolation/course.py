@@ -1,0 +1,280 @@
+"""Lengths and directions of paths between two keyframes, and how far off they may be.
+
+The image of the receiver lies at L·d from the transmitter, L the path's length and d its direction of
+departure. Where ends and surfaces move uniformly without turning, this vector changes linearly, so
+that a straight line between both keyframes' vectors is exact for paths that are reflected and transmitted.
+What it leaves, where something accelerates or a path bends about an edge, is a cubic Hermite polynomial
+with the slopes at both keyframes (de Boor, A Practical Guide to Splines, 1978, chapter IV), or follows
+from the positions where these are known.
+
+Remainder of Hermite: |error| ≤ h⁴/384·max|r''''|. A distance f = |p + vt| has, with the closest
+approach b = f·sin(angle), f'''' = 3v⁴·b²(4u² − b²)/f⁷, u² = f² − b². With x = u²/f² the factor
+(1 − x)(5x − 1) lies in [−1, 1], hence |f''''| ≤ 3v⁴/f³.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from caviar_protocol.arrays import BoolArray, Float64Array
+from caviar_protocol.coordinates import SPEED_OF_LIGHT
+from caviar_services.channel.geometry import path_geometry
+from caviar_services.channel.interpolation.joined import Joined
+from caviar_services.channel.interpolation.motion import Places, corners, image_moves, normals
+
+ROUNDING_M = 1e-8
+"""[m] What a length is off by in any case: float64 at 10 km has 2e-12 m, and a chain of mirrors some more."""
+OF_THE_CORRECTION = 0.05
+"""Share of the acceleration's correction that is not trusted, where only Doppler shifts tell of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """K paths at an instant."""
+
+    length: Float64Array
+    """[m], Shape ``[K]``."""
+    departure: Float64Array
+    """Unit vectors, Shape ``[K, 3]``; likewise ``arrival``."""
+    arrival: Float64Array
+    rate: Float64Array
+    """Change of the length [m/s], Shape ``[K]``."""
+    length_error: Float64Array
+    """[m], Shape ``[K]``."""
+    direction_error: Float64Array
+    """[rad], Shape ``[K]``."""
+
+    @classmethod
+    def of(cls, to_end: Float64Array, to_start: Float64Array) -> Course:
+        """With the lengths of the images' vectors [m], Shape ``[K, 3]`` each; no rate, no errors."""
+        nothing = np.zeros(len(to_end))
+        return cls(np.linalg.norm(to_end, axis=-1), _unit(to_end), _unit(to_start), nothing, nothing, nothing)
+
+
+class Courses:
+    """The courses of joined paths.
+
+    ``at_ends`` are positions at both keyframes, without which the Doppler shifts tell of the motion.
+    """
+
+    def __init__(self, joined: Joined, seconds: float, at_ends: tuple[Places, Places] | None) -> None:
+        self._joined, self._h, self._at_ends = joined, seconds, at_ends
+        self._specular, self._kept = joined.specular, joined.kept
+        lengths = [SPEED_OF_LIGHT * end.tau for end in joined.ends]
+        self._shortest = np.maximum(np.minimum(*lengths), ROUNDING_M)
+        self._to_end = [x[:, None] * end.departure for x, end in zip(lengths, joined.ends, strict=True)]
+        self._to_start = [x[:, None] * end.arrival for x, end in zip(lengths, joined.ends, strict=True)]
+        self._turn = np.maximum(
+            _angle(joined.ends[0].departure, joined.ends[1].departure),
+            _angle(joined.ends[0].arrival, joined.ends[1].arrival),
+        )
+        moved = self._to_end[1] - self._to_end[0]
+        chord = [(_unit(vector) * moved).sum(-1) / seconds for vector in self._to_end]
+        self._slopes = [rate - along for rate, along in zip(self._rates(), chord, strict=True)]
+        # As of the path itself, so of the straight line that is taken from it.
+        speed = np.linalg.norm(moved, axis=-1) / seconds
+        bends = 3 * speed**4 / np.maximum(_closest(*self._to_end), ROUNDING_M) ** 3 + self._of_legs()
+        self._remainder = np.where(self._specular, 0.0, seconds**4 / 384 * bends)
+        self._mismatch = self._of_images()
+
+    @property
+    def turn(self) -> Float64Array:
+        """Angle between a path's directions at both keyframes, the greater of both ends' [rad], ``[K]``."""
+        return self._turn
+
+    def at(self, s: float, now: Places | None) -> Course:
+        """The course at the share ``s`` of the interval, for paths of both keyframes and of one."""
+        if now is not None and self._at_ends is not None:
+            course = self._known(s, now, self._at_ends)
+        else:
+            course = self._by_doppler(s)
+        error = course.length_error + ROUNDING_M
+        return replace(course, length=np.maximum(course.length, 0.0), length_error=error)
+
+    def rates(self, course: Course, now: Places, moves: Places, points: Float64Array) -> Float64Array:
+        """Change of the lengths [m/s] with the velocities ``moves``, where positions are known."""
+        to_end, _ = image_moves(moves, self._normals)
+        of_images = (course.departure * to_end).sum(-1)
+        return np.where(self._specular, of_images, first_order(now, points, moves, self._joined))
+
+    def _rates(self) -> list[Float64Array]:
+        """Change of the lengths at both keyframes [m/s]: of uniform motion from one to the other where
+        positions are known, else by the Doppler shifts (τ' = −f_D/f)."""
+        joined = self._joined
+        if self._at_ends is None:
+            return [-SPEED_OF_LIGHT * end.doppler_ratio for end in joined.ends]
+        mean = (self._at_ends[1] - self._at_ends[0]).scaled(1 / self._h)
+        both = zip(self._at_ends, joined.ends, strict=True)
+        return [first_order(place, end.points, mean, joined) for place, end in both]
+
+    def _of_legs(self) -> Float64Array:
+        """Bound on the fourth derivative of the way along points that stay on their surfaces [m/s⁴]."""
+        if self._specular.all():
+            return np.zeros(len(self._specular))
+        if self._at_ends is None:  # nobody knows the legs: as if each were half of the path
+            speed = np.linalg.norm(self._to_end[1] - self._to_end[0], axis=-1) / self._h
+            halves: Float64Array = 2 * 3 * speed**4 / (self._shortest / 2) ** 3
+            return halves
+        both = zip(self._at_ends, self._joined.ends, strict=True)
+        legs = [np.diff(corners(place, end.points, self._joined), axis=1) for place, end in both]
+        used = np.minimum(*(np.linalg.norm(leg, axis=-1) for leg in legs))
+        speed = np.linalg.norm(legs[1] - legs[0], axis=-1) / self._h
+        bends: Float64Array = np.where(used > 0, 3 * speed**4 / np.maximum(used, ROUNDING_M) ** 3, 0.0).sum(1)
+        return bends
+
+    def _of_images(self) -> Float64Array:
+        """How far the image of the later keyframe is from where the moves put that of the earlier [m]."""
+        if self._at_ends is None:
+            return np.zeros(len(self._kept))
+        before, after = self._at_ends
+        points = self._joined.ends[0].points
+        self._normals = normals(corners(before, points, self._joined), self._joined)
+        for_born = normals(corners(after, points, self._joined), self._joined)
+        self._normals = np.where(self._joined.before[:, None, None], self._normals, for_born)
+        to_end, _ = image_moves(after - before, self._normals)
+        off: Float64Array = np.linalg.norm(self._to_end[0] + to_end - self._to_end[1], axis=-1)
+        off = np.where(self._specular & self._kept, off, 0.0)
+        # What is true of one path off an object may hold for another that shows it at neither keyframe.
+        of_object = np.zeros(len(self._joined.object_names) + 1)
+        for objects in self._joined.objects.T:
+            np.maximum.at(of_object, objects, off)
+        of_object[-1] = 0.0
+        worst: Float64Array = np.maximum(off, of_object[self._joined.objects].max(1, initial=0.0))
+        return worst
+
+    def _known(self, s: float, now: Places, at_ends: tuple[Places, Places]) -> Course:
+        """From where ends and objects are."""
+        before, after = at_ends
+        uniform = Places(
+            *(
+                (1 - s) * getattr(before, name) + s * getattr(after, name)
+                for name in ("start", "end", "objects")
+            )
+        )
+        origin = np.where(self._joined.before, 0.0, 1.0)
+        share = np.where(self._kept, s, origin)
+        base = _between(before, after, share)
+        moved = now - base
+        to_end, to_start = image_moves(moved, self._normals)
+        straight = Course.of(_line(self._to_end, share) + to_end, _line(self._to_start, share) + to_start)
+        # Mirrors that turn, and facets that count as one plane but lie beside it: a path may change from
+        # one to the next at any time.
+        off = self._mismatch if 0 < s < 1 else 0.0 * self._mismatch
+        exact = replace(straight, length_error=off, direction_error=off / self._shortest)
+        return _either(self._specular, exact, self._bent(s, now - uniform, uniform, share))
+
+    def _bent(self, s: float, moved: Places, uniform: Places, share: Float64Array) -> Course:
+        """Paths that no image straightens, from the deviation of known positions from uniform motion."""
+        line = Course.of(_line(self._to_end, share), _line(self._to_start, share))
+        points = (1 - s) * self._joined.ends[0].points + s * self._joined.ends[1].points
+        change = first_order(uniform, points, moved, self._joined)
+        correction, _ = self._hermite(s)
+        most = moved.most
+        length = line.length + np.where(self._kept, correction + change, 0.0)
+        bump = 4 * s * (1 - s)
+        return replace(
+            line,
+            length=length,
+            length_error=(bump**2 * self._remainder + most**2 / self._shortest) * self._kept,
+            direction_error=bump * self._turn**2 / 4 + most / self._shortest,
+        )
+
+    def _by_doppler(self, s: float) -> Course:
+        """From the Doppler shifts at both keyframes."""
+        origin = np.where(self._joined.before, 0.0, 1.0)
+        share = np.where(self._kept, s, origin)
+        line = Course.of(_line(self._to_end, share), _line(self._to_start, share))
+        correction, slope = self._hermite(s)
+        moved = (self._to_end[1] - self._to_end[0]) / self._h
+        rate = (line.departure * moved).sum(-1) + slope
+        alone = np.where(self._joined.before, *self._rates())
+        alone_length = line.length + alone * (s - origin) * self._h
+        # Doppler shifts that tell of another mean speed than the lengths do, or of an acceleration that
+        # changes: both make slopes that do not sum to zero.
+        bump = 4 * s * (1 - s)
+        disagreement = np.abs(self._slopes[0] + self._slopes[1]) / 2 * self._h * bump / 4
+        error = disagreement + OF_THE_CORRECTION * np.abs(correction) + bump**2 * self._remainder
+        return replace(
+            line,
+            length=np.where(self._kept, line.length + correction, alone_length),
+            rate=np.where(self._kept, rate, alone),
+            length_error=np.where(self._kept, error, 0.0),
+            direction_error=np.where(
+                self._kept,
+                (2 * np.abs(correction) + disagreement) / self._shortest
+                + np.where(self._specular, 0.0, bump * self._turn**2 / 4),
+                0.0,
+            ),
+        )
+
+    def _hermite(self, s: float) -> tuple[Float64Array, Float64Array]:
+        """What has the slopes at both ends and is 0 there [m], and its slope [m/s]."""
+        first, last = self._slopes
+        value = self._h * (first * s * (1 - s) ** 2 - last * s**2 * (1 - s))
+        slope = first * (1 - s) * (1 - 3 * s) - last * s * (2 - 3 * s)
+        return value, slope
+
+
+def first_order(places: Places, points: Float64Array, moves: Places, joined: Joined) -> Float64Array:
+    """Change of the lengths to first order in moves [m], or with velocities in time [m/s]; Shape ``[K]``."""
+    geometry = path_geometry(
+        start=places.start,
+        points=points,
+        end=places.end,
+        count=(joined.types != 0).sum(1),
+        start_velocity=moves.start,
+        point_velocity=moves.objects,
+        end_velocity=moves.end,
+    )
+    return -SPEED_OF_LIGHT * geometry.doppler_ratio
+
+
+def _between(before: Places, after: Places, share: Float64Array) -> Places:
+    weight = share[:, None]
+    return Places(
+        (1 - weight) * before.start + weight * after.start,
+        (1 - weight) * before.end + weight * after.end,
+        (1 - weight[..., None]) * before.objects + weight[..., None] * after.objects,
+    )
+
+
+def _line(vectors: list[Float64Array], share: Float64Array) -> Float64Array:
+    line: Float64Array = (1 - share)[:, None] * vectors[0] + share[:, None] * vectors[1]
+    return line
+
+
+def _unit(vectors: Float64Array) -> Float64Array:
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    unit: Float64Array = vectors / np.where(length > 0, length, 1.0)
+    return unit
+
+
+def _angle(one: Float64Array, other: Float64Array) -> Float64Array:
+    chord = np.linalg.norm(one - other, axis=-1)
+    angle: Float64Array = 2 * np.arcsin(np.minimum(chord / 2, 1.0))
+    return angle
+
+
+def _closest(one: Float64Array, other: Float64Array) -> Float64Array:
+    """Smallest length on the straight line between two vectors, Shape ``[K]``."""
+    along = other - one
+    square: Float64Array = (along**2).sum(-1)
+    share: Float64Array = np.clip(-(one * along).sum(-1) / np.where(square > 0, square, 1.0), 0.0, 1.0)
+    closest: Float64Array = np.linalg.norm(one + share[:, None] * along, axis=-1)
+    return closest
+
+
+def _either(which: BoolArray, one: Course, other: Course) -> Course:
+    def of(field: str) -> Float64Array:
+        a, b = getattr(one, field), getattr(other, field)
+        chosen: Float64Array = np.where(which if a.ndim == 1 else which[:, None], a, b)
+        return chosen
+
+    return Course(
+        **{
+            name: of(name)
+            for name in ("length", "departure", "arrival", "rate", "length_error", "direction_error")
+        }
+    )
