@@ -88,11 +88,15 @@ def contributing(
 
 
 def slab(
-    cosine: Float64Array, constants: Constants, thickness_m: float, frequency_hz: float
+    cosine: Float64Array,
+    constants: Constants | tuple[Float64Array, Float64Array],
+    thickness_m: float | Float64Array,
+    frequency_hz: float,
 ) -> tuple[Complex128Array, Complex128Array]:
     """Reflection and transmission coefficients of a slab in air for waves that come in at these angles.
 
-    Recommendation ITU-R P.2040-3, eqs. 37, 43 and 44; both of Shape ``[2, N]``, TE and TM.
+    Recommendation ITU-R P.2040-3, eqs. 37, 43 and 44; both of Shape ``[2, N]``, TE and TM. Slabs
+    may be one or N.
     """
     permittivity, conductivity = constants
     eta = permittivity - 1j * conductivity / (2 * np.pi * frequency_hz * _EPSILON_0)

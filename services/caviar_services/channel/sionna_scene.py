@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
+from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.errors import AssetError, PayloadError, ScenarioError
 from caviar_protocol.scene import object_pose
 from caviar_protocol.topics import Scene
 from caviar_services.channel.clearance import Surfaces
 from caviar_services.channel.contributing import SurfaceMaterial, UsedSurfaces, has_edge
+from caviar_services.channel.edge_fields import Media
 from caviar_services.channel.mesh_detail import DetailEffect, DetailSettings, detailed
 from caviar_services.channel.sionna_materials import (
     Constants,
@@ -151,6 +154,11 @@ class SionnaScene:
         """The Mitsuba scene, in metres relative to `centre`."""
         return self._scene.mi_scene
 
+    @property
+    def wavelengths(self) -> tuple[float, ...]:
+        """Of the carriers [m]."""
+        return tuple(SPEED_OF_LIGHT / frequency for frequency, _ in self._carriers)
+
     def tune(self, carrier: int) -> None:
         """Set frequency and materials to those of a carrier."""
         frequency, constants = self._carriers[carrier]
@@ -180,6 +188,27 @@ class SionnaScene:
             ),
             has_edges=any(has_edge(mesh) for mesh in [*still, *bodies]),
         )
+
+    @cached_property
+    def _surface_materials(self) -> tuple[Float64Array, Float64Array]:
+        """Of each shape, permittivity and conductivity on each carrier, Shape ``[2, C, S]``, and thickness [m]
+        and scattering coefficient, Shape ``[2, S]``."""
+        constants = []
+        for carrier in range(len(self._carriers)):
+            self.tune(carrier)
+            constants.append([_constants(shape.material) for shape in self._shapes])
+        self.tune(0)
+        slabs = [
+            (float(material.thickness[0]), float(material.scattering_coefficient[0]))
+            for material in (shape.material for shape in self._shapes)
+        ]
+        return np.moveaxis(np.array(constants), -1, 0), np.array(slabs).T
+
+    def media(self, shapes: Int64Array) -> Media:
+        """What process-local shapes are made of; anything for no shape."""
+        of = self._shape_order[self._where(shapes)]
+        constants, slabs = self._surface_materials
+        return Media(*constants[..., of], *slabs[:, of])
 
     @property
     def parking(self) -> Float64Array:
@@ -360,7 +389,7 @@ class SionnaScene:
         self.offset_by_shape[ids] = np.cumsum(totals) - totals
         self._body_id = int(ids[-1]) if self._bodies else -1
         order = np.argsort(ids)
-        self._ids = ids[order]
+        self._ids, self._shape_order = ids[order], order
         self._offsets = (np.cumsum(totals) - totals)[order]
         faces = np.concatenate([np.array(count, np.int64) for count in counts])
         self._first_triangles = np.cumsum(faces) - faces
