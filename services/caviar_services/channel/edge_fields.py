@@ -1,13 +1,20 @@
 """Fields of diffracted paths, in float64 from the meshes' own corners.
 
-A ray in the plane of a face is neither before nor behind it, and rounding in float32 says one or the other: the
-ray tracer then takes the wedge for its mirror image, or the angle 0 for 2π, and the amplitude of the path jumps
-by up to 15 dB with where the scene stands. Here the faces are those of the mesh, angles are those of the
-exterior, and what lies in a plane to within `_IN_PLANE` counts as lying in it.
+Those of the ray tracer change by 10 dB and more with where a scene stands, for the first two of three reasons:
 
-The coefficient is the ray tracer's, the uniform theory of diffraction (R. G. Kouyoumjian and P. H. Pathak, "A
+- Of a path with fewer interactions than the solver's depth, it counts the way from the last point to the
+  origin of coordinates, and from there to the receiver, as the length behind the edge.
+- A ray in the plane of a face is neither before nor behind it, and rounding in float32 says one or the other:
+  the wedge is then taken for its mirror image, the angle 0 for 2π, or a face for one in the shadow.
+- The terms that make up for the reflected wave where it ends have its opposite sign.
+
+Here legs are those of the path, faces those of the mesh, angles those of the exterior, and what lies in a plane
+to within `_IN_PLANE` counts as lying in it.
+
+The coefficient is that of the uniform theory of diffraction (R. G. Kouyoumjian and P. H. Pathak, "A
 uniform geometrical theory of diffraction for an edge in a perfectly conducting surface", Proc. IEEE 62(11), 1974)
-for a wedge of the reflection matrices R0 and Rn,
+for a wedge of the reflection matrices R0 and Rn, (the ray
+tracer's heuristic form, which is exact at the boundaries of light and of reflection):
 
 D = R0·(D1 − D4) + Rn·(D2 − D3), Di = −exp(−jπ/4) / (2n·sqrt(2πk)·sin β0) · cot(ψi)·F(kL·ai),
 
@@ -31,6 +38,10 @@ _IN_PLANE = 1e-8
 
 _FLAT = 1e-6
 """Sine of the angle between faces below which they are one plane, or lie upon one another."""
+
+_SIGN = -1.0
+"""Of reflection matrices in the bases of diffraction, which turn round from the incoming to the outgoing ray: with
+it the field is continuous at the boundaries of reflection, without it, as in the ray tracer, it is not."""
 
 _ALONG = 1e-9
 """Sine of the angle between two directions below which they are one."""
@@ -62,8 +73,8 @@ class Faces:
     @property
     def exterior(self) -> Float64Array:
         """Angle between the faces outside of the wedge [rad], Shape ``[P]``: n·π in the coefficients."""
-        cosine = -(self.normals[:, 0] * self.normals[:, 1]).sum(-1)
-        sine = np.sqrt((np.cross(self.normals[:, 0], self.normals[:, 1]) ** 2).sum(-1))
+        first, second = np.moveaxis(self.normals, 1, 0)
+        cosine, sine = -(first * second).sum(-1), _sine(first, second)
         exterior: Float64Array = 2 * np.pi - np.arctan2(sine, cosine)
         return exterior
 
@@ -76,28 +87,39 @@ class Faces:
         )
 
 
-def faces_of(corners: Float64Array) -> tuple[Faces, BoolArray]:
-    """Wedges of pairs of triangles, Shape ``[P, 2, 3, 3]`` [m], and where they are none: triangles that do
-    not share two corners, lie upon one another or have no area."""
+def faces_of(corners: Float64Array, ends: Float64Array) -> tuple[Faces, BoolArray]:
+    """Wedges of pairs of triangles, and where they are one: not where two triangles share no side, or one has no
+    area.
+
+    Parameters
+    ----------
+    corners
+        Of both triangles [m], Shape ``[P, 2, 3, 3]``.
+    ends
+        About where the edge ends [m], Shape ``[P, 2, 3]``: triangles that lie upon one another share three.
+    """
     first, second = corners[:, 0], corners[:, 1]
     same = (first[:, :, None] == second[:, None]).all(-1)
-    is_edge = (same.sum((1, 2)) == 2) & (same.any(2).sum(1) == 2) & (same.any(1).sum(1) == 2)
+    shared = same.any(2)
+    sides = shared & np.roll(shared, -1, axis=1)  # side i runs from corner i to i + 1
+    middles = (first + np.roll(first, -1, axis=1)) / 2 - ends.mean(1)[:, None]
+    side = np.argmin(np.where(sides, (middles**2).sum(-1), np.inf), axis=1)
     rows = np.arange(len(corners))
-    # The corner that is not shared lies across from the edge.
-    apex = np.argmin(same.any(2), axis=1), np.argmin(same.any(1), axis=1)
-    begin, end = first[rows, (apex[0] + 1) % 3], first[rows, (apex[0] + 2) % 3]
+    begin, end, apex = first[rows, side], first[rows, (side + 1) % 3], first[rows, (side + 2) % 3]
+    on_edge = (second == begin[:, None]).all(-1) | (second == end[:, None]).all(-1)
+    others = apex, second[rows, np.argmin(on_edge, axis=1)]
     with np.errstate(invalid="ignore", divide="ignore"):  # of what is no wedge
         edge = _unit(end - begin)
-        inward = [
-            _unit(_across(face[rows, at] - begin, edge)) for face, at in zip((first, second), apex, strict=True)
-        ]
-        is_edge &= np.sqrt((np.cross(inward[0], inward[1]) ** 2).sum(-1)) > _FLAT
-        normals = []
-        for own, other in (inward, inward[::-1]):
-            normal = np.cross(edge, own)
-            outside = (normal * other).sum(-1, keepdims=True) <= 0
-            normals.append(np.where(outside, normal, -normal))
+        inward = [_unit(_across(other - begin, edge)) for other in others]
+        normals = [np.cross(edge, part) for part in inward]
+        for normal, other in zip(normals, inward[::-1], strict=True):
+            normal *= np.where((normal * other).sum(-1, keepdims=True) > 0, -1.0, 1.0)
+        # One plane is seen from one side, two faces that lie upon one another from both.
+        level = (_sine(*inward) < _FLAT)[:, None]
+        turned = np.where((inward[0] * inward[1]).sum(-1, keepdims=True) > 0, -normals[0], normals[0])
+        normals[1] = np.where(level, turned, normals[1])
         leads_in = (np.cross(normals[0], edge) * inward[0]).sum(-1, keepdims=True) >= 0
+    is_edge = sides.any(1) & np.isfinite(normals).all((0, 2))
     return Faces(np.stack(normals, axis=1), np.where(leads_in, edge, -edge)), is_edge
 
 
@@ -210,7 +232,7 @@ def _diffracted(
         sent_back = k - 2 * (k * normal).sum(-1, keepdims=True) * normal
         s_back = -_unit(np.cross(sent_back, edge))
         back = np.stack([s_back, np.cross(sent_back, s_back)], axis=1)
-        parts.append(back @ wall.dyad(k, normal, no) @ incoming.transpose(0, 2, 1))
+        parts.append(_SIGN * back @ wall.dyad(k, normal, no) @ incoming.transpose(0, 2, 1))
     shadowed = exterior >= np.pi + angle_in - _IN_PLANE
     r_n = np.where(shadowed[:, None, None], -np.eye(2), parts[1])
     jones = parts[0] * d14[:, None, None] + r_n * d23[:, None, None]

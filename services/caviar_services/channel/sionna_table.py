@@ -92,9 +92,9 @@ def _diffract_anew(
         return
     types, shapes, primitives = types[rows], shapes[rows], primitives[rows]
     at = np.argmax(types == Interaction.DIFFRACTION, axis=1)
-    sides = Wedges.joined([part.wedge for part in parts]).faces[rows]
-    of_edge = np.broadcast_to(shapes[np.arange(len(rows)), at][:, None], sides.shape)
-    faces, is_edge = faces_of(scene.triangles(of_edge, sides) - scene.centre)
+    wedge = Wedges.joined([part.wedge for part in parts])
+    of_edge = np.broadcast_to(shapes[np.arange(len(rows)), at][:, None], (len(rows), 2))
+    faces, is_edge = faces_of(scene.triangles(of_edge, wedge.faces[rows]), wedge.ends[rows])
     triangles = scene.triangles(shapes, primitives) - scene.centre
     start, end = (place[rows] - scene.centre for place in ends)
     points = refined_points(start, traced[rows] - scene.centre, end, types, triangles)
