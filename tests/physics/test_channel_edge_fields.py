@@ -1,14 +1,26 @@
-"""Amplitudes of diffracted paths: the same wherever a scene stands, and those of the ray tracer where it is right."""
+"""Amplitudes of diffracted paths: the same wherever a scene stands, continuous, and Sommerfeld's."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from channel_lab import EPSILON_0, Array, C, Plate, Thing, antenna, measure, scene, sionna, turn, unit, write_scenery
+from channel_lab import (
+    EPSILON_0,
+    Array,
+    C,
+    Plate,
+    Thing,
+    antenna,
+    measure,
+    scene,
+    sionna,
+    turn,
+    unit,
+    write_scenery,
+)
 
 from caviar_protocol.coordinates import quaternion_from_euler
 from caviar_protocol.topics import Interaction
@@ -37,8 +49,8 @@ Levels = dict[tuple[Any, ...], float]
 def diffracted_levels(
     folder: Path, middle: Array, offset: Array, yaw: float, body: str = "metal", max_depth: int = 3
 ) -> Levels:
-    """Level [dB] of each diffracted path about a car, by sender, receiver, interactions and place; the ground's
-    middle lies off the car, and all is turned and then moved."""
+    """Level [dB] of each diffracted path about a car, by sender, receiver, interactions and place; the
+    ground's middle lies off the car, and all is turned and then moved."""
     turned = turn(yaw, 0, 0)
     ground = [
         offset + turned @ (middle + corner)
@@ -72,24 +84,24 @@ def diffracted_levels(
 
 @pytest.mark.parametrize("body", ["metal", "concrete"])
 def test_a_diffracted_path_is_as_strong_wherever_the_scene_stands(tmp_path: Path, body: str) -> None:
-    """A car on open ground, the scenery's middle off it, and all of it moved by up to 12 km and turned: every
-    diffracted path that is found in both has the same level to 0.1 dB, also in the planes of faces; nine of ten are
-    found in both, all but those over the end of an edge or along a face."""
+    """A car on open ground, the scenery's middle off it, and all of it moved by up to 12 km and turned:
+    every diffracted path that is found in both has the same level to 0.001 dB, also in the planes of faces.
+    Where nothing is turned, all but those over an edge's end are found; turned, other rays meet the car."""
     cases = [
         ((0, 0, 0), (0, 0, 0), 0.0),
         ((100, 37, 0), (0, 0, 0), 0.0),
         ((-60.3, 141.7, 0), (100, 37, 0), 0.7),
-        ((0, 0, 0), (1000.0, -430.0, 0), -2.1),
+        ((0, 0, 0), (1000.0, -430.0, 0), 0.0),
         ((15.0, -90.0, 0), (-9000.0, 7000.0, 0), 0.4),
     ]
     found = [
         diffracted_levels(tmp_path / str(i), np.array(m, float), np.array(o, float), yaw, body)
         for i, (m, o, yaw) in enumerate(cases)
     ]
-    for other in found[1:]:
+    for other, (_, _, yaw) in zip(found[1:], cases[1:], strict=True):
         both = found[0].keys() & other.keys()
-        assert len(both) > 0.9 * max(len(found[0]), len(other)) > 50
-        assert max(abs(found[0][key] - other[key]) for key in both) < 0.1
+        assert len(both) > (0.5 if yaw else 0.95) * len(found[0]) > 25
+        assert max(abs(found[0][key] - other[key]) for key in both) < 1e-3
 
 
 def test_levels_do_not_depend_on_how_deep_is_traced(tmp_path: Path) -> None:
@@ -106,7 +118,7 @@ def test_levels_do_not_depend_on_how_deep_is_traced(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def both_fields(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[tuple[Array, Array]]]:
+def both_fields(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Array, Array]]:
     """The ray tracer's dyads of diffracted paths of full depth, and what they are replaced by."""
     seen: list[tuple[Array, Array]] = []
     replaced = sionna_table._diffract_anew
@@ -119,11 +131,11 @@ def both_fields(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[tuple[Array, A
 
     monkeypatch.setattr(sionna_table, "_diffract_anew", keep)
     monkeypatch.setattr(module, "_SIGN", 1.0)  # the ray tracer's, which is wrong
-    yield seen
+    return seen
 
 
 @pytest.mark.parametrize("depth", [1, 2, 3])
-def test_fields_are_those_of_the_ray_tracer_where_it_is_right(
+def test_but_for_a_sign_fields_are_those_of_the_ray_tracer_where_its_legs_are_right(
     tmp_path: Path, both_fields: list[tuple[Array, Array]], depth: int
 ) -> None:
     """Paths of as many interactions as are traced, about bodies that stand askew, by way of plates of three
@@ -195,8 +207,8 @@ def straight(length: float) -> complex:
 def test_the_field_is_continuous_where_light_and_reflection_end(
     interior: float, eta: float, along_edge: bool
 ) -> None:
-    """Direct, reflected (Fresnel) and diffracted wave together, on both sides of both boundaries, of a conductor and
-    a dielectric, to 3 % of the direct wave."""
+    """Direct, reflected (Fresnel) and diffracted wave together, on both sides of both boundaries, of a
+    conductor and a dielectric, to 3 % of the direct wave."""
     at = 0.6
     for boundary in (np.pi + at, np.pi - at):
         if boundary > 2 * np.pi - interior:
@@ -204,7 +216,10 @@ def test_the_field_is_continuous_where_light_and_reflection_end(
         totals = []
         for angle in (boundary - 1e-5, boundary + 1e-5):
             total = over_edge(angle, at, interior, eta, along_edge)
-            tx, rx = S_IN * np.array([np.cos(at), np.sin(at)]), S_OUT * np.array([np.cos(angle), np.sin(angle)])
+            tx, rx = (
+                S_IN * np.array([np.cos(at), np.sin(at)]),
+                S_OUT * np.array([np.cos(angle), np.sin(angle)]),
+            )
             if angle < np.pi + at:
                 total += straight(float(np.linalg.norm(rx - tx)))
             if angle < np.pi - at:
@@ -219,8 +234,8 @@ def test_the_field_is_continuous_where_light_and_reflection_end(
 
 
 def test_behind_a_half_plane_is_sommerfelds_field() -> None:
-    """A conducting half-plane, E along its edge, deep in the shadow: within 2 % of the solution of A. Sommerfeld
-    (1896), asymptotically exp(−jπ/4)/(2·sqrt(2πk))·(sec((φ−φ')/2) − sec((φ+φ')/2))."""
+    """A conducting half-plane, E along its edge, deep in the shadow: within 2 % of the solution of
+    A. Sommerfeld (1896), asymptotically exp(−jπ/4)/(2·sqrt(2πk))·(sec((φ−φ')/2) − sec((φ+φ')/2))."""
     at = 1.1
     for angle in (5.2, 5.5, 5.8):
         secants = 1 / np.cos((angle - at) / 2) - 1 / np.cos((angle + at) / 2)

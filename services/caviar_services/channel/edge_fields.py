@@ -1,6 +1,6 @@
 """Fields of diffracted paths, in float64 from the meshes' own corners.
 
-Those of the ray tracer change by 10 dB and more with where a scene stands, for the first two of three reasons:
+Those of the ray tracer change by 10 dB and more with where a scene stands, for the first two reasons:
 
 - Of a path with fewer interactions than the solver's depth, it counts the way from the last point to the
   origin of coordinates, and from there to the receiver, as the length behind the edge.
@@ -8,13 +8,13 @@ Those of the ray tracer change by 10 dB and more with where a scene stands, for 
   the wedge is then taken for its mirror image, the angle 0 for 2π, or a face for one in the shadow.
 - The terms that make up for the reflected wave where it ends have its opposite sign.
 
-Here legs are those of the path, faces those of the mesh, angles those of the exterior, and what lies in a plane
-to within `_IN_PLANE` counts as lying in it.
+Here legs are those of the path, faces those of the mesh, angles those of the exterior, and what lies in a
+plane to within `_IN_PLANE` counts as lying in it.
 
 The coefficient is that of the uniform theory of diffraction (R. G. Kouyoumjian and P. H. Pathak, "A
-uniform geometrical theory of diffraction for an edge in a perfectly conducting surface", Proc. IEEE 62(11), 1974)
-for a wedge of the reflection matrices R0 and Rn, (the ray
-tracer's heuristic form, which is exact at the boundaries of light and of reflection):
+uniform geometrical theory of diffraction for an edge in a perfectly conducting surface", Proc. IEEE 62(11),
+1974) for a wedge of reflection matrices R0 and Rn, in the ray tracer's heuristic form: exact for a conductor and a field
+along the edge, else where light and reflection end,
 
 D = R0·(D1 − D4) + Rn·(D2 − D3), Di = −exp(−jπ/4) / (2n·sqrt(2πk)·sin β0) · cot(ψi)·F(kL·ai),
 
@@ -40,8 +40,8 @@ _FLAT = 1e-6
 """Sine of the angle between faces below which they are one plane, or lie upon one another."""
 
 _SIGN = -1.0
-"""Of reflection matrices in the bases of diffraction, which turn round from the incoming to the outgoing ray: with
-it the field is continuous at the boundaries of reflection, without it, as in the ray tracer, it is not."""
+"""Of reflection matrices in the bases of diffraction, which turn round from the incoming to the outgoing ray:
+with it the field is continuous where reflection ends, without it, as in the ray tracer, it is not."""
 
 _ALONG = 1e-9
 """Sine of the angle between two directions below which they are one."""
@@ -83,13 +83,13 @@ class Faces:
         met = -(self.normals * k[:, None]).sum(-1)
         swap = (met[:, 1] > met[:, 0] + _IN_PLANE)[:, None]
         return Faces(
-            np.where(swap[..., None], self.normals[:, ::-1], self.normals), np.where(swap, -self.edge, self.edge)
+            np.where(swap[..., None], self.normals[:, ::-1], self.normals),
+            np.where(swap, -self.edge, self.edge),
         )
 
 
 def faces_of(corners: Float64Array, ends: Float64Array) -> tuple[Faces, BoolArray]:
-    """Wedges of pairs of triangles, and where they are one: not where two triangles share no side, or one has no
-    area.
+    """Wedges of pairs of triangles, and where they are one: not where two share no side, or one has no area.
 
     Parameters
     ----------
@@ -206,9 +206,7 @@ class _Wall:
         """From the field that comes in along ``k`` to what is reflected, or goes through."""
         across = (k * normal).sum(-1)
         frequency = SPEED_OF_LIGHT / self.wavelength
-        back, passed = slab(
-            np.abs(across), (self.permittivity, self.conductivity), self.thickness, frequency
-        )
+        back, passed = slab(np.abs(across), (self.permittivity, self.conductivity), self.thickness, frequency)
         te, tm = np.where(through, passed, back * np.sqrt(1 - self.scattering**2))
         s = _unit(_perpendicular(k, normal))
         out = np.where(through[:, None], k, k - 2 * across[:, None] * normal)
@@ -241,8 +239,8 @@ def _diffracted(
 
 
 def _angle(direction: Float64Array, faces: Faces, exterior: Float64Array) -> Float64Array:
-    """Angle about the edge from the first face [rad], within the exterior: what is inside the wedge by rounding is
-    at the nearer face."""
+    """Angle about the edge from the first face [rad], within the exterior: what rounding puts inside the
+    wedge is at the nearer face."""
     normal = faces.normals[:, 0]
     into = np.cross(normal, faces.edge)
     angle = np.arctan2((direction * normal).sum(-1), (direction * into).sum(-1)) % (2 * np.pi)
@@ -267,17 +265,19 @@ def _coefficients(
     kl = k * legs[0] * legs[1] / (legs[0] + legs[1]) * sine**2
     factor = -np.exp(-0.25j * np.pi) / (2 * n * np.sqrt(2 * np.pi * k) * sine)
     apart, both = angle_out - angle_in, angle_out + angle_in
-    d1, d2, d3, d4 = (factor * _cot_f(sign * beta, exterior, kl) for beta in (apart, both) for sign in (1, -1))
+    d1, d2, d3, d4 = (
+        factor * _cot_f(sign * beta, exterior, kl) for beta in (apart, both) for sign in (1, -1)
+    )
     return d1 - d4, d2 - d3
 
 
 def _cot_f(beta: Float64Array, exterior: Float64Array, kl: Float64Array) -> Complex128Array:
     """cot(ψ)·F(kL·a) with ψ = (π + β)/2n and a = 2·cos²(nπN − β/2), N the nearest integer to (π + β)/2nπ.
 
-    At a shadow boundary cot is infinite and F is 0: with F(x) = 2·sqrt(πx)·exp(jπ/4)·K(sqrt(x)), K the modified
-    Fresnel integral, what remains is sqrt(a)/sin(ψ), which is sqrt(2)·n there.
+    At a shadow boundary cot is infinite and F is 0: with F(x) = 2·sqrt(πx)·exp(jπ/4)·K(sqrt(x)), K the
+    modified Fresnel integral, what remains is sqrt(a)/sin(ψ), which is sqrt(2)·n there.
     """
-    from scipy.special import modfresnelm
+    from scipy.special import modfresnelm  # type: ignore[import-untyped]
 
     n = exterior / np.pi
     psi = (np.pi + beta) / (2 * n)
@@ -286,9 +286,7 @@ def _cot_f(beta: Float64Array, exterior: Float64Array, kl: Float64Array) -> Comp
     on = np.abs(off) < _IN_PLANE
     ratio = np.where(on, np.sqrt(2.0) * n, root / np.where(on, 1.0, np.sin(psi)))
     _, k_minus = modfresnelm(np.sqrt(kl) * root)
-    product: Complex128Array = (
-        2 * np.sqrt(np.pi * kl) * np.exp(0.25j * np.pi) * np.cos(psi) * ratio * k_minus
-    )
+    product: Complex128Array = 2 * np.sqrt(np.pi * kl) * np.exp(0.25j * np.pi) * np.cos(psi) * ratio * k_minus
     return product
 
 
@@ -313,7 +311,7 @@ def _across(vectors: Float64Array, axis: Float64Array) -> Float64Array:
 
 
 def _outer(one: Complex128Array | Float64Array, other: Float64Array) -> Complex128Array:
-    outer: Complex128Array = one[:, :, None] * other[:, None] + 0j
+    outer: Complex128Array = one.astype(np.complex128)[:, :, None] * other[:, None]
     return outer
 
 

@@ -97,7 +97,7 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
         int | None, quantity("1", "receivers looked at together; absent: as many as fit")
     ] = None
     memory_gib: Annotated[
-        float, quantity("GiB", "of a launch and its candidates at most, rung mimo-rt", gt=0, le=1024)
+        float, quantity("GiB", "for element pairs looked at or traced together", gt=0, le=1024)
     ] = 4.0
     bodies: Annotated[int, quantity("1", "moving objects of one mesh at most", ge=0, le=4096)] = 32
     pool: dict[str, int] = msgspec.field(default_factory=dict)
@@ -266,14 +266,13 @@ class SionnaChannel(PathModel[SionnaSettings]):
 
     def _matrices(self, launches: Sequence[Traced], table: PathTable, traced_from: Ends) -> Matrices | None:
         """How the rung makes H; `plane_waves` where it has no way of its own."""
+        memory = int(self.settings.memory_gib * 2**30)
         if self.rung == "spherical" and table.traced is not None:
             surfaces = traced_surfaces(launches, table.traced, table.types, table.points, self._scene)
-            return SphericalWaves(surfaces, self._tracer.look, traced_from)
+            return SphericalWaves(surfaces, self._tracer.look, traced_from, memory)
         if self.rung == "mimo-rt":
             # The rays of a launch are kept whole; the rest is for the candidates of some receivers at a time.
-            lanes = (
-                int(self.settings.memory_gib * 2**30 / LANE_BYTES) - self._samples * self._launched.max_depth
-            )
+            lanes = memory // LANE_BYTES - self._samples * self._launched.max_depth
             return ElementTracer(
                 self._tracer, self._scene, self._wavelengths, max(1, lanes), self.settings.los
             )

@@ -191,8 +191,8 @@ class SionnaScene:
 
     @cached_property
     def _surface_materials(self) -> tuple[Float64Array, Float64Array]:
-        """Of each shape, permittivity and conductivity on each carrier, Shape ``[2, C, S]``, and thickness [m]
-        and scattering coefficient, Shape ``[2, S]``."""
+        """Of each shape, permittivity and conductivity [S/m] on each carrier, Shape ``[2, C, S]``, and
+        thickness [m] and scattering coefficient, Shape ``[2, S]``."""
         constants = []
         for carrier in range(len(self._carriers)):
             self.tune(carrier)

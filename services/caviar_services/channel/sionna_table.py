@@ -85,7 +85,10 @@ def _diffract_anew(
     ends: tuple[Float64Array, Float64Array],
     transfer: Complex128Array,
 ) -> None:
-    """Give diffracted paths the fields of the exact geometry, in place; ``met`` are types, shapes, triangles."""
+    """Give diffracted paths the fields of their exact geometry, in place.
+
+    ``met`` are types, shapes and triangles of all paths, ``traced`` their points and ``ends`` where they run.
+    """
     types, shapes, primitives = met
     rows = np.flatnonzero((types == Interaction.DIFFRACTION).sum(1) == 1)
     if not len(rows):
