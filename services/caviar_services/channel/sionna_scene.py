@@ -26,7 +26,7 @@ from caviar_protocol.errors import AssetError, PayloadError, ScenarioError
 from caviar_protocol.scene import object_pose
 from caviar_protocol.topics import Scene
 from caviar_services.channel.clearance import Surfaces
-from caviar_services.channel.contributing import SurfaceMaterial, UsedSurfaces, has_edge
+from caviar_services.channel.contributing import SurfaceMaterial, UsedSurfaces, edges_of, has_edge
 from caviar_services.channel.edge_fields import Media
 from caviar_services.channel.mesh_detail import DetailEffect, DetailSettings, detailed
 from caviar_services.channel.sionna_materials import (
@@ -209,6 +209,24 @@ class SionnaScene:
         of = self._shape_order[self._where(shapes)]
         constants, slabs = self._surface_materials
         return Media(*constants[..., of], *slabs[:, of])
+
+    @property
+    def edges(self) -> Float64Array:
+        """Both ends of every edge between two faces, as it stands [m], Shape ``[E, 2, 3]``; those of bodies
+        that stand for nothing have no length."""
+        return self._corners[self._edge_corners]
+
+    @cached_property
+    def _edge_corners(self) -> Int64Array:
+        meshes = [mesh for shape in self._shapes for mesh in shape.meshes]
+        bodies = [self._meshes[asset] for asset, _ in self._bodies]
+        still = len(meshes) - len(bodies)
+        found, begin = [np.zeros((0, 2), np.int64)], 0
+        for name, mesh in zip(self.names, [*meshes[:still], *bodies], strict=True):
+            if name != _PARKING:
+                found.append(begin + edges_of(mesh))
+            begin += len(mesh.vertices)
+        return np.concatenate(found)
 
     @property
     def parking(self) -> Float64Array:

@@ -46,7 +46,7 @@ def path_table(
     shapes = np.concatenate([part.shapes for _, part in parts])
     primitives = np.concatenate([part.primitives for _, part in parts])
     hidden = np.concatenate([part.hidden for _, part in parts])
-    (start, end), ends = _ends(pair, *antennas), _ends(pair, *traced_from)
+    (start, end), ends = path_ends(pair, *antennas), path_ends(pair, *traced_from)
     traced = np.concatenate([part.points for _, part in parts])
     points = refined_points(start, traced, end, types, scene.triangles(shapes, primitives), ends)
     transfer = np.concatenate([part.transfer for _, part in parts], axis=1)
@@ -116,7 +116,7 @@ def _diffract_anew(
     transfer[:, rows[good]] = fields[:, good]
 
 
-def _ends(
+def path_ends(
     pair: Int64Array, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]
 ) -> tuple[Float64Array, Float64Array]:
     """Positions [m] of TX and RX of paths, each of Shape ``[P, 3]``."""
