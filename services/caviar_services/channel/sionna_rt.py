@@ -7,6 +7,7 @@ They are one implementation with one scene and one set of options, so a rung is 
 
 from __future__ import annotations
 
+import importlib
 import itertools
 import math
 import time
@@ -378,6 +379,8 @@ class SionnaChannel(PathModel[SionnaSettings]):
         """Compile every kernel that frames need: move the bodies, and trace what finds paths."""
         self.run.progress("compiling kernels", _COMPILE_GRACE_S)
         begin = time.monotonic()
+        if self._launched.diffraction:
+            importlib.import_module("scipy.special")  # which the first diffracted path would wait for
         middle = (self._scene.low + self._scene.high) / 2
         above = np.array([middle[0], middle[1], self._scene.high[2] + 10.0])
         receivers = above + np.arange(1, 9)[:, None] * np.array([1.3, 0.7, -0.1])

@@ -168,23 +168,20 @@ class SionnaScene:
 
     def used_surfaces(self) -> UsedSurfaces:
         """What waves can meet, at rest and moving; unwelded scenery has no edges."""
-        shapes = [shape for shape in self._shapes if shape.id != _PARKING]
-        constants = []
-        for carrier in range(len(self._carriers)):
-            self.tune(carrier)
-            constants.append([_constants(shape.material) for shape in shapes])
-        self.tune(0)
+        constants, slabs = self._surface_materials
+        used = [(i, shape) for i, shape in enumerate(self._shapes) if shape.id != _PARKING]
+        shapes = [shape for _, shape in used]
         still = [mesh for shape in shapes if shape.id != _SKIN for mesh in shape.meshes]
         bodies = [mesh for asset, mesh in self._meshes.items() if self._pool[asset]]
         return UsedSurfaces(
             materials=tuple(
                 SurfaceMaterial(
                     name=_SKIN_NAME if shape.id == _SKIN else shape.material.name,
-                    constants=at_carriers,
-                    thickness_m=float(shape.material.thickness[0]),
-                    scattering_coefficient=float(shape.material.scattering_coefficient[0]),
+                    constants=tuple((float(p), float(c)) for p, c in constants[:, :, i].T),
+                    thickness_m=float(slabs[0, i]),
+                    scattering_coefficient=float(slabs[1, i]),
                 )
-                for shape, at_carriers in zip(shapes, zip(*constants, strict=True), strict=True)
+                for i, shape in used
             ),
             has_edges=any(has_edge(mesh) for mesh in [*still, *bodies]),
         )
