@@ -88,11 +88,15 @@ def contributing(
 
 
 def slab(
-    cosine: Float64Array, constants: Constants, thickness_m: float, frequency_hz: float
+    cosine: Float64Array,
+    constants: Constants | tuple[Float64Array, Float64Array],
+    thickness_m: float | Float64Array,
+    frequency_hz: float,
 ) -> tuple[Complex128Array, Complex128Array]:
     """Reflection and transmission coefficients of a slab in air for waves that come in at these angles.
 
-    Recommendation ITU-R P.2040-3, eqs. 37, 43 and 44; both of Shape ``[2, N]``, TE and TM.
+    Recommendation ITU-R P.2040-3, eqs. 37, 43 and 44; both of Shape ``[2, N]``, TE and TM. Slabs
+    may be one or N.
     """
     permittivity, conductivity = constants
     eta = permittivity - 1j * conductivity / (2 * np.pi * frequency_hz * _EPSILON_0)
@@ -104,13 +108,19 @@ def slab(
 
 
 def has_edge(mesh: Mesh) -> bool:
-    """Whether two faces that share two vertices do not lie in one plane: a wedge of the ray tracer.
+    """Whether a mesh has any of `edges_of`."""
+    return len(edges_of(mesh)) > 0
+
+
+def edges_of(mesh: Mesh) -> Int64Array:
+    """Both vertices of each edge that is a wedge of the ray tracer, Shape ``[E, 2]``: two faces that share
+    two vertices and do not lie in one plane.
 
     Faces that touch without sharing vertices have no edge for it, and neither has the rim of a face.
     """
     faces = mesh.faces.astype(np.int64)
     if len(faces) < 2:
-        return False
+        return np.zeros((0, 2), np.int64)
     corners = mesh.vertices[faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normal, axis=1)
@@ -126,7 +136,9 @@ def has_edge(mesh: Mesh) -> bool:
     size = np.maximum(size[first // 3], size[second // 3])
     # Two faces on the same side of their edge are folded onto each other.
     away = _beyond(mesh.vertices, sides[first], opposite[first], opposite[second])
-    return bool(((off > _FLAT * size) | ~away).any())
+    is_edge = (off > _FLAT * size) | ~away
+    edges: Int64Array = sides[first[is_edge]]
+    return edges
 
 
 def _beyond(vertices: Float64Array, edge: Int64Array, first: Int64Array, second: Int64Array) -> BoolArray:

@@ -161,7 +161,7 @@ class NumberedTriangles:
         self.offset_by_shape[ids] = np.cumsum(totals) - totals
         self._body_id = int(ids[-1]) if self._bodies else -1
         order = np.argsort(ids)
-        self._ids = ids[order]
+        self._ids, self._shape_order = ids[order], order
         self._offsets = (np.cumsum(totals) - totals)[order]
         faces = np.concatenate([np.array(count, np.int64) for count in counts])
         self._first_triangles = np.cumsum(faces) - faces

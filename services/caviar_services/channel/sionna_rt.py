@@ -7,6 +7,8 @@ They are one implementation with one scene and one set of options, so a rung is 
 
 from __future__ import annotations
 
+import importlib
+import itertools
 import math
 import time
 from collections.abc import Mapping, Sequence
@@ -26,6 +28,7 @@ from caviar_protocol.topics import AntennaDevice, ChannelOptions, Scene
 from caviar_services.channel.base import ChannelSettings, Found, PathModel
 from caviar_services.channel.clearance import with_near_pairs
 from caviar_services.channel.contributing import contributing
+from caviar_services.channel.edge_range import EdgeRange
 from caviar_services.channel.matrices import Matrices
 from caviar_services.channel.mesh_detail import DetailSettings
 from caviar_services.channel.mimo_rt import ElementTracer
@@ -41,7 +44,7 @@ from caviar_services.channel.sionna_materials import (
 from caviar_services.channel.sionna_reach import Corners
 from caviar_services.channel.sionna_scene import SceneSettings, SionnaScene
 from caviar_services.channel.sionna_sharing import scene_of
-from caviar_services.channel.sionna_table import Ends, path_table
+from caviar_services.channel.sionna_table import Ends, path_ends, path_table
 from caviar_services.channel.sionna_traced import Traced
 from caviar_services.channel.sionna_tracer import LANE_BYTES, Tracer
 from caviar_services.channel.spherical import SphericalWaves
@@ -75,6 +78,12 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     reflection: bool = True
     refraction: bool = False
     diffraction: bool = False
+    edges_within_m: (
+        Annotated[float, quantity("m", "from an edge that diffracts to the nearer end of a path", gt=0)]
+        | None
+    ) = None
+    """Edges farther from both ends diffract nothing; where there is none in range of a transmitter and all
+    receivers, its rays are launched without diffraction. Absent: all edges count."""
     scattering: bool = False
     """Diffuse reflection; needs a scattering_coefficient above 0 in ``materials``."""
     scattering_samples: (
@@ -98,7 +107,7 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
         int | None, quantity("1", "receivers looked at together; absent: as many as fit")
     ] = None
     memory_gib: Annotated[
-        float, quantity("GiB", "of a launch and its candidates at most, rung mimo-rt", gt=0, le=1024)
+        float, quantity("GiB", "for element pairs looked at or traced together", gt=0, le=1024)
     ] = 4.0
     bodies: Annotated[int, quantity("1", "moving objects of one mesh at most", ge=0, le=4096)] = 32
     pool: dict[str, int] = msgspec.field(default_factory=dict)
@@ -122,6 +131,10 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
         if self.scattering_samples is not None and self.rung == "mimo-rt":
             raise ValueError(
                 'rung = "mimo-rt" traces all paths of an antenna pair at once; leave out scattering_samples'
+            )
+        if self.edges_within_m is not None and (not self.diffraction or self.rung == "mimo-rt"):
+            raise ValueError(
+                'edges_within_m needs diffraction = true and a rung other than "mimo-rt"; leave it out'
             )
         mixed = self.scattering and self.scattering_samples is None
         if self.follow is not None and (self.diffraction or mixed):
@@ -152,6 +165,11 @@ class SionnaChannel(PathModel[SionnaSettings]):
         self._tracer: Tracer
         self._diffuse: Tracer | None = None
         """Traces diffuse paths where they have a launch of their own."""
+        self._edge_range: EdgeRange | None = None
+        self._unbent: Tracer
+        """Traces where no edge is in range."""
+        self._without_edge = 0
+        """Transmitters of this frame that no edge is in range of."""
         self._followed: dict[str, Followed] = {}
         self._outside: tuple[OutsideUse, ...] = ()
         self._detail = ""
@@ -217,12 +235,25 @@ class SionnaChannel(PathModel[SionnaSettings]):
             self._diffuse = Tracer(self._scene, self._wavelengths.tolist(), own)
             launched = replace(launched, scattering=False)
         self._tracer = Tracer(self._scene, self._wavelengths.tolist(), launched)
+        if s.edges_within_m is not None and launched.diffraction:
+            self._edge_range = EdgeRange(self._scene, s.edges_within_m)
+            self._unbent = Tracer(
+                self._scene, self._wavelengths.tolist(), replace(launched, diffraction=False)
+            )
+            range_note = (
+                f"diffraction is switched off for transmitters with no edge within {s.edges_within_m:g} m of "
+                "them or of a receiver, and for paths over edges farther from both ends; the count "
+                "no_edge_in_range tells for how many transmitters"
+            )
+            notes = (*notes, range_note)
         return (*notes, *switched, *self._warm_up())
 
     def reset(self, episode: int, seed: int, t0_ns: int) -> None:
         """Forget the paths of the episode before: what is followed must not begin with them."""
         self._followed.clear()
         self._tracer.forget()
+        if self._edge_range is not None:
+            self._unbent.forget()
 
     def step(self, frame: Frame) -> StepResult:
         """Raises `PayloadError` where paths that shall be followed are not known."""
@@ -248,10 +279,13 @@ class SionnaChannel(PathModel[SionnaSettings]):
         names, velocity = self._scene.place(scene, frozenset(self.settings.without_body))
         clear = [self._cleared(antenna) for antenna in (*transmitters, *receivers)]
         sources, targets = clear[: len(transmitters)], clear[len(transmitters) :]
+        self._without_edge = 0
         parts = [part for t, source in enumerate(sources) for part in self._launch(t, source, targets, names)]
         parts = parts or [(np.zeros(0, np.int64), self._tracer.nothing)]
         antennas = transmitters, receivers
         table = path_table(self._scene, parts, names, velocity, antennas, (sources, targets))
+        if self._edge_range is not None:
+            table = table.take(self._edge_range.within(table, *path_ends(table.pair, *antennas)))
         los = np.zeros(len(transmitters) * len(receivers), bool)
         straight = (table.types == 0).all(1)
         los[table.pair[straight if table.hidden is None else straight & ~table.hidden]] = True
@@ -264,20 +298,20 @@ class SionnaChannel(PathModel[SionnaSettings]):
             counts={
                 "path_limit_reached": sum(part.lost for _, part in parts),
                 "too_close": too_close,
+                **({} if self._edge_range is None else {"no_edge_in_range": self._without_edge}),
             },
             matrices=self._matrices([part for _, part in parts], table, (sources, targets)),
         )
 
     def _matrices(self, launches: Sequence[Traced], table: PathTable, traced_from: Ends) -> Matrices | None:
         """How the rung makes H; `plane_waves` where it has no way of its own."""
+        memory = int(self.settings.memory_gib * 2**30)
         if self.rung == "spherical" and table.traced is not None:
             surfaces = traced_surfaces(launches, table.traced, table.types, table.points, self._scene)
-            return SphericalWaves(surfaces, self._tracer.look, traced_from)
+            return SphericalWaves(surfaces, self._tracer.look, traced_from, memory)
         if self.rung == "mimo-rt":
             # The rays of a launch are kept whole; the rest is for the candidates of some receivers at a time.
-            lanes = (
-                int(self.settings.memory_gib * 2**30 / LANE_BYTES) - self._samples * self._launched.max_depth
-            )
+            lanes = memory // LANE_BYTES - self._samples * self._launched.max_depth
             return ElementTracer(
                 self._tracer, self._scene, self._wavelengths, max(1, lanes), self.settings.los
             )
@@ -302,10 +336,14 @@ class SionnaChannel(PathModel[SionnaSettings]):
         s, followed = self.settings, None
         if s.follow is not None:
             followed = self._followed.setdefault(transmitter.name, Followed(s.follow))
+        tracer = self._tracer
+        if self._edge_range is not None and not self._edge_range.reaches(
+            np.concatenate([transmitter.position[None], targets])
+        ):
+            tracer = self._unbent
+            self._without_edge += 1
         found = [
-            self._tracer.trace(
-                transmitter.position, targets, s.receivers_at_once, followed, names, corners=corners
-            )
+            tracer.trace(transmitter.position, targets, s.receivers_at_once, followed, names, corners=corners)
         ]
         if self._diffuse is not None:
             found.append(self._diffuse.trace(transmitter.position, targets, s.receivers_at_once))
@@ -345,20 +383,22 @@ class SionnaChannel(PathModel[SionnaSettings]):
         """Compile every kernel that frames need: move the bodies, and trace what finds paths."""
         self.run.progress("compiling kernels", _COMPILE_GRACE_S)
         begin = time.monotonic()
+        if self._launched.diffraction:
+            importlib.import_module("scipy.special")  # which the first diffracted path would wait for
         middle = (self._scene.low + self._scene.high) / 2
         above = np.array([middle[0], middle[1], self._scene.high[2] + 10.0])
         receivers = above + np.arange(1, 9)[:, None] * np.array([1.3, 0.7, -0.1])
         followed = None if self.settings.follow is None else Followed(self.settings.follow)
-        for shift in (0.0, 0.5, 1.0):
-            self._tracer.trace(
-                above + shift, receivers + shift / 2, followed=followed, names=self._scene.names
-            )
+        tracers = [self._tracer] if self._edge_range is None else [self._tracer, self._unbent]
+        for shift, tracer in itertools.product((0.0, 0.5, 1.0), tracers):
+            tracer.trace(above + shift, receivers + shift / 2, followed=followed, names=self._scene.names)
         if self._diffuse is not None:
             for shift in (0.0, 0.5):
                 self._diffuse.trace(above + shift, receivers + shift / 2)
         if self.rung != "siso-rt":
             corners = Corners(above[None] + [[0, 0, 0.1], [0, 0.1, 0]], receivers[:, None] + np.eye(3)[:2])
-            self._tracer.trace(above, receivers, corners=corners)
+            for tracer in tracers:
+                tracer.trace(above, receivers, corners=corners)
         if self.rung == "spherical":
             look = self._tracer.look
             look.nearest(receivers, receivers - 1.0)

@@ -13,16 +13,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
+from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.scene import object_pose
 from caviar_protocol.topics import Scene
-from caviar_services.channel.contributing import SurfaceMaterial, UsedSurfaces, has_edge
+from caviar_services.channel.contributing import SurfaceMaterial, UsedSurfaces, edges_of, has_edge
+from caviar_services.channel.edge_fields import Media
 from caviar_services.channel.mesh_detail import DetailSettings
 from caviar_services.channel.sionna_loading import by_material, loaded, with_detail
 from caviar_services.channel.sionna_materials import (
@@ -132,6 +135,11 @@ class SionnaScene(NumberedTriangles):
         """The Mitsuba scene, in metres relative to `centre`."""
         return self._scene.mi_scene
 
+    @property
+    def wavelengths(self) -> tuple[float, ...]:
+        """Of the carriers [m]."""
+        return tuple(SPEED_OF_LIGHT / frequency for frequency, _ in self._carriers)
+
     def tune(self, carrier: int) -> None:
         """Set frequency and materials to those of a carrier."""
         frequency, constants = self._carriers[carrier]
@@ -141,26 +149,62 @@ class SionnaScene(NumberedTriangles):
 
     def used_surfaces(self) -> UsedSurfaces:
         """What waves can meet, at rest and moving; unwelded scenery has no edges."""
-        shapes = [shape for shape in self._shapes if shape.id != _PARKING]
-        constants = []
-        for carrier in range(len(self._carriers)):
-            self.tune(carrier)
-            constants.append([_constants(shape.material) for shape in shapes])
-        self.tune(0)
+        constants, slabs = self._surface_materials
+        used = [(i, shape) for i, shape in enumerate(self._shapes) if shape.id != _PARKING]
+        shapes = [shape for _, shape in used]
         still = [mesh for shape in shapes if shape.id != _SKIN for mesh in shape.meshes]
         bodies = [mesh for asset, mesh in self._meshes.items() if self._pool[asset]]
         return UsedSurfaces(
             materials=tuple(
                 SurfaceMaterial(
                     name=_SKIN_NAME if shape.id == _SKIN else shape.material.name,
-                    constants=at_carriers,
-                    thickness_m=float(shape.material.thickness[0]),
-                    scattering_coefficient=float(shape.material.scattering_coefficient[0]),
+                    constants=tuple((float(p), float(c)) for p, c in constants[:, :, i].T),
+                    thickness_m=float(slabs[0, i]),
+                    scattering_coefficient=float(slabs[1, i]),
                 )
-                for shape, at_carriers in zip(shapes, zip(*constants, strict=True), strict=True)
+                for i, shape in used
             ),
             has_edges=any(has_edge(mesh) for mesh in [*still, *bodies]),
         )
+
+    @cached_property
+    def _surface_materials(self) -> tuple[Float64Array, Float64Array]:
+        """Of each shape, permittivity and conductivity [S/m] on each carrier, Shape ``[2, C, S]``, and
+        thickness [m] and scattering coefficient, Shape ``[2, S]``."""
+        constants = []
+        for carrier in range(len(self._carriers)):
+            self.tune(carrier)
+            constants.append([_constants(shape.material) for shape in self._shapes])
+        self.tune(0)
+        slabs = [
+            (float(material.thickness[0]), float(material.scattering_coefficient[0]))
+            for material in (shape.material for shape in self._shapes)
+        ]
+        return np.moveaxis(np.array(constants), -1, 0), np.array(slabs).T
+
+    def media(self, shapes: Int64Array) -> Media:
+        """What process-local shapes are made of; anything for no shape."""
+        of = self._shape_order[self._where(shapes)]
+        constants, slabs = self._surface_materials
+        return Media(*constants[..., of], *slabs[:, of])
+
+    @property
+    def edges(self) -> Float64Array:
+        """Both ends of every edge between two faces, as it stands [m], Shape ``[E, 2, 3]``; those of bodies
+        that stand for nothing have no length."""
+        return self._corners[self._edge_corners]
+
+    @cached_property
+    def _edge_corners(self) -> Int64Array:
+        meshes = [mesh for shape in self._shapes for mesh in shape.meshes]
+        bodies = [self._meshes[asset] for asset, _ in self._bodies]
+        still = len(meshes) - len(bodies)
+        found, begin = [np.zeros((0, 2), np.int64)], 0
+        for name, mesh in zip(self.names, [*meshes[:still], *bodies], strict=True):
+            if name != _PARKING:
+                found.append(begin + edges_of(mesh))
+            begin += len(mesh.vertices)
+        return np.concatenate(found)
 
     @property
     def parking(self) -> Float64Array:

@@ -6,12 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from caviar_protocol.arrays import Float64Array, Int64Array
+from caviar_protocol.arrays import Complex128Array, Float64Array, Int64Array, UInt8Array
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.clearance import spread_anew
+from caviar_services.channel.edge_fields import edge_fields, faces_of
 from caviar_services.channel.paths import Antenna, PathTable
 from caviar_services.channel.sionna_scene import SionnaScene
 from caviar_services.channel.sionna_traced import Traced
+from caviar_services.channel.sionna_wedges import Wedges
 from caviar_services.channel.specular import distinct, path_lengths, refined_points
 
 Ends = tuple[Sequence[Antenna], Sequence[Antenna]]
@@ -44,15 +46,17 @@ def path_table(
     shapes = np.concatenate([part.shapes for _, part in parts])
     primitives = np.concatenate([part.primitives for _, part in parts])
     hidden = np.concatenate([part.hidden for _, part in parts])
-    (start, end), ends = _ends(pair, *antennas), _ends(pair, *traced_from)
+    (start, end), ends = path_ends(pair, *antennas), path_ends(pair, *traced_from)
     traced = np.concatenate([part.points for _, part in parts])
     points = refined_points(start, traced, end, types, scene.triangles(shapes, primitives), ends)
+    transfer = np.concatenate([part.transfer for _, part in parts], axis=1)
+    _diffract_anew(scene, [part for _, part in parts], (types, shapes, primitives), traced, ends, transfer)
     specular = ((types != Interaction.DIFFRACTION) & (types != Interaction.SCATTERING)).all(1)
     objects = scene.object_index(shapes, primitives)
     table = PathTable(
         pair=pair,
         transfer=spread_anew(
-            np.concatenate([part.transfer for _, part in parts], axis=1),
+            transfer,
             specular,
             path_lengths(ends[0], traced, ends[1], types),
             path_lengths(start, points, end, types),
@@ -73,7 +77,46 @@ def path_table(
     return table.take(kept & ~(scene.is_parking(names, objects) & (types != 0)).any(1))
 
 
-def _ends(
+def _diffract_anew(
+    scene: SionnaScene,
+    parts: Sequence[Traced],
+    met: tuple[UInt8Array, Int64Array, Int64Array],
+    traced: Float64Array,
+    ends: tuple[Float64Array, Float64Array],
+    transfer: Complex128Array,
+) -> None:
+    """Give diffracted paths the fields of their exact geometry, in place.
+
+    ``met`` are types, shapes and triangles of all paths, ``traced`` their points and ``ends`` where they run.
+    """
+    types, shapes, primitives = met
+    rows = np.flatnonzero((types == Interaction.DIFFRACTION).sum(1) == 1)
+    if not len(rows):
+        return
+    types, shapes, primitives = types[rows], shapes[rows], primitives[rows]
+    at = np.argmax(types == Interaction.DIFFRACTION, axis=1)
+    wedge = Wedges.joined([part.wedge for part in parts])
+    of_edge = np.broadcast_to(shapes[np.arange(len(rows)), at][:, None], (len(rows), 2))
+    faces, is_edge = faces_of(scene.triangles(of_edge, wedge.faces[rows]), wedge.ends[rows])
+    triangles = scene.triangles(shapes, primitives) - scene.centre
+    start, end = (place[rows] - scene.centre for place in ends)
+    points = refined_points(start, traced[rows] - scene.centre, end, types, triangles)
+    points = np.where((types != 0)[..., None], points, end[:, None])
+    a, b, c = np.moveaxis(triangles, -2, 0)
+    with np.errstate(invalid="ignore", divide="ignore"):  # such paths stay as traced
+        fields = edge_fields(
+            np.concatenate([start[:, None], points, end[:, None]], axis=1),
+            types,
+            np.cross(b - a, c - a),
+            faces,
+            scene.media(shapes),
+            scene.wavelengths,
+        )
+    good = is_edge & np.isfinite(fields).all((0, 2, 3))
+    transfer[:, rows[good]] = fields[:, good]
+
+
+def path_ends(
     pair: Int64Array, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]
 ) -> tuple[Float64Array, Float64Array]:
     """Positions [m] of TX and RX of paths, each of Shape ``[P, 3]``."""

@@ -106,10 +106,7 @@ def joined(parts: Sequence[Traced], carriers: int, depth: int) -> Traced:
         shapes=np.concatenate([part.shapes for part in parts]),
         primitives=np.concatenate([part.primitives for part in parts]),
         points=np.concatenate([part.points for part in parts]),
-        wedge=Wedges(
-            np.concatenate([part.wedge.ends for part in parts]),
-            np.concatenate([part.wedge.outward for part in parts]),
-        ),
+        wedge=Wedges.joined([part.wedge for part in parts]),
         hidden=np.concatenate([part.hidden for part in parts]),
         settled=np.concatenate([part.settled for part in parts]),
         lost=sum(part.lost for part in parts),

@@ -41,11 +41,18 @@ class SphericalWaves:
         Asks this frame's scene.
     traced_from
         Transmitters and receivers off the surfaces that they are at: there their elements look.
+    memory
+        For looking at pairs of elements [bytes] at most; what is kept of each path comes on top.
     """
 
     def __init__(
-        self, surfaces: Surfaces, look: Look, traced_from: tuple[Sequence[Antenna], Sequence[Antenna]]
+        self,
+        surfaces: Surfaces,
+        look: Look,
+        traced_from: tuple[Sequence[Antenna], Sequence[Antenna]],
+        memory: int,
     ) -> None:
+        self._memory = memory
         self._surfaces = surfaces
         self._look = look
         self._sources, self._targets = traced_from
@@ -73,7 +80,7 @@ class SphericalWaves:
             wavelength = SPEED_OF_LIGHT / properties.frequency_hz
             transmit, receive = elements(transmitters, wavelength), elements(receivers, wavelength)
             looking = elements(self._sources, wavelength), elements(self._targets, wavelength)
-            seen = visibility(paths, tx, rx, *looking, self._look)
+            seen = visibility(paths, tx, rx, *looking, self._look, self._memory)
             field = _Field(
                 paths=paths,
                 seen=_far_enough(seen, paths, (tx, rx), (transmit, receive), wavelength),

@@ -48,6 +48,13 @@ _NODES = (1, 33, 17, 7, 5)
 """Elements of each side of the arrays that are looked at first, at most, by the number of sides there are."""
 
 
+_LANE_BYTES = 320
+"""Memory that looking at one pair of elements takes, for each segment that a path can have."""
+
+_AT_ONCE = 1 << 28
+"""[bytes]; more at once is no faster."""
+
+
 @dataclass(frozen=True, eq=False)
 class Elements:
     """Elements of the antennas at one end: all of them in one array."""
@@ -114,7 +121,8 @@ class Visibility:
     every: BoolArray
     """Paths that all pairs have, Shape ``[P]``."""
     some: dict[int, BoolArray]
-    """Of the other paths: which pairs have them, Shape ``[M, N]``, M elements at RX and N at TX."""
+    """Of the other paths: which pairs have them, Shape ``[M, N]``, M elements at RX and N at TX; none that is
+    absent."""
 
 
 def visibility(
@@ -124,8 +132,12 @@ def visibility(
     transmit: Elements,
     receive: Elements,
     look: Look,
+    memory: int = _AT_ONCE,
 ) -> Visibility:
-    """Of all paths, which run between antennas ``transmitter`` and ``receiver``, Shape ``[P]`` each."""
+    """Of all paths, which run between antennas ``transmitter`` and ``receiver``, Shape ``[P]`` each.
+
+    As many paths are looked at together as ``memory`` [bytes] allows, one at least.
+    """
     every: BoolArray = paths.surfaces.settled.copy()
     some: dict[int, BoolArray] = {}
     left = np.flatnonzero(~every)
@@ -133,7 +145,16 @@ def visibility(
     while len(left):
         arrays = test.arrays(left[0])
         alike = np.array([test.arrays(path) == arrays for path in left.tolist()])
-        some.update(zip(left[alike].tolist(), test.pairs(left[alike], *arrays), strict=True))
+        segments = paths.surfaces.types.shape[1] + 1
+        of_path = arrays[0].size * arrays[1].size * segments * _LANE_BYTES
+        at_once = max(1, min(memory, _AT_ONCE) // of_path)
+        of_arrays = left[alike]
+        for begin in range(0, len(of_arrays), at_once):
+            part = of_arrays[begin : begin + at_once]
+            found = test.pairs(part, *arrays)
+            every[part] = found.all((1, 2))
+            mixed = np.flatnonzero(found.any((1, 2)) & ~every[part])
+            some.update(zip(part[mixed].tolist(), found[mixed], strict=True))
         left = left[~alike]
     return Visibility(every, some)
 

@@ -18,10 +18,10 @@ from caviar_protocol.coordinates import SPEED_OF_LIGHT, angles
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.topics import Channel, ChannelMatrix, Scene
 from caviar_services.antenna import element_positions, steering_vector
-from caviar_services.channel.assemble import Antenna
 from caviar_services.channel.interpolation.course import Course, Courses
 from caviar_services.channel.interpolation.joined import Joined, carrier_phase, join
 from caviar_services.channel.interpolation.motion import Places, ends_of, places, velocities
+from caviar_services.channel.paths import Antenna
 
 PLANE_WAVES = ("free-space", "geometric", "siso-rt")
 """Rungs whose H follows from paths between reference points."""

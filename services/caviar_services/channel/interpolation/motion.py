@@ -10,8 +10,8 @@ from caviar_protocol.arrays import BoolArray, Float64Array
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.scene import antennas
 from caviar_protocol.topics import Interaction, Scene
-from caviar_services.channel.assemble import Antenna
 from caviar_services.channel.interpolation.joined import Joined
+from caviar_services.channel.paths import Antenna
 
 
 @dataclass(frozen=True, eq=False)
