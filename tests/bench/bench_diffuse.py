@@ -1,6 +1,6 @@
 """What diffuse scattering costs in the street canyon, and how far two seeds are apart with it.
 
-    python tests/bench/bench_diffuse.py --samples 1000 3000 --json diffuse.json
+    python tests/bench/bench_diffuse.py --samples 10000 30000 --paths 500 0 --json diffuse.json
 
 Takes scenes of ``deploy/scenarios/street-canyon.toml``, every material with the scattering coefficient that
 the trade of speed for accuracy takes (0.4), and steps by turns a channel without diffuse paths and two with
@@ -15,6 +15,7 @@ more rays instead of another seed: their directions are all others.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -32,10 +33,10 @@ SCENARIO = Path(__file__).parents[2] / "deploy" / "scenarios" / "street-canyon.t
 WITHOUT, ONE, OTHER, RAYS = "without", "seed 1", "seed 2", "other rays"
 
 
-def rungs(scenes: Scenes, samples: int, depth: int) -> dict[str, Rung]:
+def rungs(scenes: Scenes, samples: int, paths: int, depth: int) -> dict[str, Rung]:
     """The channels that are compared, by name."""
     plain = {"samples": 100_000, "max_depth": depth, "refraction": False, "diffraction": False}
-    rough = {"scattering": True, "max_paths": 2_000_000}
+    rough = {"scattering": True, "max_paths": 2_000_000, "scattering_paths": paths or None}
     settings: dict[str, dict[str, Any]] = {
         WITHOUT: {**plain, "scattering": False},
         ONE: {**plain, **rough, "scattering_samples": samples, "launch_seed": 1},
@@ -54,9 +55,9 @@ def rungs(scenes: Scenes, samples: int, depth: int) -> dict[str, Rung]:
     }
 
 
-def measured(scenes: Scenes, samples: int, depth: int) -> dict[str, Any]:
+def measured(scenes: Scenes, samples: int, wanted: int, depth: int) -> dict[str, Any]:
     """A row of the table."""
-    compared = rungs(scenes, samples, depth)
+    compared = rungs(scenes, samples, wanted, depth)
     times: dict[str, list[float]] = {name: [] for name in compared}
     users: dict[str, dict[Key, UserChannel]] = {name: {} for name in compared}
     paths = []
@@ -70,6 +71,7 @@ def measured(scenes: Scenes, samples: int, depth: int) -> dict[str, Any]:
         rung.close()
     return {
         "samples": samples,
+        "scattering_paths": wanted,
         "paths": float(np.mean(paths)),
         "without_ms": float(np.median(times[WITHOUT])),
         "with_ms": float(np.median(times[ONE])),
@@ -90,15 +92,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--samples", type=int, nargs="+", default=[1_000, 2_000, 3_000])
+    parser.add_argument("--samples", type=int, nargs="+", default=[10_000])
+    parser.add_argument(
+        "--paths", type=int, nargs="+", default=[500], help="of a receiver (scattering_paths); 0: all"
+    )
     parser.add_argument("--depth", type=int, default=3, help="interactions of a path at most")
     parser.add_argument("--scenes", type=int, default=25, help="with ten users each")
     parser.add_argument("--json", type=Path, help="write the rows here")
     options = parser.parse_args(arguments)
     scenes = scenes_of(SCENARIO, options.scenes)
     rows = []
-    for samples in options.samples:
-        rows.append(measured(scenes, samples, options.depth))
+    for samples, paths in itertools.product(options.samples, options.paths):
+        rows.append(measured(scenes, samples, paths, options.depth))
         print(json.dumps(rows[-1], ensure_ascii=False), flush=True)
     if options.json:
         options.json.write_text(json.dumps(rows, indent=2, ensure_ascii=False) + "\n", "utf-8")

@@ -22,9 +22,10 @@ from caviar_protocol.arrays import (
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.sionna_candidates import Candidates, Offer, Planes, positions
 from caviar_services.channel.sionna_follow import Followed
-from caviar_services.channel.sionna_launch import Launch, Launcher, LaunchOptions
+from caviar_services.channel.sionna_launch import SCATTERED, Launch, Launcher, LaunchOptions
 from caviar_services.channel.sionna_reach import Corners, Faces, at_corners, reflected
 from caviar_services.channel.sionna_scene import SionnaScene
+from caviar_services.channel.sionna_thinning import Thinning
 from caviar_services.channel.sionna_traced import Traced, geometry, joined, nothing, read
 from caviar_services.channel.specular import image_points, refined_points
 from caviar_services.channel.visibility import Look
@@ -87,6 +88,7 @@ class Tracer:
         self._patterns = antenna_pattern_registry.get("iso")(polarization="VH").patterns
         self._faces = Faces(scene)
         self._launcher = Launcher(scene.mi_scene, options)
+        self._thinning = None if options.diffuse_paths is None else Thinning(scene.mi_scene, options)
         self._images = ImageMethod()
         self._fields = FieldCalculator()
         self._last: dict[bytes, _Last] = {}
@@ -137,7 +139,7 @@ class Tracer:
         if last is None or last.version != self._scene.version:
             if followed is None:
                 source = positions(transmitter[None])
-                offer = Offer(self._scene, self._launcher(source), source, self._options)
+                offer = Offer(self._scene, self._launcher(source), source, self._options, self._thinning)
             else:
                 offer = followed.offer(self._launcher, transmitter, self._scene, names, self._options)
             offer.everywhere = corners is not None
@@ -253,6 +255,11 @@ class Tracer:
                 (buffer._vertices_z, bounce.point.z),
             ):
                 dr.scatter(tensor.array, dr.gather(type(of_rays), of_rays, ray, used), place + d, used)
+        if self._thinning is not None:
+            chosen = mi.Float(aligned_columns(candidates.chosen[None])[0])
+            is_chosen = chosen > 0.0
+            dr.scatter(buffer._interaction_types.array, mi.UInt(SCATTERED), place + interactions - 1, is_chosen)
+            dr.scatter(buffer._probs.array, chosen, place + interactions - 1, is_chosen)
         if self._options.diffraction and launch.wedges is not None:
             buffer._diffracting_wedges = dr.gather(WedgeGeometry, launch.wedges, ray, interactions > 0)
         buffer.schedule()
