@@ -17,7 +17,7 @@ from caviar_services.channel.sionna_chains import Chains, chains_of, scattered_o
 from caviar_services.channel.sionna_launch import Launch, LaunchOptions
 from caviar_services.channel.sionna_planes import PlaneTable
 from caviar_services.channel.sionna_scene import SionnaScene
-from caviar_services.channel.sionna_thinning import Thinning
+from caviar_services.channel.sionna_thinning import Points
 from caviar_services.columns import aligned_columns, aligned_indices
 
 _SLACK = 0.1
@@ -73,8 +73,8 @@ class Offer:
         Where they came from, a `mitsuba.Point3f` of width 1.
     options
         What is traced.
-    thinning
-        Chooses diffuse paths, where not all that were drawn are wanted.
+    points
+        Of the launch, to choose diffuse paths from; None: all that were drawn are wanted.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class Offer:
         launch: Launch,
         source: Any,
         options: LaunchOptions,
-        thinning: Thinning | None = None,
+        points: Points | None = None,
     ) -> None:
         self.launch = launch
         self._mi_scene = scene.mi_scene
@@ -96,8 +96,8 @@ class Offer:
         self._chains = chains_of(launch, scene, options.max_depth)
         if options.only_scattered:
             self._chains = self._chains.take(~self._chains.straight)
-        self._points = thinning and thinning.points(launch)
-        self._scattered = (self._points.ray, self._points.depth) if self._points else scattered_of(launch)
+        self._points = points
+        self._scattered = (points.ray, points.depth) if points else scattered_of(launch)
 
     @property
     def size(self) -> int:
@@ -118,7 +118,9 @@ class Offer:
             every_target = np.arange(dr.width(targets))
             seen, direct = np.isin(every_target, direct), every_target
         chain, receiver = self.planes.possible(chains, self._source, targets)
-        point, reached, probability = self._points.reached(targets) if self._points else self._reached(targets)
+        point, reached, probability = (
+            self._points.reached(targets) if self._points else self._reached(targets)
+        )
         none = np.zeros(len(direct), np.int64)
         any_plane = np.full((len(direct) + len(point), self._options.max_depth), -1, np.int32)
         every = Candidates(

@@ -41,6 +41,7 @@ from caviar_services.channel.sionna_reach import Corners
 from caviar_services.channel.sionna_scene import SceneSettings, SionnaScene
 from caviar_services.channel.sionna_sharing import scene_of
 from caviar_services.channel.sionna_table import Ends, path_table
+from caviar_services.channel.sionna_thinning import Element
 from caviar_services.channel.sionna_traced import Traced
 from caviar_services.channel.sionna_tracer import LANE_BYTES, Tracer
 from caviar_services.channel.spherical import SphericalWaves
@@ -320,7 +321,10 @@ class SionnaChannel(PathModel[SionnaSettings]):
             )
         ]
         if self._diffuse is not None:
-            found.append(self._diffuse.trace(transmitter.position, targets, s.receivers_at_once))
+            element = Element(transmitter.array.pattern, transmitter.rotation)
+            found.append(
+                self._diffuse.trace(transmitter.position, targets, s.receivers_at_once, element=element)
+            )
         first, index = t * len(receivers), np.array(others, np.int64)
         return [(first + index[traced.receiver], traced) for traced in found]
 
