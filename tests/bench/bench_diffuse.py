@@ -5,10 +5,10 @@
 Takes scenes of ``deploy/scenarios/street-canyon.toml``, every material with the scattering coefficient that
 the trade of speed for accuracy takes (0.4), and steps by turns a channel without diffuse paths and two with
 them, which differ in the seed of their launch alone. For each number of rays: median times of a scene, H
-included; the median over the scenes of their ratio, and the
-ratio of processor times, which what else the machine does changes less; 95 % of users differ by less in path gain; and
-the share of users whose best pair of DFT beams is the same. ``other rays`` compares with a launch of 7 %
-more rays instead of another seed: their directions are all others.
+included; the median over the scenes of their ratio, and the ratio of processor times, which what else the
+machine does changes less; 95 % of users differ by less in path gain; and the share of users whose best pair
+of DFT beams is the same. ``other rays`` compares with a launch of 7 % more rays besides another seed: their
+directions are all others.
 """
 
 # ruff: noqa: T201 - what it measures is printed

@@ -34,6 +34,7 @@ from caviar_services.antenna import steering_vector
 from caviar_services.channel.atmosphere import amplitude_factor
 from caviar_services.channel.geometry import PathGeometry, path_geometry
 from caviar_services.channel.patterns import radiated_field
+from caviar_services.channel.stacked import summed
 
 
 @dataclass(frozen=True, eq=False)
@@ -396,7 +397,7 @@ def plane_waves(
         receive = _steering(receivers[rx], geometry.arrival[mine])
         steered.append((tx, rx, mine, receive, transmit))
     return tuple(
-        ChannelMatrix(carrier=carrier, tx=tx, rx=rx, h=(receive * a[carrier, mine, None]).T @ transmit)
+        ChannelMatrix(carrier=carrier, tx=tx, rx=rx, h=summed(receive * a[carrier, mine, None], transmit))
         for carrier in range(len(carriers))
         for tx, rx, mine, receive, transmit in steered
     )

@@ -118,9 +118,8 @@ class Offer:
             every_target = np.arange(dr.width(targets))
             seen, direct = np.isin(every_target, direct), every_target
         chain, receiver = self.planes.possible(chains, self._source, targets)
-        point, reached, probability = (
-            self._points.reached(targets) if self._points else self._reached(targets)
-        )
+        of_points = self._points.reached if self._points else self._reached
+        point, reached, probability = of_points(targets)
         none = np.zeros(len(direct), np.int64)
         any_plane = np.full((len(direct) + len(point), self._options.max_depth), -1, np.int32)
         every = Candidates(

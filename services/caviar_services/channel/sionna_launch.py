@@ -35,7 +35,7 @@ class LaunchOptions:
     only_scattered: bool = False
     """Whether paths without a diffuse reflection are left to another launch."""
     diffuse_paths: int | None = None
-    """How many diffuse paths of a receiver are chosen, about; None: all that were drawn, and none but those."""
+    """How many diffuse paths of a receiver are chosen, about; None: those that were drawn."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -86,8 +86,8 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     scattering_paths: (
         Annotated[int, quantity("1", "diffuse paths of a receiver, about", ge=1, le=1_000_000)] | None
     ) = None
-    """Of all points at which the rays of ``scattering_samples`` meet something rough, about so many are chosen
-    for each receiver, the stronger the likelier, and stand for the others: power is right in the mean.
+    """Of all points at which the rays of ``scattering_samples`` meet something rough, about so many are
+    chosen for each receiver, the stronger the likelier, and stand for the others: power is right in the mean.
     Absent: every point at which a ray was drawn to be scattered."""
     launch_seed: Annotated[int | None, quantity("1", "of the ray launch; absent: from the run's seed")] = None
     max_paths: Annotated[
@@ -127,7 +127,7 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
             raise ValueError("scattering_samples needs scattering = true; write both or neither")
         if self.scattering_paths is not None and self.scattering_samples is None:
             raise ValueError(
-                "scattering_paths chooses among the points of a launch of its own; give scattering_samples too"
+                "scattering_paths chooses among the points of a launch of its own; give scattering_samples"
             )
         if self.scattering_samples is not None and self.rung == "mimo-rt":
             raise ValueError(

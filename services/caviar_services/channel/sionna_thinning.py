@@ -31,19 +31,18 @@ from caviar_services.channel.sionna_launch import (
     SCATTERED,
     Bounce,
     Launch,
-    LaunchOptions,
 )
 from caviar_services.columns import aligned_columns, aligned_indices, several
 
 _LEAST = 0.01
-"""What a factor of a weight is at least: factors leave out polarisation and the thickness of walls, and a point
-that was chosen against all odds brings far too much."""
+"""What a factor of a weight is at least: factors leave out polarisation and the thickness of walls, and a
+point that was chosen against all odds brings far too much."""
 
 _EPSILON_0 = 8.8541878128e-12
 """Permittivity of vacuum [F/m] (CODATA 2018)."""
 
 _GRAZING = 0.1
-"""Added to the cosine of Lambert's law, so that no point that is seen at a small angle is hardly ever chosen."""
+"""Added to the cosine of Lambert's law: a point that is seen at a small angle is chosen now and then."""
 
 _NEAR = 1.0
 """[m²]; added to the squared distance, for the same reason and so that weights have a limit."""
@@ -77,26 +76,28 @@ class Element:
 
 
 class Thinning:
-    """Chooses the diffuse paths of a launch, about ``options.diffuse_paths`` for each receiver at most.
+    """Chooses the diffuse paths of launches.
 
     Parameters
     ----------
     mi_scene
         The Mitsuba scene, with its radio materials.
-    options
-        What is traced.
+    wanted
+        About how many of each receiver are chosen at most.
+    seed
+        Where the choice begins.
     """
 
-    def __init__(self, mi_scene: Any, options: LaunchOptions) -> None:
+    def __init__(self, mi_scene: Any, wanted: int, seed: int) -> None:
         import drjit as dr
         import mitsuba as mi
 
-        assert options.diffuse_paths is not None
         self.mi_scene = mi_scene
-        self._wanted = options.diffuse_paths
-        self._offset = np.uint64(derive_seed(options.seed, 0, "diffuse paths"))
-        shapes = list(mi_scene.shapes())
-        numbers = [int(dr.reinterpret_array(mi.UInt, mi.ShapePtr(shape))[0]) for shape in shapes]
+        self._wanted = wanted
+        self._offset = np.uint64(derive_seed(seed, 0, "diffuse paths"))
+        shapes: list[Any] = list(mi_scene.shapes())
+        pointers: list[Any] = [dr.reinterpret_array(mi.UInt, mi.ShapePtr(shape)) for shape in shapes]
+        numbers = [int(pointer[0]) for pointer in pointers]
         self._roughness = np.zeros(max(numbers, default=0) + 1)
         """Squared scattering coefficient S² of each process-local shape."""
         self._mirror = np.zeros(len(self._roughness))
@@ -233,10 +234,12 @@ class Points:
         point, target = lane // per_point, lane % per_point
         towards = dr.gather(mi.Point3f, targets, target) - dr.gather(mi.Point3f, self._point, point)
         apart = dr.squared_norm(towards)
-        cosine = dr.dot(mi.Vector3f(dr.gather(mi.Normal3f, self._normal, point)), towards) * dr.rsqrt(apart)
-        weight = dr.select(cosine > 0.0, (cosine + _GRAZING) / (apart + _NEAR), 0.0)
-        found = weight.numpy().reshape(-1, receivers)[: len(self.ray)].astype(np.float64)
-        return found * self._brings[:, None]
+        normal = mi.Vector3f(dr.gather(mi.Normal3f, self._normal, point))
+        cosine = dr.dot(normal, mi.Vector3f(towards)) * dr.rsqrt(apart)
+        weight: Any = dr.select(cosine > 0.0, (cosine + _GRAZING) / (apart + _NEAR), 0.0)
+        found: Float64Array = weight.numpy().reshape(-1, receivers)[: len(self.ray)].astype(np.float64)
+        found *= self._brings[:, None]
+        return found
 
     def _free(self, point: Int64Array, receiver: Int64Array, targets: Any) -> BoolArray:
         """Whether nothing stands between these points and receivers."""

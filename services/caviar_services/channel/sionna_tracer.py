@@ -88,7 +88,9 @@ class Tracer:
         self._patterns = antenna_pattern_registry.get("iso")(polarization="VH").patterns
         self._faces = Faces(scene)
         self._launcher = Launcher(scene.mi_scene, options)
-        self._thinning = None if options.diffuse_paths is None else Thinning(scene.mi_scene, options)
+        self._thinning: Thinning | None = None
+        if options.diffuse_paths is not None:
+            self._thinning = Thinning(scene.mi_scene, options.diffuse_paths, options.seed)
         self._images = ImageMethod()
         self._fields = FieldCalculator()
         self._last: dict[bytes, _Last] = {}
@@ -129,8 +131,8 @@ class Tracer:
         ``at_once`` receivers are handled together, or as many as fit ``lanes``: to the paths it makes no
         difference. With ``followed``, what the transmitter's last launches met, a part of the rays is
         launched; ``names`` is what `SionnaScene.place` returned. With ``corners`` also paths that only a part
-        of the arrays has; nothing is then taken from an earlier trace. Diffuse paths are chosen by the gain of
-        ``element`` too, the transmitter's.
+        of the arrays has; nothing is then taken from an earlier trace. Diffuse paths are chosen by the gain
+        of ``element`` too, the transmitter's.
         """
         if not len(receivers):
             return self.nothing
@@ -143,7 +145,9 @@ class Tracer:
             if followed is None:
                 source = positions(transmitter[None])
                 launch = self._launcher(source)
-                points = self._thinning and self._thinning.points(launch, transmitter, element)
+                points = None
+                if self._thinning is not None:
+                    points = self._thinning.points(launch, transmitter, element)
                 offer = Offer(self._scene, launch, source, self._options, points)
             else:
                 offer = followed.offer(self._launcher, transmitter, self._scene, names, self._options)
