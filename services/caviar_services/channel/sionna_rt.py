@@ -236,6 +236,8 @@ class SionnaChannel(PathModel[SionnaSettings]):
         """Forget the paths of the episode before: what is followed must not begin with them."""
         self._followed.clear()
         self._tracer.forget()
+        if self._diffuse is not None:
+            self._diffuse.forget()
 
     def step(self, frame: Frame) -> StepResult:
         """Raises `PayloadError` where paths that shall be followed are not known."""

@@ -94,7 +94,7 @@ class Thinning:
 
         self.mi_scene = mi_scene
         self._wanted = wanted
-        self._offset = np.uint64(derive_seed(seed, 0, "diffuse paths"))
+        self._offset = np.uint64(2 * derive_seed(seed, 0, "diffuse paths"))  # of 31 bits
         shapes: list[Any] = list(mi_scene.shapes())
         pointers: list[Any] = [dr.reinterpret_array(mi.UInt, mi.ShapePtr(shape)) for shape in shapes]
         numbers = [int(pointer[0]) for pointer in pointers]
