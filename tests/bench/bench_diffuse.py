@@ -38,7 +38,9 @@ WITHOUT, ONE, OTHER, RAYS = "without", "seed 1", "seed 2", "other rays"
 def rungs(scenes: Scenes, samples: int, paths: int, depth: int) -> dict[str, Rung]:
     """The channels that are compared, by name."""
     plain = {"samples": 100_000, "max_depth": depth, "refraction": False, "diffraction": False}
-    rough = {"scattering": True, "max_paths": 2_000_000, "scattering_paths": paths or None}
+    rough: dict[str, Any] = {"scattering": True, "max_paths": 2_000_000}
+    if paths:
+        rough["scattering_paths"] = paths
     settings: dict[str, dict[str, Any]] = {
         WITHOUT: {**plain, "scattering": False},
         ONE: {**plain, **rough, "scattering_samples": samples, "launch_seed": 1},
