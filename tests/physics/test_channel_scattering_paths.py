@@ -23,7 +23,7 @@ def powers(channel: Channel) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
 
 
 def test_power_of_the_chosen_is_in_the_mean_that_of_all_points() -> None:
-    """Over 40 choices among the points of one launch, to four of its standard errors and to 3 %."""
+    """Over 40 choices among one launch's points, to four standard errors and 0.5 % each, and 3 % in all."""
     where = places(3, CANYON, 10)
     settings = {**ROUGH, "scattering_samples": 4_000, "launch_seed": 7}
     all_points = powers(asked(model(CANYON, **settings, scattering_paths=1_000_000), CANYON, where, TEN))
@@ -52,7 +52,7 @@ def test_all_points_bring_what_those_that_are_drawn_bring() -> None:
 
 
 def test_no_more_are_found_than_are_wanted() -> None:
-    """At each of 80 receivers: about 4σ of a binomial choice and a few ends behind a diffuse point apart."""
+    """At each of ten receivers, to half as many again: also ends behind a diffuse point are among them."""
     where = places(8, CANYON, 10)
     found = asked(model(CANYON, **ROUGH, scattering_samples=20_000, scattering_paths=100), CANYON, where, TEN)
     diffuse = (found.interactions == Interaction.SCATTERING).any(1)
