@@ -11,6 +11,7 @@ from caviar_protocol.topics import Carrier, ChannelMatrix
 from caviar_services.antenna import steering_vector
 from caviar_services.channel.geometry import PathGeometry
 from caviar_services.channel.paths import Antenna
+from caviar_services.channel.stacked import summed
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +54,7 @@ def plane_waves(
         receive = _steering(receivers[rx], geometry.arrival[mine])
         steered.append((tx, rx, mine, receive, transmit))
     return tuple(
-        ChannelMatrix(carrier=carrier, tx=tx, rx=rx, h=(receive * a[carrier, mine, None]).T @ transmit)
+        ChannelMatrix(carrier=carrier, tx=tx, rx=rx, h=summed(receive * a[carrier, mine, None], transmit))
         for carrier in range(len(carriers))
         for tx, rx, mine, receive, transmit in steered
     )

@@ -17,6 +17,7 @@ from caviar_services.channel.sionna_chains import Chains, chains_of, scattered_o
 from caviar_services.channel.sionna_launch import Launch, LaunchOptions
 from caviar_services.channel.sionna_planes import PlaneTable
 from caviar_services.channel.sionna_scene import SionnaScene
+from caviar_services.channel.sionna_thinning import Points
 from caviar_services.columns import aligned_columns, aligned_indices
 
 _SLACK = 0.1
@@ -43,11 +44,19 @@ class Candidates:
     """Plane that has to reflect at each interaction, −1 where any may, Shape ``[P, D]``."""
     found: BoolArray
     """Known to be a path; of the others the image method finds out, Shape ``[P]``."""
+    chosen: Float64Array
+    """Probability with which a path was chosen that is diffuse at its last interaction, whatever its ray did
+    there; 0 where its ray did what it does; Shape ``[P]``."""
 
     def take(self, which: Int64Array | BoolArray) -> Candidates:
         """These candidates."""
         return Candidates(
-            self.ray[which], self.depth[which], self.receiver[which], self.planes[which], self.found[which]
+            self.ray[which],
+            self.depth[which],
+            self.receiver[which],
+            self.planes[which],
+            self.found[which],
+            self.chosen[which],
         )
 
 
@@ -64,6 +73,8 @@ class Offer:
         Where they came from, a `mitsuba.Point3f` of width 1.
     options
         What is traced.
+    points
+        Of the launch, to choose diffuse paths from; None: all that were drawn are wanted.
     """
 
     def __init__(
@@ -72,6 +83,7 @@ class Offer:
         launch: Launch,
         source: Any,
         options: LaunchOptions,
+        points: Points | None = None,
     ) -> None:
         self.launch = launch
         self._mi_scene = scene.mi_scene
@@ -84,7 +96,8 @@ class Offer:
         self._chains = chains_of(launch, scene, options.max_depth)
         if options.only_scattered:
             self._chains = self._chains.take(~self._chains.straight)
-        self._scattered = scattered_of(launch)
+        self._points = points
+        self._scattered = (points.ray, points.depth) if points else scattered_of(launch)
 
     @property
     def size(self) -> int:
@@ -105,7 +118,8 @@ class Offer:
             every_target = np.arange(dr.width(targets))
             seen, direct = np.isin(every_target, direct), every_target
         chain, receiver = self.planes.possible(chains, self._source, targets)
-        point, reached = self._reached(targets)
+        of_points = self._points.reached if self._points else self._reached
+        point, reached, probability = of_points(targets)
         none = np.zeros(len(direct), np.int64)
         any_plane = np.full((len(direct) + len(point), self._options.max_depth), -1, np.int32)
         every = Candidates(
@@ -114,6 +128,7 @@ class Offer:
             np.concatenate([direct, receiver, reached]),
             np.concatenate([any_plane[: len(direct)], chains.planes[chain], any_plane[len(direct) :]]),
             np.concatenate([seen, np.repeat([False, True], [len(chain), len(point)])]),
+            np.concatenate([np.zeros(len(direct) + len(chain)), probability]),
         )
         every = every.take(every.receiver < count)
         kept = first_of_each(every.receiver, self._options.max_paths)
@@ -131,14 +146,15 @@ class Offer:
         seen: Int64Array = np.flatnonzero(free.numpy())
         return seen
 
-    def _reached(self, targets: Any) -> tuple[Int64Array, Int64Array]:
-        """Scattering points and the receivers that each of them reaches, on the side that was lit."""
+    def _reached(self, targets: Any) -> tuple[Int64Array, Int64Array, Float64Array]:
+        """Scattering points and the receivers that each of them reaches, on the side that was lit; all with
+        the probability of what was drawn."""
         import drjit as dr
         import mitsuba as mi
 
         ray, depth = self._scattered
         if not len(ray):
-            return ray, ray
+            return ray, ray, np.zeros(0)
         parts: list[tuple[Int64Array, Int64Array]] = []
         receivers = dr.width(targets)
         per_point = dr.opaque(mi.UInt, receivers)
@@ -159,7 +175,8 @@ class Offer:
             kept: Any = dr.compress(lit)
             lanes = kept.numpy().astype(np.int64)
             parts.append((first + lanes // receivers, lanes % receivers))
-        return np.concatenate([point for point, _ in parts]), np.concatenate([rx for _, rx in parts])
+        points = np.concatenate([point for point, _ in parts])
+        return points, np.concatenate([rx for _, rx in parts]), np.zeros(len(points))
 
 
 class Planes:

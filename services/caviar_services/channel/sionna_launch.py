@@ -34,6 +34,8 @@ class LaunchOptions:
     scattering: bool
     only_scattered: bool = False
     """Whether paths without a diffuse reflection are left to another launch."""
+    diffuse_paths: int | None = None
+    """How many diffuse paths of a receiver are chosen, about; None: those that were drawn."""
 
 
 @dataclass(frozen=True, eq=False)

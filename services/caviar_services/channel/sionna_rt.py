@@ -45,6 +45,7 @@ from caviar_services.channel.sionna_reach import Corners
 from caviar_services.channel.sionna_scene import SceneSettings, SionnaScene
 from caviar_services.channel.sionna_sharing import scene_of
 from caviar_services.channel.sionna_table import Ends, path_ends, path_table
+from caviar_services.channel.sionna_thinning import Element
 from caviar_services.channel.sionna_traced import Traced
 from caviar_services.channel.sionna_tracer import LANE_BYTES, Tracer
 from caviar_services.channel.spherical import SphericalWaves
@@ -92,6 +93,12 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     ) = None
     """Every point that a ray meets is a path to whoever sees it, so diffuse paths take far longer than
     others, and their power converges far sooner. Absent: the rays of ``samples`` scatter too."""
+    scattering_paths: (
+        Annotated[int, quantity("1", "diffuse paths of a receiver, about", ge=1, le=1_000_000)] | None
+    ) = None
+    """Of all points at which the rays of ``scattering_samples`` meet something rough, about so many are
+    chosen for each receiver, the stronger the likelier, and stand for the others: power is right in the mean.
+    Absent: every point at which a ray was drawn to be scattered."""
     launch_seed: Annotated[int | None, quantity("1", "of the ray launch; absent: from the run's seed")] = None
     max_paths: Annotated[
         int, quantity("1", "candidates of a TX/RX pair; more are lost and counted", ge=1)
@@ -128,6 +135,10 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         if self.scattering_samples is not None and not self.scattering:
             raise ValueError("scattering_samples needs scattering = true; write both or neither")
+        if self.scattering_paths is not None and self.scattering_samples is None:
+            raise ValueError(
+                "scattering_paths chooses among the points of a launch of its own; give scattering_samples"
+            )
         if self.scattering_samples is not None and self.rung == "mimo-rt":
             raise ValueError(
                 'rung = "mimo-rt" traces all paths of an antenna pair at once; leave out scattering_samples'
@@ -231,7 +242,13 @@ class SionnaChannel(PathModel[SionnaSettings]):
         self._wavelengths = SPEED_OF_LIGHT / np.array(frequencies)
         launched, samples = self._launched, self.settings.scattering_samples
         if samples is not None and launched.scattering:
-            own = replace(launched, samples=samples, diffraction=False, only_scattered=True)
+            own = replace(
+                launched,
+                samples=samples,
+                diffraction=False,
+                only_scattered=True,
+                diffuse_paths=self.settings.scattering_paths,
+            )
             self._diffuse = Tracer(self._scene, self._wavelengths.tolist(), own)
             launched = replace(launched, scattering=False)
         self._tracer = Tracer(self._scene, self._wavelengths.tolist(), launched)
@@ -254,6 +271,8 @@ class SionnaChannel(PathModel[SionnaSettings]):
         self._tracer.forget()
         if self._edge_range is not None:
             self._unbent.forget()
+        if self._diffuse is not None:
+            self._diffuse.forget()
 
     def step(self, frame: Frame) -> StepResult:
         """Raises `PayloadError` where paths that shall be followed are not known."""
@@ -346,7 +365,10 @@ class SionnaChannel(PathModel[SionnaSettings]):
             tracer.trace(transmitter.position, targets, s.receivers_at_once, followed, names, corners=corners)
         ]
         if self._diffuse is not None:
-            found.append(self._diffuse.trace(transmitter.position, targets, s.receivers_at_once))
+            element = Element(transmitter.array.pattern, transmitter.rotation)
+            found.append(
+                self._diffuse.trace(transmitter.position, targets, s.receivers_at_once, element=element)
+            )
         first, index = t * len(receivers), np.array(others, np.int64)
         return [(first + index[traced.receiver], traced) for traced in found]
 

@@ -22,9 +22,10 @@ from caviar_protocol.arrays import (
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.sionna_candidates import Candidates, Offer, Planes, positions
 from caviar_services.channel.sionna_follow import Followed
-from caviar_services.channel.sionna_launch import Launch, Launcher, LaunchOptions
+from caviar_services.channel.sionna_launch import SCATTERED, Launch, Launcher, LaunchOptions
 from caviar_services.channel.sionna_reach import Corners, Faces, at_corners, reflected
 from caviar_services.channel.sionna_scene import SionnaScene
+from caviar_services.channel.sionna_thinning import Element, Thinning
 from caviar_services.channel.sionna_traced import Traced, geometry, joined, nothing, read
 from caviar_services.channel.specular import image_points, refined_points
 from caviar_services.channel.visibility import Look
@@ -87,6 +88,9 @@ class Tracer:
         self._patterns = antenna_pattern_registry.get("iso")(polarization="VH").patterns
         self._faces = Faces(scene)
         self._launcher = Launcher(scene.mi_scene, options)
+        self._thinning: Thinning | None = None
+        if options.diffuse_paths is not None:
+            self._thinning = Thinning(scene.mi_scene, options.diffuse_paths, options.seed)
         self._images = ImageMethod()
         self._fields = FieldCalculator()
         self._last: dict[bytes, _Last] = {}
@@ -120,24 +124,31 @@ class Tracer:
         names: tuple[str, ...] = (),
         lanes: int = _LANES,
         corners: Corners | None = None,
+        element: Element | None = None,
     ) -> Traced:
         """Paths from one transmitter [3] to all receivers [R, 3], positions in metres in the world.
 
         ``at_once`` receivers are handled together, or as many as fit ``lanes``: to the paths it makes no
         difference. With ``followed``, what the transmitter's last launches met, a part of the rays is
         launched; ``names`` is what `SionnaScene.place` returned. With ``corners`` also paths that only a part
-        of the arrays has; nothing is then taken from an earlier trace.
+        of the arrays has; nothing is then taken from an earlier trace. Diffuse paths are chosen by the gain
+        of ``element`` too, the transmitter's.
         """
         if not len(receivers):
             return self.nothing
         centre = self._scene.centre
         transmitter, receivers = transmitter - centre, receivers - centre
         corners = corners and corners.relative_to(centre)
-        last = None if corners else self._last.get(transmitter.tobytes())
+        key = transmitter.tobytes() + (element.key if element else b"")
+        last = None if corners else self._last.get(key)
         if last is None or last.version != self._scene.version:
             if followed is None:
                 source = positions(transmitter[None])
-                offer = Offer(self._scene, self._launcher(source), source, self._options)
+                launch = self._launcher(source)
+                points = None
+                if self._thinning is not None:
+                    points = self._thinning.points(launch, transmitter, element)
+                offer = Offer(self._scene, launch, source, self._options, points)
             else:
                 offer = followed.offer(self._launcher, transmitter, self._scene, names, self._options)
             offer.everywhere = corners is not None
@@ -147,7 +158,7 @@ class Tracer:
             traced = self._since(last, transmitter, receivers, at_once)
         if corners:
             return traced
-        self._last[transmitter.tobytes()] = _Last(self._scene.version, offer, receivers, traced)
+        self._last[key] = _Last(self._scene.version, offer, receivers, traced)
         while len(self._last) > _REMEMBERED:
             del self._last[next(iter(self._last))]
         return traced
@@ -253,6 +264,13 @@ class Tracer:
                 (buffer._vertices_z, bounce.point.z),
             ):
                 dr.scatter(tensor.array, dr.gather(type(of_rays), of_rays, ray, used), place + d, used)
+        if self._thinning is not None:
+            chosen = mi.Float(aligned_columns(candidates.chosen[None])[0])
+            is_chosen = chosen > 0.0
+            dr.scatter(
+                buffer._interaction_types.array, mi.UInt(SCATTERED), place + interactions - 1, is_chosen
+            )
+            dr.scatter(buffer._probs.array, chosen, place + interactions - 1, is_chosen)
         if self._options.diffraction and launch.wedges is not None:
             buffer._diffracting_wedges = dr.gather(WedgeGeometry, launch.wedges, ray, interactions > 0)
         buffer.schedule()
