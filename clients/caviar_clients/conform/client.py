@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from caviar_protocol.errors import RunError
 from caviar_clients.conform.wire import Wire
+from caviar_protocol.errors import RunError
 
 START_S = 30.0
 """[s] from its start until a process has said HELLO: interpreters and libraries take their time."""
@@ -100,7 +100,11 @@ class Started:
     def ended(self) -> End | None:
         """Its exit status, once it has one."""
         status = None if self._process is None else self._process.poll()
-        return None if status is None else End(status, self._log.read_text(errors="replace") if self._log else "")
+        return (
+            None
+            if status is None
+            else End(status, self._log.read_text(errors="replace") if self._log else "")
+        )
 
     def terminate(self) -> bool:
         """SIGTERM to the process."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 import hashlib
 from typing import Any
 
-import msgpack
 import msgspec
 
 from caviar_clients.conform.case import Failed
+from caviar_clients.conform.packing import BROKEN, pack, unpack
 from caviar_clients.conform.wire import Fields, Received
 from caviar_protocol.codec import (
     check_parts,
@@ -20,7 +20,6 @@ from caviar_protocol.codec import (
 )
 from caviar_protocol.errors import PayloadError, ProtocolError
 
-UNPACKING = (ValueError, TypeError, RecursionError, msgpack.exceptions.UnpackException)
 ABSENT = "absent"
 
 
@@ -33,8 +32,8 @@ def checked(received: Received) -> Fields:
     """The header of a message that a client may send, or `Failed`."""
     parts = received.parts
     try:
-        fields = msgpack.unpackb(parts[0], raw=False)
-    except UNPACKING as error:
+        fields = unpack(parts[0])
+    except BROKEN as error:
         raise Failed("a MessagePack map as header", f"{parts[0][:40]!r}: {error}") from error
     try:
         check_parts(decode_message(parts[0]), parts)
@@ -43,24 +42,24 @@ def checked(received: Received) -> Fields:
         raise Failed(
             "a message of the protocol, with its parts", f"{kind} in {len(parts)} parts: {error}"
         ) from error
-    assert_map: Fields = fields
-    return assert_map
+    header: Fields = fields
+    return header
 
 
 def not_canonical(received: Received) -> str:
     """Why the header of a message that `checked` let pass is not in canonical form; empty: it is."""
     header = received.parts[0]
-    fields = msgpack.unpackb(header, raw=False)
+    fields = unpack(header)
     message = decode_message(header)
     kind = message_type(message)
     if next(iter(fields)) != "type":
         return f"{kind}: the first key is {next(iter(fields))!r}, not 'type'"
-    if msgpack.packb(fields) != header:
+    if pack(fields) != header:
         return f"{kind}: an integer, string, list or map is not in its shortest form, or a key occurs twice"
     known = {key: value for key, value in fields.items() if key in ("type", *message.__struct_fields__)}
     right = encode_message(message)
-    if msgpack.packb(known) != right:
-        return f"{kind}: keys are {', '.join(known)}; {_difference(known, msgpack.unpackb(right, raw=False))}"
+    if pack(known) != right:
+        return f"{kind}: keys are {', '.join(known)}; {_difference(known, unpack(right))}"
     return ""
 
 
@@ -95,7 +94,7 @@ def _difference(got: Fields, right: Fields) -> str:
         return f"{', '.join(superfluous)} equals its default and is to be left out"
     if list(got) != list(right):
         return f"the order of the table is {', '.join(right)}"
-    wrong = [key for key in got if msgpack.packb(got[key]) != msgpack.packb(right[key])]
+    wrong = [key for key in got if pack(got[key]) != pack(right[key])]
     return f"{', '.join(wrong)} is not canonical inside"
 
 
@@ -103,7 +102,7 @@ def _payload_difference(header: bytes, body: bytes, again: tuple[bytes, bytes]) 
     if header == again[0]:
         return f"a body of {len(body)} B where {len(again[1])} B are canonical, or other filling than zeros"
     try:
-        got: Any = msgpack.unpackb(header, raw=False)
+        got: Any = unpack(header)
         return _difference(got, msgspec.msgpack.decode(again[0]))
-    except (*UNPACKING, msgspec.MsgspecError):
+    except (*BROKEN, msgspec.MsgspecError):
         return "other bytes in the header"

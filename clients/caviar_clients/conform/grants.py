@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-import msgpack
-
 from caviar_clients.conform import street
 from caviar_clients.conform.forms import product_digest
+from caviar_clients.conform.packing import pack, unpack
 from caviar_clients.conform.wire import Fields
 
 Product = tuple[bytes, bytes]
@@ -87,9 +86,7 @@ class Inputs:
 
 def _with_stranger(header: bytes, body: bytes) -> Product:
     """The product with a field more, whose array lies behind all others."""
-    import msgpack
-
-    fields = msgpack.unpackb(header, raw=False)
+    fields = unpack(header)
     padded = body + bytes(-len(body) % 8)
     fields["strange"] = {"dtype": "<f8", "shape": [2], "offset": len(padded)}
-    return msgpack.packb(fields), padded + bytes(16)
+    return pack(fields), padded + bytes(16)

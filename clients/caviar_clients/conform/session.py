@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import tempfile
 import time
 from collections import deque
 from dataclasses import dataclass, field
@@ -31,9 +32,20 @@ class Rules:
     name: str = ""
     role: str = ""
     settings: Fields = field(default_factory=dict)
-    directory: str = "."
+    directory: str | None = None
+    """Where each life of a recorder gets a folder of its own."""
     mark: str = ""
     """Makes the scenery of this run unlike that of any other, so that no cache has it."""
+
+
+@dataclass
+class Seen:
+    """What is remembered over all lives of a client."""
+
+    odd: list[str] = field(default_factory=list)
+    """Headers that were not in canonical form, each kind once."""
+    fetched: dict[str, int] = field(default_factory=dict)
+    """Bytes of each asset, by digest, that the client asked for: it may keep them for its next life."""
 
 
 @dataclass
@@ -63,22 +75,23 @@ class Answer:
 class Session:
     """Plays the broker for one life of the client."""
 
-    def __init__(self, wire: Wire, client: Client, rules: Rules, odd: list[str]) -> None:
+    def __init__(self, wire: Wire, client: Client, rules: Rules, seen: Seen) -> None:
         self.wire, self.client, self.rules = wire, client, rules
         self.stage, self.hello, self.ready = CONNECTING, Fields(), Fields()
         self.pulse, self.silent = Pulse(), False
         self.episode, self.frame, self.completed = -1, 0, -1
         """Of the episode, the frame that is granted next and the one completed last; −1: none."""
         self.assets: list[Fields] = []
-        self.fetched: dict[str, int] = {}
-        """Bytes of each asset, by digest, that the client asked for."""
+        self.fetched = seen.fetched
         self.offered: dict[str, bytes] = {}
         """A world's scenery by name."""
         self.liveness_s = self.heartbeat_s = 0.0
-        self._odd = odd
+        self._odd = seen.odd
         self._route: bytes | None = None
         self._inbox: deque[Received] = deque()
         self._served: dict[str, bytes] = {}
+        self._early: deque[Answer] = deque()
+        """READY that came before the world's scenery was here, as it may."""
 
     # --- receiving -----------------------------------------------------------------------------------
 
@@ -142,9 +155,7 @@ class Session:
         else:
             self.pulse.wrong.append(fields["type"])
         if not self.silent:
-            self.wire.send(
-                received.route, {"type": "HEARTBEAT_ACK", "sequence": fields.get("sequence", 0)}
-            )
+            self.wire.send(received.route, {"type": "HEARTBEAT_ACK", "sequence": fields.get("sequence", 0)})
 
     def _seconds(self, seconds: float | None) -> float:
         return self.rules.timeout_s if seconds is None else seconds
@@ -181,7 +192,11 @@ class Session:
     def welcome(self, heartbeat_s: float = 0.05, liveness_s: float = 3.0, **more: Any) -> None:
         """WELCOME; ``more`` are other values of its fields."""
         self.heartbeat_s, self.liveness_s = heartbeat_s, liveness_s
-        recorder = {"directory": self.rules.directory} if self.hello["role"] == "recorder" else {}
+        recorder = (
+            {"directory": tempfile.mkdtemp(dir=self.rules.directory)}
+            if self.hello["role"] == "recorder"
+            else {}
+        )
         common = [c for c in ("assets", "episodes", "parts") if c in self.hello.get("capabilities", [])]
         fields = {
             "version": [1, 1],
@@ -203,7 +218,7 @@ class Session:
         topics = [topic for topic in hello.get("outputs", []) if demand]
         self.send("PREPARE", {**self.who, **self._order(topics, inputs or Inputs()), **more})
         while True:
-            answer = self.receive("READY")
+            answer = self._early.popleft() if self._early else self.receive("READY")
             match answer.kind:
                 case "ASSET_GET":
                     self._serve(answer.fields)
@@ -252,6 +267,9 @@ class Session:
             while True:
                 self.send("ASSET_GET", {"digest": asset["digest"], "offset": len(data)})
                 answer = self.receive("ASSET_DATA")
+                if answer.kind == "READY":
+                    self._early.append(answer)
+                    answer = self.receive("ASSET_DATA")
                 if answer.kind != "ASSET_DATA" or answer.fields["offset"] != len(data):
                     raise Failed(f"ASSET_DATA from byte {len(data)}", str(answer))
                 data += answer.parts[1]

@@ -115,7 +115,9 @@ def gap(kit: Kit) -> str:
 
 
 @case(
-    "reordered-grants", "clause 7; Wrong things", "ERROR unexpected or that frame's answer; then the next frame"
+    "reordered-grants",
+    "clause 7; Wrong things",
+    "ERROR unexpected or that frame's answer; then the next frame",
 )
 def reordered_grants(kit: Kit) -> str:
     """A GRANT of a frame behind those that were answered harms nobody."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import msgpack
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
+from caviar_clients.conform.packing import BROKEN, pack, unpack
 from caviar_protocol.errors import RunError
 
 MAX_PART = 1 << 30
@@ -28,8 +28,8 @@ class Received:
     def fields(self) -> Fields:
         """The header, or an empty map where it is none."""
         try:
-            header = msgpack.unpackb(self.parts[0], raw=False)
-        except (ValueError, TypeError, RecursionError, msgpack.exceptions.UnpackException, IndexError):
+            header = unpack(self.parts[0])
+        except (*BROKEN, IndexError):
             return {}
         return header if isinstance(header, dict) else {}
 
@@ -73,7 +73,7 @@ class Wire:
 
     def send(self, route: bytes, header: Fields | bytes, *parts: bytes) -> None:
         """Send a message; one to a connection that is gone is lost."""
-        packed = header if isinstance(header, bytes) else msgpack.packb(header)
+        packed = header if isinstance(header, bytes) else pack(header)
         self._socket.send_multipart([route, packed, *parts])
 
     def send_parts(self, route: bytes, parts: list[bytes]) -> None:

@@ -6,11 +6,10 @@ import random
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
-import msgpack
-
 from caviar_clients.conform.case import Failed, NotApplicable, case
 from caviar_clients.conform.client import End
 from caviar_clients.conform.grants import Inputs
+from caviar_clients.conform.packing import pack
 from caviar_clients.conform.session import ACTIVE, ATTEMPT, EPOCH, Answer, Session
 from caviar_clients.conform.wire import Fields
 
@@ -79,11 +78,11 @@ def garbage(kit: Kit) -> str:
         [
             ("an empty part", _bytes(b"")),
             ("noise", _bytes(b"\xc1" + noise)),
-            ("a list", _bytes(msgpack.packb([1, 2, 3]))),
-            ("a map without type", _bytes(msgpack.packb({"frame": 0}))),
-            ("an unknown type", _bytes(msgpack.packb({"type": "NONSENSE"}))),
-            ("a type that is a number", _bytes(msgpack.packb({"type": 7}))),
-            ("GRANT without its fields", _bytes(msgpack.packb({"type": "GRANT"}))),
+            ("a list", _bytes(pack([1, 2, 3]))),
+            ("a map without type", _bytes(pack({"frame": 0}))),
+            ("an unknown type", _bytes(pack({"type": "NONSENSE"}))),
+            ("a type that is a number", _bytes(pack({"type": 7}))),
+            ("GRANT without its fields", _bytes(pack({"type": "GRANT"}))),
         ],
         ("malformed", "limit"),
     )
@@ -120,7 +119,7 @@ def lying_counts(kit: Kit) -> str:
 
     def half(session: Session) -> None:
         fields, parts = session.granting(session.frame, Inputs())
-        packed = msgpack.packb({"type": "GRANT", **fields})
+        packed = pack({"type": "GRANT", **fields})
         session.send_bytes(packed[: len(packed) // 2], *parts)
 
     way = survive(
@@ -156,14 +155,20 @@ def oversized(kit: Kit) -> str:
     return survive(kit, variants, ("limit", "malformed"))
 
 
-@case("deep", "Limits", "the GRANT's answer or an ERROR, and the next frame, or an end with another status than 0")
+@case(
+    "deep",
+    "Limits",
+    "the GRANT's answer or an ERROR, and the next frame, or an end with another status than 0",
+)
 def deep(kit: Kit) -> str:
     """A field that nobody knows may nest to any depth: it is survived."""
 
     def send(session: Session) -> None:
         fields, parts = session.granting(session.frame, Inputs())
-        packed = msgpack.packb({"type": "GRANT", **fields})
-        session.send_bytes(bytes([packed[0] + 1]) + packed[1:] + b"\xa3abc" + b"\x91" * 200_000 + b"\xc0", *parts)
+        packed = pack({"type": "GRANT", **fields})
+        session.send_bytes(
+            bytes([packed[0] + 1]) + packed[1:] + b"\xa3abc" + b"\x91" * 200_000 + b"\xc0", *parts
+        )
 
     return survive(kit, [("200,000 lists in each other", send)], ("limit", "malformed"), pardoned=True)
 
@@ -252,7 +257,11 @@ def unexpected(kit: Kit) -> str:
     return "ERROR unexpected, and the next frame"
 
 
-@case("complaints", "Wrong things and their answers", "no answer; the next frame, or an end with another status than 0")
+@case(
+    "complaints",
+    "Wrong things and their answers",
+    "no answer; the next frame, or an end with another status than 0",
+)
 def complaints(kit: Kit) -> str:
     """STALE and ERROR are never answered, and a code that nobody knows is one."""
     ways: dict[str, None] = {}
