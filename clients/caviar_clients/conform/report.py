@@ -23,7 +23,8 @@ def summary(verdicts: Sequence[Verdict]) -> str:
 def as_json(verdicts: Sequence[Verdict]) -> str:
     """An object with ``verdicts`` and how many of each outcome there are."""
     counts = Counter(verdict.outcome for verdict in verdicts)
-    content: dict[str, object] = {**{outcome: counts[outcome] for outcome in OUTCOMES}, "verdicts": list(verdicts)}
+    content: dict[str, object] = {outcome: counts[outcome] for outcome in OUTCOMES}
+    content["verdicts"] = list(verdicts)
     return msgspec.json.format(msgspec.json.encode(content), indent=2).decode() + "\n"
 
 
