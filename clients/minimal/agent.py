@@ -34,6 +34,7 @@ def done(grant, parts):
     product = {"products": [{"topic": "action", "digest": digest}]}
     return [msgpack.packb(report)] if grant.get("final") else [msgpack.packb(report | product), payload, b""]
 
+signal.signal(signal.SIGTERM, lambda *_: sys.exit(broker.send(msgpack.packb({"type": "BYE", **who})) or 143))
 with zmq.Context() as context, context.socket(zmq.DEALER) as broker:
     broker.linger = 1000  # [ms] at the end, so that a broker that is gone holds nobody up
     broker.connect(ENDPOINT)
@@ -45,7 +46,6 @@ with zmq.Context() as context, context.socket(zmq.DEALER) as broker:
                 sys.exit(f"{NAME}: {kind}: {message.get('message', message)}")
             case "WELCOME":
                 turn = {"episode": -1, **(who := {key: message[key] for key in ("epoch", "attempt")})}
-                signal.signal(15, lambda *_: sys.exit(broker.send(msgpack.packb({"type": "BYE", **who})) or 143))
                 threading.Thread(target=beat, args=[message], daemon=True).start()
             case "PREPARE":
                 broker.send(msgpack.packb({"type": "READY", **who, "actuators": ["beam:*"]}))
@@ -56,5 +56,5 @@ with zmq.Context() as context, context.socket(zmq.DEALER) as broker:
                 stored[message["frame"]] = stored.get(message["frame"]) or done(message, parts)
                 broker.send_multipart(stored[message["frame"]])
             case kind if kind not in ("CANCEL", "EPISODE_END", "SHUTDOWN"):
-                broker.send(msgpack.packb({"type": "ERROR", "code": "unexpected", "message": f"not due: {kind}"}))
+                broker.send(msgpack.packb({"type": "ERROR", "code": "unexpected", "message": str(kind)}))
     broker.send(msgpack.packb({"type": "BYE", **who}))
