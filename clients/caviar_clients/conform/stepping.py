@@ -157,6 +157,7 @@ def absent_inputs(kit: Kit) -> str:
     optional = [i["topic"] for i in session.hello.get("inputs", []) if not i.get("required", True)]
     if not optional:
         raise NotApplicable("all its inputs are required")
+    session.step()
     session.step(Inputs(without_optional=True))
     session.step()
     return f"DONE without {', '.join(optional)}"
