@@ -175,7 +175,7 @@ class Client:
     def joined(self, fields: dict[str, Any]) -> int | None:
         if fields["type"] == "REFUSE":
             if not bad("says nothing when refused"):
-                print(fields["message"], file=sys.stderr)
+                sys.stderr.write(f"{fields['message']}\n")
             return 0 if bad("ends well when refused") else 1
         if fields["version"][0] != 1 and not bad("stays with another major version"):
             return 1
