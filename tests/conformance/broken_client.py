@@ -63,6 +63,8 @@ class Beat(threading.Thread):
             beat = {"type": "HEARTBEAT", "sequence": number, **({"progress": progress} if progress else {})}
             if bad("says BYE on the heartbeat connection"):
                 beat = {"type": "BYE", **self.who}
+            while bad("floods with heartbeats"):
+                pulse.send(msgpack.packb({"type": "HEARTBEAT", "sequence": 0}))
             if not self.quiet:
                 pulse.send(msgpack.packb(beat))
             sequence += 1
@@ -208,6 +210,9 @@ class Client:
         if bad("claims scenery that it did not fetch"):
             chain = "".join(f"{a['name']}\0{a['digest']}\0" for a in fields["assets"])
             ready["geometry"] = hashlib.sha256(chain.encode()).hexdigest()
+        if bad("asks for scenery again and again"):
+            self.say("ASSET_GET", digest=fields["assets"][1]["digest"])
+            return
         if ROLE == "world":
             ready["prefixes"] = [NAME + "."]
         self.say("READY", **who, **ready)
@@ -215,6 +220,9 @@ class Client:
     def on_asset_get(self, fields: dict[str, Any], parts: list[bytes]) -> None:
         if not bad("passes over unknown assets"):
             self.say("ERROR", code="unknown-asset", message="no such asset", subject=fields["digest"])
+
+    def on_asset_data(self, fields: dict[str, Any], parts: list[bytes]) -> None:
+        self.say("ASSET_GET", digest=fields["digest"])
 
     def on_reset(self, fields: dict[str, Any], parts: list[bytes]) -> None:
         self.episode, self.last, self.stored = fields["episode"], -1, {}

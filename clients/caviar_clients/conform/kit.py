@@ -13,10 +13,12 @@ from tempfile import TemporaryDirectory
 from caviar_clients.conform import joining, leaving, stepping, wrong
 from caviar_clients.conform.case import Case, Failed, NotApplicable, Outcome, Verdict
 from caviar_clients.conform.client import ByHand, Client, Started
-from caviar_clients.conform.session import CONNECTING, JOINED, READY, Rules, Seen, Session
+from caviar_clients.conform.session import CONNECTING, JOINED, PATIENCE, READY, Rules, Seen, Session
 from caviar_clients.conform.wire import Wire
 from caviar_protocol.errors import RunError, SetupError
 
+LONGEST = 600
+"""Characters of what came, in a verdict."""
 HOPELESS_AFTER = 2
 """Lives in a row that do not get as far as a case needs, until the rest is not tried any more."""
 
@@ -97,6 +99,7 @@ class Kit:
     def judge(self, case: Case) -> Verdict:
         """Play one case."""
         started = time.monotonic()
+        self.seen.allow(PATIENCE * self.rules.timeout_s)
         expected = case.expected
         outcome: Outcome = "pass"
         try:
@@ -112,7 +115,7 @@ class Kit:
             clauses=case.clauses,
             outcome=outcome,
             expected=expected,
-            got=got,
+            got=got[:LONGEST],
             seconds=round(time.monotonic() - started, 3),
         )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import tempfile
 import time
 from collections import deque
@@ -11,7 +12,7 @@ from typing import Any
 
 from caviar_clients.conform import forms, street
 from caviar_clients.conform.case import Failed
-from caviar_clients.conform.client import Client, End
+from caviar_clients.conform.client import BY_HAND_S, Client, End
 from caviar_clients.conform.grants import Inputs
 from caviar_clients.conform.wire import Fields, Received, Wire
 from caviar_protocol.topics import PARTS
@@ -21,6 +22,10 @@ EPOCH, ATTEMPT = 3, 2
 SEED = 11
 CHUNK = 700
 """[B] of an ASSET_DATA from the kit, so that even small files take several."""
+LEFT_OVER = 100_000
+"""Messages of a life that are thrown away before the next one, at most."""
+PATIENCE = 12
+"""Times the time-out that a case, or a life in it, may take altogether."""
 CONNECTING, JOINED, READY, ACTIVE, OVER = range(5)
 
 
@@ -46,6 +51,12 @@ class Seen:
     """Headers that were not in canonical form, each kind once."""
     fetched: dict[str, int] = field(default_factory=dict)
     """Bytes of each asset, by digest, that the client asked for: it may keep them for its next life."""
+    until: float = math.inf
+    """When the case, or this life in it, has to be over, whatever the client still sends."""
+
+    def allow(self, seconds: float) -> None:
+        """From now on so much time."""
+        self.until = time.monotonic() + seconds
 
 
 @dataclass
@@ -68,7 +79,8 @@ class Answer:
     parts: list[bytes]
 
     def __str__(self) -> str:
-        words = {key: value for key, value in self.fields.items() if key in ("code", "message", "frame")}
+        told = ("code", "message", "frame")
+        words = {key: str(value)[:300] for key, value in self.fields.items() if key in told}
         return f"{self.kind} {words}" if words else self.kind
 
 
@@ -86,7 +98,7 @@ class Session:
         self.offered: dict[str, bytes] = {}
         """A world's scenery by name."""
         self.liveness_s = self.heartbeat_s = 0.0
-        self._odd = seen.odd
+        self._seen = seen
         self._route: bytes | None = None
         self._inbox: deque[Received] = deque()
         self._served: dict[str, bytes] = {}
@@ -104,23 +116,24 @@ class Session:
 
     def take(self, seconds: float | None = None) -> Answer | End | None:
         """The next message, or how the client ended, or None when the time is over."""
-        until = time.monotonic() + self._seconds(seconds)
+        now = time.monotonic()
+        if now > self._seen.until:
+            raise Failed(f"an end within {PATIENCE * self.rules.timeout_s:g} s", "ever more messages")
+        until = now + self._seconds(seconds)
         while not self._inbox:
-            end = self.client.ended() if self._route or self.client.start_s < 100 else None
-            while self.pump(0.0 if end is None else 0.1):
-                pass
+            end = self.client.ended() if self._route or self.client.start_s < BY_HAND_S else None
+            heard = self.pump(0.02 if end is None else 0.1)
             if self._inbox:
                 break
-            if end is not None:
+            if end is not None and not heard:
                 return end
             if time.monotonic() > until:
                 return None
-            self.pump(0.02)
         received = self._inbox.popleft()
         fields = forms.checked(received)
         odd = forms.not_canonical(received)
-        if odd and odd not in self._odd:
-            self._odd.append(odd)
+        if odd and odd not in self._seen.odd:
+            self._seen.odd.append(odd)
         return Answer(fields["type"], fields, received.parts)
 
     def pump(self, seconds: float) -> bool:
@@ -184,7 +197,9 @@ class Session:
     def begin(self) -> None:
         """Start the client and wait for its HELLO."""
         self.client.start()
+        self._seen.until = math.inf
         answer = self.receive("HELLO", self.client.start_s)
+        self._seen.allow(PATIENCE * self.rules.timeout_s)
         if answer.kind != "HELLO":
             raise Failed("HELLO as the first message", str(answer))
         self.hello = answer.fields
@@ -365,5 +380,6 @@ class Session:
                 self.stage = OVER
         self.stage = OVER
         self.client.dispose()
-        while self.wire.poll(0.0):
-            pass
+        for _ in range(LEFT_OVER):
+            if self.wire.poll(0.0) is None:
+                break
