@@ -10,8 +10,7 @@ def beat(welcome):
         pulse.send(msgpack.packb(beating))
         answer = msgpack.unpackb(pulse.recv()) if pulse.poll(welcome["liveness_ns"] / 1e6) else {}
         if answer.get("type") != "HEARTBEAT_ACK":
-            os.write(2, f"{NAME}: from the broker came {answer or 'no answer to a heartbeat'}\n".encode())
-            os._exit(1)  # the other thread may be waiting for a message that never comes
+            raise RuntimeError(f"from the broker came {answer or 'no answer to a heartbeat'}")
         beating = {"type": "HEARTBEAT", "sequence": sequence}
         time.sleep(welcome["heartbeat_ns"] / 1e9)
 
@@ -34,6 +33,7 @@ def done(grant, parts):
     product = {"products": [{"topic": "action", "digest": digest}]}
     return [msgpack.packb(report)] if grant.get("final") else [msgpack.packb(report | product), payload, b""]
 
+threading.excepthook = lambda end: os._exit(os.write(2, f"{NAME}: {end.exc_value!r}\n".encode()) and 1)
 signal.signal(signal.SIGTERM, lambda *_: sys.exit(broker.send(msgpack.packb({"type": "BYE", **who})) or 143))
 with zmq.Context() as context, context.socket(zmq.DEALER) as broker:
     broker.linger = 1000  # [ms] at the end, so that a broker that is gone holds nobody up

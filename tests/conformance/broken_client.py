@@ -70,7 +70,8 @@ class Beat(threading.Thread):
             sequence += 1
             time.sleep(every * (8 if bad("beats too slowly") else 1))
             while pulse.poll(0):
-                pulse.recv()
+                if pulse.recv()[:1] == b"\xc1" and bad("stops beating at noise"):
+                    self.quiet = True
                 heard = time.monotonic()
             if time.monotonic() - heard > liveness and not bad("bears silence"):
                 os._exit(0 if bad("ends well in silence") else 1)

@@ -136,6 +136,7 @@ FAULTS: dict[str, tuple[str, ...]] = {
     "truncated": ("does not count parts",),
     "lying-counts": ("allocates what is announced",),
     "oversized": ("takes oversized headers",),
+    "heartbeat-noise": ("stops beating at noise",),
     "complaints": ("answers complaints",),
     "shutdown": (
         "stays after SHUTDOWN",
@@ -160,7 +161,8 @@ def broken(fault: str, *names: str) -> list[Verdict]:
     """Verdicts on the client with this fault."""
     fault, _, role = fault.partition("/")
     command = python(BROKEN, "{endpoint}", "{name}", fault, role or "agent")
-    rules = Rules(name="mine", role=role or "agent", timeout_s=1.5)
+    patience = 0.5 if "again and again" in fault else 1.5
+    rules = Rules(name="mine", role=role or "agent", timeout_s=patience)
     return conform(ANY, command=command, names=names, rules=rules)
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from caviar_clients.conform.case import Failed, NotApplicable, case
 from caviar_clients.conform.client import End
 from caviar_clients.conform.grants import Inputs
+from caviar_clients.conform.joining import BEATS
 from caviar_clients.conform.packing import pack
 from caviar_clients.conform.session import ACTIVE, ATTEMPT, EPOCH, Answer, Session
 from caviar_clients.conform.wire import Fields
@@ -283,6 +284,27 @@ def complaints(kit: Kit) -> str:
     return "; ".join(ways)
 
 
+@case(
+    "heartbeat-noise",
+    "clause 2; Heartbeats and liveness",
+    "heartbeats and frames go on, or an end with a status other than 0",
+)
+def heartbeat_noise(kit: Kit) -> str:
+    """Nonsense on the heartbeat connection does not silence the client."""
+    session = kit.at(ACTIVE)
+    since = len(session.pulse.beats)
+    session.wire.send(session.pulse.route or b"", b"\xc1noise")
+    session.listen(BEATS * session.heartbeat_s)
+    end = session.client.ended()
+    if end is not None:
+        return right_end(end, "heartbeats, or an end with a status other than 0")
+    count = len(session.pulse.beats) - since
+    if count < BEATS // 3:
+        raise Failed(f"about {BEATS} HEARTBEATs after it, or an end", f"{count}, and it is still there")
+    session.step()
+    return "goes on"
+
+
 CASES = (
     stale_grant,
     other_episode,
@@ -294,4 +316,5 @@ CASES = (
     lying_counts,
     oversized,
     complaints,
+    heartbeat_noise,
 )
