@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import tempfile
 import time
@@ -10,18 +9,15 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
-from caviar_clients.conform import forms, street
+from caviar_clients.conform import forms, scenery, street
 from caviar_clients.conform.case import Failed
 from caviar_clients.conform.client import BY_HAND_S, Client, End
 from caviar_clients.conform.grants import Inputs
 from caviar_clients.conform.wire import Fields, Received, Wire
-from caviar_protocol.topics import PARTS
 
 EPOCH, ATTEMPT = 3, 2
 """Not 1, so that a client which does not repeat what it is told shows."""
 SEED = 11
-CHUNK = 700
-"""[B] of an ASSET_DATA from the kit, so that even small files take several."""
 LEFT_OVER = 100_000
 """Messages of a life that are thrown away before the next one, at most."""
 PATIENCE = 12
@@ -101,8 +97,9 @@ class Session:
         self._seen = seen
         self._route: bytes | None = None
         self._inbox: deque[Received] = deque()
-        self._served: dict[str, bytes] = {}
-        self._early: deque[Answer] = deque()
+        self.served: dict[str, bytes] = {}
+        """Scenery that the kit has, by digest."""
+        self.early: deque[Answer] = deque()
         """READY that came before the world's scenery was here, as it may."""
 
     # --- receiving -----------------------------------------------------------------------------------
@@ -231,71 +228,20 @@ class Session:
         """PREPARE, and the exchange of scenery, up to READY."""
         hello = self.hello
         topics = [topic for topic in hello.get("outputs", []) if demand]
-        self.send("PREPARE", {**self.who, **self._order(topics, inputs or Inputs()), **more})
+        self.send("PREPARE", {**self.who, **scenery.order(self, topics, inputs or Inputs()), **more})
         while True:
-            answer = self._early.popleft() if self._early else self.receive("READY")
+            answer = self.early.popleft() if self.early else self.receive("READY")
             match answer.kind:
                 case "ASSET_GET":
-                    self._serve(answer.fields)
+                    scenery.serve(self, answer.fields)
                 case "ASSET_OFFER":
-                    self._fetch(answer.fields)
+                    scenery.fetch(self, answer.fields)
                 case "READY":
                     self.check_identity(answer)
                     self.ready, self.stage = answer.fields, READY
                     return answer
                 case _:
                     raise Failed("READY", str(answer))
-
-    def _order(self, topics: list[str], inputs: Inputs) -> Fields:
-        order: Fields = {}
-        if topics:
-            order["demand"] = [
-                {"topic": topic, **({"parts": list(PARTS[topic])} if PARTS.get(topic) else {})}
-                for topic in topics
-            ]
-        if self.hello["role"] != "world":
-            files = street.scenery(self.rules.mark)
-            self._served = {hashlib.sha256(data).hexdigest(): data for data in files.values()}
-            self.assets = [
-                {"name": name, "digest": hashlib.sha256(data).hexdigest(), "size": len(data)}
-                for name, data in files.items()
-            ]
-            order["assets"] = self.assets
-        order["producers"] = {topic: list(names) for topic, names in sorted(inputs.sources.items())}
-        return order
-
-    def _serve(self, get: Fields) -> None:
-        digest, offset = get["digest"], get.get("offset", 0)
-        data = self._served.get(digest)
-        if data is None or offset > len(data):
-            raise Failed("ASSET_GET of an asset of PREPARE", f"one of {digest[:12]}… from byte {offset}")
-        chunk = data[offset : offset + CHUNK]
-        self.fetched[digest] = self.fetched.get(digest, 0) + len(chunk)
-        self.send("ASSET_DATA", {"digest": digest, "offset": offset, "size": len(data)}, chunk)
-
-    def _fetch(self, offer: Fields) -> None:
-        """Take a world's scenery, each file in as many parts as the world makes of it."""
-        if self.hello["role"] != "world":
-            raise Failed("READY", "ASSET_OFFER, which only worlds send")
-        for asset in offer["assets"]:
-            data = b""
-            while True:
-                self.send("ASSET_GET", {"digest": asset["digest"], "offset": len(data)})
-                answer = self.receive("ASSET_DATA")
-                if answer.kind == "READY":
-                    self._early.append(answer)
-                    answer = self.receive("ASSET_DATA")
-                if answer.kind != "ASSET_DATA" or answer.fields["offset"] != len(data):
-                    raise Failed(f"ASSET_DATA from byte {len(data)}", str(answer))
-                data += answer.parts[1]
-                if len(data) >= asset["size"]:
-                    break
-                if not answer.parts[1]:
-                    raise Failed("at least one byte of an ASSET_DATA before the end", "none")
-            if hashlib.sha256(data).hexdigest() != asset["digest"]:
-                raise Failed(f"bytes of {asset['name']} with the digest of its offer", "others")
-            self.offered[asset["name"]] = data
-        self.assets = list(offer["assets"])
 
     def reset(self, episode: int, *, seed_episode: int = 0, **more: Any) -> None:
         """RESET and its RESET_DONE."""
