@@ -78,6 +78,19 @@ def test_the_node_agent_fails_nothing(
     assert failures(conform(ANY, command=command, rules=Rules(name="mine"))) == {}
 
 
+def test_a_world_that_brings_scenery_is_asked_for_all_of_it(tmp_path: Path) -> None:
+    for name, data in street.scenery("of the test").items():
+        file = tmp_path / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(data)
+    settings = {**TRAJECTORY["settings"], "scenery": str(tmp_path / "scenery/street.xml")}
+    command, _ = RIGHT["world:trajectory"]
+    names = ["ready", "scenery", "frames", "no-demand"]
+    verdicts = conform(ANY, command=command, names=names, rules=Rules(name="mine", settings=settings))
+    assert failures(verdicts) == {}
+    assert next(v.got for v in verdicts if v.case == "scenery").startswith("offers 4 files")
+
+
 # --- clients that are not ---------------------------------------------------------------------------
 
 FAULTS: dict[str, tuple[str, ...]] = {
