@@ -1,8 +1,6 @@
 """A whole agent, written from protocol/SPEC.md alone: python agent.py tcp://HOST:PORT NAME"""
-import hashlib, itertools, os, struct, sys, threading, time, msgpack, zmq
-
-ENDPOINT, NAME = sys.argv[1:3]
-INPUTS = [{"topic": "scene"}, {"topic": "link", "lag": 1, "required": False}]
+import hashlib, itertools, os, signal, struct, sys, threading, time, msgpack, zmq
+ENDPOINT, NAME, INPUTS = *sys.argv[1:3], [{"topic": "scene"}, {"topic": "link", "lag": 1, "required": False}]
 message = {"version": [1, 0], "name": NAME, "role": "agent", "inputs": INPUTS, "outputs": ["action"]}
 
 def beat(welcome):
@@ -12,14 +10,12 @@ def beat(welcome):
         pulse.send(msgpack.packb(beating))
         answer = msgpack.unpackb(pulse.recv()) if pulse.poll(welcome["liveness_ns"] / 1e6) else {}
         if answer.get("type") != "HEARTBEAT_ACK":
-            os.write(2, f"{NAME}: from the broker came {answer or 'no answer to a heartbeat'}\n".encode())
-            os._exit(1)  # the other thread may be waiting for a message that never comes
+            raise RuntimeError(f"from the broker came {answer or 'no answer to a heartbeat'}")
         beating = {"type": "HEARTBEAT", "sequence": sequence}
         time.sleep(welcome["heartbeat_ns"] / 1e9)
 
 def done(grant, parts):
-    report = {"type": "DONE", **who, "episode": grant["episode"], "frame": grant["frame"]}
-    antennas, best, commands = [], {}, []
+    report, antennas, best, commands = {"type": "DONE", **turn, "frame": grant["frame"]}, [], {}, []
     topics = [entry["topic"] for entry in grant["inputs"] if entry["status"] != "absent"]
     for topic, header, body in zip(topics, map(msgpack.unpackb, parts[::2]), parts[1::2], strict=True):
         antennas += [device for device in header.get("devices", []) if device["type"] == "antenna"]
@@ -37,24 +33,28 @@ def done(grant, parts):
     product = {"products": [{"topic": "action", "digest": digest}]}
     return [msgpack.packb(report)] if grant.get("final") else [msgpack.packb(report | product), payload, b""]
 
+threading.excepthook = lambda end: os._exit(os.write(2, f"{NAME}: {end.exc_value!r}\n".encode()) and 1)
+signal.signal(signal.SIGTERM, lambda *_: sys.exit(broker.send(msgpack.packb({"type": "BYE", **who})) or 143))
 with zmq.Context() as context, context.socket(zmq.DEALER) as broker:
     broker.linger = 1000  # [ms] at the end, so that a broker that is gone holds nobody up
     broker.connect(ENDPOINT)
     broker.send(msgpack.packb({"type": "HELLO", **message}))
     while message.get("type") != "SHUTDOWN":
         header, *parts = broker.recv_multipart()
-        match (message := msgpack.unpackb(header))["type"]:
+        match (message := msgpack.unpackb(header[: 1 << 20]))["type"]:
             case kind if kind in ("REFUSE", "STALE", "ERROR") or message.get("version", [1])[0] != 1:
                 sys.exit(f"{NAME}: {kind}: {message.get('message', message)}")
             case "WELCOME":
-                who = {"epoch": message["epoch"], "attempt": message["attempt"]}
+                turn = {"episode": -1, **(who := {key: message[key] for key in ("epoch", "attempt")})}
                 threading.Thread(target=beat, args=[message], daemon=True).start()
             case "PREPARE":
                 broker.send(msgpack.packb({"type": "READY", **who, "actuators": ["beam:*"]}))
             case "RESET":
-                stored = {}
-                broker.send(msgpack.packb({"type": "RESET_DONE", **who, "episode": message["episode"]}))
-            case "GRANT":
+                turn, stored = {**who, "episode": message["episode"]}, {}
+                broker.send(msgpack.packb({"type": "RESET_DONE", **turn}))
+            case "GRANT" if message.items() >= turn.items():
                 stored[message["frame"]] = stored.get(message["frame"]) or done(message, parts)
                 broker.send_multipart(stored[message["frame"]])
+            case kind if kind not in ("CANCEL", "EPISODE_END", "SHUTDOWN"):
+                broker.send(msgpack.packb({"type": "ERROR", "code": "unexpected", "message": str(kind)}))
     broker.send(msgpack.packb({"type": "BYE", **who}))

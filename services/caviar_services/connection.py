@@ -12,7 +12,7 @@ import zmq
 from caviar_protocol import limits
 from caviar_protocol import messages as m
 from caviar_protocol.codec import check_parts, decode_message, encode_message, message_type
-from caviar_protocol.errors import ProtocolError, RunError
+from caviar_protocol.errors import ProtocolError, RunError, VersionError
 from caviar_services.heartbeat import HeartbeatThread
 from caviar_services.termination import Termination
 
@@ -130,6 +130,8 @@ class Connection:
         try:
             message = decode_message(parts[0].buffer)
             check_parts(message, parts)
+        except VersionError as error:
+            raise RunError(f"the broker at {self.endpoint} cannot be talked to: {error}") from error
         except ProtocolError as error:
             _log.warning("the broker sent what is no message: %s", error)
             self.send(m.Error(code=error.code, message=str(error)))

@@ -22,7 +22,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Payload
 from caviar_protocol.codec import decode_payload
-from caviar_protocol.errors import PayloadError
+from caviar_protocol.errors import PayloadError, ProtocolError
 from caviar_protocol.messages import GrantInput, Input, Report, Role, Status
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.scene import merge_scenes
@@ -115,12 +115,19 @@ class FrameInput:
 
     @property
     def payload(self) -> Payload:
-        """The payload; its arrays are read-only. `PayloadError` where absent."""
+        """The payload; its arrays are read-only.
+
+        `PayloadError` where absent, `ProtocolError` naming topic and source where it cannot be decoded.
+        """
         if not self.present:
             entry = self.provenance
             raise PayloadError(f"{entry.topic} of {entry.source} is absent: {entry.cause}")
         if self._payload is None:
-            self._payload = decode_payload(self.provenance.topic, self.header, self.body)
+            entry = self.provenance
+            try:
+                self._payload = decode_payload(entry.topic, self.header, self.body)
+            except ProtocolError as error:
+                raise type(error)(f"{entry.topic} of {entry.source!r} cannot be read: {error}") from error
         return self._payload
 
 

@@ -110,6 +110,38 @@ def stability(
 
 
 @app.command()
+def conform(
+    listen: Annotated[str, typer.Option(help="address to listen on; port 0: any")] = "tcp://127.0.0.1:5590",
+    role: Annotated[
+        str, typer.Option(help="role that the client has to declare: agent, world, …; by default any")
+    ] = "",
+    name: Annotated[str, typer.Option(help="name that it has to declare; by default any")] = "",
+    case: Annotated[list[str] | None, typer.Option(help="only this case; may be repeated")] = None,
+    command: Annotated[
+        str,
+        typer.Option(help="starts the client for each life, with {endpoint} and {name} filled in"),
+    ] = "",
+    timeout: Annotated[float, typer.Option(min=0.1, help="seconds in which the client has to answer")] = 5.0,
+    settings: Annotated[Path | None, typer.Option(help="TOML or JSON file: its settings in WELCOME")] = None,
+    json: Annotated[Path | None, typer.Option(help="write the verdicts to this file")] = None,
+    markdown: Annotated[Path | None, typer.Option(help="write them as a Markdown table")] = None,
+    list_cases: Annotated[bool, typer.Option("--list", help="only list the cases")] = False,
+) -> None:
+    """Judge a client in any language against the protocol, clause by clause; status 1 where one fails."""
+    from caviar_clients.cli import conform as kit
+    from caviar_clients.conform.session import Rules
+
+    if list_cases:
+        kit.list_cases(_console)
+        return
+    rules = Rules(timeout_s=timeout, name=name, role=role, settings=kit.settings_of(settings))
+    status = kit.conform_client(
+        _console, listen, rules, command=command, names=case or (), json_file=json, markdown_file=markdown
+    )
+    raise typer.Exit(status)
+
+
+@app.command()
 def inspect(
     run: RunDirectory,
     digest: Annotated[bool, typer.Option("--digest", help="only the digest, from the payloads")] = False,

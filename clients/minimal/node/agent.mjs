@@ -3,15 +3,14 @@ import { createHash } from "node:crypto";
 import { setTimeout as sleep } from "node:timers/promises";
 import { decode, encode } from "@msgpack/msgpack";
 import { Dealer } from "zeromq";
-
 const [endpoint, name] = process.argv.slice(2);
 const broker = new Dealer({ linger: 1000 }); // [ms] at the end, so that a broker that is gone holds nobody up
-let who = {}, stored = new Map(), kind = "";
+let who = {}, turn = { episode: -1 }, stored = new Map(), kind = ""; broker.connect(endpoint);
 const fail = (text) => { process.stderr.write(`${name}: ${text}\n`); process.exit(1); };
 
 async function beat({ heartbeat_ns, liveness_ns }) { // nothing here takes long, so that no thread is needed
-  const pulse = new Dealer({ linger: 0, receiveTimeout: liveness_ns / 1e6 });
-  pulse.connect(endpoint);
+  process.on("SIGTERM", () => say({ type: "BYE", ...who }).then(() => process.exit(143)));
+  const pulse = new Dealer({ linger: 0, receiveTimeout: liveness_ns / 1e6 }); pulse.connect(endpoint);
   for (let sequence = -1; kind !== "SHUTDOWN"; sequence++) {
     await pulse.send(encode(sequence < 0 ? { type: "ATTACH", ...who, name } : { type: "HEARTBEAT", sequence }));
     const answer = decode((await pulse.receive().catch(() => [encode("no answer to a heartbeat")]))[0]);
@@ -21,10 +20,12 @@ async function beat({ heartbeat_ns, liveness_ns }) { // nothing here takes long,
 }
 
 function done(grant, parts) {
-  const report = { type: "DONE", ...who, episode: grant.episode, frame: grant.frame };
+  const report = { type: "DONE", ...turn, frame: grant.frame };
   if (grant.final) return [encode(report)];
   const antennas = [], best = new Map(), commands = [], key = (tx, rx) => JSON.stringify([tx, rx]);
-  grant.inputs.filter((input) => input.status !== "absent").forEach(({ topic }, index) => {
+  const present = (grant.inputs ?? []).filter((input) => input.status !== "absent");
+  if (parts.length !== 2 * present.length) fail(`${parts.length} parts for ${present.length} inputs`);
+  present.forEach(({ topic }, index) => {
     const header = decode(parts[2 * index]), body = parts[2 * index + 1];
     const first = ({ offset, shape }, user) => body.readInt32LE(offset + 4 * shape[1] * user); // [user, 0]
     antennas.push(...(header.devices ?? []).filter((device) => device.type === "antenna"));
@@ -41,19 +42,19 @@ function done(grant, parts) {
   const digest = createHash("sha256").update(length).update(payload).digest("hex");
   return [encode({ ...report, products: [{ topic: "action", digest }] }), payload, Buffer.alloc(0)];
 }
-
 const say = (message) => broker.send(encode(message));
 const inputs = [{ topic: "scene" }, { topic: "link", lag: 1, required: false }];
-broker.connect(endpoint);
 await say({ type: "HELLO", version: [1, 0], name, role: "agent", inputs, outputs: ["action"] });
 while (kind !== "SHUTDOWN") {
-  const [head, ...parts] = await broker.receive(), message = decode(head), { episode, frame } = message;
+  const [head, ...parts] = await broker.receive(), message = decode(head.subarray(0, 1 << 20)), { episode, frame } = message;
   kind = message.type;
   if (["REFUSE", "STALE", "ERROR"].includes(kind) || (message.version ?? [1])[0] !== 1)
     fail(`${kind}: ${message.message ?? JSON.stringify(message)}`);
   else if (kind === "WELCOME") { who = { epoch: message.epoch, attempt: message.attempt }; beat(message); }
   else if (kind === "PREPARE") await say({ type: "READY", ...who, actuators: ["beam:*"] });
-  else if (kind === "RESET") { stored = new Map(); await say({ type: "RESET_DONE", ...who, episode }); }
-  else if (kind === "GRANT") await broker.send(stored.get(frame) ?? stored.set(frame, done(message, parts)).get(frame));
+  else if (kind === "RESET") { stored = new Map(); turn = { ...who, episode }; await say({ type: "RESET_DONE", ...turn }); }
+  else if (kind === "GRANT" && Object.entries(turn).every(([key, value]) => message[key] === value))
+    await broker.send(stored.get(frame) ?? stored.set(frame, done(message, parts)).get(frame));
+  else if (!["CANCEL", "EPISODE_END", "SHUTDOWN"].includes(kind)) await say({ type: "ERROR", code: "unexpected", message: `${kind}` });
 }
 await say({ type: "BYE", ...who });

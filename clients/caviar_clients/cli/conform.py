@@ -1,0 +1,105 @@
+"""``caviar conform``: judge a client of the user's, case by case."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from caviar_clients.conform import Verdict, cases, conform
+from caviar_clients.conform.report import as_json, as_markdown, summary
+from caviar_clients.conform.session import Rules
+from caviar_protocol.errors import RunError, SetupError
+
+STYLES = {"pass": "green", "fail": "bold red", "not applicable": "dim"}
+
+
+def conform_client(
+    console: Console,
+    listen: str,
+    rules: Rules,
+    *,
+    command: str = "",
+    names: Sequence[str] = (),
+    json_file: Path | None = None,
+    markdown_file: Path | None = None,
+) -> int:
+    """Play the cases, print and write the verdicts; status 1 where one is «fail».
+
+    Raises `SetupError` for an unknown case, `RunError` where nothing can be listened at, the command
+    cannot be started or a file cannot be written.
+    """
+
+    def tell(text: str) -> None:
+        console.print(Text(text, style="bold"), soft_wrap=True)
+
+    def each(verdict: Verdict) -> None:
+        line = Text(f"{verdict.outcome:<15}", style=STYLES[verdict.outcome])
+        console.print(line + Text(f"{verdict.case}: {verdict.title}", style="default"), soft_wrap=True)
+
+    verdicts = conform(listen, command=command, names=names, rules=rules, tell=tell, each=each)
+    console.print()
+    console.print(_table(verdicts))
+    failed = any(verdict.outcome == "fail" for verdict in verdicts)
+    console.print(summary(verdicts), style="bold red" if failed else "bold green", highlight=False)
+    for file, text in ((json_file, as_json(verdicts)), (markdown_file, as_markdown(verdicts))):
+        if file is not None:
+            _write(file, text)
+    return 1 if failed else 0
+
+
+def list_cases(console: Console) -> None:
+    """Print what can be asked for with ``--case``."""
+    table = Table(box=None, pad_edge=False)
+    for column in ("case", "what it shows", "clauses"):
+        table.add_column(column, overflow="fold", no_wrap=column == "case")
+    for case in cases():
+        table.add_row(case.name, Text(case.title), Text(case.clauses))
+    console.print(table)
+
+
+def settings_of(file: Path | None) -> dict[str, Any]:
+    """``settings`` of WELCOME from a TOML or JSON file.
+
+    Raises `SetupError` where it cannot be read.
+    """
+    if file is None:
+        return {}
+    try:
+        text = file.read_text("utf-8")
+        found = json.loads(text) if file.suffix == ".json" else tomllib.loads(text)
+    except (OSError, ValueError) as error:
+        raise SetupError(f"cannot read settings from {file}: {error}; give a TOML or JSON file") from error
+    if not isinstance(found, dict):
+        raise SetupError(f"{file} holds {type(found).__name__}, expected a table of settings")
+    return found
+
+
+def _table(verdicts: Sequence[Verdict]) -> Table:
+    table = Table(box=None, pad_edge=False)
+    table.add_column("case", no_wrap=True)
+    for column in ("clauses", "expected", "got"):
+        table.add_column(column, overflow="fold", ratio=1)
+    table.add_column("verdict", no_wrap=True)
+    for verdict in verdicts:
+        table.add_row(
+            Text(verdict.case),
+            Text(verdict.clauses),
+            Text(verdict.expected),
+            Text(verdict.got),
+            Text(verdict.outcome, style=STYLES[verdict.outcome]),
+        )
+    return table
+
+
+def _write(file: Path, text: str) -> None:
+    try:
+        file.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise RunError(f"cannot write {file}: {error.strerror}; give another path") from error

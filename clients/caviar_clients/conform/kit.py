@@ -1,0 +1,184 @@
+"""Takes a client through the cases, one life after another, and collects the verdicts."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from caviar_clients.conform import joining, leaving, stepping, wrong
+from caviar_clients.conform.case import Case, Failed, NotApplicable, Outcome, Verdict
+from caviar_clients.conform.client import ByHand, Client, Started
+from caviar_clients.conform.session import CONNECTING, JOINED, PATIENCE, READY, Rules, Seen, Session
+from caviar_clients.conform.wire import Wire
+from caviar_protocol.errors import RunError, SetupError
+
+LONGEST = 600
+"""Characters of what came, in a verdict."""
+HOPELESS_AFTER = 2
+"""Lives in a row that do not get as far as a case needs, until the rest is not tried any more."""
+
+
+def cases() -> tuple[Case, ...]:
+    """All cases, in the order in which they need the fewest lives."""
+    return (
+        *joining.CASES,
+        *stepping.CASES,
+        *wrong.CASES,
+        *leaving.CASES,
+        *stepping.AFTERWARDS,
+        leaving.canonical,
+    )
+
+
+class Kit:
+    """What a case works with.
+
+    Parameters
+    ----------
+    wire
+        Where the client comes to.
+    client
+        How it is started.
+    rules
+        What the user told about it.
+    """
+
+    def __init__(self, wire: Wire, client: Client, rules: Rules) -> None:
+        self.rules = rules
+        self.seen = Seen()
+        self._wire, self._client = wire, client
+        self._session: Session | None = None
+        self._unborn: list[str] = []
+
+    # --- for the cases -----------------------------------------------------------------------------
+
+    def at(self, stage: int) -> Session:
+        """A session in this state, the one that there is where it has not passed it."""
+        session = self._session
+        if session is None or session.stage > stage or session.client.ended() is not None:
+            session = self.fresh()
+        try:
+            if session.stage == CONNECTING and stage > CONNECTING:
+                session.welcome()
+            if session.stage == JOINED and stage > JOINED:
+                session.prepare()
+            if session.stage == READY and stage > READY:
+                session.reset(0)
+        except Failed as failed:
+            self._unborn.append(str(failed))
+            raise
+        self._unborn.clear()
+        return session
+
+    def fresh(self) -> Session:
+        """A new life of the client, which has said HELLO."""
+        self.discard()
+        if len(self._unborn) >= HOPELESS_AFTER:
+            raise Failed("a client that gets as far as this case", f"none: {self._unborn[-1]}")
+        self._session = Session(self._wire, self._client, self.rules, self.seen)
+        try:
+            self._session.begin()
+        except Failed as failed:
+            self._unborn += [str(failed)] * HOPELESS_AFTER
+            raise
+        return self._session
+
+    def discard(self) -> None:
+        """End the present life."""
+        if self._session is not None:
+            session, self._session = self._session, None
+            session.close()
+
+    # --- the run -----------------------------------------------------------------------------------
+
+    def judge(self, case: Case) -> Verdict:
+        """Play one case."""
+        started = time.monotonic()
+        self.seen.allow(PATIENCE * self.rules.timeout_s)
+        expected = case.expected
+        outcome: Outcome = "pass"
+        try:
+            got = case.run(self)
+        except NotApplicable as reason:
+            outcome, got = "not applicable", str(reason)
+        except Failed as failed:
+            outcome, expected, got = "fail", failed.expected, failed.got
+            self._drop()
+        return Verdict(
+            case=case.name,
+            title=case.title,
+            clauses=case.clauses,
+            outcome=outcome,
+            expected=expected,
+            got=got[:LONGEST],
+            seconds=round(time.monotonic() - started, 3),
+        )
+
+    def _drop(self) -> None:
+        """End a life that went wrong, whatever that takes."""
+        try:
+            self.discard()
+        except RunError as error:
+            self._unborn += [str(error)] * HOPELESS_AFTER
+
+
+def chosen(names: Sequence[str]) -> list[Case]:
+    """The cases of these names, or all. `SetupError` for a name that no case has."""
+    known = {case.name: case for case in cases()}
+    for name in names:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f"did you mean {near[0]!r}? " if near else ""
+            raise SetupError(f"there is no case {name!r}; {hint}cases: {', '.join(known)}")
+    return [case for case in known.values() if case.name in names or not names]
+
+
+def conform(
+    endpoint: str,
+    *,
+    command: str = "",
+    names: Sequence[str] = (),
+    rules: Rules | None = None,
+    tell: Callable[[str], None] = lambda text: None,
+    each: Callable[[Verdict], None] = lambda verdict: None,
+) -> list[Verdict]:
+    """Listen at ``endpoint`` and judge a client; the verdicts in order of the cases.
+
+    Parameters
+    ----------
+    command
+        Starts the client, with ``{endpoint}`` and ``{name}`` filled in; empty: the user does, when
+        ``tell`` says so.
+    names
+        Cases to play; by default all.
+    rules
+        What is known of the client.
+    each
+        Gets each verdict as soon as there is one.
+
+    Raises `SetupError` for an unknown case, `RunError` where the endpoint cannot be listened at or the
+    command cannot be started.
+    """
+    picked, given = chosen(names), rules or Rules()
+    wire = Wire(endpoint)
+    verdicts = []
+    with TemporaryDirectory(prefix="caviar-conform-", ignore_cleanup_errors=True) as folder:
+        client: Client = ByHand(wire, tell, given.timeout_s)
+        if command:
+            client = Started(command, wire.endpoint, given.name or "client", Path(folder))
+        kit = Kit(wire, client, replace(given, directory=folder, mark=os.urandom(8).hex()))
+        try:
+            for case in picked:
+                verdicts.append(kit.judge(case))
+                each(verdicts[-1])
+            kit.discard()
+        finally:
+            if command:
+                client.dispose()
+            wire.close()
+    return verdicts

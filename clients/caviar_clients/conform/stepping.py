@@ -1,0 +1,264 @@
+"""Cases of frames and episodes: GRANT, DONE, and what lies between."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from caviar_clients.conform import forms, street
+from caviar_clients.conform.case import Failed, NotApplicable, case
+from caviar_clients.conform.grants import HELD_FOR, Inputs
+from caviar_clients.conform.joining import BEATS, _check_beats
+from caviar_clients.conform.session import ACTIVE, Answer, Session
+
+if TYPE_CHECKING:
+    from caviar_clients.conform.kit import Kit
+
+FRAMES = 4
+
+
+@case(
+    "frames",
+    "clauses 6, 20, 21; Encoding, Digests, Payloads",
+    "DONE of each frame, with valid, canonical products and right digests",
+)
+def frames(kit: Kit) -> str:
+    """Each GRANT is answered with DONE and its products."""
+    session = kit.at(ACTIVE)
+    found: dict[str, int] = {}
+    for _ in range(FRAMES):
+        for entry in session.step().fields.get("products", []):
+            found[entry["topic"]] = found.get(entry["topic"], 0) + 1
+    missing = [topic for topic in session.hello.get("outputs", []) if topic not in found]
+    if missing:
+        raise Failed("every demanded output", f"no {', '.join(missing)} in {FRAMES} frames")
+    return f"{FRAMES} frames: " + (", ".join(f"{n} of {t}" for t, n in sorted(found.items())) or "no product")
+
+
+@case("repeated-grant", "clause 7", "the stored DONE, byte by byte")
+def repeated_grant(kit: Kit) -> str:
+    """A repeated GRANT is answered with the DONE of before."""
+    session = kit.at(ACTIVE)
+    answers = [session.step(), session.step()]
+    for answer in reversed(answers):
+        frame = answer.fields["frame"]
+        session.send("GRANT", *_again(session, frame))
+        again = session.done(frame)
+        if again.parts != answer.parts:
+            raise Failed(f"the same bytes for frame {frame}", _what_differs(answer, again))
+    session.step()
+    return "the same bytes, of the newest frame and of the one before"
+
+
+def _again(session: Session, frame: int) -> tuple[dict[str, object], *tuple[bytes, ...]]:
+    fields, parts = session.granting(frame, Inputs())
+    if frame:
+        fields["previous_frame"] = frame - 1
+    return fields, *parts
+
+
+def _what_differs(first: Answer, second: Answer) -> str:
+    differing = [key for key in first.fields if first.fields[key] != second.fields.get(key)]
+    return f"others in {', '.join(differing)}" if differing else "another product"
+
+
+@case("heartbeats-in-frames", "clause 15", "HEARTBEATs as often as asked while frames are computed")
+def heartbeats_in_frames(kit: Kit) -> str:
+    """Work does not hold heartbeats up."""
+    session = kit.at(ACTIVE)
+    since, period = len(session.pulse.beats), session.heartbeat_s
+    for _ in range(BEATS):
+        session.step()
+        session.listen(period)
+    return _check_beats(session, since)
+
+
+@case("cancel", "clause 7", "the DONE (or FAULT) that is due, and nothing for the CANCEL")
+def cancel(kit: Kit) -> str:
+    """CANCEL is advice: what was granted is still answered, another frame's is ignored."""
+    session = kit.at(ACTIVE)
+    session.send("CANCEL", {**session.who, "episode": session.episode, "frame": 900})
+    frame = session.grant()
+    session.send("CANCEL", {**session.who, "episode": session.episode, "frame": frame})
+    answer = session.receive("DONE or FAULT")
+    if answer.kind == "FAULT" and answer.fields.get("frame") == frame:
+        session.frame += 1
+    else:
+        session.judge(answer, frame)
+    session.step()
+    return f"{answer.kind}, and the next frame"
+
+
+@case("queued-grants", "clause 7; Connections and states", "answers in the order of the grants")
+def queued_grants(kit: Kit) -> str:
+    """Grants that are queued are answered in their order."""
+    session = kit.at(ACTIVE)
+    depth = session.hello.get("max_in_flight", 1)
+    if depth == 1:
+        raise NotApplicable("it queues no grants: max_in_flight is 1")
+    first = session.frame
+    count = min(depth, 4)
+    for frame in range(first, first + count):
+        session.grant(frame, None, **({"previous_frame": frame - 1} if frame else {}))
+    for frame in range(first, first + count):
+        session.done(frame)
+    return f"{count} queued, answered in order"
+
+
+@case("gap", "clause 6", "DONE of the granted frame, over the whole gap")
+def gap(kit: Kit) -> str:
+    """Frames may be left out: previous_frame says which was completed last."""
+    session = kit.at(ACTIVE)
+    session.step()
+    frame = session.frame + 3
+    session.done(session.grant(frame))
+    return f"DONE of frame {frame}, where frame {frame - 4} was the last before it"
+
+
+@case(
+    "reordered-grants",
+    "clause 7; Wrong things",
+    "ERROR unexpected or that frame's answer; then the next frame",
+)
+def reordered_grants(kit: Kit) -> str:
+    """A GRANT of a frame behind those that were answered harms nobody."""
+    session = kit.at(ACTIVE)
+    session.step()
+    skipped = session.frame
+    session.done(session.grant(skipped + 1))
+    completed, session.completed = session.completed, skipped - 1
+    session.grant(skipped)
+    session.completed = completed
+    answer = session.receive("ERROR unexpected, or DONE")
+    if answer.kind == "DONE":
+        session.judge(answer, skipped)
+    elif (answer.kind, answer.fields.get("code")) != ("ERROR", "unexpected") and answer.kind != "FAULT":
+        raise Failed("ERROR unexpected, or DONE of that frame", str(answer))
+    session.step()
+    return f"{answer.kind}, and the next frame"
+
+
+@case("held-inputs", "clauses 6, 9, 12", "DONE, from inputs of an earlier frame")
+def held_inputs(kit: Kit) -> str:
+    """Inputs may be held: they keep their own frame, and have an age."""
+    session = kit.at(ACTIVE)
+    if not session.hello.get("inputs"):
+        raise NotApplicable("it has no inputs")
+    while session.frame < HELD_FOR + 1:
+        session.step()
+    session.step(Inputs(held=True))
+    session.step()
+    return f"DONE with inputs that are {HELD_FOR} frames old"
+
+
+@case("absent-inputs", "clauses 6, 10", "DONE without what is not required")
+def absent_inputs(kit: Kit) -> str:
+    """Inputs that are not required may be absent, and have no parts."""
+    session = kit.at(ACTIVE)
+    optional = [i["topic"] for i in session.hello.get("inputs", []) if not i.get("required", True)]
+    if not optional:
+        raise NotApplicable("all its inputs are required")
+    session.step()
+    session.step(Inputs(without_optional=True))
+    session.step()
+    return f"DONE without {', '.join(optional)}"
+
+
+@case("late-inputs", "clause 11", "DONE with a product of an earlier frame beside each one")
+def late_inputs(kit: Kit) -> str:
+    """Recorders get products that came too late, under their own frame's number."""
+    session = kit.at(ACTIVE)
+    if session.hello["role"] != "recorder":
+        raise NotApplicable("only recorders get what came too late")
+    session.step()
+    session.step(Inputs(late=True))
+    return "DONE"
+
+
+@case("unknown-fields", "Versions; Arrays", "DONE, as if they were not there")
+def unknown_fields(kit: Kit) -> str:
+    """Fields and arrays of a later minor version are ignored."""
+    session = kit.at(ACTIVE)
+    session.step(Inputs(stranger=True), shade={"of": ["a", "later", "version"]})
+    session.step()
+    return "DONE"
+
+
+@case("several-sources", "clause 3", "DONE, with inputs told apart by topic and source")
+def several_sources(kit: Kit) -> str:
+    """A topic may have several sources."""
+    doubled = Inputs(sources=street.DOUBLED)
+    session = kit.fresh()
+    topics = {item["topic"] for item in session.hello.get("inputs", [])}
+    if not topics & {"scene", "action", "*"}:
+        raise NotApplicable("none of its inputs has more than one source")
+    session.welcome()
+    session.prepare(inputs=doubled)
+    session.reset(0)
+    for _ in range(2):
+        session.step(doubled)
+    kit.discard()
+    return "DONE with two worlds and two agents"
+
+
+@case("final-grant", "clause 16", "DONE without a product")
+def final_grant(kit: Kit) -> str:
+    """An agent's last grant of an episode has no action."""
+    session = kit.at(ACTIVE)
+    if session.hello["role"] != "agent":
+        raise NotApplicable("only agents get one")
+    session.step()
+    _end_episode(session)
+    kit.discard()
+    return "DONE without a product"
+
+
+def _end_episode(session: Session) -> None:
+    frames_done = session.completed + 1
+    if session.hello["role"] == "agent":
+        declared = [item for item in session.hello.get("inputs", []) if item.get("lag", 0)]
+        entries, parts = Inputs().of(declared, session.frame)
+        fields, _ = session.granting(session.frame, Inputs(), final=True)
+        fields["inputs"] = entries
+        session.send("GRANT", {key: value for key, value in fields.items() if value != []}, *parts)
+        answer = session.done(session.frame)
+        if answer.fields.get("products"):
+            raise Failed("no product for the final grant", f"{len(answer.fields['products'])}")
+    session.send("EPISODE_END", {**session.who, "episode": session.episode, "frames": frames_done})
+
+
+@case("episodes", "clauses 16, 19, 20", "RESET_DONE after EPISODE_END, and for equal seeds equal products")
+def episodes(kit: Kit) -> str:
+    """Another RESET begins anew; the same seed gives the same bytes."""
+    session = kit.at(ACTIVE)
+    if "episodes" not in session.hello.get("capabilities", []):
+        raise NotApplicable("it did not name the capability `episodes`")
+    played = []
+    for _ in range(2):
+        if session.completed >= 0:
+            _end_episode(session)
+        session.reset(session.episode + 1, seed_episode=1)
+        answers = [session.step() for _ in range(FRAMES)]
+        outputs = session.hello.get("outputs", [])
+        played.append([forms.check_products(a.fields, a.parts, outputs) for a in answers])
+    for frame, (first, second) in enumerate(zip(*played, strict=True)):
+        if first != second:
+            raise Failed("equal products in two episodes with equal seeds", f"others in frame {frame}")
+    return "two more episodes, equal byte by byte"
+
+
+CASES = (
+    frames,
+    repeated_grant,
+    heartbeats_in_frames,
+    cancel,
+    queued_grants,
+    gap,
+    reordered_grants,
+    held_inputs,
+    absent_inputs,
+    late_inputs,
+    unknown_fields,
+    episodes,
+)
+AFTERWARDS = (final_grant, several_sources)
+"""Those that end a life."""

@@ -1,0 +1,236 @@
+"""What the scripted run is about: a base station, a car, a UAV, one carrier; a product of every topic.
+
+Small, asymmetric, moving. Every product is the same bytes at each call with the same arguments.
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from caviar_protocol.arrays import Payload
+from caviar_protocol.codec import encode_payload
+from caviar_protocol.topics import (
+    Action,
+    AntennaArray,
+    AntennaDevice,
+    BeamChoice,
+    Camera,
+    CameraDevice,
+    CameraImage,
+    Channel,
+    ChannelMatrix,
+    Depth,
+    DepthImage,
+    Intrinsics,
+    Lidar,
+    LidarDevice,
+    LidarScan,
+    Link,
+    Scene,
+    Segmentation,
+    SegmentationImage,
+)
+from caviar_protocol.topics.channel import Carrier
+
+PERIOD_NS = 100_000_000
+FREQUENCY_HZ = 28e9
+C = 299_792_458.0
+
+RUN: dict[str, Any] = {
+    "carriers": [{"name": "mmwave", "frequency_hz": FREQUENCY_HZ, "bandwidth_hz": 100e6}],
+    "devices": [
+        {"name": "bs", "kind": "antenna", "position_m": [0.0, -10.0, 9.0], "role": "tx"},
+        {"name": "rx", "kind": "antenna", "on": "*", "count": 2, "role": "rx"},
+        {"name": "lidar", "kind": "lidar", "on": "*"},
+        {"name": "camera", "kind": "camera", "on": "*"},
+    ],
+    "sampling_period_ns": PERIOD_NS,
+    "frames": 1000,
+}
+"""``scenario`` of WELCOME."""
+
+SOURCES = {
+    "scene": ["traffic"],
+    "channel": ["propagation"],
+    "lidar": ["eyes"],
+    "camera": ["eyes"],
+    "depth": ["eyes"],
+    "segmentation": ["eyes"],
+    "action": ["pilot"],
+    "link": ["radio"],
+}
+"""Who produces each topic."""
+DOUBLED = {**SOURCES, "scene": ["air", "traffic"], "action": ["copilot", "pilot"]}
+"""The same with two worlds and two agents."""
+
+
+@cache
+def product(topic: str, source: str, frame: int) -> tuple[bytes, bytes]:
+    """Header and body of a product."""
+    return encode_payload(_payload(topic, source, frame))
+
+
+def scenery(mark: str) -> dict[str, bytes]:
+    """Files of scenery by name; ``mark`` makes their bytes, and so their digests, unlike all others."""
+    ground = ((-60, -40), (80, -40), (80, 30), (-60, 30))
+    vertices = "".join(f"{x} {y} 0\n" for x, y in ground)
+    mesh = (
+        f"ply\nformat ascii 1.0\ncomment {mark}\nelement vertex 4\n"
+        "property float x\nproperty float y\nproperty float z\n"
+        f"element face 2\nproperty list uchar int vertex_indices\nend_header\n{vertices}3 0 1 2\n3 0 2 3\n"
+    )
+    scene = (
+        f'<!-- {mark} -->\n<scene version="2.1.0">\n'
+        '  <bsdf type="itu-radio-material" id="mat-concrete">\n'
+        '    <string name="type" value="concrete"/>\n    <float name="thickness" value="0.2"/>\n  </bsdf>\n'
+        '  <shape type="ply" id="mesh-ground">\n'
+        '    <string name="filename" value="meshes/ground.ply"/>\n'
+        '    <boolean name="face_normals" value="true"/>\n'
+        '    <ref id="mat-concrete" name="bsdf"/>\n  </shape>\n</scene>\n'
+    )
+    return {
+        "scenery/meshes/empty.txt": b"",
+        "scenery/meshes/ground.ply": mesh.encode(),
+        "scenery/street.xml": scene.encode(),
+    }
+
+
+def _payload(topic: str, source: str, frame: int) -> Payload:
+    match topic:
+        case "scene":
+            return _scene(source, frame)
+        case "channel":
+            return _channel(frame)
+        case "action":
+            return _action(source, frame)
+        case "link":
+            return _link(frame)
+        case "lidar":
+            return _lidar(frame)
+        case _:
+            return _images(topic, frame)
+
+
+def _place(frame: int) -> tuple[float, float, float]:
+    return (-12.0 + 0.9 * frame, 4.0 + 0.25 * frame, 0.75)
+
+
+def _scene(source: str, frame: int) -> Scene:
+    car = source != "air"
+    name = "car.1" if car else "uav.1"
+    devices: list[Any] = [
+        AntennaDevice(
+            name=f"{name}/rx", parent=name, position=(0.2, 0.0, 0.9), role="rx", array=AntennaArray(columns=2)
+        )
+    ]
+    if car:
+        fixed = AntennaDevice(name="bs", position=(0.0, -10.0, 9.0), role="tx", array=AntennaArray(columns=4))
+        camera = CameraDevice(
+            name="car.1/camera", parent="car.1", position=(2.0, 0.0, 0.5), width=16, height=8
+        )
+        lidar = LidarDevice(
+            name="car.1/lidar", parent="car.1", position=(0.0, 0.2, 1.3), beams=2, azimuth_steps=12
+        )
+        devices = [fixed, camera, lidar, *devices]
+    return Scene(
+        names=(name,),
+        classes=("car" if car else "uav",),
+        assets=("",),
+        position=np.array([_place(frame) if car else (6.0, 3.0 + 0.5 * frame, 20.0)]),
+        orientation=np.array([[math.cos(0.1 * frame), 0.0, 0.0, math.sin(0.1 * frame)]]),
+        velocity=np.array([[9.0, 2.5, 0.0]]),
+        dimensions=np.array([[4.6, 1.9, 1.5]]),
+        devices=tuple(devices),
+    )
+
+
+def _channel(frame: int) -> Channel:
+    x, y, z = (a - b for a, b in zip(_place(frame), (0.0, -10.0, 8.1), strict=True))
+    distance = math.hypot(x, y, z)
+    tau, zenith, azimuth = distance / C, math.acos(z / distance), math.atan2(y, x)
+    gain = C / FREQUENCY_HZ / (4 * math.pi * distance) * cmath.exp(-2j * math.pi * FREQUENCY_HZ * tau)
+    phases = np.exp(1j * math.pi * np.outer(np.arange(2), np.ones(4)) * math.sin(azimuth))
+    return Channel(
+        rung="free-space",
+        carriers=(Carrier(name="mmwave", frequency_hz=FREQUENCY_HZ, bandwidth_hz=100e6),),
+        tx=("bs",),
+        rx=("car.1/rx",),
+        los=np.array([[True]]),
+        offsets=np.array([0, 1], dtype="<i8"),
+        id=np.array([7], dtype="<u8"),
+        a=np.array([[gain]]),
+        tau=np.array([tau]),
+        aod=np.array([[zenith, azimuth]]),
+        aoa=np.array([[math.pi - zenith, azimuth - math.pi]]),
+        doppler=np.array([[12.5]]),
+        interactions=np.zeros((1, 0), dtype="|u1"),
+        points=np.zeros((1, 0, 3)),
+        objects=np.zeros((1, 0), dtype="<i4"),
+        h=(ChannelMatrix(carrier=0, tx=0, rx=0, h=gain * phases),),
+    )
+
+
+def _action(source: str, frame: int) -> Action:
+    receiver = "car.1/rx" if source == "pilot" else "uav.1/rx"
+    return Action(commands=(BeamChoice(tx="bs", rx=receiver, tx_beam=frame % 4, rx_beam=1),))
+
+
+def _link(frame: int) -> Link:
+    floats: dict[str, Any] = {
+        name: np.array([0.125 * (1 + index)])
+        for index, name in enumerate(
+            ("baseline_abs_y", "aod_azimuth", "aoa_azimuth", "snr", "snr_best", "spectral_efficiency")
+        )
+    }
+    return Link(
+        tx=("bs",),
+        rx=("car.1/rx",),
+        carrier=("mmwave",),
+        has_path=np.array([True]),
+        los=np.array([True]),
+        tx_beam=np.array([1], dtype="<i4"),
+        rx_beam=np.array([0], dtype="<i4"),
+        abs_y=np.array([0.25]),
+        top_tx_beam=np.array([[frame % 4, (frame + 1) % 4]], dtype="<i4"),
+        top_rx_beam=np.array([[1, 0]], dtype="<i4"),
+        top_abs_y=np.array([[0.5, 0.25]]),
+        bit_rate=np.array([1e8]),
+        reward=np.array([0.25]),
+        **floats,
+    )
+
+
+def _lidar(frame: int) -> Lidar:
+    points = np.array([[1.0, 2.0, 0.5], [3.0, -1.0, 0.25 * (frame % 7)]], dtype="<f4")
+    scan = LidarScan(
+        sensor="car.1/lidar",
+        position=_place(frame),
+        orientation=(1.0, 0.0, 0.0, 0.0),
+        ray=np.array([3, 17], dtype="<i4"),
+        points=points,
+        points_world=points + np.float32(1.5),
+        range=np.linalg.norm(points, axis=1).astype("<f4"),
+        object=np.array([0, 1], dtype="<i4"),
+    )
+    return Lidar(object_names=("car.1", "ground"), scans=(scan,))
+
+
+def _images(topic: str, frame: int) -> Payload:
+    optics: dict[str, Any] = {
+        "sensor": "car.1/camera",
+        "intrinsics": Intrinsics(fx=16.0, fy=16.0, cx=2.0, cy=1.5),
+        "position": _place(frame),
+        "orientation": (1.0, 0.0, 0.0, 0.0),
+    }
+    pixels = (np.arange(12).reshape(3, 4) + frame) % 5
+    if topic == "camera":
+        return Camera(images=(CameraImage(**optics, rgb=np.stack([pixels] * 3, -1).astype("|u1")),))
+    if topic == "depth":
+        return Depth(images=(DepthImage(**optics, depth=pixels.astype("<f4") + np.float32(2)),))
+    image = SegmentationImage(**optics, object=(pixels % 2).astype("<i4"))
+    return Segmentation(object_names=("car.1", "ground"), images=(image,))

@@ -1,0 +1,264 @@
+"""The conformance kit for clients passes those that are right, and fails each kind of fault."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from caviar_clients.cli.main import app
+from caviar_clients.conform import Verdict, cases, conform, street
+from caviar_clients.conform.session import Rules
+from caviar_protocol.codec import decode_payload, encode_payload
+from caviar_protocol.errors import RunError, SetupError
+
+ROOT = Path(__file__).resolve().parents[2]
+BROKEN = Path(__file__).with_name("broken_client.py")
+ANY = "tcp://127.0.0.1:0"
+TRAJECTORY = tomllib.loads((ROOT / "deploy/scenarios/remote.toml").read_text())["services"]["world"]
+
+
+def python(*words: object) -> str:
+    """Command line of a Python program."""
+    return shlex.join([sys.executable, *map(str, words)])
+
+
+def failures(verdicts: list[Verdict]) -> dict[str, str]:
+    """What went wrong, by case."""
+    return {v.case: f"expected {v.expected}; got {v.got}" for v in verdicts if v.outcome == "fail"}
+
+
+# --- clients that are right -------------------------------------------------------------------------
+
+RIGHT = {
+    "agent.py": (python(ROOT / "clients/minimal/agent.py", "{endpoint}", "{name}"), {}),
+    "control": (python(BROKEN, "{endpoint}", "{name}", "none"), {}),
+    "control-world": (python(BROKEN, "{endpoint}", "{name}", "none", "world"), {}),
+    "control-recorder": (python(BROKEN, "{endpoint}", "{name}", "none", "recorder"), {}),
+} | {
+    use: (
+        python("-m", "caviar_services", "{name}", "--use", use, "--broker", "{endpoint}"),
+        TRAJECTORY["settings"] if use == "world:trajectory" else {},
+    )
+    for use in ("world:trajectory", "channel:free-space", "link:beams", "agent:los-beam", "recorder:mcap")
+}
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scenery of the kit goes where the test's other files are."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+
+
+@pytest.mark.parametrize("client", RIGHT)
+def test_a_right_client_fails_nothing(client: str) -> None:
+    command, settings = RIGHT[client]
+    verdicts = conform(ANY, command=command, rules=Rules(name="mine", settings=settings))
+    assert failures(verdicts) == {}
+    assert [v.case for v in verdicts] == [case.name for case in cases()]
+    assert sum(v.outcome == "pass" for v in verdicts) >= 25
+
+
+def test_the_node_agent_fails_nothing(
+    tmp_path_factory: pytest.TempPathFactory, pytestconfig: pytest.Config
+) -> None:
+    from node_project import node_project
+
+    source = ROOT / "clients/minimal/node"
+    cache = pytestconfig.cache
+    folder = cache.mkdir("minimal-node") if cache is not None else tmp_path_factory.mktemp("node")
+    script = node_project(source, "agent.mjs", folder) / "agent.mjs"
+    command = shlex.join(["node", str(script), "{endpoint}", "{name}"])
+    assert failures(conform(ANY, command=command, rules=Rules(name="mine"))) == {}
+
+
+def test_a_world_that_brings_scenery_is_asked_for_all_of_it(tmp_path: Path) -> None:
+    for name, data in street.scenery("of the test").items():
+        file = tmp_path / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(data)
+    settings = {**TRAJECTORY["settings"], "scenery": str(tmp_path / "scenery/street.xml")}
+    command, _ = RIGHT["world:trajectory"]
+    names = ["ready", "scenery", "frames", "no-demand"]
+    verdicts = conform(ANY, command=command, names=names, rules=Rules(name="mine", settings=settings))
+    assert failures(verdicts) == {}
+    assert next(v.got for v in verdicts if v.case == "scenery").startswith("offers 4 files")
+
+
+# --- clients that are not ---------------------------------------------------------------------------
+
+FAULTS: dict[str, tuple[str, ...]] = {
+    "hello": (
+        "declares an unknown topic",
+        "speaks another version",
+        "has another name",
+        "has another role",
+    ),
+    "attach": ("never attaches", "attaches to another epoch"),
+    "heartbeats": (
+        "skips sequence numbers",
+        "progress falls",
+        "says BYE on the heartbeat connection",
+        "beats too slowly",
+        "floods with heartbeats",
+    ),
+    "ready": ("asks for scenery again and again", "is READY in another epoch", "holds another geometry"),
+    "scenery": ("claims scenery that it did not fetch", "passes over unknown assets/world"),
+    "early-grant": ("takes grants of other episodes",),
+    "reset": ("resets another episode",),
+    "frames": (
+        "answers another frame",
+        "answers another episode",
+        "answers in another epoch",
+        "writes digests in capitals",
+        "makes what it did not declare",
+        "makes a topic twice",
+        "makes no product",
+        "makes what is no payload",
+        "writes out a default in a payload",
+        "pads the body",
+    ),
+    "repeated-grant": ("computes anew",),
+    "heartbeats-in-frames": ("stops beating in frames",),
+    "cancel": ("complains of CANCEL",),
+    "queued-grants": ("answers the newest grant first",),
+    "gap": ("wants frames in order",),
+    "reordered-grants": ("ends at a frame of the past",),
+    "held-inputs": ("ends at a held input",),
+    "absent-inputs": ("ends at an absent input",),
+    "late-inputs": ("ends at a late input/recorder",),
+    "unknown-fields": ("ends at an unknown field",),
+    "episodes": ("remembers the episode before",),
+    "stale-grant": ("takes grants of other epochs",),
+    "other-episode": ("takes grants of other episodes",),
+    "unexpected": ("passes over what is not due",),
+    "undecodable-input": ("does not say which input",),
+    "deep": ("crashes at nonsense",),
+    "garbage": (
+        "crashes at nonsense",
+        "hangs at nonsense",
+        "ends well at nonsense",
+        "passes over nonsense",
+    ),
+    "truncated": ("does not count parts",),
+    "lying-counts": ("allocates what is announced",),
+    "oversized": ("takes oversized headers",),
+    "heartbeat-noise": ("stops beating at noise",),
+    "complaints": ("answers complaints",),
+    "shutdown": (
+        "stays after SHUTDOWN",
+        "leaves without BYE",
+        "talks after BYE",
+        "ends badly after SHUTDOWN",
+    ),
+    "early-shutdown": ("does not leave before PREPARE",),
+    "sigterm": ("ignores SIGTERM", "dies of SIGTERM"),
+    "silence": ("bears silence", "ends well in silence"),
+    "other-major": ("stays with another major version",),
+    "refused": ("ends well when refused", "says nothing when refused"),
+    "later-minor": ("accepts its own minor version only",),
+    "no-demand": ("wants demand/world",),
+    "final-grant": ("acts in the final grant",),
+    "several-sources": ("wants one source of each topic",),
+    "canonical": ("writes out a default",),
+}
+
+
+def broken(fault: str, *names: str) -> list[Verdict]:
+    """Verdicts on the client with this fault."""
+    fault, _, role = fault.partition("/")
+    command = python(BROKEN, "{endpoint}", "{name}", fault, role or "agent")
+    patience = 0.5 if "again and again" in fault else 1.5
+    rules = Rules(name="mine", role=role or "agent", timeout_s=patience)
+    return conform(ANY, command=command, names=names, rules=rules)
+
+
+@pytest.mark.parametrize(
+    ("case", "fault"), [(case, fault) for case, faults in FAULTS.items() for fault in faults]
+)
+def test_each_fault_is_found_by_its_case(case: str, fault: str) -> None:
+    verdicts = broken(fault, *(["hello"] if case == "canonical" else []), case)
+    assert list(failures(verdicts)) == [case]
+    assert verdicts[-1].got
+
+
+def test_there_is_a_fault_for_every_case() -> None:
+    """So that no verdict is one that cannot fail."""
+    assert set(FAULTS) == {case.name for case in cases()}
+
+
+# --- what the kit is made of, and its command -------------------------------------------------------
+
+
+@pytest.mark.parametrize("topic", street.SOURCES)
+def test_the_products_of_the_kit_are_canonical(topic: str) -> None:
+    for source in street.DOUBLED[topic]:
+        for frame in (0, 3):
+            header, body = street.product(topic, source, frame)
+            assert encode_payload(decode_payload(topic, header, body)) == (header, body)
+        assert street.product(topic, source, 0) != street.product(topic, source, 3)
+
+
+def test_a_client_that_never_says_hello_ends_every_case_at_once() -> None:
+    verdicts = conform(ANY, command=python("-c", "print('I am no client')"))
+    assert {v.outcome for v in verdicts[:-1]} == {"fail"}
+    assert "«I am no client»" in verdicts[0].got
+    assert sum(v.seconds for v in verdicts) < 10
+
+
+def test_an_unknown_case_a_bad_address_and_a_missing_program_are_named() -> None:
+    with pytest.raises(SetupError, match="did you mean 'garbage'"):
+        conform(ANY, names=["garbages"])
+    with pytest.raises(RunError, match="tcp://nowhere"):
+        conform("tcp://nowhere", command="true")
+    with pytest.raises(RunError, match="'no-such-program'"):
+        conform(ANY, command="no-such-program {endpoint}")
+
+
+def test_a_client_started_by_hand_is_told_when(tmp_path: Path) -> None:
+    """The kit says when; here a test starts what a user would."""
+    started: list[subprocess.Popen[bytes]] = []
+
+    def tell(text: str) -> None:
+        if text.startswith("start your client"):
+            endpoint = text.split()[-1]
+            command = [sys.executable, str(ROOT / "clients/minimal/agent.py"), endpoint, "mine"]
+            started.append(subprocess.Popen(command, stderr=subprocess.DEVNULL))
+
+    names = ["hello", "frames", "shutdown", "refused", "sigterm"]
+    verdicts = conform(ANY, names=names, tell=tell)
+    outcomes = {v.case: v.outcome for v in verdicts}
+    assert outcomes == dict.fromkeys(names, "pass") | {"sigterm": "not applicable"}
+    assert len(started) == 3
+    assert [process.wait(10) == 0 for process in started] == [True, True, False]
+
+
+def test_the_command_prints_a_table_writes_files_and_tells_by_its_status(tmp_path: Path) -> None:
+    from typer.testing import CliRunner
+
+    def invoke(fault: str) -> Any:
+        command = python(BROKEN, "{endpoint}", "{name}", fault)
+        words = ["--listen", ANY, "--command", command, "--case", "reset", "--case", "no-demand"]
+        files = ["--json", str(tmp_path / "v.json"), "--markdown", str(tmp_path / "v.md")]
+        return CliRunner().invoke(app, ["conform", *words, *files])
+
+    assert invoke("none").exit_code == 0
+    found = json.loads((tmp_path / "v.json").read_text())
+    assert (found["pass"], found["fail"], found["not applicable"]) == (1, 0, 1)
+    result = invoke("resets another episode")
+    assert result.exit_code == 1
+    assert "1 failed" in result.output
+    found = json.loads((tmp_path / "v.json").read_text())
+    verdict = found["verdicts"][0]
+    assert (verdict["case"], verdict["outcome"], verdict["clauses"]) == ("reset", "fail", "clauses 1, 16")
+    assert "| reset: RESET is answered with RESET_DONE | clauses 1, 16 | fail |" in (
+        tmp_path / "v.md"
+    ).read_text("utf-8")
+    listed = CliRunner().invoke(app, ["conform", "--list"])
+    assert all(case.name in listed.output for case in cases())
