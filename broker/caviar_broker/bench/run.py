@@ -80,7 +80,10 @@ def measure(topology: Topology, services: int, payload: int, frames: int) -> Mea
         sampling_period_ns=SECOND,
         record=("lidar",),
     )
-    with TemporaryDirectory() as folder, closing(JournalFile(Path(folder) / "journal", plan.epoch)) as journal:
+    with (
+        TemporaryDirectory() as folder,
+        closing(JournalFile(Path(folder) / "journal", plan.epoch)) as journal,
+    ):
         store = AssetStore(Path(folder) / "assets")
         server = BrokerServer(plan, "tcp://127.0.0.1:0", journal, _Silent(), store)
         tune_collector()

@@ -35,7 +35,9 @@ def broker(
     from caviar_broker.bench.run import measure
 
     measured = measure(topology, services, payload, frames)
-    table = Table("services", "payload B", "µs a frame: mean", "p50", "p99", "MB/s", "broker CPU µs", "misses")
+    table = Table(
+        "services", "payload B", "µs a frame: mean", "p50", "p99", "MB/s", "broker CPU µs", "misses"
+    )
     time = measured.us_per_frame
     table.add_row(
         str(services),
@@ -50,4 +52,6 @@ def broker(
         try:
             json.write_bytes(msgspec.json.format(msgspec.json.encode(measured), indent=2) + b"\n")
         except OSError as error:
-            raise RunError(f"cannot write {json}: {error.strerror}; choose another file with --json") from error
+            raise RunError(
+                f"cannot write {json}: {error.strerror}; choose another file with --json"
+            ) from error
