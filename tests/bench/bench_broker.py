@@ -7,7 +7,7 @@ the others, and each of them takes the hub's. The kinds of loop take turns, roun
 machine's moods fall on all of them; ratios are medians of the ratios within each round.
 
 - *bare*: a ROUTER loop that knows nothing but this pattern, and DEALER clients that send bytes back;
-- *broker*: `caviar bench broker`: frame clock, deadlines, journal, latency record, and clients of the protocol;
+- *broker*: `caviar bench broker`: frame clock, deadlines, journal, latency record, clients of the protocol;
 - *helics*, *mosaik*: where they are installed (``pip install helics mosaik``).
 """
 
@@ -18,6 +18,7 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
+import re
 import statistics
 import subprocess
 import sys
@@ -106,8 +107,9 @@ def peer(name: str) -> Seconds:
         done = subprocess.run(
             command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, timeout=600, check=True
         )
-        told = [line for line in done.stdout.decode().splitlines() if "seconds a frame:" in line]
-        return float(told[-1].rpartition(":")[2])
+        found = re.search(rb"seconds a frame: ([-+.e0-9]+)", done.stdout)
+        assert found, f"{script.name} told no time: {done.stdout[-500:]!r}"
+        return float(found[1])
 
     return seconds
 

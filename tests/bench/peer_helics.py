@@ -20,7 +20,9 @@ def federate(number: int, services: int, payload: int, frames: int, port: int) -
 
     info = h.helicsCreateFederateInfo()
     h.helicsFederateInfoSetCoreTypeFromString(info, "zmq")
-    h.helicsFederateInfoSetCoreInitString(info, f"--federates=1 --broker_address=tcp://127.0.0.1:{port}")
+    h.helicsFederateInfoSetCoreInitString(
+        info, f"--federates=1 --loglevel=none --broker_address=tcp://127.0.0.1:{port}"
+    )
     h.helicsFederateInfoSetTimeProperty(info, h.HELICS_PROPERTY_TIME_DELTA, 1.0)
     me = h.helicsCreateValueFederate(f"fed{number}", info)
     mine = h.helicsFederateRegisterGlobalPublication(me, f"pub{number}", h.HELICS_DATA_TYPE_STRING, "")
@@ -53,7 +55,7 @@ def main() -> None:
         return
     services, payload, frames = arguments
     port = 24000 + time.monotonic_ns() % 8000
-    broker = h.helicsCreateBroker("zmq", "", f"--federates={services} --port={port}")
+    broker = h.helicsCreateBroker("zmq", "", f"--federates={services} --loglevel=none --port={port}")
     command = [sys.executable, __file__]
     started = [
         subprocess.Popen([*command, *map(str, (number, services, payload, frames, port))])

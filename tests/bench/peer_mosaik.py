@@ -8,9 +8,9 @@ Prints the seconds that a frame takes. Needs ``pip install mosaik``.
 from __future__ import annotations
 
 import logging
-import os
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 import mosaik
@@ -63,7 +63,7 @@ def main() -> None:
         mosaik_api_v3.start_simulation(Peer())
         return
     services, payload, frames = (int(value) for value in sys.argv[1:])
-    command = f"{sys.executable} {os.path.abspath(__file__)} --peer %(addr)s"
+    command = f"{sys.executable} {Path(__file__).resolve()} --peer %(addr)s"
     with mosaik.World({"Peer": {"cmd": command}}, skip_greetings=True) as world:
         hub = world.start("Peer", payload=payload, frames=frames, sources=services - 1).M()
         for _ in range(services - 1):
