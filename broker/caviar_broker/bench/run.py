@@ -16,7 +16,7 @@ import numpy as np
 from caviar_broker.__main__ import tune_collector
 from caviar_broker.bench.topology import Topology, deliveries, parts
 from caviar_broker.core import events as ev
-from caviar_broker.core.plan import SECOND, RunPlan, ServicePlan
+from caviar_broker.core.plan import SECOND, Limits, RunPlan, ServicePlan
 from caviar_broker.journal import JournalFile
 from caviar_broker.server import BrokerServer
 from caviar_broker.statistics import Statistics
@@ -27,6 +27,9 @@ WARM_UP = 50
 """Frames at the start that do not count."""
 BUDGET_NS = SECOND
 """Of every service: long, so that a noisy machine does not turn up as misses, but kept watch over."""
+CLIENT = "caviar_broker.bench.client"
+CONNECT_NS = 30 * SECOND
+"""Until all clients have to be there."""
 END_S = 10.0
 """[s] that a client gets to end after the run."""
 
@@ -79,6 +82,7 @@ def measure(topology: Topology, services: int, payload: int, frames: int) -> Mea
         frames=frames + WARM_UP,
         sampling_period_ns=SECOND,
         record=("lidar",),
+        limits=Limits(connect=CONNECT_NS),
     )
     with (
         TemporaryDirectory() as folder,
@@ -111,7 +115,7 @@ def measure(topology: Topology, services: int, payload: int, frames: int) -> Mea
 @contextmanager
 def _clients(topology: Topology, services: int, payload: int, endpoint: str) -> Iterator[None]:
     """The clients as processes; none of them outlives the block."""
-    command = [sys.executable, "-m", "caviar_broker.bench.client", topology, str(services)]
+    command = [sys.executable, "-m", CLIENT, topology, str(services)]
     started: Sequence[subprocess.Popen[bytes]] = [
         subprocess.Popen([*command, str(number), str(payload), endpoint])  # noqa: S603  # our own module
         for number in range(services)
