@@ -59,7 +59,7 @@ def authorize(
 @app.command("list")
 def list_keys(directory: Directory = DEFAULT) -> None:
     """Show who may take part, and who may look on over HTTP."""
-    rows = []
+    rows: list[tuple[str, str, str, str]] = []
     for entry in k.read_authorized(directory):
         topics = "all of its role" if entry.topics is None else ", ".join(entry.topics) or "none"
         rows.append((entry.name, entry.role, f"topics: {topics}", f"key {entry.public}"))
