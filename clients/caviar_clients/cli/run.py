@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
+from caviar_broker.security.local import check_bind
 from caviar_clients.cli.inside import EmbeddedLauncher
 from caviar_clients.cli.launch import Launcher
 from caviar_clients.cli.remote import reachable, start_command, waiting_text
@@ -59,9 +60,11 @@ def run_scenario(
     json_file: Path | None = None,
     bind: str = "tcp://127.0.0.1:0",
     embedded: bool = False,
+    keys: Path | None = None,
 ) -> int:
     """Run a scenario; the exit status: 0 exactly if it came to its end."""
     scenario = checked_scenario(path, frames, seed)
+    check_bind(bind, keys=keys is not None)
     if embedded:
         refuse_remote(scenario)
     if json_file is not None:
@@ -72,7 +75,7 @@ def run_scenario(
     if embedded:
         launcher = EmbeddedLauncher(scenario, directory)
     else:
-        launcher = Launcher(scenario, path.resolve(), directory, frames, seed, bind)
+        launcher = Launcher(scenario, path.resolve(), directory, frames, seed, bind, keys)
     outcome: Mapping[str, Any] = {}
     interrupted = _Interruption(launcher)
     with launcher, interrupted, _progress_bar(console) as bar:
