@@ -37,6 +37,8 @@ LOOK_NS = 1_000_000
 """[ns] until deadlines are looked at again, however busy the port is."""
 MESSAGES_A_TURN = 64
 """Messages taken before the clock is looked at again."""
+_COMPLAINTS = (m.Error, m.Stale, m.Refuse, m.HeartbeatAck)
+"""Messages that nobody answers: they give no right to a further message."""
 
 
 class Observer(Protocol):
@@ -398,8 +400,8 @@ class BrokerServer:
 
     def _send(self, action: ev.Send) -> None:
         parts = [part for product in action.products for part in product.payload]
-        earns = type(action.message) is not m.Stale
-        reason = self._port.send(self._routes[action.service], encode_message(action.message), parts, earns)
+        route, message = self._routes[action.service], action.message
+        reason = self._port.send(route, encode_message(message), parts, not isinstance(message, _COMPLAINTS))
         if not reason or self.clock.state is RunState.FINISHED:
             return
         if not self._watchdog.cut_off(action.service):
@@ -408,8 +410,7 @@ class BrokerServer:
 
     def _reply(self, route: bytes, message: m.Message, *parts: bytes) -> None:
         """Answer a routing id; a peer that is gone meanwhile needs no answer."""
-        earns = not isinstance(message, m.Error | m.Refuse | m.HeartbeatAck)
-        reason = self._port.send(route, encode_message(message), parts, earns)
+        reason = self._port.send(route, encode_message(message), parts, not isinstance(message, _COMPLAINTS))
         if reason:
             connection = self._connections.get(route)
             service = connection.service if connection else ""

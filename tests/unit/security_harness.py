@@ -77,12 +77,12 @@ class Background:
 
     @property
     def misses(self) -> int:
-        return sum(s.misses for s in self.broker.server.statistics.services().values())
+        return sum(notice.kind == "miss" for notice in list(self.broker.witness.notices))
 
 
 def steady(limits: dict[str, int] | None = None, frames: int = 100_000) -> RunPlan:
     """A run in real time: 20 ms a frame, of which each service has 50 ms budget."""
-    return plan(*EIGHT, frames=frames, sampling_period_ns=20 * MS, pace="realtime", limits=limits)
+    return plan(*EIGHT, frames=frames, sampling_period_ns=20 * MS, realtime=True, limits=limits)
 
 
 @contextmanager

@@ -5,17 +5,15 @@ from __future__ import annotations
 import socket
 import struct
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
 import zmq
-from broker_harness import MS, Client, Serving, eventually, plan, serving
+from broker_harness import Client, Serving, eventually, plan, play_to_the_end, playing, serving
 from security_harness import Background, eight_services
 
-from caviar_broker.core import events as ev
 from caviar_broker.security.guard import PeerLimits
 from caviar_protocol import messages as m
 from caviar_protocol.codec import encode_message
@@ -23,7 +21,7 @@ from caviar_protocol.codec import encode_message
 BESIDE_S = 1.5
 """[s] for which the run goes on beside the peer that means ill."""
 GREETING = b"\xff" + bytes(8) + b"\x7f" + b"\x03\x00" + b"NULL" + bytes(16) + b"\0" + bytes(31)
-READY = b"\x04\x19\x05READY\x0bSocket-Type\0\0\0\x06DEALER"
+READY = b"\x04\x1c\x05READY\x0bSocket-Type\0\0\0\x06DEALER"
 SMALL = PeerLimits(strangers=20)
 
 
@@ -49,7 +47,9 @@ def raw(endpoint: str) -> socket.socket:
     """A ZMTP connection of our own, behind its handshake."""
     connection = socket.create_connection(address(endpoint), timeout=5.0)
     connection.sendall(GREETING + READY)
-    assert connection.recv(64)
+    received = b""
+    while b"READY" not in received:
+        received += connection.recv(4096)
     return connection
 
 
@@ -129,7 +129,7 @@ def test_bytes_that_are_no_zeromq_end_their_connection_and_are_told(tmp_path: Pa
         with socket.create_connection(address(background.broker.endpoint)) as connection:
             connection.sendall(b"GET / HTTP/1.1\r\nHost: x\r\n\r\n" * 20)
             eventually(lambda: is_ended(connection), "the connection is ended", 8.0)
-        told(background.broker, "a connection from 127.0.0.1 ended without being a ZeroMQ peer")
+        told(background.broker, "a connection from 127.0.0.1 ended before it sent a message")
         unharmed(background)
 
 
@@ -150,36 +150,73 @@ def test_connections_that_say_nothing_make_room_for_those_that_do(tmp_path: Path
 
 
 def test_a_connection_that_never_shakes_hands_is_ended(tmp_path: Path) -> None:
-    with serving(plan("world"), tmp_path) as broker, socket.create_connection(address(broker.endpoint)) as half:
+    with (
+        serving(plan("world"), tmp_path) as broker,
+        socket.create_connection(address(broker.endpoint)) as half,
+    ):
         assert not is_ended(half)
         eventually(lambda: is_ended(half), "the connection is ended", 8.0)
 
 
 # --- members ---------------------------------------------------------------------------------------------
 
-TWO = ("world", "sensors:good", "sensors:bad")
-
 
 @contextmanager
-def with_a_bad_member(tmp_path: Path, limits: PeerLimits | None = None) -> Iterator[tuple[Serving, list[Client]]]:
-    """A run that goes on without the service ``bad``."""
-    run = plan(*TWO, frames=10_000, limits={"rejoin": 60_000 * MS})
-    services = [type(s)(name=s.name, role=s.role, budget_ns=s.budget_ns, **extra(s.name)) for s in run.services]
-    run = type(run)(**{f: getattr(run, f) for f in run.__struct_fields__} | {"services": tuple(services)})
-    with serving(run, tmp_path, peer_limits=limits) as broker:
-        clients = [
-            Client(broker.endpoint, "world"),
-            Client(broker.endpoint, "good", "sensors"),
-            Client(broker.endpoint, "bad", "sensors"),
-        ]
-        try:
-            for client in clients:
-                client.join()
-            for client in clients:
-                client.ready()
-            for client in clients:
-                client.reset()
-            yield broker, clients
-        finally:
-            for client in clients:
-                client.close()
+def beside_a_bad_member(tmp_path: Path, limits: PeerLimits | None = None) -> Iterator[tuple[Serving, Client]]:
+    """A run of ``world`` and ``bad``, both behind their first frame."""
+    with (
+        serving(plan("world", "sensors:bad", frames=1000), tmp_path, peer_limits=limits) as broker,
+        playing(broker.endpoint, "world", "sensors:bad") as (world, bad),
+    ):
+        world.answer()
+        bad.answer()
+        yield broker, bad
+
+
+def named_and_cut_off(broker: Serving, words: str) -> None:
+    """Without its answers the run cannot go on: clause 15, with the reason."""
+    outcome = broker.outcome()
+    assert outcome.culprit == "bad"
+    assert f"it was cut off: {words}" in outcome.error
+
+
+def test_a_member_that_floods_is_cut_off_and_named(tmp_path: Path) -> None:
+    with beside_a_bad_member(tmp_path) as (broker, bad):
+        for _ in range(6000):
+            bad.send(m.ResetDone(**bad.ids, episode=77))
+        named_and_cut_off(broker, "it sends messages faster than 500 a second")
+
+
+def test_heartbeats_too_are_counted(tmp_path: Path) -> None:
+    with beside_a_bad_member(tmp_path) as (broker, bad):
+        pulse = bad.attach()
+        for sequence in range(6000):
+            pulse.send(encode_message(m.Heartbeat(sequence=sequence)))
+        named_and_cut_off(broker, "it sends messages faster than 500 a second")
+
+
+def test_a_member_that_answers_all_it_is_granted_is_never_too_fast(tmp_path: Path) -> None:
+    """A run as fast as it can be is faster than the rate that unasked messages have."""
+    limits = PeerLimits(burst=20.0, rate=1.0)
+    with (
+        serving(plan("world", "sensors", frames=400), tmp_path, peer_limits=limits) as broker,
+        playing(broker.endpoint, "world", "sensors") as clients,
+    ):
+        play_to_the_end(clients, 400)
+        assert not broker.outcome().error
+
+
+def test_a_member_that_never_reads_is_cut_off_before_it_fills_the_memory(tmp_path: Path) -> None:
+    """It asks for scenery again and again, and takes nothing of it."""
+    with (
+        serving(plan("world", "sensors:bad"), tmp_path, peer_limits=PeerLimits(queued=32 << 20)) as broker,
+        raw(broker.endpoint) as bad,
+    ):
+        store = broker.server._scenery.exchange._store
+        asset = store.add("scenery/large.ply", bytes(4 << 20))
+        hello = m.Hello(version=(1, 0), name="bad", role="sensors", outputs=("lidar",))
+        for message in (hello, *[m.AssetGet(digest=asset.digest, offset=0)] * 40):
+            data = encode_message(message)
+            bad.sendall(bytes([0, len(data)]) + data)
+        told(broker, "it was cut off: it reads too slowly: ")
+        eventually(lambda: is_ended(bad), "the connection is ended", 5.0)

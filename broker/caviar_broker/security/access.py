@@ -104,16 +104,19 @@ class Access:
         return (found.st_mtime_ns, found.st_ino, found.st_size)
 
 
-def answer(access: Access, request: Sequence[bytes]) -> tuple[list[bytes], str]:
+def answer(access: Access | None, request: Sequence[bytes]) -> tuple[list[bytes], str]:
     """Reply to a request of the ZeroMQ Authentication Protocol (RFC 27), and why it is a refusal.
 
-    The user id that it gives to each message of the connection is the public key, in Z85.
+    The user id that it gives to each message of the connection is the public key, in Z85. Without
+    ``access`` everybody is let in who asks for no mechanism.
     """
-    version, sequence, *rest = [*request, b"", b""][:2] + list(request[2:])
+    version, sequence = [*request, b"", b""][:2]
     reason = f"a request of {len(request)} parts"
     key = ""
-    if len(request) == 7 and request[5] == b"CURVE" and len(request[6]) == 32:
-        key = z85.encode(rest[4]).decode()
+    if access is None and len(request) > 5 and request[5] == b"NULL":
+        reason = ""
+    elif access is not None and len(request) == 7 and request[5] == b"CURVE" and len(request[6]) == 32:
+        key = z85.encode(request[6]).decode()
         reason = access.admits(key)
     elif len(request) > 5:
         reason = f"the mechanism {request[5].decode(errors='replace')!r} has no keys"

@@ -101,14 +101,14 @@ class Guard:
         self._barred: dict[str, int] = {}
         """Address to the instant until which it is barred [ns]."""
         self._scan_at = self._scan_from = 0
-        self._zap: zmq.Socket[Any] | None = None
         self._lost: Callable[[bytes, str], bool] = lambda route, why: False
         self._tell: Callable[[str, str], None] = lambda kind, text: None
+        # Asked also where there are no keys: libzmq then takes no older peer than ZMTP 3's, which may be any bytes.
+        self._zap = context.socket(zmq.REP)
+        self._zap.linger = 0
+        self._zap.bind(ZAP)
+        socket.zap_domain = b"caviar"
         if access is not None:
-            self._zap = context.socket(zmq.REP)
-            self._zap.linger = 0
-            self._zap.bind(ZAP)
-            socket.zap_domain = b"caviar"
             socket.curve_server = True
             socket.curve_secretkey = access.pair.secret.encode()
 
@@ -126,14 +126,12 @@ class Guard:
         """
         self._lost, self._tell = lost, tell
         loop.watch(self._wires.monitor, self._connections_changed)
-        if self._zap is not None:
-            loop.watch(self._zap, self._authenticate)
+        loop.watch(self._zap, self._authenticate)
 
     def close(self) -> None:
         """Stop watching."""
         self._wires.close()
-        if self._zap is not None:
-            self._zap.close()
+        self._zap.close()
 
     # --- messages ------------------------------------------------------------------------------------
 
@@ -257,8 +255,9 @@ class Guard:
         for wire in [wire for wire in self._by_wire if not wire.open]:
             self._by_wire.pop(wire).ended = now
         for address in failures:
-            what = "without an authorized key" if self.access else "without being a ZeroMQ peer"
-            self._tell(f"handshake {address}", f"a connection from {address} ended {what}")
+            what = "no authorized key" if self.access else "no ZMTP 3"
+            text = f"a connection from {address} ended before it sent a message, like one that has {what}"
+            self._tell(f"handshake {address}", text)
         for wire in fresh:
             if self._barred.get(wire.address, 0) > now:
                 wire.end()
@@ -320,8 +319,6 @@ class Guard:
 
     def _authenticate(self) -> None:
         """Answer libzmq, which asks about each new connection."""
-        if self._zap is None or self.access is None:
-            return
         try:
             request = self._zap.recv_multipart(zmq.NOBLOCK)
         except zmq.Again:

@@ -23,12 +23,7 @@ _EVENT = struct.Struct("=HI")
 _BYTES = struct.Struct("=QQ")
 _BYTES_AT = 120
 """Where ``tcpi_bytes_acked`` and ``tcpi_bytes_received`` stand in struct tcp_info (linux/tcp.h)."""
-_FAILED = (
-    int(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL)
-    | int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL)
-    | int(zmq.EVENT_HANDSHAKE_FAILED_AUTH)
-)
-_WATCHED = int(zmq.EVENT_ACCEPTED) | int(zmq.EVENT_DISCONNECTED) | int(zmq.EVENT_CLOSED) | _FAILED
+_WATCHED = int(zmq.EVENT_ACCEPTED) | int(zmq.EVENT_DISCONNECTED) | int(zmq.EVENT_CLOSED)
 UNCLEAR_NS = 2_000_000_000
 """[ns] for which messages of a closed connection may still come, while its descriptor is another's."""
 
@@ -48,9 +43,12 @@ class Wire:
     claimed: bool = False
     """Whether a routing id is known to be this connection."""
     open: bool = True
+    dismissed: bool = False
+    """Whether the broker ended it."""
 
     def end(self) -> None:
         """End the connection; nothing where it has ended."""
+        self.dismissed = True
         with self._socket() as found:
             if found is not None:
                 try:
@@ -99,15 +97,13 @@ class Wires:
         return len(self._open)
 
     def update(self) -> tuple[list[Wire], list[str]]:
-        """Take note of what began and ended: the new connections, and the addresses of those that ended
-        without being ZeroMQ's, or without a key."""
+        """Take note of what began and ended: the new connections, and the addresses of those that ended by
+        themselves before a message came, as those do that are not ZeroMQ's or have no key."""
         fresh: dict[int, Wire] = {}
-        failures, failed = [], False
+        failures = []
         while (event := self._next()) is not None:
             kind, fd = event
-            if kind & _FAILED:
-                failed = True  # the end of the same connection is told next
-            elif kind == zmq.EVENT_ACCEPTED:
+            if kind == zmq.EVENT_ACCEPTED:
                 self._ended(fd)
                 fresh.pop(fd, None)
                 wire = self._begun(fd)
@@ -116,9 +112,8 @@ class Wires:
             else:
                 ended = self._ended(fd)
                 fresh.pop(fd, None)
-                if failed and ended is not None:
+                if ended is not None and not ended.claimed and not ended.dismissed:
                     failures.append(ended.address)
-                failed = False
         return list(fresh.values()), failures
 
     def claim(self, fd: int, address: str) -> Wire | None:
