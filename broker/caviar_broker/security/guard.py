@@ -103,7 +103,8 @@ class Guard:
         self._scan_at = self._scan_from = 0
         self._lost: Callable[[bytes, str], bool] = lambda route, why: False
         self._tell: Callable[[str, str], None] = lambda kind, text: None
-        # Asked also where there are no keys: libzmq then takes no older peer than ZMTP 3's, which may be any bytes.
+        # Asked also where there are no keys: libzmq then takes no peer older than ZMTP 3, where any bytes
+        # would do.
         self._zap = context.socket(zmq.REP)
         self._zap.linger = 0
         self._zap.bind(ZAP)
