@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "broker" / "SECURITY.md").read_text()
 
 
-def tests_of_the_repository() -> set[str]:
+def known_tests() -> set[str]:
     found = set()
     for path in (ROOT / "tests").rglob("test_*.py"):
         tree = ast.parse(path.read_text())
@@ -29,7 +29,7 @@ def test_each_promise_names_tests_that_exist() -> None:
     for row in promises:
         assert "`test_" in row, f"no test holds: {row}"
     named = set(re.findall(r"`(test_\w+)`", PAGE))
-    assert named <= tests_of_the_repository()
+    assert named <= known_tests()
 
 
 def test_its_figures_are_those_of_the_code() -> None:
