@@ -119,7 +119,7 @@ class BrokerServer:
         self.loop = Loop()
         """Others may have descriptors watched by it."""
         self.loop.watch(self._port.socket, self._receive_all)
-        self._guard.start(self.loop, self._cut_off, self._grumble)
+        self._guard.start(self.loop, self._cut_off, self._gone, self._grumble)
         self._watchdog = Watchdog(
             clock=self.clock,
             heartbeat_ns=plan.limits.heartbeat,
@@ -314,6 +314,17 @@ class BrokerServer:
             self._guard.cut(other, why)
         self.feed(ev.Lost(connection.service, f"it was cut off: {why}"))
         return True
+
+    def _gone(self, route: bytes) -> None:
+        """A connection has ended: a remote service is lost; of a local one the operating system tells."""
+        connection = self._connections.get(route)
+        if connection is None:
+            return
+        service = connection.service
+        if connection.heartbeat:
+            self._watchdog.recheck(service)
+        elif not self._watchdog.cut_off(service):
+            self.feed(ev.Lost(service, "it is unreachable or stopped: its connection is gone"))
 
     def _attach(self, route: bytes, attach: m.Attach) -> None:
         if why := self._guard.refusal(route, attach.name):

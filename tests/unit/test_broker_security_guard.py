@@ -96,7 +96,7 @@ def test_an_address_is_barred_unless_a_good_service_is_at_home_there() -> None:
             dealer.linger = 0
             dealer.connect(port.endpoint)
             dealer.send(b"x")
-            port.guard.start(_NoLoop(), lambda *_: False, lambda *_: None)  # type: ignore[arg-type]
+            port.guard.start(_NoLoop(), lambda *_: False, lambda *_: None, lambda *_: None)  # type: ignore[arg-type]
             received = []
             eventually(
                 lambda: (guard._authenticate(), received.append(port.receive()), received[-1])[-1], "it came"

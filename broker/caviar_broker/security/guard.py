@@ -23,6 +23,8 @@ SCANNED = 128
 """Connections looked at in one scan."""
 KEPT_NS = 5_000_000_000
 """[ns] for which a peer is remembered whose connection has ended: messages of it may still come."""
+LAST_WORDS_NS = 200_000_000
+"""[ns] for which a connection that ended is not missed: its last messages, and BYE, may wait to be read."""
 FRAMING = 48
 """[B] that ZMTP and CURVE may add to a part."""
 CHATTER = 1024
@@ -70,6 +72,8 @@ class _Peer:
     """[B] handed to libzmq for it."""
     cut: bool = False
     ended: int = 0
+    """When its connection ended [ns]; 0: it has not."""
+    missed: bool = False
 
 
 class Guard:
@@ -102,6 +106,7 @@ class Guard:
         """Address to the instant until which it is barred [ns]."""
         self._scan_at = self._scan_from = 0
         self._lost: Callable[[bytes, str], bool] = lambda route, why: False
+        self._gone: Callable[[bytes], None] = lambda route: None
         self._tell: Callable[[str, str], None] = lambda kind, text: None
         # Asked also where there are no keys: libzmq then takes no peer older than ZMTP 3, where any bytes
         # would do.
@@ -113,7 +118,13 @@ class Guard:
             socket.curve_server = True
             socket.curve_secretkey = access.pair.secret.encode()
 
-    def start(self, loop: Loop, lost: Callable[[bytes, str], bool], tell: Callable[[str, str], None]) -> None:
+    def start(
+        self,
+        loop: Loop,
+        lost: Callable[[bytes, str], bool],
+        gone: Callable[[bytes], None],
+        tell: Callable[[str, str], None],
+    ) -> None:
         """Begin to watch.
 
         Parameters
@@ -122,10 +133,12 @@ class Guard:
             The broker's.
         lost
             Is told routing id and reason of a peer that is cut off; whether that was a service.
+        gone
+            Is told the routing id of a service whose connection has ended.
         tell
             Is told of what others than services did: its kind, and a text.
         """
-        self._lost, self._tell = lost, tell
+        self._lost, self._gone, self._tell = lost, gone, tell
         loop.watch(self._wires.monitor, self._connections_changed)
         loop.watch(self._zap, self._authenticate)
 
@@ -222,8 +235,15 @@ class Guard:
         self._scan_from += SCANNED
         for wire in wires[first : first + SCANNED]:
             self._measure(wire, now)
-        for route in [r for r, p in self._peers.items() if p.ended and now - p.ended > KEPT_NS]:
-            del self._peers[route]
+        self._miss([peer for peer in self._peers.values() if peer.ended], now)
+
+    def _miss(self, ended: Sequence[_Peer], now: int) -> None:
+        for peer in ended:
+            if peer.service and not peer.cut and not peer.missed and now - peer.ended > LAST_WORDS_NS:
+                peer.missed = True
+                self._gone(peer.route)
+            if now - peer.ended > KEPT_NS:
+                self._peers.pop(peer.route, None)
 
     def _measure(self, wire: Wire, now: int) -> None:
         """Cut off whoever has more waiting than it may."""
