@@ -210,6 +210,6 @@ def test_a_remote_service_whose_connection_ends_is_missed_at_once(tmp_path: Path
                 client.ready()
             started = time.monotonic()
         outcome = broker.outcome()
-        assert time.monotonic() - started < 0.2 + MARGIN_S
+        assert time.monotonic() - started < 0.2 + 2 * MARGIN_S  # liveness is 1.5 s
     assert outcome.culprit == "world"
     assert "its connection is gone" in outcome.error

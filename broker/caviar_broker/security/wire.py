@@ -24,6 +24,8 @@ _BYTES = struct.Struct("=QQ")
 _BYTES_AT = 120
 """Where ``tcpi_bytes_acked`` and ``tcpi_bytes_received`` stand in struct tcp_info (linux/tcp.h)."""
 _WATCHED = int(zmq.EVENT_ACCEPTED) | int(zmq.EVENT_DISCONNECTED) | int(zmq.EVENT_CLOSED)
+UNKNOWN = "somewhere"
+"""Address of a connection that ended before anybody could ask for it."""
 UNCLEAR_NS = 2_000_000_000
 """[ns] for which messages of a closed connection may still come, while its descriptor is another's."""
 
@@ -109,6 +111,8 @@ class Wires:
                 wire = self._begun(fd)
                 if wire is not None:
                     fresh[fd] = wire
+                else:
+                    failures.append(UNKNOWN)
             else:
                 ended = self._ended(fd)
                 fresh.pop(fd, None)
