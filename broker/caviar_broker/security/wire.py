@@ -113,6 +113,7 @@ class Wires:
                     fresh[fd] = wire
                 else:
                     failures.append(UNKNOWN)
+                    self._closed[fd] = time.monotonic_ns()
             else:
                 ended = self._ended(fd)
                 fresh.pop(fd, None)
