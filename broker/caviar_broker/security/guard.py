@@ -235,6 +235,7 @@ class Guard:
         self._scan_from += SCANNED
         for wire in wires[first : first + SCANNED]:
             self._measure(wire, now)
+        self._barred = {address: until for address, until in self._barred.items() if until > now}
         self._miss([peer for peer in self._peers.values() if peer.ended], now)
 
     def _miss(self, ended: Sequence[_Peer], now: int) -> None:

@@ -18,7 +18,7 @@ from rich.text import Text
 from caviar_broker.security.local import check_bind
 from caviar_clients.cli.inside import EmbeddedLauncher
 from caviar_clients.cli.launch import Launcher
-from caviar_clients.cli.remote import reachable, start_command, waiting_text
+from caviar_clients.cli.remote import key_text, reachable, start_command, waiting_text
 from caviar_clients.cli.summary import recorded_figures, summary_of, summary_table
 from caviar_clients.sessions.checking import checked_scenario
 from caviar_protocol.errors import RunError
@@ -79,7 +79,7 @@ def run_scenario(
     outcome: Mapping[str, Any] = {}
     interrupted = _Interruption(launcher)
     with launcher, interrupted, _progress_bar(console) as bar:
-        watcher = _Watcher(bar, console, scenario)
+        watcher = _Watcher(bar, console, scenario, keys)
         for event in launcher.events():
             watcher.take(event)
             if event["event"] == "finished":
@@ -129,13 +129,13 @@ class _Interruption:
 class _Watcher:
     """Shows what the broker reports."""
 
-    def __init__(self, bar: Progress, console: Console, scenario: Scenario) -> None:
+    def __init__(self, bar: Progress, console: Console, scenario: Scenario, keys: Path | None) -> None:
         self._bar, self._console = bar, console
         total = scenario.run.frames * scenario.run.episodes
         self._task = bar.add_task("starting", total=total, rate="", misses="")
         self._first: tuple[float, int] | None = None
         self._shown: dict[tuple[str, str], int] = {}
-        self._scenario, self._endpoint = scenario, ""
+        self._scenario, self._endpoint, self._keys = scenario, "", keys
 
     def take(self, event: Mapping[str, Any]) -> None:
         """Show one event."""
@@ -154,7 +154,7 @@ class _Watcher:
         for name, spec in self._scenario.services.items():
             if spec.remote:
                 connect_s = self._scenario.timeouts.connect_s
-                self._tell(waiting_text(name, spec, endpoint, connect_s), "bold")
+                self._tell(waiting_text(name, spec, endpoint, connect_s) + key_text(name, self._keys), "bold")
 
     def _frame(self, frames: int, misses: int) -> None:
         now = time.monotonic()
