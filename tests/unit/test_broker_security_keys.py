@@ -111,7 +111,7 @@ def test_a_service_without_the_right_key_ends_within_seconds_with_the_remedy(
         connection.close()
         assert time.monotonic() - started < 5.0
         assert broker.server.clock.peer("world").attempt == 0  # type: ignore[union-attr]
-        eventually(lambda: "a connection from 127.0.0.1" in broker.witness.texts(), "the user is told")
+        eventually(lambda: "a connection from " in broker.witness.texts(), "the user is told")
 
 
 def test_a_revoked_key_is_cut_off_and_named_within_a_second(tmp_path: Path, keys: Ring) -> None:
