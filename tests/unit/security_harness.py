@@ -81,8 +81,8 @@ class Background:
 
 
 def steady(limits: dict[str, int] | None = None, frames: int = 100_000) -> RunPlan:
-    """A run in real time, 20 ms a frame. The budgets leave room for the test's own eight services, which share
-    one thread, and for a machine that is busy with other things."""
+    """A run in real time, 20 ms a frame. The budgets leave room for the test's own eight services, which
+    share one thread, and for a machine that is busy with other things."""
     run = plan(*EIGHT, frames=frames, sampling_period_ns=20 * MS, realtime=True, limits=limits)
     return replace(run, services=tuple(replace(service, budget_ns=250 * MS) for service in run.services))
 
