@@ -1,10 +1,18 @@
 """A whole agent, written from protocol/SPEC.md alone: python agent.py tcp://HOST:PORT NAME"""
-import hashlib, itertools, os, signal, struct, sys, threading, time, msgpack, zmq
+import hashlib, itertools, os, pathlib, signal, struct, sys, threading, time, tomllib, msgpack, zmq
 ENDPOINT, NAME, INPUTS = *sys.argv[1:3], [{"topic": "scene"}, {"topic": "link", "lag": 1, "required": False}]
 message = {"version": [1, 0], "name": NAME, "role": "agent", "inputs": INPUTS, "outputs": ["action"]}
 
+def dealer(context):  # a broker with keys wants the files that two environment variables name
+    socket, variables = context.socket(zmq.DEALER), ("CAVIAR_KEY", "CAVIAR_BROKER_KEY")
+    if os.environ.get("CAVIAR_KEY"):
+        own, broker = (tomllib.loads(pathlib.Path(os.environ[file]).read_text()) for file in variables)
+        socket.curve_publickey, socket.curve_secretkey = own["public"].encode(), own["secret"].encode()
+        socket.curve_serverkey = broker["public"].encode()
+    return socket
+
 def beat(welcome):
-    pulse, beating = zmq.Context().socket(zmq.DEALER), {"type": "ATTACH", **who, "name": NAME}
+    pulse, beating = dealer(zmq.Context()), {"type": "ATTACH", **who, "name": NAME}
     pulse.connect(ENDPOINT)
     for sequence in itertools.count():
         pulse.send(msgpack.packb(beating))
@@ -35,7 +43,7 @@ def done(grant, parts):
 
 threading.excepthook = lambda end: os._exit(os.write(2, f"{NAME}: {end.exc_value!r}\n".encode()) and 1)
 signal.signal(signal.SIGTERM, lambda *_: sys.exit(broker.send(msgpack.packb({"type": "BYE", **who})) or 143))
-with zmq.Context() as context, context.socket(zmq.DEALER) as broker:
+with zmq.Context() as context, dealer(context) as broker:
     broker.linger = 1000  # [ms] at the end, so that a broker that is gone holds nobody up
     broker.connect(ENDPOINT)
     broker.send(msgpack.packb({"type": "HELLO", **message}))
