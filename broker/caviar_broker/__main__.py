@@ -18,6 +18,7 @@ import msgspec
 from caviar_broker.briefing import briefings, with_ownership
 from caviar_broker.control import Control, Reporter, stop_on_signals
 from caviar_broker.core.plan import plan_run
+from caviar_broker.desk import Desk
 from caviar_broker.journal import JournalFile
 from caviar_broker.server import BrokerServer
 from caviar_protocol.errors import CaviarError, RunError
@@ -44,14 +45,17 @@ def serve(arguments: argparse.Namespace) -> int:
     reporter = Reporter(sys.stdout.fileno(), directory / "events.jsonl", arguments.control)
     with closing(JournalFile(directory / "journal.msgpack", plan.epoch)) as journal:
         supervised = arguments.supervised if arguments.control else ()
-        server = BrokerServer(plan, arguments.bind, journal, reporter, supervised=supervised)
-        reporter.attach(server)
-        if arguments.control:
-            Control(server)
-        stop_on_signals(server)
-        reporter.listening(server.endpoint)
-        tune_collector()
-        outcome = server.run()
+        desk = Desk(directory, reporter)
+        with closing(desk):
+            server = BrokerServer(plan, arguments.bind, journal, desk, supervised=supervised)
+            reporter.attach(server)
+            desk.attach(server)
+            if arguments.control:
+                Control(server)
+            stop_on_signals(server)
+            reporter.listening(server.endpoint)
+            tune_collector()
+            outcome = server.run()
     statistics = server.statistics
     statistics.save(directory / "latency.npz")
     reporter.finished(
