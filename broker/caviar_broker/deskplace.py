@@ -6,10 +6,12 @@ import json
 import os
 import shutil
 import socket
+import struct
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from caviar_protocol.errors import RunError
 
@@ -79,17 +81,52 @@ def connect(directory: Path) -> socket.socket:
     except (OSError, ValueError, KeyError, TypeError):
         path = directory / SOCKET
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    connection.settimeout(REACH_S)
+    # With a timeout of Python's, a full backlog would be an error at once.
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("ll", round(REACH_S), 0))
     if path.parent.is_dir() and path.name == SOCKET:
         with _short(path.parent) as folder:
             try:
                 connection.connect(f"{folder}/{SOCKET}")
+            except BlockingIOError:
+                connection.close()
+                raise _no_answer(directory) from None
             except OSError:
                 connection.close()
             else:
+                connection.settimeout(REACH_S)
                 return connection
     connection.close()
     raise RunError(f"no broker runs in {directory}: it has ended, or was never started there")
+
+
+def ask(directory: Path, **request: Any) -> dict[str, Any]:
+    """The answer of a broker's desk to one request: ``ask(run, do="why")``.
+
+    Raises `RunError` where no broker runs there, where it does not answer, or with what it refuses.
+    """
+    line = b""
+    with connect(directory) as connection:
+        try:
+            connection.sendall(json.dumps(request).encode() + b"\n")
+            while not line.endswith(b"\n") and (data := connection.recv(1 << 16)):
+                line += data
+        except TimeoutError:
+            raise _no_answer(directory) from None
+        except OSError as error:
+            raise RunError(f"the broker in {directory} hung up: {error.strerror}") from error
+    if not line.endswith(b"\n"):
+        raise RunError(f"the broker in {directory} hung up: its run is over, or too many ask it at once")
+    answer: dict[str, Any] = json.loads(line)
+    if not answer["ok"]:
+        raise RunError(f"the broker in {directory} refuses: {answer['error']}")
+    return answer
+
+
+def _no_answer(directory: Path) -> RunError:
+    return RunError(
+        f"the broker in {directory} did not answer within {REACH_S:g} s: "
+        "its process is stopped, or its machine is overloaded"
+    )
 
 
 def _answers(directory: Path) -> bool:

@@ -29,7 +29,7 @@ class RecentStatistics(msgspec.Struct, frozen=True, kw_only=True):
     p99_ms: float | None
     total_ms: float
     """Of all latencies."""
-    grants: int
+    grants_answered: int
     """How many these are."""
     misses: int
     budget_ms: float
@@ -107,7 +107,7 @@ class Statistics:
                 p50_ms=_rank(newest, 0.50),
                 p99_ms=_rank(newest, 0.99),
                 total_ms=self._totals[name] / 1e6,
-                grants=len(values),
+                grants_answered=len(values),
                 misses=self._misses[name],
                 budget_ms=self._budgets[name] / 1e6,
             )

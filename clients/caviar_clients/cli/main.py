@@ -87,6 +87,18 @@ def service(
 
 
 @app.command()
+def why(
+    run: Annotated[
+        Path | None, typer.Argument(help="directory of a run; by default the newest in ./runs")
+    ] = None,
+) -> None:
+    """Ask a running broker whom it waits for now, and why."""
+    from caviar_clients.cli.why import why_command
+
+    why_command(run, _console)
+
+
+@app.command()
 def doctor() -> None:
     """Check what this machine has; for what is missing, say the command that mends it."""
     from caviar_clients.cli import doctor as checks
