@@ -15,6 +15,7 @@ from pathlib import Path
 
 import msgspec
 
+from caviar_broker.beside import HttpBeside
 from caviar_broker.briefing import briefings, with_ownership
 from caviar_broker.control import Control, Reporter, stop_on_signals
 from caviar_broker.core.plan import plan_run
@@ -41,12 +42,13 @@ def serve(arguments: argparse.Namespace) -> int:
     scenario = load_scenario(arguments.scenario)
     scenario = with_ownership(with_overrides(scenario, arguments.frames, arguments.seed))
     directory = _made(arguments.directory)
+    beside = HttpBeside(directory, arguments.http, arguments.keys)
     plan = plan_run(scenario, arguments.run or directory.name, briefings(scenario, directory))
     reporter = Reporter(sys.stdout.fileno(), directory / "events.jsonl", arguments.control)
     with closing(JournalFile(directory / "journal.msgpack", plan.epoch)) as journal:
         supervised = arguments.supervised if arguments.control else ()
         desk = Desk(directory, reporter)
-        with closing(desk):
+        with closing(beside), closing(desk):
             server = BrokerServer(plan, arguments.bind, journal, desk, supervised=supervised)
             reporter.attach(server)
             desk.attach(server)
@@ -54,6 +56,7 @@ def serve(arguments: argparse.Namespace) -> int:
                 Control(server)
             stop_on_signals(server)
             reporter.listening(server.endpoint)
+            beside.start(server)
             tune_collector()
             outcome = server.run()
     statistics = server.statistics
@@ -87,6 +90,8 @@ def parser() -> argparse.ArgumentParser:
     found = argparse.ArgumentParser(prog="python -m caviar_broker", description=__doc__)
     found.add_argument("scenario", type=Path)
     found.add_argument("--bind", default="tcp://127.0.0.1:5570", help="address to listen on")
+    found.add_argument("--keys", type=Path, help="keys directory: who may take part (caviar keys)")
+    found.add_argument("--http", default="", help="HOST:PORT: serve HTTP and WebSocket there")
     found.add_argument("--directory", type=Path, required=True, help="where the run is written")
     found.add_argument("--run", default="", help="id of the run; by default the directory's name")
     found.add_argument("--frames", type=int, default=None, help="instead of the scenario's")

@@ -60,6 +60,10 @@ class Launcher:
     frames: int | None = None
     seed: int | None = None
     bind: str = "tcp://127.0.0.1:0"
+    keys: Path | None = None
+    """Keys directory of the broker."""
+    http: str = ""
+    """``HOST:PORT`` at which the broker has HTTP served; "" for none."""
     endpoint: str = ""
     _children: dict[str, Child] = field(default_factory=dict)
     _broker: subprocess.Popen[bytes] | None = None
@@ -121,6 +125,8 @@ class Launcher:
             command += ["--frames", str(self.frames)]
         if self.seed is not None:
             command += ["--seed", str(self.seed)]
+        command += ["--http", self.http] if self.http else []
+        command += ["--keys", str(self.keys)] if self.keys is not None else []
         command += ["--supervised", *self._local]
         with (self.directory / "logs" / "broker.log").open("wb") as log:
             self._broker = subprocess.Popen(  # noqa: S603  # our own module with checked arguments
