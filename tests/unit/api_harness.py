@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.client
 import json
 import re
+import socket
 import subprocess
 import sys
 import time
@@ -13,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
+from urllib.parse import urlsplit
 
 from broker_harness import PATIENCE_S, Serving, plan, serving
 from websockets.sync.client import ClientConnection, connect
@@ -105,14 +107,25 @@ def port_of(directory: Path, process: subprocess.Popen[bytes]) -> int:
         assert time.monotonic() < until, "HTTP is not served"
 
 
+def opened(url: str, **options: Any) -> ClientConnection:
+    """A WebSocket that is open; whoever opened it closes it."""
+    return connect(url, **options).__enter__()
+
+
 class Peer:
     """A service over a WebSocket."""
 
-    def __init__(self, url: str, name: str, role: str = "", token: str = "", **hello: Any) -> None:
+    def __init__(
+        self, url: str, name: str, role: str = "", token: str = "", window: int = 0, **hello: Any
+    ) -> None:
         role = role or name
         headers = {"Authorization": f"Bearer {token}"} if token else {}
-        self.socket: ClientConnection = connect(
+        stream = socket.create_connection(("127.0.0.1", urlsplit(url).port), PATIENCE_S) if window else None
+        if stream is not None:
+            stream.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, window)
+        self.socket = opened(
             url,
+            sock=stream,
             additional_headers=headers,
             max_size=None,
             compression=None,
@@ -154,7 +167,7 @@ class Peer:
         self.ids = {"epoch": welcome.epoch, "attempt": welcome.attempt}
 
     def attach(self) -> ClientConnection:
-        pulse = connect(self.url, additional_headers=self.headers, compression=None)
+        pulse = opened(self.url, additional_headers=self.headers, compression=None)
         pulse.send(join_parts([encode_message(m.Attach(**self.ids, name=self.name))]))
         frame = pulse.recv(timeout=PATIENCE_S)
         assert isinstance(frame, bytes)

@@ -15,8 +15,10 @@ from pathlib import Path
 from caviar_broker.api.tokens import Tokens, http_address
 from caviar_protocol.errors import CaviarError, RunError
 
-UNREACHABLE_MS = 5000
-"""[ms] without an acknowledgement from a peer's machine behind which its connection is gone."""
+UNREACHABLE_MS = 8000
+"""[ms] for which a peer's machine may acknowledge nothing, or have no room, until its connection is gone."""
+SEND_BUFFER = 1 << 18
+"""[B] that the system keeps for a peer at most, so that one that does not read is noticed soon."""
 BACKLOG = 128
 MAX_CONNECTIONS = 512
 
@@ -80,6 +82,7 @@ def _listening(host: str, port: int) -> socket.socket:
     found = socket.socket(family, socket.SOCK_STREAM)
     found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     # The peer's kernel answers for a peer that is busy or stopped, so this tells only of what is unreachable.
+    found.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
     found.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, UNREACHABLE_MS)
     found.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     found.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 1)

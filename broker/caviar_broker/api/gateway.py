@@ -32,6 +32,8 @@ QUEUE = 16
 LOOK_S = 1.0
 """[s] between looks at whether a token still holds."""
 MAX_CONNECTIONS = 256
+ABNORMAL = 1006
+"""Close code of a connection that ended without a close frame."""
 
 Tell = Callable[[str, str], Awaitable[None]]
 
@@ -137,6 +139,7 @@ class _Bridge:
         while True:
             event = await self._socket.receive()
             if event["type"] == "websocket.disconnect":
+                await self._note_end(event.get("code", ABNORMAL))
                 return
             frame = event.get("bytes")
             if frame is None:
@@ -148,6 +151,14 @@ class _Bridge:
                 raise _CutOff(1007, f"it sent a frame that is no message: {error}") from error
             parts[0] = await self._header(parts[0])
             await self._dealer.send_multipart(parts)
+
+    async def _note_end(self, code: int) -> None:
+        """A peer that is gone without a word; the broker sees so, but not why."""
+        if code == ABNORMAL and self._name:
+            reason = "its process ended, its machine is unreachable, or it has not read for long"
+            await self._tell(
+                self._name, f"a WebSocket of {self._name!r} ended without being closed: {reason}"
+            )
 
     async def _header(self, header: memoryview) -> Any:
         """The header as the broker gets it.
