@@ -18,7 +18,7 @@ from websockets.typing import Subprotocol
 
 from caviar_protocol import messages as m
 from caviar_protocol.codec import decode_message, encode_message
-from caviar_protocol.websocket import join_parts, split_frame
+from caviar_protocol.websocket import MAX_FRAME, join_parts, split_frame
 
 LIMITS = {"heartbeat": 50 * MS, "liveness": 300 * MS}
 SECRET = "a-token-of-the-world"  # noqa: S105
@@ -176,6 +176,15 @@ def test_a_broken_frame_of_a_member_cuts_it_off_and_names_it(tmp_path: Path) -> 
         assert world.expect(m.Error).code == "malformed"
         assert closed(world)[0] == 1007
         eventually(lambda: "of 'world' was cut off" in http.broker.witness.texts("world"), "it is named")
+
+
+def test_a_message_that_is_too_large_is_refused_as_soon_as_it_is_announced(tmp_path: Path) -> None:
+    with site(tmp_path, limits=LIMITS) as http, Peer(http.url, "world") as world:
+        world.join()
+        world.socket.socket.sendall(b"\x82\xff" + (MAX_FRAME + 1).to_bytes(8, "big") + bytes(4))
+        assert closed(world)[0] == 1009
+        told = f"it sent a message of more than {MAX_FRAME} B"
+        eventually(lambda: told in http.broker.witness.texts("world"), "it is named")
 
 
 def test_a_connection_is_that_of_one_service(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from caviar_broker.api.tokens import Token, Tokens
 from caviar_protocol import messages as m
 from caviar_protocol.codec import decode_message, encode_message, message_type
 from caviar_protocol.errors import ProtocolError
-from caviar_protocol.websocket import join_parts, split_frame
+from caviar_protocol.websocket import MAX_FRAME, join_parts, split_frame
 
 SLOW_S = 5.0
 """[s] that a peer may take nothing of what is sent to it."""
@@ -32,6 +32,7 @@ QUEUE = 16
 LOOK_S = 1.0
 """[s] between looks at whether a token still holds."""
 MAX_CONNECTIONS = 256
+TOO_LARGE = 1009
 ABNORMAL = 1006
 """Close code of a connection that ended without a close frame."""
 
