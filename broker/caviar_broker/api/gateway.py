@@ -155,11 +155,12 @@ class _Bridge:
 
     async def _note_end(self, code: int) -> None:
         """A peer that is gone without a word; the broker sees so, but not why."""
-        if code == ABNORMAL and self._name:
-            reason = "its process ended, its machine is unreachable, or it has not read for long"
-            await self._tell(
-                self._name, f"a WebSocket of {self._name!r} ended without being closed: {reason}"
-            )
+        reason = {
+            ABNORMAL: "its process ended, its machine is unreachable, or it has not read for long",
+            TOO_LARGE: f"it sent a message of more than {MAX_FRAME} B",
+        }.get(code, "")
+        if reason and self._name:
+            await self._tell(self._name, f"a WebSocket of {self._name!r} ended with code {code}: {reason}")
 
     async def _header(self, header: memoryview) -> Any:
         """The header as the broker gets it.
