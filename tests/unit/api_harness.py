@@ -5,7 +5,6 @@ from __future__ import annotations
 import http.client
 import json
 import re
-import socket
 import subprocess
 import sys
 import time
@@ -14,7 +13,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
-from urllib.parse import urlsplit
 
 from broker_harness import PATIENCE_S, Serving, plan, serving
 from websockets.sync.client import ClientConnection, connect
@@ -115,17 +113,11 @@ def opened(url: str, **options: Any) -> ClientConnection:
 class Peer:
     """A service over a WebSocket."""
 
-    def __init__(
-        self, url: str, name: str, role: str = "", token: str = "", window: int = 0, **hello: Any
-    ) -> None:
+    def __init__(self, url: str, name: str, role: str = "", token: str = "", **hello: Any) -> None:
         role = role or name
         headers = {"Authorization": f"Bearer {token}"} if token else {}
-        stream = socket.create_connection(("127.0.0.1", urlsplit(url).port), PATIENCE_S) if window else None
-        if stream is not None:
-            stream.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, window)
         self.socket = opened(
             url,
-            sock=stream,
             additional_headers=headers,
             max_size=None,
             compression=None,

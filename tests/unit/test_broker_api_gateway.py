@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import json
 import socket
@@ -10,12 +11,17 @@ import threading
 from pathlib import Path
 
 import pytest
+import zmq
+import zmq.asyncio
 from api_harness import PAIR, Peer, Site, opened, site
 from broker_harness import MS, PATIENCE_S, eventually, plan, playing, serving
+from starlette.datastructures import Headers
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
+from caviar_broker.api.gateway import Gateway
+from caviar_broker.api.tokens import Tokens
 from caviar_protocol import messages as m
 from caviar_protocol.codec import decode_message, encode_message
 from caviar_protocol.websocket import MAX_FRAME, join_parts, split_frame
@@ -194,35 +200,56 @@ def test_a_connection_is_that_of_one_service(tmp_path: Path) -> None:
         assert closed(world) == (1008, "it said that it is 'sensors', on the connection of 'world'")
 
 
-def test_one_who_does_not_read_is_cut_off_named_and_holds_nobody_up(tmp_path: Path) -> None:
-    """Sensors that take part in nothing but reading no ERROR: each of their messages has one as answer."""
-    with site(tmp_path) as http, Peer(http.url, "sensors", window=4096) as mute:
-        mute.join()
-        stop = threading.Event()
-        flood = threading.Thread(target=send_on, args=(mute, stop), daemon=True)
-        flood.start()
-        eventually(
-            lambda: "it has not read for" in http.broker.witness.texts("sensors"),  # we or TCP cut it off
-            "it is cut off",
-            within_s=30,
-        )
-        stop.set()
-        assert http.get("/healthz").status == 200
-        flood.join(PATIENCE_S)
+def test_one_who_does_not_read_is_cut_off_and_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A WebSocket that takes what it is sent never; its connection to the broker is closed."""
+    monkeypatch.setattr("caviar_broker.api.gateway.SLOW_S", 0.1)
+    told: list[tuple[str, str]] = []
+
+    async def tell(service: str, text: str) -> None:
+        told.append((service, text))
+
+    async def serve() -> MuteSocket:
+        mute = MuteSocket()
+        with zmq.asyncio.Context() as context, context.socket(zmq.ROUTER) as router:
+            router.linger = 0
+            port = router.bind_to_random_port("tcp://127.0.0.1")
+            gateway = Gateway(f"tcp://127.0.0.1:{port}", Tokens(None), tell)
+            serving_it = asyncio.create_task(gateway.serve(mute))  # type: ignore[arg-type]
+            route, _ = await router.recv_multipart()
+            await router.send_multipart([route, encode_message(m.HeartbeatAck(sequence=0))])
+            async with asyncio.timeout(PATIENCE_S):
+                await serving_it
+            assert gateway.connections == 0
+            gateway.close()
+        return mute
+
+    assert asyncio.run(serve()).closed == (1008, "it has not read for 0.1 s")
+    assert told == [("sensors", "the WebSocket of 'sensors' was cut off: it has not read for 0.1 s")]
 
 
-def send_on(peer: Peer, stop: threading.Event) -> None:
-    """Send what is answered, over the bare socket, so that nothing is read."""
-    stream = peer.socket.socket
-    payload = join_parts([encode_message(m.AssetGet(digest="0" * 64, offset=0))])
-    head = b"\x82" + bytes([0x80 | len(payload)]) if len(payload) < 126 else b""
-    head = head or b"\x82\xfe" + len(payload).to_bytes(2, "big")
-    frames = (head + bytes(4) + payload) * 500
-    try:
-        while not stop.is_set():
-            stream.sendall(frames)
-    except OSError:
+class MuteSocket:
+    """A WebSocket that says HELLO and reads nothing."""
+
+    def __init__(self) -> None:
+        hello = m.Hello(version=(1, 0), name="sensors", role="sensors")
+        self._frames = [join_parts([encode_message(hello)])]
+        self.scope: dict[str, object] = {}
+        self.headers = Headers({})
+        self.closed: tuple[int, str] | None = None
+
+    async def accept(self, _: object) -> None:
         return
+
+    async def receive(self) -> dict[str, object]:
+        if not self._frames:
+            await asyncio.Event().wait()
+        return {"type": "websocket.receive", "bytes": self._frames.pop()}
+
+    async def send_bytes(self, _: bytes) -> None:
+        await asyncio.Event().wait()
+
+    async def close(self, code: int, reason: str) -> None:
+        self.closed = code, reason
 
 
 # --- who comes in -----------------------------------------------------------------------------------------
