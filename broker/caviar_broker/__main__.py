@@ -16,9 +16,11 @@ from pathlib import Path
 
 import msgspec
 
+from caviar_broker.beside import HttpBeside
 from caviar_broker.briefing import briefings, with_ownership
 from caviar_broker.control import Control, Reporter, stop_on_signals
 from caviar_broker.core.plan import plan_run
+from caviar_broker.desk import Desk
 from caviar_broker.journal import JournalFile
 from caviar_broker.security.access import Access
 from caviar_broker.security.local import check_bind
@@ -47,18 +49,23 @@ def serve(arguments: argparse.Namespace) -> int:
     )
     check_bind(arguments.bind, keys=access is not None)
     directory = _made(arguments.directory)
+    beside = HttpBeside(directory, arguments.http, arguments.keys)
     plan = plan_run(scenario, arguments.run or directory.name, briefings(scenario, directory))
     reporter = Reporter(sys.stdout.fileno(), directory / "events.jsonl", arguments.control)
     with closing(JournalFile(directory / "journal.msgpack", plan.epoch)) as journal:
         supervised = arguments.supervised if arguments.control else ()
-        server = BrokerServer(plan, arguments.bind, journal, reporter, supervised=supervised, access=access)
-        reporter.attach(server)
-        if arguments.control:
-            Control(server)
-        stop_on_signals(server)
-        reporter.listening(server.endpoint)
-        tune_collector()
-        outcome = server.run()
+        desk = Desk(directory, reporter)
+        with closing(beside), closing(desk):
+            server = BrokerServer(plan, arguments.bind, journal, desk, supervised=supervised, access=access)
+            reporter.attach(server)
+            desk.attach(server)
+            if arguments.control:
+                Control(server)
+            stop_on_signals(server)
+            reporter.listening(server.endpoint)
+            beside.start(server)
+            tune_collector()
+            outcome = server.run()
     statistics = server.statistics
     statistics.save(directory / "latency.npz")
     reporter.finished(
@@ -98,6 +105,7 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--bind", default="tcp://127.0.0.1:5570", help="address to listen on")
     found.add_argument("--keys", type=Path, help="keys directory: who may take part (caviar keys)")
     found.add_argument("--local-key", default="", help="public key of the services that a launcher starts")
+    found.add_argument("--http", default="", help="HOST:PORT: serve HTTP and WebSocket there")
     found.add_argument("--directory", type=Path, required=True, help="where the run is written")
     found.add_argument("--run", default="", help="id of the run; by default the directory's name")
     found.add_argument("--frames", type=int, default=None, help="instead of the scenario's")

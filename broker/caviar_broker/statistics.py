@@ -21,6 +21,24 @@ class ServiceStatistics(msgspec.Struct, frozen=True, kw_only=True):
     budget_ms: float
 
 
+class RecentStatistics(msgspec.Struct, frozen=True, kw_only=True):
+    """How a service keeps its budget now."""
+
+    p50_ms: float | None
+    """Of the newest `RECENT` latencies; None: there is none yet."""
+    p99_ms: float | None
+    total_ms: float
+    """Of all latencies."""
+    grants_answered: int
+    """How many these are."""
+    misses: int
+    budget_ms: float
+
+
+RECENT = 512
+"""Latencies behind figures that are asked for while the run goes on; few, since frames wait meanwhile."""
+
+
 class Statistics:
     """Collects latencies [ns] and frame times, and sums them up.
 
@@ -32,12 +50,14 @@ class Statistics:
         self._budgets = budgets_ns
         self._latencies = {name: array("q") for name in budgets_ns}
         self._misses = dict.fromkeys(budgets_ns, 0)
+        self._totals = dict.fromkeys(budgets_ns, 0)
         self._finished_at = array("q")
 
     def latency(self, service: str, elapsed_ns: int, missed: bool) -> None:
         """A grant was answered, or its deadline passed."""
         self._latencies[service].append(elapsed_ns)
         self._misses[service] += missed
+        self._totals[service] += elapsed_ns
 
     def frame(self, now: int) -> None:
         """A frame is finished."""
@@ -71,6 +91,28 @@ class Statistics:
         elapsed = self._finished_at[-1] - self._finished_at[first]
         return (self.frames - 1 - first) / (elapsed / 1e9) if elapsed else 0.0
 
+    def recent_rate(self, now: int) -> float:
+        """Frames a second [1/s] over the newest `RECENT`, up to ``now`` [ns]; 0 if unknown."""
+        count = min(RECENT, self.frames) - 1
+        if count < 1:
+            return 0.0
+        return count / max(1, now - self._finished_at[-1 - count]) * 1e9
+
+    def recent_services(self) -> dict[str, RecentStatistics]:
+        """By service, in a time that does not depend on how long the run is."""
+        found = {}
+        for name, values in self._latencies.items():
+            newest = sorted(values[-RECENT:])
+            found[name] = RecentStatistics(
+                p50_ms=_rank(newest, 0.50),
+                p99_ms=_rank(newest, 0.99),
+                total_ms=self._totals[name] / 1e6,
+                grants_answered=len(values),
+                misses=self._misses[name],
+                budget_ms=self._budgets[name] / 1e6,
+            )
+        return found
+
     def save(self, path: Path) -> None:
         """Write every figure as a NumPy archive: ``finished_ns`` by frame, ``latency_ns/NAME`` by grant.
 
@@ -96,3 +138,10 @@ class Statistics:
             for name, values in self._latencies.items()
             if len(values)
         }
+
+
+def _rank(ascending: Sequence[int], share: float) -> float | None:
+    """The value [ms] that so many of the others do not exceed."""
+    if not ascending:
+        return None
+    return ascending[min(len(ascending) - 1, int(share * len(ascending)))] / 1e6

@@ -1,6 +1,6 @@
 """Makes the byte vectors from the JSON beside them.
 
-    python make.py            write NAME.msgpack and NAME.body for every NAME.json
+    python make.py            write NAME.msgpack, NAME.body and NAME.frame for every NAME.json
     python make.py --check    say which of them differ, and exit with 1 where one does
 
 Needs the ``msgpack`` package and nothing of CAVIAR, so that the vectors judge its codec and are
@@ -15,6 +15,7 @@ not judged by it. A JSON file has these keys:
 ``body``      instead of ``values``: the body as hex
 ``parts``     further parts of a message, as hex; ``product`` names the vector that is the first product
 ``lengths``   lengths of further parts that are too large to be written out
+``frame``     true where NAME.frame is the message with its parts as one WebSocket frame
 ``tolerated`` true where a reader accepts what a writer does not write; ``means`` is then the canonical form
 ``refused``   the error code with which a reader refuses it
 """
@@ -70,14 +71,25 @@ def vector(text: str) -> tuple[bytes, bytes]:
     return header, bytes(body)
 
 
+def frame_of(stated: Any, header: bytes) -> bytes:
+    """A message as one WebSocket frame: u32 count, u32 lengths, the parts."""
+    parts = [header, *map(bytes.fromhex, stated.get("parts", []))]
+    if "product" in stated:
+        source = Path(__file__).with_name(f"{stated['product']}.json")
+        parts += vector(source.read_text("utf-8"))
+    return struct.pack(f"<{len(parts) + 1}I", len(parts), *map(len, parts)) + b"".join(parts)
+
+
 def main(check: bool) -> int:
     """Write or check every vector in this folder."""
     wrong = 0
     for source in sorted(Path(__file__).parent.glob("*.json")):
         header, body = vector(source.read_text("utf-8"))
-        for suffix, content in ((".msgpack", header), (".body", body)):
+        stated = json.loads(source.read_text("utf-8"))
+        frame = frame_of(stated, header) if stated.get("frame") else b""
+        for suffix, content in ((".msgpack", header), (".body", body), (".frame", frame)):
             target = source.with_suffix(suffix)
-            if suffix == ".body" and not content:
+            if suffix != ".msgpack" and not content:
                 continue
             if not check:
                 target.write_bytes(content)

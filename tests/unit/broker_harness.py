@@ -15,6 +15,7 @@ import zmq
 
 from caviar_broker.core import events as ev
 from caviar_broker.core.plan import Limits, RunPlan, ServicePlan
+from caviar_broker.desk import Desk
 from caviar_broker.journal import JournalFile
 from caviar_broker.server import BrokerServer
 from caviar_broker.statistics import Statistics
@@ -87,19 +88,28 @@ def plan(*services: str, limits: dict[str, int] | None = None, **run: Any) -> Ru
 
 @contextmanager
 def serving(
-    run: RunPlan, tmp_path: Path, journal: Callable[[Path], JournalFile] | None = None, **server_options: Any
+    run: RunPlan,
+    tmp_path: Path,
+    journal: Callable[[Path], JournalFile] | None = None,
+    desk: Path | None = None,
+    **server_options: Any,
 ) -> Iterator[Serving]:
-    """The broker of a run, until the block is left."""
+    """The broker of a run, until the block is left; with a desk in that directory."""
     witness, failures = Witness(), list[BaseException]()
     make = journal or (lambda path: JournalFile(path, 1))
     file = make(tmp_path / "journal.msgpack")
     store = AssetStore(tmp_path / "broker-cache")
     endpoint = server_options.pop("endpoint", "tcp://127.0.0.1:0")
-    server = BrokerServer(run, endpoint, file, witness, store, **server_options)
+    observer = witness if desk is None else Desk(desk, witness)
+    server = BrokerServer(run, endpoint, file, observer, store, **server_options)
+    if isinstance(observer, Desk):
+        observer.attach(server)
 
     def body() -> None:
         try:
             server.run()
+            if isinstance(observer, Desk):
+                observer.close()
         except BaseException as error:
             failures.append(error)
             raise

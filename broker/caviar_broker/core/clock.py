@@ -25,6 +25,7 @@ from caviar_broker.core.peers import Peer
 from caviar_broker.core.plan import RunPlan
 from caviar_broker.core.run import Run
 from caviar_broker.core.transitions import RunState, ServiceState
+from caviar_broker.core.view import RunView, look
 from caviar_protocol.digest import RunDigest
 
 
@@ -60,6 +61,9 @@ class FrameClock:
             ev.Lost: self._liveness.lost,
             ev.ByeReceived: self._liveness.bye,
             ev.StopRequested: self._stop_requested,
+            ev.PauseRequested: self._episodes.paused,
+            ev.ResumeRequested: self._episodes.paused,
+            ev.StepRequested: self._episodes.paused,
         }
 
     # --- the interface of a shell ----------------------------------------------------------------
@@ -131,6 +135,11 @@ class FrameClock:
         return self._run.state
 
     @property
+    def over(self) -> bool:
+        """Whether the run has ended, if perhaps not everybody has left."""
+        return self._run.over
+
+    @property
     def graph(self) -> Graph | None:
         """Who gets what from whom; None until all services have joined."""
         return self._run.graph
@@ -158,6 +167,10 @@ class FrameClock:
     def peer(self, name: str) -> Peer | None:
         """What is known of a service; None for a name that the run does not expect."""
         return self._run.peers.get(name)
+
+    def look(self, now: int) -> RunView:
+        """Who does what, and who is waited for, at the time ``now`` [ns]."""
+        return look(self._run, self._episodes, now)
 
     def validate(self) -> None:
         """Cross-field invariants; raises AssertionError naming the one that is broken."""

@@ -65,7 +65,7 @@ class Episodes:
             assert run.graph is not None
             capacity = {p.name: _capacity(p) for p in self._members()}
             self.schedule = EpisodeSchedule(
-                run.graph, run.plan, capacity, run.episode, run.digest, run.ledger
+                run.graph, run.plan, capacity, run.episode, run.digest, run.ledger, run.gate
             )
 
     def _over(self, schedule: EpisodeSchedule, now: int) -> None:
@@ -81,6 +81,7 @@ class Episodes:
                 run.send(peer, end)
         if run.episode + 1 < run.plan.episodes:
             run.episode += 1
+            run.gate.next_episode()
             run.enter(RunEvent.NEXT_EPISODE, now)
             self.begin(now)
         else:
@@ -196,6 +197,19 @@ class Episodes:
         """Decisions are safe; what waited for that may be granted."""
         if self._run.ledger.confirm(event.number, now) and self.schedule is not None:
             self.schedule.journal_written()
+
+    def paused(self, event: ev.PauseRequested | ev.ResumeRequested | ev.StepRequested, now: int) -> None:
+        """The user pauses the run, or lets it go on."""
+        gate, schedule = self._run.gate, self.schedule
+        match event:
+            case ev.PauseRequested():
+                gate.pause(schedule.begun if schedule is not None else -1)
+            case ev.ResumeRequested():
+                gate.resume()
+            case ev.StepRequested(frames=frames):
+                gate.step(frames)
+        if schedule is not None:
+            schedule.gate_moved()
 
     def pump(self, now: int) -> None:
         """Let the schedule act, and carry out what it wants."""

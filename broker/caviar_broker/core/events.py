@@ -118,9 +118,24 @@ class StopRequested(msgspec.Struct, frozen=True):
     reason: str
 
 
+class PauseRequested(msgspec.Struct, frozen=True):
+    """The user wants no new frame to begin."""
+
+
+class ResumeRequested(msgspec.Struct, frozen=True):
+    """The user wants frames to begin again."""
+
+
+class StepRequested(msgspec.Struct, frozen=True):
+    """The user wants so many frames of a paused run to begin."""
+
+    frames: int
+
+
 Event = (
     Joined | AssetsOffered | ReadyReceived | ResetDoneReceived | DoneReceived | FaultReceived
     | Violated | Progressed | Lost | ByeReceived | Journaled | StopRequested
+    | PauseRequested | ResumeRequested | StepRequested
 )  # fmt: skip
 
 

@@ -40,6 +40,14 @@ class Pacer:
         """When the frame that was asked for in vain will be due [ns]; None if there is none."""
         return self._due() if self._awaited else None
 
+    def withdraw(self) -> None:
+        """The frame that was asked for in vain is not wanted for now."""
+        self._awaited = False
+
+    def shift(self, held_ns: int) -> None:
+        """The run was paused for so long [ns]: that is no slip."""
+        self._reference += held_ns
+
     def _due(self) -> int:
         frame = self._released_frame
         return self._reference + self._plan.t_ns(frame + 1) - self._plan.t_ns(frame)

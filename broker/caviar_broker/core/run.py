@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from caviar_broker.core.events import Action, Finished, Notice, Product, Send
+from caviar_broker.core.gate import Gate
 from caviar_broker.core.graph import Graph
 from caviar_broker.core.ledger import Ledger
 from caviar_broker.core.peers import Peer
@@ -31,6 +32,7 @@ class Run:
         self._wished: tuple[int, Peer] | None = None
         """Seed of the next episode, and the agent that chose it."""
         self.digest = RunDigest()
+        self.gate = Gate()
         self.ledger = Ledger(kept=not plan.ephemeral)
         self.over = False
         """Whether the run has ended, if perhaps not everybody has left."""

@@ -12,6 +12,7 @@ from msgspec.structs import replace
 
 from caviar_broker.core.decisions import DecisionBook
 from caviar_broker.core.events import Action, Latency, Notice, Product
+from caviar_broker.core.gate import Gate
 from caviar_broker.core.graph import Graph
 from caviar_broker.core.inputs import Gathered, Inputs
 from caviar_broker.core.ledger import Ledger
@@ -42,8 +43,8 @@ class EpisodeSchedule:
         Grants that each service can have outstanding (clause 7).
     episode
         Number of the episode.
-    digest, ledger
-        The run's digest and journal.
+    digest, ledger, gate
+        The run's digest and journal, and whether it is paused.
     """
 
     def __init__(
@@ -54,6 +55,7 @@ class EpisodeSchedule:
         episode: int,
         digest: RunDigest,
         ledger: Ledger,
+        gate: Gate | None = None,
     ) -> None:
         self.graph, self.plan, self.episode = graph, plan, episode
         self.actions: list[Action] = []
@@ -67,7 +69,7 @@ class EpisodeSchedule:
         self._plans: Mapping[str, ServicePlan] = {p.name: p for p in plan.services}
         self._capacity, self._ledger = capacity, ledger
         self._first_entry = ledger.last
-        self._pacer = Pacer(plan)
+        self._pacer, self._gate = Pacer(plan), gate or Gate()
         self._book = DecisionBook(graph, plan, episode, digest, ledger, self.actions)
         self._book.lag_ns = lambda: self._pacer.lag_ns
         self._inputs = Inputs(graph, self._book)
@@ -130,6 +132,10 @@ class EpisodeSchedule:
     def journal_written(self) -> None:
         """More entries of the ledger are safe; what waited for them may be granted."""
         self._turns.wake(self._turns.waiting_for_journal)
+
+    def gate_moved(self) -> None:
+        """The run was paused, or goes on."""
+        self._turns.wake(self._turns.waiting_for_pace)
 
     def pause(self, service: str) -> None:
         """The service is gone: its outstanding grants stay owed, no new ones are made."""
@@ -199,6 +205,13 @@ class EpisodeSchedule:
         return self._book.frames
 
     @property
+    def begun(self) -> int:
+        """The last frame that has begun for somebody; −1: none."""
+        granted = (owed[-1].frame for owed in self._outstanding.values() if owed)
+        begun = max(max(self._book.next.values()) - 1, max(granted, default=-1))
+        return min(begun, self._book.frames - 1)
+
+    @property
     def finished(self) -> bool:
         """Whether every frame is decided, final grants are answered, and nobody is waited for."""
         return self._over and not any(owed and self._binds(name) for name, owed in self._outstanding.items())
@@ -265,7 +278,7 @@ class EpisodeSchedule:
             if self._ledger.written < max(self._first_entry, inputs.entry):
                 self._turns.waiting_for_journal.add(name)
                 return
-            if self.plan.realtime and not self._released(task, now):
+            if (self.plan.realtime or self._gate.closed) and not self._released(task, now):
                 self._turns.waiting_for_pace.add(name)
                 return
             if in_flight and inputs.cause is not None:
@@ -283,9 +296,13 @@ class EpisodeSchedule:
                 return
 
     def _released(self, task: Task, now: int) -> bool:
-        """Whether real time has come to this frame (clause 8)."""
+        """Whether the run is not paused, and real time has come to this frame (clause 8)."""
         if task.frame >= self._book.frames:
             return True
+        if not self._gate.admits(task.frame, now):
+            self._pacer.withdraw()
+            return False
+        self._pacer.shift(self._gate.held_ns(now))
         slip = self._pacer.release(task.frame, now)
         if slip is None:
             return False

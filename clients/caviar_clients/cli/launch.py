@@ -63,6 +63,8 @@ class Launcher:
     bind: str = "tcp://127.0.0.1:0"
     keys: Path | None = None
     """Keys directory of the broker."""
+    http: str = ""
+    """``HOST:PORT`` at which the broker has HTTP served; "" for none."""
     endpoint: str = ""
     _key: BorrowedKey = field(init=False)
     _children: dict[str, Child] = field(default_factory=dict)
@@ -129,6 +131,7 @@ class Launcher:
             command += ["--frames", str(self.frames)]
         if self.seed is not None:
             command += ["--seed", str(self.seed)]
+        command += ["--http", self.http] if self.http else []
         command += [*self._key.options(), "--supervised", *self._local]
         with (self.directory / "logs" / "broker.log").open("wb") as log:
             self._broker = subprocess.Popen(  # noqa: S603  # our own module with checked arguments

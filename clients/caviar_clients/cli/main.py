@@ -31,6 +31,11 @@ RunDirectory = Annotated[Path, typer.Argument(help="directory of a run, or one s
 Frames = Annotated[int | None, typer.Option(min=1, help="frames of an episode, instead of the scenario's")]
 Seed = Annotated[int | None, typer.Option(min=0, max=2**63 - 1, help="seed, instead of the scenario's")]
 
+Keys = Annotated[
+    Path | None, typer.Option(help="keys directory: only authorized keys take part (caviar keys)")
+]
+Http = Annotated[str, typer.Option(help="HOST:PORT: serve status, orders and WebSocket there")]
+
 
 @app.command()
 def run(
@@ -40,17 +45,16 @@ def run(
     json: Annotated[Path | None, typer.Option(help="write the summary to this file too")] = None,
     out: Annotated[Path, typer.Option(help="directory in which the run's own is made")] = Path("runs"),
     bind: Annotated[str, typer.Option(help="address of the broker; port 0: any")] = "tcp://127.0.0.1:0",
-    keys: Annotated[
-        Path | None, typer.Option(help="keys directory: only authorized keys take part (caviar keys)")
-    ] = None,
     embedded: Annotated[
         bool, typer.Option("--embedded", help="all in this process, without sockets")
     ] = False,
+    keys: Keys = None,
+    http: Http = "",
 ) -> None:
     """Run a scenario: the broker and every service as processes of their own, or all in this one."""
     from caviar_clients.cli.run import run_scenario
 
-    raise typer.Exit(run_scenario(scenario, out, _console, frames, seed, json, bind, embedded, keys))
+    raise typer.Exit(run_scenario(scenario, out, _console, frames, seed, json, bind, embedded, keys, http))
 
 
 @app.command()
@@ -60,9 +64,8 @@ def broker(
     frames: Frames = None,
     seed: Seed = None,
     out: Annotated[Path, typer.Option(help="directory in which the run's own is made")] = Path("runs"),
-    keys: Annotated[
-        Path | None, typer.Option(help="keys directory: only authorized keys take part (caviar keys)")
-    ] = None,
+    keys: Keys = None,
+    http: Http = "",
 ) -> None:
     """Run only the broker; start the services with `caviar service`, here or on other machines."""
     from caviar_broker.__main__ import parser, serve
@@ -78,7 +81,7 @@ def broker(
         use = "IMPLEMENTATION" if spec.remote else spec.use
         typer.echo("  " + shlex.join(["caviar", "service", name, "--use", f"{spec.role}:{use}"]))
     arguments = [str(scenario), "--bind", bind, "--directory", str(directory)]
-    for name, value in (("--frames", frames), ("--seed", seed), ("--keys", keys)):
+    for name, value in (("--frames", frames), ("--seed", seed), ("--keys", keys), ("--http", http or None)):
         arguments += [] if value is None else [name, str(value)]
     raise typer.Exit(serve(parser().parse_args(arguments)))
 
@@ -102,6 +105,18 @@ def service(
     from caviar_services.__main__ import serve
 
     raise typer.Exit(serve(name, use, broker, connect_timeout, key, broker_key))
+
+
+@app.command()
+def why(
+    run: Annotated[
+        Path | None, typer.Argument(help="directory of a run; by default the newest in ./runs")
+    ] = None,
+) -> None:
+    """Ask a running broker whom it waits for now, and why."""
+    from caviar_clients.cli.why import why_command
+
+    why_command(run, _console)
 
 
 @app.command()

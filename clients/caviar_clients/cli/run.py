@@ -15,13 +15,14 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
+from caviar_broker.api.tokens import http_address
 from caviar_broker.security.local import check_bind
 from caviar_clients.cli.inside import EmbeddedLauncher
 from caviar_clients.cli.launch import Launcher
 from caviar_clients.cli.remote import key_text, reachable, start_command, waiting_text
 from caviar_clients.cli.summary import recorded_figures, summary_of, summary_table
 from caviar_clients.sessions.checking import checked_scenario
-from caviar_protocol.errors import RunError
+from caviar_protocol.errors import RunError, SetupError
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario_checks import refuse_remote
 
@@ -61,12 +62,15 @@ def run_scenario(
     bind: str = "tcp://127.0.0.1:0",
     embedded: bool = False,
     keys: Path | None = None,
+    http: str = "",
 ) -> int:
     """Run a scenario; the exit status: 0 exactly if it came to its end."""
     scenario = checked_scenario(path, frames, seed)
     check_bind(bind, keys=keys is not None)
     if embedded:
         refuse_remote(scenario)
+    if http:
+        _check_http(http, keys, embedded)
     if json_file is not None:
         _write(json_file, "")  # before the run, since after it an unwritable file would cost the figures
     directory = run_directory(out, scenario.run.name)
@@ -75,7 +79,7 @@ def run_scenario(
     if embedded:
         launcher = EmbeddedLauncher(scenario, directory)
     else:
-        launcher = Launcher(scenario, path.resolve(), directory, frames, seed, bind, keys)
+        launcher = Launcher(scenario, path.resolve(), directory, frames, seed, bind, keys, http)
     outcome: Mapping[str, Any] = {}
     interrupted = _Interruption(launcher)
     with launcher, interrupted, _progress_bar(console) as bar:
@@ -101,6 +105,12 @@ def run_scenario(
         if log is not None:
             console.print(Text(f"its log: {log}"), soft_wrap=True)
     return 130 if interrupted.came else 1 if outcome["error"] else 0
+
+
+def _check_http(http: str, keys: Path | None, embedded: bool) -> None:
+    if embedded:
+        raise SetupError("an embedded run has no broker process that HTTP could ask; leave out --http")
+    http_address(http, keys)
 
 
 class _Interruption:

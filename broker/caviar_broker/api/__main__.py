@@ -1,0 +1,130 @@
+"""``python -m caviar_broker.api RUN --http HOST:PORT``: HTTP and WebSocket beside a broker that runs.
+
+Ends when the broker does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import socket
+import sys
+from pathlib import Path
+
+from caviar_broker.api.tokens import Tokens, http_address
+from caviar_protocol.errors import CaviarError, RunError
+
+UNREACHABLE_MS = 8000
+"""[ms] for which a peer's machine may acknowledge nothing, or have no room, until its connection is gone."""
+SEND_BUFFER = 1 << 18
+"""[B] that the system keeps for a peer at most, so that one that does not read is noticed soon."""
+BACKLOG = 128
+MAX_CONNECTIONS = 512
+
+
+async def serve(run: Path, address: str, keys: Path | None) -> None:
+    """Serve until the broker ends. Raises `RunError` where none runs there, or the address is taken."""
+    import uvicorn
+
+    from caviar_broker.api.app import make_app
+    from caviar_broker.api.gateway import Gateway
+    from caviar_broker.api.link import DeskLink
+    from caviar_protocol.websocket import MAX_FRAME
+
+    host, port = http_address(address, keys)
+    tokens, desk = Tokens(keys), DeskLink(run)
+    status = (await desk.ask("status"))["status"]
+
+    async def tell(service: str, text: str) -> None:
+        known = [entry["name"] for entry in status["services"]]
+        with contextlib.suppress(RunError):
+            await desk.ask("note", service=service if service in known else "", text=text[:1000])
+
+    gateway = Gateway(_reachable(status["endpoint"]), tokens, tell)
+    listening = _listening(host, port)
+    config = uvicorn.Config(
+        make_app(desk, tokens, gateway),
+        loop="asyncio",
+        http="h11",
+        ws="websockets-sansio",
+        ws_max_size=MAX_FRAME,
+        ws_ping_interval=None,  # a busy peer answers no pings, and is not gone
+        ws_per_message_deflate=False,
+        lifespan="off",
+        log_level="warning",
+        access_log=False,
+        server_header=False,
+        limit_concurrency=MAX_CONNECTIONS,
+        timeout_graceful_shutdown=1,
+    )
+    server = uvicorn.Server(config)
+
+    async def end_with_the_broker() -> None:
+        async for _ in desk.events():
+            continue
+        server.should_exit = True
+
+    follower = asyncio.create_task(end_with_the_broker())
+    shown = f"[{host}]" if ":" in host else host
+    await desk.ask("serving", http=f"http://{shown}:{listening.getsockname()[1]}")
+    try:
+        await server.serve(sockets=[listening])
+    finally:
+        follower.cancel()
+        desk.close()
+        gateway.close()
+
+
+def _listening(host: str, port: int) -> socket.socket:
+    """A listening socket; what is accepted from it has its options."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    found = socket.socket(family, socket.SOCK_STREAM)
+    found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    # The peer's kernel answers for a peer that is busy or stopped, so this tells only of what is unreachable.
+    found.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+    found.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, UNREACHABLE_MS)
+    found.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    found.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 1)
+    found.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 1)
+    found.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    try:
+        found.bind((host, port))
+        found.listen(BACKLOG)
+    except OSError as error:
+        found.close()
+        raise RunError(
+            f"cannot serve HTTP at {host}:{port}: {error.strerror}; choose another --http HOST:PORT (0: any)"
+        ) from error
+    return found
+
+
+def _reachable(endpoint: str) -> str:
+    """Where this machine reaches a broker that listens at all of its addresses."""
+    return endpoint.replace("//0.0.0.0:", "//127.0.0.1:").replace("//[::]:", "//[::1]:")
+
+
+def parser() -> argparse.ArgumentParser:
+    """Command line."""
+    found = argparse.ArgumentParser(prog="python -m caviar_broker.api", description=__doc__)
+    found.add_argument("run", type=Path, help="directory of the run")
+    found.add_argument("--http", default="127.0.0.1:8080", help="address to serve at; port 0: any free one")
+    found.add_argument("--keys", type=Path, default=None, help="keys directory, with tokens.toml")
+    return found
+
+
+def main() -> int:
+    """Parse the command line and serve; the exit status."""
+    arguments = parser().parse_args()
+    try:
+        asyncio.run(serve(arguments.run, arguments.http, arguments.keys))
+    except CaviarError as error:
+        sys.stderr.write(f"caviar http: {error}\n")
+        return 1
+    except KeyboardInterrupt:
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

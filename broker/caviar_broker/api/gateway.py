@@ -1,0 +1,231 @@
+"""The gateway: a WebSocket is one connection to the broker's port, message by message.
+
+Each has a DEALER socket of its own, closed with it, so that the broker sees whether the peer is there.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import msgspec
+import zmq
+import zmq.asyncio
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from caviar_broker.api.door import subprotocol, token_of
+from caviar_broker.api.tokens import Token, Tokens
+from caviar_protocol import messages as m
+from caviar_protocol.codec import decode_message, encode_message, message_type
+from caviar_protocol.errors import ProtocolError
+from caviar_protocol.websocket import MAX_FRAME, join_parts, split_frame
+
+SLOW_S = 5.0
+"""[s] that a peer may take nothing of what is sent to it."""
+SLOW_RATE = 1e6
+"""[B/s] at which it has to take what is large."""
+LINGER_MS = 1000
+"""[ms] that the last messages of a peer that has gone are kept for the broker."""
+QUEUE = 16
+"""Messages that wait in either direction."""
+LOOK_S = 1.0
+"""[s] between looks at whether a token still holds."""
+MAX_CONNECTIONS = 256
+TOO_LARGE = 1009
+ABNORMAL = 1006
+"""Close code of a connection that ended without a close frame."""
+
+Tell = Callable[[str, str], Awaitable[None]]
+
+
+class Gateway:
+    """Connects WebSockets with a broker.
+
+    Parameters
+    ----------
+    endpoint
+        Where the broker listens.
+    tokens
+        Who may take part.
+    tell
+        Called with a service, or "", and what the run's user should know about it.
+    """
+
+    def __init__(self, endpoint: str, tokens: Tokens, tell: Tell) -> None:
+        self._endpoint, self._tokens, self._tell = endpoint, tokens, tell
+        self._context: zmq.asyncio.Context = zmq.asyncio.Context()
+        self.connections = 0
+        """How many are open."""
+
+    async def serve(self, socket: WebSocket) -> None:
+        """Serve one WebSocket until it closes."""
+        offered = socket.scope.get("subprotocols", [])
+        token = token_of(socket.headers, self._tokens, offered)
+        if self._tokens.exist and (token is None or not token.of_service):
+            await socket.close(1008, "this asks for a token of a service")
+            return
+        if self.connections >= MAX_CONNECTIONS:
+            await socket.close(1013, f"there are {MAX_CONNECTIONS} connections already")
+            return
+        self.connections += 1
+        try:
+            await socket.accept(subprotocol(offered))
+            await _Bridge(socket, self._dealer(), self._tokens, token, self._tell).run()
+        finally:
+            self.connections -= 1
+
+    def _dealer(self) -> zmq.asyncio.Socket:
+        dealer = self._context.socket(zmq.DEALER)
+        dealer.linger = LINGER_MS
+        dealer.sndhwm = dealer.rcvhwm = QUEUE
+        dealer.connect(self._endpoint)
+        return dealer
+
+    def close(self) -> None:
+        """Close everything."""
+        self._context.destroy(linger=LINGER_MS)
+
+
+class _CutOff(Exception):  # noqa: N818  # it ends a connection, and is no error of ours
+    """The peer is cut off: close code and reason."""
+
+    def __init__(self, code: int, reason: str) -> None:
+        self.code, self.reason = code, reason
+        super().__init__(reason)
+
+
+class _Bridge:
+    """One WebSocket and its DEALER."""
+
+    def __init__(
+        self, socket: WebSocket, dealer: zmq.asyncio.Socket, tokens: Tokens, token: Token | None, tell: Tell
+    ) -> None:
+        self._socket, self._dealer, self._tell = socket, dealer, tell
+        self._tokens, self._token = tokens, token
+        self._name = ""
+        """What the peer is called, once it said so."""
+        self._sent = 0
+        """Bytes of the frame sent last, which may still be under way."""
+
+    async def run(self) -> None:
+        """Carry messages both ways until one side ends."""
+        tasks = [asyncio.create_task(way) for way in (self._up(), self._down(), self._watch_token())]
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+            self._dealer.close()
+        for task in done:
+            error = task.exception()
+            if isinstance(error, _CutOff):
+                await self._cut(error)
+            elif error is not None and not isinstance(error, WebSocketDisconnect):
+                raise error
+
+    async def _cut(self, why: _CutOff) -> None:
+        who = f"the WebSocket of {self._name!r}" if self._name else "a WebSocket that has not said who it is"
+        await self._tell(self._name, f"{who} was cut off: {why.reason}")
+        try:
+            async with asyncio.timeout(LOOK_S):
+                await self._socket.close(why.code, why.reason[:100])
+        except (TimeoutError, RuntimeError, WebSocketDisconnect):
+            return  # it does not read, or has gone
+
+    # --- from the peer ------------------------------------------------------------------------------
+
+    async def _up(self) -> None:
+        while True:
+            event = await self._socket.receive()
+            if event["type"] == "websocket.disconnect":
+                await self._note_end(event.get("code", ABNORMAL))
+                return
+            frame = event.get("bytes")
+            if frame is None:
+                raise _CutOff(1003, "it sent text; a message is one binary frame")
+            try:
+                parts: list[Any] = list(split_frame(frame))
+            except ProtocolError as error:
+                await self._answer(m.Error(code=error.code, message=str(error)))
+                raise _CutOff(1007, f"it sent a frame that is no message: {error}") from error
+            parts[0] = await self._header(parts[0])
+            await self._dealer.send_multipart(parts)
+
+    async def _note_end(self, code: int) -> None:
+        """A peer that is gone without a word; the broker sees so, but not why."""
+        reason = {
+            ABNORMAL: "its process ended, its machine is unreachable, or it has not read for long",
+            TOO_LARGE: f"it sent a message of more than {MAX_FRAME} B",
+        }.get(code, "")
+        if reason and self._name:
+            await self._tell(self._name, f"a WebSocket of {self._name!r} ended with code {code}: {reason}")
+
+    async def _header(self, header: memoryview) -> Any:
+        """The header as the broker gets it.
+
+        What is no message goes on to the broker, which judges it as it does over ZeroMQ, except before
+        the peer said who it is.
+        """
+        try:
+            message = decode_message(header)
+        except ProtocolError as error:
+            if self._name:
+                return header
+            await self._answer(m.Error(code=error.code, message=str(error)))
+            raise _CutOff(1007, f"it sent what is not in the protocol: {error}") from error
+        match message:
+            case m.Hello():
+                await self._identify(message.name, message.role)
+                # A process id means nothing here: this connection tells whether the peer is there.
+                fields = msgspec.msgpack.decode(header)
+                return msgspec.msgpack.encode({k: v for k, v in fields.items() if k not in ("pid", "host")})
+            case m.Attach():
+                await self._identify(message.name, "")
+            case _ if not self._name:
+                text = f"{message_type(message)} came before HELLO or ATTACH"
+                await self._answer(m.Error(code="unknown-peer", of=message_type(message), message=text))
+                raise _CutOff(1008, text)
+            case _:
+                pass
+        return header
+
+    async def _identify(self, name: str, role: str) -> None:
+        token = self._token
+        if token is not None and (token.name != name or role not in ("", token.role)):
+            told = f"the token is of {token.role} {token.name!r}, not of {role} {name!r}".replace("  ", " ")
+            await self._answer(m.Refuse(code="unauthorized", message=told))
+            raise _CutOff(1008, told)
+        if self._name not in ("", name):
+            raise _CutOff(1008, f"it said that it is {name!r}, on the connection of {self._name!r}")
+        self._name = name
+
+    async def _answer(self, message: m.Message) -> None:
+        """An answer of the gateway's own, in front of a cut."""
+        try:
+            async with asyncio.timeout(LOOK_S):
+                await self._socket.send_bytes(join_parts([encode_message(message)]))
+        except (TimeoutError, WebSocketDisconnect):
+            return
+
+    # --- to the peer --------------------------------------------------------------------------------
+
+    async def _down(self) -> None:
+        while True:
+            parts = await self._dealer.recv_multipart(copy=False)
+            frame = join_parts([part.buffer for part in parts])
+            patience = SLOW_S + self._sent / SLOW_RATE
+            try:
+                async with asyncio.timeout(patience):
+                    await self._socket.send_bytes(frame)
+            except TimeoutError as error:
+                raise _CutOff(1008, f"it has not read for {patience:.3g} s") from error
+            self._sent = len(frame)
+
+    async def _watch_token(self) -> None:
+        """A token that is revoked ends what came in with it."""
+        while True:
+            await asyncio.sleep(LOOK_S)
+            if self._token is not None and not self._tokens.holds(self._token):
+                raise _CutOff(1008, "its token was revoked")
