@@ -83,7 +83,7 @@ class BrokerServer:
         store: AssetStore | None = None,
         supervised: Sequence[str] = (),
     ) -> None:
-        self.clock = FrameClock(plan, time.monotonic_ns())
+        self.clock = FrameClock(plan, time.monotonic_ns(), weigh=_weight)
         self.statistics = Statistics({s.name: s.budget_ns for s in plan.services})
         self.outcome: ev.Finished | None = None
         self._plan, self._journal, self._observer = plan, journal, observer
@@ -123,6 +123,7 @@ class BrokerServer:
             m.ResetDone: self._reset_done,
             m.Fault: self._fault,
             m.Bye: self._bye,
+            m.CheckpointDone: self._checkpoint_done,
             m.Error: self._error,
             m.AssetOffer: self._scenery.offer,
             m.AssetGet: self._scenery.get,
@@ -307,6 +308,9 @@ class BrokerServer:
     def _reset_done(self, service: str, message: m.ResetDone, _: Sequence[zmq.Frame]) -> None:
         self.feed(ev.ResetDoneReceived(service, message))
 
+    def _checkpoint_done(self, service: str, message: m.CheckpointDone, parts: Sequence[zmq.Frame]) -> None:
+        self.feed(ev.CheckpointReceived(service, message, parts[0]))
+
     def _fault(self, service: str, message: m.Fault, _: Sequence[zmq.Frame]) -> None:
         self.feed(ev.FaultReceived(service, message))
 
@@ -347,6 +351,7 @@ class BrokerServer:
         self.statistics.latency(action.service, action.elapsed_ns, action.missed)
 
     def _frame_finished(self, action: ev.FrameFinished) -> None:
+        self._journal.checkpoints.finished = action.episode, action.frame
         self.statistics.frame(time.monotonic_ns())
         self._observer.frame(action, self.statistics)
 
@@ -365,6 +370,8 @@ class BrokerServer:
 
     def _send(self, action: ev.Send) -> None:
         parts = [part for product in action.products for part in product.payload]
+        if action.attachment is not None:
+            parts.append(action.attachment)
         reason = self._port.send(self._routes[action.service], encode_message(action.message), parts)
         if not reason or self.clock.state is RunState.FINISHED:
             return
@@ -388,6 +395,10 @@ class BrokerServer:
         text = self._grumbles.tell(kind, text, time.monotonic_ns())
         if text:
             self.note(service, text)
+
+
+def _weight(payload: Sequence[zmq.Frame]) -> int:
+    return sum(map(len, payload))
 
 
 def _is_no_send(action: ev.Action) -> bool:

@@ -94,6 +94,8 @@ class Runner:
             m.Reset: self._reset,
             m.Grant: self._grant,
             m.EpisodeEnd: self._episode_end,
+            m.Checkpoint: self._checkpoint,
+            m.Restore: self._restore,
         }
 
     def run(self) -> int:
@@ -264,6 +266,21 @@ class Runner:
     def _episode_end(self, message: m.EpisodeEnd, _: Sequence[zmq.Frame]) -> None:
         with self._reporting("end of episode", message.episode):
             self._running.end_episode(message.frames)
+
+    # --- state (clause 18) -----------------------------------------------------------------------------
+
+    def _checkpoint(self, message: m.Checkpoint, _: Sequence[zmq.Frame]) -> None:
+        with self._reporting("checkpoint", message.episode):
+            self._broker.progress(f"saving the state after frame {message.frame}")
+            state = self._running.checkpoint()
+            done = m.CheckpointDone(**self._identity, episode=message.episode, frame=message.frame)
+            self._broker.send(done, state)
+
+    def _restore(self, message: m.Restore, parts: Sequence[zmq.Frame]) -> None:
+        with self._reporting("restore", message.episode):
+            self._broker.progress(f"restoring the state after frame {message.frame}")
+            self._running.restore(parts[0].bytes)
+            self._broker.send(m.Ready(**self._identity))
 
     # --- what both need ------------------------------------------------------------------------------
 

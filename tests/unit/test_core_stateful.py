@@ -28,6 +28,7 @@ from caviar_broker.core.plan import Limits
 from caviar_broker.core.transitions import RunState
 from caviar_protocol import messages as m
 
+ANSWERED = m.Prepare | m.Reset | m.Grant | m.Shutdown | m.Checkpoint | m.Restore
 BETWEEN = (RunState.RESETTING, RunState.RUNNING)
 TOPICS = ("scene", "channel", "lidar", "action", "link")
 POLICIES: tuple[m.Policy, ...] = ("wait", "wait", "hold", "hold", "drop", "abort")
@@ -68,6 +69,8 @@ def graphs(draw: st.DrawFn, policies: tuple[m.Policy, ...] = POLICIES) -> list[S
     if draw(st.booleans()):
         everything = (m.Input(topic="*", required=False),)
         services.append(Sim("recorder", "recorder", everything, max_in_flight=draw(st.integers(1, 2))))
+    for service in services:
+        service.stateful = service.role != "recorder" and draw(st.booleans())
     return draw(st.permutations(services))
 
 
@@ -78,6 +81,7 @@ def plans() -> st.SearchStrategy[dict[str, Any]]:
             "episodes": st.integers(1, 2),
             "frames_in_flight": st.integers(1, 4),
             "realtime": st.booleans(),
+            "checkpoint_frames": st.integers(0, 3),
             "record": st.lists(st.sampled_from(["scene"]), max_size=1).map(tuple),
             "sampling_period_ns": st.just(20 * MS),
         }
@@ -90,6 +94,7 @@ class Puppets(Simulation):
     def __init__(self, services: list[Sim], **plan: Any) -> None:
         super().__init__(services, **plan)
         self.inbox: dict[str, list[m.Message]] = {name: [] for name in self.services}
+        self.to_restore: dict[str, Any] = {}
         self.unwritten: list[int] = []
 
     def perform(self) -> None:
@@ -98,8 +103,10 @@ class Puppets(Simulation):
         self._queue.clear()  # the harness's own journal
         self.unwritten += [a.number for _, a in self.log[seen:] if isinstance(a, ev.Journal)]
 
-    def _deliver(self, name: str, message: m.Message) -> None:
-        if name in self.alive and isinstance(message, m.Prepare | m.Reset | m.Grant | m.Shutdown):
+    def _deliver(self, name: str, message: m.Message, state: Any = None) -> None:
+        if isinstance(message, m.Restore):
+            self.to_restore[name] = state
+        if name in self.alive and isinstance(message, ANSWERED):
             self.inbox[name].append(message)
 
     def react(self, name: str, **answer: Any) -> None:
@@ -110,7 +117,11 @@ class Puppets(Simulation):
             case m.Prepare():
                 self.feed(ev.ReadyReceived(name, m.Ready(**ids)))
             case m.Reset():
-                self.feed(ev.ResetDoneReceived(name, m.ResetDone(**ids, episode=message.episode)))
+                self.was_reset(name, message, m.ResetDone(**ids, episode=message.episode))
+            case m.Checkpoint():
+                self.saved(name, message)
+            case m.Restore():
+                self.restored(name, self.to_restore[name], ids)
             case m.Grant():
                 sim, at = self.services[name], (message.episode, message.frame)
                 sim.faults = {at: "told to"} if answer.get("fails") else {}

@@ -154,6 +154,9 @@ class Joining:
         run, peer, message = self._run, self._run.peers[event.service], event.message
         if not run.current(peer, message.epoch, message.attempt, "READY"):
             return
+        if peer.state is ServiceState.RESTORING:
+            self._episodes.recall.restored(peer, now)
+            return
         if peer.state is not ServiceState.PREPARING:
             run.unexpected(peer, "READY", "once, after PREPARE")
             return

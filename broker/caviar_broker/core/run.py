@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from caviar_broker.core.events import Action, Finished, Notice, Product, Send
+from typing import Any
+
+from caviar_broker.core.events import Action, Finished, Journal, Notice, Product, Send
 from caviar_broker.core.graph import Graph
 from caviar_broker.core.ledger import Ledger
 from caviar_broker.core.peers import Peer
@@ -89,9 +91,17 @@ class Run:
 
     # --- what goes out -------------------------------------------------------------------------------
 
-    def send(self, peer: Peer, message: Message, products: tuple[Product, ...] = ()) -> None:
+    def send(
+        self, peer: Peer, message: Message, products: tuple[Product, ...] = (), attachment: Any = None
+    ) -> None:
         """Have a message sent."""
-        self.actions.append(Send(peer.name, message, products))
+        self.actions.append(Send(peer.name, message, products, attachment))
+
+    def enter_journal(self, outcome: str, service: str, frame: int, now: int, **facts: Any) -> None:
+        """Have something written down that is no decision about a task."""
+        if not self.plan.ephemeral:
+            number = self.ledger.enter(now)
+            self.actions.append(Journal(number, self.episode, frame, service, outcome, **facts))
 
     def notice(self, kind: str, service: str, text: str, frame: int = -1) -> None:
         """Have something told to the user."""
