@@ -2,7 +2,8 @@
 
 With ``--control`` a launcher talks to it in JSON lines. On standard output come ``listening``,
 ``notice``, ``frame`` and ``finished`` events; on standard input it takes
-``{"lost": SERVICE, "verdict": TEXT}`` and ``{"stop": REASON}``. When the input ends, the run does.
+``{"lost": SERVICE, "verdict": TEXT}``, ``{"restarted": SERVICE, "text": TEXT}`` and
+``{"stop": REASON}``. When the input ends, the run does.
 """
 
 from __future__ import annotations

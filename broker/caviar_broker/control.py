@@ -118,6 +118,8 @@ class Control:
         match order:
             case {"lost": str(service), "verdict": str(verdict)} if self._server.clock.peer(service):
                 self._server.feed(ev.Lost(service, verdict))
+            case {"restarted": str(service), "text": str(text)}:
+                self._server.note(service, text, "restarted")
             case {"stop": str(reason)}:
                 self._server.feed(ev.StopRequested(reason))
             case _:

@@ -387,9 +387,9 @@ class BrokerServer:
             service = connection.service if connection else ""
             self._grumble(f"reply {service}", f"{message_type(message)} reached nobody: {reason}", service)
 
-    def note(self, service: str, text: str) -> None:
+    def note(self, service: str, text: str, kind: str = "note") -> None:
         """Tell the observer something about a service, or in general."""
-        self._observer.notice(ev.Notice("note", service, text, self.clock.episode))
+        self._observer.notice(ev.Notice(kind, service, text, self.clock.episode))
 
     def _grumble(self, kind: str, text: str, service: str = "") -> None:
         text = self._grumbles.tell(kind, text, time.monotonic_ns())

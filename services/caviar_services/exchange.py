@@ -51,6 +51,7 @@ def run_info(name: str, welcome: m.Welcome, progress: Progress) -> RunInfo:
     return RunInfo(
         name=name,
         run=welcome.run,
+        again=welcome.epoch > 1 or welcome.attempt > 1,
         seed=welcome.seed,
         sampling_period_ns=int(told.get("sampling_period_ns", 1)),
         frames=int(told.get("frames", 1)),

@@ -65,6 +65,8 @@ class RunInfo:
     directory: Path = Path()
     """Where the recorder writes."""
     progress: Progress = _silent
+    again: bool = False
+    """Whether another process of this name was in the run before, or may have been."""
 
 
 @dataclass(frozen=True, kw_only=True)

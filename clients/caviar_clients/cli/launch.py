@@ -24,6 +24,8 @@ KILL_AFTER_S = 1.0
 
 BROKER_S = 10.0
 """[s] that the broker gets to end after its last service, beyond the run's ``shutdown_s``."""
+MAX_RESTARTS = 3
+"""Processes that are started for a service that died, before it comes back."""
 TAIL = 1 << 16
 """[B] of a log that are looked at for its last line."""
 
@@ -65,6 +67,10 @@ class Launcher:
     _broker: subprocess.Popen[bytes] | None = None
     _selector: selectors.BaseSelector = field(default_factory=selectors.DefaultSelector)
     _rest: bytes = b""
+    _awaited: set[str] = field(default_factory=set)
+    """Services that died and that the broker waits for."""
+    _restarts: dict[str, int] = field(default_factory=dict)
+    """Processes that were started since a service was last there."""
     _over: bool = False
     """Whether the broker told how the run ended."""
     _frames: int = 0
@@ -137,17 +143,31 @@ class Launcher:
         self._selector.register(self._broker.stdout, selectors.EVENT_READ)
 
     def _start_services(self) -> None:
-        for name, spec in self._local.items():
-            path = self.directory / "logs" / f"{name}.log"
-            command = [sys.executable, "-m", "caviar_services", name]
-            command += ["--use", f"{spec.role}:{spec.use}", "--broker", self.endpoint]
-            with path.open("wb") as log:
-                process = subprocess.Popen(  # noqa: S603  # our own module with checked arguments
-                    command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True
-                )
-            child = Child(name, process, path, os.pidfd_open(process.pid))
-            self._children[name] = child
-            self._selector.register(child.pidfd, selectors.EVENT_READ, child)
+        for name in self._local:
+            self._start(name)
+
+    def _start(self, name: str) -> None:
+        """Start a service; its log goes on where one before it ended."""
+        spec, path = self._local[name], self.directory / "logs" / f"{name}.log"
+        command = [sys.executable, "-m", "caviar_services", name]
+        command += ["--use", f"{spec.role}:{spec.use}", "--broker", self.endpoint]
+        with path.open("ab") as log:
+            process = subprocess.Popen(  # noqa: S603  # our own module with checked arguments
+                command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True
+            )
+        child = Child(name, process, path, os.pidfd_open(process.pid))
+        before, self._children[name] = self._children.get(name), child
+        if before is not None:
+            os.close(before.pidfd)
+        self._selector.register(child.pidfd, selectors.EVENT_READ, child)
+        self._give_up_at = None
+
+    def _start_again(self, name: str) -> None:
+        """Start a service that died and is waited for, unless that was in vain too often."""
+        self._restarts[name] = number = self._restarts.get(name, 0) + 1
+        if number <= MAX_RESTARTS:
+            self._start(name)
+            self._order({"restarted": name, "text": f"a new process was started, number {number}"})
 
     # --- while it runs -----------------------------------------------------------------------------
 
@@ -167,6 +187,8 @@ class Launcher:
             if event["event"] == "listening":
                 self.endpoint = event["endpoint"]
                 self._start_services()
+            if event["event"] == "notice" and event["service"] in self._children:
+                self._heed(event["kind"], event["service"])
             if event["event"] == "finished":
                 self._over, self._frames = True, event["frames"]
             yield event
@@ -183,6 +205,23 @@ class Launcher:
             raise RunError(last.removeprefix("caviar broker: ") if told else f"the broker died: {last}")
         return {"event": "ended", "status": status}
 
+    def _heed(self, kind: str, name: str) -> None:
+        """The broker waits for a service to come back (``timeouts.rejoin_s``), or it has come."""
+        if kind == "back":
+            self._awaited.discard(name)
+            self._restarts.pop(name, None)
+        elif kind == "away" and not self._over:
+            self._awaited.add(name)
+            process = self._children[name].process
+            if process.poll() is None:
+                process.kill()  # stopped, or cut off; its end is seen like any other
+            elif name not in self._unseen():
+                self._start_again(name)
+
+    def _unseen(self) -> set[str]:
+        """Services whose end has not been seen to yet."""
+        return {key.data.name for key in self._selector.get_map().values() if isinstance(key.data, Child)}
+
     def _child_died(self, child: Child) -> None:
         self._selector.unregister(child.pidfd)
         status = child.process.wait()
@@ -192,6 +231,8 @@ class Launcher:
             verdict = describe_exit(status)
             tail = child.last_line()
             self._order({"lost": child.name, "verdict": f"{verdict}, saying: {tail}" if tail else verdict})
+            if child.name in self._awaited:
+                self._start_again(child.name)
 
     def _order(self, order: Mapping[str, str]) -> None:
         if self._broker is None or self._broker.stdin is None:

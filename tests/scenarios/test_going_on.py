@@ -1,0 +1,88 @@
+"""Clause 18 with real processes: whoever is killed, the run ends with the digest that it would have had."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import pytest
+from scenarios_support import (
+    caviar,
+    eventually,
+    frames_recorded,
+    marked,
+    pid_of,
+    recorded_below,
+    run,
+    running,
+    scenario_file,
+)
+
+FRAMES = 60
+ADDER = """
+[services.adder]
+role = "sensors"
+use = "stateful:Adding"
+budget_ms = 50
+settings = { seconds = 0.01 }
+
+[timeouts]
+rejoin_s = 20.0
+"""
+CHANGES = [
+    ("frames = 100\n", f"frames = {FRAMES}\ncheckpoint_frames = 7\n"),
+    ('"action", "link"]', '"action", "link", "lidar"]'),
+]
+
+
+@pytest.fixture(scope="module")
+def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Smoke with a service that adds up all it ever took in."""
+    return scenario_file(tmp_path_factory.mktemp("going-on"), CHANGES, ADDER)
+
+
+@pytest.fixture(scope="module")
+def digest(scenario: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Of the run that nobody disturbs."""
+    finished = run(scenario, tmp_path_factory.mktemp("undisturbed"))
+    assert finished.status == 0, finished.output
+    return str(json.loads((finished.directory / "summary.json").read_text())["digest"])
+
+
+def assert_same(out: Path, output: str, status: int, digest: str) -> Path:
+    """The run came to its end, and what it recorded is whole and the same."""
+    assert status == 0, output
+    directory = next(out.glob("*/"))
+    assert json.loads((directory / "summary.json").read_text())["digest"] == digest
+    assert frames_recorded(directory) == FRAMES
+    recomputed = caviar("inspect", "--digest", directory)
+    assert recomputed.output.split() == [digest]
+    assert recomputed.status == 0
+    return directory
+
+
+@pytest.mark.parametrize(
+    ("service", "number"),
+    [
+        ("adder", signal.SIGKILL),
+        ("recorder", signal.SIGKILL),
+        ("world", signal.SIGKILL),
+        ("agent", signal.SIGSTOP),
+    ],
+)
+def test_a_service_that_is_killed_twice_is_started_again_and_the_digest_is_the_same(
+    scenario: Path, digest: str, tmp_path: Path, service: str, number: signal.Signals
+) -> None:
+    with running(scenario, tmp_path) as (process, mark):
+        for frame in (10, 35):
+            eventually(lambda f=frame: recorded_below(tmp_path) > f, 30, f"frame {frame} is recorded")
+            os.kill(pid_of(mark, f"caviar_services {service}"), number)
+        output, _ = process.communicate(timeout=40)
+        assert marked(mark) == []
+    directory = assert_same(tmp_path, output, process.returncode, digest)
+    told = [json.loads(line) for line in (directory / "events.jsonl").read_text().splitlines()]
+    kinds = [line["kind"] for line in told if line["service"] == service]
+    assert kinds.count("restarted") == kinds.count("back") == 2
+    assert "differs" not in kinds
