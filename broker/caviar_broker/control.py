@@ -49,7 +49,8 @@ class Reporter:
         now = time.monotonic()
         if self._control and now - self._last_frame >= FRAME_REPORT_S:
             self._last_frame = now
-            line = {"episode": frame.episode, "frames": statistics.frames, "misses": statistics.misses}
+            frames = statistics.frames + statistics.earlier
+            line = {"episode": frame.episode, "frames": frames, "misses": statistics.misses}
             self._outbox.passing({"event": "frame", **line})
             self._see_to_the_rest()
 

@@ -43,9 +43,9 @@ class JournalFile:
     a flush to the disk for each frame, is what clause 18 asks for.
     """
 
-    def __init__(self, path: Path, epoch: int) -> None:
+    def __init__(self, path: Path, epoch: int, checkpoints: CheckpointFiles | None = None) -> None:
         self.path, self._epoch = path, epoch
-        self.checkpoints = CheckpointFiles(path.parent)
+        self.checkpoints = checkpoints or CheckpointFiles(path.parent)
         self._encoder = msgspec.msgpack.Encoder()
         self._buffer = bytearray()
         try:
@@ -90,6 +90,27 @@ class JournalFile:
     def close(self) -> None:
         """Close the file."""
         os.close(self._fd)
+
+
+def mend_journal(path: Path) -> None:
+    """Cut off an entry that was not written whole, so that others can follow.
+
+    Raises `RecordingError` naming the place of what is no entry.
+    """
+    if not path.exists():
+        return
+    whole = 0
+    with path.open("rb") as file:
+        unpacker = msgpack.Unpacker(file, max_buffer_size=0)
+        while True:
+            try:
+                unpacker.skip()
+            except msgpack.OutOfData:
+                break
+            except (ValueError, msgpack.UnpackException) as error:
+                raise RecordingError(f"{path}: no entry of a journal at byte {whole}: {error}") from error
+            whole = unpacker.tell()
+    os.truncate(path, whole)
 
 
 def read_journal(path: Path) -> Iterator[JournalEntry]:

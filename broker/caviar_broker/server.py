@@ -17,6 +17,7 @@ import zmq
 from caviar_broker.core import events as ev
 from caviar_broker.core.clock import FrameClock
 from caviar_broker.core.plan import RunPlan
+from caviar_broker.core.resumption import Resumption
 from caviar_broker.core.transitions import RunState
 from caviar_broker.grumbles import Grumbles
 from caviar_broker.journal import JournalFile
@@ -72,6 +73,8 @@ class BrokerServer:
         Where scenery is kept.
     supervised
         Services whose death somebody else reports, who knows their exit status and last words.
+    resumption
+        What another broker left of the run.
     """
 
     def __init__(
@@ -82,8 +85,9 @@ class BrokerServer:
         observer: Observer,
         store: AssetStore | None = None,
         supervised: Sequence[str] = (),
+        resumption: Resumption | None = None,
     ) -> None:
-        self.clock = FrameClock(plan, time.monotonic_ns(), weigh=_weight)
+        self.clock = FrameClock(plan, time.monotonic_ns(), weigh=_weight, resumption=resumption)
         self.statistics = Statistics({s.name: s.budget_ns for s in plan.services})
         self.outcome: ev.Finished | None = None
         self._plan, self._journal, self._observer = plan, journal, observer

@@ -20,7 +20,9 @@ from core_history import History
 from caviar_broker.core import events as ev
 from caviar_broker.core.clock import FrameClock
 from caviar_broker.core.plan import Limits, RunPlan, ServicePlan
+from caviar_broker.core.resumption import Resumption
 from caviar_broker.core.transitions import RunState
+from caviar_broker.journal import JournalFile
 from caviar_protocol import messages as m
 
 MS = 1_000_000
@@ -139,6 +141,8 @@ class Simulation:
         limits: Limits | None = None,
         journal_after: int = 0,
         strict: bool = True,
+        journal: JournalFile | None = None,
+        resumption: Resumption | None = None,
         **plan: Any,
     ) -> None:
         self.services = {sim.name: sim for sim in services}
@@ -150,8 +154,10 @@ class Simulation:
             **settings,
         )
         self.now = SECOND  # not 0, so that a forgotten offset shows
-        self.clock = FrameClock(self.plan, self.now)
+        self.clock = FrameClock(self.plan, self.now, resumption=resumption)
         self.history = History(self.plan, self.services) if strict else None
+        self.journal = journal
+        self._entries: list[ev.Journal] = []
         self.journal_after = journal_after
         self.log: list[tuple[int, ev.Action]] = []
         self.busy_until: dict[str, int] = {}
@@ -206,6 +212,7 @@ class Simulation:
                 case ev.Send():
                     self._deliver(action.service, action.message, action.attachment)
                 case ev.Journal(number=number):
+                    self._entries.append(action)
                     self.after(self.journal_after, lambda number=number: self.journaled(number))
                 case _:
                     pass
@@ -213,6 +220,9 @@ class Simulation:
     def journaled(self, number: int) -> None:
         if self.history is not None:
             self.history.journaled = max(self.history.journaled, number)
+        if self.journal is not None:
+            self.journal.write([entry for entry in self._entries if entry.number <= number])
+            self._entries = [entry for entry in self._entries if entry.number > number]
         self.feed(ev.Journaled(number))
 
     def step(self) -> bool:
@@ -292,10 +302,10 @@ class Simulation:
 
     def saved(self, name: str, message: m.Checkpoint) -> None:
         ids = {f: getattr(message, f) for f in ("epoch", "attempt", "episode", "frame")}
-        self.feed(ev.CheckpointReceived(name, m.CheckpointDone(**ids), self.states[name]))
+        self.feed(ev.CheckpointReceived(name, m.CheckpointDone(**ids), self.states[name].encode()))
 
     def restored(self, name: str, state: Any, ids: Mapping[str, int]) -> None:
-        self.states[name] = state + " roughly" if self.services[name].forgets else state
+        self.states[name] = state.decode() + " roughly" * self.services[name].forgets
         self.feed(ev.ReadyReceived(name, m.Ready(**ids)))
 
     def _later(self, name: str, takes: int, act: Callable[[], None]) -> None:
@@ -331,7 +341,9 @@ class Simulation:
         topics = () if grant.final or at in sim.omits else sim.outputs
         headers = tuple(m.ProductHeader(topic=t, digest=product_digest(name, t, *at, said)) for t in topics)
         fields = {"products": headers, "end_episode": at in sim.ends, **sim.report(*at)} | ids
-        self.feed(ev.DoneReceived(name, m.Done(**fields), tuple((name, t, *at) for t in topics)))
+        self.feed(
+            ev.DoneReceived(name, m.Done(**fields), tuple((f"{name} {t} {at}".encode(), b"") for t in topics))
+        )
 
     def kill(self, name: str, verdict: str = "exit status 1") -> None:
         self.alive.discard(name)

@@ -97,7 +97,7 @@ class History:
 
     def _turn(self, entry: ev.Journal) -> None:
         """An entry about the run, or about the state of a service."""
-        if entry.outcome == "checkpoint":
+        if entry.outcome == "checkpoint" and entry.frame >= 0:
             name, key = entry.service, (entry.episode, entry.service)
             assert not self.owed.get(name), f"{name} saved its state with {self.owed[name]} outstanding"
             answered = self.answered.get(key, {})

@@ -24,6 +24,7 @@ from caviar_broker.core.liveness import Liveness
 from caviar_broker.core.memory import Weigh
 from caviar_broker.core.peers import Peer
 from caviar_broker.core.plan import RunPlan
+from caviar_broker.core.resumption import Resumption
 from caviar_broker.core.run import Run
 from caviar_broker.core.transitions import RunState, ServiceState
 from caviar_protocol.digest import RunDigest
@@ -40,11 +41,15 @@ class FrameClock:
         The time [ns], of the same monotonic clock as every later ``now``.
     weigh
         Size of a payload [B], for what is kept of a service that may come back.
+    resumption
+        What another broker left of the run.
     """
 
-    def __init__(self, plan: RunPlan, now: int, weigh: Weigh = lambda payload: 0) -> None:
+    def __init__(
+        self, plan: RunPlan, now: int, weigh: Weigh = lambda payload: 0, resumption: Resumption | None = None
+    ) -> None:
         self.plan = plan
-        self._run = Run(plan, now)
+        self._run = Run(plan, now, resumption)
         self._episodes = Episodes(self._run, weigh)
         self._joining = Joining(self._run, self._episodes)
         self._liveness = Liveness(self._run, self._episodes)

@@ -33,7 +33,8 @@ class Episodes:
 
     def begin(self, now: int) -> None:
         """RESET for everybody who is ready; who is not, gets it when it is."""
-        self._run.next_seed()
+        if self._run.resumption is None:
+            self._run.next_seed()
         self.recall.begin()
         for peer in self._members():
             if peer.state is ServiceState.READY:
@@ -75,14 +76,26 @@ class Episodes:
                 self._grant(order)
         elif all(p.state is ServiceState.ACTIVE for p in self._members()):
             run.enter(RunEvent.ALL_RESET, now)
-            assert run.graph is not None
-            capacity = {p.name: _capacity(p) for p in self._members()}
-            self.schedule = EpisodeSchedule(
-                run.graph, run.plan, capacity, run.episode, run.digest, run.ledger
-            )
-            # Behind the schedule, so that frame 0 need not wait for this entry.
-            facts = {"seed": run.seed, "seed_episode": run.seed_episode, "frames": run.plan.frames}
-            run.enter_journal("episode", "", 0, now, facts=facts, members=run.graph.order)
+            self._start(now)
+
+    def _start(self, now: int) -> None:
+        """Everybody is there: the episode starts, or goes on where it was."""
+        run, memories = self._run, self.recall.memories
+        assert run.graph is not None
+        capacity = {p.name: _capacity(p) for p in self._members()}
+        self.schedule = EpisodeSchedule(
+            run.graph, run.plan, capacity, run.episode, run.digest, run.ledger, memories
+        )
+        # Behind the schedule, so that frame 0 need not wait for these entries.
+        facts = {"seed": run.seed, "seed_episode": run.seed_episode, "frames": self.schedule.frames}
+        before, run.resumption = run.resumption, None
+        if before is not None:
+            self.schedule.go_on(before, {name: memory.last for name, memory in memories.items()})
+            run.enter_journal("resumed", "", before.finished, now, facts=facts, members=run.graph.order)
+            return
+        run.enter_journal("episode", "", 0, now, facts=facts, members=run.graph.order)
+        for name in memories:
+            run.enter_journal("checkpoint", name, -1, now)
 
     def _over(self, schedule: EpisodeSchedule, now: int) -> None:
         run = self._run
@@ -164,7 +177,7 @@ class Episodes:
         if message.seed >= 0:
             self._seed_chosen(peer, message, schedule, now)
         if self.recall.of(peer.name) is not None:
-            self._remember(peer, schedule, {header.topic: header.digest for header in message.products})
+            self._remember(peer, schedule, self.recall.digests(peer, message))
         schedule.done(peer.name, message.frame, products, now, told, end=message.end_episode)
         if message.end_episode and peer.role == "agent":
             self._tell(schedule)  # entries in order

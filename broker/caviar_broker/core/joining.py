@@ -166,7 +166,7 @@ class Joining:
         if not self._accepted(peer, message, now):
             return
         peer.ready = message
-        if message.seed >= 0 and run.state is RunState.PREPARING:
+        if message.seed >= 0 and run.state is RunState.PREPARING and run.resumption is None:
             run.wish(message.seed, peer, now)
         self._prepare_whoever_can(now)
         if run.state is not RunState.PREPARING:

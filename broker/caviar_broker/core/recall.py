@@ -43,9 +43,23 @@ class Recall:
 
     # --- keeping -------------------------------------------------------------------------------------
 
-    def begin(self, memories: Mapping[str, Memory] | None = None) -> None:
-        """An episode begins, or is gone on with from these memories."""
-        self._memories = dict(memories or {})
+    def begin(self) -> None:
+        """An episode begins, or is gone on with."""
+        run, before = self._run, self._run.resumption
+        self._memories = {}
+        if before is not None and run.graph is not None:
+            self._memories = before.memories(run.graph, run.plan, self._weigh)
+
+    @property
+    def memories(self) -> Mapping[str, Memory]:
+        """What is kept, by service."""
+        return self._memories
+
+    def digests(self, peer: Peer, answer: Done) -> dict[str, str]:
+        """Digests by topic of what an answer holds and somebody asked for."""
+        graph = self._run.graph
+        wanted = graph.outputs[peer.name] if graph else ()
+        return {header.topic: header.digest for header in answer.products if header.topic in wanted}
 
     def of(self, service: str) -> Memory | None:
         """The memory that is kept for a service; None: it is not told to save its state."""
@@ -159,7 +173,7 @@ class Recall:
                 return
             now_digests = None
         else:
-            now_digests = {header.topic: header.digest for header in answer.products}
+            now_digests = self.digests(peer, answer)
         self._compare(peer, answer.frame, pending.digests, now_digests)
         memory.position += 1
         self._next(peer, memory, now)

@@ -9,6 +9,7 @@ from caviar_broker.core.graph import Graph
 from caviar_broker.core.ledger import Ledger
 from caviar_broker.core.peers import Peer
 from caviar_broker.core.plan import RunPlan
+from caviar_broker.core.resumption import Resumption
 from caviar_broker.core.transitions import RUN, RunEvent, RunState, step
 from caviar_protocol.digest import RunDigest
 from caviar_protocol.messages import Error, Message, Shutdown, Stale
@@ -17,8 +18,10 @@ from caviar_protocol.messages import Error, Message, Shutdown, Stale
 class Run:
     """One run: its present state, its services, and the actions that wait to be carried out."""
 
-    def __init__(self, plan: RunPlan, now: int) -> None:
+    def __init__(self, plan: RunPlan, now: int, resumption: Resumption | None = None) -> None:
         self.plan = plan
+        self.resumption = resumption
+        """What another broker left of the run, until it goes on."""
         self.state = RunState.JOINING
         self.since = now
         """When the present state began [ns]."""
@@ -36,9 +39,18 @@ class Run:
         self.ledger = Ledger(kept=not plan.ephemeral)
         self.over = False
         """Whether the run has ended, if perhaps not everybody has left."""
+        if resumption is not None:
+            self._take_over(resumption)
         self.error = ""
         self.culprit = ""
         self.actions: list[Action] = []
+
+    def _take_over(self, before: Resumption) -> None:
+        self.episode, self.seed, self.seed_episode = before.episode, before.seed, before.seed_episode
+        self.digest = before.digest
+        self.ledger.last = self.ledger.written = before.entries
+        if before.wish is not None:
+            self._wished = before.wish[0], self.peers[before.wish[1]]
 
     def takes_part(self, peer: Peer) -> bool:
         """Whether the run needs a service: all until the graph is known, then those in it (clause 5)."""
@@ -48,7 +60,7 @@ class Run:
 
     def wish(self, seed: int, peer: Peer, now: int) -> None:
         """An agent chooses the seed of the next episode."""
-        if self._wished is not None and self._wished[0] != seed:
+        if self._wished is not None and self._wished[0] != seed and self._wished[1] is not peer:
             other = self._wished[1]
             self.fail(
                 f"{other} and {peer} choose different seeds, {self._wished[0]} and {seed}", peer.name, now

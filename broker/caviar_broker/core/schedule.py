@@ -6,7 +6,7 @@ nothing of joining, dying or messages; `episodes.Episodes` does that around it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 
 from msgspec.structs import replace
 
@@ -17,6 +17,7 @@ from caviar_broker.core.inputs import Gathered, Inputs
 from caviar_broker.core.ledger import Ledger
 from caviar_broker.core.pace import Pacer
 from caviar_broker.core.plan import RunPlan, ServicePlan
+from caviar_broker.core.resumption import Resumption
 from caviar_broker.core.tasks import Decision, GrantOrder, Task, milliseconds, provenance
 from caviar_broker.core.transitions import OUTSTANDING, TaskEvent, TaskState
 from caviar_broker.core.turns import Turns
@@ -44,6 +45,8 @@ class EpisodeSchedule:
         Number of the episode.
     digest, ledger
         The run's digest and journal.
+    remembering
+        Services that save their state.
     """
 
     def __init__(
@@ -54,6 +57,7 @@ class EpisodeSchedule:
         episode: int,
         digest: RunDigest,
         ledger: Ledger,
+        remembering: Collection[str] = (),
     ) -> None:
         self.graph, self.plan, self.episode = graph, plan, episode
         self.actions: list[Action] = []
@@ -68,7 +72,8 @@ class EpisodeSchedule:
         self._capacity, self._ledger = capacity, ledger
         self._first_entry = ledger.last
         self._pacer = Pacer(plan)
-        self._book = DecisionBook(graph, plan, episode, digest, ledger, self.actions)
+        sources = {edge.source for name in remembering for edge in graph.inputs[name]}
+        self._book = DecisionBook(graph, plan, episode, digest, ledger, self.actions, sources)
         self._book.lag_ns = lambda: self._pacer.lag_ns
         self._inputs = Inputs(graph, self._book)
         self._turns = Turns(graph, plan, self._book)
@@ -78,6 +83,12 @@ class EpisodeSchedule:
         """Late products that the recorder has not been told of (clause 11)."""
         self._paused: set[str] = set()
         self._saving: set[str] = set()
+
+    def go_on(self, resumption: Resumption, completed: Mapping[str, int]) -> None:
+        """Go on behind the last finished frame; ``completed`` says how far services got that have state."""
+        resumption.restore(self._book)
+        self._book.forget_before(resumption.finished - 1)
+        self._completed.update(completed)
 
     # --- what happens ------------------------------------------------------------------------------
 
