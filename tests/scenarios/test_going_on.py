@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -86,3 +87,28 @@ def test_a_service_that_is_killed_twice_is_started_again_and_the_digest_is_the_s
     kinds = [line["kind"] for line in told if line["service"] == service]
     assert kinds.count("restarted") == kinds.count("back") == 2
     assert "differs" not in kinds
+
+
+def test_a_broker_that_is_killed_is_followed_by_another_and_the_digest_is_the_same(
+    scenario: Path, digest: str, tmp_path: Path
+) -> None:
+    with running(scenario, tmp_path) as (process, mark):
+        for frame in (10, 35):
+            eventually(lambda f=frame: recorded_below(tmp_path) > f, 30, f"frame {frame} is recorded")
+            os.kill(pid_of(mark, "caviar_broker"), signal.SIGKILL)
+        output, _ = process.communicate(timeout=40)
+        assert marked(mark) == []
+    assert_same(tmp_path, output, process.returncode, digest)
+    assert output.count("another one goes on with the run") == 2
+
+
+def test_a_run_whose_machine_went_down_is_gone_on_with(scenario: Path, digest: str, tmp_path: Path) -> None:
+    with running(scenario, tmp_path) as (process, mark):
+        eventually(lambda: recorded_below(tmp_path) > 25, 30, "frame 25 is recorded")
+        for entry in [f"{process.pid} ", *marked(mark)]:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(int(entry.split()[0]), signal.SIGKILL)
+        process.communicate(timeout=10)
+    resumed = caviar("run", "--resume", next(tmp_path.glob("*/")))
+    assert resumed.leftovers == []
+    assert_same(tmp_path, resumed.output, resumed.status, digest)

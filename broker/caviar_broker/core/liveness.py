@@ -66,9 +66,9 @@ class Liveness:
             schedule.pause(peer.name)
 
     def _may_return(self, peer: Peer) -> bool:
-        """Whether the loss of a service is survived for a while: it was ready once, or is started by
-        hand and can be again; and it got somewhere."""
-        was_ready = peer.ready is not None or peer.plan.remote
+        """Whether the loss of a service is survived for a while: it was ready once, perhaps under a
+        broker before, or is started by hand and can be again; and it got somewhere."""
+        was_ready = peer.ready is not None or peer.plan.remote or self._run.plan.epoch > 1
         return peer.rejoin(self._run.plan.limits) > 0 and was_ready and peer.losses < MAX_LOSSES
 
     # --- deadlines -----------------------------------------------------------------------------------

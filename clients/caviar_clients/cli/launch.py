@@ -62,6 +62,8 @@ class Launcher:
     frames: int | None = None
     seed: int | None = None
     bind: str = "tcp://127.0.0.1:0"
+    resume: bool = False
+    """Whether to go on with the run in the directory, whatever ``path``, ``frames`` and ``seed`` say."""
     endpoint: str = ""
     _children: dict[str, Child] = field(default_factory=dict)
     _broker: subprocess.Popen[bytes] | None = None
@@ -69,12 +71,16 @@ class Launcher:
     _rest: bytes = b""
     _awaited: set[str] = field(default_factory=set)
     """Services that died and that the broker waits for."""
+    _brokers: int = 0
+    """That were started after others that died, since frames were last finished."""
     _restarts: dict[str, int] = field(default_factory=dict)
     """Processes that were started since a service was last there."""
     _over: bool = False
     """Whether the broker told how the run ended."""
     _frames: int = 0
     """Frames that the run had, once it is over."""
+    _stopping: bool = False
+    """Whether the user wants the run to end."""
     _finished: bool = False
     """Whether the broker's output has ended."""
     _give_up_at: float | None = None
@@ -106,6 +112,7 @@ class Launcher:
 
     def stop(self, reason: str) -> None:
         """Ask for an orderly end."""
+        self._stopping = True
         self._order({"stop": reason})
 
     def log_of(self, service: str) -> Path | None:
@@ -120,15 +127,21 @@ class Launcher:
 
     # --- starting ----------------------------------------------------------------------------------
 
-    def _start_broker(self) -> None:
-        command = [sys.executable, "-m", "caviar_broker", str(self.path), "--bind", self.bind]
-        command += ["--directory", str(self.directory), "--control"]
+    def _broker_arguments(self) -> list[str]:
+        if self.resume:
+            bind = ["--bind", self.bind] if self.bind else []
+            return ["--resume", str(self.directory), *bind]
+        arguments = [str(self.path), "--bind", self.bind, "--directory", str(self.directory)]
         if self.frames is not None:
-            command += ["--frames", str(self.frames)]
+            arguments += ["--frames", str(self.frames)]
         if self.seed is not None:
-            command += ["--seed", str(self.seed)]
-        command += ["--supervised", *self._local]
-        with (self.directory / "logs" / "broker.log").open("wb") as log:
+            arguments += ["--seed", str(self.seed)]
+        return arguments
+
+    def _start_broker(self) -> None:
+        command = [sys.executable, "-m", "caviar_broker", *self._broker_arguments()]
+        command += ["--control", "--supervised", *self._local]
+        with (self.directory / "logs" / "broker.log").open("ab") as log:
             self._broker = subprocess.Popen(  # noqa: S603  # our own module with checked arguments
                 command,
                 stdin=subprocess.PIPE,
@@ -178,6 +191,9 @@ class Launcher:
         data = os.read(broker.stdout.fileno(), 65536)
         if not data:
             self._selector.unregister(broker.stdout)
+            if self._may_resume():
+                self._resume_broker(broker)
+                return
             self._finished = True
             yield self._broker_ended(broker)
             return
@@ -189,9 +205,54 @@ class Launcher:
                 self._start_services()
             if event["event"] == "notice" and event["service"] in self._children:
                 self._heed(event["kind"], event["service"])
+            if event["event"] == "frame":
+                self._brokers = 0
             if event["event"] == "finished":
                 self._over, self._frames = True, event["frames"]
             yield event
+
+    # --- another broker ----------------------------------------------------------------------------
+
+    def _may_resume(self) -> bool:
+        """Whether a broker that died is followed by another: the run waits for who is lost, the broker
+        had begun, and those before it got somewhere."""
+        waits = (self.scenario.timeouts.rejoin_s or 0.0) > 0.0
+        return (
+            waits
+            and not self._over
+            and not self._stopping
+            and bool(self.endpoint)
+            and self._brokers < MAX_RESTARTS
+        )
+
+    def _resume_broker(self, broker: subprocess.Popen[bytes]) -> None:
+        """Start a broker that goes on with the run, at the same address; services are started again
+        once it listens, since none of them is known to it."""
+        if broker.stdin is not None:
+            broker.stdin.close()
+        if broker.stdout is not None:
+            broker.stdout.close()
+        _wait([broker], KILL_AFTER_S)
+        if broker.poll() is None:
+            broker.kill()
+        verdict = describe_exit(broker.wait())
+        self._end_services()
+        self._brokers += 1
+        self.resume, self.bind, self._rest = True, self.endpoint, b""
+        self._awaited.clear()
+        self._restarts.clear()
+        self._start_broker()
+        text = f"the broker died ({verdict}); another one goes on with the run, number {self._brokers}"
+        self._order({"restarted": "", "text": text})
+
+    def _end_services(self) -> None:
+        processes = [child.process for child in self._children.values()]
+        _end(processes, KILL_AFTER_S)
+        for child in self._children.values():
+            if child.pidfd in self._selector.get_map():
+                self._selector.unregister(child.pidfd)
+            os.close(child.pidfd)
+        self._children.clear()
 
     def _broker_ended(self, broker: subprocess.Popen[bytes]) -> Mapping[str, Any]:
         _wait([broker], self.scenario.timeouts.shutdown_s + BROKER_S)
@@ -253,18 +314,23 @@ class Launcher:
         # Before the first frame some services may not have connected, so that no SHUTDOWN reached them.
         grace = self.scenario.timeouts.shutdown_s if self._frames else 0.0
         _wait(processes, grace)
-        for process in processes:
-            if process.poll() is None:
-                process.send_signal(signal.SIGTERM)
-        _wait(processes, self.scenario.timeouts.shutdown_s + KILL_AFTER_S)
-        for process in processes:
-            if process.poll() is None:
-                process.kill()
-            process.wait()
+        _end(processes, self.scenario.timeouts.shutdown_s + KILL_AFTER_S)
         for child in self._children.values():
             os.close(child.pidfd)
         if self._broker is not None and self._broker.stdout is not None:
             self._broker.stdout.close()
+
+
+def _end(processes: list[subprocess.Popen[bytes]], seconds: float) -> None:
+    """End all: SIGTERM, and after so long [s] SIGKILL."""
+    for process in processes:
+        if process.poll() is None:
+            process.send_signal(signal.SIGTERM)
+    _wait(processes, seconds)
+    for process in processes:
+        if process.poll() is None:
+            process.kill()
+        process.wait()
 
 
 def _wait(processes: list[subprocess.Popen[bytes]], seconds: float) -> None:
