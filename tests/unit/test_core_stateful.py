@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable
+from contextlib import closing
 from typing import Any
 
+import pytest
 from core_harness import MS, SECOND, Sim, Simulation
 from hypothesis import HealthCheck, Phase, assume, given, settings
 from hypothesis import strategies as st
@@ -23,9 +25,12 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
+from caviar_broker.checkpoints import CheckpointFiles
 from caviar_broker.core import events as ev
 from caviar_broker.core.plan import Limits
 from caviar_broker.core.transitions import RunState
+from caviar_broker.journal import JournalFile
+from caviar_broker.resume import read_resumption
 from caviar_protocol import messages as m
 
 ANSWERED = m.Prepare | m.Reset | m.Grant | m.Shutdown | m.Checkpoint | m.Restore
@@ -363,3 +368,40 @@ def test_clauses_18_and_20_under_wait_equal_inputs_give_equal_digests_kills_or_n
     slow.run()
     assert slow.outcome.error == ""
     assert slow.outcome.digest == quick.outcome.digest
+
+
+@given(
+    services=graphs(policies=("wait",)),
+    plan=plans().map(lambda plan: plan | {"checkpoint_frames": max(1, plan["checkpoint_frames"])}),
+    timing=st.randoms(use_true_random=False),
+    ends=st.sets(st.tuples(st.integers(0, 1), st.integers(0, 4)), max_size=2),
+    crashes=st.lists(st.integers(5, 200), min_size=1, max_size=3),
+)
+@settings(max_examples=100, deadline=None, phases=PHASES, suppress_health_check=list(HealthCheck))
+def test_clauses_18_and_20_under_wait_brokers_that_die_do_not_change_the_digest(
+    tmp_path_factory: pytest.TempPathFactory,
+    services: list[Sim],
+    plan: dict[str, Any],
+    timing: random.Random,
+    ends: set[tuple[int, int]],
+    crashes: list[int],
+) -> None:
+    for sim in services:
+        sim.ends = frozenset(ends) if sim.role == "agent" else frozenset()
+        sim.stateful = sim.role != "recorder"
+    quick = Simulation(services, **plan).join().run()
+    assume(quick.clock.graph is not None)
+    folder = tmp_path_factory.mktemp("run")
+    path, files = folder / "journal.msgpack", CheckpointFiles(folder)
+    for epoch, crash in enumerate([*crashes, None], 1):
+        for sim in services:
+            times: dict[tuple[int, int], int] = {}
+            sim.latency = lambda e, k, times=times: times.setdefault((e, k), timing.randrange(20 * MS))
+        before = read_resumption(path, files) if epoch > 1 else None
+        with closing(JournalFile(path, epoch, files)) as journal:
+            settings = {"journal": journal, "resumption": before, "epoch": epoch, "strict": False}
+            run = Simulation(services, journal_after=timing.randrange(9 * MS), **settings, **plan).join()
+            run.run() if crash is None else run.run_to(run.now + crash * MS)
+    assert run.outcome.error == ""
+    assert run.outcome.digest == quick.outcome.digest
+    assert run.notices("differs") == []
