@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from caviar_broker.core.resumption import Resumption
 from caviar_broker.journal import JournalFile, mend_journal, read_journal
 from caviar_broker.resume import read_resumption
 from caviar_protocol import messages as m
+from caviar_protocol.digest import RunDigest
 
 STATEFUL: dict[str, dict[str, Any]] = {
     "world": {"stateful": True},
@@ -151,3 +153,26 @@ def test_services_that_come_back_while_a_resumed_run_goes_on_are_restored_too(tm
     assert run.outcome.error == ""
     assert run.outcome.digest == undisturbed(STATEFUL)
     assert run.notices("differs") == []
+
+
+def test_what_a_broker_decided_anew_counts_and_not_what_the_one_before_had_decided(tmp_path: Path) -> None:
+    def entry(number: int, outcome: str, service: str = "", said: str = "", **fields: Any) -> ev.Journal:
+        digest = hashlib.sha256(said.encode()).hexdigest()
+        told = m.GrantInput(topic="lidar", source=service, status=m.Status.FRESH, frame=0, digest=digest)
+        decisions = (told,) if service else ()
+        return ev.Journal(number, 0, 0, service, outcome, decisions=decisions, **fields)
+
+    facts = {"seed": 1, "seed_episode": 0, "frames": 3}
+    path = tmp_path / "journal.msgpack"
+    with closing(JournalFile(path, 1)) as journal:
+        journal.write([entry(1, "episode", facts=facts, members=("a", "b")), entry(2, "done", "a", "before")])
+        journal.write([entry(3, "resumed", facts=facts), entry(4, "done", "b", "b")])
+        journal.write([entry(5, "done", "a", "anew")])
+    found = read_resumption(path, CheckpointFiles(tmp_path))
+    expected = RunDigest()
+    said = {"a": "anew", "b": "b"}
+    products = [("lidar", name, hashlib.sha256(text.encode()).hexdigest()) for name, text in said.items()]
+    expected.add_frame(0, 0, products)
+    assert found is not None
+    assert (found.finished, found.entries) == (1, 5)
+    assert found.digest.hexdigest() == expected.hexdigest()
