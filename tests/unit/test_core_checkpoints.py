@@ -145,3 +145,21 @@ def test_a_state_that_nobody_asked_for_is_stale() -> None:
     ids = {"epoch": 1, "attempt": 1, "episode": 0, "frame": 0}
     run.feed(ev.CheckpointReceived("link", m.CheckpointDone(**ids), "state"))
     assert [s.of for s in run.seen(m.Stale, "link")] == ["CHECKPOINT_DONE"]
+
+
+@pytest.mark.parametrize("kind", [m.Checkpoint, m.Restore])
+def test_a_service_that_cannot_save_or_restore_its_state_ends_the_run_with_its_words(kind: type) -> None:
+    services = STATEFUL | {"link": {"stateful": True, "saving": None if kind is m.Checkpoint else MS}}
+    run = simulation(services=services)
+    if kind is m.Restore:
+        run.run(granted("link", 5))
+        run.kill("link")
+        run.services["link"].saving = None
+        run.hello("link")
+    run.run(lambda r: bool(r.seen(kind, "link")))
+    asked = run.seen(kind, "link")[-1]
+    ids = {f: getattr(asked, f) for f in ("epoch", "attempt", "episode", "frame")}
+    run.feed(ev.FaultReceived("link", m.Fault(**ids, phase="state", message="the disk is full")))
+    run.run()
+    assert run.outcome.culprit == "link"
+    assert "state: the disk is full" in run.outcome.error

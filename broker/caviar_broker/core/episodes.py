@@ -215,7 +215,7 @@ class Episodes:
         """FAULT: fatal, unless it is in a frame that the run can do without."""
         run, peer, message = self._run, self._run.peers[event.service], event.message
         text = f"{message.phase}: {message.message}"
-        if message.frame < 0:
+        if message.frame < 0 or self.recall.is_concerned(peer, message):
             if not run.current(peer, message.epoch, message.attempt, "FAULT"):
                 return
             if run.takes_part(peer):

@@ -8,7 +8,7 @@ from caviar_broker.core.peers import Peer
 from caviar_broker.core.run import Run
 from caviar_broker.core.transitions import RunState, ServiceEvent, ServiceState
 
-MAX_LOSSES = 3
+MAX_LOSSES = 5
 """A service that was lost so often without an answer in between is not waited for again."""
 
 

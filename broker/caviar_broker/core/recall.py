@@ -10,7 +10,7 @@ from caviar_broker.core.memory import Memory, Weigh
 from caviar_broker.core.peers import Peer
 from caviar_broker.core.run import Run
 from caviar_broker.core.tasks import GrantOrder
-from caviar_broker.core.transitions import ServiceEvent
+from caviar_broker.core.transitions import ServiceEvent, ServiceState
 from caviar_protocol.messages import Checkpoint, Done, Fault, Restore
 
 CAPABILITY = "checkpoint"
@@ -118,6 +118,14 @@ class Recall:
         memory.saved(event.state)
         run.enter_journal("checkpoint", peer.name, message.frame, now, state=event.state)
         return True
+
+    def is_concerned(self, peer: Peer, fault: Fault) -> bool:
+        """Whether a FAULT answers CHECKPOINT or RESTORE, and not a grant."""
+        memory = self._memories.get(peer.name)
+        if memory is None or fault.episode != self._run.episode:
+            return False
+        restoring = peer.state is ServiceState.RESTORING and not peer.restored
+        return fault.frame == (memory.frame if restoring else memory.asked)
 
     # --- restoring -----------------------------------------------------------------------------------
 

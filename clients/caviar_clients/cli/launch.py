@@ -24,7 +24,7 @@ KILL_AFTER_S = 1.0
 
 BROKER_S = 10.0
 """[s] that the broker gets to end after its last service, beyond the run's ``shutdown_s``."""
-MAX_RESTARTS = 3
+MAX_RESTARTS = 5
 """Processes that are started for a service that died, before it comes back."""
 TAIL = 1 << 16
 """[B] of a log that are looked at for its last line."""
