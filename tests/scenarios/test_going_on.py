@@ -112,3 +112,16 @@ def test_a_run_whose_machine_went_down_is_gone_on_with(scenario: Path, digest: s
     resumed = caviar("run", "--resume", next(tmp_path.glob("*/")))
     assert resumed.leftovers == []
     assert_same(tmp_path, resumed.output, resumed.status, digest)
+
+
+@pytest.mark.parametrize("command", ["run", "broker"])
+def test_what_cannot_be_resumed_is_named(scenario: Path, tmp_path: Path, command: str) -> None:
+    empty = caviar(command, "--resume", tmp_path)
+    assert empty.status == 1
+    assert "run.json" in empty.output
+    both = caviar(command, scenario, "--resume", tmp_path)
+    assert both.status == 1
+    assert "--resume takes no scenario" in both.output
+    neither = caviar(command)
+    assert neither.status == 1
+    assert "give a scenario file, or --resume" in neither.output
