@@ -203,7 +203,7 @@ class Launcher:
             if event["event"] == "listening":
                 self.endpoint = event["endpoint"]
                 self._start_services()
-            if event["event"] == "notice" and event["service"] in self._children:
+            if event["event"] == "notice" and event.get("service") in self._children:
                 self._heed(event["kind"], event["service"])
             if event["event"] == "frame":
                 self._brokers = 0
