@@ -13,7 +13,7 @@ from rich.text import Text
 
 from caviar_clients.cli import bench
 from caviar_clients.cli.keys import app as keys
-from caviar_protocol.errors import CaviarError
+from caviar_protocol.errors import CaviarError, RunError
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -35,37 +35,56 @@ Keys = Annotated[
     Path | None, typer.Option(help="keys directory: only authorized keys take part (caviar keys)")
 ]
 Http = Annotated[str, typer.Option(help="HOST:PORT: serve status, orders and WebSocket there")]
+Resume = Annotated[Path | None, typer.Option(help="go on with the run in this directory, whose broker died")]
+ScenarioOrNone = Annotated[Path | None, typer.Argument(help="scenario file (TOML)", show_default=False)]
+ANY_PORT = "tcp://127.0.0.1:0"
+
+
+def _nothing_else(*values: object) -> None:
+    if any(value is not None for value in values):
+        raise RunError("a run goes on as it began: --resume takes no scenario, frames, seed or --embedded")
 
 
 @app.command()
 def run(
-    scenario: ScenarioFile,
+    scenario: ScenarioOrNone = None,
     frames: Frames = None,
     seed: Seed = None,
     json: Annotated[Path | None, typer.Option(help="write the summary to this file too")] = None,
     out: Annotated[Path, typer.Option(help="directory in which the run's own is made")] = Path("runs"),
-    bind: Annotated[str, typer.Option(help="address of the broker; port 0: any")] = "tcp://127.0.0.1:0",
+    bind: Annotated[str, typer.Option(help="address of the broker; port 0: any")] = ANY_PORT,
     embedded: Annotated[
         bool, typer.Option("--embedded", help="all in this process, without sockets")
     ] = False,
     keys: Keys = None,
     http: Http = "",
+    resume: Resume = None,
 ) -> None:
     """Run a scenario: the broker and every service as processes of their own, or all in this one."""
-    from caviar_clients.cli.run import run_scenario
+    from caviar_clients.cli.run import resume_run, run_scenario
 
+    if resume is not None:
+        _nothing_else(scenario, frames, seed, embedded or None)
+        bind = "" if bind == ANY_PORT else bind
+        raise typer.Exit(resume_run(resume, _console, json, bind, keys, http))
+    if scenario is None:
+        raise RunError("give a scenario file, or --resume with the directory of a run")
     raise typer.Exit(run_scenario(scenario, out, _console, frames, seed, json, bind, embedded, keys, http))
 
 
 @app.command()
 def broker(
-    scenario: ScenarioFile,
-    bind: Annotated[str, typer.Option(help="address to listen on")] = "tcp://127.0.0.1:5570",
+    scenario: ScenarioOrNone = None,
+    bind: Annotated[
+        str,
+        typer.Option(help="address to listen on; by default port 5570 of this machine, or as before"),
+    ] = "",
     frames: Frames = None,
     seed: Seed = None,
     out: Annotated[Path, typer.Option(help="directory in which the run's own is made")] = Path("runs"),
     keys: Keys = None,
     http: Http = "",
+    resume: Resume = None,
 ) -> None:
     """Run only the broker; start the services with `caviar service`, here or on other machines."""
     from caviar_broker.__main__ import parser, serve
@@ -73,6 +92,14 @@ def broker(
     from caviar_clients.cli.run import run_directory
     from caviar_clients.sessions.checking import checked_scenario
 
+    if resume is not None:
+        _nothing_else(scenario, frames, seed)
+        again = ["--resume", str(resume), "--bind", bind]
+        again += [] if keys is None else ["--keys", str(keys)]
+        again += ["--http", http] if http else []
+        raise typer.Exit(serve(parser().parse_args(again)))
+    if scenario is None:
+        raise RunError("give a scenario file, or --resume with the directory of a run")
     checked = checked_scenario(scenario, frames, seed)
     check_bind(bind, keys=keys is not None)
     directory = run_directory(out, checked.run.name)
