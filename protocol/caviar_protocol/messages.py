@@ -49,7 +49,7 @@ from caviar_protocol.items import Status as Status
 PROTOCOL_VERSION = (1, 1)
 """Major and minor version of the protocol that this package speaks."""
 
-CAPABILITIES: tuple[str, ...] = ("assets", "episodes", "parts")
+CAPABILITIES: tuple[str, ...] = ("assets", "checkpoint", "episodes", "parts")
 """Optional features that this package implements. Peers use what both of them list."""
 
 

@@ -37,7 +37,7 @@ def hello_of(name: str, use: str, cls: type[Service[Any]], host: str = "", pid: 
         role=cls.role,
         inputs=cls.inputs,
         outputs=cls.outputs,
-        capabilities=m.CAPABILITIES,
+        capabilities=tuple(c for c in m.CAPABILITIES if c != "checkpoint" or cls.checkpoints),
         implementation=use,
         max_in_flight=limits.MAX_IN_FLIGHT,
         host=host,

@@ -12,13 +12,14 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, cast
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from caviar_protocol.arrays import Int64Array, quantity
+from caviar_protocol.arrays import Float64Array, Int64Array, quantity
+from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.errors import PayloadError, ScenarioError, SetupError
 from caviar_protocol.seeding import derive_seed
@@ -30,7 +31,7 @@ from caviar_services.channel.matrices import Matrices
 from caviar_services.channel.mesh_detail import DetailSettings
 from caviar_services.channel.mimo_rt import ElementTracer
 from caviar_services.channel.paths import Antenna, PathTable
-from caviar_services.channel.sionna_follow import Followed
+from caviar_services.channel.sionna_follow import Followed, FollowedState, TableState
 from caviar_services.channel.sionna_launch import LaunchOptions
 from caviar_services.channel.sionna_materials import (
     MaterialPolicy,
@@ -49,6 +50,7 @@ from caviar_services.channel.traced_surfaces import traced_surfaces
 from caviar_services.channel.visibility import outermost
 from caviar_services.llvm import activate_llvm, choose_variant
 from caviar_services.service import Frame, Preparation, RunInfo, StepResult
+from caviar_services.state import restored, saved
 
 Array = NDArray[Any]
 
@@ -93,7 +95,7 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     ) = None
     """Reflections and transmissions are followed from frame to frame, not looked for with all rays in each:
     new ones are found within this many frames, and a channel that is started again in the middle of an
-    episode cannot go on. Absent: each frame stands on its own."""
+    episode cannot go on unless states are saved. Absent: each frame stands on its own."""
     receivers_at_once: Annotated[
         int | None, quantity("1", "receivers looked at together; absent: as many as fit")
     ] = None
@@ -131,6 +133,17 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
             )
 
 
+class _State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What is followed; nothing where each frame stands on its own."""
+
+    followed: dict[str, FollowedState] = {}
+    """By transmitter."""
+    scene: tuple[bytes, bytes] | None = None
+    """That the bodies stand in, header and body; None: they have been moved since."""
+    offers: dict[bytes, TableState] = {}
+    """What is on offer while nothing moves, by the position that it was launched from."""
+
+
 class SionnaChannel(PathModel[SionnaSettings]):
     """Ray-traced channel, on any number of carriers.
 
@@ -142,6 +155,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
     Settings: ClassVar[type[msgspec.Struct]] = SionnaSettings
     rung = "siso-rt"
     uses_scenery: ClassVar[bool] = True
+    checkpoints: ClassVar[bool] = True
 
     def __init__(self, settings: SionnaSettings, run: RunInfo) -> None:
         super().__init__(settings, run)
@@ -153,6 +167,8 @@ class SionnaChannel(PathModel[SionnaSettings]):
         self._diffuse: Tracer | None = None
         """Traces diffuse paths where they have a launch of their own."""
         self._followed: dict[str, Followed] = {}
+        self._placed: tuple[Scene, int] | None = None
+        """What the bodies were moved to last, with the version that the scene then had."""
         self._outside: tuple[OutsideUse, ...] = ()
         self._detail = ""
         seed = settings.launch_seed
@@ -222,14 +238,40 @@ class SionnaChannel(PathModel[SionnaSettings]):
     def reset(self, episode: int, seed: int, t0_ns: int) -> None:
         """Forget the paths of the episode before: what is followed must not begin with them."""
         self._followed.clear()
+        self._placed = None
         self._tracer.forget()
+
+    def checkpoint(self) -> bytes:
+        """The chains that are followed."""
+        if self.settings.follow is None or self._placed is None:
+            return saved(self, 1, _State())
+        scene, version = self._placed
+        stands = version == self._scene.version
+        state = _State(
+            followed={name: followed.state for name, followed in self._followed.items()},
+            scene=encode_payload(scene) if stands else None,
+            offers=self._tracer.offers() if stands else {},
+        )
+        return saved(self, 1, state)
+
+    def restore(self, state: bytes) -> None:
+        """See `checkpoint`."""
+        was, parts = restored(self, 1, _State, state), self.settings.follow
+        if parts is None:
+            return
+        self._followed = {name: Followed.going_on(parts, one) for name, one in was.followed.items()}
+        if was.scene is not None:
+            self._activate()
+            self._place(cast(Scene, decode_payload("scene", *was.scene)))
+            self._tracer.offer_again(was.offers)
 
     def step(self, frame: Frame) -> StepResult:
         """Raises `PayloadError` where paths that shall be followed are not known."""
         if self.settings.follow is not None and frame.previous < 0 < frame.number:
             raise PayloadError(
                 f"{self.run.name} follows paths from the beginning of an episode and was started again in "
-                f"frame {frame.number}, where it knows none; without its setting `follow` the run goes on"
+                f"frame {frame.number}, where it knows none; have states saved (run.checkpoint_frames above "
+                "0), or leave out its setting `follow`"
             )
         return super().step(frame)
 
@@ -240,12 +282,9 @@ class SionnaChannel(PathModel[SionnaSettings]):
         dr.flush_malloc_cache()
 
     def paths(self, scene: Scene, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]) -> Found:
-        import mitsuba as mi
-
-        if mi.variant() != self._variant:
-            mi.set_variant(self._variant)
+        self._activate()
         _refuse_buried(scene, self.settings.without_body)
-        names, velocity = self._scene.place(scene, frozenset(self.settings.without_body))
+        names, velocity = self._place(scene)
         clear = [self._cleared(antenna) for antenna in (*transmitters, *receivers)]
         sources, targets = clear[: len(transmitters)], clear[len(transmitters) :]
         parts = [part for t, source in enumerate(sources) for part in self._launch(t, source, targets, names)]
@@ -267,6 +306,19 @@ class SionnaChannel(PathModel[SionnaSettings]):
             },
             matrices=self._matrices([part for _, part in parts], table, (sources, targets)),
         )
+
+    def _activate(self) -> None:
+        """The variant of Mitsuba is the process's, and others may have set theirs."""
+        import mitsuba as mi
+
+        if mi.variant() != self._variant:
+            mi.set_variant(self._variant)
+
+    def _place(self, scene: Scene) -> tuple[tuple[str, ...], Float64Array]:
+        """Move the bodies; see `SionnaScene.place`."""
+        placed = self._scene.place(scene, frozenset(self.settings.without_body))
+        self._placed = scene, self._scene.version
+        return placed
 
     def _matrices(self, launches: Sequence[Traced], table: PathTable, traced_from: Ends) -> Matrices | None:
         """How the rung makes H; `plane_waves` where it has no way of its own."""
