@@ -72,7 +72,7 @@ def restored(service: Service[Any], version: int, cls: type[T], state: bytes) ->
     who = f"{service.run.name!r} cannot go on from a saved state"
     try:
         envelope = msgspec.msgpack.decode(state, type=_Envelope)
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
         raise RunError(f"{who}: these {len(state)} bytes are none ({error}); start the run again") from error
     if _digest(envelope.body) != envelope.digest:
         raise RunError(f"{who}: its bytes are not those that were saved; start the run again")

@@ -270,8 +270,8 @@ class SionnaChannel(PathModel[SionnaSettings]):
         if self.settings.follow is not None and frame.previous < 0 < frame.number:
             raise PayloadError(
                 f"{self.run.name} follows paths from the beginning of an episode and was started again in "
-                f"frame {frame.number}, where it knows none; have states saved (run.checkpoint_frames above "
-                "0), or leave out its setting `follow`"
+                f"frame {frame.number}, where it knows none; without its setting `follow`, or with states "
+                "saved (run.checkpoint_frames above 0), the run goes on"
             )
         return super().step(frame)
 
