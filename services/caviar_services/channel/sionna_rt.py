@@ -12,14 +12,13 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any, ClassVar, Literal, cast
+from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from caviar_protocol.arrays import Float64Array, Int64Array, quantity
-from caviar_protocol.codec import decode_payload, encode_payload
+from caviar_protocol.arrays import Int64Array, quantity
 from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.errors import PayloadError, ScenarioError, SetupError
 from caviar_protocol.seeding import derive_seed
@@ -31,7 +30,8 @@ from caviar_services.channel.matrices import Matrices
 from caviar_services.channel.mesh_detail import DetailSettings
 from caviar_services.channel.mimo_rt import ElementTracer
 from caviar_services.channel.paths import Antenna, PathTable
-from caviar_services.channel.sionna_follow import Followed, FollowedState, TableState
+from caviar_services.channel.sionna_follow import Followed
+from caviar_services.channel.sionna_following import Following, FollowingState
 from caviar_services.channel.sionna_launch import LaunchOptions
 from caviar_services.channel.sionna_materials import (
     MaterialPolicy,
@@ -133,17 +133,6 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
             )
 
 
-class _State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What is followed; nothing where each frame stands on its own."""
-
-    followed: dict[str, FollowedState] = {}
-    """By transmitter."""
-    scene: tuple[bytes, bytes] | None = None
-    """That the bodies stand in, header and body; None: they have been moved since."""
-    offers: dict[bytes, TableState] = {}
-    """What is on offer while nothing moves, by the position that it was launched from."""
-
-
 class SionnaChannel(PathModel[SionnaSettings]):
     """Ray-traced channel, on any number of carriers.
 
@@ -166,9 +155,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         self._tracer: Tracer
         self._diffuse: Tracer | None = None
         """Traces diffuse paths where they have a launch of their own."""
-        self._followed: dict[str, Followed] = {}
-        self._placed: tuple[Scene, int] | None = None
-        """What the bodies were moved to last, with the version that the scene then had."""
+        self._following: Following | None = None
         self._outside: tuple[OutsideUse, ...] = ()
         self._detail = ""
         seed = settings.launch_seed
@@ -233,37 +220,26 @@ class SionnaChannel(PathModel[SionnaSettings]):
             self._diffuse = Tracer(self._scene, self._wavelengths.tolist(), own)
             launched = replace(launched, scattering=False)
         self._tracer = Tracer(self._scene, self._wavelengths.tolist(), launched)
+        if s.follow is not None:
+            self._following = Following(s.follow, self._scene, self._tracer, frozenset(s.without_body))
         return (*notes, *switched, *self._warm_up())
 
     def reset(self, episode: int, seed: int, t0_ns: int) -> None:
         """Forget the paths of the episode before: what is followed must not begin with them."""
-        self._followed.clear()
-        self._placed = None
+        if self._following is not None:
+            self._following.clear()
         self._tracer.forget()
 
     def checkpoint(self) -> bytes:
         """The chains that are followed."""
-        if self.settings.follow is None or self._placed is None:
-            return saved(self, 1, _State())
-        scene, version = self._placed
-        stands = version == self._scene.version
-        state = _State(
-            followed={name: followed.state for name, followed in self._followed.items()},
-            scene=encode_payload(scene) if stands else None,
-            offers=self._tracer.offers() if stands else {},
-        )
-        return saved(self, 1, state)
+        return saved(self, 1, self._following.state if self._following else FollowingState())
 
     def restore(self, state: bytes) -> None:
         """See `checkpoint`."""
-        was, parts = restored(self, 1, _State, state), self.settings.follow
-        if parts is None:
-            return
-        self._followed = {name: Followed.going_on(parts, one) for name, one in was.followed.items()}
-        if was.scene is not None:
+        was = restored(self, 1, FollowingState, state)
+        if self._following is not None:
             self._activate()
-            self._place(cast(Scene, decode_payload("scene", *was.scene)))
-            self._tracer.offer_again(was.offers)
+            self._following.go_on(was)
 
     def step(self, frame: Frame) -> StepResult:
         """Raises `PayloadError` where paths that shall be followed are not known."""
@@ -284,7 +260,10 @@ class SionnaChannel(PathModel[SionnaSettings]):
     def paths(self, scene: Scene, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]) -> Found:
         self._activate()
         _refuse_buried(scene, self.settings.without_body)
-        names, velocity = self._place(scene)
+        if self._following is not None:
+            names, velocity = self._following.place(scene)
+        else:
+            names, velocity = self._scene.place(scene, frozenset(self.settings.without_body))
         clear = [self._cleared(antenna) for antenna in (*transmitters, *receivers)]
         sources, targets = clear[: len(transmitters)], clear[len(transmitters) :]
         parts = [part for t, source in enumerate(sources) for part in self._launch(t, source, targets, names)]
@@ -313,12 +292,6 @@ class SionnaChannel(PathModel[SionnaSettings]):
 
         if mi.variant() != self._variant:
             mi.set_variant(self._variant)
-
-    def _place(self, scene: Scene) -> tuple[tuple[str, ...], Float64Array]:
-        """Move the bodies; see `SionnaScene.place`."""
-        placed = self._scene.place(scene, frozenset(self.settings.without_body))
-        self._placed = scene, self._scene.version
-        return placed
 
     def _matrices(self, launches: Sequence[Traced], table: PathTable, traced_from: Ends) -> Matrices | None:
         """How the rung makes H; `plane_waves` where it has no way of its own."""
@@ -351,9 +324,8 @@ class SionnaChannel(PathModel[SionnaSettings]):
             corners = Corners(
                 outermost([transmitter], longest)[0], outermost([receivers[r] for r in others], longest)
             )
-        s, followed = self.settings, None
-        if s.follow is not None:
-            followed = self._followed.setdefault(transmitter.name, Followed(s.follow))
+        s = self.settings
+        followed = self._following and self._following.of(transmitter.name)
         found = [
             self._tracer.trace(
                 transmitter.position, targets, s.receivers_at_once, followed, names, corners=corners

@@ -8,7 +8,7 @@ with positions as arrays instead of one device object each, and their flat buffe
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -95,17 +95,17 @@ class Tracer:
         """Trace anew, also where nothing has moved."""
         self._last.clear()
 
-    def offers(self) -> dict[bytes, TableState]:
-        """What followed transmitters have on offer as long as nothing moves, by where they are."""
-        return {
-            position: last.offer.state
+    def offers(self) -> tuple[tuple[bytes, TableState], ...]:
+        """What followed transmitters have on offer as long as nothing moves, and where they are."""
+        return tuple(
+            (position, last.offer.state)
             for position, last in self._last.items()
             if last.version == self._scene.version and isinstance(last.offer, FollowedOffer)
-        }
+        )
 
-    def offer_again(self, offers: Mapping[bytes, TableState]) -> None:
+    def offer_again(self, offers: Sequence[tuple[bytes, TableState]]) -> None:
         """Go on with what was on offer, the scene being as it was then."""
-        for position, state in offers.items():
+        for position, state in offers:
             offer = FollowedOffer.again(state, np.frombuffer(position), self._scene, self._options)
             self._last[position] = _Last(self._scene.version, offer, np.zeros((0, 3)), self.nothing)
 
