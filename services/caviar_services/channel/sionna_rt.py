@@ -325,7 +325,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
                 outermost([transmitter], longest)[0], outermost([receivers[r] for r in others], longest)
             )
         s = self.settings
-        followed = self._following and self._following.of(transmitter.name)
+        followed = None if self._following is None else self._following.of(transmitter.name)
         found = [
             self._tracer.trace(
                 transmitter.position, targets, s.receivers_at_once, followed, names, corners=corners
