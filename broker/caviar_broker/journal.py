@@ -30,6 +30,8 @@ class JournalEntry(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
     products: tuple[tuple[str, bytes, bytes], ...] = ()
     """(topic, payload header, body) of products that a later frame may consume, or a service that
     comes back (clause 18)."""
+    chosen: dict[str, str] = {}
+    """Decisions that the service took."""
     facts: dict[str, int] = {}
     members: tuple[str, ...] = ()
     file: str = ""
@@ -74,6 +76,7 @@ class JournalFile:
         if entry.state is not None:
             file = self.checkpoints.save(entry.service, entry.episode, entry.frame, entry.state)
         return JournalEntry(
+            chosen=dict(entry.chosen or {}),
             facts=dict(entry.facts or {}),
             members=entry.members,
             file=file,

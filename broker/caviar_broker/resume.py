@@ -50,6 +50,7 @@ class _Reader:
         self._products: dict[tuple[str, str], dict[int, tuple[Product, int]]] = {}
         """By (service, topic) and frame: those in the journal, and their entries."""
         self._answered: dict[str, dict[int, Mapping[str, str] | None]] = {}
+        self._chosen: dict[str, dict[int, Mapping[str, str]]] = {}
         self._states: dict[str, list[tuple[int, str]]] = {}
         """Checkpoints by service: frame, file."""
         self._ends: list[JournalEntry] = []
@@ -78,6 +79,7 @@ class _Reader:
             *self._tasks.values(),
             *self._products.values(),
             *self._answered.values(),
+            *self._chosen.values(),
         ]
         for table in tables:
             for late in [number for number in table if number >= frame]:
@@ -96,6 +98,8 @@ class _Reader:
         if entry.outcome in ("done", "late"):
             digests = {d.topic: d.digest for d in entry.decisions if d.status in (Status.FRESH, Status.LATE)}
             self._answered.setdefault(entry.service, {})[entry.frame] = digests
+            if entry.chosen:
+                self._chosen.setdefault(entry.service, {})[entry.frame] = entry.chosen
         elif entry.outcome == "fault":
             self._answered.setdefault(entry.service, {})[entry.frame] = None
         if entry.outcome != "late":
@@ -145,10 +149,12 @@ class _Reader:
             newest = max((number for number in products if number <= low), default=low)
             for old in [number for number in products if number < newest]:
                 del products[old]
-        for name, answered in self._answered.items():
-            base = self._base(self._states[name])[0] if name in self._states else self._finished - 1
-            for old in [number for number in answered if number <= base]:
-                del answered[old]
+        tables: list[dict[str, dict[int, Any]]] = [self._answered, self._chosen]
+        for table in tables:
+            for name, of_frames in table.items():
+                base = self._base(self._states[name])[0] if name in self._states else self._finished - 1
+                for old in [number for number in of_frames if number <= base]:
+                    del of_frames[old]
 
     def _base(self, states: list[tuple[int, str]]) -> tuple[int, str]:
         """The newest checkpoint of a finished frame."""
@@ -188,6 +194,7 @@ class _Reader:
             },
             newest=newest,
             answered=self._answered,
+            chosen=self._chosen,
             states=states,
         )
 

@@ -6,7 +6,9 @@ sees a socket, a deadline or another service: `runner.py` does that part for all
 the embedded run uses the same objects without sockets.
 
 Life of a service: ``__init__`` → ``scenery`` (worlds) → ``prepare`` → per episode ``reset``,
-``step`` for each frame, ``end_episode`` → ``close``.
+``step`` for each frame, ``end_episode`` → ``close``. What a service with state knows after a frame
+it saves with ``checkpoint``; another process takes it over with ``restore``, behind ``reset`` of the
+same episode, and goes on with the same bytes (`state` makes bytes of a struct, and checks them).
 """
 
 from __future__ import annotations

@@ -43,6 +43,12 @@ OVERRIDES: dict[str, dict[str, object]] = {
 }
 """What the small street of the tests needs in other sizes than the scenario."""
 
+FOLLOWING: dict[str, dict[str, object]] = {
+    "channel:adaptive": {"common": {"max_depth": 2, "pool": {}, "bodies": 2, "follow": 2}},
+    "channel:sionna-rt": {"follow": 2},
+}
+"""With these settings a frame needs those before it."""
+
 
 def _example(role: str, name: str) -> tuple[Scenario, str] | None:
     """The first shipped scenario with this implementation, and the service's name there."""
@@ -74,3 +80,12 @@ def _tests_of(key: str) -> type[ServiceConformance]:
 for _key in BUILT_IN:
     _tests = _tests_of(_key)
     globals()[_tests.__name__] = _tests
+
+
+@pytest.mark.parametrize("key", FOLLOWING)
+def test_what_is_followed_goes_on_in_another_process(key: str, tmp_path: Path) -> None:
+    """In the registry's tests each frame stands on its own; here none does."""
+    pytest.importorskip("sionna")
+    tests = _tests_of(key)
+    tests.settings = {**tests.settings, **FOLLOWING[key]}
+    tests().test_another_process_goes_on_with_the_same_bytes(tmp_path)

@@ -114,7 +114,8 @@ class History:
         what = f"clause 18: {send.service} was granted frame {grant.frame} again"
         assert grant.attempt > before.attempt or grant.epoch > before.epoch, what
         assert grant.frame > self.saved.get((grant.episode, send.service), -1), f"{what} behind its state"
-        for field in ("previous_frame", "inputs", "final", "t_ns", "decisions"):
+        assert before.decisions.items() <= grant.decisions.items(), f"{what} with other decisions"
+        for field in ("previous_frame", "inputs", "final", "t_ns"):
             assert getattr(grant, field) == getattr(before, field), f"{what} with another {field}"
         return True
 

@@ -144,7 +144,8 @@ def service(
     role, _, name = use.partition(":")
     command = [sys.executable, "-m", "caviar_services", "sick", "--broker", endpoint, *arguments]
     command += ["--use", f"{role}:runner_services:{name}"]
-    environment = os.environ | {"PYTHONPATH": str(HERE)}
+    paths = [str(HERE), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
     if cache is not None:
         environment["XDG_CACHE_HOME"] = str(cache)
     process = subprocess.Popen(

@@ -13,7 +13,7 @@ from typing import ClassVar
 import msgspec
 import numpy as np
 
-from caviar_protocol.errors import ScenarioError
+from caviar_protocol.errors import RunError, ScenarioError
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.topics import Action, Lidar, LidarScan
 from caviar_services.service import Frame, Preparation, Prepared, Service, StepResult
@@ -216,3 +216,21 @@ class HoldsForever(_Stuck):
     def never_return(self) -> None:
         while True:
             ctypes.PyDLL(None).sleep(60)
+
+
+class Stateful(Sensors):
+    """Its state is the number of its steps."""
+
+    checkpoints: ClassVar[bool] = True
+
+    def reset(self, episode: int, seed: int, t0_ns: int) -> None:
+        self.steps = 0
+
+    def checkpoint(self) -> bytes:
+        self.fail_in("checkpoint")
+        return str(self.steps).encode()
+
+    def restore(self, state: bytes) -> None:
+        if not state.isdigit():
+            raise RunError(f"{state!r} is no number of steps; start the run again")
+        self.steps = int(state)

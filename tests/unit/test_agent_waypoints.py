@@ -131,3 +131,13 @@ def test_settings_without_sense_are_refused(wrong: dict[str, object]) -> None:
     convert_settings(WaypointsSettings, plain)
     with pytest.raises(ScenarioError):
         convert_settings(WaypointsSettings, {**plain, **wrong})
+
+
+def test_another_process_goes_on_to_the_same_waypoint() -> None:
+    """Which were reached does not follow from where the object is."""
+    first, second = agent(), agent()
+    assert targets(first, (10.0, 0.5, 5.0)) == [POINTS[1]]
+    second.restore(first.checkpoint())
+    assert second.checkpoint() == first.checkpoint()
+    assert targets(second, (3.0, 3.0, 5.0)) == [POINTS[1]] == targets(first, (3.0, 3.0, 5.0))
+    assert targets(agent(), (3.0, 3.0, 5.0)) == [POINTS[0]]

@@ -81,6 +81,24 @@ def test_a_service_that_is_killed_gets_its_state_back_and_the_digest_is_the_same
         assert [r.frame for r in run.seen(m.Restore, name)] == [5 if frame > 5 else 2]
 
 
+def test_decisions_that_were_taken_are_imposed_when_a_frame_is_granted_again() -> None:
+    def rung(episode: int, frame: int) -> dict[str, Any]:
+        return {"decisions": {"rung": f"of frame {frame}"}} if frame % 2 else {}
+
+    services = STATEFUL | {"channel": {"stateful": True, "report": rung}}
+    run = simulation(services=services).run(granted("channel", 5))
+    run.kill("channel")
+    run.after(200 * MS, lambda: run.hello("channel"))
+    run.run()
+    repeated = [g for g in run.grants("channel") if g.attempt == 2]
+    assert [(g.frame, g.decisions) for g in repeated][:4] == [
+        (3, {"rung": "of frame 3"}),
+        (4, {}),
+        (5, {}),
+        (6, {}),
+    ]
+
+
 @pytest.mark.parametrize("times", [1, 2])
 def test_a_service_that_dies_while_it_is_being_restored_is_restored_again(times: int) -> None:
     run = simulation().run(granted("link", 5))

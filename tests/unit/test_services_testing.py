@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from caviar_protocol.arrays import quantity
-from caviar_protocol.errors import PayloadError
+from caviar_protocol.errors import PayloadError, RunError
 from caviar_protocol.messages import Input
 from caviar_protocol.topics import Channel
 from caviar_services.agent.base import Agent, AgentSettings
@@ -80,7 +80,73 @@ class Amplifying(FreeSpaceChannel):
         return StepResult(products={"channel": msgspec.structs.replace(channel, a=channel.a * 1e9)})
 
 
+class Counting(FreeSpaceChannel):
+    """Counts the frames of an episode, and does not say that it has state."""
+
+    count = 0
+
+    def reset(self, episode: int, seed: int, t0_ns: int) -> None:
+        self.count = 0
+
+    def step(self, frame: Frame) -> StepResult:
+        self.count += 1
+        channel = super().step(frame).products["channel"]
+        return StepResult(products={"channel": msgspec.structs.replace(channel, dropped=self.count)})
+
+
+class Saving(Counting):
+    """Saves its count."""
+
+    checkpoints: ClassVar[bool] = True
+
+    def checkpoint(self) -> bytes:
+        return self.count.to_bytes(8)
+
+    def restore(self, state: bytes) -> None:
+        if len(state) != 8 or state[0]:
+            raise RunError(f"{state[:8]!r} is no count of frames; start the run again")
+        self.count = int.from_bytes(state)
+
+
+class Forgetting(Saving):
+    """Saves what is not its state."""
+
+    def checkpoint(self) -> bytes:
+        return bytes(8)
+
+
+class Deaf(Saving):
+    """Does not take over what it saved."""
+
+    def restore(self, state: bytes) -> None:
+        """Nothing."""
+
+
+class Credulous(Saving):
+    """Takes over anything."""
+
+    def restore(self, state: bytes) -> None:
+        self.count = int.from_bytes(state)
+
+
+class Restless(Saving):
+    """Saves something else each time."""
+
+    saves = 0
+
+    def checkpoint(self) -> bytes:
+        self.saves += 1
+        return self.saves.to_bytes(8)
+
+
+_GOES_ON = "test_another_process_goes_on_with_the_same_bytes"
+
 BROKEN = [
+    (Counting, _GOES_ON),
+    (Forgetting, _GOES_ON),
+    (Deaf, _GOES_ON),
+    (Credulous, "test_what_is_no_state_is_refused"),
+    (Restless, "test_saving_twice_gives_the_same_bytes"),
     (Unseeded, "test_the_same_seed_gives_the_same_bytes_in_another_life"),
     (Remembering, "test_a_reset_leaves_nothing_of_the_episode_before"),
     (Infinite, "test_products_are_finite_and_survive_the_wire"),
@@ -105,8 +171,13 @@ def test_a_broken_service_fails_the_test_of_what_it_breaks(
     test = getattr(tests, name)
     arguments = {"played": played, "tmp_path": tmp_path / "second"}
     wanted = test.__code__.co_varnames[1 : test.__code__.co_argcount]
-    with pytest.raises((AssertionError, PayloadError)):
+    with pytest.raises((AssertionError, PayloadError, pytest.fail.Exception)):
         test(**{key: arguments[key] for key in wanted})
+
+
+@pytest.mark.parametrize("name", [_GOES_ON, "test_saving_twice_gives_the_same_bytes"])
+def test_a_service_that_saves_all_of_its_state_passes(name: str, tmp_path: Path) -> None:
+    getattr(conformance_of(Saving, ChannelConformance), name)(tmp_path)
 
 
 class LooseSettings(msgspec.Struct, kw_only=True):

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from caviar_protocol.codec import encode_payload
 from caviar_protocol.coordinates import Vector, euler_from_quaternion
 from caviar_protocol.errors import PayloadError, RunError, ScenarioError
 from caviar_protocol.messages import GrantInput, Status
@@ -214,6 +215,36 @@ def test_a_process_that_comes_back_in_the_middle_does_not_start_over() -> None:
     made.reset(0, 1, 0)
     with pytest.raises(RunError, match="came back in frame 7"):
         made.step(commanded(7, {}))
+
+
+@given(
+    first=points,
+    then=st.one_of(points, st.none()),
+    split=st.integers(1, 19),
+    period_ms=st.integers(3, 130),
+)
+@settings(max_examples=40, deadline=None)
+def test_another_process_flies_on_bit_by_bit(
+    first: Vector, then: Vector | None, split: int, period_ms: int
+) -> None:
+    """To a waypoint, then to another or with no command, saved in the middle of a sub-step or not."""
+
+    def frame(number: int) -> Frame:
+        target = first if number < 10 else then
+        told = {} if target is None else {"a": (WaypointCommand(object="uav", position=target, speed=20.0),)}
+        return commanded(number, told, t_ns=number * period_ms * 1_000_000)
+
+    original, other = world(), world()
+    for number in range(1, split):
+        original.step(frame(number))
+    kept = original.checkpoint()
+    other.reset(0, 1, 0)
+    other.restore(kept)
+    assert other.checkpoint() == kept
+    for number in range(split, 20):
+        one, two = original.step(frame(number)), other.step(frame(number))
+        assert encode_payload(one.products["scene"]) == encode_payload(two.products["scene"])
+        assert one.counts == two.counts
 
 
 def test_two_agents_cannot_fly_one_object() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import math
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -16,6 +17,7 @@ from world_builders import T_SAM_NS, scene_at, wire_bytes
 
 from caviar_protocol.coordinates import rotation_matrix
 from caviar_protocol.errors import CaviarError, RunError, ScenarioError, SetupError
+from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.topics import Scene
 from caviar_services.service import Frame, Preparation, RunInfo
 from caviar_services.world.sumo import SumoSettings, SumoWorld, step_length_ms
@@ -51,6 +53,34 @@ print(digest.hexdigest())
 """
 
 
+INTERRUPTED = """
+import os, signal, sys
+from pathlib import Path
+from caviar_protocol.codec import encode_payload
+from caviar_services.service import Frame, Preparation, RunInfo
+from caviar_services.world.sumo import SumoSettings, SumoWorld
+
+folder, scratch, first, last, kill = sys.argv[1], Path(sys.argv[2]), *map(int, sys.argv[3:])
+world = SumoWorld(
+    SumoSettings(net=folder + "/canyon.net.xml", routes=folder + "/canyon.rou.xml", begin_s=20.0),
+    RunInfo(name="traffic", devices=()),
+)
+world.prepare(Preparation(demand={}))
+world.reset(0, 7, 0)
+if first:
+    world.restore((scratch / "state").read_bytes())
+with (scratch / "products").open("ab") as file:
+    for number in range(first, last):
+        frame = Frame(episode=0, number=number, t_ns=number * 100_000_000, previous=number - 1)
+        for part in encode_payload(world.step(frame).products["scene"]):
+            file.write(part)
+if kill:
+    (scratch / "state").write_bytes(world.checkpoint())
+    os.kill(os.getpid(), signal.SIGKILL)
+world.close()
+"""
+
+
 @pytest.fixture
 def make(repository: Path) -> Iterator[Make]:
     """Worlds in the street of the canyon. Making one closes the one before, and the test's end the
@@ -58,7 +88,12 @@ def make(repository: Path) -> Iterator[Make]:
     folder = repository / "deploy" / "scenarios" / "street-canyon"
     worlds: list[SumoWorld] = []
 
-    def create(name: str = "traffic", sampling_period_ns: int = T_SAM_NS, **changes: object) -> SumoWorld:
+    def create(
+        name: str = "traffic",
+        sampling_period_ns: int = T_SAM_NS,
+        devices: tuple[DeviceSpec, ...] = (),
+        **changes: object,
+    ) -> SumoWorld:
         files = {
             "net": str(folder / "canyon.net.xml"),
             "routes": str(folder / "canyon.rou.xml"),
@@ -67,7 +102,8 @@ def make(repository: Path) -> Iterator[Make]:
         settings = SumoSettings(**{**files, **changes})
         for world in worlds:
             world.close()
-        worlds.append(SumoWorld(settings, RunInfo(name=name, sampling_period_ns=sampling_period_ns)))
+        run = RunInfo(name=name, sampling_period_ns=sampling_period_ns, devices=devices)
+        worlds.append(SumoWorld(settings, run))
         worlds[-1].prepare(Preparation(demand={}))
         return worlds[-1]
 
@@ -401,3 +437,49 @@ def test_a_configuration_file_is_run_and_settings_go_before_it(
 
     assert len(names((), 60.0)) > 5
     assert names(str(mine), 1.0) == ("traffic.mine",)
+
+
+# --- states ------------------------------------------------------------------------------------
+
+
+def test_a_process_that_is_killed_is_gone_on_for_by_another(repository: Path, tmp_path: Path) -> None:
+    """60 frames in one process, and with a kill behind frame 16: the same bytes."""
+    folder = repository / "deploy" / "scenarios" / "street-canyon"
+
+    def run(scratch: Path, first: int, last: int, *, kill: bool) -> int:
+        scratch.mkdir(exist_ok=True)
+        numbers = map(str, (first, last, int(kill)))
+        command = [sys.executable, "-c", INTERRUPTED, str(folder), str(scratch), *numbers]
+        return subprocess.run(command, check=False, timeout=60).returncode
+
+    assert run(tmp_path / "whole", 0, 60, kill=False) == 0
+    assert run(tmp_path / "broken", 0, 17, kill=True) == -signal.SIGKILL
+    assert run(tmp_path / "broken", 17, 60, kill=False) == 0
+    whole, broken = ((tmp_path / name / "products").read_bytes() for name in ("whole", "broken"))
+    assert hashlib.sha256(whole).hexdigest() == hashlib.sha256(broken).hexdigest()
+    assert len(whole) > 60 * 100
+
+
+def test_who_came_first_keeps_a_device_in_another_process(make: Make) -> None:
+    """A pattern's devices are with those that came first, also of objects that came long ago."""
+    devices = (DeviceSpec(name="rx", kind="antenna", role="rx", on="*", count=2),)
+    world = make(devices=devices)
+    before = scenes(world, 7, 40)
+    state = world.checkpoint()
+    expected = [wire_bytes(scene_at(world, k)) for k in range(40, 60)]
+    assert len(before[-1].names) > 2
+    again = make(devices=devices)
+    again.reset(0, 7, 0)
+    again.restore(state)
+    assert again.checkpoint() == state
+    assert [wire_bytes(scene_at(again, k)) for k in range(40, 60)] == expected
+
+
+def test_other_traffic_than_that_which_was_saved_is_an_error(make: Make) -> None:
+    """What SUMO then does is not what the run has seen."""
+    world = make()
+    scenes(world, 7, 30)
+    state = world.checkpoint()
+    world.reset(0, 8, 0)
+    with pytest.raises(RunError, match="has other traffic 29 steps behind frame 0 than it had before"):
+        world.restore(state)

@@ -216,6 +216,7 @@ class DecisionBook:
                     for topic, decision in decisions.items()
                 ),
                 products=products,
+                chosen=task.report.decisions if task.report else None,
             )
         )
 

@@ -179,17 +179,23 @@ class Episodes:
         if message.seed >= 0:
             self._seed_chosen(peer, message, schedule, now)
         if self.recall.of(peer.name) is not None:
-            self._remember(peer, schedule, self.recall.digests(peer, message))
+            self._remember(peer, schedule, self.recall.digests(peer, message), message.decisions)
         schedule.done(peer.name, message.frame, products, now, told, end=message.end_episode)
         if message.end_episode and peer.role == "agent":
             self._tell(schedule)  # entries in order
             run.enter_journal("end", peer.name, message.frame, now, facts={"frames": schedule.frames})
         self._save_if_due(peer, schedule, now)
 
-    def _remember(self, peer: Peer, schedule: EpisodeSchedule, digests: Mapping[str, str] | None) -> None:
+    def _remember(
+        self,
+        peer: Peer,
+        schedule: EpisodeSchedule,
+        digests: Mapping[str, str] | None,
+        chosen: Mapping[str, str],
+    ) -> None:
         order = schedule.outstanding(peer.name)[0].order
         if order is not None:
-            self.recall.answered(peer, order, digests)
+            self.recall.answered(peer, order, digests, chosen)
 
     def _save_if_due(self, peer: Peer, schedule: EpisodeSchedule, now: int) -> None:
         if self.recall.is_due(peer) and not schedule.is_through(peer.name):
@@ -235,7 +241,7 @@ class Episodes:
         if needed and peer.plan.policy in ("wait", "abort"):
             run.fail(f"{peer} failed in frame {message.frame}, {text}", peer.name, now)
         else:
-            self._remember(peer, schedule, None)
+            self._remember(peer, schedule, None, {})
             schedule.fault(peer.name, message.frame, text, now)
             self._save_if_due(peer, schedule, now)
 
@@ -302,8 +308,10 @@ class Episodes:
         elif schedule.finished:
             self._over(schedule, now)
 
-    def _grant(self, order: GrantOrder) -> None:
+    def _grant(self, order: GrantOrder, chosen: Mapping[str, str] | None = None) -> None:
+        """GRANT; with ``chosen`` it was answered before, after these decisions."""
         run, peer = self._run, self._run.peers[order.service]
+        imposed = run.plan.imposed.get((order.service, run.episode, order.frame), {})
         grant = Grant(
             epoch=run.plan.epoch,
             attempt=peer.attempt,
@@ -314,7 +322,7 @@ class Episodes:
             budget_ns=peer.plan.budget_ns,
             inputs=order.inputs,
             final=order.final,
-            decisions=dict(run.plan.imposed.get((order.service, run.episode, order.frame), {})),
+            decisions={**imposed, **(chosen or {})},
             reports=order.reports,
         )
         run.send(peer, grant, order.products)

@@ -184,6 +184,8 @@ class Journal(msgspec.Struct, frozen=True):
     decisions: tuple[GrantInput, ...] = ()
     products: tuple[Product, ...] = ()
     """Those that a later frame may consume, or a service that comes back."""
+    chosen: Mapping[str, str] | None = None
+    """Decisions that the service took."""
     facts: Mapping[str, int] | None = None
     """``seed``, ``seed_episode`` and ``frames``, where they are told."""
     members: tuple[str, ...] = ()

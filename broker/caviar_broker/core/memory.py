@@ -22,6 +22,8 @@ class Remembered:
     order: GrantOrder
     digests: Mapping[str, str] | None
     """By topic; None: with FAULT."""
+    chosen: Mapping[str, str] = field(default_factory=dict)
+    """Decisions that were taken: imposed when it is granted again, since they may rest on wall time."""
 
 
 @dataclass(slots=True)
@@ -45,9 +47,15 @@ class Memory:
     position: int = 0
     """The grant that is sent again next, or was and is not answered yet."""
 
-    def remember(self, order: GrantOrder, digests: Mapping[str, str] | None, weigh: Weigh) -> None:
+    def remember(
+        self,
+        order: GrantOrder,
+        digests: Mapping[str, str] | None,
+        weigh: Weigh,
+        chosen: Mapping[str, str] | None = None,
+    ) -> None:
         """A grant was answered."""
-        self.grants.append(Remembered(order, digests))
+        self.grants.append(Remembered(order, digests, chosen or {}))
         self.weight += sum(weigh(product.payload) for product in order.products)
 
     def due(self, period: int) -> bool:

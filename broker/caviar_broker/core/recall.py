@@ -24,7 +24,7 @@ class Recall:
     run
         The run.
     grant
-        Sends a grant.
+        Sends a grant, with decisions imposed.
     returned
         Called with a service that is where it was.
     weigh
@@ -34,7 +34,7 @@ class Recall:
     def __init__(
         self,
         run: Run,
-        grant: Callable[[GrantOrder], None],
+        grant: Callable[[GrantOrder, Mapping[str, str]], None],
         returned: Callable[[Peer, int], None],
         weigh: Weigh,
     ) -> None:
@@ -79,11 +79,13 @@ class Recall:
         elif begins:
             self._memories[peer.name] = Memory()
 
-    def answered(self, peer: Peer, order: GrantOrder, digests: Mapping[str, str] | None) -> None:
-        """A grant was answered with these products; None: with FAULT."""
+    def answered(
+        self, peer: Peer, order: GrantOrder, digests: Mapping[str, str] | None, chosen: Mapping[str, str]
+    ) -> None:
+        """A grant was answered with these products, or with FAULT (None), after these decisions."""
         memory = self._memories.get(peer.name)
         if memory is not None:
-            memory.remember(order, digests, self._weigh)
+            memory.remember(order, digests, self._weigh, chosen)
 
     # --- saving --------------------------------------------------------------------------------------
 
@@ -157,7 +159,7 @@ class Recall:
         pending = memory.pending
         if pending is not None:
             peer.restored = True
-            self._grant(pending.order)
+            self._grant(pending.order, pending.chosen)
         else:
             peer.move(ServiceEvent.RESTORED, now)
             self._returned(peer, now)

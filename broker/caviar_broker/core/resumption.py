@@ -48,6 +48,8 @@ class Resumption:
     """Newest product and its journal entry by (service, topic)."""
     answered: Mapping[str, Mapping[int, Mapping[str, str] | None]] = field(default_factory=dict)
     """What services answered: digests by topic, None for FAULT, by service and frame."""
+    chosen: Mapping[str, Mapping[int, Mapping[str, str]]] = field(default_factory=dict)
+    """Decisions that services took, by service and frame."""
     states: Mapping[str, tuple[int, Any]] = field(default_factory=dict)
     """Last checkpoint: frame and state, by service; frame −1 where there is none."""
 
@@ -61,7 +63,7 @@ class Resumption:
             for number, digests in sorted(self.answered.get(name, {}).items()):
                 if frame < number < self.finished:
                     order = self._order(name, number, memory.last, inputs)
-                    memory.remember(order, digests, weigh)
+                    memory.remember(order, digests, weigh, self.chosen.get(name, {}).get(number))
         return found
 
     def restore(self, book: DecisionBook) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import msgspec
 
@@ -15,6 +15,7 @@ from caviar_protocol.topics import BeamChoice, Scene, WaypointCommand
 from caviar_services.agent.base import Agent, AgentSettings
 from caviar_services.agent.los_beam import straight_choices
 from caviar_services.service import Frame, RunInfo
+from caviar_services.state import restored, saved
 
 
 class WaypointsSettings(AgentSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -28,10 +29,16 @@ class WaypointsSettings(AgentSettings, frozen=True, kw_only=True, forbid_unknown
     reach_m: Annotated[float, quantity("m", "so near, a waypoint is reached", gt=0)] = 1.0
 
 
+class _State(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    next: Annotated[int, msgspec.Meta(ge=0)]
+    """Index of the waypoint that it flies to."""
+
+
 class WaypointsAgent(Agent[WaypointsSettings]):
     """Goes to the next waypoint when one is reached; the beams are those of ``los-beam``."""
 
     Settings = WaypointsSettings
+    checkpoints: ClassVar[bool] = True
 
     def __init__(self, settings: WaypointsSettings, run: RunInfo) -> None:
         super().__init__(settings, run)
@@ -40,6 +47,14 @@ class WaypointsAgent(Agent[WaypointsSettings]):
     def reset(self, episode: int, seed: int, t0_ns: int) -> None:
         """Every episode begins with the first waypoint."""
         self._next = 0
+
+    def checkpoint(self) -> bytes:
+        """The waypoint under way: which were reached does not follow from where the object is."""
+        return saved(self, 1, _State(self._next))
+
+    def restore(self, state: bytes) -> None:
+        """See `checkpoint`."""
+        self._next = restored(self, 1, _State, state).next
 
     def other_actuators(self) -> tuple[str, ...]:
         """The motion of the object."""

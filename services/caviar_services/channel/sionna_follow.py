@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt64Array
@@ -27,6 +28,7 @@ from caviar_services.channel.sionna_launch import (
 )
 from caviar_services.channel.sionna_scene import SionnaScene
 from caviar_services.columns import aligned_columns, aligned_indices
+from caviar_services.state import Packed
 
 _JUMP = 20.0
 """[m] A transmitter that has moved farther since the frame before is looked for anew."""
@@ -66,6 +68,50 @@ class _Table:
         return self.depth, self.kind, self.triangle, self.probability, self.seen
 
 
+class TableState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Chains in a saved state; the columns are those of a table."""
+
+    depth: Packed
+    kind: Packed
+    triangle: Packed
+    probability: Packed
+    seen: Packed
+
+    @classmethod
+    def of(cls, table: _Table) -> TableState:
+        """The state of a table."""
+        return cls(
+            depth=Packed.of(table.depth, "<i4"),
+            kind=Packed.of(table.kind, "<i4"),
+            triangle=Packed.of(table.triangle, "<i4"),
+            probability=Packed.of(table.probability, "<f8"),
+            seen=Packed.of(table.seen, "<i8"),
+        )
+
+    def table(self) -> _Table:
+        """The table."""
+        return _Table(
+            depth=self.depth.array(np.int64),
+            kind=self.kind.array(np.int64),
+            triangle=self.triangle.array(np.int64),
+            probability=self.probability.array(np.float64),
+            seen=self.seen.array(np.int64),
+        )
+
+
+class FollowedState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A `Followed` between two frames."""
+
+    number: int
+    known: TableState | None
+    names: tuple[str, ...]
+    came_from: Packed
+    rays: int
+    """Of a launch; 0 before the first."""
+    on_object: Packed
+    """Numbers of those that met a moving object."""
+
+
 class Followed:
     """The chains of one transmitter, from the beginning of an episode on.
 
@@ -87,6 +133,29 @@ class Followed:
         """Where the last launch came from [m]."""
         self._on_object: BoolArray = np.zeros(0, np.bool_)
         """Which rays met a moving object when they were launched last."""
+
+    @property
+    def state(self) -> FollowedState:
+        """All that the chains of the next frame follow from, beside its scene."""
+        return FollowedState(
+            number=self._number,
+            known=None if self._known is None else TableState.of(self._known),
+            names=self._names,
+            came_from=Packed.of(self._from, "<f8"),
+            rays=len(self._on_object),
+            on_object=Packed.of(np.flatnonzero(self._on_object), "<i4"),
+        )
+
+    @classmethod
+    def going_on(cls, parts: int, state: FollowedState) -> Followed:
+        """One that is where another was."""
+        made = cls(parts)
+        made._number, made._names = state.number, state.names
+        made._known = None if state.known is None else state.known.table()
+        made._from = state.came_from.array(np.float64)
+        made._on_object = np.zeros(state.rays, np.bool_)
+        made._on_object[state.on_object.array(np.int64)] = True
+        return made
 
     def offer(
         self,
@@ -110,7 +179,7 @@ class Followed:
             known = replace(known, triangle=triangle).take((triangle >= 0).all(1) & recent)
             met = met.with_those(known.take(~np.isin(_keys(known, scene), _keys(met, scene))))
         self._known, self._names, self._number, self._from = met, names, number + 1, transmitter
-        return _FollowedOffer(met, scene, source, options)
+        return FollowedOffer(met, scene, source, options)
 
     def _rays(self, number: int) -> Int64Array:
         """Numbers of the rays of a part, and of those on or beside moving objects."""
@@ -134,8 +203,20 @@ class Followed:
             self._on_object[rays] = met
 
 
-class _FollowedOffer(Offer):
+class FollowedOffer(Offer):
     """Known chains in place of those of a launch."""
+
+    @classmethod
+    def again(
+        cls, state: TableState, transmitter: Float64Array, scene: SionnaScene, options: LaunchOptions
+    ) -> FollowedOffer:
+        """What was on offer from a position when the scene was as it is now."""
+        return cls(state.table(), scene, positions(transmitter[None]), options)
+
+    @property
+    def state(self) -> TableState:
+        """What is on offer."""
+        return TableState.of(self._table)
 
     def __init__(self, table: _Table, scene: SionnaScene, source: Any, options: LaunchOptions) -> None:
         super().__init__(scene, Launch((), None), source, options)

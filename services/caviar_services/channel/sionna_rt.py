@@ -34,6 +34,7 @@ from caviar_services.channel.mesh_detail import DetailSettings
 from caviar_services.channel.mimo_rt import ElementTracer
 from caviar_services.channel.paths import Antenna, PathTable
 from caviar_services.channel.sionna_follow import Followed
+from caviar_services.channel.sionna_following import Following, FollowingState
 from caviar_services.channel.sionna_launch import LaunchOptions
 from caviar_services.channel.sionna_materials import (
     MaterialPolicy,
@@ -53,6 +54,7 @@ from caviar_services.channel.traced_surfaces import traced_surfaces
 from caviar_services.channel.visibility import outermost
 from caviar_services.llvm import activate_llvm, choose_variant
 from caviar_services.service import Frame, Preparation, RunInfo, StepResult
+from caviar_services.state import restored, saved
 
 Array = NDArray[Any]
 
@@ -109,7 +111,7 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     ) = None
     """Reflections and transmissions are followed from frame to frame, not looked for with all rays in each:
     new ones are found within this many frames, and a channel that is started again in the middle of an
-    episode cannot go on. Absent: each frame stands on its own."""
+    episode cannot go on unless states are saved. Absent: each frame stands on its own."""
     receivers_at_once: Annotated[
         int | None, quantity("1", "receivers looked at together; absent: as many as fit")
     ] = None
@@ -166,6 +168,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
     Settings: ClassVar[type[msgspec.Struct]] = SionnaSettings
     rung = "siso-rt"
     uses_scenery: ClassVar[bool] = True
+    checkpoints: ClassVar[bool] = True
 
     def __init__(self, settings: SionnaSettings, run: RunInfo) -> None:
         super().__init__(settings, run)
@@ -181,7 +184,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         """Traces where no edge is in range."""
         self._without_edge = 0
         """Transmitters of this frame that no edge is in range of."""
-        self._followed: dict[str, Followed] = {}
+        self._following: Following | None = None
         self._outside: tuple[OutsideUse, ...] = ()
         self._detail = ""
         seed = settings.launch_seed
@@ -263,23 +266,38 @@ class SionnaChannel(PathModel[SionnaSettings]):
                 "no_edge_in_range tells for how many transmitters"
             )
             notes = (*notes, range_note)
+        if s.follow is not None:
+            self._following = Following(s.follow, self._scene, self._tracer, frozenset(s.without_body))
         return (*notes, *switched, *self._warm_up())
 
     def reset(self, episode: int, seed: int, t0_ns: int) -> None:
         """Forget the paths of the episode before: what is followed must not begin with them."""
-        self._followed.clear()
+        if self._following is not None:
+            self._following.clear()
         self._tracer.forget()
         if self._edge_range is not None:
             self._unbent.forget()
         if self._diffuse is not None:
             self._diffuse.forget()
 
+    def checkpoint(self) -> bytes:
+        """The chains that are followed."""
+        return saved(self, 1, self._following.state if self._following else FollowingState())
+
+    def restore(self, state: bytes) -> None:
+        """See `checkpoint`."""
+        was = restored(self, 1, FollowingState, state)
+        if self._following is not None:
+            self._activate()
+            self._following.go_on(was)
+
     def step(self, frame: Frame) -> StepResult:
         """Raises `PayloadError` where paths that shall be followed are not known."""
         if self.settings.follow is not None and frame.previous < 0 < frame.number:
             raise PayloadError(
                 f"{self.run.name} follows paths from the beginning of an episode and was started again in "
-                f"frame {frame.number}, where it knows none; without its setting `follow` the run goes on"
+                f"frame {frame.number}, where it knows none; without its setting `follow`, or with states "
+                "saved (run.checkpoint_frames above 0), the run goes on"
             )
         return super().step(frame)
 
@@ -290,12 +308,12 @@ class SionnaChannel(PathModel[SionnaSettings]):
         dr.flush_malloc_cache()
 
     def paths(self, scene: Scene, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]) -> Found:
-        import mitsuba as mi
-
-        if mi.variant() != self._variant:
-            mi.set_variant(self._variant)
+        self._activate()
         _refuse_buried(scene, self.settings.without_body)
-        names, velocity = self._scene.place(scene, frozenset(self.settings.without_body))
+        if self._following is not None:
+            names, velocity = self._following.place(scene)
+        else:
+            names, velocity = self._scene.place(scene, frozenset(self.settings.without_body))
         clear = [self._cleared(antenna) for antenna in (*transmitters, *receivers)]
         sources, targets = clear[: len(transmitters)], clear[len(transmitters) :]
         self._without_edge = 0
@@ -321,6 +339,13 @@ class SionnaChannel(PathModel[SionnaSettings]):
             },
             matrices=self._matrices([part for _, part in parts], table, (sources, targets)),
         )
+
+    def _activate(self) -> None:
+        """The variant of Mitsuba is the process's, and others may have set theirs."""
+        import mitsuba as mi
+
+        if mi.variant() != self._variant:
+            mi.set_variant(self._variant)
 
     def _matrices(self, launches: Sequence[Traced], table: PathTable, traced_from: Ends) -> Matrices | None:
         """How the rung makes H; `plane_waves` where it has no way of its own."""
@@ -352,9 +377,8 @@ class SionnaChannel(PathModel[SionnaSettings]):
             corners = Corners(
                 outermost([transmitter], longest)[0], outermost([receivers[r] for r in others], longest)
             )
-        s, followed = self.settings, None
-        if s.follow is not None:
-            followed = self._followed.setdefault(transmitter.name, Followed(s.follow))
+        s = self.settings
+        followed = None if self._following is None else self._following.of(transmitter.name)
         tracer = self._tracer
         if self._edge_range is not None and not self._edge_range.reaches(
             np.concatenate([transmitter.position[None], targets])

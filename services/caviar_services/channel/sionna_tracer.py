@@ -21,7 +21,7 @@ from caviar_protocol.arrays import (
 )
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.sionna_candidates import Candidates, Offer, Planes, positions
-from caviar_services.channel.sionna_follow import Followed
+from caviar_services.channel.sionna_follow import Followed, FollowedOffer, TableState
 from caviar_services.channel.sionna_launch import SCATTERED, Launch, Launcher, LaunchOptions
 from caviar_services.channel.sionna_reach import Corners, Faces, at_corners, reflected
 from caviar_services.channel.sionna_scene import SionnaScene
@@ -98,6 +98,20 @@ class Tracer:
     def forget(self) -> None:
         """Trace anew, also where nothing has moved."""
         self._last.clear()
+
+    def offers(self) -> tuple[tuple[bytes, TableState], ...]:
+        """What followed transmitters have on offer as long as nothing moves, and where they are."""
+        return tuple(
+            (position, last.offer.state)
+            for position, last in self._last.items()
+            if last.version == self._scene.version and isinstance(last.offer, FollowedOffer)
+        )
+
+    def offer_again(self, offers: Sequence[tuple[bytes, TableState]]) -> None:
+        """Go on with what was on offer, the scene being as it was then."""
+        for position, state in offers:
+            offer = FollowedOffer.again(state, np.frombuffer(position), self._scene, self._options)
+            self._last[position] = _Last(self._scene.version, offer, np.zeros((0, 3)), self.nothing)
 
     @property
     def look(self) -> Look:

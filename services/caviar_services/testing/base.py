@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, get_args
@@ -26,6 +27,9 @@ HEAVY = ("mitsuba", "drjit", "sionna", "torch", "libsumo", "traci", "matplotlib"
 """Libraries that an implementation imports only when it prepares."""
 
 FRAMES = 4
+INTERRUPTED = 3
+"""Frames behind which a service is replaced by another; as many follow."""
+
 EPISODE_SEED = 11
 
 Encoded = dict[str, tuple[bytes, bytes]]
@@ -48,10 +52,12 @@ class Played:
 
     def encoded(self, episode: int = 0) -> list[Encoded]:
         """Bytes of every product, frame by frame."""
-        return [
-            {topic: encode_payload(payload) for topic, payload in result.products.items()}
-            for result in self.episodes[episode]
-        ]
+        return [encoded(result) for result in self.episodes[episode]]
+
+
+def encoded(result: StepResult) -> Encoded:
+    """Bytes of every product of a frame."""
+    return {topic: encode_payload(payload) for topic, payload in result.products.items()}
 
 
 class ServiceConformance:
@@ -101,7 +107,7 @@ class ServiceConformance:
         return samples.scenery(directory)
 
     @classmethod
-    def frames_of(cls, service: Service[Any], episode: int) -> list[Frame]:
+    def frames_of(cls, service: Service[Any], episode: int, count: int = FRAMES) -> list[Frame]:
         """Grants of an episode. In the last one, whatever is not required is absent."""
         optional = {i.topic: "left out" for i in service.inputs if not i.required and i.topic != "*"}
         return [
@@ -110,24 +116,40 @@ class ServiceConformance:
                 number=number,
                 t_ns=number * samples.SAMPLING_PERIOD_NS,
                 previous=number - 1,
-                inputs=samples.inputs(service.inputs, number, optional if number == FRAMES - 1 else {}),
+                inputs=samples.inputs(service.inputs, number, optional if number == count - 1 else {}),
                 service=service.run.name,
                 seed=EPISODE_SEED,
                 seed_episode=episode,
             )
-            for number in range(FRAMES)
+            for number in range(count)
         ]
+
+    @classmethod
+    def prepared(cls, service: Service[Any], directory: Path) -> tuple[Prepared, Mapping[str, Path]]:
+        """Prepare a service with the sample street; what it answers, and the files of scenery."""
+        assets = cls.street(service, directory / "assets")
+        demand = cls.demand or {topic: frozenset(PARTS.get(topic, ())) for topic in service.outputs}
+        producers = {topic: (samples.source(topic),) for topic in PAYLOADS}
+        return service.prepare(Preparation(demand=demand, assets=assets, producers=producers)), assets
+
+    @classmethod
+    @contextmanager
+    def at_start(cls, directory: Path) -> Iterator[Service[Any]]:
+        """The service at the beginning of the first episode; closed in the end."""
+        service = cls.build(directory)
+        try:
+            cls.prepared(service, directory)
+            service.reset(cls.episodes[0], EPISODE_SEED, 0)
+            yield service
+        finally:
+            service.close()
 
     @classmethod
     def play(cls, directory: Path, skip: Sequence[int] = ()) -> Played:
         """Prepare, play the episodes without the frames in ``skip``, close."""
         service = cls.build(directory)
         try:
-            assets = cls.street(service, directory / "assets")
-            demand = cls.demand or {topic: frozenset(PARTS.get(topic, ())) for topic in service.outputs}
-            producers = {topic: (samples.source(topic),) for topic in PAYLOADS}
-            prepared = service.prepare(Preparation(demand=demand, assets=assets, producers=producers))
-            played = Played(service, prepared, assets, service.run.directory)
+            played = Played(service, *cls.prepared(service, directory), service.run.directory)
             for episode in cls.episodes:
                 service.reset(episode, EPISODE_SEED, 0)
                 frames = [frame for frame in cls.frames_of(service, episode) if frame.number not in skip]
@@ -233,6 +255,48 @@ class ServiceConformance:
         """The same episode played twice in one life is the same."""
         if len(set(self.episodes)) == 1:
             assert played.encoded(1) == played.encoded(0)
+
+    def test_another_process_goes_on_with_the_same_bytes(self, tmp_path: Path) -> None:
+        """Clause 18: behind what `checkpoint` saved; a service without state, from its frames alone."""
+        declared = self.service_class.checkpoints
+        with self.at_start(tmp_path / "first") as first:
+            frames = self.frames_of(first, self.episodes[0], 2 * INTERRUPTED)
+            for frame in frames[:INTERRUPTED]:
+                first.step(frame)
+            state = first.checkpoint() if declared else b""
+            expected = [encoded(first.step(frame)) for frame in frames[INTERRUPTED:]]
+        with self.at_start(tmp_path / "second") as second:
+            later = frames[INTERRUPTED:]
+            if declared:
+                second.restore(state)
+                assert second.checkpoint() == state, "what was restored is not what was saved"
+            else:
+                later[0] = msgspec.structs.replace(later[0], previous=-1)
+            found = [encoded(second.step(frame)) for frame in later]
+        assert found == expected, "has state that outlives a frame: " + (
+            "checkpoint and restore leave some of it out" if declared else "set checkpoints = True"
+        )
+
+    def test_saving_twice_gives_the_same_bytes(self, tmp_path: Path) -> None:
+        """A state has one form, and saving it changes nothing."""
+        if not self.service_class.checkpoints:
+            pytest.skip("keeps no state from frame to frame")
+        with self.at_start(tmp_path) as service:
+            service.step(self.frames_of(service, self.episodes[0])[0])
+            assert service.checkpoint() == service.checkpoint()
+
+    def test_what_is_no_state_is_refused(self, tmp_path: Path) -> None:
+        """With an error that is told to the user, not a traceback."""
+        if not self.service_class.checkpoints:
+            pytest.skip("keeps no state from frame to frame")
+        with self.at_start(tmp_path) as service:
+            service.step(self.frames_of(service, self.episodes[0])[0])
+            state = service.checkpoint()
+            flipped = bytes([*state[:-1], state[-1] ^ 1])
+            for garbage in (b"", b"no state at all", state[: len(state) // 2], flipped):
+                with pytest.raises(CaviarError) as error:
+                    service.restore(garbage)
+                assert len(str(error.value)) > 20
 
     def test_inputs_are_left_as_they_were(self, played: Played) -> None:
         """Other services of an embedded run get the same objects."""

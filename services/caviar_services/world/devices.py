@@ -34,9 +34,14 @@ class Mounts:
         """Names of the devices that stand in the world without a parent."""
         return tuple(device.name for device in self._fixed)
 
-    def clear(self) -> None:
-        """Forget who came first: a new episode begins."""
-        self._arrived = []
+    @property
+    def arrived(self) -> tuple[str, ...]:
+        """The objects of the last frame, those that came first in front."""
+        return tuple(self._arrived)
+
+    def clear(self, arrived: Sequence[str] = ()) -> None:
+        """Forget who came first: a new episode begins, or goes on behind a frame with these objects."""
+        self._arrived = list(arrived)
         self._objects = None
 
     def devices(self, objects: Sequence[tuple[str, Vector]]) -> tuple[Device, ...]:

@@ -19,9 +19,10 @@ from caviar_protocol.errors import PayloadError, RunError, ScenarioError
 from caviar_protocol.messages import Input
 from caviar_protocol.topics import Action, VelocityCommand, WaypointCommand
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
+from caviar_services.state import restored, saved
 from caviar_services.world.assets import scenery_assets
 from caviar_services.world.base import ObjectState
-from caviar_services.world.flyer import Flyer, Limits, Motion
+from caviar_services.world.flyer import Flyer, FlyerState, Limits, Motion
 from caviar_services.world.obstacles import Obstacles, scenery_triangles
 from caviar_services.world.shapes import SHAPES
 from caviar_services.world.trajectory import Length, MovingObject, TrajectorySettings, TrajectoryWorld
@@ -56,6 +57,12 @@ class FlightSettings(TrajectorySettings, frozen=True, kw_only=True, forbid_unkno
     flown: tuple[FlownObject, ...]
 
 
+class _State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    elapsed_ns: Annotated[int, msgspec.Meta(ge=0)]
+    """Since the beginning of the episode."""
+    flyers: dict[str, FlyerState]
+
+
 class FlightWorld(TrajectoryWorld):
     """Objects that agents fly, with limited speed and acceleration, clear of the scenery.
 
@@ -63,6 +70,7 @@ class FlightWorld(TrajectoryWorld):
     """
 
     Settings: ClassVar[type[msgspec.Struct]] = FlightSettings
+    checkpoints: ClassVar[bool] = True
     inputs: ClassVar[tuple[Input, ...]] = (Input(topic="action", lag=1, required=False),)
 
     def __init__(self, settings: FlightSettings, run: RunInfo) -> None:
@@ -116,7 +124,8 @@ class FlightWorld(TrajectoryWorld):
         if frame.number > 0 and not self._begun:
             raise RunError(
                 f"world {self.run.name!r} came back in frame {frame.number}: where its objects had been "
-                "flown to is lost with the process that knew it; start the run again"
+                "flown to is lost with the process that knew it; have states saved "
+                "(run.checkpoint_frames above 0), and start the run again"
             )
         self._begun = True
         motions = self._motions(frame)
@@ -127,6 +136,18 @@ class FlightWorld(TrajectoryWorld):
             counts.update(flyer.fly(motions.get(name), length_ns))
         self._elapsed_ns = elapsed_ns
         return replace(super().step(frame), counts=dict(counts))
+
+    def checkpoint(self) -> bytes:
+        """Where the flown objects are, and what is under way."""
+        flyers = {name: flyer.state for name, flyer in self._flyers.items()}
+        return saved(self, 1, _State(elapsed_ns=self._elapsed_ns, flyers=flyers))
+
+    def restore(self, state: bytes) -> None:
+        """See `checkpoint`."""
+        was = restored(self, 1, _State, state)
+        self._elapsed_ns, self._begun = was.elapsed_ns, True
+        for name, flyer in self._flyers.items():
+            flyer.go_on(was.flyers[name])
 
     def _motions(self, frame: Frame) -> dict[str, Motion]:
         """What each flown object is told to do; beams and schedules are not for worlds."""

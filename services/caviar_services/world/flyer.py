@@ -13,7 +13,9 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
+
+import msgspec
 
 from caviar_protocol.coordinates import Vector
 from caviar_services.world.obstacles import Obstacles
@@ -75,8 +77,7 @@ class Limits:
         return self.clearance + self.acceleration * _H**2 / 8
 
 
-@dataclass(frozen=True, kw_only=True)
-class Motion:
+class Motion(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What an object is told: a velocity, or a target and the speed with which to go there."""
 
     velocity: Vector = (0.0, 0.0, 0.0)
@@ -107,6 +108,23 @@ class _Piece(NamedTuple):
         return _sum(position, self.after, t - self.ramp), self.after
 
 
+class FlyerState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A `Flyer` between two frames."""
+
+    position: Vector
+    velocity: Vector
+    yaw: float
+    motion: Motion
+    begin: tuple[Vector, Vector]
+    """Position and velocity at the beginning of the sub-step under way."""
+    begin_yaw: float
+    into_ns: Annotated[int, msgspec.Meta(ge=0, lt=SUB_STEP_NS)]
+    """How far into it."""
+    pieces: tuple[_Piece, ...]
+    """It and those looked at behind it."""
+    at_once: Annotated[int, msgspec.Meta(ge=1, le=_AT_ONCE)]
+
+
 class Flyer:
     """Position, velocity and yaw of one object."""
 
@@ -129,6 +147,28 @@ class Flyer:
         self._into_ns = 0
         self._pieces: deque[_Piece] = deque()
         self._at_once = _AT_ONCE
+
+    @property
+    def state(self) -> FlyerState:
+        """All that its further way follows from, beside commands and obstacles."""
+        return FlyerState(
+            position=self.position,
+            velocity=self.velocity,
+            yaw=self.yaw,
+            motion=self._motion,
+            begin=self._begin,
+            begin_yaw=self._begin_yaw,
+            into_ns=self._into_ns,
+            pieces=tuple(self._pieces),
+            at_once=self._at_once,
+        )
+
+    def go_on(self, state: FlyerState) -> None:
+        """Be where another one was."""
+        self.position, self.velocity, self.yaw = state.position, state.velocity, state.yaw
+        self._motion = state.motion
+        self._begin, self._begin_yaw, self._into_ns = state.begin, state.begin_yaw, state.into_ns
+        self._pieces, self._at_once = deque(state.pieces), state.at_once
 
     def fly(self, motion: Motion | None, length_ns: int) -> Counter[str]:
         """Move for a time [ns]; without a motion brake and hover.

@@ -19,14 +19,15 @@ from caviar_protocol.messages import Input, Role
 from caviar_protocol.scene import antennas
 from caviar_protocol.tables import Place
 from caviar_protocol.topics import AntennaDevice, Channel, Scene
-from caviar_services.channel.adaptive.controller import Choice, Controller
-from caviar_services.channel.adaptive.cost_model import CostModel, Workload
-from caviar_services.channel.adaptive.errors_stated import StatedError, nmse_db
+from caviar_services.channel.adaptive.controller import Choice, Controller, ControllerState
+from caviar_services.channel.adaptive.cost_model import CostModel, CostState, Workload
+from caviar_services.channel.adaptive.errors_stated import ErrorState, StatedError, nmse_db
 from caviar_services.channel.adaptive.rehearsal import rehearsal_scene
 from caviar_services.channel.adaptive.settings import AdaptiveSettings, Rung, built, models, rung_of
 from caviar_services.channel.base import Modelled
 from caviar_services.channel.sionna_sharing import shared_scenes
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
+from caviar_services.state import restored, saved
 
 DECISION = "rung"
 """Key of the decision in DONE."""
@@ -40,6 +41,15 @@ Devices = tuple[Sequence[AntennaDevice], Sequence[AntennaDevice]]
 """Transmitters and receivers."""
 
 
+class _State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    costs: CostState
+    errors: tuple[ErrorState, ...]
+    controller: ControllerState
+    current: int | None
+    rungs: tuple[bytes, ...]
+    """State of each rung's model; empty where it has none."""
+
+
 class AdaptiveChannel(Service[AdaptiveSettings]):
     """A ladder of channel models, one of which computes a frame."""
 
@@ -47,6 +57,7 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
     inputs: ClassVar[tuple[Input, ...]] = (Input(topic="scene"),)
     outputs: ClassVar[tuple[str, ...]] = ("channel",)
     uses_scenery: ClassVar[bool] = True
+    checkpoints: ClassVar[bool] = True
     Settings: ClassVar[type[msgspec.Struct]] = AdaptiveSettings
     clock: Callable[[], int] = staticmethod(time.perf_counter_ns)
     """Wall time [ns]."""
@@ -190,6 +201,32 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
         error = nmse_db(mine, true)
         held = None if error is None else self.errors[checked].check(error)
         return {} if held is None else {"error-checks": 1, "error-covered": int(held)}
+
+    def checkpoint(self) -> bytes:
+        """What is known of costs and errors, the rung, and what the rungs follow.
+
+        Durations decide, so the same frames lead to the same rungs only where those are imposed.
+        """
+        state = _State(
+            costs=self.costs.state,
+            errors=tuple(error.state for error in self.errors),
+            controller=self._controller.state,
+            current=self._current,
+            rungs=tuple(rung.model.checkpoint() if rung.model.checkpoints else b"" for rung in self.rungs),
+        )
+        return saved(self, 1, state)
+
+    def restore(self, state: bytes) -> None:
+        """See `checkpoint`."""
+        was = restored(self, 1, _State, state)
+        for error, known in zip(self.errors, was.errors, strict=True):
+            error.go_on(known)
+        for rung, model_state in zip(self.rungs, was.rungs, strict=True):
+            if rung.model.checkpoints:
+                rung.model.restore(model_state)
+        self.costs.go_on(was.costs)
+        self._controller.go_on(was.controller)
+        self._current = was.current
 
     # --- the rest of its life ------------------------------------------------------------------------
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import msgspec
+
 
 @dataclass(frozen=True, kw_only=True)
 class Choice:
@@ -13,6 +15,13 @@ class Choice:
     rung: int
     fits: bool
     """Whether the frame is expected to be done in time."""
+
+
+class ControllerState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A `Controller` between two frames."""
+
+    current: int | None
+    streaks: tuple[int, ...]
 
 
 class Controller:
@@ -40,6 +49,15 @@ class Controller:
     def reset(self) -> None:
         """Forget everything: the next frame is the first."""
         self._current, self._streaks = None, []
+
+    @property
+    def state(self) -> ControllerState:
+        """The rung, and for how long others would have fitted."""
+        return ControllerState(current=self._current, streaks=tuple(self._streaks))
+
+    def go_on(self, state: ControllerState) -> None:
+        """Be where another one was."""
+        self._current, self._streaks = state.current, list(state.streaks)
 
     def choose(self, predicted_ns: Sequence[float], budget_ns: int) -> Choice:
         """The rung for a frame, from the duration predicted for each, lowest rung first.

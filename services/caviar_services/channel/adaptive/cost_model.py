@@ -22,9 +22,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 
+import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array
+from caviar_services.state import Packed
 
 HALF_LIFE = 32
 """Frames after which a ratio counts half. One slow frame is then 2 to 4 % of all, and leaves a p95 alone."""
@@ -69,6 +71,22 @@ class Workload:
     """Transmitters times receivers."""
     objects: int
     """Moving objects in the scene."""
+
+
+class CostState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A `CostModel` between two frames."""
+
+    timing: Packed
+    pairs: int
+    mean: Packed
+    covariance: Packed
+    side: int
+    changed: int
+    rung: int | None
+    raised: float
+    rows: Packed
+    measured: tuple[float, ...]
+    expected: tuple[float, ...]
 
 
 class CostModel:
@@ -123,6 +141,37 @@ class CostModel:
             self._rows.append(rows[rung])
             self._measured.append(measured + scatter.inv_cdf(share))
             self._expected.append(0.0)
+
+    @property
+    def state(self) -> CostState:
+        """All that was learned, and what it is relative to."""
+        return CostState(
+            timing=Packed.of(self._timing, "<f8"),
+            pairs=self._pairs,
+            mean=Packed.of(self._mean, "<f8"),
+            covariance=Packed.of(self._covariance, "<f8"),
+            side=self._side,
+            changed=self._changed,
+            rung=self._rung,
+            raised=self._raised,
+            rows=Packed.of(np.array(self._rows), "<f8"),
+            measured=tuple(self._measured),
+            expected=tuple(self._expected),
+        )
+
+    def go_on(self, state: CostState) -> None:
+        """Predict what another one would have, of the same ladder.
+
+        Its timings come with what it learned, which is relative to them; how this machine differs from
+        the other's is learned as a change of load.
+        """
+        self._timing, self._pairs = state.timing.array(np.float64), state.pairs
+        self._mean, self._covariance = state.mean.array(np.float64), state.covariance.array(np.float64)
+        self._side, self._changed, self._rung = state.side, state.changed, state.rung
+        self._raised = state.raised
+        self._rows = deque(state.rows.array(np.float64), maxlen=_WINDOW)
+        self._measured = deque(state.measured, maxlen=_WINDOW)
+        self._expected = deque(state.expected, maxlen=_WINDOW)
 
     @property
     def load(self) -> float:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections import deque
 
+import msgspec
 import numpy as np
 
 from caviar_protocol.topics import Channel
@@ -41,6 +42,14 @@ def nmse_db(channel: Channel, reference: Channel) -> float | None:
     if power == 0.0:
         return None
     return max(10 * math.log10(error / power), FLOOR_DB) if error > 0 else FLOOR_DB
+
+
+class ErrorState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A `StatedError` between two frames."""
+
+    errors_db: tuple[float, ...]
+    checks: int
+    covered: int
 
 
 class StatedError:
@@ -78,6 +87,16 @@ class StatedError:
         held = error_db <= stated
         self.covered += held
         return held
+
+    @property
+    def state(self) -> ErrorState:
+        """What was measured."""
+        return ErrorState(errors_db=tuple(self._errors), checks=self.checks, covered=self.covered)
+
+    def go_on(self, state: ErrorState) -> None:
+        """Know what another one knew."""
+        self._errors = deque(state.errors_db, maxlen=WINDOW)
+        self.checks, self.covered = state.checks, state.covered
 
     def reset(self) -> None:
         """Forget what was measured."""
