@@ -21,7 +21,7 @@ from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.topics import Scene
 from caviar_services.service import Frame, Preparation, RunInfo
 from caviar_services.world.sumo import SumoSettings, SumoWorld, step_length_ms
-from caviar_services.world.sumo_process import load_libsumo
+from caviar_services.world.sumo_process import check_file, load_libsumo
 
 pytestmark = [
     pytest.mark.sumo,
@@ -355,6 +355,18 @@ def test_what_is_wrong_with_files_is_named(make: Make, tmp_path: Path) -> None:
         make(net="")
     with pytest.raises(ScenarioError, match=r"no mesh is there for 'cart'; known: .*car"):
         make(meshes=("cart",))
+
+
+@pytest.mark.parametrize("later", ['<flow id="later" begin="0"', '<trip id="later" depart="0.5"'])
+def test_traffic_that_sumo_would_leave_out_is_named_with_its_line(tmp_path: Path, later: str) -> None:
+    routes = tmp_path / "traffic.rou.xml"
+    first = '<flow id="first" begin="1" end="9" period="2" from="a" to="b"/>'
+    routes.write_text(f'<routes>\n{first}\n{later} from="a" to="b"/>\n</routes>\n')
+    with pytest.raises(ScenarioError, match=r"'later' departs at 0.* behind flow 'first' at 1 s") as caught:
+        check_file("routes", str(routes))
+    assert (caught.value.line, caught.value.key) == (3, "settings.routes")
+    routes.write_text(f'<routes>\n{later} from="a" to="b"/>\n{first}\n</routes>\n')
+    check_file("routes", str(routes))
 
 
 def test_what_sumo_refuses_is_said_in_its_words(make: Make) -> None:

@@ -79,7 +79,6 @@ class Rung:
         assets = scenes.assets if cls.uses_scenery else {}
         self._model.prepare(Preparation(demand={"channel": frozenset({"h"})}, assets=assets))
         self._seed = scenes.seed
-        self._model.reset(0, self._seed, 0)
         first = self.sample(scenes.instants[0])
         after = resident_mib()
         self.loaded = Loaded(
@@ -100,6 +99,8 @@ class Rung:
             service=SERVICE,
             seed=self._seed,
         )
+        # What was traced before is not to be taken again, where a scene is timed that warmed the model up.
+        self._model.reset(0, self._seed, 0)
         self._model.release_memory()
         before = reset_peak()
         begin = time.perf_counter()

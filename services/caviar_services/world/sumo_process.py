@@ -7,6 +7,7 @@ process on some broken files; so files are looked at first, and its output is ca
 from __future__ import annotations
 
 import io
+import math
 import os
 import sys
 import tempfile
@@ -25,6 +26,16 @@ _ROOTS = {
     "routes": ("routes",),
     "additional": ("additional", "add", "routes"),
 }
+
+
+_DEPARTS = {
+    "flow": "begin",
+    "personFlow": "begin",
+    "vehicle": "depart",
+    "trip": "depart",
+    "person": "depart",
+}
+"""Elements of traffic, and which attribute says when it begins."""
 
 
 def load_libsumo() -> ModuleType:
@@ -48,11 +59,14 @@ def check_file(key: str, file: str) -> None:
     if path.suffix == ".gz":
         return
     roots: list[str] = []
+    order = _Departures(file, f"settings.{key}")
     parser = expat.ParserCreate()
 
-    def start(tag: str, _: dict[str, str]) -> None:
+    def start(tag: str, attributes: dict[str, str]) -> None:
         if not roots:
             roots.append(tag)
+        elif key == "routes":
+            order.see(tag, attributes, parser.CurrentLineNumber)
 
     parser.StartElementHandler = start
     try:
@@ -64,6 +78,32 @@ def check_file(key: str, file: str) -> None:
         raise ScenarioError(
             f"holds <{roots[0]}>, {key} takes a file with <{_ROOTS[key][0]}>", file, f"settings.{key}"
         )
+
+
+class _Departures:
+    """Whether a file of routes has its traffic in the order of departure: SUMO leaves out whatever stands
+    behind something later, with a warning among many."""
+
+    def __init__(self, file: str, key: str) -> None:
+        self._file, self._key = file, key
+        self._latest, self._of = -math.inf, ""
+
+    def see(self, tag: str, attributes: dict[str, str], line: int) -> None:
+        """One more element. `ScenarioError` where it departs before the one before."""
+        time = attributes.get(_DEPARTS.get(tag, ""))
+        try:
+            departs = float(time or "nan")
+        except ValueError:
+            return  # "triggered", or hours and minutes, which SUMO knows how to read
+        name = f"{tag} {attributes.get('id', '')!r}"
+        if departs < self._latest:
+            text = (
+                f"{name} departs at {departs:g} s, behind {self._of} at {self._latest:g} s: SUMO would leave "
+                "it out; sort flows, vehicles and trips by departure"
+            )
+            raise ScenarioError(text, self._file, self._key, line)
+        if departs > self._latest:
+            self._latest, self._of = departs, name
 
 
 class Simulation:
