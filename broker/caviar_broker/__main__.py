@@ -19,6 +19,7 @@ from caviar_broker.briefing import briefings, with_ownership
 from caviar_broker.control import Control, Reporter, stop_on_signals
 from caviar_broker.core.plan import plan_run
 from caviar_broker.journal import JournalFile
+from caviar_broker.replaying import with_replay
 from caviar_broker.server import BrokerServer
 from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.host import steady_memory
@@ -41,6 +42,7 @@ def serve(arguments: argparse.Namespace) -> int:
     scenario = with_ownership(with_overrides(scenario, arguments.frames, arguments.seed))
     directory = _made(arguments.directory)
     plan = plan_run(scenario, arguments.run or directory.name, briefings(scenario, directory))
+    plan = with_replay(plan, scenario.replay)
     reporter = Reporter(sys.stdout.fileno(), directory / "events.jsonl", arguments.control)
     with closing(JournalFile(directory / "journal.msgpack", plan.epoch)) as journal:
         supervised = arguments.supervised if arguments.control else ()
