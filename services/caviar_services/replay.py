@@ -51,7 +51,9 @@ class Replayer(Service[ReplaySettings]):
     def check_settings(cls, settings: ReplaySettings, place: Place) -> None:
         """Raise `ScenarioError` where there is no such directory."""
         if not Path(settings.recording).exists():
-            raise place.at("recording").error(f"there is no {settings.recording}; name the directory of a run")
+            raise place.at("recording").error(
+                f"there is no {settings.recording}; name the directory of a run"
+            )
 
     @cached_property
     def _recording(self) -> Recording:
