@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, cast, get_args
+from typing import Annotated, Any, cast, get_args
 
 import msgspec
 from msgspec import Meta
@@ -128,8 +128,8 @@ class Replayer(Service[ReplaySettings]):
         missing = [asset.name for asset in recording.metadata.assets if asset.name not in recording.assets]
         if missing:
             raise RecordingError(
-                f"{recording.path} was recorded without its scenery: {missing[0]} is not in it; run the world "
-                f"again, as in caviar replay --keep {self.run.name}"
+                f"{recording.path} was recorded without its scenery: {missing[0]} is not in it; run the "
+                f"world again, as in caviar replay --keep {self.run.name}"
             )
 
 

@@ -77,13 +77,13 @@ def plan_replay(run: RecordedRun, request: Request, frames: int | None = None) -
         scenario=scenario,
         frames=length,
         roles=roles,
-        notes=tuple([*cut, *_notes(run, roles, missed)]),
+        notes=(*cut, *_notes(run, roles, missed)),
         identical=not request.changed and not missed,
     )
 
 
 def _role(name: str, spec: ServiceSpec, run: RecordedRun, request: Request) -> Role:
-    """What becomes of a service. Who takes what a changed one makes runs again, with whom it feeds in turn."""
+    """What becomes of a service. Whoever takes what a changed one makes runs again, and so on downstream."""
     if name in request.replace:
         return Role(name, "replaced", request.replace[name], f"in place of {spec.use}")
     if name in request.settings:
