@@ -32,13 +32,14 @@ def budget_run(run: Path, console: Console, json_file: Path | None = None) -> Fo
 
 
 def lines(found: Forecast) -> list[str]:
-    """What there is to say beyond the table, whose rates are those with one service alone and without it."""
+    """What there is to say beyond the table."""
     rates = ", ".join(f"{policy} {found.rates[policy]:.1f}" for policy in POLICIES)
     substituted = {
         policy: {s.name: s.substituted[policy] for s in found.services if s.substituted[policy]}
         for policy in POLICIES
     }
     return [
+        f"alone, without: frames/s if only it took time, or all others; misses: {'/'.join(POLICIES)}",
         f"frames/s as budgets are: {rates}; measured {found.measured:.1f}, real time {found.realtime:.1f}",
         *(
             f"under {policy}, held or absent in so many of {found.frames} frames: "
@@ -66,15 +67,7 @@ def _bound(found: Forecast) -> str:
 def _services(found: Forecast) -> Table:
     table = Table()
     table.add_column("service")
-    headings = (
-        "p50 ms",
-        "p99 ms",
-        "budget",
-        "suggested",
-        "alone 1/s",
-        "without",
-        f"misses {'/'.join(POLICIES)}",
-    )
+    headings = ("p50 ms", "p99 ms", "budget", "suggested", "alone", "without", "misses")
     for heading in headings:
         table.add_column(heading, justify="right")
     for service in found.services:

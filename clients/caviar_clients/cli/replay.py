@@ -16,6 +16,7 @@ from caviar_clients.replay.plan import ReplayPlan, plan_replay
 from caviar_clients.replay.recorded import RecordedRun
 from caviar_clients.replay.request import request_of
 from caviar_clients.replay.toml import scenario_text
+from caviar_clients.sessions.checking import check_implementations
 from caviar_protocol.recording import Recording
 
 PARTS = {
@@ -45,6 +46,7 @@ def replay_run(
     found = RecordedRun(Recording(run))
     request = request_of(found.scenario.services, replace, settings, keep, recorded, again)
     plan = plan_replay(found, request, frames)
+    check_implementations(plan.scenario)
     _tell(plan, found, console)
     with tempfile.TemporaryDirectory(prefix="caviar-replay-") as folder:
         scenario, figures = Path(folder) / f"{plan.scenario.run.name}.toml", Path(folder) / "summary.json"

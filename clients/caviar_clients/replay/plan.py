@@ -5,14 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
+import msgspec
 from msgspec.structs import replace
 
 from caviar_clients.replay.recorded import RecordedRun, declared
-from caviar_clients.replay.request import Request, merged
+from caviar_clients.replay.request import Request, merged, typed
 from caviar_protocol.errors import RunError
 from caviar_protocol.messages import Hello, Input
-from caviar_protocol.scenario import ReplaySpec, Scenario, ServiceSpec
+from caviar_protocol.scenario import REMOTE, ReplaySpec, Scenario, ServiceSpec
 from caviar_protocol.scenario_checks import world_of
+from caviar_services.registry import load
 from caviar_services.replay import use_of
 
 Part: TypeAlias = Literal["recorded", "replaced", "again", "left out"]
@@ -111,7 +113,9 @@ def _spec(role: Role, run: RecordedRun, request: Request) -> ServiceSpec:
         return replace(spec, use=role.use, settings=settings, max_in_flight=1)
     if role.part == "replaced":
         same = role.use == spec.use
-        changed = merged(spec.settings if same else {}, request.settings.get(role.name, {}))
+        given = request.settings.get(role.name, {})
+        settings = msgspec.Struct if role.use == REMOTE else load(spec.role, role.use).Settings
+        changed = merged(spec.settings if same else {}, typed(given, settings))
         return replace(spec, use=role.use, settings=changed)
     return spec
 

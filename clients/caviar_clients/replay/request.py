@@ -7,6 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import msgspec
+
 from caviar_protocol.errors import RunError
 from caviar_protocol.scenario import ServiceSpec
 from caviar_protocol.tables import suggestion
@@ -19,7 +21,7 @@ class Request:
     replace: Mapping[str, str] = field(default_factory=dict)
     """Implementation in place of the recorded one."""
     settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """Settings in place of the recorded ones, as nested tables."""
+    """Settings in place of the recorded ones, as nested tables of what was typed."""
     keep: frozenset[str] = frozenset()
     """Services that run again as recorded."""
     recorded: frozenset[str] = frozenset()
@@ -97,7 +99,7 @@ def _settings(services: Mapping[str, ServiceSpec], texts: Sequence[str]) -> dict
             table = table.setdefault(key, {})
             if not isinstance(table, dict):
                 raise RunError(f"--set {text}: {key!r} was given a value of its own before; leave out one")
-        table[keys[-1]] = _value(value)
+        table[keys[-1]] = value
     return found
 
 
@@ -107,6 +109,27 @@ def _value(text: str) -> Any:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         return text
+
+
+def typed(changes: Mapping[str, Any], cls: type[msgspec.Struct]) -> dict[str, Any]:
+    """Settings from the command line as TOML values, but where only text fits: ``1e3``, the name of a rung."""
+    types = {field.encode_name: field.type for field in msgspec.structs.fields(cls)}
+    return {key: _typed(value, types.get(key, Any)) for key, value in changes.items()}
+
+
+def _typed(given: Any, expected: Any) -> Any:
+    if isinstance(given, Mapping):
+        return {key: _typed(value, Any) for key, value in given.items()}
+    value = _value(given)
+    return given if not _fits(value, expected) and _fits(given, expected) else value
+
+
+def _fits(value: Any, expected: Any) -> bool:
+    try:
+        msgspec.convert(value, expected)
+    except msgspec.ValidationError:
+        return False
+    return True
 
 
 def merged(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
