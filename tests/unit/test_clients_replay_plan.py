@@ -192,7 +192,7 @@ def test_the_scenario_of_another_version_is_told(smoke: RecordedRun) -> None:
     recording = Recording(smoke.recording.path)
     scenario = {**recording.metadata.scenario, "weather": {"rain_mm_h": 3}}
     recording.metadata = msgspec.structs.replace(recording.metadata, scenario=scenario)
-    with pytest.raises(RecordingError, match="weather.*replay it with the version that recorded it"):
+    with pytest.raises(RecordingError, match=r"weather.*replay it with the version that recorded it"):
         RecordedRun(recording)
 
 

@@ -114,8 +114,8 @@ def _spec(role: Role, run: RecordedRun, request: Request) -> ServiceSpec:
     if role.part == "replaced":
         same = role.use == spec.use
         given = request.settings.get(role.name, {})
-        settings = msgspec.Struct if role.use == REMOTE else load(spec.role, role.use).Settings
-        changed = merged(spec.settings if same else {}, typed(given, settings))
+        types = msgspec.Struct if role.use == REMOTE else load(spec.role, role.use).Settings
+        changed = merged(spec.settings if same else {}, typed(given, types))
         return replace(spec, use=role.use, settings=changed)
     return spec
 

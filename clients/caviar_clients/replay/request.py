@@ -112,7 +112,7 @@ def _value(text: str) -> Any:
 
 
 def typed(changes: Mapping[str, Any], cls: type[msgspec.Struct]) -> dict[str, Any]:
-    """Settings from the command line as TOML values, but where only text fits: ``1e3``, the name of a rung."""
+    """What was typed, as TOML values, but where only text fits: ``1e3``, the name of a rung."""
     types = {field.encode_name: field.type for field in msgspec.structs.fields(cls)}
     return {key: _typed(value, types.get(key, Any)) for key, value in changes.items()}
 
