@@ -124,8 +124,8 @@ class Replayer(Service[ReplaySettings]):
         return following[1] if here and following and following[1] != here[1] else -1
 
     def _check_scenery(self) -> None:
-        recording = self._recording
-        missing = [asset.name for asset in recording.metadata.assets if asset.name not in recording.assets]
+        recording, there = self._recording, self._recording.assets
+        missing = [asset.name for asset in recording.metadata.assets if asset.name not in there]
         if missing:
             raise RecordingError(
                 f"{recording.path} was recorded without its scenery: {missing[0]} is not in it; run the "
