@@ -126,13 +126,14 @@ class DecisionBook:
         recorded, decisions = {entry.topic: entry for entry in entries}, {}
         for topic in self._due_topics(task):
             entry, product = recorded.get(topic), products.get(topic)
-            if entry is None or product is None:
-                cause = entry.cause if entry is not None else ""
+            status = entry.status if entry is not None else _FRESH
+            cause = entry.cause if entry is not None else ""
+            if product is None or status is Status.ABSENT:
                 cause = cause or f"{task.service} produced no {topic} in frame {task.frame}"
                 decisions[topic] = Decision(Status.ABSENT, None, cause)
-            elif entry.status is Status.HELD:
-                held = replace(product, frame=entry.frame, t_ns=entry.t_ns)
-                decisions[topic] = Decision(Status.HELD, held, entry.cause)
+            elif entry is not None and status is Status.HELD:
+                product = replace(product, frame=entry.frame, t_ns=entry.t_ns)
+                decisions[topic] = Decision(Status.HELD, product, cause)
             else:
                 decisions[topic] = Decision(_FRESH, product)
         self._decide(task, decisions, "done", now)

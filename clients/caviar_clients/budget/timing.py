@@ -123,7 +123,7 @@ def _latencies(run: RecordedRun) -> dict[str, npt.NDArray[np.int64]]:
 def _archive(run: RecordedRun) -> dict[str, npt.NDArray[np.int64]]:
     path: Path = run.recording.directory / LATENCIES
     try:
-        with np.load(path) as archive:
+        with path.open("rb") as file, np.load(file) as archive:
             return {key: archive[key] for key in archive.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise RecordingError(
