@@ -164,5 +164,5 @@ def test_budget_predicts_the_frame_rate_of_its_own_run(smoke: Path, tmp_path: Pa
     found = json.loads(file.read_text())
     measured = json.loads((smoke / "summary.json").read_text())["frames_per_second"]
     assert found["measured"] == pytest.approx(measured)
-    assert found["rates"]["wait"] == pytest.approx(measured, rel=0.5)
+    assert found["predicted"] == found["rates"]["wait"] == pytest.approx(measured, rel=0.5)
     assert found["bound"]["service"] in {"world", "channel", "link", "agent", "recorder"}

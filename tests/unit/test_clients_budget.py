@@ -70,6 +70,15 @@ def test_a_loop_over_two_services_takes_their_sum(smoke: RecordedRun) -> None:
     assert found.bound.service == "agent"
 
 
+def test_a_run_that_its_latencies_do_not_explain_is_told(smoke: RecordedRun) -> None:
+    """It had 100 frames/s; services that take 10 ms explain that, ones of 2 ms do not."""
+    explained = forecast(timed(smoke, world=1, channel=10, link=3, agent=2, recorder=4))
+    assert explained.predicted == pytest.approx(100.0)
+    assert not any("where its latencies lead to" in note for note in explained.notes)
+    other = forecast(timed(smoke, world=1, channel=2, link=1, agent=1, recorder=1))
+    assert any("100.0 frames/s where its latencies lead to 500.0" in note for note in other.notes)
+
+
 def test_how_much_faster_a_service_has_to_be_for_real_time(smoke: RecordedRun) -> None:
     """Real time is 10 frames/s, the channel takes 250 ms: 2.5 times as fast."""
     found = forecast(timed(smoke, world=1, channel=250, link=3, agent=2, recorder=4))

@@ -10,7 +10,7 @@ from typing import Annotated
 import msgspec
 from msgspec.structs import replace as replace_field
 
-from caviar_broker.core.plan import RunPlan, plan_run
+from caviar_broker.core.plan import RunPlan, ServicePlan, plan_run
 from caviar_clients.budget.timing import Timing, measured_rate, timings_of
 from caviar_clients.budget.virtual import Played, VirtualRun
 from caviar_clients.replay.recorded import RecordedRun
@@ -24,6 +24,8 @@ MARGIN = 0.2
 """Beyond the 99th percentile that a suggested budget leaves."""
 LONGEST = 1000
 """Frames that are played at most."""
+TOLERANCE = 0.15
+"""By which prediction and measurement may differ without a word."""
 FACTOR_STEPS = 12
 """Halvings in the search for how much faster a service has to be."""
 
@@ -62,6 +64,7 @@ class Forecast(msgspec.Struct, frozen=True, kw_only=True):
     frames: int
     """That were played."""
     measured: Annotated[float, quantity("1/s", "frame rate of the recorded run")]
+    predicted: Annotated[float, quantity("1/s", "frame rate of the recorded policies at full speed")]
     realtime: Annotated[float, quantity("1/s", "frame rate of real time")]
     rates: Annotated[dict[str, float], quantity("1/s", "frame rate of each policy")]
     bound: Bound
@@ -79,13 +82,14 @@ def forecast(run: RecordedRun, margin: float = MARGIN) -> Forecast:
     played = {policy: stage.play(policy) for policy in POLICIES}
     without = {name: stage.play("wait", {name: 0.0}).rate for name in timings}
     alone = {name: stage.play("wait", {n: 0.0 for n in timings if n != name}).rate for name in timings}
-    rate = played["wait"].rate
+    rate, measured, predicted = played["wait"].rate, measured_rate(run), stage.play(None).rate
     realtime = 1e9 / run.scenario.run.sampling_period_ns
     slowest = max(timings, key=lambda name: (without[name], -alone[name]))
     return Forecast(
         run=run.recording.metadata.run,
         frames=stage.frames,
-        measured=measured_rate(run),
+        measured=measured,
+        predicted=predicted,
         realtime=realtime,
         rates={policy: result.rate for policy, result in played.items()},
         bound=Bound(
@@ -107,7 +111,7 @@ def forecast(run: RecordedRun, margin: float = MARGIN) -> Forecast:
             )
             for name, timing in timings.items()
         ],
-        notes=_notes(run, timings, stage.frames),
+        notes=[*_unexplained(run, measured, predicted), *_notes(run, timings, stage.frames)],
     )
 
 
@@ -131,17 +135,11 @@ class _Stage:
         """What it declares; parts are of no matter here, and grants queue as far as the scenario says."""
         return replace_field(self._run.hellos[name], max_in_flight=64)
 
-    def play(self, policy: Policy, factors: Mapping[str, float] | None = None) -> Played:
-        """``factors``: by which a service's times are multiplied."""
+    def play(self, policy: Policy | None, factors: Mapping[str, float] | None = None) -> Played:
+        """``policy``: of all services that may have it, or None for those of the scenario; ``factors``: by
+        which a service's times are multiplied."""
         factors = factors or {}
-        services = tuple(
-            replace(
-                s,
-                policy="wait" if s.role in STRICT else policy,
-                max_in_flight=_queue(s.max_in_flight, policy),
-            )
-            for s in self._plan.services
-        )
+        services = tuple(_under(service, policy) for service in self._plan.services)
 
         def takes(name: str, episode: int, frame: int) -> int:
             return round(self._timings[name].at(episode, frame) * factors.get(name, 1.0))
@@ -165,8 +163,20 @@ class _Stage:
         return 1.0 / low if low else None
 
 
-def _queue(planned: int, policy: Policy) -> int:
-    return planned if policy == "wait" else 1
+def _under(service: ServicePlan, policy: Policy | None) -> ServicePlan:
+    """A service under a policy; only one that waits can have several grants."""
+    if policy is None:
+        return service
+    if service.role in STRICT or policy == "wait":
+        return replace(service, policy="wait")
+    return replace(service, policy=policy, max_in_flight=1)
+
+
+def _unexplained(run: RecordedRun, measured: float, predicted: float) -> list[str]:
+    if not measured or run.scenario.run.pace != "fast" or abs(predicted / measured - 1.0) <= TOLERANCE:
+        return []
+    text = f"the recorded run had {measured:.1f} frames/s where its latencies lead to {predicted:.1f}"
+    return [f"{text}: services did not overlap, as in one process, or what is between them took time too"]
 
 
 def _plan(run: RecordedRun, hellos: Mapping[str, Hello]) -> RunPlan:
@@ -191,6 +201,12 @@ def _notes(run: RecordedRun, timings: Mapping[str, Timing], frames: int) -> list
     for name, timing in timings.items():
         if not timing.exact:
             notes.append(f"latencies of {name} are not one a frame: they were taken in their order")
+    for report in run.recording.entry(0).reports:
+        if report.decisions and report.source in timings:
+            notes.append(
+                f"{report.source} decided for its recorded budget ({', '.join(report.decisions)}); with "
+                "another one its latencies become others"
+            )
     for name, spec in run.scenario.services.items():
         if spec.remote:
             notes.append(f"what {name} takes is not recorded: it is played as if it took nothing")
