@@ -30,6 +30,7 @@ from caviar_broker.core.resumption import Resumption
 from caviar_broker.desk import Desk
 from caviar_broker.journal import JournalFile, mend_journal
 from caviar_broker.record import RunRecord, read_record
+from caviar_broker.replaying import with_replay
 from caviar_broker.resume import read_resumption
 from caviar_broker.security.access import Access
 from caviar_broker.security.local import check_bind
@@ -61,6 +62,7 @@ def serve(arguments: argparse.Namespace) -> int:
     check_bind(record.endpoint, keys=access is not None)
     beside = HttpBeside(directory, arguments.http, arguments.keys)
     plan = replace(plan_run(told, record.run, briefings(told, directory)), epoch=record.epoch)
+    plan = with_replay(plan, told.replay)
     checkpoints = CheckpointFiles(directory)
     resumption = _left(directory, checkpoints) if arguments.resume else None
     reporter = Reporter(sys.stdout.fileno(), directory / "events.jsonl", arguments.control)

@@ -123,6 +123,19 @@ class ServiceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         return self.use == REMOTE
 
 
+class ReplaySpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a run repeats of a recorded one; `caviar replay` writes it."""
+
+    recording: Annotated[str, Meta(min_length=1)]
+    """Directory of the recorded run."""
+    served: tuple[str, ...] = ()
+    """Services whose products are the recorded ones; those that were held or absent are so again."""
+    imposed: tuple[str, ...] = ()
+    """Services that run again and take over their recorded decisions (contract, clause 6)."""
+    digest: str = ""
+    """Of the recorded run, as far as it is repeated."""
+
+
 class Scenario(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A whole scenario file."""
 
@@ -133,5 +146,6 @@ class Scenario(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     timeouts: Timeouts = Timeouts()
     carriers: tuple[Carrier, ...] = ()
     devices: tuple[DeviceSpec, ...] = ()
+    replay: ReplaySpec | None = None
     source: Source = Source()
     """Where this was read from, so that whatever turns out wrong later can name the line."""

@@ -12,11 +12,11 @@ import msgspec
 from caviar_protocol import limits
 from caviar_protocol import messages as m
 from caviar_protocol.arrays import Payload
-from caviar_protocol.codec import encode_payload
 from caviar_protocol.digest import geometry_digest, payload_digest
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.topics import PAYLOADS, Carrier
+from caviar_services.encoded import Encoded, decoded, encoded
 from caviar_services.service import (
     Frame,
     FrameInput,
@@ -129,10 +129,9 @@ def done_of(
     started = time.monotonic_ns()
     headers, parts = [], list[Any]()
     for topic, payload in _products(use, result):
-        header, body = encode_payload(payload)
-        headers.append(
-            m.ProductHeader(topic=topic, digest=payload_digest(header, body), fidelity=result.fidelity)
-        )
+        header, body = encoded(payload)
+        fidelity = payload.fidelity if isinstance(payload, Encoded) else result.fidelity
+        headers.append(m.ProductHeader(topic=topic, digest=payload_digest(header, body), fidelity=fidelity))
         parts += [header, body]
     done = m.Done(
         **identity,
@@ -166,12 +165,12 @@ def plain_done_of(
         end_episode=result.end_episode,
         seed=result.seed,
     )
-    return done, tuple([payload for _, payload in products])
+    return done, tuple([decoded(payload) for _, payload in products])
 
 
 def _products(use: str, result: StepResult) -> list[tuple[str, Payload]]:
     products = sorted(result.products.items()) if len(result.products) > 1 else [*result.products.items()]
     for topic, payload in products:
-        if type(payload) is not PAYLOADS.get(topic):
+        if type(payload) is not PAYLOADS.get(topic) and not isinstance(payload, Encoded):
             raise PayloadError(f"{use} made a payload {type(payload).__name__} for the topic {topic!r}")
     return products

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping
 
+from msgspec.structs import replace
+
 from caviar_broker.core.events import Action, FrameFinished, Journal, Product
 from caviar_broker.core.graph import Edge, Graph
 from caviar_broker.core.ledger import Ledger
@@ -11,7 +13,7 @@ from caviar_broker.core.plan import RunPlan
 from caviar_broker.core.tasks import Decision, Task, provenance, validate_decision
 from caviar_broker.core.transitions import DECIDED, OUTSTANDING, TaskState
 from caviar_protocol.digest import RunDigest
-from caviar_protocol.messages import Status
+from caviar_protocol.messages import GrantInput, Status
 
 _FRESH = Status.FRESH
 _FIRST = Decision(Status.ABSENT, None, "there is no earlier frame")
@@ -140,6 +142,25 @@ class DecisionBook:
         self._decide(task, decisions, "done", now)
         if task.service in self._holding:
             self._renew(products.values(), task.journal)
+
+    def as_recorded(
+        self, task: Task, entries: Iterable[GrantInput], products: Mapping[str, Product], now: int
+    ) -> None:
+        """A replayed service: its products are held or absent where they were, with the recorded cause."""
+        recorded, decisions = {entry.topic: entry for entry in entries}, {}
+        for topic in self._due_topics(task):
+            entry, product = recorded.get(topic), products.get(topic)
+            status = entry.status if entry is not None else _FRESH
+            cause = entry.cause if entry is not None else ""
+            if product is None or status is Status.ABSENT:
+                cause = cause or f"{task.service} produced no {topic} in frame {task.frame}"
+                decisions[topic] = Decision(Status.ABSENT, None, cause)
+            elif entry is not None and status is Status.HELD:
+                product = replace(product, frame=entry.frame, t_ns=entry.t_ns)
+                decisions[topic] = Decision(Status.HELD, product, cause)
+            else:
+                decisions[topic] = Decision(_FRESH, product)
+        self._decide(task, decisions, "done", now)
 
     def substitute(self, task: Task, cause: str, outcome: str, now: int) -> None:
         """Clause 9: under hold consumers get the newest earlier product; else, or without one, nothing."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from caviar_protocol.instants import instants_ns
-from caviar_protocol.messages import Policy, Role
+from caviar_protocol.messages import GrantInput, Policy, Role
 from caviar_protocol.scenario import REMOTE_REJOIN_S, Scenario
 from caviar_protocol.tables import Source
 
@@ -76,6 +76,8 @@ class RunPlan:
     """Frames after which a service that can do so saves its state; 0: never."""
     imposed: Mapping[tuple[str, int, int], Mapping[str, str]] = field(default_factory=dict)
     """Decisions imposed in a replay, by (service, episode, frame) (clause 6)."""
+    recorded: Mapping[tuple[str, int, int], tuple[GrantInput, ...]] = field(default_factory=dict)
+    """Provenance of what replayed services had not in time, by (service, episode, frame)."""
 
     @property
     def remembers(self) -> bool:

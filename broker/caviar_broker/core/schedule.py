@@ -118,7 +118,11 @@ class EpisodeSchedule:
             self._came_late(task, by_topic, now)
         else:
             task.report = report
-            self._book.fresh(task, by_topic, now)
+            recorded = self.plan.recorded.get((service, self.episode, frame))
+            if recorded is None:
+                self._book.fresh(task, by_topic, now)
+            else:
+                self._book.as_recorded(task, recorded, by_topic, now)
             self._turns.decided(task.service)
         if frame >= self._book.frames and by_topic:
             self._notice("discarded", task, f"answered its final grant with {', '.join(sorted(by_topic))}")

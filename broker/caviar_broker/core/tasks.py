@@ -18,7 +18,7 @@ class Decision(msgspec.Struct, frozen=True):
     product: Product | None
     cause: str = ""
     journal: int = 0
-    """Journal entry that holds a held product; 0: the one of this decision."""
+    """Journal entry that holds a held product; 0: the one of this decision, as for one that is replayed."""
 
 
 class GrantOrder(msgspec.Struct, frozen=True):
@@ -88,7 +88,6 @@ def validate_decision(service: str, frame: int, topic: str, decision: Decision) 
             assert decision.product is not None, f"{what} is held without a product"
             assert decision.product.frame < frame, f"{what} is not an earlier one"
             assert decision.cause, f"{what} is held without a cause"
-            assert decision.journal, f"{what} is held from no journal entry"
         case _:
             assert decision.product is None, f"{what} is absent with a product"
             assert decision.cause, f"{what} is absent without a cause"

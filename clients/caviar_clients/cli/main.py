@@ -252,6 +252,48 @@ def video(
 
 
 @app.command()
+def replay(
+    run: RunDirectory,
+    replace: Annotated[
+        list[str] | None, typer.Option(help="SERVICE=IMPLEMENTATION, by name or role; may be repeated")
+    ] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="SERVICE.SETTING=VALUE; may be repeated")
+    ] = None,
+    keep: Annotated[list[str] | None, typer.Option(help="service that runs again as recorded")] = None,
+    recorded: Annotated[
+        list[str] | None, typer.Option(help="service served as recorded, though what it takes has changed")
+    ] = None,
+    again: Annotated[bool, typer.Option("--again", help="run everything again, decisions imposed")] = False,
+    frames: Annotated[int | None, typer.Option(min=1, help="only the first frames of each episode")] = None,
+    json: Annotated[Path | None, typer.Option(help="write the summary to this file too")] = None,
+    out: Annotated[Path, typer.Option(help="directory in which the run's own is made")] = Path("runs"),
+    embedded: Annotated[
+        bool, typer.Option("--embedded", help="all in this process, without sockets")
+    ] = False,
+) -> None:
+    """Run a recorded world again: products served as recorded, but of what is replaced and what follows."""
+    from caviar_clients.cli.replay import replay_run
+
+    status = replay_run(
+        run, out, _console, replace=replace or (), settings=set_ or (), keep=keep or (),
+        recorded=recorded or (), again=again, frames=frames, json_file=json, embedded=embedded,
+    )  # fmt: skip
+    raise typer.Exit(status)
+
+
+@app.command()
+def budget(
+    run: RunDirectory,
+    json: Annotated[Path | None, typer.Option(help="write all figures to this file")] = None,
+) -> None:
+    """Tell from a recorded run the frame rate that each policy sustains, and which service bounds it."""
+    from caviar_clients.cli.budget import budget_run
+
+    budget_run(run, _console, json)
+
+
+@app.command()
 def tradeoff(
     source: Annotated[
         Path,

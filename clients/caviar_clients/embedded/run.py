@@ -21,6 +21,7 @@ from caviar_broker.core import events as ev
 from caviar_broker.core.clock import FrameClock
 from caviar_broker.core.plan import plan_run
 from caviar_broker.journal import JournalFile
+from caviar_broker.replaying import with_replay
 from caviar_broker.statistics import Statistics
 from caviar_clients.embedded.place import Place, Seat
 from caviar_protocol import messages as m
@@ -71,8 +72,10 @@ class EmbeddedRun:
         folder = (directory or Path()).resolve()
         plan = plan_run(scenario, folder.name, briefings(scenario, folder))
         # Whoever runs ahead gains nothing in one process, and works in vain where an agent ends the episode.
+        plan = with_replay(plan, scenario.replay)
+        imposed = plan.imposed if imposed is None else imposed
         plan = replace(
-            plan, frames_in_flight=1, checkpoint_frames=0, ephemeral=directory is None, imposed=imposed or {}
+            plan, frames_in_flight=1, checkpoint_frames=0, ephemeral=directory is None, imposed=imposed
         )
         self.statistics = Statistics({s.name: s.budget_ns for s in plan.services})
         self._now = 0

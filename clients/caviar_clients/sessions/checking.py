@@ -29,7 +29,11 @@ def checked_scenario(path: Path, frames: int | None = None, seed: int | None = N
     Raises `ScenarioError` naming file, key and line for an implementation or a setting that does
     not exist, and for a topic to record that no implementation produces.
     """
-    scenario = with_overrides(load_scenario(path), frames, seed)
+    return check_implementations(with_overrides(load_scenario(path), frames, seed))
+
+
+def check_implementations(scenario: Scenario) -> Scenario:
+    """The scenario, checked as `checked_scenario` does."""
     produced: set[str] = set()
     for name, spec in scenario.services.items():
         if spec.remote:

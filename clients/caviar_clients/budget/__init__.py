@@ -1,0 +1,1 @@
+"""What frame rate a recorded run would sustain."""

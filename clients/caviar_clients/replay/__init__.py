@@ -1,0 +1,1 @@
+"""Repeating recorded runs, with some of their services replaced."""

@@ -1,0 +1,200 @@
+"""Which services of a recorded run are served from the recording, and which run again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import msgspec
+from msgspec.structs import replace
+
+from caviar_clients.replay.recorded import RecordedRun, declared
+from caviar_clients.replay.request import Request, merged, typed
+from caviar_protocol.errors import RunError
+from caviar_protocol.messages import Hello, Input
+from caviar_protocol.scenario import REMOTE, ReplaySpec, Scenario, ServiceSpec
+from caviar_protocol.scenario_checks import world_of
+from caviar_services.registry import load
+from caviar_services.replay import use_of
+
+Part: TypeAlias = Literal["recorded", "replaced", "again", "left out"]
+
+
+@dataclass(frozen=True)
+class Role:
+    """What becomes of one service."""
+
+    name: str
+    part: Part
+    use: str
+    why: str
+
+
+@dataclass(frozen=True)
+class ReplayPlan:
+    """A replay before it begins."""
+
+    scenario: Scenario
+    frames: int
+    """Frames of an episode, at most."""
+    roles: tuple[Role, ...]
+    notes: tuple[str, ...]
+    identical: bool
+    """Whether the digest has to be that of the recorded run."""
+
+
+def plan_replay(run: RecordedRun, request: Request, frames: int | None = None) -> ReplayPlan:
+    """Plan of a replay. Raises `RunError` where somebody needs what was not recorded and does not run."""
+    roles = tuple(_role(name, spec, run, request) for name, spec in run.scenario.services.items())
+    services = {role.name: _spec(role, run, request) for role in roles if role.part != "left out"}
+    hellos = {name: _declared(name, spec, run) for name, spec in services.items()}
+    _check_needs(hellos, roles, run)
+    length, cut = _length(run, roles, frames)
+    served = tuple(role.name for role in roles if role.part == "recorded")
+    produced = {topic for hello in hellos.values() for topic in hello.outputs}
+    spec = ReplaySpec(
+        recording=str(run.recording.directory.resolve()),
+        served=served,
+        imposed=tuple(r.name for r in roles if r.part == "again" and run.hellos[r.name].role != "recorder"),
+        digest=run.digest(length),
+    )
+    scenario = replace(
+        run.scenario,
+        run=replace(
+            run.scenario.run,
+            pace="fast",
+            episodes=len(run.lengths),
+            seed=run.recording.metadata.seed,
+            record=tuple(entry for entry in run.demand if entry.partition(".")[0] in produced),
+        ),
+        services=services,
+        devices=tuple(
+            replace(device, world=world_of(run.scenario, index))
+            for index, device in enumerate(run.scenario.devices)
+        ),
+        replay=spec,
+    )
+    missed = [name for name in spec.imposed if run.misses(name)]
+    return ReplayPlan(
+        scenario=scenario,
+        frames=length,
+        roles=roles,
+        notes=(*cut, *_notes(run, roles, missed)),
+        identical=not request.changed and not missed,
+    )
+
+
+def _role(name: str, spec: ServiceSpec, run: RecordedRun, request: Request) -> Role:
+    """What becomes of a service. Whoever takes what a changed one makes runs again, and so on downstream."""
+    if name in request.replace:
+        return Role(name, "replaced", request.replace[name], f"in place of {spec.use}")
+    if name in request.settings:
+        return Role(name, "replaced", spec.use, "with other settings")
+    if spec.role == "recorder":
+        return Role(name, "again", spec.use, "records")
+    if request.again and run.topics[name]:
+        return Role(name, "again", spec.use, "as recorded, its decisions imposed")
+    if name in request.keep:
+        return Role(name, "again", spec.use, "as asked for")
+    after = run.after(request.changed) - request.recorded
+    if name in after:
+        origin = ", ".join(sorted(other for other in request.changed if name in run.after([other])))
+        return Role(name, "again", spec.use, f"it takes what follows from {origin}")
+    if not run.topics[name]:
+        return Role(name, "left out", spec.use, "nothing of it was recorded")
+    return Role(name, "recorded", use_of(spec.role, run.topics[name]), ", ".join(run.topics[name]))
+
+
+def _spec(role: Role, run: RecordedRun, request: Request) -> ServiceSpec:
+    """Everybody waits: a replay is not to depend on how fast this machine is."""
+    spec = replace(run.scenario.services[role.name], policy="wait")
+    if role.part == "recorded":
+        settings = {"recording": str(run.recording.directory.resolve())}
+        return replace(spec, use=role.use, settings=settings, max_in_flight=1)
+    if role.part == "replaced":
+        same = role.use == spec.use
+        given = request.settings.get(role.name, {})
+        types = msgspec.Struct if role.use == REMOTE else load(spec.role, role.use).Settings
+        changed = merged(spec.settings if same else {}, typed(given, types))
+        return replace(spec, use=role.use, settings=changed)
+    return spec
+
+
+def _declared(name: str, spec: ServiceSpec, run: RecordedRun) -> Hello:
+    """Of what runs; `DeclarationError` where that is not registered."""
+    return run.hellos[name] if spec.remote else declared(name, spec)
+
+
+def _check_needs(hellos: dict[str, Hello], roles: tuple[Role, ...], run: RecordedRun) -> None:
+    """Whoever runs has to find what it needs, from one that runs or in the recording."""
+    recorded = {role.name for role in roles if role.part == "recorded"}
+    for name, hello in hellos.items():
+        for item in hello.inputs:
+            if hello.role == "recorder":
+                continue
+            sources = [other for other, its in hellos.items() if item.topic in its.outputs]
+            if not sources and item.required:
+                raise RunError(_not_recorded(name, item, run))
+            if sources and run.parts_are_known and recorded.issuperset(sources):
+                _check_parts(name, item, sources[0], run)
+
+
+def _check_parts(name: str, item: Input, source: str, run: RecordedRun) -> None:
+    for part in item.parts:
+        entry = f"{item.topic}.{part}"
+        if entry not in run.demand:
+            raise RunError(
+                f"{name!r} needs {entry}, and {item.topic} was recorded without it; add --keep {source}, or "
+                f'record a run with record = […, "{entry}"]'
+            )
+
+
+def _not_recorded(name: str, item: Input, run: RecordedRun) -> str:
+    makers = [other for other, hello in run.hellos.items() if item.topic in hello.outputs]
+    text = f"{name!r} needs {item.topic}, which {run.recording.path} does not hold"
+    if makers:
+        return (
+            f"{text}; add --keep {makers[0]}, which makes it, or record a run with "
+            f'record = […, "{item.topic}"]'
+        )
+    known = ", ".join(sorted(run.recording.topics))
+    return f"{text}, and no service of the recorded run makes; it holds {known}"
+
+
+def _length(run: RecordedRun, roles: tuple[Role, ...], frames: int | None) -> tuple[int, list[str]]:
+    """Frames of an episode. Replayed agents end episodes where they ended; without one, all are as short
+    as the shortest."""
+    agents = [r for r in roles if r.part == "recorded" and run.hellos[r.name].role == "agent"]
+    shortest, longest = min(run.lengths.values()), max(run.lengths.values())
+    found, notes = longest, []
+    if not agents and any(role.part == "recorded" for role in roles):
+        found = shortest
+        if shortest < longest:
+            notes.append(f"episodes have {shortest} frames, as many as the shortest recorded one")
+    if not run.recording.complete:
+        notes.append("the recording breaks off; what there is of it is repeated")
+    if frames is not None and frames > found:
+        raise RunError(f"--frames {frames}: the recording has {found} of an episode; write at most {found}")
+    return frames or found, notes
+
+
+def _notes(run: RecordedRun, roles: tuple[Role, ...], missed: list[str]) -> list[str]:
+    runs = {role.name for role in roles if role.part in ("replaced", "again")}
+    acts = any(run.scenario.services[name].role == "agent" for name in runs)
+    notes = []
+    for role in roles:
+        hello = run.hellos[role.name]
+        follows = hello.role == "world" and any(item.topic == "action" for item in hello.inputs)
+        if role.part == "recorded" and follows and acts:
+            notes.append(
+                f"{role.name} is as recorded: it does not follow the actions of this run (open loop)"
+            )
+    for name in missed:
+        notes.append(
+            f"{name} missed {run.misses(name)} frames in the recorded run; it computes them now, so that the "
+            "digest becomes another"
+        )
+    strict = [n for n, s in run.scenario.services.items() if s.policy != "wait" and n in runs]
+    if strict:
+        notes.append(f"nothing is late in a replay: {', '.join(strict)} wait instead of missing frames")
+    return notes
