@@ -99,6 +99,8 @@ class BrokerServer:
         self._routes: dict[str, bytes] = {}
         self._host = host_identity()
         self._replying = b""
+        self._taken = False
+        """Whether the clock took answers that it has not acted upon yet."""
         self._entries: list[ev.Journal] = []
         """Decisions that are not in the journal yet."""
         self._next_check = self._look_at = 0
@@ -159,14 +161,16 @@ class BrokerServer:
     def _turn(self) -> None:
         """Serve whoever is there; with nobody there, or after `LOOK_NS` at the latest, see to deadlines.
 
-        Finding the next deadline is work for the time in which nobody waits for this process.
+        Deadlines are looked for once in `LOOK_NS` at most: that costs as much as an answer.
         """
         busy, now = self._port.readable, time.monotonic_ns()
-        if busy and now < self._look_at:
-            self._receive_all()
-        else:
+        if now >= self._look_at:
             wake = self._see_to_deadlines(now)
             self.loop.call(self.loop.poll(0 if busy else wake - now))
+        elif busy:
+            self._receive_all()
+        else:
+            self.loop.call(self.loop.poll(self._look_at - now))
         self._write_journal()
 
     def _see_to_deadlines(self, now: int) -> int:
@@ -188,10 +192,13 @@ class BrokerServer:
     def _receive_all(self) -> None:
         for _ in range(MESSAGES_A_TURN):
             received = self._port.receive()
-            if received is not None:
-                self._handle(*received)
-            if not self._port.readable:
-                return
+            if received is None:
+                break
+            self._handle(*received)
+        if self._taken:  # what services answer together is acted upon once
+            self._taken = False
+            self.clock.settle(time.monotonic_ns())
+            self._perform()
 
     # --- what comes ----------------------------------------------------------------------------------
 
@@ -302,7 +309,8 @@ class BrokerServer:
 
     def _done(self, service: str, message: m.Done, parts: Sequence[zmq.Frame]) -> None:
         payloads = tuple(zip(parts[::2], parts[1::2], strict=True))
-        self.feed(ev.DoneReceived(service, message, payloads))
+        self.clock.take(ev.DoneReceived(service, message, payloads), time.monotonic_ns())
+        self._taken = True
 
     def _reset_done(self, service: str, message: m.ResetDone, _: Sequence[zmq.Frame]) -> None:
         self.feed(ev.ResetDoneReceived(service, message))

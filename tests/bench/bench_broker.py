@@ -1,313 +1,182 @@
-"""What a frame costs in the broker, beside a bare ROUTER/DEALER loop that forwards the same products.
+"""What a frame costs in the broker, beside a bare loop that forwards the same bytes, HELICS and mosaik.
 
-    python tests/bench/bench_broker.py [--services 2 4 8] [--frames 2000] [--size 100] [--profile]
+    python tests/bench/bench_broker.py [--services 2 4 8 32] [--payload 100] [--frames 2000] [--json FILE]
 
-One hub and N − 1 leaves, each a process of its own. In every frame the hub's product goes to all
-leaves, and the product of each leaf goes to the hub in the next frame. Three loops run in turn:
+One hub and N - 1 others, each a process of its own. In every frame the hub takes a product of each of
+the others, and each of them takes the hub's. The kinds of loop take turns, round by round, so that a
+machine's moods fall on all of them; ratios are medians of the ratios within each round.
 
-- *bare*: a ROUTER loop that knows nothing but this pattern, and clients that echo bytes;
-- *broker*: the broker with its frame clock and journal, and clients that speak the protocol;
-- *runner*: the same broker, and clients that are services in the runner that all services share.
-
-Times are medians over the rounds, ratios are to *bare* in the same round. With ``--size 1000000`` the
-hub's product is large and goes one way; then bytes a second delivered to the leaves are printed too.
+- *bare*: a ROUTER loop that knows nothing but this pattern, and DEALER clients that send bytes back;
+- *broker*: `caviar bench broker`: frame clock, deadlines, journal, latency record, clients of the protocol;
+- *helics*, *mosaik*: where they are installed (``pip install helics mosaik``).
 """
+
+# ruff: noqa: T201 - a command that prints what it measured
 
 from __future__ import annotations
 
 import argparse
-import cProfile
-import os
-import pstats
+import importlib.util
+import json
+import re
 import statistics
 import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
-import msgspec
-import numpy as np
 import zmq
 
-from caviar_broker.__main__ import tune_collector
-from caviar_broker.core import events as ev
-from caviar_broker.core.plan import Limits, RunPlan, ServicePlan
-from caviar_broker.journal import JournalFile
-from caviar_broker.server import BrokerServer
-from caviar_broker.statistics import Statistics
-from caviar_protocol import messages as m
-from caviar_protocol.assets import AssetStore
-from caviar_protocol.codec import decode_message, encode_message
-from caviar_protocol.digest import payload_digest
-from caviar_protocol.host import host_identity
-from caviar_protocol.topics import Lidar, Scene
-from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
+from caviar_broker.bench.run import WARM_UP, measure
+from caviar_broker.bench.topology import deliveries
 
-SECOND = 1_000_000_000
-LEAF_SIZE = 100
-WARM_UP = 50
-"""Frames at the start that do not count."""
+HEADER = bytes(60)
+"""Stands for what the broker tells with each product."""
+PEERS_LEAST = 100
+"""Frames of HELICS and mosaik, which take longer, at least."""
 
-HUB_INPUTS = (m.Input(topic="lidar", lag=1, required=False),)
-LEAF_INPUTS = (m.Input(topic="scene"),)
+Seconds = Callable[[int, int, int], float]
+"""``kind(services, payload, frames)``: seconds that a frame takes."""
 
 
-class Silent:
-    """Observer that tells nobody."""
-
-    def notice(self, notice: ev.Notice) -> None:
-        """Problems end the run, which is told."""
-
-    def frame(self, frame: ev.FrameFinished, statistics: Statistics) -> None:
-        """Measured by the statistics."""
-
-
-def main() -> None:
-    arguments = parser().parse_args()
-    if arguments.client:
-        kind, name, endpoint = arguments.client
-        CLIENTS[kind](name, endpoint, arguments.size)
-        return
-    for count in arguments.services:
-        rows: dict[str, list[float]] = {}
-        for _ in range(arguments.rounds):
-            for kind in arguments.kinds:
-                measured = (bare if kind == "bare" else real)(
-                    kind, count, arguments.frames, arguments.size, arguments.profile
-                )
-                rows.setdefault(kind, []).append(measured)
-        report(count, arguments.size, rows)
-
-
-def report(count: int, size: int, rows: dict[str, list[float]]) -> None:
-    """One line for each kind of loop."""
-    for kind, seconds in rows.items():
-        line = f"N = {count}  {kind:7}{statistics.median(seconds) * 1e6:9.0f} µs a frame"
-        if "bare" in rows and kind != "bare":
-            ratios = [mine / bare for mine, bare in zip(seconds, rows["bare"], strict=True)]
-            line += f"   {statistics.median(ratios):5.2f} × bare ({min(ratios):.2f}–{max(ratios):.2f})"
-        if size >= 100_000:
-            line += f"   {(count - 1) * size / statistics.median(seconds) / 1e9:.2f} GB/s delivered"
-        sys.stdout.write(line + "\n")
-    sys.stdout.flush()
-
-
-# --- the loops ------------------------------------------------------------------------------------------
-
-
-def bare(kind: str, count: int, frames: int, size: int, profile: bool) -> float:
-    """Seconds a frame of a loop that knows nothing but the pattern."""
+def bare(services: int, payload: int, frames: int) -> float:
+    """A loop that knows nothing but the pattern."""
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     socket = context.socket(zmq.ROUTER)
     socket.bind("tcp://127.0.0.1:0")
-    with clients(kind, count, socket.getsockopt_string(zmq.LAST_ENDPOINT), size):
+    command = [sys.executable, __file__, "--echo", str(payload), socket.getsockopt_string(zmq.LAST_ENDPOINT)]
+    started = [subprocess.Popen([*command, str(number)]) for number in range(services)]
+    try:
         routes = {}
-        while len(routes) < count:
+        while len(routes) < services:
             route, name = socket.recv_multipart()
-            routes[name.decode()] = route
-        hub, *leaves = (routes[name] for name in names(count))
-        header = encode_message(m.Cancel(epoch=1, attempt=1, episode=0, frame=0))
-        back: list[Any] = []
-        started = 0.0
+            routes[int(name)] = route
+        hub, leaves = routes[0], [routes[number] for number in range(1, services)]
+        back: list[Any] = [b"\x80", bytes(payload)]
+        began = 0.0
         for frame in range(frames + WARM_UP):
             if frame == WARM_UP:
-                started = time.perf_counter()
-            socket.send_multipart([hub, header, *back], copy=False)
-            _, _, *product = socket.recv_multipart(copy=False)
+                began = time.perf_counter()
             for leaf in leaves:
-                socket.send_multipart([leaf, header, *product], copy=False)
-            back = []
+                socket.send_multipart([leaf, HEADER, *back], copy=False)
+            taken: list[Any] = []
             for _ in leaves:
-                back += socket.recv_multipart(copy=False)[2:]
-        elapsed = time.perf_counter() - started
+                taken += socket.recv_multipart(copy=False)[2:]
+            socket.send_multipart([hub, HEADER, *taken], copy=False)
+            back = socket.recv_multipart(copy=False)[2:]
+        elapsed = time.perf_counter() - began
         for route in routes.values():
             socket.send_multipart([route, b""])
-    socket.close(0)
-    context.term()
-    return elapsed / frames
-
-
-def real(kind: str, count: int, frames: int, size: int, profile: bool) -> float:
-    """Seconds a frame of the broker."""
-    services = tuple(
-        ServicePlan(name=name, role="world" if name == "hub" else "sensors", budget_ns=SECOND)
-        for name in names(count)
-    )
-    plan = RunPlan(
-        run="bench",
-        services=services,
-        frames=frames + WARM_UP,
-        sampling_period_ns=SECOND,
-        record=("lidar",),
-        limits=Limits(),
-    )
-    with tempfile.TemporaryDirectory() as folder:
-        journal = JournalFile(Path(folder) / "journal", 1)
-        server = BrokerServer(plan, "tcp://127.0.0.1:0", journal, Silent(), AssetStore(Path(folder)))
-        tune_collector()
-        with clients(kind, count, server.endpoint, size):
-            profiler = cProfile.Profile()
-            outcome = profiler.runcall(server.run) if profile else server.run()
-        journal.close()
-    if outcome.error:
-        raise SystemExit(outcome.error)
-    if profile:
-        pstats.Stats(profiler).sort_stats("tottime").print_stats(28)
-    finished = server.statistics.finished_ns
-    return (finished[-1] - finished[WARM_UP - 1]) / 1e9 / frames
-
-
-def names(count: int) -> list[str]:
-    return ["hub", *(f"leaf-{number}" for number in range(1, count))]
-
-
-@contextmanager
-def clients(kind: str, count: int, endpoint: str, size: int) -> Iterator[None]:
-    """The services as processes."""
-    command = [sys.executable, __file__, "--size", str(size), "--client", kind]
-    path = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
-    environment = os.environ | {"PYTHONPATH": path, "CAVIAR_BENCH_SIZE": str(size)}
-    started = [subprocess.Popen([*command, name, endpoint], env=environment) for name in names(count)]
-    try:
-        yield
         for process in started:
             process.wait(10)
     finally:
         for process in started:
             process.kill()
             process.wait()
+        socket.close(0)
+        context.term()
+    return elapsed / frames
 
 
-# --- the services ------------------------------------------------------------------------------------------
-
-
-def product(name: str, size: int) -> tuple[bytes, bytes]:
-    return b"\x80", bytes(size if name == "hub" else LEAF_SIZE)
-
-
-def connected(endpoint: str) -> zmq.Socket[bytes]:
-    socket = zmq.Context.instance().socket(zmq.DEALER)
-    socket.connect(endpoint)
-    return socket
-
-
-def echo(name: str, endpoint: str, size: int) -> None:
-    """Client of the bare loop."""
-    socket = connected(endpoint)
-    socket.send(name.encode())
-    header, body = product(name, size)
-    answer = encode_message(m.Cancel(epoch=1, attempt=1, episode=0, frame=0))
-    while True:
-        first, *_ = socket.recv_multipart(copy=False)
-        if not first.bytes:
-            return
-        socket.send_multipart([answer, header, body], copy=False)
-
-
-def speak(name: str, endpoint: str, size: int) -> None:
-    """Client of the broker: the protocol and nothing else."""
-    socket, hub = connected(endpoint), name == "hub"
-    hello = m.Hello(
-        version=m.PROTOCOL_VERSION,
-        name=name,
-        role="world" if hub else "sensors",
-        inputs=HUB_INPUTS if hub else LEAF_INPUTS,
-        outputs=("scene",) if hub else ("lidar",),
-        host=host_identity(),
-        pid=os.getpid(),
-    )
-    socket.send(encode_message(hello))
-    header, body = product(name, size)
-    products = (m.ProductHeader(topic=hello.outputs[0], digest=payload_digest(header, body)),)
-    ids: dict[str, int] = {}
-    while True:
-        first, *_ = socket.recv_multipart(copy=False)
-        message = decode_message(first.buffer)
-        match message:
-            case m.Grant():
-                done = m.Done(**ids, episode=message.episode, frame=message.frame, products=products)
-                socket.send_multipart([encode_message(done), header, body], copy=False)
-            case m.Welcome():
-                ids = {"epoch": message.epoch, "attempt": message.attempt}
-            case m.Prepare():
-                socket.send(encode_message(m.Ready(**ids)))
-            case m.Reset():
-                socket.send(encode_message(m.ResetDone(**ids, episode=message.episode)))
-            case m.Shutdown():
-                socket.send(encode_message(m.Bye(**ids)))
+def echo(payload: int, endpoint: str, name: str) -> None:
+    """A client of the bare loop."""
+    with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
+        socket.connect(endpoint)
+        socket.send(name.encode())
+        body = bytes(payload)
+        while True:
+            first, *_ = socket.recv_multipart(copy=False)
+            if not first.bytes:
                 return
+            socket.send_multipart([HEADER, b"\x80", body], copy=False)
 
 
-def serve(name: str, endpoint: str, size: int) -> None:
-    """Client of the broker: a service in the runner."""
-    from caviar_services.runner import CONNECT_TIMEOUT_S, run_service
-
-    hub = name == "hub"
-    place = "bench_broker:Hub" if hub else "bench_broker:Leaf"
-    run_service(name, "world" if hub else "sensors", place, endpoint, CONNECT_TIMEOUT_S)
+def broker(services: int, payload: int, frames: int) -> float:
+    """The broker."""
+    return measure("hub", services, payload, frames).us_per_frame.mean / 1e6
 
 
-class Settings(msgspec.Struct, frozen=True):
-    """None."""
+def peer(name: str) -> Seconds:
+    """Another co-simulation, in a process of its own."""
 
-
-class Hub(Service[Settings]):
-    """A world whose product is one image-like array."""
-
-    role: ClassVar[m.Role] = "world"
-    inputs: ClassVar[tuple[m.Input, ...]] = HUB_INPUTS
-    outputs: ClassVar[tuple[str, ...]] = ("scene",)
-    Settings: ClassVar[type[msgspec.Struct]] = Settings
-
-    def __init__(self, settings: Settings, run: RunInfo) -> None:
-        super().__init__(settings, run)
-        count = int(os.environ["CAVIAR_BENCH_SIZE"]) // 104 + 1  # position, orientation, velocity, dimensions
-        self._scene = Scene(
-            names=tuple(f"o{n:06}" for n in range(count)),
-            classes=("car",) * count,
-            assets=("",) * count,
-            position=np.zeros((count, 3)),
-            orientation=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
-            velocity=np.zeros((count, 3)),
-            dimensions=np.ones((count, 3)),
+    def seconds(services: int, payload: int, frames: int) -> float:
+        script = Path(__file__).with_name(f"peer_{name}.py")
+        command = [sys.executable, str(script), *map(str, (services, payload, max(PEERS_LEAST, frames // 4)))]
+        done = subprocess.run(
+            command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, timeout=600, check=True
         )
+        found = re.search(rb"seconds a frame: ([-+.e0-9]+)", done.stdout)
+        assert found, f"{script.name} told no time: {done.stdout[-500:]!r}"
+        return float(found[1])
 
-    def prepare(self, preparation: Preparation) -> Prepared:
-        return Prepared(prefixes=("o",))
-
-    def step(self, frame: Frame) -> StepResult:
-        return StepResult(products={"scene": self._scene})
-
-
-class Leaf(Service[Settings]):
-    """Sensors that see nothing."""
-
-    role: ClassVar[m.Role] = "sensors"
-    inputs: ClassVar[tuple[m.Input, ...]] = LEAF_INPUTS
-    outputs: ClassVar[tuple[str, ...]] = ("lidar",)
-    Settings: ClassVar[type[msgspec.Struct]] = Settings
-
-    def step(self, frame: Frame) -> StepResult:
-        return StepResult(products={"lidar": Lidar(object_names=(), scans=())})
+    return seconds
 
 
-CLIENTS: dict[str, Callable[[str, str, int], None]] = {"bare": echo, "broker": speak, "runner": serve}
+KINDS: dict[str, Seconds] = {
+    "bare": bare,
+    "broker": broker,
+    "helics": peer("helics"),
+    "mosaik": peer("mosaik"),
+}
 
 
-def parser() -> argparse.ArgumentParser:
-    found = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    found.add_argument("--services", type=int, nargs="+", default=[2, 4, 8], help="N")
-    found.add_argument("--frames", type=int, default=2000)
-    found.add_argument("--rounds", type=int, default=3)
-    found.add_argument("--size", type=int, default=100, help="bytes of the hub's product")
-    found.add_argument("--kinds", nargs="+", choices=list(CLIENTS), default=["bare", "broker", "runner"])
-    found.add_argument("--profile", action="store_true", help="profile the broker's loop")
-    found.add_argument("--client", nargs=3, help=argparse.SUPPRESS)
-    return found
+def report(services: int, payload: int, rows: dict[str, list[float]]) -> list[dict[str, Any]]:
+    """Print and return a line for each kind of loop."""
+    lines = []
+    delivered = deliveries("hub", services) * payload
+    for kind, seconds in rows.items():
+        to_bare = [mine / bare for mine, bare in zip(seconds, rows["bare"], strict=True)]
+        line = {
+            "services": services,
+            "payload": payload,
+            "kind": kind,
+            "us_per_frame": statistics.median(seconds) * 1e6,
+            "bytes_per_second": delivered / statistics.median(seconds),
+            "time_to_bare": statistics.median(to_bare),
+            "time_to_bare_range": [min(to_bare), max(to_bare)],
+        }
+        lines.append(line)
+        low, high = line["time_to_bare_range"]
+        print(
+            f"N = {services:3} {payload:8} B  {kind:7}{line['us_per_frame']:9.0f} µs a frame "
+            f"{line['time_to_bare']:7.2f} × bare ({low:.2f} to {high:.2f}) "
+            f"{line['bytes_per_second'] / 1e6:9.3g} MB/s",
+            flush=True,
+        )
+    return lines
+
+
+def main() -> None:
+    """What the command line says."""
+    if sys.argv[1:2] == ["--echo"]:
+        echo(int(sys.argv[2]), *sys.argv[3:])
+        return
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--services", type=int, nargs="+", default=[2, 4, 8, 32], help="N")
+    parser.add_argument("--payload", type=int, nargs="+", default=[100], help="bytes of every product")
+    parser.add_argument("--frames", type=int, default=2000)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--kinds", nargs="+", choices=list(KINDS), default=list(KINDS))
+    parser.add_argument("--json", type=Path)
+    told = parser.parse_args()
+    kinds = ["bare", *(k for k in told.kinds if k != "bare")]
+    for kind in [k for k in kinds if k in ("helics", "mosaik") and importlib.util.find_spec(k) is None]:
+        print(f"{kind} is left out: pip install {kind}")
+        kinds.remove(kind)
+    lines = []
+    for payload in told.payload:
+        for services in told.services:
+            rows: dict[str, list[float]] = {kind: [] for kind in kinds}
+            for _ in range(told.rounds):
+                for kind in kinds:
+                    rows[kind].append(KINDS[kind](services, payload, told.frames))
+            lines += report(services, payload, rows)
+    if told.json:
+        told.json.write_text(json.dumps(lines, indent=2) + "\n")
 
 
 if __name__ == "__main__":

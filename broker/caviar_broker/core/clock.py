@@ -66,9 +66,13 @@ class FrameClock:
 
     def receive(self, event: ev.Event, now: int) -> None:
         """Take in one event at the time ``now`` [ns]."""
+        self.take(event, now)
+        self.settle(now)
+
+    def take(self, event: ev.Event, now: int) -> None:
+        """The first half of `receive`, for several events that came together: `settle` follows the last."""
         handler = self._late if self._run.over else self._handlers[type(event)]
         handler(event, now)
-        self._settle(now)
 
     def expire(self, now: int) -> None:
         """Act on every deadline that has passed."""
@@ -76,7 +80,7 @@ class FrameClock:
             self._episodes.schedule.expire(now)
             self._episodes.pump(now)
         self._liveness.expire(now)
-        self._settle(now)
+        self.settle(now)
 
     def next_deadline(self) -> int | None:
         """When `expire` has to be called at the latest [ns]; None if nothing is awaited."""
@@ -93,7 +97,7 @@ class FrameClock:
         actions, self._run.actions = self._run.actions, []
         return actions
 
-    def _settle(self, now: int) -> None:
+    def settle(self, now: int) -> None:
         """What follows from any event: the schedule acts, and a run that is over gets done."""
         self._deadline_is_known = False
         self._episodes.pump(now)

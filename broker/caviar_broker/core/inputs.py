@@ -45,22 +45,22 @@ class Inputs:
     def gathered(self, task: Task) -> Gathered | None:
         """What is decided about its inputs; None while one of them is not (clause 7)."""
         frame, undecided = task.frame, self._book.next
-        edges = self.taken(task)
+        edges = (self._all if frame < self._book.frames else self._lagged)[task.service]
         for edge in edges:
-            lag = edge.lag
-            if frame - lag >= undecided[edge.source] and frame >= lag:
+            if frame - edge.lag >= undecided[edge.source] and frame >= edge.lag:
                 return None
         # The service's own last decision is relied on too. What was decided in this very frame would be
         # decided again. Entries become safe in order, so nothing is missing between them.
-        cause, entry = None, self._book.entry(task.service, frame - 1)
+        book = self._book
+        cause, entry = None, book.entry(task.service, frame - 1)
         decisions = []
         for edge in edges:
-            decision = self._book.decision(edge, frame)
+            decision = book.decision(edge, frame)
             decisions.append((edge, decision))
             if decision.product is None and edge.required and frame >= edge.lag and cause is None:
                 cause = decision.cause
-            if edge.lag:
-                entry = max(entry, self._book.entry(edge.source, frame - edge.lag))
+            if edge.lag and (of_input := book.entry(edge.source, frame - edge.lag)) > entry:
+                entry = of_input
             if decision.journal > entry:
                 entry = decision.journal
         return Gathered(decisions, cause, entry)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from caviar_broker.core.plan import Limits, ServicePlan
 from caviar_broker.core.tasks import Task
@@ -45,16 +45,13 @@ class Peer:
     """How its loss is known."""
     losses: int = 0
     """How often it was lost since it last answered a grant."""
+    name: str = field(init=False)
+    """Name in the run."""
+    role: str = field(init=False)
+    """Role in the run."""
 
-    @property
-    def name(self) -> str:
-        """Name in the run."""
-        return self.plan.name
-
-    @property
-    def role(self) -> str:
-        """Role in the run."""
-        return self.plan.role
+    def __post_init__(self) -> None:
+        self.name, self.role = self.plan.name, self.plan.role
 
     @property
     def present(self) -> bool:

@@ -11,6 +11,7 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
+from caviar_clients.cli import bench
 from caviar_protocol.errors import CaviarError
 
 app = typer.Typer(
@@ -19,6 +20,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Co-simulation of machine-learning-based 6G in virtual worlds.",
 )
+app.add_typer(bench.app, name="bench")
 _console = Console()
 _errors = Console(stderr=True)
 

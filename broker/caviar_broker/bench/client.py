@@ -1,0 +1,77 @@
+"""A client of a measured run: the protocol, and nothing else.
+
+``python -m caviar_broker.bench.client TOPOLOGY SERVICES NUMBER PAYLOAD ENDPOINT``
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import get_args
+
+import zmq
+
+from caviar_broker.bench.topology import Part, Topology, parts
+from caviar_protocol import messages as m
+from caviar_protocol.codec import decode_message, encode_message
+from caviar_protocol.digest import payload_digest
+from caviar_protocol.host import host_identity
+
+
+def speak(part: Part, payload: int, endpoint: str) -> None:
+    """Take part in a run until the broker ends it, with a product of ``payload`` bytes in every frame."""
+    with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
+        socket.connect(endpoint)
+        socket.send(encode_message(_hello(part)))
+        header, body = b"\x80", bytes(payload)
+        # Hashed once, since it is the same in every frame: hashing is the producer's work, not the broker's.
+        products = (m.ProductHeader(topic=part.output, digest=payload_digest(header, body)),)
+        epoch = attempt = 0
+        while True:
+            first, *_ = socket.recv_multipart(copy=False)
+            message = decode_message(first.buffer)
+            match message:
+                case m.Grant():
+                    done = m.Done(
+                        epoch=epoch,
+                        attempt=attempt,
+                        episode=message.episode,
+                        frame=message.frame,
+                        products=products,
+                    )
+                    socket.send_multipart([encode_message(done), header, body], copy=False)
+                case m.Welcome():
+                    epoch, attempt = message.epoch, message.attempt
+                case m.Prepare():
+                    socket.send(encode_message(m.Ready(epoch=epoch, attempt=attempt)))
+                case m.Reset():
+                    answer = m.ResetDone(epoch=epoch, attempt=attempt, episode=message.episode)
+                    socket.send(encode_message(answer))
+                case m.Shutdown():
+                    socket.send(encode_message(m.Bye(epoch=epoch, attempt=attempt)))
+                    return
+                case m.Refuse():
+                    raise SystemExit(f"{part.name}: {message.message}")
+
+
+def _hello(part: Part) -> m.Hello:
+    return m.Hello(
+        version=m.PROTOCOL_VERSION,
+        name=part.name,
+        role=part.role,
+        inputs=part.inputs,
+        outputs=(part.output,),
+        host=host_identity(),
+        pid=os.getpid(),
+    )
+
+
+def main() -> None:
+    """What the command line says."""
+    topology, services, number, payload, endpoint = sys.argv[1:]
+    chosen: Topology = next(t for t in get_args(Topology) if t == topology)
+    speak(parts(chosen, int(services))[int(number)], int(payload), endpoint)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,126 @@
+"""The broker of a measured run: port, frame clock, deadlines, journal and latency record, as in any run."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import msgspec
+import numpy as np
+
+from caviar_broker.__main__ import tune_collector
+from caviar_broker.bench.topology import Topology, deliveries, parts
+from caviar_broker.core import events as ev
+from caviar_broker.core.plan import SECOND, RunPlan, ServicePlan
+from caviar_broker.journal import JournalFile
+from caviar_broker.server import BrokerServer
+from caviar_broker.statistics import Statistics
+from caviar_protocol.assets import AssetStore
+from caviar_protocol.errors import RunError
+
+WARM_UP = 50
+"""Frames at the start that do not count."""
+BUDGET_NS = SECOND
+"""Of every service: long, so that a noisy machine does not turn up as misses, but kept watch over."""
+END_S = 10.0
+"""[s] that a client gets to end after the run."""
+
+
+class MicrosecondsPerFrame(msgspec.Struct, frozen=True):
+    """Wall time between the ends of frames [µs]."""
+
+    mean: float
+    p50: float
+    p99: float
+
+
+class Measured(msgspec.Struct, frozen=True, kw_only=True):
+    """What a run cost."""
+
+    topology: Topology
+    services: int
+    payload: int
+    """[B]"""
+    frames: int
+    """That were measured, behind the warm-up."""
+    us_per_frame: MicrosecondsPerFrame
+    bytes_per_second: float
+    """Delivered to consumers [B/s]."""
+    broker_cpu_us_per_frame: float
+    """CPU time of the broker's own thread [µs]; what ZeroMQ's threads do is not in it."""
+    misses: int
+    """Deadlines that were missed."""
+
+
+class _Silent:
+    """Observer that tells nobody."""
+
+    def notice(self, notice: ev.Notice) -> None:
+        """Problems end the run, which is told; misses are counted."""
+
+    def frame(self, frame: ev.FrameFinished, statistics: Statistics) -> None:
+        """Measured by the statistics."""
+
+
+def measure(topology: Topology, services: int, payload: int, frames: int) -> Measured:
+    """Run ``services`` clients, each a process, with products of ``payload`` bytes.
+
+    Raises `RunError` where the run, or one of the clients, does not come to its end.
+    """
+    declared = parts(topology, services)
+    plan = RunPlan(
+        run="bench",
+        services=tuple(ServicePlan(name=p.name, role=p.role, budget_ns=BUDGET_NS) for p in declared),
+        frames=frames + WARM_UP,
+        sampling_period_ns=SECOND,
+        record=("lidar",),
+    )
+    with (
+        TemporaryDirectory() as folder,
+        closing(JournalFile(Path(folder) / "journal", plan.epoch)) as journal,
+    ):
+        store = AssetStore(Path(folder) / "assets")
+        server = BrokerServer(plan, "tcp://127.0.0.1:0", journal, _Silent(), store)
+        tune_collector()
+        with _clients(topology, services, payload, server.endpoint):
+            began = time.thread_time()
+            outcome = server.run()
+            cpu = time.thread_time() - began
+    if outcome.error:
+        raise RunError(f"the measured run did not come to its end: {outcome.error}")
+    ends = np.asarray(server.statistics.finished_ns[WARM_UP - 1 :], np.int64)
+    each = np.diff(ends) / 1e3
+    mean = float(each.mean())
+    return Measured(
+        topology=topology,
+        services=services,
+        payload=payload,
+        frames=frames,
+        us_per_frame=MicrosecondsPerFrame(mean, float(np.median(each)), float(np.percentile(each, 99))),
+        bytes_per_second=deliveries(topology, services) * payload / mean * 1e6,
+        broker_cpu_us_per_frame=cpu / (frames + WARM_UP) * 1e6,
+        misses=server.statistics.misses,
+    )
+
+
+@contextmanager
+def _clients(topology: Topology, services: int, payload: int, endpoint: str) -> Iterator[None]:
+    """The clients as processes; none of them outlives the block."""
+    command = [sys.executable, "-m", "caviar_broker.bench.client", topology, str(services)]
+    started: Sequence[subprocess.Popen[bytes]] = [
+        subprocess.Popen([*command, str(number), str(payload), endpoint])  # noqa: S603  # our own module
+        for number in range(services)
+    ]
+    try:
+        yield
+        for process in started:
+            process.wait(END_S)
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
