@@ -19,6 +19,7 @@ from caviar_broker.briefing import briefings, with_ownership
 from caviar_broker.control import Control, Reporter, stop_on_signals
 from caviar_broker.core.plan import plan_run
 from caviar_broker.journal import JournalFile
+from caviar_broker.scheduling import prefer
 from caviar_broker.server import BrokerServer
 from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.host import steady_memory
@@ -38,9 +39,10 @@ def serve(arguments: argparse.Namespace) -> int:
     """Run the broker; the exit status: 0 exactly if the run came to its end."""
     steady_memory()
     scenario = load_scenario(arguments.scenario)
-    scenario = with_ownership(with_overrides(scenario, arguments.frames, arguments.seed))
+    scenario = with_ownership(with_overrides(scenario, arguments.frames, arguments.seed, arguments.pace))
     directory = _made(arguments.directory)
     plan = plan_run(scenario, arguments.run or directory.name, briefings(scenario, directory))
+    scheduling = prefer()  # before the threads of the port are started, which inherit it
     reporter = Reporter(sys.stdout.fileno(), directory / "events.jsonl", arguments.control)
     with closing(JournalFile(directory / "journal.msgpack", plan.epoch)) as journal:
         supervised = arguments.supervised if arguments.control else ()
@@ -61,6 +63,8 @@ def serve(arguments: argparse.Namespace) -> int:
         frames=statistics.frames,
         frames_per_second=statistics.frames_per_second(),
         warm_up_frames=statistics.warm_up_frames,
+        deadlines={"scheduling": scheduling} | msgspec.structs.asdict(statistics.deadlines()),
+        pace=msgspec.structs.asdict(statistics.pace()),
         services={n: msgspec.structs.asdict(s) for n, s in statistics.services().items()},
     )
     if outcome.error and not arguments.control:
@@ -87,6 +91,7 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--run", default="", help="id of the run; by default the directory's name")
     found.add_argument("--frames", type=int, default=None, help="instead of the scenario's")
     found.add_argument("--seed", type=int, default=None, help="instead of the scenario's")
+    found.add_argument("--pace", default=None, help="instead of the scenario's: free, realtime or a factor")
     found.add_argument("--control", action="store_true", help="talk JSON lines with a launcher")
     found.add_argument("--supervised", nargs="*", default=[], help="services the launcher watches itself")
     return found

@@ -134,6 +134,7 @@ class BrokerServer:
             ev.Send: self._send,
             ev.Journal: lambda action: self._entries.append(action),
             ev.Latency: self._latency,
+            ev.Overdue: self._overdue,
             ev.Notice: self._observer.notice,
             ev.FrameFinished: self._frame_finished,
             ev.EpisodeFinished: self._episode_finished,
@@ -170,7 +171,7 @@ class BrokerServer:
         elif busy:
             self._receive_all()
         else:
-            self.loop.call(self.loop.poll(self._look_at - now))
+            self.loop.call(self.loop.poll_sockets(self._look_at))
         self._write_journal()
 
     def _see_to_deadlines(self, now: int) -> int:
@@ -354,8 +355,11 @@ class BrokerServer:
     def _latency(self, action: ev.Latency) -> None:
         self.statistics.latency(action.service, action.elapsed_ns, action.missed)
 
+    def _overdue(self, action: ev.Overdue) -> None:
+        self.statistics.decision(time.monotonic_ns() - action.due_ns)
+
     def _frame_finished(self, action: ev.FrameFinished) -> None:
-        self.statistics.frame(time.monotonic_ns())
+        self.statistics.frame(time.monotonic_ns(), action.episode, action.lag_ns)
         self._observer.frame(action, self.statistics)
 
     def _episode_finished(self, action: ev.EpisodeFinished) -> None:

@@ -60,6 +60,7 @@ class Launcher:
     frames: int | None = None
     seed: int | None = None
     bind: str = "tcp://127.0.0.1:0"
+    pace: str | None = None
     endpoint: str = ""
     _children: dict[str, Child] = field(default_factory=dict)
     _broker: subprocess.Popen[bytes] | None = None
@@ -121,6 +122,8 @@ class Launcher:
             command += ["--frames", str(self.frames)]
         if self.seed is not None:
             command += ["--seed", str(self.seed)]
+        if self.pace is not None:
+            command += ["--pace", self.pace]
         command += ["--supervised", *self._local]
         with (self.directory / "logs" / "broker.log").open("wb") as log:
             self._broker = subprocess.Popen(  # noqa: S603  # our own module with checked arguments

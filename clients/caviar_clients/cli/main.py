@@ -28,6 +28,9 @@ ScenarioFile = Annotated[Path, typer.Argument(help="scenario file (TOML)", show_
 RunDirectory = Annotated[Path, typer.Argument(help="directory of a run, or one segment of its recording")]
 Frames = Annotated[int | None, typer.Option(min=1, help="frames of an episode, instead of the scenario's")]
 Seed = Annotated[int | None, typer.Option(min=0, max=2**63 - 1, help="seed, instead of the scenario's")]
+Pace = Annotated[
+    str | None, typer.Option(help="free, realtime or a number [times real time], instead of the scenario's")
+]
 
 
 @app.command()
@@ -41,11 +44,12 @@ def run(
     embedded: Annotated[
         bool, typer.Option("--embedded", help="all in this process, without sockets")
     ] = False,
+    pace: Pace = None,
 ) -> None:
     """Run a scenario: the broker and every service as processes of their own, or all in this one."""
     from caviar_clients.cli.run import run_scenario
 
-    raise typer.Exit(run_scenario(scenario, out, _console, frames, seed, json, bind, embedded))
+    raise typer.Exit(run_scenario(scenario, out, _console, frames, seed, json, bind, embedded, pace))
 
 
 @app.command()
@@ -55,20 +59,21 @@ def broker(
     frames: Frames = None,
     seed: Seed = None,
     out: Annotated[Path, typer.Option(help="directory in which the run's own is made")] = Path("runs"),
+    pace: Pace = None,
 ) -> None:
     """Run only the broker; start the services with `caviar service`, here or on other machines."""
     from caviar_broker.__main__ import parser, serve
     from caviar_clients.cli.run import run_directory
     from caviar_clients.sessions.checking import checked_scenario
 
-    checked = checked_scenario(scenario, frames, seed)
+    checked = checked_scenario(scenario, frames, seed, pace)
     directory = run_directory(out, checked.run.name)
     typer.echo(f"run {directory}; start its services with --broker and this broker's address:")
     for name, spec in checked.services.items():
         use = "IMPLEMENTATION" if spec.remote else spec.use
         typer.echo("  " + shlex.join(["caviar", "service", name, "--use", f"{spec.role}:{use}"]))
     arguments = [str(scenario), "--bind", bind, "--directory", str(directory)]
-    for name, value in (("--frames", frames), ("--seed", seed)):
+    for name, value in (("--frames", frames), ("--seed", seed), ("--pace", pace)):
         arguments += [] if value is None else [name, str(value)]
     raise typer.Exit(serve(parser().parse_args(arguments)))
 

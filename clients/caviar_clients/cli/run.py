@@ -59,9 +59,10 @@ def run_scenario(
     json_file: Path | None = None,
     bind: str = "tcp://127.0.0.1:0",
     embedded: bool = False,
+    pace: str | None = None,
 ) -> int:
     """Run a scenario; the exit status: 0 exactly if it came to its end."""
-    scenario = checked_scenario(path, frames, seed)
+    scenario = checked_scenario(path, frames, seed, pace)
     if embedded:
         refuse_remote(scenario)
     if json_file is not None:
@@ -72,7 +73,7 @@ def run_scenario(
     if embedded:
         launcher = EmbeddedLauncher(scenario, directory)
     else:
-        launcher = Launcher(scenario, path.resolve(), directory, frames, seed, bind)
+        launcher = Launcher(scenario, path.resolve(), directory, frames, seed, bind, pace=pace)
     outcome: Mapping[str, Any] = {}
     interrupted = _Interruption(launcher)
     with launcher, interrupted, _progress_bar(console) as bar:
