@@ -110,14 +110,14 @@ class Mutator:
         which = self.draw(4) if body else 3
         if which != 0:
             tree = self._trees.get(header)
-            header = self.restructured(tree) if tree and self.draw(3) == 0 else self.mutated(header)
+            header = self.restructured(header, tree) if tree and self.draw(3) == 0 else self.mutated(header)
         if which < 2:
             body = self.mutated(body)
         if self.draw(64) == 0:
             topic = TOPICS[self.draw(len(TOPICS))]
         return topic, header, body
 
-    def restructured(self, tree: dict[Any, Any]) -> bytes:
+    def restructured(self, header: bytes, tree: dict[Any, Any]) -> bytes:
         """What a header says, with one or two things in it exchanged, taken out, or told twice."""
         tree = copy.deepcopy(tree)
         for _ in range(1 + self.draw(2)):
@@ -130,7 +130,10 @@ class Mutator:
                     self._exchange(holder, key)
                     break
                 holder = inner
-        return bytes(msgpack.packb(tree))
+        try:
+            return bytes(msgpack.packb(tree))
+        except ValueError:  # deep things within deep things, which the packer refuses
+            return self.mutated(header)
 
     def _exchange(self, holder: Any, key: Any) -> None:
         kind = self.draw(6)
@@ -146,7 +149,7 @@ class Mutator:
         elif kind == 3 and isinstance(holder[key], int):
             holder[key] = min(2**64 - 1, max(-(2**63), holder[key] + self.draw(5) - 2))
         else:
-            holder[key] = VALUES[self.draw(len(VALUES))]
+            holder[key] = copy.deepcopy(VALUES[self.draw(len(VALUES))])
 
     def mutated(self, data: bytes) -> bytes:
         """Other bytes, of these: cut, spliced, repeated, overwritten."""
