@@ -38,5 +38,5 @@ def test_a_run_is_the_same_beside_ten_thousand_wrong_messages() -> None:
 
 
 @pytest.mark.slow
-def test_a_run_is_the_same_beside_half_a_million_wrong_messages() -> None:
-    fuzzed(500_000, 300)
+def test_a_run_is_the_same_beside_a_million_wrong_messages() -> None:
+    fuzzed(1_000_000, 300)
