@@ -167,6 +167,7 @@ class BrokerServer:
         busy, now = self._port.readable, time.monotonic_ns()
         if now >= self._look_at:
             wake = self._see_to_deadlines(now)
+            self._look_at = min(now + LOOK_NS, wake)
             self.loop.call(self.loop.poll(0 if busy else wake - now))
         elif busy:
             self._receive_all()
@@ -176,7 +177,6 @@ class BrokerServer:
 
     def _see_to_deadlines(self, now: int) -> int:
         """Act on whatever is due; the instant of the next thing that will be [ns]."""
-        self._look_at = now + LOOK_NS
         if now >= self._next_check:
             self._next_check = now + CHECK_NS
             self._watchdog.check(now)
