@@ -1,6 +1,6 @@
 """Feeds a broker that is in the middle of a run what is wrong, from many connections; run as a script.
 
-    python server_fuzzer.py [--inputs 100000] [--seed 6] [--connections 40] [--frames 50]
+    python server_fuzzer.py [--inputs 100000] [--seed 6] [--connections 40] [--frames FRAMES]
 
 Two services play a run over real sockets. Between their frames, connections that nobody knows send
 mutated messages, in parts that fit or do not, out of turn, come and go, and speak no ZMTP at all; the
@@ -39,6 +39,8 @@ from caviar_protocol.digest import payload_digest
 
 WORLD, EYES = "fuzzed-world", "fuzzed-eyes"
 """Names that no vector has."""
+CHUNK = 500
+"""Inputs between two frames, so that little waits to be read: memory that grows shows."""
 DRAINED_MS = 500
 """[ms] of silence after which everything that was sent counts as handled: all of it is answered."""
 PATIENCE_MS = 30_000
@@ -262,10 +264,13 @@ def main() -> int:
     parser.add_argument("--inputs", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=6)
     parser.add_argument("--connections", type=int, default=40)
-    parser.add_argument("--frames", type=int, default=50)
+    parser.add_argument(
+        "--frames", type=int, default=0, help=f"of the run; by default one for {CHUNK} inputs"
+    )
     arguments = parser.parse_args()
-    undisturbed = serve(0, arguments.seed, 0, arguments.frames)
-    report = serve(arguments.inputs, arguments.seed, arguments.connections, arguments.frames)
+    frames = arguments.frames or max(20, arguments.inputs // CHUNK)
+    undisturbed = serve(0, arguments.seed, 0, frames)
+    report = serve(arguments.inputs, arguments.seed, arguments.connections, frames)
     report |= {"inputs": arguments.inputs, "undisturbed": undisturbed["digest"]}
     sys.stdout.write(json.dumps(report) + "\n")
     return int(report["digest"] != report["undisturbed"])
