@@ -32,6 +32,7 @@ from caviar_broker.journal import JournalFile, mend_journal
 from caviar_broker.record import RunRecord, read_record
 from caviar_broker.replaying import with_replay
 from caviar_broker.resume import read_resumption
+from caviar_broker.scheduling import prefer
 from caviar_broker.security.access import Access
 from caviar_broker.security.local import check_bind
 from caviar_broker.server import BrokerServer
@@ -65,6 +66,7 @@ def serve(arguments: argparse.Namespace) -> int:
     plan = with_replay(plan, told.replay)
     checkpoints = CheckpointFiles(directory)
     resumption = _left(directory, checkpoints) if arguments.resume else None
+    scheduling = prefer()  # before the threads of the port are started, which inherit it
     reporter = Reporter(sys.stdout.fileno(), directory / "events.jsonl", arguments.control)
     with closing(JournalFile(directory / JOURNAL, plan.epoch, checkpoints)) as journal:
         supervised = arguments.supervised if arguments.control else ()
@@ -100,6 +102,8 @@ def serve(arguments: argparse.Namespace) -> int:
         frames=statistics.frames + statistics.earlier,
         frames_per_second=statistics.frames_per_second(),
         warm_up_frames=statistics.warm_up_frames,
+        deadlines={"scheduling": scheduling} | msgspec.structs.asdict(statistics.deadlines()),
+        pace=msgspec.structs.asdict(statistics.pace()),
         services={n: msgspec.structs.asdict(s) for n, s in statistics.services().items()},
     )
     if outcome.error and not arguments.control:
@@ -117,7 +121,9 @@ def _begun(arguments: argparse.Namespace) -> tuple[RunRecord, Path]:
     """A new run, and its directory."""
     if arguments.scenario is None or arguments.directory is None:
         raise RunError("give a scenario and a --directory, or --resume with the directory of a run")
-    scenario = with_overrides(load_scenario(arguments.scenario), arguments.frames, arguments.seed)
+    scenario = with_overrides(
+        load_scenario(arguments.scenario), arguments.frames, arguments.seed, arguments.pace
+    )
     directory = _made(arguments.directory)
     run, endpoint = arguments.run or directory.name, arguments.bind or DEFAULT_BIND
     return RunRecord(run=run, epoch=1, endpoint=endpoint, scenario=scenario), directory
@@ -161,6 +167,7 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--run", default="", help="id of the run; by default the directory's name")
     found.add_argument("--frames", type=int, default=None, help="instead of the scenario's")
     found.add_argument("--seed", type=int, default=None, help="instead of the scenario's")
+    found.add_argument("--pace", default=None, help="instead of the scenario's: free, realtime or a factor")
     found.add_argument("--control", action="store_true", help="talk JSON lines with a launcher")
     found.add_argument("--supervised", nargs="*", default=[], help="services the launcher watches itself")
     return found

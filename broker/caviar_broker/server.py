@@ -151,6 +151,7 @@ class BrokerServer:
             ev.Send: self._send,
             ev.Journal: lambda action: self._entries.append(action),
             ev.Latency: self._latency,
+            ev.Overdue: self._overdue,
             ev.Notice: self._observer.notice,
             ev.FrameFinished: self._frame_finished,
             ev.EpisodeFinished: self._episode_finished,
@@ -183,16 +184,16 @@ class BrokerServer:
         busy, now = self._port.readable, time.monotonic_ns()
         if now >= self._look_at:
             wake = self._see_to_deadlines(now)
+            self._look_at = min(now + LOOK_NS, wake)
             self.loop.call(self.loop.poll(0 if busy else wake - now))
         elif busy:
             self._receive_all()
         else:
-            self.loop.call(self.loop.poll(self._look_at - now))
+            self.loop.call(self.loop.poll_sockets(self._look_at))
         self._write_journal()
 
     def _see_to_deadlines(self, now: int) -> int:
         """Act on whatever is due; the instant of the next thing that will be [ns]."""
-        self._look_at = now + LOOK_NS
         if now >= self._next_check:
             self._next_check = now + CHECK_NS
             self._watchdog.check(now)
@@ -408,9 +409,12 @@ class BrokerServer:
     def _latency(self, action: ev.Latency) -> None:
         self.statistics.latency(action.service, action.elapsed_ns, action.missed)
 
+    def _overdue(self, action: ev.Overdue) -> None:
+        self.statistics.decision(time.monotonic_ns() - action.due_ns)
+
     def _frame_finished(self, action: ev.FrameFinished) -> None:
         self._journal.checkpoints.finished = action.episode, action.frame
-        self.statistics.frame(time.monotonic_ns())
+        self.statistics.frame(time.monotonic_ns(), action.episode, action.lag_ns)
         self._observer.frame(action, self.statistics)
 
     def _episode_finished(self, action: ev.EpisodeFinished) -> None:

@@ -39,6 +39,24 @@ RECENT = 512
 """Latencies behind figures that are asked for while the run goes on; few, since frames wait meanwhile."""
 
 
+class DeadlineStatistics(msgspec.Struct, frozen=True, kw_only=True):
+    """How long after its deadline each decision was taken (clause 9)."""
+
+    decisions: int
+    p99_ms: float
+    worst_ms: float
+
+
+class PaceStatistics(msgspec.Struct, frozen=True, kw_only=True):
+    """How a run kept its pace (clause 8); no slips where it is free."""
+
+    slips: int
+    """Frames that were released later than they were due."""
+    worst_slip_ms: float
+    lag_ms: float
+    """Sum of all slips."""
+
+
 class Statistics:
     """Collects latencies [ns] and frame times, and sums them up.
 
@@ -54,6 +72,9 @@ class Statistics:
         self._finished_at = array("q")
         self.earlier = 0
         """Frames that were finished before, under another broker."""
+        self._lateness = array("q")
+        self._slips = self._worst_slip = self._lag = 0
+        self._lag_of_episode = (0, 0)
 
     def latency(self, service: str, elapsed_ns: int, missed: bool) -> None:
         """A grant was answered, or its deadline passed."""
@@ -61,9 +82,20 @@ class Statistics:
         self._misses[service] += missed
         self._totals[service] += elapsed_ns
 
-    def frame(self, now: int) -> None:
-        """A frame is finished."""
+    def decision(self, lateness_ns: int) -> None:
+        """A deadline passed, and that long after it the decision was taken."""
+        self._lateness.append(lateness_ns)
+
+    def frame(self, now: int, episode: int = 0, lag_ns: int = 0) -> None:
+        """A frame is finished, in an episode that has slipped so far by ``lag_ns``."""
         self._finished_at.append(now)
+        known, before = self._lag_of_episode
+        slip = lag_ns - before if episode == known else lag_ns
+        self._lag_of_episode = episode, lag_ns
+        if slip:
+            self._slips += 1
+            self._worst_slip = max(self._worst_slip, slip)
+            self._lag += slip
 
     @property
     def frames(self) -> int:
@@ -115,12 +147,27 @@ class Statistics:
             )
         return found
 
+    def deadlines(self) -> DeadlineStatistics:
+        """How late the decisions at deadlines were."""
+        lateness = np.asarray(self._lateness, np.int64)
+        return DeadlineStatistics(
+            decisions=len(lateness),
+            p99_ms=float(np.percentile(lateness, 99)) / 1e6 if len(lateness) else 0.0,
+            worst_ms=float(lateness.max(initial=0)) / 1e6,
+        )
+
+    def pace(self) -> PaceStatistics:
+        """By how much frames slipped behind real time."""
+        return PaceStatistics(slips=self._slips, worst_slip_ms=self._worst_slip / 1e6, lag_ms=self._lag / 1e6)
+
     def save(self, path: Path) -> None:
-        """Write every figure as a NumPy archive: ``finished_ns`` by frame, ``latency_ns/NAME`` by grant.
+        """Write every figure as a NumPy archive: ``finished_ns`` by frame, ``latency_ns/NAME`` by grant,
+        ``decision_lateness_ns`` by deadline that was missed.
 
         A disk that is full costs the record, not the run's result.
         """
         figures: dict[str, Any] = {"finished_ns": np.asarray(self._finished_at, np.int64)}
+        figures["decision_lateness_ns"] = np.asarray(self._lateness, np.int64)
         figures |= {f"latency_ns/{n}": np.asarray(v, np.int64) for n, v in self._latencies.items()}
         try:
             np.savez_compressed(path, **figures)

@@ -55,7 +55,9 @@ class Run(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     follow from it. ``instants_ns`` and ``file:PATH.csv`` are read into it (`caviar_protocol.instants`)."""
     episodes: Annotated[int, quantity("1", "episodes", ge=1)] = 1
     seed: Annotated[int, quantity("1", "seed of everything random", ge=0, le=2**63 - 1)] = 1
-    pace: Literal["fast", "realtime"] = "fast"
+    pace: Literal["free", "realtime", "fast"] | Annotated[float, quantity("1", "", ge=1e-6, le=1e6)] = "free"
+    """When frames are released: ``free`` (``fast`` is its older name) as soon as they can be, ``realtime``
+    as simulated time passes, a number that many times as fast. Never is a frame skipped (clause 8)."""
     record: tuple[str, ...] = ()
     """Topics that are produced because they shall be recorded, though nobody else asks (clause 5):
     ``lidar``, or with a part of it ``lidar.grid``."""

@@ -100,12 +100,14 @@ def world_of(scenario: Scenario, index: int) -> str:
     )
 
 
-def with_overrides(scenario: Scenario, frames: int | None = None, seed: int | None = None) -> Scenario:
+def with_overrides(
+    scenario: Scenario, frames: int | None = None, seed: int | None = None, pace: str | None = None
+) -> Scenario:
     """The scenario with values from the command line in place of its own.
 
     Raises `ScenarioError` where one is out of range.
     """
-    given = {"frames": frames, "seed": seed}
+    given = {"frames": frames, "seed": seed, "pace": None if pace is None else _number_or_word(pace)}
     changes = {name: value for name, value in given.items() if value is not None}
     if not changes:
         return scenario
@@ -157,6 +159,13 @@ def patterns_overlap(a: str, b: str) -> bool:
         todo += steps - reachable
         reachable |= steps
     return False
+
+
+def _number_or_word(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text
 
 
 def _plain(value: Any) -> Any:

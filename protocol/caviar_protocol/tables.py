@@ -168,6 +168,8 @@ def _check_union(value: object, choices: tuple[inspect.Type, ...], place: Place)
             plain = [choice for choice in plain if isinstance(choice, _ARRAYS)] or plain
         if len(plain) == 1:
             _check(value, plain[0], place)
+        elif len(plain) == 2 and isinstance(plain[0], inspect.LiteralType):
+            _check_word_or(value, plain[0], plain[1], place)
         return  # what remains is left to msgspec, which knows every type
     if len(structs) == 1:
         _check_struct(value, structs[0], place)
@@ -178,6 +180,17 @@ def _check_union(value: object, choices: tuple[inspect.Type, ...], place: Place)
     if tag not in by_tag:
         raise place.at(tag_field).error(f"is {show(tag)}; {suggestion(str(tag), by_tag)}")
     _check_struct(value, by_tag[tag], place)
+
+
+def _check_word_or(value: object, words: inspect.LiteralType, other: inspect.Type, place: Place) -> None:
+    """One of some words, or something that is no text."""
+    if isinstance(value, str) and value in words.values:
+        return
+    while isinstance(other, inspect.Metadata):
+        other = other.type
+    if not _fits(value, other):
+        shown = ", ".join(f'"{word}"' for word in words.values)
+        raise place.error(f"is {show(value)}, write {_describe(other)}, or one of {shown}")
 
 
 def _table(value: object, place: Place) -> dict[str, object]:

@@ -1,21 +1,28 @@
-"""Feeds the decoder random and mutated bytes; run as a script, in a process of its own.
+"""Feeds the decoder random and mutated bytes; run as a script, in processes of its own.
 
-    python decoder_fuzzer.py SEED COUNT [MEMORY_MIB]
+    python decoder_fuzzer.py [--inputs 1000000] [--seed 6] [--processes 2] [--memory-mib 256]
 
-Prints a JSON report. Whatever comes out of the decoder other than a `ProtocolError`, takes long, or
-does not survive its own round trip, ends it with a line that names seed, index and input.
+Inputs are made of the vectors: as bytes, and as what those bytes say, with values, keys and types
+exchanged. Prints a JSON report, and while it works how far it has come. Whatever comes out of the decoder
+other than a `ProtocolError`, takes long, or does not survive its own round trip, ends it with a line that
+names seed, index and input.
 """
 
 from __future__ import annotations
 
+import argparse
 import contextlib
+import copy
 import json
+import multiprocessing
+import os
 import resource
 import sys
 import time
 from pathlib import Path
 from typing import Any
 
+import msgpack  # type: ignore[import-untyped]
 import numpy as np
 
 from caviar_protocol.codec import (
@@ -45,6 +52,26 @@ MARKERS = bytes(
 )
 """First bytes of every family of values."""
 
+VALUES: tuple[Any, ...] = (
+    *(None, True, False, 0, 1, -1, 2**31, 2**63 - 1, 2**64 - 1, -(2**63), 0.0, -0.0, 1e308, -1e-320),
+    *(float("nan"), float("inf"), -float("inf"), "", "a", "\x00", "é" * 40, "x" * 300, b"", b"\xff" * 9),
+    *(
+        [],
+        {},
+        [[]],
+        {"": 0},
+        [0] * 20,
+        {"type": "HELLO"},
+        msgpack.ExtType(5, b"abc"),
+        msgpack.Timestamp(1, 2),
+    ),
+)
+"""What may stand where something else was expected."""
+CHUNK = 10_000
+"""Inputs that are made of one seed."""
+PROGRESS_S = 5.0
+"""[s] between reports of progress."""
+
 Seed = tuple[str, bytes, bytes]
 """Topic (empty for a message), header, body."""
 
@@ -63,10 +90,12 @@ def seeds() -> list[Seed]:
 class Mutator:
     """Makes new inputs of old ones; the same seed makes the same inputs."""
 
-    def __init__(self, seed: int, corpus: list[Seed]) -> None:
+    def __init__(self, seed: int | tuple[int, int], corpus: list[Seed]) -> None:
         self.seed = seed
         self._rng = np.random.default_rng(seed)
         self._corpus = corpus
+        self._trees = {header: tree for _, header, _ in corpus if (tree := _tree(header))}
+        self._others = list(self._trees.values())
         self._draws: list[int] = []
 
     def draw(self, bound: int) -> int:
@@ -80,14 +109,50 @@ class Mutator:
         topic, header, body = self._corpus[self.draw(len(self._corpus))]
         which = self.draw(4) if body else 3
         if which != 0:
-            header = self._mutated(header)
+            tree = self._trees.get(header)
+            header = self.restructured(header, tree) if tree and self.draw(3) == 0 else self.mutated(header)
         if which < 2:
-            body = self._mutated(body)
+            body = self.mutated(body)
         if self.draw(64) == 0:
             topic = TOPICS[self.draw(len(TOPICS))]
         return topic, header, body
 
-    def _mutated(self, data: bytes) -> bytes:
+    def restructured(self, header: bytes, tree: dict[Any, Any]) -> bytes:
+        """What a header says, with one or two things in it exchanged, taken out, or told twice."""
+        tree = copy.deepcopy(tree)
+        for _ in range(1 + self.draw(2)):
+            holder: Any = tree
+            while holder:
+                keys = list(holder) if isinstance(holder, dict) else range(len(holder))
+                key = keys[self.draw(len(keys))]
+                inner = holder[key]
+                if not isinstance(inner, dict | list) or not inner or self.draw(4) == 0:
+                    self._exchange(holder, key)
+                    break
+                holder = inner
+        try:
+            return bytes(msgpack.packb(tree))
+        except ValueError:  # deep things within deep things, which the packer refuses
+            return self.mutated(header)
+
+    def _exchange(self, holder: Any, key: Any) -> None:
+        kind = self.draw(6)
+        if kind == 0:
+            del holder[key]
+        elif kind == 1 and isinstance(holder, list):
+            holder.insert(key, copy.deepcopy(holder[key]))
+        elif kind == 1:
+            holder[f"{key}x"] = holder.pop(key)
+        elif kind == 2:
+            values = list(self._others[self.draw(len(self._others))].values())
+            holder[key] = copy.deepcopy(values[self.draw(len(values))])
+        elif kind == 3 and isinstance(holder[key], int):
+            holder[key] = min(2**64 - 1, max(-(2**63), holder[key] + self.draw(5) - 2))
+        else:
+            holder[key] = copy.deepcopy(VALUES[self.draw(len(VALUES))])
+
+    def mutated(self, data: bytes) -> bytes:
+        """Other bytes, of these: cut, spliced, repeated, overwritten."""
         kind = self.draw(9)
         if kind == 0:
             return self._rng.bytes(self.draw(64))
@@ -110,6 +175,15 @@ class Mutator:
             at = self.draw(len(changed))
             changed[at] = MARKERS[self.draw(len(MARKERS))] if kind == 6 else changed[at] ^ 1 << self.draw(8)
         return bytes(changed)
+
+
+def _tree(header: bytes) -> dict[Any, Any] | None:
+    """What a header says; None where it is no map, or an empty one."""
+    try:
+        tree = msgpack.unpackb(header, strict_map_key=False)
+    except (ValueError, msgpack.UnpackException):
+        return None
+    return tree if isinstance(tree, dict) and tree else None
 
 
 def feed(topic: str, header: bytes, body: bytes) -> bool:
@@ -157,23 +231,58 @@ def fuzz(mutator: Mutator, count: int) -> tuple[int, float]:
     return accepted, slowest
 
 
-def main(seed: int, count: int, memory_mib: int) -> int:
-    """Feed ``count`` inputs with at most so much more memory than now; 0 when all went as it should."""
-    mutator = Mutator(seed, seeds())
-    fuzz(mutator, 1000)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+def _bound_memory(memory_mib: int) -> None:
+    """This process may take so much more memory than now."""
+    fuzz(Mutator(0, seeds()), 1000)
     in_use = int(Path("/proc/self/statm").read_text("ascii").split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (in_use + (memory_mib << 20),) * 2)
-    accepted, slowest = fuzz(mutator, count)
-    report = {
-        "inputs": count,
+
+
+def _chunk(job: tuple[int, int, int]) -> tuple[int, int, float, int]:
+    """Feed one chunk: inputs, how many were accepted, the longest time [s], growth of the process [KiB]."""
+    seed, number, count = job
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    accepted, slowest = fuzz(Mutator((seed, number), seeds()), count)
+    return count, accepted, slowest, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+
+
+def run(inputs: int, seed: int, processes: int, memory_mib: int) -> dict[str, float]:
+    """Feed so many inputs; the report."""
+    jobs = [(seed, n, min(CHUNK, inputs - n * CHUNK)) for n in range(-(-inputs // CHUNK))]
+    began = told = time.monotonic()
+    done = accepted = grown = 0
+    slowest = 0.0
+    context = multiprocessing.get_context("spawn")
+    with context.Pool(processes, _bound_memory, (memory_mib,)) as pool:
+        for count, good, took, more in pool.imap_unordered(_chunk, jobs):
+            done, accepted, grown, slowest = done + count, accepted + good, grown + more, max(slowest, took)
+            now = time.monotonic()
+            if now - told > PROGRESS_S:
+                told, rate = now, done / (now - began)
+                sys.stderr.write(
+                    f"{done} of {inputs} inputs, {rate:.0f} /s, {(inputs - done) / rate:.0f} s left\n"
+                )
+    return {
+        "inputs": done,
         "accepted": accepted,
         "slowest_s": slowest,
-        "grown_kib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before,
+        "grown_kib": grown,
+        "seconds": time.monotonic() - began,
     }
+
+
+def main() -> int:
+    """What the command line says; 0 when all went as it should."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--inputs", type=int, default=1_000_000)
+    parser.add_argument("--seed", type=int, default=6)
+    parser.add_argument("--processes", type=int, default=len(os.sched_getaffinity(0)))
+    parser.add_argument("--memory-mib", type=int, default=256)
+    arguments = parser.parse_args()
+    report = run(arguments.inputs, arguments.seed, arguments.processes, arguments.memory_mib)
     sys.stdout.write(json.dumps(report) + "\n")
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(int(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]) if len(sys.argv) > 3 else 256))
+    sys.exit(main())

@@ -26,7 +26,7 @@ def test_a_million_wrong_inputs_raise_only_our_error_in_bounded_memory() -> None
     """The process may take 256 MiB more than at its start; an input may take 1 s."""
     fuzzer = Path(decoder_fuzzer.__file__)
     result = subprocess.run(
-        [sys.executable, fuzzer, str(SEED), str(INPUTS), "256"],
+        [sys.executable, fuzzer, "--inputs", str(INPUTS), "--seed", str(SEED)],
         capture_output=True,
         text=True,
         timeout=240,

@@ -76,8 +76,14 @@ def test_latencies_are_kept_for_every_frame_and_service(tmp_path: Path) -> None:
         assert finishes_well(broker)
     broker.server.statistics.save(tmp_path / "latency.npz")
     with np.load(tmp_path / "latency.npz") as figures:
-        assert set(figures) == {"finished_ns", "latency_ns/world", "latency_ns/sensors"}
-        assert all(len(figures[name]) == 5 for name in figures)
+        assert set(figures) == {
+            "finished_ns",
+            "latency_ns/world",
+            "latency_ns/sensors",
+            "decision_lateness_ns",
+        }
+        assert len(figures["decision_lateness_ns"]) == 0
+        assert all(len(figures[f"latency_ns/{name}"]) == 5 for name in ("world", "sensors"))
         assert (np.diff(figures["finished_ns"]) > 0).all()
         p50 = float(np.percentile(figures["latency_ns/world"], 50)) / 1e6
     assert broker.server.statistics.services()["world"].p50_ms == pytest.approx(p50)

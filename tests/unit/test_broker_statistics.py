@@ -40,10 +40,12 @@ def test_every_figure_is_saved(tmp_path: Path) -> None:
     statistics = Statistics({"file": MS, "idle": MS})
     statistics.latency("file", 5, False)
     statistics.frame(7)
+    statistics.decision(3)
     statistics.save(tmp_path / "latency.npz")
     with np.load(tmp_path / "latency.npz") as saved:
         assert {name: saved[name].tolist() for name in saved} == {
             "finished_ns": [7],
+            "decision_lateness_ns": [3],
             "latency_ns/file": [5],
             "latency_ns/idle": [],
         }
@@ -52,3 +54,24 @@ def test_every_figure_is_saved(tmp_path: Path) -> None:
 def test_a_record_that_cannot_be_written_costs_nothing_else(tmp_path: Path) -> None:
     Statistics({}).save(tmp_path / "nowhere" / "latency.npz")
     assert not (tmp_path / "nowhere").exists()
+
+
+def test_lateness_of_decisions_is_summed_up() -> None:
+    statistics = Statistics({})
+    assert statistics.deadlines().decisions == 0
+    lateness = np.random.default_rng(2).integers(1, MS, 500)
+    for value in lateness:
+        statistics.decision(int(value))
+    figures = statistics.deadlines()
+    assert figures.decisions == 500
+    assert figures.p99_ms == pytest.approx(float(np.percentile(lateness, 99)) / MS)
+    assert figures.worst_ms == pytest.approx(int(lateness.max()) / MS)
+
+
+def test_slips_are_counted_within_their_episode() -> None:
+    """The lag that is told with a frame is the sum of its episode."""
+    statistics = Statistics({})
+    for episode, lag in [(0, 0), (0, 3), (0, 3), (0, 10), (1, 12), (1, 12), (2, 0)]:
+        statistics.frame(1, episode, lag * MS)
+    pace = statistics.pace()
+    assert (pace.slips, pace.worst_slip_ms, pace.lag_ms) == (3, 12.0, 22.0)

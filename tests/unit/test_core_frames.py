@@ -212,6 +212,25 @@ def test_clause_8_realtime_releases_frames_at_the_sampling_period() -> None:
     assert not run.notices("lag")
 
 
+@pytest.mark.parametrize(("speed", "period"), [(2.0, 50 * MS), (0.5, 200 * MS), (3.0, 33_333_333)])
+def test_clause_8_a_factor_divides_the_time_between_frames(speed: float, period: int) -> None:
+    run = Simulation(loop(), realtime=True, speed=speed, frames=10).join().run()
+    times = [run.time_of("world", k) for k in range(10)]
+    assert times == [times[0] + k * period for k in range(10)]
+    assert run.seen(ev.FrameFinished)[-1].lag_ns == 0
+
+
+def test_clause_8_a_slip_is_counted_in_real_time_at_any_pace() -> None:
+    slow = {"latency": lambda e, k: 75 * MS if k == 2 else MS, "budget": SECOND}
+    run = Simulation(loop(world=slow), realtime=True, speed=2.0, frames=6).join().run()
+    first = run.time_of("world", 0)
+    times = [run.time_of("world", k) - first for k in range(6)]
+    assert times == [0, 50 * MS, 100 * MS, 175 * MS, 225 * MS, 275 * MS], "slips by 25 ms, skips nothing"
+    assert [n.frame for n in run.notices("lag")] == [3]
+    assert "25.0 ms behind real time" in run.notices("lag")[0].text
+    assert run.seen(ev.FrameFinished)[-1].lag_ns == 25 * MS
+
+
 def test_clause_8_an_overrun_slips_all_later_frames_and_reports_its_lag() -> None:
     slow = {"latency": lambda e, k: 250 * MS if k == 2 else MS, "budget": SECOND}
     run = Simulation(loop(world=slow), realtime=True, frames=6).join().run()

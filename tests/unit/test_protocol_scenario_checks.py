@@ -8,6 +8,7 @@ from typing import Annotated
 import msgspec
 import pytest
 
+from caviar_broker.core.plan import plan_run
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.scenario import DeviceSpec, Run, Scenario, ServiceSpec
@@ -76,6 +77,50 @@ def test_overrides_replace_and_are_checked() -> None:
         with_overrides(base, frames=0)
     with pytest.raises(ScenarioError, match=r"run\.seed: is -1"):
         with_overrides(base, seed=-1)
+
+
+@pytest.mark.parametrize(
+    ("text", "pace"), [("free", "free"), ("realtime", "realtime"), ("2", 2.0), ("0.5", 0.5), ("1e3", 1000.0)]
+)
+def test_a_pace_on_the_command_line_is_a_word_or_a_factor(text: str, pace: str | float) -> None:
+    assert with_overrides(scenario(streets=world()), pace=text).run.pace == pace
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "nan", "inf", "1e9", "quick", ""])
+def test_a_pace_that_is_none_is_refused_on_the_command_line(text: str) -> None:
+    with pytest.raises(ScenarioError, match=r'run\.pace: is .*, write a number .*, or one of "fast", "free"'):
+        with_overrides(scenario(streets=world()), pace=text)
+
+
+@pytest.mark.parametrize("value", ["0", "-1.0", "0.0", "nan", "inf", "-inf", '"quick"', '"2"', "true", "[1]"])
+def test_a_pace_that_is_none_is_refused_with_its_line(value: str) -> None:
+    text = f"""
+[run]
+name = "x"
+frames = 3
+pace = {value}
+[services.w]
+role = "world"
+use = "trajectory"
+budget_ms = 1
+"""
+    with pytest.raises(
+        ScenarioError, match=r':5: run\.pace: is .*, write a number .*, or one of "fast", "free"'
+    ):
+        parse_scenario(text, "paced.toml")
+
+
+@pytest.mark.parametrize(
+    ("value", "realtime", "speed"),
+    [('"free"', False, 1.0), ('"realtime"', True, 1.0), ("2", True, 2.0), ("0.25", True, 0.25)],
+)
+def test_the_pace_of_the_file_is_that_of_the_run(value: str, realtime: bool, speed: float) -> None:
+    text = (
+        f'[run]\nname = "x"\nframes = 3\npace = {value}\n'
+        '[services.w]\nrole = "world"\nuse = "trajectory"\nbudget_ms = 1\n'
+    )
+    plan = plan_run(parse_scenario(text, "paced.toml"), "run", {})
+    assert (plan.realtime, plan.speed) == (realtime, speed)
 
 
 TEXT = """\

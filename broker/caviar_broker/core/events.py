@@ -217,6 +217,16 @@ class Latency(msgspec.Struct, frozen=True):
     missed: bool
 
 
+class Overdue(msgspec.Struct, frozen=True):
+    """A deadline has passed; what the policy says about it goes with this action."""
+
+    service: str
+    episode: int
+    frame: int
+    due_ns: int
+    """When the deadline was, on the clock of ``now``."""
+
+
 class FrameFinished(msgspec.Struct, frozen=True):
     """Every service is through with a frame."""
 
@@ -242,4 +252,4 @@ class Finished(msgspec.Struct, frozen=True):
     digest: str
 
 
-Action = Send | TurnAway | Journal | Notice | Latency | FrameFinished | EpisodeFinished | Finished
+Action = Send | TurnAway | Journal | Notice | Latency | Overdue | FrameFinished | EpisodeFinished | Finished

@@ -9,9 +9,9 @@ class Pacer:
     """Releases the frames of one episode (contract, clause 8).
 
     Frame 0 is released when somebody first asks for it. A later one is due as long after the one
-    before as simulated time says; when nobody is ready for it by then, all frames behind it slip by as
-    much. A timer that fires late delays its own frame, not those behind it. As fast as possible,
-    every frame is released at once.
+    before as simulated time says, divided by the run's speed; when nobody is ready for it by then, all
+    frames behind it slip by as much. A timer that fires late delays its own frame, not those behind it. As
+    fast as possible, every frame is released at once.
     """
 
     def __init__(self, plan: RunPlan) -> None:
@@ -36,6 +36,10 @@ class Pacer:
         self.lag_ns += slip
         return slip
 
+    def tells(self, slip: int) -> bool:
+        """Whether a slip is worth a notice of its own: a tenth of a period, in real time."""
+        return slip > self._real_ns(self._plan.sampling_period_ns) // 10
+
     def next_instant(self) -> int | None:
         """When the frame that was asked for in vain will be due [ns]; None if there is none."""
         return self._due() if self._awaited else None
@@ -50,4 +54,7 @@ class Pacer:
 
     def _due(self) -> int:
         frame = self._released_frame
-        return self._reference + self._plan.t_ns(frame + 1) - self._plan.t_ns(frame)
+        return self._reference + self._real_ns(self._plan.t_ns(frame + 1) - self._plan.t_ns(frame))
+
+    def _real_ns(self, simulated_ns: int) -> int:
+        return simulated_ns if self._plan.speed == 1.0 else round(simulated_ns / self._plan.speed)

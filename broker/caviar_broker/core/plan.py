@@ -63,6 +63,9 @@ class RunPlan:
     episodes: int = 1
     seed: int = 0
     realtime: bool = False
+    """Whether frames wait until real time has come to them (clause 8)."""
+    speed: float = 1.0
+    """How many times as fast as real time, where they do."""
     record: tuple[str, ...] = ()
     """``topic`` or ``topic.part`` that is produced because it shall be recorded (clause 5)."""
     frames_in_flight: int = 4
@@ -117,7 +120,8 @@ def plan_run(scenario: Scenario, run: str, told: Mapping[str, Mapping[str, Any]]
         instants_ns=instants_ns(scenario.run.instants_s),
         episodes=scenario.run.episodes,
         seed=scenario.run.seed,
-        realtime=scenario.run.pace == "realtime",
+        realtime=scenario.run.pace not in ("free", "fast"),
+        speed=1.0 if isinstance(scenario.run.pace, str) else scenario.run.pace,
         record=scenario.run.record,
         source=scenario.source,
         frames_in_flight=scenario.run.frames_in_flight,

@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterable, Mapping
 from msgspec.structs import replace
 
 from caviar_broker.core.decisions import DecisionBook
-from caviar_broker.core.events import Action, Latency, Notice, Product
+from caviar_broker.core.events import Action, Latency, Notice, Overdue, Product
 from caviar_broker.core.gate import Gate
 from caviar_broker.core.graph import Graph
 from caviar_broker.core.inputs import Gathered, Inputs
@@ -205,6 +205,7 @@ class EpisodeSchedule:
         for name in self.graph.order:
             due = self._due(name)
             if due is not None and due[0] <= now:
+                self.actions.append(Overdue(name, self.episode, due[1].frame, due[0]))
                 self._expired(due[1], now)
         instant = self._next_release()
         if instant is not None and instant <= now:
@@ -340,7 +341,7 @@ class EpisodeSchedule:
         if slip is None:
             return False
         self._turns.wake(self._turns.waiting_for_pace)  # whoever asks first releases the frame for all
-        if slip > self.plan.sampling_period_ns // 10:
+        if self._pacer.tells(slip):
             behind = milliseconds(self._pacer.lag_ns)
             self._notice("lag", task, f"{milliseconds(slip)} behind real time, {behind} since the start")
         return True

@@ -57,6 +57,8 @@ class EmbeddedLauncher:
             "frames": statistics.frames,
             "frames_per_second": statistics.frames_per_second(),
             "warm_up_frames": statistics.warm_up_frames,
+            "deadlines": msgspec.structs.asdict(statistics.deadlines()),
+            "pace": msgspec.structs.asdict(statistics.pace()),
             "services": {n: msgspec.structs.asdict(s) for n, s in statistics.services().items()},
         }
 

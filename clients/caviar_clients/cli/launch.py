@@ -69,6 +69,7 @@ class Launcher:
     """``HOST:PORT`` at which the broker has HTTP served; "" for none."""
     resume: bool = False
     """Whether to go on with the run in the directory, whatever ``path``, ``frames`` and ``seed`` say."""
+    pace: str | None = None
     endpoint: str = ""
     _key: BorrowedKey = field(init=False)
     _children: dict[str, Child] = field(default_factory=dict)
@@ -146,6 +147,8 @@ class Launcher:
             arguments += ["--frames", str(self.frames)]
         if self.seed is not None:
             arguments += ["--seed", str(self.seed)]
+        if self.pace is not None:
+            arguments += ["--pace", self.pace]
         return arguments
 
     def _start_broker(self) -> None:

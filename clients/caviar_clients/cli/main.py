@@ -30,6 +30,9 @@ ScenarioFile = Annotated[Path, typer.Argument(help="scenario file (TOML)", show_
 RunDirectory = Annotated[Path, typer.Argument(help="directory of a run, or one segment of its recording")]
 Frames = Annotated[int | None, typer.Option(min=1, help="frames of an episode, instead of the scenario's")]
 Seed = Annotated[int | None, typer.Option(min=0, max=2**63 - 1, help="seed, instead of the scenario's")]
+Pace = Annotated[
+    str | None, typer.Option(help="free, realtime or a number [times real time], instead of the scenario's")
+]
 
 Keys = Annotated[
     Path | None, typer.Option(help="keys directory: only authorized keys take part (caviar keys)")
@@ -56,6 +59,7 @@ def run(
     embedded: Annotated[
         bool, typer.Option("--embedded", help="all in this process, without sockets")
     ] = False,
+    pace: Pace = None,
     keys: Keys = None,
     http: Http = "",
     resume: Resume = None,
@@ -64,12 +68,14 @@ def run(
     from caviar_clients.cli.run import resume_run, run_scenario
 
     if resume is not None:
-        _nothing_else(scenario, frames, seed, embedded or None)
+        _nothing_else(scenario, frames, seed, embedded or None, pace)
         bind = "" if bind == ANY_PORT else bind
         raise typer.Exit(resume_run(resume, _console, json, bind, keys, http))
     if scenario is None:
         raise RunError("give a scenario file, or --resume with the directory of a run")
-    raise typer.Exit(run_scenario(scenario, out, _console, frames, seed, json, bind, embedded, keys, http))
+    raise typer.Exit(
+        run_scenario(scenario, out, _console, frames, seed, json, bind, embedded, keys, http, pace)
+    )
 
 
 @app.command()
@@ -82,6 +88,7 @@ def broker(
     frames: Frames = None,
     seed: Seed = None,
     out: Annotated[Path, typer.Option(help="directory in which the run's own is made")] = Path("runs"),
+    pace: Pace = None,
     keys: Keys = None,
     http: Http = "",
     resume: Resume = None,
@@ -93,14 +100,14 @@ def broker(
     from caviar_clients.sessions.checking import checked_scenario
 
     if resume is not None:
-        _nothing_else(scenario, frames, seed)
+        _nothing_else(scenario, frames, seed, pace)
         again = ["--resume", str(resume), "--bind", bind]
         again += [] if keys is None else ["--keys", str(keys)]
         again += ["--http", http] if http else []
         raise typer.Exit(serve(parser().parse_args(again)))
     if scenario is None:
         raise RunError("give a scenario file, or --resume with the directory of a run")
-    checked = checked_scenario(scenario, frames, seed)
+    checked = checked_scenario(scenario, frames, seed, pace)
     check_bind(bind, keys=keys is not None)
     directory = run_directory(out, checked.run.name)
     typer.echo(f"run {directory}; start its services with --broker and this broker's address:")
@@ -108,7 +115,8 @@ def broker(
         use = "IMPLEMENTATION" if spec.remote else spec.use
         typer.echo("  " + shlex.join(["caviar", "service", name, "--use", f"{spec.role}:{use}"]))
     arguments = [str(scenario), "--bind", bind, "--directory", str(directory)]
-    for name, value in (("--frames", frames), ("--seed", seed), ("--keys", keys), ("--http", http or None)):
+    told = {"--frames": frames, "--seed": seed, "--keys": keys, "--http": http or None, "--pace": pace}
+    for name, value in told.items():
         arguments += [] if value is None else [name, str(value)]
     raise typer.Exit(serve(parser().parse_args(arguments)))
 

@@ -64,9 +64,10 @@ def run_scenario(
     embedded: bool = False,
     keys: Path | None = None,
     http: str = "",
+    pace: str | None = None,
 ) -> int:
     """Run a scenario; the exit status: 0 exactly if it came to its end."""
-    scenario = checked_scenario(path, frames, seed)
+    scenario = checked_scenario(path, frames, seed, pace)
     check_bind(bind, keys=keys is not None)
     if embedded:
         refuse_remote(scenario)
@@ -80,7 +81,7 @@ def run_scenario(
     if embedded:
         launcher = EmbeddedLauncher(scenario, directory)
     else:
-        launcher = Launcher(scenario, path.resolve(), directory, frames, seed, bind, keys, http)
+        launcher = Launcher(scenario, path.resolve(), directory, frames, seed, bind, keys, http, pace=pace)
     return _follow(launcher, scenario, directory, console, json_file, keys)
 
 

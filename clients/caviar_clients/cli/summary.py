@@ -40,6 +40,8 @@ def summary_of(
         "frames_per_second": outcome["frames_per_second"],
         "warm_up_frames": outcome["warm_up_frames"],
         "services": outcome["services"],
+        "deadlines": outcome["deadlines"],
+        "pace": outcome["pace"],
         "digest": outcome["digest"],
         "mean_abs_y": figures.mean_abs_y if figures else None,
         "mean_abs_y_best": figures.mean_abs_y_best if figures else None,
@@ -70,6 +72,17 @@ def summary_table(summary: Mapping[str, Any]) -> Table:
 
 def _caption(summary: Mapping[str, Any]) -> str:
     parts = [f"{summary['frames']} frames, {summary['frames_per_second']:.1f} frames/s"]
+    late, pace = summary["deadlines"], summary["pace"]
+    if late["decisions"]:
+        parts.append(
+            f"{late['decisions']} missed deadlines, decided {late['p99_ms']:.2f} ms (p99) behind them, "
+            f"{late['worst_ms']:.2f} ms at worst"
+        )
+    if pace["slips"]:
+        parts.append(
+            f"{pace['slips']} frames slipped behind real time, by {pace['worst_slip_ms']:.1f} ms at worst, "
+            f"{pace['lag_ms']:.1f} ms in all; none was skipped"
+        )
     if summary["mean_abs_y"] is not None:
         share = summary["mean_abs_y"] / summary["mean_abs_y_best"] if summary["mean_abs_y_best"] else 0.0
         parts.append(

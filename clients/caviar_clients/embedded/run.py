@@ -178,7 +178,7 @@ class EmbeddedRun:
         match action:
             case ev.FrameFinished():
                 if self._journal is not None:
-                    self.statistics.frame(time.monotonic_ns())
+                    self.statistics.frame(time.monotonic_ns(), action.episode, action.lag_ns)
                 self._on_frame(action)
             case ev.Notice():
                 self._on_notice(action)

@@ -23,13 +23,15 @@ TOPICS_OF: Mapping[str, tuple[str, ...]] = {
 """What a remote service may produce, by its role; what it does produce it says when it joins."""
 
 
-def checked_scenario(path: Path, frames: int | None = None, seed: int | None = None) -> Scenario:
+def checked_scenario(
+    path: Path, frames: int | None = None, seed: int | None = None, pace: str | None = None
+) -> Scenario:
     """Load a scenario and check it against the implementations it uses.
 
     Raises `ScenarioError` naming file, key and line for an implementation or a setting that does
     not exist, and for a topic to record that no implementation produces.
     """
-    return check_implementations(with_overrides(load_scenario(path), frames, seed))
+    return check_implementations(with_overrides(load_scenario(path), frames, seed, pace))
 
 
 def check_implementations(scenario: Scenario) -> Scenario:

@@ -163,7 +163,7 @@ def worlds_only(scenario: Scenario) -> Scenario:
     kept = {name: spec for name, spec in scenario.services.items() if _is_kept(spec)}
     budget_ms = 1e3  # never reached: nothing is late in an embedded run
     kept[KEEPER] = ServiceSpec(role="sensors", use=KEEPER, budget_ms=budget_ms)
-    return replace(scenario, services=kept, run=replace(scenario.run, episodes=1, record=(), pace="fast"))
+    return replace(scenario, services=kept, run=replace(scenario.run, episodes=1, record=(), pace="free"))
 
 
 def _is_kept(spec: ServiceSpec) -> bool:
