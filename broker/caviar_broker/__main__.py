@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import gc
 import sys
+from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
 
@@ -19,6 +20,8 @@ from caviar_broker.briefing import briefings, with_ownership
 from caviar_broker.control import Control, Reporter, stop_on_signals
 from caviar_broker.core.plan import plan_run
 from caviar_broker.journal import JournalFile
+from caviar_broker.security.access import Access
+from caviar_broker.security.local import check_bind
 from caviar_broker.server import BrokerServer
 from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.host import steady_memory
@@ -39,12 +42,16 @@ def serve(arguments: argparse.Namespace) -> int:
     steady_memory()
     scenario = load_scenario(arguments.scenario)
     scenario = with_ownership(with_overrides(scenario, arguments.frames, arguments.seed))
+    access = _access(
+        arguments, {name: spec.role for name, spec in scenario.services.items() if not spec.remote}
+    )
+    check_bind(arguments.bind, keys=access is not None)
     directory = _made(arguments.directory)
     plan = plan_run(scenario, arguments.run or directory.name, briefings(scenario, directory))
     reporter = Reporter(sys.stdout.fileno(), directory / "events.jsonl", arguments.control)
     with closing(JournalFile(directory / "journal.msgpack", plan.epoch)) as journal:
         supervised = arguments.supervised if arguments.control else ()
-        server = BrokerServer(plan, arguments.bind, journal, reporter, supervised=supervised)
+        server = BrokerServer(plan, arguments.bind, journal, reporter, supervised=supervised, access=access)
         reporter.attach(server)
         if arguments.control:
             Control(server)
@@ -68,6 +75,12 @@ def serve(arguments: argparse.Namespace) -> int:
     return 1 if outcome.error else 0
 
 
+def _access(arguments: argparse.Namespace, local: Mapping[str, str]) -> Access | None:
+    if arguments.keys is None:
+        return None
+    return Access(arguments.keys, arguments.local_key, local)
+
+
 def _made(directory: Path) -> Path:
     try:
         directory.mkdir(parents=True, exist_ok=True)
@@ -83,6 +96,8 @@ def parser() -> argparse.ArgumentParser:
     found = argparse.ArgumentParser(prog="python -m caviar_broker", description=__doc__)
     found.add_argument("scenario", type=Path)
     found.add_argument("--bind", default="tcp://127.0.0.1:5570", help="address to listen on")
+    found.add_argument("--keys", type=Path, help="keys directory: who may take part (caviar keys)")
+    found.add_argument("--local-key", default="", help="public key of the services that a launcher starts")
     found.add_argument("--directory", type=Path, required=True, help="where the run is written")
     found.add_argument("--run", default="", help="id of the run; by default the directory's name")
     found.add_argument("--frames", type=int, default=None, help="instead of the scenario's")

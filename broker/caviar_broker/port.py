@@ -6,6 +6,9 @@ from collections.abc import Sequence
 
 import zmq
 
+from caviar_broker.security.access import Access
+from caviar_broker.security.guard import Guard, PeerLimits
+from caviar_broker.security.local import check_bind
 from caviar_protocol import limits
 from caviar_protocol.errors import RunError
 
@@ -16,6 +19,8 @@ _NOBLOCK_MORE = int(zmq.NOBLOCK) | int(zmq.SNDMORE)
 
 LINGER_MS = 500
 """[ms] that closing waits until the last messages are on their way."""
+HANDSHAKE_MS = 5000
+"""[ms] after which a connection is closed that has not shaken hands."""
 
 
 class Port:
@@ -29,11 +34,22 @@ class Port:
         A peer that is stopped or unreachable loses its connection before this is over, and the next
         `send` to it says so. libzmq's own thread answers for a peer that is merely busy, so a slow
         service is never taken for a dead one (contract, clause 15).
+    access
+        The keys of those who may connect; None: none are asked for, and only this machine can connect.
+    peer_limits
+        What each peer may use.
 
-    Raises `RunError` naming the remedy where the address cannot be bound.
+    Raises `RunError` naming the remedy where the address cannot be bound, or may not without keys.
     """
 
-    def __init__(self, endpoint: str, liveness_ns: int) -> None:
+    def __init__(
+        self,
+        endpoint: str,
+        liveness_ns: int,
+        access: Access | None = None,
+        peer_limits: PeerLimits | None = None,
+    ) -> None:
+        check_bind(endpoint, keys=access is not None)
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self.socket = self._context.socket(zmq.ROUTER)
         liveness_ms = liveness_ns // 1_000_000
@@ -41,7 +57,11 @@ class Port:
         self.socket.setsockopt(zmq.HEARTBEAT_IVL, max(1, liveness_ms // 3))
         self.socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, max(1, liveness_ms // 2))
         self.socket.setsockopt(zmq.MAXMSGSIZE, limits.MAX_BODY)
+        self.socket.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
+        self.socket.setsockopt(zmq.IPV6, int("[" in endpoint))
         self.socket.linger = LINGER_MS
+        self.guard = Guard(self._context, self.socket, access, peer_limits)
+        """Watches over the peers."""
         try:
             self.socket.bind(endpoint)
         except zmq.ZMQError as error:
@@ -53,6 +73,11 @@ class Port:
             ) from error
         self.endpoint = self.socket.getsockopt_string(zmq.LAST_ENDPOINT)
         """Where services connect to."""
+        try:
+            check_bind(self.endpoint, keys=access is not None)  # what a name has come to
+        except RunError:
+            self.close()
+            raise
 
     @property
     def readable(self) -> bool:
@@ -60,7 +85,7 @@ class Port:
         return bool(int(self.socket.getsockopt(zmq.EVENTS)) & _POLLIN)
 
     def receive(self) -> tuple[bytes, list[zmq.Frame]] | None:
-        """Routing id and parts of the next message; None where there is none now.
+        """Routing id and parts of the next message; None where there is none now, or one to be dropped.
 
         Of a message with more parts than any may have, one part too many is returned.
         """
@@ -70,22 +95,28 @@ class Port:
         except zmq.Again:
             return None
         parts: list[zmq.Frame] = []
-        more = True
+        more, size = True, 0
         while more:
             part = receive(_NOBLOCK, False)
             more = part.more
+            size += len(part)
             if len(parts) <= limits.MAX_PARTS:
                 parts.append(part)
-        return route, parts
+        return (route, parts) if self.guard.admits(route, parts, size) else None
 
-    def send(self, route: bytes, header: bytes, parts: Sequence[bytes | zmq.Frame] = ()) -> str:
+    def send(
+        self, route: bytes, header: bytes, parts: Sequence[bytes | zmq.Frame] = (), earns: bool = True
+    ) -> str:
         """Send a message to a routing id; why it did not go, or an empty text.
+
+        One that ``earns`` gives its receiver the right to one message more.
 
         Parts that were received go out as they came, without a copy.
         """
         send = self.socket.send
         try:
             send(route, _NOBLOCK_MORE)
+            self.guard.sent(route, len(header) + sum(map(len, parts)), earns)
             if not parts:
                 send(header, _NOBLOCK)
                 return ""
@@ -103,5 +134,6 @@ class Port:
 
     def close(self) -> None:
         """Send what is queued, as far as `LINGER_MS` allow, and close."""
+        self.guard.close()
         self.socket.close()
         self._context.term()

@@ -23,6 +23,8 @@ from caviar_broker.journal import JournalFile
 from caviar_broker.loop import Loop
 from caviar_broker.port import Port
 from caviar_broker.scenery import SceneryDesk, SceneryExchange
+from caviar_broker.security.access import Access
+from caviar_broker.security.guard import PeerLimits
 from caviar_broker.statistics import Statistics
 from caviar_broker.watchdog import CHECK_NS, Watchdog
 from caviar_protocol import messages as m
@@ -35,6 +37,8 @@ LOOK_NS = 1_000_000
 """[ns] until deadlines are looked at again, however busy the port is."""
 MESSAGES_A_TURN = 64
 """Messages taken before the clock is looked at again."""
+_COMPLAINTS = (m.Error, m.Stale, m.Refuse, m.HeartbeatAck)
+"""Messages that nobody answers: they give no right to a further message."""
 
 
 class Observer(Protocol):
@@ -72,6 +76,10 @@ class BrokerServer:
         Where scenery is kept.
     supervised
         Services whose death somebody else reports, who knows their exit status and last words.
+    access
+        The keys of those who may take part; None: every process of this machine may.
+    peer_limits
+        What each peer may use of the broker.
     """
 
     def __init__(
@@ -82,6 +90,8 @@ class BrokerServer:
         observer: Observer,
         store: AssetStore | None = None,
         supervised: Sequence[str] = (),
+        access: Access | None = None,
+        peer_limits: PeerLimits | None = None,
     ) -> None:
         self.clock = FrameClock(plan, time.monotonic_ns())
         self.statistics = Statistics({s.name: s.budget_ns for s in plan.services})
@@ -102,12 +112,14 @@ class BrokerServer:
         self._entries: list[ev.Journal] = []
         """Decisions that are not in the journal yet."""
         self._next_check = self._look_at = 0
-        self._port = Port(endpoint, plan.limits.liveness)
+        self._port = Port(endpoint, plan.limits.liveness, access, peer_limits)
+        self._guard = self._port.guard
         self.endpoint = self._port.endpoint
         """Where services connect to."""
         self.loop = Loop()
         """Others may have descriptors watched by it."""
         self.loop.watch(self._port.socket, self._receive_all)
+        self._guard.start(self.loop, self._cut_off, self._gone, self._grumble)
         self._watchdog = Watchdog(
             clock=self.clock,
             heartbeat_ns=plan.limits.heartbeat,
@@ -175,6 +187,7 @@ class BrokerServer:
         if now >= self._next_check:
             self._next_check = now + CHECK_NS
             self._watchdog.check(now)
+            self._guard.check(now)
             self._write_journal()
         deadline = self.clock.next_deadline()
         if deadline is None:
@@ -253,6 +266,9 @@ class BrokerServer:
             )
 
     def _hello(self, route: bytes, hello: m.Hello) -> None:
+        if why := self._guard.refusal(route, hello.name, hello.role, hello.outputs):
+            self._unauthorized(route, f"HELLO as {hello.name!r} ({hello.role}): {why}")
+            return
         before = self.clock.peer(hello.name)
         attempt = before.attempt if before else 0
         self._replying = route
@@ -275,6 +291,7 @@ class BrokerServer:
             del self._connections[old]
         self._routes[name] = route
         self._connections[route] = _Connection(name, heartbeat=False)
+        self._guard.known(route, name)
         local = hello.pid and hello.host and hello.host == self._host
         fd = self._watchdog.welcome(name, hello.pid if local else None)
         if fd is not None:
@@ -284,7 +301,35 @@ class BrokerServer:
         self.loop.unwatch(fd)
         self._watchdog.died(service)
 
+    def _unauthorized(self, route: bytes, text: str) -> None:
+        self._reply(route, m.Refuse(code="unauthorized", message=text))
+        self._grumble("unauthorized", f"a connection was refused: {text}")
+
+    def _cut_off(self, route: bytes, why: str) -> bool:
+        """A peer took more than its share, or may not take part any more: whether it was a service."""
+        connection = self._connections.pop(route, None)
+        if connection is None:
+            return False
+        for other in [r for r, c in self._connections.items() if c.service == connection.service]:
+            self._guard.cut(other, why)
+        self.feed(ev.Lost(connection.service, f"it was cut off: {why}"))
+        return True
+
+    def _gone(self, route: bytes) -> None:
+        """A connection has ended: a remote service is lost; of a local one the operating system tells."""
+        connection = self._connections.get(route)
+        if connection is None:
+            return
+        service = connection.service
+        if connection.heartbeat:
+            self._watchdog.recheck(service)
+        elif not self._watchdog.cut_off(service):
+            self.feed(ev.Lost(service, "it is unreachable or stopped: its connection is gone"))
+
     def _attach(self, route: bytes, attach: m.Attach) -> None:
+        if why := self._guard.refusal(route, attach.name):
+            self._unauthorized(route, f"ATTACH to {attach.name!r}: {why}")
+            return
         name, peer = attach.name, self.clock.peer(attach.name)
         current = peer is not None and peer.present and name in self._routes
         if peer is None or not current or (attach.epoch, attach.attempt) != (self._plan.epoch, peer.attempt):
@@ -296,6 +341,7 @@ class BrokerServer:
         if earlier is not None:
             self._connections.pop(earlier, None)
         self._connections[route] = _Connection(name, heartbeat=True)
+        self._guard.known(route, name, pulse=True)
         self._reply(route, m.HeartbeatAck(sequence=0))
 
     # --- answers -------------------------------------------------------------------------------------
@@ -365,7 +411,8 @@ class BrokerServer:
 
     def _send(self, action: ev.Send) -> None:
         parts = [part for product in action.products for part in product.payload]
-        reason = self._port.send(self._routes[action.service], encode_message(action.message), parts)
+        route, message = self._routes[action.service], action.message
+        reason = self._port.send(route, encode_message(message), parts, not isinstance(message, _COMPLAINTS))
         if not reason or self.clock.state is RunState.FINISHED:
             return
         if not self._watchdog.cut_off(action.service):
@@ -374,7 +421,7 @@ class BrokerServer:
 
     def _reply(self, route: bytes, message: m.Message, *parts: bytes) -> None:
         """Answer a routing id; a peer that is gone meanwhile needs no answer."""
-        reason = self._port.send(route, encode_message(message), parts)
+        reason = self._port.send(route, encode_message(message), parts, not isinstance(message, _COMPLAINTS))
         if reason:
             connection = self._connections.get(route)
             service = connection.service if connection else ""

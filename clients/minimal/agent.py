@@ -1,12 +1,20 @@
 """A whole agent, written from protocol/SPEC.md alone: python agent.py tcp://HOST:PORT NAME"""
-import hashlib, itertools, os, struct, sys, threading, time, msgpack, zmq
+import hashlib, itertools, os, pathlib, struct, sys, threading, time, tomllib, msgpack, zmq
 
 ENDPOINT, NAME = sys.argv[1:3]
 INPUTS = [{"topic": "scene"}, {"topic": "link", "lag": 1, "required": False}]
 message = {"version": [1, 0], "name": NAME, "role": "agent", "inputs": INPUTS, "outputs": ["action"]}
 
+def dealer(context):  # a broker with keys wants the files that two environment variables name
+    socket, variables = context.socket(zmq.DEALER), ("CAVIAR_KEY", "CAVIAR_BROKER_KEY")
+    if os.environ.get("CAVIAR_KEY"):
+        own, broker = (tomllib.loads(pathlib.Path(os.environ[file]).read_text()) for file in variables)
+        socket.curve_publickey, socket.curve_secretkey = own["public"].encode(), own["secret"].encode()
+        socket.curve_serverkey = broker["public"].encode()
+    return socket
+
 def beat(welcome):
-    pulse, beating = zmq.Context().socket(zmq.DEALER), {"type": "ATTACH", **who, "name": NAME}
+    pulse, beating = dealer(zmq.Context()), {"type": "ATTACH", **who, "name": NAME}
     pulse.connect(ENDPOINT)
     for sequence in itertools.count():
         pulse.send(msgpack.packb(beating))
@@ -37,7 +45,7 @@ def done(grant, parts):
     product = {"products": [{"topic": "action", "digest": digest}]}
     return [msgpack.packb(report)] if grant.get("final") else [msgpack.packb(report | product), payload, b""]
 
-with zmq.Context() as context, context.socket(zmq.DEALER) as broker:
+with zmq.Context() as context, dealer(context) as broker:
     broker.linger = 1000  # [ms] at the end, so that a broker that is gone holds nobody up
     broker.connect(ENDPOINT)
     broker.send(msgpack.packb({"type": "HELLO", **message}))

@@ -110,11 +110,11 @@ class Welcome(_Message, frozen=True, kw_only=True, tag="WELCOME"):
 
 
 class Refuse(_Message, frozen=True, kw_only=True, tag="REFUSE"):
-    """Broker to service, answers HELLO: you cannot take part. The service exits with a status other
+    """Broker to service, answers HELLO or ATTACH: you cannot take part. The service exits with a status other
     than 0."""
 
     code: Word
-    """``version``, ``name-taken``, ``unknown-name``, ``declaration``, ``late``."""
+    """``version``, ``name-taken``, ``unknown-name``, ``unauthorized``, ``declaration``, ``late``."""
     message: Text
     """What is wrong, naming both sides of a contradiction, and what to change."""
 

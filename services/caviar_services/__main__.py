@@ -5,12 +5,21 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
+from pathlib import Path
 
 from caviar_protocol.errors import CaviarError
+from caviar_protocol.keys import credentials
 from caviar_services.runner import CONNECT_TIMEOUT_S, run_service
 
 
-def serve(name: str, use: str, broker: str, connect_timeout_s: float = CONNECT_TIMEOUT_S) -> int:
+def serve(
+    name: str,
+    use: str,
+    broker: str,
+    connect_timeout_s: float = CONNECT_TIMEOUT_S,
+    key: Path | None = None,
+    broker_key: Path | None = None,
+) -> int:
     """Run the implementation ``use`` ("role:name") as the service ``name``; the exit status."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(message)s")
     role, separator, implementation = use.partition(":")
@@ -18,7 +27,8 @@ def serve(name: str, use: str, broker: str, connect_timeout_s: float = CONNECT_T
         sys.stderr.write(f"caviar service: --use {use!r} is not ROLE:NAME, for example world:sumo\n")
         return 2
     try:
-        return run_service(name, role, implementation, broker, connect_timeout_s)
+        found = credentials(key, broker_key)
+        return run_service(name, role, implementation, broker, connect_timeout_s, found)
     except CaviarError as error:
         sys.stderr.write(f"caviar service {name}: {error}\n")
         return 1
@@ -37,8 +47,19 @@ def main() -> int:
         metavar="S",
         help="how long to wait for the broker; it may start later than its services",
     )
+    parser.add_argument("--key", type=Path, help="secret key of this service, NAME.key; else $CAVIAR_KEY")
+    parser.add_argument(
+        "--broker-key", type=Path, help="public key of the broker, broker.pub; else $CAVIAR_BROKER_KEY"
+    )
     arguments = parser.parse_args()
-    return serve(arguments.name, arguments.use, arguments.broker, arguments.connect_timeout)
+    return serve(
+        arguments.name,
+        arguments.use,
+        arguments.broker,
+        arguments.connect_timeout,
+        arguments.key,
+        arguments.broker_key,
+    )
 
 
 if __name__ == "__main__":

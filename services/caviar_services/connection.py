@@ -13,6 +13,8 @@ from caviar_protocol import limits
 from caviar_protocol import messages as m
 from caviar_protocol.codec import check_parts, decode_message, encode_message, message_type
 from caviar_protocol.errors import ProtocolError, RunError
+from caviar_protocol.keys import Credentials
+from caviar_services.handshake import Handshake, dress
 from caviar_services.heartbeat import HeartbeatThread
 from caviar_services.termination import Termination
 
@@ -43,11 +45,14 @@ class RunOver(BaseException):
 class Connection:
     """Sends to and receives from the broker at ``endpoint`` for the service ``name``.
 
-    Used by one thread; the heartbeat thread that `beat` starts has a socket of its own.
+    Used by one thread; the heartbeat thread that `beat` starts has a socket of its own. ``credentials`` are
+    for a broker with keys.
     """
 
-    def __init__(self, name: str, endpoint: str, termination: Termination) -> None:
-        self.name, self.endpoint = name, endpoint
+    def __init__(
+        self, name: str, endpoint: str, termination: Termination, credentials: Credentials | None = None
+    ) -> None:
+        self.name, self.endpoint, self._credentials = name, endpoint, credentials
         self._termination = termination
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._socket = self._context.socket(zmq.DEALER)
@@ -56,7 +61,9 @@ class Connection:
         self._socket.sndtimeo = SEND_TIMEOUT_MS
         self._socket.setsockopt(zmq.MAXMSGSIZE, limits.MAX_BODY)
         self._heartbeat: HeartbeatThread | None = None
+        self._handshake = Handshake(self._context, self._socket, endpoint, credentials is not None)
         try:
+            dress(self._socket, endpoint, credentials)
             self._socket.connect(endpoint)
         except zmq.ZMQError as error:
             self.close()
@@ -67,7 +74,7 @@ class Connection:
     def beat(self, welcome: m.Welcome) -> None:
         """Start the heartbeats."""
         self._heartbeat = HeartbeatThread(
-            self._context, self.endpoint, self.name, welcome, self._broker_is_gone
+            self._context, self.endpoint, self.name, welcome, self._broker_is_gone, self._credentials
         )
         self._heartbeat.start()
 
@@ -105,6 +112,7 @@ class Connection:
             received = self._next()
             if received is not None:
                 return received
+            self._handshake.check()
             silence = self._heartbeat.broker_silence if self._heartbeat else None
             if silence is not None:
                 raise RunError(self._silence(silence))
@@ -118,6 +126,7 @@ class Connection:
         """End the heartbeats and close both connections."""
         if self._heartbeat is not None:
             self._heartbeat.stop()
+        self._handshake.close()
         self._socket.close()
         self._context.term()
 

@@ -13,7 +13,9 @@ import zmq
 
 from caviar_protocol.codec import decode_message, encode_message
 from caviar_protocol.errors import ProtocolError
+from caviar_protocol.keys import Credentials
 from caviar_protocol.messages import Attach, Heartbeat, HeartbeatAck, Welcome
+from caviar_services.handshake import dress
 
 _log = logging.getLogger("caviar.heartbeat")
 
@@ -32,9 +34,11 @@ class HeartbeatThread(threading.Thread):
         name: str,
         welcome: Welcome,
         gone: Callable[[], None],
+        credentials: Credentials | None = None,
     ) -> None:
         super().__init__(name="heartbeat", daemon=True)
         self._context, self._endpoint, self._gone = context, endpoint, gone
+        self._credentials = credentials
         self._attach = Attach(epoch=welcome.epoch, attempt=welcome.attempt, name=name)
         self._interval = welcome.heartbeat_ns / 1e9
         self._liveness = welcome.liveness_ns / 1e9
@@ -59,6 +63,7 @@ class HeartbeatThread(threading.Thread):
         """Send heartbeats until told to stop, or until the broker is silent for too long."""
         with self._context.socket(zmq.DEALER) as socket:
             socket.linger = 0
+            dress(socket, self._endpoint, self._credentials)
             socket.connect(self._endpoint)
             socket.send(encode_message(self._attach), zmq.NOBLOCK)
             self._beat(socket)

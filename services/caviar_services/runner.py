@@ -20,6 +20,8 @@ from caviar_protocol.assets import AssetStore, Incoming
 from caviar_protocol.codec import check_version, encode_message, message_type
 from caviar_protocol.errors import AssetError, ProtocolError, RunError
 from caviar_protocol.host import host_identity, trim_memory
+from caviar_protocol.keys import Credentials
+from caviar_protocol.keys import credentials as find_credentials
 from caviar_protocol.tables import convert_settings
 from caviar_services.answers import Answers, Guard
 from caviar_services.connection import Connection, RunOver, Terminated, describe
@@ -62,6 +64,8 @@ class Runner:
         How this runner is told to end; none: not by signals.
     own_process
         Whether the process is this service's own, so that its memory may be tuned for it.
+    credentials
+        For a broker with keys; None: what the environment says (`caviar_protocol.keys.credentials`).
     """
 
     def __init__(
@@ -74,6 +78,7 @@ class Runner:
         termination: Termination | None = None,
         *,
         own_process: bool = True,
+        credentials: Credentials | None = None,
     ) -> None:
         self._own_process = own_process
         self.name, self.use, self.cls = name, use, cls
@@ -82,7 +87,7 @@ class Runner:
         self._timeout_s = connect_timeout_s
         self._store = AssetStore()
         self._termination = termination or Termination()
-        self._broker = Connection(name, endpoint, self._termination)
+        self._broker = Connection(name, endpoint, self._termination, credentials or find_credentials())
         self._service: Service[Any] | None = None
         self._identity: dict[str, Any] = {}
         """``epoch`` and ``attempt``, which stand in every message (clause 1)."""
@@ -289,6 +294,15 @@ class Runner:
             self._termination.finished()
 
 
-def run_service(name: str, role: str, use: str, endpoint: str, connect_timeout_s: float) -> int:
+def run_service(
+    name: str,
+    role: str,
+    use: str,
+    endpoint: str,
+    connect_timeout_s: float,
+    credentials: Credentials | None = None,
+) -> int:
     """Run a registered implementation as the service ``name``; the exit status."""
-    return Runner(name, load(role, use), use, endpoint, connect_timeout_s, SignalTermination()).run()
+    termination = SignalTermination()
+    cls = load(role, use)
+    return Runner(name, cls, use, endpoint, connect_timeout_s, termination, credentials=credentials).run()

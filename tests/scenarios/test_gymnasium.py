@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scenarios_support import SCENARIOS, pid_of, running, scenario_file
+from scenarios_support import SCENARIOS, caviar, pid_of, running, scenario_file
 
 from caviar_clients.envs.beam_selection import BeamSelectionEnv
 from caviar_clients.envs.uav_path import UavPathEnv
@@ -65,13 +65,13 @@ class Waiting:
 
 @contextmanager
 def waiting(
-    folder: Path, frames: int = FRAMES, episodes: int = EPISODES, rejoin_s: float = 0.5
+    folder: Path, frames: int = FRAMES, episodes: int = EPISODES, rejoin_s: float = 0.5, *arguments: str
 ) -> Iterator[Waiting]:
     """The shipped geometric scenario, shorter, with the agent's place free."""
     changes = [("frames = 500", f"frames = {frames}\nepisodes = {episodes}"), REMOTE]
     scenario = scenario_file(folder, changes, f"[timeouts]\nrejoin_s = {rejoin_s}\n", base="geometric")
     out = folder / "out"
-    with running(scenario, out, "--bind", "tcp://127.0.0.1:0") as (process, mark):
+    with running(scenario, out, "--bind", "tcp://127.0.0.1:0", *arguments) as (process, mark):
         yield Waiting(process, mark, scenario, out)
 
 
@@ -191,6 +191,25 @@ def test_no_broker_at_the_address_is_told_in_time() -> None:
     with closing(session), pytest.raises(RunError, match=re.escape(address)):
         session.reset()
     assert time.monotonic() - began < 10
+
+
+def test_an_environment_shows_its_key_to_a_broker_that_asks_for_one(tmp_path: Path) -> None:
+    keys = tmp_path / "keys"
+    for arguments in (["new", "broker"], ["new", "agent", "--role", "agent"]):
+        assert caviar("keys", *arguments, "--directory", keys).status == 0
+    shown = {"key": keys / "agent.key", "broker_key": keys / "broker.pub"}
+    with waiting(tmp_path, 4, 2, 20.0, "--keys", str(keys)) as run:
+        with closing(run.environment()) as without, pytest.raises(RunError, match="asks for keys"):
+            without.reset()
+        with closing(run.environment(**shown)) as env:
+            env.reset()
+            for _ in range(4):
+                *_, truncated, _ = env.step(np.int64(0))
+            assert truncated
+            env.reset()
+            for _ in range(4):
+                env.step(np.int64(0))
+        assert run.ended()[0] == 0
 
 
 def test_an_agent_that_the_run_does_not_wait_for_is_refused(tmp_path: Path) -> None:

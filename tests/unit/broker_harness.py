@@ -22,6 +22,8 @@ from caviar_protocol import messages as m
 from caviar_protocol.assets import AssetStore
 from caviar_protocol.codec import decode_message, encode_message
 from caviar_protocol.digest import payload_digest
+from caviar_protocol.keys import Credentials
+from caviar_services.handshake import dress
 
 M = TypeVar("M", bound=m.Message)
 MS = 1_000_000
@@ -85,13 +87,15 @@ def plan(*services: str, limits: dict[str, int] | None = None, **run: Any) -> Ru
 
 @contextmanager
 def serving(
-    run: RunPlan, tmp_path: Path, journal: Callable[[Path], JournalFile] | None = None
+    run: RunPlan, tmp_path: Path, journal: Callable[[Path], JournalFile] | None = None, **server_options: Any
 ) -> Iterator[Serving]:
     """The broker of a run, until the block is left."""
     witness, failures = Witness(), list[BaseException]()
     make = journal or (lambda path: JournalFile(path, 1))
     file = make(tmp_path / "journal.msgpack")
-    server = BrokerServer(run, "tcp://127.0.0.1:0", file, witness, AssetStore(tmp_path / "broker-cache"))
+    store = AssetStore(tmp_path / "broker-cache")
+    endpoint = server_options.pop("endpoint", "tcp://127.0.0.1:0")
+    server = BrokerServer(run, endpoint, file, witness, store, **server_options)
 
     def body() -> None:
         try:
@@ -138,12 +142,15 @@ class Client:
         *,
         inputs: Sequence[m.Input] | None = None,
         outputs: Sequence[str] | None = None,
+        credentials: Credentials | None = None,
         **hello: Any,
     ) -> None:
         role = role or name
         self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self.socket = self.context.socket(zmq.DEALER)
         self.socket.linger = 0
+        self.credentials = credentials
+        dress(self.socket, endpoint, credentials)
         self.socket.connect(endpoint)
         self.endpoint, self.name = endpoint, name
         declared = {"version": (1, 0), "name": name, "role": role}
@@ -194,6 +201,7 @@ class Client:
     def attach(self) -> zmq.Socket[bytes]:
         self.pulse = self.context.socket(zmq.DEALER)
         self.pulse.linger = 0
+        dress(self.pulse, self.endpoint, self.credentials)
         self.pulse.connect(self.endpoint)
         self.pulse.send(encode_message(m.Attach(**self.ids, name=self.name)))
         assert self.pulse.poll(round(PATIENCE_S * 1000))

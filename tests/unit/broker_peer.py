@@ -17,6 +17,10 @@ import zmq
 ENDPOINT, LOCAL, HOW = sys.argv[1], sys.argv[2] == "local", sys.argv[3]
 
 
+beating = threading.Event()
+"""Set once the broker has heard a heartbeat."""
+
+
 def identity() -> dict[str, object]:
     if not LOCAL:
         return {}
@@ -48,6 +52,7 @@ def main() -> None:
     receive("RESET")
     send(type="RESET_DONE", episode=0, **who)
     receive("GRANT")
+    assert beating.wait(20.0)
     sys.stdout.write("granted\n")
     sys.stdout.flush()
     if HOW == "wait":
@@ -71,7 +76,7 @@ def beat(context: zmq.Context[zmq.Socket[bytes]], who: dict[str, object]) -> Non
     pulse = context.socket(zmq.DEALER)
     pulse.connect(ENDPOINT)
     pulse.send(msgpack.packb({"type": "ATTACH", "name": "world", **who}))
-    sequence = 0
+    sequence = answers = 0
     while True:
         pulse.send(msgpack.packb({"type": "HEARTBEAT", "sequence": sequence, "phase": "playing"}))
         sequence += 1
@@ -79,6 +84,9 @@ def beat(context: zmq.Context[zmq.Socket[bytes]], who: dict[str, object]) -> Non
         while (left := until - time.monotonic()) > 0:
             if pulse.poll(left * 1000):
                 pulse.recv()
+                answers += 1
+                if answers == 2:  # to ATTACH, and to the first heartbeat
+                    beating.set()
 
 
 main()

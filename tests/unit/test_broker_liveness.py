@@ -198,3 +198,18 @@ def test_a_process_that_rejoins_is_watched_in_place_of_the_one_before(tmp_path: 
             assert (known.attempt, known.present) == (2, True)
             second.kill()
             eventually(lambda: losses(broker) == 2, "the death of the second is known")
+
+
+def test_a_remote_service_whose_connection_ends_is_missed_at_once(tmp_path: Path) -> None:
+    """Its death need not wait for a heartbeat that is missed, nor for a message that finds nobody."""
+    with serving(plan("world", "sensors"), tmp_path) as broker, Client(broker.endpoint, "sensors") as sensors:
+        with Client(broker.endpoint, "world") as world:
+            for client in (world, sensors):
+                client.join()
+            for client in (world, sensors):
+                client.ready()
+            started = time.monotonic()
+        outcome = broker.outcome()
+        assert time.monotonic() - started < 0.2 + 2 * MARGIN_S  # liveness is 1.5 s
+    assert outcome.culprit == "world"
+    assert "its connection is gone" in outcome.error

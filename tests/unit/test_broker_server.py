@@ -346,11 +346,11 @@ def test_no_grant_overtakes_the_journal_entries_that_it_relies_on(tmp_path: Path
     with serving(plan(*PAIR, frames=20), tmp_path, diary) as broker:
         events, send = diaries[0].events, broker.server._port.send
 
-        def recorded(route: bytes, header: bytes, parts: Any = ()) -> str:
+        def recorded(route: bytes, header: bytes, parts: Any = (), earns: bool = True) -> str:
             message = decode_message(header)
             if isinstance(message, m.Grant):
                 events.append(("granted", "", message.frame))
-            return send(route, header, parts)
+            return send(route, header, parts, earns)
 
         broker.server._port.send = recorded  # type: ignore[method-assign]
         feedback = (m.Input(topic="lidar", lag=1, required=False),)

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from caviar_broker.processes import describe_exit
+from caviar_clients.cli.borrowed import BorrowedKey
 from caviar_protocol.errors import RunError
 from caviar_protocol.scenario import Scenario, ServiceSpec
 
@@ -60,7 +61,10 @@ class Launcher:
     frames: int | None = None
     seed: int | None = None
     bind: str = "tcp://127.0.0.1:0"
+    keys: Path | None = None
+    """Keys directory of the broker."""
     endpoint: str = ""
+    _key: BorrowedKey = field(init=False)
     _children: dict[str, Child] = field(default_factory=dict)
     _broker: subprocess.Popen[bytes] | None = None
     _selector: selectors.BaseSelector = field(default_factory=selectors.DefaultSelector)
@@ -74,6 +78,9 @@ class Launcher:
     _give_up_at: float | None = None
     """When a broker that all services have left must have ended [s]; None while one is left."""
 
+    def __post_init__(self) -> None:
+        self._key = BorrowedKey(self.keys)
+
     def __enter__(self) -> Launcher:
         (self.directory / "logs").mkdir(parents=True, exist_ok=True)
         return self
@@ -81,6 +88,7 @@ class Launcher:
     def __exit__(self, *_: object) -> None:
         self._end_all()
         self._selector.close()
+        self._key.close()
 
     def events(self) -> Iterator[Mapping[str, Any]]:
         """Start everything; what the broker tells, then what became of the processes.
@@ -121,7 +129,7 @@ class Launcher:
             command += ["--frames", str(self.frames)]
         if self.seed is not None:
             command += ["--seed", str(self.seed)]
-        command += ["--supervised", *self._local]
+        command += [*self._key.options(), "--supervised", *self._local]
         with (self.directory / "logs" / "broker.log").open("wb") as log:
             self._broker = subprocess.Popen(  # noqa: S603  # our own module with checked arguments
                 command,
@@ -143,7 +151,12 @@ class Launcher:
             command += ["--use", f"{spec.role}:{spec.use}", "--broker", self.endpoint]
             with path.open("wb") as log:
                 process = subprocess.Popen(  # noqa: S603  # our own module with checked arguments
-                    command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True
+                    command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=log,
+                    start_new_session=True,
+                    env=self._key.environment(),
                 )
             child = Child(name, process, path, os.pidfd_open(process.pid))
             self._children[name] = child

@@ -11,6 +11,7 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
+from caviar_clients.cli.keys import app as keys
 from caviar_protocol.errors import CaviarError
 
 app = typer.Typer(
@@ -19,6 +20,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Co-simulation of machine-learning-based 6G in virtual worlds.",
 )
+app.add_typer(keys, name="keys")
 _console = Console()
 _errors = Console(stderr=True)
 
@@ -36,6 +38,9 @@ def run(
     json: Annotated[Path | None, typer.Option(help="write the summary to this file too")] = None,
     out: Annotated[Path, typer.Option(help="directory in which the run's own is made")] = Path("runs"),
     bind: Annotated[str, typer.Option(help="address of the broker; port 0: any")] = "tcp://127.0.0.1:0",
+    keys: Annotated[
+        Path | None, typer.Option(help="keys directory: only authorized keys take part (caviar keys)")
+    ] = None,
     embedded: Annotated[
         bool, typer.Option("--embedded", help="all in this process, without sockets")
     ] = False,
@@ -43,7 +48,7 @@ def run(
     """Run a scenario: the broker and every service as processes of their own, or all in this one."""
     from caviar_clients.cli.run import run_scenario
 
-    raise typer.Exit(run_scenario(scenario, out, _console, frames, seed, json, bind, embedded))
+    raise typer.Exit(run_scenario(scenario, out, _console, frames, seed, json, bind, embedded, keys))
 
 
 @app.command()
@@ -53,20 +58,25 @@ def broker(
     frames: Frames = None,
     seed: Seed = None,
     out: Annotated[Path, typer.Option(help="directory in which the run's own is made")] = Path("runs"),
+    keys: Annotated[
+        Path | None, typer.Option(help="keys directory: only authorized keys take part (caviar keys)")
+    ] = None,
 ) -> None:
     """Run only the broker; start the services with `caviar service`, here or on other machines."""
     from caviar_broker.__main__ import parser, serve
+    from caviar_broker.security.local import check_bind
     from caviar_clients.cli.run import run_directory
     from caviar_clients.sessions.checking import checked_scenario
 
     checked = checked_scenario(scenario, frames, seed)
+    check_bind(bind, keys=keys is not None)
     directory = run_directory(out, checked.run.name)
     typer.echo(f"run {directory}; start its services with --broker and this broker's address:")
     for name, spec in checked.services.items():
         use = "IMPLEMENTATION" if spec.remote else spec.use
         typer.echo("  " + shlex.join(["caviar", "service", name, "--use", f"{spec.role}:{use}"]))
     arguments = [str(scenario), "--bind", bind, "--directory", str(directory)]
-    for name, value in (("--frames", frames), ("--seed", seed)):
+    for name, value in (("--frames", frames), ("--seed", seed), ("--keys", keys)):
         arguments += [] if value is None else [name, str(value)]
     raise typer.Exit(serve(parser().parse_args(arguments)))
 
@@ -79,11 +89,17 @@ def service(
     connect_timeout: Annotated[
         float, typer.Option(min=0.0, help="seconds to wait for the broker, which may start later")
     ] = 30.0,
+    key: Annotated[
+        Path | None, typer.Option(help="secret key of this service, NAME.key", envvar="CAVIAR_KEY")
+    ] = None,
+    broker_key: Annotated[
+        Path | None, typer.Option(help="public key of the broker, broker.pub", envvar="CAVIAR_BROKER_KEY")
+    ] = None,
 ) -> None:
     """Run one service and connect it to a broker."""
     from caviar_services.__main__ import serve
 
-    raise typer.Exit(serve(name, use, broker, connect_timeout))
+    raise typer.Exit(serve(name, use, broker, connect_timeout, key, broker_key))
 
 
 @app.command()

@@ -7,6 +7,7 @@ import socket
 from pathlib import Path
 
 import caviar_clients
+from caviar_protocol.keys import BROKER, BROKER_KEY_VARIABLE, KEY_VARIABLE
 from caviar_protocol.scenario import ServiceSpec
 
 MINIMAL = Path(caviar_clients.__file__).parents[1] / "minimal" / "agent.py"
@@ -36,6 +37,14 @@ def waiting_text(name: str, spec: ServiceSpec, endpoint: str, seconds: float) ->
         f"waiting for {name!r} ({spec.role}) at {there}, for {seconds:g} s (timeouts.connect_s): "
         f"start it with  {start_command(name, spec, there)}"
     )
+
+
+def key_text(name: str, keys: Path | None) -> str:
+    """What the user is told of the key that a service needs; nothing where the broker has none."""
+    if keys is None:
+        return ""
+    broker = keys / f"{BROKER}.pub"
+    return f"  with {KEY_VARIABLE}={name}.key and {BROKER_KEY_VARIABLE}={broker} in its environment"
 
 
 def _shown(path: Path) -> str:

@@ -15,9 +15,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
+from caviar_broker.security.local import check_bind
 from caviar_clients.cli.inside import EmbeddedLauncher
 from caviar_clients.cli.launch import Launcher
-from caviar_clients.cli.remote import reachable, start_command, waiting_text
+from caviar_clients.cli.remote import key_text, reachable, start_command, waiting_text
 from caviar_clients.cli.summary import recorded_figures, summary_of, summary_table
 from caviar_clients.sessions.checking import checked_scenario
 from caviar_protocol.errors import RunError
@@ -59,9 +60,11 @@ def run_scenario(
     json_file: Path | None = None,
     bind: str = "tcp://127.0.0.1:0",
     embedded: bool = False,
+    keys: Path | None = None,
 ) -> int:
     """Run a scenario; the exit status: 0 exactly if it came to its end."""
     scenario = checked_scenario(path, frames, seed)
+    check_bind(bind, keys=keys is not None)
     if embedded:
         refuse_remote(scenario)
     if json_file is not None:
@@ -72,11 +75,11 @@ def run_scenario(
     if embedded:
         launcher = EmbeddedLauncher(scenario, directory)
     else:
-        launcher = Launcher(scenario, path.resolve(), directory, frames, seed, bind)
+        launcher = Launcher(scenario, path.resolve(), directory, frames, seed, bind, keys)
     outcome: Mapping[str, Any] = {}
     interrupted = _Interruption(launcher)
     with launcher, interrupted, _progress_bar(console) as bar:
-        watcher = _Watcher(bar, console, scenario)
+        watcher = _Watcher(bar, console, scenario, keys)
         for event in launcher.events():
             watcher.take(event)
             if event["event"] == "finished":
@@ -126,13 +129,13 @@ class _Interruption:
 class _Watcher:
     """Shows what the broker reports."""
 
-    def __init__(self, bar: Progress, console: Console, scenario: Scenario) -> None:
+    def __init__(self, bar: Progress, console: Console, scenario: Scenario, keys: Path | None) -> None:
         self._bar, self._console = bar, console
         total = scenario.run.frames * scenario.run.episodes
         self._task = bar.add_task("starting", total=total, rate="", misses="")
         self._first: tuple[float, int] | None = None
         self._shown: dict[tuple[str, str], int] = {}
-        self._scenario, self._endpoint = scenario, ""
+        self._scenario, self._endpoint, self._keys = scenario, "", keys
 
     def take(self, event: Mapping[str, Any]) -> None:
         """Show one event."""
@@ -151,7 +154,7 @@ class _Watcher:
         for name, spec in self._scenario.services.items():
             if spec.remote:
                 connect_s = self._scenario.timeouts.connect_s
-                self._tell(waiting_text(name, spec, endpoint, connect_s), "bold")
+                self._tell(waiting_text(name, spec, endpoint, connect_s) + key_text(name, self._keys), "bold")
 
     def _frame(self, frames: int, misses: int) -> None:
         now = time.monotonic()

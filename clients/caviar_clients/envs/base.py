@@ -20,6 +20,7 @@ from caviar_clients.sessions.base import Frame, Session
 from caviar_clients.sessions.checking import checked_scenario
 from caviar_clients.sessions.opening import agent_of, open_session
 from caviar_protocol.errors import RunError, ScenarioError
+from caviar_protocol.keys import credentials
 from caviar_protocol.messages import Input
 from caviar_protocol.topics import Action, Link
 from caviar_protocol.topics.action import Command
@@ -54,6 +55,9 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         Where an embedded run records; None: it does not, which is faster.
     render_mode
         ``rgb_array``: a map of the scene.
+    key, broker_key
+        For a broker with keys: files with the agent's secret key and with the broker's public one. By default
+        those that CAVIAR_KEY and CAVIAR_BROKER_KEY name.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012  # as gymnasium has it
@@ -68,6 +72,8 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         reward: RewardKind = "abs_y",
         directory: str | Path | None = None,
         render_mode: str | None = None,
+        key: str | Path | None = None,
+        broker_key: str | Path | None = None,
     ) -> None:
         if reward not in KINDS:
             raise ScenarioError(f"no reward is called {reward!r}; there are: {', '.join(KINDS)}")
@@ -86,6 +92,8 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         )
         self._reward = Reward(reward)
         self._broker = broker
+        own, its = (None if path is None else Path(path) for path in (key, broker_key))
+        self._credentials = None if broker is None else credentials(own, its)
         self._directory = None if directory is None else Path(directory)
         self._renderer: MapRenderer | None = None
         self._session: Session | None = None
@@ -102,7 +110,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
             raise ScenarioError(f"options are not used, got {sorted(options)}; set them in the scenario")
         if self._session is None:
             self._session = open_session(
-                self.scenario, self.agent, self._inputs(), self._broker, self._directory
+                self.scenario, self.agent, self._inputs(), self._broker, self._directory, self._credentials
             )
         self._moment = self._at(self._session.reset(seed))
         return self._observation(self._moment), self._info(self._moment)

@@ -9,6 +9,7 @@ from queue import Empty, SimpleQueue
 from caviar_clients.sessions.agent import declared
 from caviar_clients.sessions.base import Frame, Session
 from caviar_protocol.errors import CaviarError, RunError
+from caviar_protocol.keys import Credentials
 from caviar_protocol.messages import Input
 from caviar_services.connection import Terminated
 from caviar_services.runner import CONNECT_TIMEOUT_S, Runner
@@ -37,6 +38,8 @@ class ConnectedSession(Session):
         What it consumes.
     connect_timeout_s
         Until the broker has to answer [s].
+    credentials
+        For a broker with keys; None: what the environment says.
     """
 
     def __init__(
@@ -45,6 +48,7 @@ class ConnectedSession(Session):
         agent: str,
         inputs: tuple[Input, ...],
         connect_timeout_s: float = CONNECT_TIMEOUT_S,
+        credentials: Credentials | None = None,
     ) -> None:
         super().__init__()
         self._grants: SimpleQueue[Frame | CaviarError] = SimpleQueue()
@@ -53,7 +57,14 @@ class ConnectedSession(Session):
         self._termination = _Leaving(self)
         cls = declared(inputs, self._first_seed, self._decided)
         runner = Runner(
-            agent, cls, IMPLEMENTATION, broker, connect_timeout_s, self._termination, own_process=False
+            agent,
+            cls,
+            IMPLEMENTATION,
+            broker,
+            connect_timeout_s,
+            self._termination,
+            own_process=False,
+            credentials=credentials,
         )
         self._thread = threading.Thread(target=self._serve, args=(runner,), name="session", daemon=True)
         self._thread.start()

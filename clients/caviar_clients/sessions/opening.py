@@ -8,6 +8,7 @@ from caviar_clients.sessions.base import Session
 from caviar_clients.sessions.connected import ConnectedSession
 from caviar_clients.sessions.embedded import EmbeddedSession
 from caviar_protocol.errors import ScenarioError
+from caviar_protocol.keys import Credentials
 from caviar_protocol.messages import Input
 from caviar_protocol.scenario import Scenario
 
@@ -38,10 +39,11 @@ def open_session(
     inputs: tuple[Input, ...],
     broker: str | None = None,
     directory: Path | None = None,
+    credentials: Credentials | None = None,
 ) -> Session:
     """A session of ``agent``, at ``broker`` or, without one, in this process."""
     if broker is None:
         return EmbeddedSession(scenario, agent, inputs, directory)
     if directory is not None:
         raise ScenarioError("a connected run records where its broker says; leave directory=… out")
-    return ConnectedSession(broker, agent, inputs)
+    return ConnectedSession(broker, agent, inputs, credentials=credentials)

@@ -1,16 +1,22 @@
 // A whole agent, written from protocol/SPEC.md alone: node agent.mjs tcp://HOST:PORT NAME
 import { createHash } from "node:crypto";
+import { readFileSync } from "node:fs";
 import { setTimeout as sleep } from "node:timers/promises";
 import { decode, encode } from "@msgpack/msgpack";
 import { Dealer } from "zeromq";
 
 const [endpoint, name] = process.argv.slice(2);
-const broker = new Dealer({ linger: 1000 }); // [ms] at the end, so that a broker that is gone holds nobody up
+const key = (variable, what) => // from the files that a broker with keys wants
+  process.env[variable] && readFileSync(process.env[variable], "utf8").match(`${what} = "(.*)"`)[1];
+const [publicKey, secretKey, curveServerKey] = [
+  key("CAVIAR_KEY", "public"), key("CAVIAR_KEY", "secret"), key("CAVIAR_BROKER_KEY", "public")];
+const curve = curveServerKey && { curvePublicKey: publicKey, curveSecretKey: secretKey, curveServerKey };
+const broker = new Dealer({ linger: 1000, ...curve }); // [ms] at the end, so that a broker that is gone holds nobody up
 let who = {}, stored = new Map(), kind = "";
 const fail = (text) => { process.stderr.write(`${name}: ${text}\n`); process.exit(1); };
 
 async function beat({ heartbeat_ns, liveness_ns }) { // nothing here takes long, so that no thread is needed
-  const pulse = new Dealer({ linger: 0, receiveTimeout: liveness_ns / 1e6 });
+  const pulse = new Dealer({ linger: 0, ...curve, receiveTimeout: liveness_ns / 1e6 });
   pulse.connect(endpoint);
   for (let sequence = -1; kind !== "SHUTDOWN"; sequence++) {
     await pulse.send(encode(sequence < 0 ? { type: "ATTACH", ...who, name } : { type: "HEARTBEAT", sequence }));

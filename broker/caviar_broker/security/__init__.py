@@ -1,0 +1,1 @@
+"""Who may take part, and how much of the broker one peer may use."""

@@ -1,0 +1,138 @@
+"""Which key may take part as what: the authorized file, asked at each handshake and at each HELLO."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from zmq.utils import z85
+
+from caviar_protocol.errors import SetupError
+from caviar_protocol.keys import AUTHORIZED, BROKER, Authorization, read_authorized, read_pair
+
+BAR_NS = 10_000_000_000
+"""[ns] for which a key that was cut off for its behaviour is not let in again."""
+LOCAL = "services of this run"
+"""What the key is called that a launcher gives to the services that it starts itself."""
+
+
+class Access:
+    """The keys of a broker.
+
+    Parameters
+    ----------
+    directory
+        Keys directory, with ``broker.key`` and ``authorized.toml``, which may change at any time.
+    local_key
+        Public key of the services that a launcher starts itself; "" for none.
+    local
+        Name to role of these.
+
+    Raises `SetupError` naming the remedy where the directory lacks something.
+    """
+
+    def __init__(self, directory: Path, local_key: str = "", local: Mapping[str, str] | None = None) -> None:
+        self.directory = directory
+        path = directory / f"{BROKER}.key"
+        if not path.exists():
+            raise SetupError(
+                f"there is no {path}; make it with  caviar keys new {BROKER} --directory {directory}"
+            )
+        self.pair = read_pair(path)
+        self._local_key, self._local = local_key, dict(local or {})
+        self._stamp = self._look()
+        self._entries = {entry.public: entry for entry in read_authorized(directory)}
+        self._barred: dict[str, int] = {}
+        """Public key to the instant until which it is barred [ns]."""
+
+    def name(self, key: str) -> str:
+        """What a key is called; "" for one that is not authorized."""
+        if key == self._local_key:
+            return LOCAL
+        entry = self._entries.get(key)
+        return entry.name if entry else ""
+
+    def admits(self, key: str) -> str:
+        """Why a key may not connect at all; empty where it may."""
+        if not self.name(key):
+            return f"the key {key} is not authorized (caviar keys authorize)"
+        if self._barred.get(key, 0) > time.monotonic_ns():
+            return f"the key of {self.name(key)!r} was cut off and is barred for {BAR_NS // 10**9} s"
+        return ""
+
+    def refusal(self, key: str, name: str, role: str = "", outputs: Sequence[str] = ()) -> str:
+        """Why a key may not appear as that service; empty where it may. Without ``role`` only the name
+        counts."""
+        if key and key == self._local_key:
+            known = self._local.get(name)
+            if known is None:
+                return f"the key given to services that this run starts is not for {name!r}"
+            return _role_refusal(name, known, role)
+        entry = self._entries.get(key)
+        if entry is None:
+            return "its key is not authorized (caviar keys authorize)"
+        if entry.name != name:
+            return f"its key is authorized for the name {entry.name!r}, not for {name!r}"
+        return _role_refusal(name, entry.role, role) or _topic_refusal(entry, outputs)
+
+    def bar(self, key: str) -> None:
+        """Do not let a key in for `BAR_NS`."""
+        if key and key != self._local_key:
+            self._barred[key] = time.monotonic_ns() + BAR_NS
+
+    def reload(self) -> str | None:
+        """Read the authorized file again if it changed: None if it did not, else why it cannot be used,
+        in which case nothing changes, or an empty text."""
+        stamp = self._look()
+        if stamp == self._stamp:
+            return None
+        self._stamp = stamp
+        try:
+            entries = read_authorized(self.directory)
+        except SetupError as error:
+            return f"{error}; what stood there before goes on holding"
+        self._entries = {entry.public: entry for entry in entries}
+        return ""
+
+    def _look(self) -> tuple[int, int, int]:
+        """Changes whenever the file does."""
+        try:
+            found = (self.directory / AUTHORIZED).stat()
+        except OSError:
+            return (0, 0, 0)
+        return (found.st_mtime_ns, found.st_ino, found.st_size)
+
+
+def answer(access: Access | None, request: Sequence[bytes]) -> tuple[list[bytes], str]:
+    """Reply to a request of the ZeroMQ Authentication Protocol (RFC 27), and why it is a refusal.
+
+    The user id that it gives to each message of the connection is the public key, in Z85. Without
+    ``access`` everybody is let in who asks for no mechanism.
+    """
+    version, sequence = [*request, b"", b""][:2]
+    reason = f"a request of {len(request)} parts"
+    key = ""
+    if access is None and len(request) > 5 and request[5] == b"NULL":
+        reason = ""
+    elif access is not None and len(request) == 7 and request[5] == b"CURVE" and len(request[6]) == 32:
+        key = z85.encode(request[6]).decode()
+        reason = access.admits(key)
+    elif len(request) > 5:
+        reason = f"the mechanism {request[5].decode(errors='replace')!r} has no keys"
+    status, text = (b"400", b"not authorized") if reason else (b"200", b"OK")
+    return [version or b"1.0", sequence, status, text, b"" if reason else key.encode(), b""], reason
+
+
+def _role_refusal(name: str, known: str, role: str) -> str:
+    if role and role != known:
+        return f"its key is authorized for {name!r} as {known}, not as {role}"
+    return ""
+
+
+def _topic_refusal(entry: Authorization, outputs: Sequence[str]) -> str:
+    beyond = [] if entry.topics is None else [topic for topic in outputs if topic not in entry.topics]
+    if not beyond:
+        return ""
+    allowed = ", ".join(entry.topics or ()) or "none"
+    return f"its key is authorized for the topics {allowed}, not for {', '.join(beyond)}"

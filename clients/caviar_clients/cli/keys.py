@@ -1,0 +1,132 @@
+"""`caviar keys`: making key pairs, and saying who may take part."""
+
+from __future__ import annotations
+
+import hashlib
+import secrets
+from pathlib import Path
+from typing import Annotated, cast
+
+import typer
+import zmq
+
+from caviar_protocol import keys as k
+from caviar_protocol.errors import SetupError
+from caviar_protocol.messages import Role
+
+app = typer.Typer(no_args_is_help=True, help="Keys: who may take part in a run, and as what.")
+
+Directory = Annotated[Path, typer.Option(help="keys directory")]
+DEFAULT = Path("keys")
+
+
+@app.command()
+def new(
+    name: Annotated[str, typer.Argument(help="of the service, or `broker`", show_default=False)],
+    role: Annotated[str | None, typer.Option(help="authorize it for this role as well")] = None,
+    directory: Directory = DEFAULT,
+) -> None:
+    """Make a key pair: NAME.key, which is secret, and NAME.pub."""
+    if role is not None:
+        _free(directory, name)
+        _role(role)
+    public, secret = zmq.curve_keypair()
+    pair = k.Pair(public=public.decode(), secret=secret.decode())
+    key, pub = k.write_pair(directory, name, pair)
+    typer.echo(f"{key}: secret, stays on its machine\n{pub}: for the others")
+    if role is not None:
+        _add(directory, k.Authorization(name=name, role=_role(role), public=pair.public))
+
+
+@app.command()
+def authorize(
+    file: Annotated[Path, typer.Argument(help="public key, NAME.pub", show_default=False)],
+    name: Annotated[str, typer.Option(help="name of the service that it may appear as")],
+    role: Annotated[str, typer.Option(help="role that it may take: " + ", ".join(k.ROLES))],
+    topics: Annotated[
+        str | None, typer.Option(help="topics that it may produce, as a,b; by default all")
+    ] = None,
+    directory: Directory = DEFAULT,
+) -> None:
+    """Let a key take part in the runs of the broker of this keys directory."""
+    listed = None if topics is None else tuple(topic for topic in topics.split(",") if topic)
+    for topic in listed or ():
+        k.check_name(topic)
+    _free(directory, name)
+    _add(directory, k.Authorization(name=name, role=_role(role), public=k.read_public(file), topics=listed))
+
+
+@app.command("list")
+def list_keys(directory: Directory = DEFAULT) -> None:
+    """Show who may take part, and who may look on over HTTP."""
+    rows: list[tuple[str, str, str, str]] = []
+    for entry in k.read_authorized(directory):
+        topics = "all of its role" if entry.topics is None else ", ".join(entry.topics) or "none"
+        rows.append((entry.name, entry.role, f"topics: {topics}", f"key {entry.public}"))
+    for held in k.read_tokens(directory):
+        rows.append((held.name, held.role, "HTTP token", f"sha256 {held.sha256}"))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        typer.echo("  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)))
+    if not rows:
+        typer.echo(f"nobody is authorized in {directory}")
+
+
+@app.command()
+def revoke(
+    name: Annotated[str, typer.Argument(help="as `caviar keys list` shows it", show_default=False)],
+    directory: Directory = DEFAULT,
+) -> None:
+    """Withdraw a key or a token; whoever takes part with it is cut off within a second."""
+    entries, tokens = k.read_authorized(directory), k.read_tokens(directory)
+    kept = [entry for entry in entries if entry.name != name]
+    kept_tokens = [token for token in tokens if token.name != name]
+    if len(kept) == len(entries) and len(kept_tokens) == len(tokens):
+        names = ", ".join([e.name for e in entries] + [t.name for t in tokens]) or "nobody"
+        raise SetupError(f"{name!r} is not authorized in {directory}, but: {names}")
+    if len(kept) < len(entries):
+        k.write_authorized(directory, kept)
+    if len(kept_tokens) < len(tokens):
+        k.write_tokens(directory, kept_tokens)
+    typer.echo(f"{name} is revoked")
+
+
+@app.command()
+def token(
+    name: Annotated[str, typer.Argument(help="of who gets it", show_default=False)],
+    role: Annotated[str, typer.Option(help="what its holder may do")] = "reader",
+    directory: Directory = DEFAULT,
+) -> None:
+    """Make a token for the HTTP interface. It is shown once; only its digest is kept."""
+    k.check_name(name)
+    k.check_name(role)
+    tokens = k.read_tokens(directory)
+    if any(other.name == name for other in tokens):
+        raise SetupError(f"there is a token {name!r} already; revoke it first:  caviar keys revoke {name}")
+    text = secrets.token_urlsafe(32)
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    k.write_tokens(directory, [*tokens, k.Token(name=name, role=role, sha256=digest)])
+    typer.echo(text)
+
+
+def _role(role: str) -> Role:
+    if role not in k.ROLES:
+        raise SetupError(f"there is no role {role!r}; write one of: {', '.join(k.ROLES)}")
+    return cast("Role", role)
+
+
+def _free(directory: Path, name: str) -> None:
+    k.check_name(name)
+    if any(entry.name == name for entry in k.read_authorized(directory)):
+        raise SetupError(f"{name!r} is authorized already; revoke it first:  caviar keys revoke {name}")
+
+
+def _add(directory: Path, entry: k.Authorization) -> None:
+    entries = k.read_authorized(directory)
+    for other in entries:
+        if other.public == entry.public:
+            raise SetupError(
+                f"this key is authorized already, as {other.name!r}; make another, or revoke that"
+            )
+    k.write_authorized(directory, [*entries, entry])
+    typer.echo(f"{entry.name} may take part as {entry.role}")

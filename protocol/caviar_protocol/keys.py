@@ -1,0 +1,269 @@
+"""Keys of a run: who may take part, and as what.
+
+A keys directory holds, all of them TOML that a person can read:
+
+``NAME.key``
+    A secret key with its public one, mode 0600. It never leaves the machine of its owner.
+``NAME.pub``
+    The public key alone, for handing out.
+``broker.key``, ``broker.pub``
+    Those of the broker, by which its services recognise it.
+``authorized.toml``
+    The public keys that may take part, each with its name, role and, if need be, topics.
+``tokens.toml``
+    SHA-256 of the tokens that may look at a run over HTTP, each with a name and a role.
+
+Keys are CurveZMQ's (Curve25519), 32 B written as 40 characters of Z85 (ZeroMQ RFC 26 and 32).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, TypeVar, get_args
+
+import msgspec
+from msgspec import Meta
+
+from caviar_protocol.errors import SetupError
+from caviar_protocol.messages import Role
+
+BROKER = "broker"
+"""Name of the broker's own pair."""
+AUTHORIZED = "authorized.toml"
+TOKENS = "tokens.toml"
+KEY_VARIABLE, BROKER_KEY_VARIABLE = "CAVIAR_KEY", "CAVIAR_BROKER_KEY"
+"""Environment variables with the paths of a service's secret key and of its broker's public one."""
+ROLES: tuple[str, ...] = get_args(Role)
+
+Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
+Z85 = Annotated[str, Meta(pattern=r"^[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}$")]
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+
+
+class _Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """Base of all entries: unknown keys are refused."""
+
+
+class Authorization(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """One key that may take part in runs."""
+
+    name: Name
+    """Of the service that it may appear as, and of the key itself."""
+    role: Role
+    public: Z85
+    topics: tuple[str, ...] | None = None
+    """Topics that it may produce; None: all that its role has."""
+
+
+class Token(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """One token that opens a run to a reader over HTTP."""
+
+    name: Name
+    role: str
+    """What its holder may do; the HTTP interface says which words there are."""
+    sha256: Annotated[str, Meta(pattern=r"^[0-9a-f]{64}$")]
+    """Of the token's text; the token itself is written nowhere."""
+
+
+class Pair(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """A secret key and its public one."""
+
+    public: Z85
+    secret: Z85
+
+    def __repr__(self) -> str:
+        """Without the secret, which a traceback or a log might show."""
+        return f"Pair(public={self.public!r}, secret=…)"
+
+
+class _Public(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    public: Z85
+
+
+class _AuthorizedFile(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    key: tuple[Authorization, ...] = ()
+
+
+class _TokenFile(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    token: tuple[Token, ...] = ()
+
+
+T = TypeVar("T")
+
+
+def check_name(name: str) -> str:
+    """``name`` itself. Raises `SetupError` where a key cannot be called so."""
+    if not _NAME.fullmatch(name):
+        raise SetupError(
+            f"a key cannot be called {name!r}; write letters, digits, '_', '.', '-', at most 64 of them, "
+            "beginning with a letter or digit"
+        )
+    return name
+
+
+def write_pair(directory: Path, name: str, pair: Pair) -> tuple[Path, Path]:
+    """Write ``NAME.key``, readable by its owner alone, and ``NAME.pub``; their paths.
+
+    Raises `SetupError` where one of them exists, which stays as it is.
+    """
+    check_name(name)
+    key, pub = directory / f"{name}.key", directory / f"{name}.pub"
+    for path in (key, pub):
+        if path.exists() or path.is_symlink():
+            raise SetupError(f"{path} exists and is not overwritten; choose another name, or remove it first")
+    secret = f"# Secret key of {name!r}: keep it on its machine, and to yourself.\n" + _table(
+        "public", pair.public
+    )
+    secret += _table("secret", pair.secret)
+    public = f"# Public key of {name!r}: for whoever shall recognise it.\n" + _table("public", pair.public)
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        _create(key, secret, 0o600)
+        _create(pub, public, 0o644)
+    except OSError as error:
+        raise SetupError(
+            f"cannot write {error.filename}: {error.strerror}; choose another --directory"
+        ) from error
+    return key, pub
+
+
+def read_pair(path: Path) -> Pair:
+    """The key pair in a ``.key`` file.
+
+    Raises `SetupError` where there is none, it is no key, or others on this machine can read it.
+    """
+    pair = _decoded(path, Pair, "make it with  caviar keys new NAME")
+    mode = stat.S_IMODE(path.stat().st_mode)
+    if mode & 0o077:
+        raise SetupError(
+            f"{path} holds a secret key, and its mode is {mode:03o}, so that others can read it; "
+            f"mend it with  chmod 600 {path}"
+        )
+    return pair
+
+
+def read_public(path: Path) -> str:
+    """The public key in a ``.pub`` file."""
+    remedy = "it is the file NAME.pub that  caviar keys new NAME  writes"
+    if path.suffix == ".key":
+        raise SetupError(f"{path} holds a secret key, which stays where it is; give the .pub file beside it")
+    return _decoded(path, _Public, remedy).public
+
+
+def read_authorized(directory: Path) -> tuple[Authorization, ...]:
+    """Who may take part; nobody where there is no such file yet."""
+    path = directory / AUTHORIZED
+    if not path.exists():
+        return ()
+    entries = _decoded(path, _AuthorizedFile, "mend that line").key
+    for what in ("name", "public"):
+        values = [getattr(entry, what) for entry in entries]
+        for value in values:
+            if values.count(value) > 1:
+                raise SetupError(
+                    f"{path}: the {what} {value!r} stands there twice; remove one of the entries"
+                )
+    return entries
+
+
+def write_authorized(directory: Path, entries: Sequence[Authorization]) -> None:
+    """Write who may take part; a reader sees the old file or the new one, never half of it."""
+    heading = (
+        "# Keys that may take part in runs of this broker.\n# caviar keys authorize and revoke write it.\n"
+    )
+    _replace(directory / AUTHORIZED, heading, "key", entries)
+
+
+def read_tokens(directory: Path) -> tuple[Token, ...]:
+    """Tokens that open runs to readers; none where there is no such file yet."""
+    path = directory / TOKENS
+    return _decoded(path, _TokenFile, "mend that line").token if path.exists() else ()
+
+
+def write_tokens(directory: Path, entries: Sequence[Token]) -> None:
+    """Write the tokens' digests."""
+    heading = "# Digests of the tokens that open runs over HTTP. caviar keys token writes it.\n"
+    _replace(directory / TOKENS, heading, "token", entries)
+
+
+class Credentials(msgspec.Struct, frozen=True):
+    """What a service shows its broker, and by what it recognises it."""
+
+    pair: Pair
+    broker: str
+    """Public key of the broker."""
+
+
+def credentials(
+    key: Path | None = None, broker_key: Path | None = None, environment: Mapping[str, str] = os.environ
+) -> Credentials | None:
+    """Credentials from files; where a file is not given, from that which the environment names.
+
+    None where neither says anything. Raises `SetupError` where there is only one of the two.
+    """
+    own = key or _path(environment.get(KEY_VARIABLE))
+    broker = broker_key or _path(environment.get(BROKER_KEY_VARIABLE))
+    if own is None and broker is None:
+        return None
+    if own is None or broker is None:
+        given, missing = ("--broker-key", "--key") if own is None else ("--key", "--broker-key")
+        variable = KEY_VARIABLE if own is None else BROKER_KEY_VARIABLE
+        raise SetupError(f"{given} is given without {missing} (or {variable}); a broker with keys needs both")
+    return Credentials(read_pair(own), read_public(broker))
+
+
+def _path(text: str | None) -> Path | None:
+    return Path(text) if text else None
+
+
+def _decoded(path: Path, kind: type[T], remedy: str) -> T:
+    try:
+        return msgspec.toml.decode(path.read_bytes(), type=kind)
+    except OSError as error:
+        raise SetupError(f"cannot read {path}: {error.strerror}; {remedy}") from error
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        # What the file holds may be secret: only the place and the rule are told, never the content.
+        raise SetupError(f"{path} is not what it should be: {_rule(error)}; {remedy}") from None
+
+
+def _rule(error: Exception) -> str:
+    return str(error) if isinstance(error, msgspec.ValidationError) else "it is not TOML"
+
+
+def _table(key: str, text: str) -> str:
+    return f'{key} = "{text}"\n'
+
+
+def _create(path: Path, text: str, mode: int) -> None:
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+    with os.fdopen(descriptor, "w") as file:
+        os.fchmod(descriptor, mode)
+        file.write(text)
+
+
+def _replace(path: Path, heading: str, table: str, entries: Sequence[msgspec.Struct]) -> None:
+    text = heading
+    for entry in entries:
+        text += f"\n[[{table}]]\n"
+        for key, value in msgspec.to_builtins(entry).items():
+            shown = value if isinstance(value, str) else None
+            text += _table(key, shown) if shown is not None else f"{key} = [{_listed(value)}]\n"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}-")
+        with os.fdopen(descriptor, "w") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        Path(name).replace(path)
+    except OSError as error:
+        raise SetupError(f"cannot write {path}: {error.strerror}; choose another --directory") from error
+
+
+def _listed(values: Sequence[str]) -> str:
+    return ", ".join(f'"{value}"' for value in values)

@@ -1,0 +1,222 @@
+"""A peer that floods, stalls or sends garbage harms only itself: an eight-service run goes on beside it."""
+
+from __future__ import annotations
+
+import socket
+import struct
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pytest
+import zmq
+from broker_harness import Client, Serving, eventually, plan, play_to_the_end, playing, serving
+from security_harness import Background, eight_services
+
+from caviar_broker.security.guard import PeerLimits
+from caviar_protocol import messages as m
+from caviar_protocol.codec import encode_message
+
+BESIDE_S = 1.5
+"""[s] for which the run goes on beside the peer that means ill."""
+GREETING = b"\xff" + bytes(8) + b"\x7f" + b"\x03\x00" + b"NULL" + bytes(16) + b"\0" + bytes(31)
+READY = b"\x04\x1c\x05READY\x0bSocket-Type\0\0\0\x06DEALER"
+SMALL = PeerLimits(strangers=20)
+
+
+def address(endpoint: str) -> tuple[str, int]:
+    host, _, port = endpoint.removeprefix("tcp://").rpartition(":")
+    return host, int(port)
+
+
+@contextmanager
+def in_background(body: Callable[[threading.Event], None]) -> Iterator[None]:
+    over = threading.Event()
+    thread = threading.Thread(target=body, args=(over,), daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join(10.0)
+        assert not thread.is_alive()
+
+
+def raw(endpoint: str) -> socket.socket:
+    """A ZMTP connection of our own, behind its handshake."""
+    connection = socket.create_connection(address(endpoint), timeout=5.0)
+    connection.sendall(GREETING + READY)
+    received = b""
+    while b"READY" not in received:
+        received += connection.recv(4096)
+    return connection
+
+
+def is_ended(connection: socket.socket) -> bool:
+    """Whether the other side has ended a connection."""
+    connection.settimeout(0.01)
+    try:
+        while connection.recv(65536):
+            pass
+    except TimeoutError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
+def unharmed(background: Background, seconds: float = BESIDE_S) -> None:
+    """The run goes on in its pace, no frame late. One miss is left to a machine that is busy otherwise."""
+    misses, frames = background.misses, background.frames
+    background.go_on_for(seconds)
+    rate = (background.frames - frames) / seconds
+    assert background.misses - misses <= 1
+    assert rate > 0.8 / 0.020, f"{rate:.1f} frames/s"
+
+
+def told(broker: Serving, words: str) -> None:
+    eventually(lambda: words in broker.witness.texts(), f"the user is told {words!r}", 5.0)
+
+
+# --- strangers -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [10, 1 << 20])
+def test_a_stranger_that_floods_is_cut_off_again_and_again(tmp_path: Path, size: int) -> None:
+    """libzmq connects again by itself, ten times a second."""
+    with eight_services(tmp_path) as background:
+        endpoint = background.broker.endpoint
+
+        def flood(over: threading.Event) -> None:
+            context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+            with context, context.socket(zmq.DEALER) as dealer:
+                dealer.linger = 0
+                dealer.sndtimeo = 50
+                dealer.connect(endpoint)
+                while not over.is_set():
+                    with suppress(zmq.Again):
+                        dealer.send(b"\xc1" * size)
+                    over.wait(0 if size > 1000 else 20e-6)
+
+        with in_background(flood):
+            told(background.broker, "a connection from 127.0.0.1 was cut off")
+            unharmed(background)
+
+
+def test_a_message_without_an_end_is_cut_off_before_it_fills_the_memory(tmp_path: Path) -> None:
+    """Parts wait in libzmq until the last one is there: here, it never comes."""
+    with eight_services(tmp_path) as background, raw(background.broker.endpoint) as connection:
+        sent = 0
+        with suppress(OSError):
+            for _ in range(100_000):
+                connection.sendall(b"\x03" + struct.pack(">Q", 1 << 16) + bytes(1 << 16))
+                sent += 1 << 16
+        assert sent < 1 << 30
+        told(background.broker, "wait for being a message")
+        unharmed(background)
+
+
+def test_a_part_that_announces_more_than_any_may_have_ends_its_connection(tmp_path: Path) -> None:
+    with eight_services(tmp_path) as background, raw(background.broker.endpoint) as connection:
+        connection.sendall(b"\x02" + struct.pack(">Q", 1 << 40))
+        eventually(lambda: is_ended(connection), "the connection is ended", 3.0)
+        unharmed(background)
+
+
+def test_bytes_that_are_no_zeromq_end_their_connection_and_are_told(tmp_path: Path) -> None:
+    with eight_services(tmp_path) as background:
+        with socket.create_connection(address(background.broker.endpoint)) as connection:
+            connection.sendall(b"GET / HTTP/1.1\r\nHost: x\r\n\r\n" * 20)
+            eventually(lambda: is_ended(connection), "the connection is ended", 8.0)
+        told(background.broker, "ended before it sent a message, like one that has no ZMTP 3")
+        unharmed(background)
+
+
+def test_connections_that_say_nothing_make_room_for_those_that_do(tmp_path: Path) -> None:
+    """The oldest ones end where one address has too many; a service can always join."""
+    with eight_services(tmp_path, SMALL) as background:
+        silent = [socket.create_connection(address(background.broker.endpoint)) for _ in range(60)]
+        shaken = [raw(background.broker.endpoint) for _ in range(40)]
+        told(background.broker, "that never said HELLO were ended: there were too many")
+        eventually(lambda: sum(map(is_ended, silent + shaken)) >= 80, "the oldest are ended", 5.0)
+        assert not is_ended(shaken[-1])
+        with Client(background.broker.endpoint, "late", "agent", inputs=(), outputs=("action",)) as client:
+            client.send(client.hello)
+            assert client.expect(m.Refuse).code == "unknown-name"
+        unharmed(background)
+        for connection in silent + shaken:
+            connection.close()
+
+
+def test_a_connection_that_never_shakes_hands_is_ended(tmp_path: Path) -> None:
+    with (
+        serving(plan("world"), tmp_path) as broker,
+        socket.create_connection(address(broker.endpoint)) as half,
+    ):
+        assert not is_ended(half)
+        eventually(lambda: is_ended(half), "the connection is ended", 8.0)
+
+
+# --- members ---------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def beside_a_bad_member(tmp_path: Path, limits: PeerLimits | None = None) -> Iterator[tuple[Serving, Client]]:
+    """A run of ``world`` and ``bad``, both behind their first frame."""
+    with (
+        serving(plan("world", "sensors:bad", frames=1000), tmp_path, peer_limits=limits) as broker,
+        playing(broker.endpoint, "world", "sensors:bad") as (world, bad),
+    ):
+        world.answer()
+        bad.answer()
+        yield broker, bad
+
+
+def named_and_cut_off(broker: Serving, words: str) -> None:
+    """Without its answers the run cannot go on: clause 15, with the reason."""
+    outcome = broker.outcome()
+    assert outcome.culprit == "bad"
+    assert f"it was cut off: {words}" in outcome.error
+
+
+def test_a_member_that_floods_is_cut_off_and_named(tmp_path: Path) -> None:
+    with beside_a_bad_member(tmp_path) as (broker, bad):
+        for _ in range(6000):
+            bad.send(m.ResetDone(**bad.ids, episode=77))
+        named_and_cut_off(broker, "it sends messages faster than 500 a second")
+
+
+def test_heartbeats_too_are_counted(tmp_path: Path) -> None:
+    with beside_a_bad_member(tmp_path) as (broker, bad):
+        pulse = bad.attach()
+        for sequence in range(6000):
+            pulse.send(encode_message(m.Heartbeat(sequence=sequence)))
+        named_and_cut_off(broker, "it sends messages faster than 500 a second")
+
+
+def test_a_member_that_answers_all_it_is_granted_is_never_too_fast(tmp_path: Path) -> None:
+    """A run as fast as it can be is faster than the rate that unasked messages have."""
+    limits = PeerLimits(burst=20.0, rate=1.0)
+    with (
+        serving(plan("world", "sensors", frames=400), tmp_path, peer_limits=limits) as broker,
+        playing(broker.endpoint, "world", "sensors") as clients,
+    ):
+        play_to_the_end(clients, 400)
+        assert not broker.outcome().error
+
+
+def test_a_member_that_never_reads_is_cut_off_before_it_fills_the_memory(tmp_path: Path) -> None:
+    """It asks for scenery again and again, and takes nothing of it."""
+    with (
+        serving(plan("world", "sensors:bad"), tmp_path, peer_limits=PeerLimits(queued=32 << 20)) as broker,
+        raw(broker.endpoint) as bad,
+    ):
+        store = broker.server._scenery.exchange._store
+        asset = store.add("scenery/large.ply", bytes(4 << 20))
+        hello = m.Hello(version=(1, 0), name="bad", role="sensors", outputs=("lidar",))
+        for message in (hello, *[m.AssetGet(digest=asset.digest, offset=0)] * 40):
+            data = encode_message(message)
+            bad.sendall(bytes([0, len(data)]) + data)
+        told(broker, "it was cut off: it reads too slowly: ")
+        eventually(lambda: is_ended(bad), "the connection is ended", 5.0)

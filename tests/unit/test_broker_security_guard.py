@@ -1,0 +1,148 @@
+"""The connections under a socket, and who is barred: what the tests with whole runs cannot bring about."""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import zmq
+from broker_harness import MS, Client, eventually, plan, serving
+from security_harness import ring
+
+from caviar_broker.port import Port
+from caviar_broker.security.access import BAR_NS, Access
+from caviar_broker.security.guard import PeerLimits
+from caviar_broker.security.wire import Wire, Wires
+from caviar_protocol import messages as m
+from caviar_protocol.errors import RunError
+from caviar_services.connection import Connection
+from caviar_services.termination import Termination
+
+
+@pytest.fixture
+def couple() -> Iterator[tuple[socket.socket, socket.socket]]:
+    """Two ends of a TCP connection."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        near = socket.create_connection(server.getsockname())
+        far, _ = server.accept()
+        with near, far:
+            yield near, far
+
+
+@pytest.fixture
+def wires() -> Iterator[Wires]:
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as router:
+        made = Wires(context, router)
+        yield made
+        made.close()
+
+
+def wire_of(end: socket.socket) -> Wire:
+    return Wire(end.fileno(), os.fstat(end.fileno()).st_ino, "127.0.0.1", 0)
+
+
+def test_the_bytes_of_a_connection_are_counted_in_both_directions(couple) -> None:
+    near, far = couple
+    near.sendall(bytes(1000))
+    far.sendall(bytes(300))
+    eventually(lambda: wire_of(far).transferred()[1] == 1000, "what came is counted")
+    eventually(lambda: wire_of(far).transferred()[0] in (300, 301), "what went is counted")  # 1 is the SYN
+
+
+def test_a_descriptor_that_is_another_connection_by_now_is_left_alone(couple) -> None:
+    near, far = couple
+    stale = Wire(far.fileno(), os.fstat(far.fileno()).st_ino + 1, "127.0.0.1", 0)
+    stale.end()
+    assert stale.transferred() == (0, 0)
+    near.sendall(b"alive")
+    assert far.recv(10) == b"alive"
+
+
+def test_a_descriptor_that_is_no_socket_is_left_alone(tmp_path: Path) -> None:
+    with (tmp_path / "file").open("wb") as file:
+        wire = Wire(file.fileno(), os.fstat(file.fileno()).st_ino, "127.0.0.1", 0)
+        wire.end()
+        assert wire.transferred() == (0, 0)
+        file.write(b"x")
+
+
+def test_what_may_be_of_the_connection_before_is_not_taken_for_the_present_one(wires: Wires, couple) -> None:
+    """A descriptor is used again at once: a late message of the one before must not end its successor."""
+    _, far = couple
+    wires._begun(far.fileno())
+    wires._ended(far.fileno())
+    second = wires._begun(far.fileno())
+    assert second is not None
+    assert wires.claim(far.fileno(), "127.0.0.1") is None
+    second.unclear_until = 0
+    assert wires.claim(far.fileno(), "10.0.0.1") is None
+    assert wires.claim(far.fileno(), "127.0.0.1") is second
+    assert wires.claim(far.fileno(), "127.0.0.1") is None, "one routing id, one connection"
+
+
+def test_an_address_is_barred_unless_a_good_service_is_at_home_there() -> None:
+    port = Port("tcp://127.0.0.1:0", 1500 * MS)
+    try:
+        guard = port.guard
+        guard._bar("10.0.0.1")
+        guard._bar("127.0.0.1")
+        guard._bar("::1")
+        assert set(guard._barred) == {"10.0.0.1"}
+        with zmq.Context() as context, context.socket(zmq.DEALER) as dealer:
+            dealer.linger = 0
+            dealer.connect(port.endpoint)
+            dealer.send(b"x")
+            port.guard.start(_NoLoop(), lambda *_: False, lambda *_: None, lambda *_: None)  # type: ignore[arg-type]
+            received = []
+            eventually(
+                lambda: (guard._authenticate(), received.append(port.receive()), received[-1])[-1], "it came"
+            )
+            route, _ = received[-1]  # type: ignore[misc]
+            guard._peers[route].address = "10.0.0.2"
+            guard.known(route, "world")
+            guard._bar("10.0.0.2")
+        assert set(guard._barred) == {"10.0.0.1"}
+    finally:
+        port.close()
+
+
+class _NoLoop:
+    def watch(self, *_: object) -> None:
+        """The test calls back itself."""
+
+
+def test_a_key_that_was_cut_off_is_barred_for_a_while(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keys = ring(tmp_path / "keys")
+    own = keys.authorize("world", "world")
+    limits = PeerLimits(burst=10.0, rate=1.0)
+    access, now = keys.access(), time.monotonic_ns
+    with (
+        serving(plan("world", "sensors"), tmp_path, access=access, peer_limits=limits) as broker,
+        Client(broker.endpoint, "world", credentials=own) as client,
+    ):
+        client.join()
+        for _ in range(50):
+            client.send(m.ResetDone(**client.ids, episode=7))
+        eventually(lambda: "cut off" in broker.witness.texts("world"), "it is cut off")
+    assert "was cut off and is barred for 10 s" in access.admits(own.pair.public)
+    monkeypatch.setattr(time, "monotonic_ns", lambda: now() + BAR_NS)
+    assert access.admits(own.pair.public) == ""
+
+
+def test_a_barred_key_is_told_so_by_its_own_side(tmp_path: Path) -> None:
+    keys = ring(tmp_path / "keys")
+    own = keys.authorize("world", "world")
+    access: Access = keys.access()
+    access.bar(own.pair.public)
+    with serving(plan("world"), tmp_path, access=access) as broker:
+        connection = Connection("world", broker.endpoint, Termination(), own)
+        connection.send(m.Hello(version=(1, 0), name="world", role="world"))
+        with pytest.raises(RunError, match="or barred for a while"):
+            connection.receive(10.0)
+        connection.close()
