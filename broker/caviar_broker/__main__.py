@@ -1,8 +1,12 @@
 """The broker as a process: ``python -m caviar_broker SCENARIO --bind URL --directory DIR``.
 
+``python -m caviar_broker --resume DIR`` goes on with a run that another broker left, at the address
+where that one listened unless ``--bind`` says another.
+
 With ``--control`` a launcher talks to it in JSON lines. On standard output come ``listening``,
 ``notice``, ``frame`` and ``finished`` events; on standard input it takes
-``{"lost": SERVICE, "verdict": TEXT}`` and ``{"stop": REASON}``. When the input ends, the run does.
+``{"lost": SERVICE, "verdict": TEXT}``, ``{"restarted": SERVICE, "text": TEXT}`` and
+``{"stop": REASON}``. When the input ends, the run does.
 """
 
 from __future__ import annotations
@@ -12,14 +16,19 @@ import gc
 import sys
 from collections.abc import Mapping
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
 
 from caviar_broker.briefing import briefings, with_ownership
+from caviar_broker.checkpoints import CheckpointFiles
 from caviar_broker.control import Control, Reporter, stop_on_signals
 from caviar_broker.core.plan import plan_run
-from caviar_broker.journal import JournalFile
+from caviar_broker.core.resumption import Resumption
+from caviar_broker.journal import JournalFile, mend_journal
+from caviar_broker.record import RunRecord, read_record
+from caviar_broker.resume import read_resumption
 from caviar_broker.security.access import Access
 from caviar_broker.security.local import check_bind
 from caviar_broker.server import BrokerServer
@@ -27,6 +36,9 @@ from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.host import steady_memory
 from caviar_protocol.scenario_checks import with_overrides
 from caviar_protocol.scenario_loader import load_scenario
+
+JOURNAL = "journal.msgpack"
+DEFAULT_BIND = "tcp://127.0.0.1:5570"
 
 
 def tune_collector() -> None:
@@ -40,19 +52,29 @@ def tune_collector() -> None:
 def serve(arguments: argparse.Namespace) -> int:
     """Run the broker; the exit status: 0 exactly if the run came to its end."""
     steady_memory()
-    scenario = load_scenario(arguments.scenario)
-    scenario = with_ownership(with_overrides(scenario, arguments.frames, arguments.seed))
-    access = _access(
-        arguments, {name: spec.role for name, spec in scenario.services.items() if not spec.remote}
-    )
-    check_bind(arguments.bind, keys=access is not None)
-    directory = _made(arguments.directory)
-    plan = plan_run(scenario, arguments.run or directory.name, briefings(scenario, directory))
+    record, directory = _resumed(arguments) if arguments.resume else _begun(arguments)
+    told = with_ownership(record.scenario)
+    access = _access(arguments, {name: spec.role for name, spec in told.services.items() if not spec.remote})
+    check_bind(record.endpoint, keys=access is not None)
+    plan = replace(plan_run(told, record.run, briefings(told, directory)), epoch=record.epoch)
+    checkpoints = CheckpointFiles(directory)
+    resumption = _left(directory, checkpoints) if arguments.resume else None
     reporter = Reporter(sys.stdout.fileno(), directory / "events.jsonl", arguments.control)
-    with closing(JournalFile(directory / "journal.msgpack", plan.epoch)) as journal:
+    with closing(JournalFile(directory / JOURNAL, plan.epoch, checkpoints)) as journal:
         supervised = arguments.supervised if arguments.control else ()
-        server = BrokerServer(plan, arguments.bind, journal, reporter, supervised=supervised, access=access)
+        server = BrokerServer(
+            plan,
+            record.endpoint,
+            journal,
+            reporter,
+            supervised=supervised,
+            access=access,
+            resumption=resumption,
+        )
+        msgspec.structs.replace(record, endpoint=server.endpoint).save(directory)
         reporter.attach(server)
+        if resumption is not None:
+            server.statistics.earlier = resumption.finished_before + resumption.finished
         if arguments.control:
             Control(server)
         stop_on_signals(server)
@@ -65,7 +87,7 @@ def serve(arguments: argparse.Namespace) -> int:
         error=outcome.error,
         culprit=outcome.culprit,
         digest=outcome.digest,
-        frames=statistics.frames,
+        frames=statistics.frames + statistics.earlier,
         frames_per_second=statistics.frames_per_second(),
         warm_up_frames=statistics.warm_up_frames,
         services={n: msgspec.structs.asdict(s) for n, s in statistics.services().items()},
@@ -81,6 +103,31 @@ def _access(arguments: argparse.Namespace, local: Mapping[str, str]) -> Access |
     return Access(arguments.keys, arguments.local_key, local)
 
 
+def _begun(arguments: argparse.Namespace) -> tuple[RunRecord, Path]:
+    """A new run, and its directory."""
+    if arguments.scenario is None or arguments.directory is None:
+        raise RunError("give a scenario and a --directory, or --resume with the directory of a run")
+    scenario = with_overrides(load_scenario(arguments.scenario), arguments.frames, arguments.seed)
+    directory = _made(arguments.directory)
+    run, endpoint = arguments.run or directory.name, arguments.bind or DEFAULT_BIND
+    return RunRecord(run=run, epoch=1, endpoint=endpoint, scenario=scenario), directory
+
+
+def _resumed(arguments: argparse.Namespace) -> tuple[RunRecord, Path]:
+    """A run that another broker left, in the next epoch."""
+    directory: Path = arguments.resume.resolve()
+    before = read_record(directory)
+    endpoint = arguments.bind or before.endpoint
+    return msgspec.structs.replace(before, epoch=before.epoch + 1, endpoint=endpoint), directory
+
+
+def _left(directory: Path, checkpoints: CheckpointFiles) -> Resumption | None:
+    """What the journal says, which then is ready to be gone on with."""
+    journal = directory / JOURNAL
+    mend_journal(journal)
+    return read_resumption(journal, checkpoints) if journal.exists() else None
+
+
 def _made(directory: Path) -> Path:
     try:
         directory.mkdir(parents=True, exist_ok=True)
@@ -94,11 +141,12 @@ def _made(directory: Path) -> Path:
 def parser() -> argparse.ArgumentParser:
     """Command line of the broker."""
     found = argparse.ArgumentParser(prog="python -m caviar_broker", description=__doc__)
-    found.add_argument("scenario", type=Path)
-    found.add_argument("--bind", default="tcp://127.0.0.1:5570", help="address to listen on")
+    found.add_argument("scenario", type=Path, nargs="?")
+    found.add_argument("--bind", default="", help=f"address to listen on; by default {DEFAULT_BIND}")
+    found.add_argument("--directory", type=Path, help="where the run is written")
+    found.add_argument("--resume", type=Path, help="go on with the run in this directory, and nothing else")
     found.add_argument("--keys", type=Path, help="keys directory: who may take part (caviar keys)")
     found.add_argument("--local-key", default="", help="public key of the services that a launcher starts")
-    found.add_argument("--directory", type=Path, required=True, help="where the run is written")
     found.add_argument("--run", default="", help="id of the run; by default the directory's name")
     found.add_argument("--frames", type=int, default=None, help="instead of the scenario's")
     found.add_argument("--seed", type=int, default=None, help="instead of the scenario's")

@@ -49,7 +49,8 @@ class Reporter:
         now = time.monotonic()
         if self._control and now - self._last_frame >= FRAME_REPORT_S:
             self._last_frame = now
-            line = {"episode": frame.episode, "frames": statistics.frames, "misses": statistics.misses}
+            frames = statistics.frames + statistics.earlier
+            line = {"episode": frame.episode, "frames": frames, "misses": statistics.misses}
             self._outbox.passing({"event": "frame", **line})
             self._see_to_the_rest()
 
@@ -118,6 +119,8 @@ class Control:
         match order:
             case {"lost": str(service), "verdict": str(verdict)} if self._server.clock.peer(service):
                 self._server.feed(ev.Lost(service, verdict))
+            case {"restarted": str(service), "text": str(text)}:
+                self._server.note(service, text, "restarted")
             case {"stop": str(reason)}:
                 self._server.feed(ev.StopRequested(reason))
             case _:

@@ -10,13 +10,15 @@ from typing import Any
 import msgpack  # type: ignore[import-untyped]
 import msgspec
 
+from caviar_broker.checkpoints import CheckpointFiles
 from caviar_broker.core.events import Journal
 from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.messages import GrantInput
 
 
 class JournalEntry(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """One entry of the journal: what became of one service's part of one frame."""
+    """One entry of the journal: what became of one service's part of one frame, or a turn of the run;
+    see `caviar_broker.core.events.Journal`."""
 
     number: int
     epoch: int
@@ -26,7 +28,12 @@ class JournalEntry(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
     outcome: str
     decisions: tuple[GrantInput, ...] = ()
     products: tuple[tuple[str, bytes, bytes], ...] = ()
-    """(topic, payload header, body) of products that a later frame may consume (clause 18)."""
+    """(topic, payload header, body) of products that a later frame may consume, or a service that
+    comes back (clause 18)."""
+    facts: dict[str, int] = {}
+    members: tuple[str, ...] = ()
+    file: str = ""
+    """Of the service's state, in ``checkpoints/``."""
 
 
 class JournalFile:
@@ -36,8 +43,9 @@ class JournalFile:
     a flush to the disk for each frame, is what clause 18 asks for.
     """
 
-    def __init__(self, path: Path, epoch: int) -> None:
+    def __init__(self, path: Path, epoch: int, checkpoints: CheckpointFiles | None = None) -> None:
         self.path, self._epoch = path, epoch
+        self.checkpoints = checkpoints or CheckpointFiles(path.parent)
         self._encoder = msgspec.msgpack.Encoder()
         self._buffer = bytearray()
         try:
@@ -62,7 +70,13 @@ class JournalFile:
         products: tuple[tuple[str, Any, Any], ...] = tuple(
             (p.topic, memoryview(p.payload[0]), memoryview(p.payload[1])) for p in entry.products
         )
+        file = ""
+        if entry.state is not None:
+            file = self.checkpoints.save(entry.service, entry.episode, entry.frame, entry.state)
         return JournalEntry(
+            facts=dict(entry.facts or {}),
+            members=entry.members,
+            file=file,
             number=entry.number,
             epoch=self._epoch,
             episode=entry.episode,
@@ -76,6 +90,27 @@ class JournalFile:
     def close(self) -> None:
         """Close the file."""
         os.close(self._fd)
+
+
+def mend_journal(path: Path) -> None:
+    """Cut off an entry that was not written whole, so that others can follow.
+
+    Raises `RecordingError` naming the place of what is no entry.
+    """
+    if not path.exists():
+        return
+    whole = 0
+    with path.open("rb") as file:
+        unpacker = msgpack.Unpacker(file, max_buffer_size=0)
+        while True:
+            try:
+                unpacker.skip()
+            except msgpack.OutOfData:
+                break
+            except (ValueError, msgpack.UnpackException) as error:
+                raise RecordingError(f"{path}: no entry of a journal at byte {whole}: {error}") from error
+            whole = unpacker.tell()
+    os.truncate(path, whole)
 
 
 def read_journal(path: Path) -> Iterator[JournalEntry]:

@@ -17,6 +17,7 @@ import zmq
 from caviar_broker.core import events as ev
 from caviar_broker.core.clock import FrameClock
 from caviar_broker.core.plan import RunPlan
+from caviar_broker.core.resumption import Resumption
 from caviar_broker.core.transitions import RunState
 from caviar_broker.grumbles import Grumbles
 from caviar_broker.journal import JournalFile
@@ -80,6 +81,8 @@ class BrokerServer:
         The keys of those who may take part; None: every process of this machine may.
     peer_limits
         What each peer may use of the broker.
+    resumption
+        What another broker left of the run.
     """
 
     def __init__(
@@ -92,8 +95,9 @@ class BrokerServer:
         supervised: Sequence[str] = (),
         access: Access | None = None,
         peer_limits: PeerLimits | None = None,
+        resumption: Resumption | None = None,
     ) -> None:
-        self.clock = FrameClock(plan, time.monotonic_ns())
+        self.clock = FrameClock(plan, time.monotonic_ns(), weigh=_weight, resumption=resumption)
         self.statistics = Statistics({s.name: s.budget_ns for s in plan.services})
         self.outcome: ev.Finished | None = None
         self._plan, self._journal, self._observer = plan, journal, observer
@@ -135,6 +139,7 @@ class BrokerServer:
             m.ResetDone: self._reset_done,
             m.Fault: self._fault,
             m.Bye: self._bye,
+            m.CheckpointDone: self._checkpoint_done,
             m.Error: self._error,
             m.AssetOffer: self._scenery.offer,
             m.AssetGet: self._scenery.get,
@@ -353,6 +358,9 @@ class BrokerServer:
     def _reset_done(self, service: str, message: m.ResetDone, _: Sequence[zmq.Frame]) -> None:
         self.feed(ev.ResetDoneReceived(service, message))
 
+    def _checkpoint_done(self, service: str, message: m.CheckpointDone, parts: Sequence[zmq.Frame]) -> None:
+        self.feed(ev.CheckpointReceived(service, message, parts[0]))
+
     def _fault(self, service: str, message: m.Fault, _: Sequence[zmq.Frame]) -> None:
         self.feed(ev.FaultReceived(service, message))
 
@@ -393,6 +401,7 @@ class BrokerServer:
         self.statistics.latency(action.service, action.elapsed_ns, action.missed)
 
     def _frame_finished(self, action: ev.FrameFinished) -> None:
+        self._journal.checkpoints.finished = action.episode, action.frame
         self.statistics.frame(time.monotonic_ns())
         self._observer.frame(action, self.statistics)
 
@@ -411,6 +420,8 @@ class BrokerServer:
 
     def _send(self, action: ev.Send) -> None:
         parts = [part for product in action.products for part in product.payload]
+        if action.attachment is not None:
+            parts.append(action.attachment)
         route, message = self._routes[action.service], action.message
         reason = self._port.send(route, encode_message(message), parts, not isinstance(message, _COMPLAINTS))
         if not reason or self.clock.state is RunState.FINISHED:
@@ -427,14 +438,18 @@ class BrokerServer:
             service = connection.service if connection else ""
             self._grumble(f"reply {service}", f"{message_type(message)} reached nobody: {reason}", service)
 
-    def note(self, service: str, text: str) -> None:
+    def note(self, service: str, text: str, kind: str = "note") -> None:
         """Tell the observer something about a service, or in general."""
-        self._observer.notice(ev.Notice("note", service, text, self.clock.episode))
+        self._observer.notice(ev.Notice(kind, service, text, self.clock.episode))
 
     def _grumble(self, kind: str, text: str, service: str = "") -> None:
         text = self._grumbles.tell(kind, text, time.monotonic_ns())
         if text:
             self.note(service, text)
+
+
+def _weight(payload: Sequence[zmq.Frame]) -> int:
+    return sum(map(len, payload))
 
 
 def _is_no_send(action: ev.Action) -> bool:

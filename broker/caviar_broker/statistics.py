@@ -33,6 +33,8 @@ class Statistics:
         self._latencies = {name: array("q") for name in budgets_ns}
         self._misses = dict.fromkeys(budgets_ns, 0)
         self._finished_at = array("q")
+        self.earlier = 0
+        """Frames that were finished before, under another broker."""
 
     def latency(self, service: str, elapsed_ns: int, missed: bool) -> None:
         """A grant was answered, or its deadline passed."""

@@ -46,10 +46,10 @@ from caviar_protocol.items import Report as Report
 from caviar_protocol.items import Role as Role
 from caviar_protocol.items import Status as Status
 
-PROTOCOL_VERSION = (1, 1)
+PROTOCOL_VERSION = (1, 2)
 """Major and minor version of the protocol that this package speaks."""
 
-CAPABILITIES: tuple[str, ...] = ("assets", "episodes", "parts")
+CAPABILITIES: tuple[str, ...] = ("assets", "checkpoint", "episodes", "parts")
 """Optional features that this package implements. Peers use what both of them list."""
 
 
@@ -284,8 +284,9 @@ class EpisodeEnd(_Message, frozen=True, kw_only=True, tag="EPISODE_END"):
 
 
 class Checkpoint(_Message, frozen=True, kw_only=True, tag="CHECKPOINT"):
-    """Broker to service: save your state after this frame. Answered by CHECKPOINT_DONE. Needs
-    capability ``checkpoint``."""
+    """Broker to service: save your state after this frame, the last that you completed; nothing is
+    outstanding. Answered by CHECKPOINT_DONE, before which nothing is granted. Needs capability
+    ``checkpoint``."""
 
     epoch: Epoch
     attempt: Attempt
@@ -303,8 +304,9 @@ class CheckpointDone(_Message, frozen=True, kw_only=True, tag="CHECKPOINT_DONE")
 
 
 class Restore(_Message, frozen=True, kw_only=True, tag="RESTORE"):
-    """Broker to a service that rejoined: your state after this frame, in one further part; grants
-    since then follow. Answered by READY. Needs capability ``checkpoint``."""
+    """Broker to a service that rejoined, behind RESET: your state after this frame, in one further
+    part. Answered by READY. The grants since then follow, as they were, one after the other; each is
+    answered by DONE as before. Needs capability ``checkpoint``."""
 
     epoch: Epoch
     attempt: Attempt

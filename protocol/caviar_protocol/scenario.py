@@ -59,6 +59,9 @@ class Run(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     record: tuple[str, ...] = ()
     """Topics that are produced because they shall be recorded, though nobody else asks (clause 5):
     ``lidar``, or with a part of it ``lidar.grid``."""
+    checkpoint_frames: Annotated[
+        int, quantity("frame", "after which services that can do so save their state; 0: never", ge=0)
+    ] = 20
     frames_in_flight: Annotated[int, quantity("frame", "frames that may overlap at most", ge=1, le=64)] = 4
 
 

@@ -31,8 +31,12 @@ class Answers:
 
     def clear(self) -> None:
         """A new episode begins."""
+        self.go_on_behind(-1)
+
+    def go_on_behind(self, frame: int) -> None:
+        """The service is where it was after this frame: that and those before are not answered again."""
         self._parts.clear()
-        self._bytes, self._newest = 0, -1
+        self._bytes, self._newest = 0, frame
 
     def is_new(self, frame: int) -> bool:
         """Whether the frame lies behind all that were answered."""

@@ -37,7 +37,7 @@ def hello_of(name: str, use: str, cls: type[Service[Any]], host: str = "", pid: 
         role=cls.role,
         inputs=cls.inputs,
         outputs=cls.outputs,
-        capabilities=m.CAPABILITIES,
+        capabilities=tuple(c for c in m.CAPABILITIES if c != "checkpoint" or cls.checkpoints),
         implementation=use,
         max_in_flight=limits.MAX_IN_FLIGHT,
         host=host,
@@ -51,6 +51,7 @@ def run_info(name: str, welcome: m.Welcome, progress: Progress) -> RunInfo:
     return RunInfo(
         name=name,
         run=welcome.run,
+        again=welcome.epoch > 1 or welcome.attempt > 1,
         seed=welcome.seed,
         sampling_period_ns=int(told.get("sampling_period_ns", 1)),
         frames=int(told.get("frames", 1)),

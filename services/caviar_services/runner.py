@@ -99,6 +99,8 @@ class Runner:
             m.Reset: self._reset,
             m.Grant: self._grant,
             m.EpisodeEnd: self._episode_end,
+            m.Checkpoint: self._checkpoint,
+            m.Restore: self._restore,
         }
 
     def run(self) -> int:
@@ -269,6 +271,37 @@ class Runner:
     def _episode_end(self, message: m.EpisodeEnd, _: Sequence[zmq.Frame]) -> None:
         with self._reporting("end of episode", message.episode):
             self._running.end_episode(message.frames)
+
+    # --- state (clause 18) -----------------------------------------------------------------------------
+
+    def _checkpoint(self, message: m.Checkpoint, _: Sequence[zmq.Frame]) -> None:
+        if not self._keeps_state(message):
+            return
+        with self._reporting("checkpoint", message.episode, message.frame):
+            self._broker.progress(f"saving the state after frame {message.frame}")
+            state = self._running.checkpoint()
+            done = m.CheckpointDone(**self._identity, episode=message.episode, frame=message.frame)
+            self._broker.send(done, state)
+
+    def _restore(self, message: m.Restore, parts: Sequence[zmq.Frame]) -> None:
+        if not self._keeps_state(message):
+            return
+        with self._reporting("restore", message.episode, message.frame):
+            self._broker.progress(f"restoring the state after frame {message.frame}")
+            self._running.restore(parts[0].bytes)
+            self._answers.go_on_behind(message.frame)
+            self._broker.send(m.Ready(**self._identity))
+
+    def _keeps_state(self, message: m.Checkpoint | m.Restore) -> bool:
+        """Whether the message is for this service as it is."""
+        reset = self._reset_to
+        if not self.cls.checkpoints:
+            self._unexpected(message, f"{self.use} has no state, and named no capability 'checkpoint'")
+        elif reset is None or message.episode != reset.episode:
+            self._unexpected(message, f"there was no RESET to episode {message.episode}")
+        else:
+            return True
+        return False
 
     # --- what both need ------------------------------------------------------------------------------
 

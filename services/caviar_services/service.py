@@ -66,6 +66,8 @@ class RunInfo:
     directory: Path = Path()
     """Where the recorder writes."""
     progress: Progress = _silent
+    again: bool = False
+    """Whether another process of this name was in the run before, or may have been."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,6 +216,8 @@ class Service(ABC, Generic[S]):
     outputs: ClassVar[tuple[str, ...]] = ()
     uses_scenery: ClassVar[bool] = False
     """Whether the assets of the run are fetched for this service before `prepare` (clause 4)."""
+    checkpoints: ClassVar[bool] = False
+    """Whether `checkpoint` and `restore` are implemented: the service has state that outlives a frame."""
     Settings: ClassVar[type[msgspec.Struct]]
     """Settings from the scenario: a frozen struct, ``forbid_unknown_fields=True``, units in names."""
 
@@ -246,6 +250,14 @@ class Service(ABC, Generic[S]):
     @abstractmethod
     def step(self, frame: Frame) -> StepResult:
         """Compute this service's part of a frame."""
+
+    def checkpoint(self) -> bytes:
+        """The state after the last frame, from which `restore` goes on as if nothing had happened."""
+        raise NotImplementedError(f"{type(self).__name__} has no state to save")
+
+    def restore(self, state: bytes) -> None:
+        """Take over a state that `checkpoint` gave. Called after `reset` of the same episode."""
+        raise NotImplementedError(f"{type(self).__name__} has no state to restore")
 
     def release_memory(self) -> None:  # optional hook
         """Give back buffers that are kept for reuse. Called now and then between frames."""

@@ -20,7 +20,9 @@ from core_history import History
 from caviar_broker.core import events as ev
 from caviar_broker.core.clock import FrameClock
 from caviar_broker.core.plan import Limits, RunPlan, ServicePlan
+from caviar_broker.core.resumption import Resumption
 from caviar_broker.core.transitions import RunState
+from caviar_broker.journal import JournalFile
 from caviar_protocol import messages as m
 
 MS = 1_000_000
@@ -68,6 +70,12 @@ class Sim:
     """(period [ns], whether progress counts on); None: no heartbeats."""
     phase: str = "step"
     grace: int = 0
+    stateful: bool = False
+    """Whether its products depend on all that it was granted in the episode, and it can save that."""
+    saving: int | None = MS
+    """How long CHECKPOINT and RESTORE take [ns]; None: they are never answered."""
+    forgets: bool = False
+    """Whether a restored state is another than that which was saved."""
 
     def plan(self) -> ServicePlan:
         return ServicePlan(
@@ -133,6 +141,8 @@ class Simulation:
         limits: Limits | None = None,
         journal_after: int = 0,
         strict: bool = True,
+        journal: JournalFile | None = None,
+        resumption: Resumption | None = None,
         **plan: Any,
     ) -> None:
         self.services = {sim.name: sim for sim in services}
@@ -144,8 +154,10 @@ class Simulation:
             **settings,
         )
         self.now = SECOND  # not 0, so that a forgotten offset shows
-        self.clock = FrameClock(self.plan, self.now)
+        self.clock = FrameClock(self.plan, self.now, resumption=resumption)
         self.history = History(self.plan, self.services) if strict else None
+        self.journal = journal
+        self._entries: list[ev.Journal] = []
         self.journal_after = journal_after
         self.log: list[tuple[int, ev.Action]] = []
         self.busy_until: dict[str, int] = {}
@@ -153,6 +165,8 @@ class Simulation:
         self._queue: list[tuple[int, int, Callable[[], None]]] = []
         self._ticket = itertools.count()
         self._progress: dict[str, int] = {}
+        self.states: dict[str, str] = {}
+        """What is in the memory of stateful services."""
 
     # --- driving -------------------------------------------------------------------------------
 
@@ -171,6 +185,7 @@ class Simulation:
             "inputs": sim.inputs,
             "outputs": sim.outputs,
             "max_in_flight": sim.max_in_flight,
+            "capabilities": m.CAPABILITIES if sim.stateful else (),
         }
         self.alive.add(name)
         self.feed(ev.Joined(m.Hello(**(fields | dict(sim.hello) | changes))))
@@ -183,7 +198,7 @@ class Simulation:
     def feed(self, event: ev.Event) -> None:
         """One event, now, and whatever follows from it at once."""
         if self.history is not None:
-            self.history.heard(event, {n: self.attempt(n) for n in self.services})
+            self.history.heard(event, {n: self.attempt(n) if n in self.alive else -1 for n in self.services})
         self.clock.receive(event, self.now)
         self.perform()
 
@@ -195,8 +210,9 @@ class Simulation:
                 self.history.saw(action)
             match action:
                 case ev.Send():
-                    self._deliver(action.service, action.message)
+                    self._deliver(action.service, action.message, action.attachment)
                 case ev.Journal(number=number):
+                    self._entries.append(action)
                     self.after(self.journal_after, lambda number=number: self.journaled(number))
                 case _:
                     pass
@@ -204,6 +220,9 @@ class Simulation:
     def journaled(self, number: int) -> None:
         if self.history is not None:
             self.history.journaled = max(self.history.journaled, number)
+        if self.journal is not None:
+            self.journal.write([entry for entry in self._entries if entry.number <= number])
+            self._entries = [entry for entry in self._entries if entry.number > number]
         self.feed(ev.Journaled(number))
 
     def step(self) -> bool:
@@ -252,7 +271,7 @@ class Simulation:
         assert peer is not None
         return peer.attempt
 
-    def _deliver(self, name: str, message: m.Message) -> None:
+    def _deliver(self, name: str, message: m.Message, state: Any = None) -> None:
         if name not in self.alive:
             return
         sim, attempt = self.services[name], self.attempt(name)
@@ -263,7 +282,11 @@ class Simulation:
                 self._later(name, sim.ready_after, lambda: self._get_ready(sim, m.Ready(**ids, **fields)))
             case m.Reset() if sim.reset_after is not None:
                 done = m.ResetDone(**ids, episode=message.episode)
-                self._later(name, sim.reset_after, lambda: self.feed(ev.ResetDoneReceived(name, done)))
+                self._later(name, sim.reset_after, lambda: self.was_reset(name, message, done))
+            case m.Checkpoint() if sim.saving is not None:
+                self._later(name, sim.saving, lambda: self.saved(name, message))
+            case m.Restore() if sim.saving is not None:
+                self._later(name, sim.saving, lambda: self.restored(name, state, ids))
             case m.Grant():
                 takes = sim.takes(message.episode, message.frame)
                 if takes is not None:
@@ -272,6 +295,18 @@ class Simulation:
                 self._later(name, 0, lambda: self.feed(ev.ByeReceived(name, "told to")))
             case _:
                 pass
+
+    def was_reset(self, name: str, message: m.Reset, done: m.ResetDone) -> None:
+        self.states[name] = f"{name} reset to {message.seed} {message.seed_episode}"
+        self.feed(ev.ResetDoneReceived(name, done))
+
+    def saved(self, name: str, message: m.Checkpoint) -> None:
+        ids = {f: getattr(message, f) for f in ("epoch", "attempt", "episode", "frame")}
+        self.feed(ev.CheckpointReceived(name, m.CheckpointDone(**ids), self.states[name].encode()))
+
+    def restored(self, name: str, state: Any, ids: Mapping[str, int]) -> None:
+        self.states[name] = state.decode() + " roughly" * self.services[name].forgets
+        self.feed(ev.ReadyReceived(name, m.Ready(**ids)))
 
     def _later(self, name: str, takes: int, act: Callable[[], None]) -> None:
         """A service does one thing at a time, and nothing once its process is gone."""
@@ -297,12 +332,18 @@ class Simulation:
             fault = m.Fault(**ids, phase="step", message=sim.faults[at])
             self.feed(ev.FaultReceived(name, fault))
             return
+        said: Any = grant.inputs
+        if sim.stateful:
+            told = [(i.topic, i.source, i.digest) for i in grant.inputs]
+            text = f"{self.states[name]} {grant.frame} {grant.previous_frame} {told}"
+            self.states[name] = hashlib.sha256(text.encode()).hexdigest()
+            said = [m.GrantInput(topic="", source=self.states[name], status=m.Status.ABSENT)]
         topics = () if grant.final or at in sim.omits else sim.outputs
-        headers = tuple(
-            m.ProductHeader(topic=t, digest=product_digest(name, t, *at, grant.inputs)) for t in topics
-        )
+        headers = tuple(m.ProductHeader(topic=t, digest=product_digest(name, t, *at, said)) for t in topics)
         fields = {"products": headers, "end_episode": at in sim.ends, **sim.report(*at)} | ids
-        self.feed(ev.DoneReceived(name, m.Done(**fields), tuple((name, t, *at) for t in topics)))
+        self.feed(
+            ev.DoneReceived(name, m.Done(**fields), tuple((f"{name} {t} {at}".encode(), b"") for t in topics))
+        )
 
     def kill(self, name: str, verdict: str = "exit status 1") -> None:
         self.alive.discard(name)

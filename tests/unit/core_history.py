@@ -33,6 +33,11 @@ class History:
         """(episode, service, topic) to (frame, journal number) of products in the journal."""
         self.frames: list[tuple[int, int]] = []
         self.episodes: list[int] = []
+        self.granted: dict[tuple[str, int, int], m.Grant] = {}
+        self.answered: dict[tuple[int, str], dict[int, m.Grant]] = {}
+        """Grants that were answered, by (episode, service) and frame."""
+        self.saved: dict[tuple[int, str], int] = {}
+        """Frame of the last checkpoint by (episode, service)."""
         self.cancelled: set[tuple[str, int, int]] = set()
         self.finished = False
 
@@ -43,6 +48,10 @@ class History:
             current = (answer.epoch, answer.attempt) == (self.plan.epoch, attempts[event.service])
             if current and owed[:1] == [(answer.episode, answer.frame)]:
                 owed.pop(0)
+                key = (answer.episode, answer.frame)
+                self.answered.setdefault((answer.episode, event.service), {})[answer.frame] = self.granted[
+                    event.service, *key
+                ]
 
     def saw(self, action: ev.Action) -> None:
         """Check one action and remember it."""
@@ -69,6 +78,9 @@ class History:
     def _journal(self, entry: ev.Journal) -> None:
         assert entry.number == self.numbers + 1, "journal entries are numbered without gaps"
         self.numbers = entry.number
+        if entry.outcome in ("episode", "resumed", "end", "seed", "checkpoint"):
+            self._turn(entry)
+            return
         key = (entry.episode, entry.frame, entry.service)
         if entry.outcome != "late":
             assert key not in self.decisions, f"{key} decided twice"
@@ -82,6 +94,29 @@ class History:
             assert product.frame == entry.frame, "clause 11: a product stands under its true frame"
             known = self.known.setdefault((entry.episode, entry.service, product.topic), [])
             known.append((product.frame, entry.number))
+
+    def _turn(self, entry: ev.Journal) -> None:
+        """An entry about the run, or about the state of a service."""
+        if entry.outcome == "checkpoint" and entry.frame >= 0:
+            name, key = entry.service, (entry.episode, entry.service)
+            assert not self.owed.get(name), f"{name} saved its state with {self.owed[name]} outstanding"
+            answered = self.answered.get(key, {})
+            assert entry.frame == max(answered), (
+                f"{name} saved {entry.frame}, it has answered {max(answered)}"
+            )
+            self.saved[key] = entry.frame
+
+    def _again(self, send: ev.Send, grant: m.Grant) -> bool:
+        """A grant that was answered is only sent again to a service that has lost it, as it was."""
+        before = self.answered.get((grant.episode, send.service), {}).get(grant.frame)
+        if before is None:
+            return False
+        what = f"clause 18: {send.service} was granted frame {grant.frame} again"
+        assert grant.attempt > before.attempt or grant.epoch > before.epoch, what
+        assert grant.frame > self.saved.get((grant.episode, send.service), -1), f"{what} behind its state"
+        for field in ("previous_frame", "inputs", "final", "t_ns", "decisions"):
+            assert getattr(grant, field) == getattr(before, field), f"{what} with another {field}"
+        return True
 
     def _decision(self, entry: ev.Journal, decision: m.GrantInput) -> None:
         what = f"{decision} of {entry.service} in frame {entry.frame}"
@@ -106,6 +141,9 @@ class History:
         name, frame, episode = send.service, grant.frame, grant.episode
         sim = self.services[name]
         what = f"grant of frame {frame} of episode {episode} to {name}"
+        if self._again(send, grant):
+            return
+        self.granted[name, episode, frame] = grant
         last = self.plan.frames if sim.role == "agent" else self.plan.frames - 1
         assert frame <= last, what
         assert grant.final == (frame == self.plan.frames) or grant.final, f"clause 16: {what}"

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable
+from contextlib import closing
 from typing import Any
 
+import pytest
 from core_harness import MS, SECOND, Sim, Simulation
 from hypothesis import HealthCheck, Phase, assume, given, settings
 from hypothesis import strategies as st
@@ -23,11 +25,15 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
+from caviar_broker.checkpoints import CheckpointFiles
 from caviar_broker.core import events as ev
 from caviar_broker.core.plan import Limits
 from caviar_broker.core.transitions import RunState
+from caviar_broker.journal import JournalFile
+from caviar_broker.resume import read_resumption
 from caviar_protocol import messages as m
 
+ANSWERED = m.Prepare | m.Reset | m.Grant | m.Shutdown | m.Checkpoint | m.Restore
 BETWEEN = (RunState.RESETTING, RunState.RUNNING)
 TOPICS = ("scene", "channel", "lidar", "action", "link")
 POLICIES: tuple[m.Policy, ...] = ("wait", "wait", "hold", "hold", "drop", "abort")
@@ -68,6 +74,8 @@ def graphs(draw: st.DrawFn, policies: tuple[m.Policy, ...] = POLICIES) -> list[S
     if draw(st.booleans()):
         everything = (m.Input(topic="*", required=False),)
         services.append(Sim("recorder", "recorder", everything, max_in_flight=draw(st.integers(1, 2))))
+    for service in services:
+        service.stateful = service.role != "recorder" and draw(st.booleans())
     return draw(st.permutations(services))
 
 
@@ -78,6 +86,7 @@ def plans() -> st.SearchStrategy[dict[str, Any]]:
             "episodes": st.integers(1, 2),
             "frames_in_flight": st.integers(1, 4),
             "realtime": st.booleans(),
+            "checkpoint_frames": st.integers(0, 3),
             "record": st.lists(st.sampled_from(["scene"]), max_size=1).map(tuple),
             "sampling_period_ns": st.just(20 * MS),
         }
@@ -90,6 +99,7 @@ class Puppets(Simulation):
     def __init__(self, services: list[Sim], **plan: Any) -> None:
         super().__init__(services, **plan)
         self.inbox: dict[str, list[m.Message]] = {name: [] for name in self.services}
+        self.to_restore: dict[str, Any] = {}
         self.unwritten: list[int] = []
 
     def perform(self) -> None:
@@ -98,8 +108,10 @@ class Puppets(Simulation):
         self._queue.clear()  # the harness's own journal
         self.unwritten += [a.number for _, a in self.log[seen:] if isinstance(a, ev.Journal)]
 
-    def _deliver(self, name: str, message: m.Message) -> None:
-        if name in self.alive and isinstance(message, m.Prepare | m.Reset | m.Grant | m.Shutdown):
+    def _deliver(self, name: str, message: m.Message, state: Any = None) -> None:
+        if isinstance(message, m.Restore):
+            self.to_restore[name] = state
+        if name in self.alive and isinstance(message, ANSWERED):
             self.inbox[name].append(message)
 
     def react(self, name: str, **answer: Any) -> None:
@@ -110,7 +122,11 @@ class Puppets(Simulation):
             case m.Prepare():
                 self.feed(ev.ReadyReceived(name, m.Ready(**ids)))
             case m.Reset():
-                self.feed(ev.ResetDoneReceived(name, m.ResetDone(**ids, episode=message.episode)))
+                self.was_reset(name, message, m.ResetDone(**ids, episode=message.episode))
+            case m.Checkpoint():
+                self.saved(name, message)
+            case m.Restore():
+                self.restored(name, self.to_restore[name], ids)
             case m.Grant():
                 sim, at = self.services[name], (message.episode, message.frame)
                 sim.faults = {at: "told to"} if answer.get("fails") else {}
@@ -352,3 +368,40 @@ def test_clauses_18_and_20_under_wait_equal_inputs_give_equal_digests_kills_or_n
     slow.run()
     assert slow.outcome.error == ""
     assert slow.outcome.digest == quick.outcome.digest
+
+
+@given(
+    services=graphs(policies=("wait",)),
+    plan=plans().map(lambda plan: plan | {"checkpoint_frames": max(1, plan["checkpoint_frames"])}),
+    timing=st.randoms(use_true_random=False),
+    ends=st.sets(st.tuples(st.integers(0, 1), st.integers(0, 4)), max_size=2),
+    crashes=st.lists(st.integers(5, 200), min_size=1, max_size=3),
+)
+@settings(max_examples=100, deadline=None, phases=PHASES, suppress_health_check=list(HealthCheck))
+def test_clauses_18_and_20_under_wait_brokers_that_die_do_not_change_the_digest(
+    tmp_path_factory: pytest.TempPathFactory,
+    services: list[Sim],
+    plan: dict[str, Any],
+    timing: random.Random,
+    ends: set[tuple[int, int]],
+    crashes: list[int],
+) -> None:
+    for sim in services:
+        sim.ends = frozenset(ends) if sim.role == "agent" else frozenset()
+        sim.stateful = sim.role != "recorder"
+    quick = Simulation(services, **plan).join().run()
+    assume(quick.clock.graph is not None)
+    folder = tmp_path_factory.mktemp("run")
+    path, files = folder / "journal.msgpack", CheckpointFiles(folder)
+    for epoch, crash in enumerate([*crashes, None], 1):
+        for sim in services:
+            times: dict[tuple[int, int], int] = {}
+            sim.latency = lambda e, k, times=times: times.setdefault((e, k), timing.randrange(20 * MS))
+        before = read_resumption(path, files) if epoch > 1 else None
+        with closing(JournalFile(path, epoch, files)) as journal:
+            settings = {"journal": journal, "resumption": before, "epoch": epoch, "strict": False}
+            run = Simulation(services, journal_after=timing.randrange(9 * MS), **settings, **plan).join()
+            run.run() if crash is None else run.run_to(run.now + crash * MS)
+    assert run.outcome.error == ""
+    assert run.outcome.digest == quick.outcome.digest
+    assert run.notices("differs") == []

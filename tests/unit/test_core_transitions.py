@@ -93,12 +93,51 @@ def rejoining_between_episodes() -> Simulation:
     return simulation
 
 
+def restored(*, until: int, **how: Any) -> Simulation:
+    """A link that dies with a state to get back, and something happens so much later."""
+    services = loop(link={"stateful": True, "latency": 5 * MS, "saving": 20 * MS} | how)
+    plan = {"frames": 6, "checkpoint_frames": 2, "limits": Limits(rejoin=SECOND)}
+    simulation = Simulation(services, **plan).join()
+    simulation.run(lambda s: any(g.frame == 3 for g in s.grants("link")))
+    simulation.kill("link")
+    simulation.hello("link")
+    return simulation.run_to(simulation.now + until)
+
+
+def killed_while_restored() -> Simulation:
+    simulation = restored(until=10 * MS)
+    simulation.kill("link")
+    simulation.hello("link")
+    return simulation
+
+
+def leaving_while_restored() -> Simulation:
+    simulation = restored(until=10 * MS)
+    simulation.feed(ev.StopRequested("Ctrl-C"))
+    return simulation
+
+
+def an_episode_that_ends_while_somebody_is_restored() -> Simulation:
+    """Nobody needs the world any more, which dies with nothing outstanding."""
+    services = loop(world={"stateful": True, "saving": 400 * MS}, link={"latency": 50 * MS})
+    plan = {"frames": 4, "episodes": 2, "checkpoint_frames": 3, "limits": Limits(rejoin=5 * SECOND)}
+    simulation = Simulation(services, **plan).join()
+    simulation.run(lambda s: any(g.frame == 3 for g in s.grants("link")))
+    simulation.kill("world")
+    simulation.hello("world")
+    return simulation
+
+
 SCENARIOS: list[Callable[[], Simulation]] = [
     *[lambda t=t: stopped_at(t * MS) for t in range(12)],
     *[lambda t=t: killed_at(t * MS) for t in range(16)],
     lambda: Simulation(loop(), episodes=2).join(),
     lambda: Simulation(loop()),
     rejoining_between_episodes,
+    lambda: restored(until=0),
+    killed_while_restored,
+    leaving_while_restored,
+    an_episode_that_ends_while_somebody_is_restored,
     lambda: hold_run(latency=at(2, 60 * MS)),
     lambda: hold_run(latency=at(2, 60 * MS), faults={(0, 2): "late fault"}),
     lambda: hold_run(faults={(0, 2): "fault"}, omits=frozenset({(0, 1)})),

@@ -21,8 +21,10 @@ from caviar_broker.core.episodes import Episodes
 from caviar_broker.core.graph import Graph
 from caviar_broker.core.joining import Joining
 from caviar_broker.core.liveness import Liveness
+from caviar_broker.core.memory import Weigh
 from caviar_broker.core.peers import Peer
 from caviar_broker.core.plan import RunPlan
+from caviar_broker.core.resumption import Resumption
 from caviar_broker.core.run import Run
 from caviar_broker.core.transitions import RunState, ServiceState
 from caviar_protocol.digest import RunDigest
@@ -37,12 +39,18 @@ class FrameClock:
         The run.
     now
         The time [ns], of the same monotonic clock as every later ``now``.
+    weigh
+        Size of a payload [B], for what is kept of a service that may come back.
+    resumption
+        What another broker left of the run.
     """
 
-    def __init__(self, plan: RunPlan, now: int) -> None:
+    def __init__(
+        self, plan: RunPlan, now: int, weigh: Weigh = lambda payload: 0, resumption: Resumption | None = None
+    ) -> None:
         self.plan = plan
-        self._run = Run(plan, now)
-        self._episodes = Episodes(self._run)
+        self._run = Run(plan, now, resumption)
+        self._episodes = Episodes(self._run, weigh)
         self._joining = Joining(self._run, self._episodes)
         self._liveness = Liveness(self._run, self._episodes)
         self._deadline: int | None = None
@@ -54,6 +62,7 @@ class FrameClock:
             ev.ResetDoneReceived: self._episodes.reset_done,
             ev.DoneReceived: self._episodes.done,
             ev.FaultReceived: self._episodes.fault,
+            ev.CheckpointReceived: self._episodes.checkpointed,
             ev.Journaled: self._episodes.journaled,
             ev.Violated: self._liveness.violated,
             ev.Progressed: self._liveness.progressed,

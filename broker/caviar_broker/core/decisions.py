@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 
 from caviar_broker.core.events import Action, FrameFinished, Journal, Product
 from caviar_broker.core.graph import Edge, Graph
@@ -35,6 +35,8 @@ class DecisionBook:
         The run's journal.
     actions
         Where journal entries and finished frames are put.
+    sources
+        Services whose products stand in the journal because those that take them remember them.
     """
 
     def __init__(
@@ -45,6 +47,7 @@ class DecisionBook:
         digest: RunDigest,
         ledger: Ledger,
         actions: list[Action],
+        sources: Collection[str] = (),
     ) -> None:
         self.frames = plan.frames
         """Frames of the episode; becomes less when an agent ends it early."""
@@ -56,10 +59,31 @@ class DecisionBook:
         self._graph, self._plan, self._episode = graph, plan, episode
         self._digest, self._ledger, self._actions = digest, ledger, actions
         self._holding = frozenset(p.name for p in plan.services if p.policy == "hold")
-        self._kept = self._holding | graph.retained
+        self._kept = self._holding | graph.retained | frozenset(sources)
         self._tasks: dict[str, dict[int, Task]] = {name: {} for name in graph.order}
         self._newest: dict[tuple[str, str], tuple[Product, int]] = {}
         """Newest product and its journal entry by (service, topic), late ones included (clause 12)."""
+
+    def go_on(
+        self,
+        finished: int,
+        frames: int,
+        tasks: Mapping[str, Mapping[int, Task]],
+        newest: Mapping[tuple[str, str], tuple[Product, int]],
+    ) -> None:
+        """Go on with an episode of which so many frames are finished; the book must be new."""
+        assert not self.finished_frames, "only a new book can go on"
+        self.finished_frames, self.frames = finished, frames
+        for name in self.next:
+            self.next[name] = finished
+            self._tasks[name] = dict(tasks.get(name, {}))
+        self._newest = {key: known for key, known in newest.items() if key[0] in self._holding}
+
+    def forget_before(self, frame: int) -> None:
+        """Nothing needs tasks of earlier frames any more."""
+        for tasks in self._tasks.values():
+            for old in [number for number in tasks if number < frame]:
+                del tasks[old]
 
     # --- tasks -----------------------------------------------------------------------------------
 

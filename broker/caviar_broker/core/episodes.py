@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from caviar_broker.core import events as ev
+from caviar_broker.core.memory import Weigh
 from caviar_broker.core.peers import Peer
+from caviar_broker.core.recall import Recall
 from caviar_broker.core.run import Run
 from caviar_broker.core.schedule import EpisodeSchedule
 from caviar_broker.core.tasks import GrantOrder
@@ -17,8 +21,10 @@ _ACTIVE, _RUNNING = ServiceState.ACTIVE, RunState.RUNNING
 class Episodes:
     """Drives the schedule of one episode after the other (clauses 1, 6, 16 and 18)."""
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: Run, weigh: Weigh = lambda payload: 0) -> None:
         self._run = run
+        self.recall = Recall(run, self._grant, self._returned, weigh)
+        """What is kept for services that may come back."""
         self.schedule: EpisodeSchedule | None = None
         """Of the episode that is under way; None between episodes."""
         self._ended: EpisodeSchedule | None = None
@@ -28,7 +34,9 @@ class Episodes:
 
     def begin(self, now: int) -> None:
         """RESET for everybody who is ready; who is not, gets it when it is."""
-        self._run.next_seed()
+        if self._run.resumption is None:
+            self._run.next_seed()
+        self.recall.begin()
         for peer in self._members():
             if peer.state is ServiceState.READY:
                 self.reset(peer, now)
@@ -38,6 +46,7 @@ class Episodes:
         run = self._run
         if run.takes_part(peer) and not run.over:
             peer.move(ServiceEvent.RESET, now)
+            self.recall.reset(peer, begins=self.schedule is None)
             message = Reset(
                 epoch=run.plan.epoch,
                 attempt=peer.attempt,
@@ -56,24 +65,45 @@ class Episodes:
         if peer.state is not ServiceState.RESETTING or message.episode != run.episode:
             run.unexpected(peer, "RESET_DONE", f"after RESET of episode {run.episode}")
             return
-        peer.move(ServiceEvent.RESET_DONE, now)
+        if not self.recall.bring_back(peer, now):
+            peer.move(ServiceEvent.RESET_DONE, now)
+            self._returned(peer, now)
+
+    def _returned(self, peer: Peer, now: int) -> None:
+        """A service is where it has to be: it gets what it owes, or the episode starts."""
+        run, memory = self._run, self.recall.of(peer.name)
         if self.schedule is not None:
-            for order in self.schedule.resume(peer.name, now):
+            for order in self.schedule.resume(peer.name, now, memory.last if memory else -1):
                 self._grant(order)
         elif all(p.state is ServiceState.ACTIVE for p in self._members()):
             run.enter(RunEvent.ALL_RESET, now)
-            assert run.graph is not None
-            capacity = {p.name: _capacity(p) for p in self._members()}
-            self.schedule = EpisodeSchedule(
-                run.graph, run.plan, capacity, run.episode, run.digest, run.ledger
-            )
+            self._start(now)
+
+    def _start(self, now: int) -> None:
+        """Everybody is there: the episode starts, or goes on where it was."""
+        run, memories = self._run, self.recall.memories
+        assert run.graph is not None
+        capacity = {p.name: _capacity(p) for p in self._members()}
+        self.schedule = EpisodeSchedule(
+            run.graph, run.plan, capacity, run.episode, run.digest, run.ledger, memories
+        )
+        # Behind the schedule, so that frame 0 need not wait for these entries.
+        facts = {"seed": run.seed, "seed_episode": run.seed_episode, "frames": self.schedule.frames}
+        before, run.resumption = run.resumption, None
+        if before is not None:
+            self.schedule.go_on(before, {name: memory.last for name, memory in memories.items()})
+            run.enter_journal("resumed", "", before.finished, now, facts=facts, members=run.graph.order)
+            return
+        run.enter_journal("episode", "", 0, now, facts=facts, members=run.graph.order)
+        for name in memories:
+            run.enter_journal("checkpoint", name, -1, now)
 
     def _over(self, schedule: EpisodeSchedule, now: int) -> None:
         run = self._run
         self.close(now)
         run.actions.append(ev.EpisodeFinished(run.episode, schedule.frames))
         for peer in self._members():
-            if peer.state in (ServiceState.ACTIVE, ServiceState.RESETTING):
+            if peer.state in (ServiceState.ACTIVE, ServiceState.RESETTING, ServiceState.RESTORING):
                 peer.move(ServiceEvent.EPISODE_END, now)
                 end = EpisodeEnd(
                     epoch=run.plan.epoch, attempt=peer.attempt, episode=run.episode, frames=schedule.frames
@@ -118,6 +148,9 @@ class Episodes:
     def done(self, event: ev.DoneReceived, now: int) -> None:
         """DONE: its products are decided, or it is stale."""
         run, peer, message = self._run, self._run.peers[event.service], event.message
+        if peer.state is ServiceState.RESTORING:
+            self.recall.repeated(peer, message, now)
+            return
         schedule = self._owing(peer, message, "DONE")
         if schedule is None:
             return
@@ -144,12 +177,35 @@ class Episodes:
             )
         if message.seed >= 0:
             self._seed_chosen(peer, message, schedule, now)
+        if self.recall.of(peer.name) is not None:
+            self._remember(peer, schedule, self.recall.digests(peer, message))
         schedule.done(peer.name, message.frame, products, now, told, end=message.end_episode)
+        if message.end_episode and peer.role == "agent":
+            self._tell(schedule)  # entries in order
+            run.enter_journal("end", peer.name, message.frame, now, facts={"frames": schedule.frames})
+        self._save_if_due(peer, schedule, now)
+
+    def _remember(self, peer: Peer, schedule: EpisodeSchedule, digests: Mapping[str, str] | None) -> None:
+        order = schedule.outstanding(peer.name)[0].order
+        if order is not None:
+            self.recall.answered(peer, order, digests)
+
+    def _save_if_due(self, peer: Peer, schedule: EpisodeSchedule, now: int) -> None:
+        if self.recall.is_due(peer) and not schedule.is_through(peer.name):
+            schedule.save(peer.name)
+            if not schedule.outstanding(peer.name):
+                self.recall.ask(peer, now)
+
+    def checkpointed(self, event: ev.CheckpointReceived, now: int) -> None:
+        """CHECKPOINT_DONE: the service may be granted again."""
+        if self.recall.saved(event, now) and self.schedule is not None:
+            self.schedule.saved(event.service, now)
 
     def _seed_chosen(self, peer: Peer, message: Done, schedule: EpisodeSchedule, now: int) -> None:
         ends = message.end_episode or message.frame >= schedule.frames
         if ends and peer.role == "agent":
             self._run.wish(message.seed, peer, now)
+            self._run.enter_journal("seed", peer.name, message.frame, now, facts={"seed": message.seed})
         else:
             text = (
                 f"chose the seed {message.seed}, which only an agent may where it ends an episode; not used"
@@ -160,13 +216,16 @@ class Episodes:
         """FAULT: fatal, unless it is in a frame that the run can do without."""
         run, peer, message = self._run, self._run.peers[event.service], event.message
         text = f"{message.phase}: {located(message.message, peer.name, run.plan.source)}"
-        if message.frame < 0:
+        if message.frame < 0 or self.recall.is_concerned(peer, message):
             if not run.current(peer, message.epoch, message.attempt, "FAULT"):
                 return
             if run.takes_part(peer):
                 run.fail(f"{peer} failed in {text}", peer.name, now)
             else:
                 run.notice("fault", peer.name, text)
+            return
+        if peer.state is ServiceState.RESTORING:
+            self.recall.repeated(peer, message, now)
             return
         schedule = self._owing(peer, message, "FAULT")
         if schedule is None:
@@ -175,7 +234,9 @@ class Episodes:
         if needed and peer.plan.policy in ("wait", "abort"):
             run.fail(f"{peer} failed in frame {message.frame}, {text}", peer.name, now)
         else:
+            self._remember(peer, schedule, None)
             schedule.fault(peer.name, message.frame, text, now)
+            self._save_if_due(peer, schedule, now)
 
     def _owing(self, peer: Peer, answer: Done | Fault, kind: str) -> EpisodeSchedule | None:
         """The schedule, if this answers the oldest outstanding grant (clause 1)."""

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import msgspec
 
 from caviar_protocol.messages import (
     Asset,
+    CheckpointDone,
     Done,
     Fault,
     GrantInput,
@@ -76,6 +78,14 @@ class FaultReceived(msgspec.Struct, frozen=True):
     message: Fault
 
 
+class CheckpointReceived(msgspec.Struct, frozen=True):
+    """CHECKPOINT_DONE came; ``state`` is opaque."""
+
+    service: str
+    message: CheckpointDone
+    state: Any
+
+
 class Violated(msgspec.Struct, frozen=True):
     """A service sent what it may not, in a way it cannot be told to mend."""
 
@@ -120,7 +130,7 @@ class StopRequested(msgspec.Struct, frozen=True):
 
 Event = (
     Joined | AssetsOffered | ReadyReceived | ResetDoneReceived | DoneReceived | FaultReceived
-    | Violated | Progressed | Lost | ByeReceived | Journaled | StopRequested
+    | CheckpointReceived | Violated | Progressed | Lost | ByeReceived | Journaled | StopRequested
 )  # fmt: skip
 
 
@@ -133,6 +143,8 @@ class Send(msgspec.Struct, frozen=True):
     service: str
     message: Message
     products: tuple[Product, ...] = ()
+    attachment: Any = None
+    """State of a service, in one part."""
 
 
 class TurnAway(msgspec.Struct, frozen=True):
@@ -143,17 +155,26 @@ class TurnAway(msgspec.Struct, frozen=True):
 
 
 class Journal(msgspec.Struct, frozen=True):
-    """Write one task's outcome to the journal, then feed `Journaled` (clause 18)."""
+    """Write one task's outcome, or another turn of the run, to the journal, then feed `Journaled`
+    (clause 18)."""
 
     number: int
     episode: int
     frame: int
     service: str
     outcome: str
-    """``done``, ``fault``, ``overdue``, ``skipped``, or, for products that came later, ``late``."""
-    decisions: tuple[GrantInput, ...]
-    products: tuple[Product, ...]
-    """Those that a later frame may consume."""
+    """``done``, ``fault``, ``overdue``, ``skipped``, or, for what came later, ``late``. Of the run:
+    ``episode`` (one begins), ``resumed`` (one goes on with this frame), ``end`` (an agent ends it with
+    this frame), ``seed`` (an agent chooses the next one's), ``checkpoint`` (a service saved its state)."""
+    decisions: tuple[GrantInput, ...] = ()
+    products: tuple[Product, ...] = ()
+    """Those that a later frame may consume, or a service that comes back."""
+    facts: Mapping[str, int] | None = None
+    """``seed``, ``seed_episode`` and ``frames``, where they are told."""
+    members: tuple[str, ...] = ()
+    """Services of the run, where an episode begins."""
+    state: Any = None
+    """Of a service, after this frame; opaque."""
 
 
 class Notice(msgspec.Struct, frozen=True):
@@ -161,7 +182,7 @@ class Notice(msgspec.Struct, frozen=True):
 
     kind: str
     """``miss``, ``late``, ``skipped``, ``fault``, ``lost``, ``away``, ``back``, ``refused``, ``idle``,
-    ``lag``, ``stale``, ``discarded`` or ``note``."""
+    ``lag``, ``stale``, ``discarded``, ``differs`` or ``note``."""
     service: str
     text: str
     episode: int = 0

@@ -154,6 +154,9 @@ class Joining:
         run, peer, message = self._run, self._run.peers[event.service], event.message
         if not run.current(peer, message.epoch, message.attempt, "READY"):
             return
+        if peer.state is ServiceState.RESTORING:
+            self._episodes.recall.restored(peer, now)
+            return
         if peer.state is not ServiceState.PREPARING:
             run.unexpected(peer, "READY", "once, after PREPARE")
             return
@@ -163,7 +166,7 @@ class Joining:
         if not self._accepted(peer, message, now):
             return
         peer.ready = message
-        if message.seed >= 0 and run.state is RunState.PREPARING:
+        if message.seed >= 0 and run.state is RunState.PREPARING and run.resumption is None:
             run.wish(message.seed, peer, now)
         self._prepare_whoever_can(now)
         if run.state is not RunState.PREPARING:

@@ -8,7 +8,7 @@ from caviar_broker.core.peers import Peer
 from caviar_broker.core.run import Run
 from caviar_broker.core.transitions import RunState, ServiceEvent, ServiceState
 
-MAX_LOSSES = 3
+MAX_LOSSES = 5
 """A service that was lost so often without an answer in between is not waited for again."""
 
 
@@ -66,9 +66,9 @@ class Liveness:
             schedule.pause(peer.name)
 
     def _may_return(self, peer: Peer) -> bool:
-        """Whether the loss of a service is survived for a while: it was ready once, or is started by
-        hand and can be again; and it got somewhere."""
-        was_ready = peer.ready is not None or peer.plan.remote
+        """Whether the loss of a service is survived for a while: it was ready once, perhaps under a
+        broker before, or is started by hand and can be again; and it got somewhere."""
+        was_ready = peer.ready is not None or peer.plan.remote or self._run.plan.epoch > 1
         return peer.rejoin(self._run.plan.limits) > 0 and was_ready and peer.losses < MAX_LOSSES
 
     # --- deadlines -----------------------------------------------------------------------------------
@@ -115,16 +115,21 @@ class Liveness:
                 return self._run.since + limits.connect
             case ServiceState.PREPARING:
                 return peer.silent_until(peer.since, limits.ready)
-            case ServiceState.RESETTING:
+            case ServiceState.RESETTING | ServiceState.RESTORING:
                 return peer.silent_until(peer.since, limits.reset)
             case ServiceState.LOST:
                 return peer.since + peer.rejoin(limits)
             case ServiceState.ACTIVE:
                 schedule = self._episodes.schedule
                 task = schedule.awaited(peer.name) if schedule else None
-                return peer.silent_until(task.started_at, limits.stall) if task else None
+                since = task.started_at if task else self._saving_since(peer)
+                return None if since is None else peer.silent_until(since, limits.stall)
             case _:
                 return None  # it waits for others
+
+    def _saving_since(self, peer: Peer) -> int | None:
+        """Since when a service without which the run cannot go on saves its state [ns]."""
+        return self._episodes.recall.saving_since(peer) if peer.plan.policy in ("wait", "abort") else None
 
     def _blame(self, peer: Peer, now: int) -> str:
         limits, schedule = self._run.plan.limits, self._episodes.schedule
@@ -133,6 +138,10 @@ class Liveness:
             waiting = schedule.waiting_for(peer.name)
             return peer.blame_task(task, "makes no progress (timeouts.stall_s)", now, waiting)
         match peer.state:
+            case ServiceState.ACTIVE:
+                since = (now - (self._saving_since(peer) or now)) / 1e9
+                words = f"makes no progress (timeouts.stall_s): {since:.3g} s since CHECKPOINT"
+                return f"{peer} {words}; {peer.last_words(now)}"
             case ServiceState.EXPECTED:
                 missing = [p for p in self._run.peers.values() if p.state is ServiceState.EXPECTED]
                 names = ", ".join(str(p) for p in missing)

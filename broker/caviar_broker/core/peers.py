@@ -15,6 +15,7 @@ _DOING = {
     ServiceState.PREPARING: "preparing",
     ServiceState.READY: "waiting for the others",
     ServiceState.RESETTING: "resetting",
+    ServiceState.RESTORING: "being restored",
     ServiceState.ACTIVE: "idle in an episode",
     ServiceState.LOST: "lost",
     ServiceState.LEFT: "gone",
@@ -45,6 +46,8 @@ class Peer:
     """How its loss is known."""
     losses: int = 0
     """How often it was lost since it last answered a grant."""
+    restored: bool = False
+    """Whether it has the state that it was saved with, and is sent what it was granted since."""
 
     @property
     def name(self) -> str:
@@ -73,6 +76,7 @@ class Peer:
         self.move(ServiceEvent.HELLO, now)
         self.hello, self.attempt = hello, self.attempt + 1
         self.heard_at, self.progress, self.phase, self.grace_ns = None, 0, "", 0
+        self.restored = False
 
     def heartbeat(self, progress: int, phase: str, grace_ns: int, now: int) -> None:
         """A heartbeat came."""

@@ -72,8 +72,15 @@ class RunPlan:
     """Whether nothing is kept of the run: no journal, digest or latencies. An embedded run without files."""
     source: Source = field(default_factory=Source)
     """Where the scenario was read from, to name the lines of what services find wrong in it."""
+    checkpoint_frames: int = 0
+    """Frames after which a service that can do so saves its state; 0: never."""
     imposed: Mapping[tuple[str, int, int], Mapping[str, str]] = field(default_factory=dict)
     """Decisions imposed in a replay, by (service, episode, frame) (clause 6)."""
+
+    @property
+    def remembers(self) -> bool:
+        """Whether services save their state."""
+        return self.checkpoint_frames > 0 and not self.ephemeral
 
     def t_ns(self, frame: int) -> int:
         """Simulated time of a frame of any episode [ns]; one behind the last comes a period later."""
@@ -112,6 +119,7 @@ def plan_run(scenario: Scenario, run: str, told: Mapping[str, Mapping[str, Any]]
         record=scenario.run.record,
         source=scenario.source,
         frames_in_flight=scenario.run.frames_in_flight,
+        checkpoint_frames=scenario.run.checkpoint_frames,
         limits=Limits(
             connect=round(t.connect_s * SECOND),
             ready=round(t.ready_s * SECOND),

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from caviar_broker.core.events import Action, Finished, Notice, Product, Send
+from typing import Any
+
+from caviar_broker.core.events import Action, Finished, Journal, Notice, Product, Send
 from caviar_broker.core.graph import Graph
 from caviar_broker.core.ledger import Ledger
 from caviar_broker.core.peers import Peer
 from caviar_broker.core.plan import RunPlan
+from caviar_broker.core.resumption import Resumption
 from caviar_broker.core.transitions import RUN, RunEvent, RunState, step
 from caviar_protocol.digest import RunDigest
 from caviar_protocol.messages import Error, Message, Shutdown, Stale
@@ -15,8 +18,10 @@ from caviar_protocol.messages import Error, Message, Shutdown, Stale
 class Run:
     """One run: its present state, its services, and the actions that wait to be carried out."""
 
-    def __init__(self, plan: RunPlan, now: int) -> None:
+    def __init__(self, plan: RunPlan, now: int, resumption: Resumption | None = None) -> None:
         self.plan = plan
+        self.resumption = resumption
+        """What another broker left of the run, until it goes on."""
         self.state = RunState.JOINING
         self.since = now
         """When the present state began [ns]."""
@@ -34,9 +39,18 @@ class Run:
         self.ledger = Ledger(kept=not plan.ephemeral)
         self.over = False
         """Whether the run has ended, if perhaps not everybody has left."""
+        if resumption is not None:
+            self._take_over(resumption)
         self.error = ""
         self.culprit = ""
         self.actions: list[Action] = []
+
+    def _take_over(self, before: Resumption) -> None:
+        self.episode, self.seed, self.seed_episode = before.episode, before.seed, before.seed_episode
+        self.digest = before.digest
+        self.ledger.last = self.ledger.written = before.entries
+        if before.wish is not None:
+            self._wished = before.wish[0], self.peers[before.wish[1]]
 
     def takes_part(self, peer: Peer) -> bool:
         """Whether the run needs a service: all until the graph is known, then those in it (clause 5)."""
@@ -46,7 +60,7 @@ class Run:
 
     def wish(self, seed: int, peer: Peer, now: int) -> None:
         """An agent chooses the seed of the next episode."""
-        if self._wished is not None and self._wished[0] != seed:
+        if self._wished is not None and self._wished[0] != seed and self._wished[1] is not peer:
             other = self._wished[1]
             self.fail(
                 f"{other} and {peer} choose different seeds, {self._wished[0]} and {seed}", peer.name, now
@@ -89,9 +103,17 @@ class Run:
 
     # --- what goes out -------------------------------------------------------------------------------
 
-    def send(self, peer: Peer, message: Message, products: tuple[Product, ...] = ()) -> None:
+    def send(
+        self, peer: Peer, message: Message, products: tuple[Product, ...] = (), attachment: Any = None
+    ) -> None:
         """Have a message sent."""
-        self.actions.append(Send(peer.name, message, products))
+        self.actions.append(Send(peer.name, message, products, attachment))
+
+    def enter_journal(self, outcome: str, service: str, frame: int, now: int, **facts: Any) -> None:
+        """Have something written down that is no decision about a task."""
+        if not self.plan.ephemeral:
+            number = self.ledger.enter(now)
+            self.actions.append(Journal(number, self.episode, frame, service, outcome, **facts))
 
     def notice(self, kind: str, service: str, text: str, frame: int = -1) -> None:
         """Have something told to the user."""

@@ -6,7 +6,7 @@ nothing of joining, dying or messages; `episodes.Episodes` does that around it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 
 from msgspec.structs import replace
 
@@ -17,6 +17,7 @@ from caviar_broker.core.inputs import Gathered, Inputs
 from caviar_broker.core.ledger import Ledger
 from caviar_broker.core.pace import Pacer
 from caviar_broker.core.plan import RunPlan, ServicePlan
+from caviar_broker.core.resumption import Resumption
 from caviar_broker.core.tasks import Decision, GrantOrder, Task, milliseconds, provenance
 from caviar_broker.core.transitions import OUTSTANDING, TaskEvent, TaskState
 from caviar_broker.core.turns import Turns
@@ -44,6 +45,8 @@ class EpisodeSchedule:
         Number of the episode.
     digest, ledger
         The run's digest and journal.
+    remembering
+        Services that save their state.
     """
 
     def __init__(
@@ -54,6 +57,7 @@ class EpisodeSchedule:
         episode: int,
         digest: RunDigest,
         ledger: Ledger,
+        remembering: Collection[str] = (),
     ) -> None:
         self.graph, self.plan, self.episode = graph, plan, episode
         self.actions: list[Action] = []
@@ -68,7 +72,8 @@ class EpisodeSchedule:
         self._capacity, self._ledger = capacity, ledger
         self._first_entry = ledger.last
         self._pacer = Pacer(plan)
-        self._book = DecisionBook(graph, plan, episode, digest, ledger, self.actions)
+        sources = {edge.source for name in remembering for edge in graph.inputs[name]}
+        self._book = DecisionBook(graph, plan, episode, digest, ledger, self.actions, sources)
         self._book.lag_ns = lambda: self._pacer.lag_ns
         self._inputs = Inputs(graph, self._book)
         self._turns = Turns(graph, plan, self._book)
@@ -77,6 +82,13 @@ class EpisodeSchedule:
         self._late: list[Product] = []
         """Late products that the recorder has not been told of (clause 11)."""
         self._paused: set[str] = set()
+        self._saving: set[str] = set()
+
+    def go_on(self, resumption: Resumption, completed: Mapping[str, int]) -> None:
+        """Go on behind the last finished frame; ``completed`` says how far services got that have state."""
+        resumption.restore(self._book)
+        self._book.forget_before(resumption.finished - 1)
+        self._completed.update(completed)
 
     # --- what happens ------------------------------------------------------------------------------
 
@@ -135,14 +147,15 @@ class EpisodeSchedule:
         """The service is gone: its outstanding grants stay owed, no new ones are made."""
         self._paused.add(service)
 
-    def resume(self, service: str, now: int) -> list[GrantOrder]:
+    def resume(self, service: str, now: int, completed: int = -1) -> list[GrantOrder]:
         """The service is back: the grants it owes, to be sent again (clause 18).
 
-        It starts from its reset, so ``previous`` is −1 and a world steps the whole gap.
+        It has got as far as ``completed``; from its reset that is −1, and a world steps the whole gap.
         """
         self._paused.discard(service)
+        self._saving.discard(service)
         self._turns.concerned.add(service)
-        self._completed[service] = previous = -1
+        self._completed[service] = previous = completed
         again = []
         for task in self._outstanding[service]:
             task.started_at = now
@@ -151,6 +164,22 @@ class EpisodeSchedule:
                 again.append(task.order)
             previous = task.frame
         return again
+
+    def save(self, service: str) -> None:
+        """The service shall save its state: no new grants are made until `saved`."""
+        self._saving.add(service)
+
+    def saved(self, service: str, now: int) -> None:
+        """The service has saved its state."""
+        self._saving.discard(service)
+        self._turns.concerned.add(service)
+        task = self._book.find(service, self._book.next[service])
+        if task is not None and self._plans[service].policy == "abort" and task.eligible_at is not None:
+            task.eligible_at = now  # it could not have been granted before
+
+    def is_through(self, service: str) -> bool:
+        """Whether a service has nothing more to do in the episode."""
+        return self._book.next[service] >= self._book.frames + (service in self._turns.agents)
 
     def advance(self, now: int) -> None:
         """Grant and skip whatever can be, until nothing changes."""
@@ -277,7 +306,7 @@ class EpisodeSchedule:
                 self._notice("skipped", task, inputs.cause)
                 self._book.consequence(task, inputs.cause, now)
                 self._turns.decided(task.service)
-            elif has_room and name not in self._paused:
+            elif has_room and name not in self._paused and name not in self._saving:
                 self._grant(task, inputs, now)
             else:
                 return
@@ -338,8 +367,7 @@ class EpisodeSchedule:
     def _came_late(self, task: Task, products: Mapping[str, Product], now: int) -> None:
         elapsed = milliseconds(now - task.started_at)
         self._notice("late", task, f"answered after {elapsed}; its frame had gone on")
-        if products:
-            self._book.late(task, products, now)
+        self._book.late(task, products, now)
         if self._turns.recorders:
             self._late += products.values()
         self._book.release(task)
@@ -367,7 +395,8 @@ class EpisodeSchedule:
         if task.state is _GRANTED:
             return None if task.overran else (task.started_at + budget, task)
         if task.state is TaskState.PENDING and task.eligible_at is not None:
-            waits = self._plans[name].policy == "wait"
+            policy = self._plans[name].policy
+            waits = policy == "wait" or (policy == "abort" and name in self._saving)
             return None if waits else (task.eligible_at + budget, task)
         return None
 
@@ -388,6 +417,8 @@ class EpisodeSchedule:
         else:
             owed = self._outstanding[task.service]
             why = f"still busy with frame {owed[0].frame}" if owed else "not connected"
+            if not owed and task.service in self._saving:
+                why = "saving its state"
             cause = f"{task.service} missed frame {task.frame} ({plan.policy}, budget {budget}), {why}"
             elapsed = now - (task.eligible_at or now)
             self.actions.append(Latency(task.service, self.episode, task.frame, elapsed, missed=True))

@@ -53,6 +53,8 @@ class ServiceState(Enum):
     PREPARING = auto()
     READY = auto()
     RESETTING = auto()
+    RESTORING = auto()
+    """Gets its state back, and the grants since, before it takes part again."""
     ACTIVE = auto()
     """In an episode: may be granted frames."""
     LOST = auto()
@@ -69,6 +71,8 @@ class ServiceEvent(Enum):
     READY = auto()
     RESET = auto()
     RESET_DONE = auto()
+    RESTORE = auto()
+    RESTORED = auto()
     EPISODE_END = auto()
     LOST = auto()
     BYE = auto()
@@ -123,6 +127,7 @@ _PRESENT = (
     ServiceState.PREPARING,
     ServiceState.READY,
     ServiceState.RESETTING,
+    ServiceState.RESTORING,
     ServiceState.ACTIVE,
 )
 
@@ -133,6 +138,9 @@ SERVICE: dict[tuple[ServiceState, ServiceEvent], ServiceState] = {
     (ServiceState.PREPARING, ServiceEvent.READY): ServiceState.READY,
     (ServiceState.READY, ServiceEvent.RESET): ServiceState.RESETTING,
     (ServiceState.RESETTING, ServiceEvent.RESET_DONE): ServiceState.ACTIVE,
+    (ServiceState.RESETTING, ServiceEvent.RESTORE): ServiceState.RESTORING,
+    (ServiceState.RESTORING, ServiceEvent.RESTORED): ServiceState.ACTIVE,
+    (ServiceState.RESTORING, ServiceEvent.EPISODE_END): ServiceState.READY,
     (ServiceState.ACTIVE, ServiceEvent.EPISODE_END): ServiceState.READY,
     (ServiceState.RESETTING, ServiceEvent.EPISODE_END): ServiceState.READY,
     (ServiceState.EXPECTED, ServiceEvent.LOST): ServiceState.LOST,

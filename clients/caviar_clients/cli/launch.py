@@ -25,6 +25,8 @@ KILL_AFTER_S = 1.0
 
 BROKER_S = 10.0
 """[s] that the broker gets to end after its last service, beyond the run's ``shutdown_s``."""
+MAX_RESTARTS = 5
+"""Processes that are started for a service that died, before it comes back."""
 TAIL = 1 << 16
 """[B] of a log that are looked at for its last line."""
 
@@ -63,16 +65,26 @@ class Launcher:
     bind: str = "tcp://127.0.0.1:0"
     keys: Path | None = None
     """Keys directory of the broker."""
+    resume: bool = False
+    """Whether to go on with the run in the directory, whatever ``path``, ``frames`` and ``seed`` say."""
     endpoint: str = ""
     _key: BorrowedKey = field(init=False)
     _children: dict[str, Child] = field(default_factory=dict)
     _broker: subprocess.Popen[bytes] | None = None
     _selector: selectors.BaseSelector = field(default_factory=selectors.DefaultSelector)
     _rest: bytes = b""
+    _awaited: set[str] = field(default_factory=set)
+    """Services that died and that the broker waits for."""
+    _brokers: int = 0
+    """That were started after others that died, since frames were last finished."""
+    _restarts: dict[str, int] = field(default_factory=dict)
+    """Processes that were started since a service was last there."""
     _over: bool = False
     """Whether the broker told how the run ended."""
     _frames: int = 0
     """Frames that the run had, once it is over."""
+    _stopping: bool = False
+    """Whether the user wants the run to end."""
     _finished: bool = False
     """Whether the broker's output has ended."""
     _give_up_at: float | None = None
@@ -108,6 +120,7 @@ class Launcher:
 
     def stop(self, reason: str) -> None:
         """Ask for an orderly end."""
+        self._stopping = True
         self._order({"stop": reason})
 
     def log_of(self, service: str) -> Path | None:
@@ -122,15 +135,21 @@ class Launcher:
 
     # --- starting ----------------------------------------------------------------------------------
 
-    def _start_broker(self) -> None:
-        command = [sys.executable, "-m", "caviar_broker", str(self.path), "--bind", self.bind]
-        command += ["--directory", str(self.directory), "--control"]
+    def _broker_arguments(self) -> list[str]:
+        if self.resume:
+            bind = ["--bind", self.bind] if self.bind else []
+            return ["--resume", str(self.directory), *bind]
+        arguments = [str(self.path), "--bind", self.bind, "--directory", str(self.directory)]
         if self.frames is not None:
-            command += ["--frames", str(self.frames)]
+            arguments += ["--frames", str(self.frames)]
         if self.seed is not None:
-            command += ["--seed", str(self.seed)]
-        command += [*self._key.options(), "--supervised", *self._local]
-        with (self.directory / "logs" / "broker.log").open("wb") as log:
+            arguments += ["--seed", str(self.seed)]
+        return arguments
+
+    def _start_broker(self) -> None:
+        command = [sys.executable, "-m", "caviar_broker", *self._broker_arguments()]
+        command += [*self._key.options(), "--control", "--supervised", *self._local]
+        with (self.directory / "logs" / "broker.log").open("ab") as log:
             self._broker = subprocess.Popen(  # noqa: S603  # our own module with checked arguments
                 command,
                 stdin=subprocess.PIPE,
@@ -145,22 +164,36 @@ class Launcher:
         self._selector.register(self._broker.stdout, selectors.EVENT_READ)
 
     def _start_services(self) -> None:
-        for name, spec in self._local.items():
-            path = self.directory / "logs" / f"{name}.log"
-            command = [sys.executable, "-m", "caviar_services", name]
-            command += ["--use", f"{spec.role}:{spec.use}", "--broker", self.endpoint]
-            with path.open("wb") as log:
-                process = subprocess.Popen(  # noqa: S603  # our own module with checked arguments
-                    command,
-                    stdin=subprocess.DEVNULL,
-                    stdout=log,
-                    stderr=log,
-                    start_new_session=True,
-                    env=self._key.environment(),
-                )
-            child = Child(name, process, path, os.pidfd_open(process.pid))
-            self._children[name] = child
-            self._selector.register(child.pidfd, selectors.EVENT_READ, child)
+        for name in self._local:
+            self._start(name)
+
+    def _start(self, name: str) -> None:
+        """Start a service; its log goes on where one before it ended."""
+        spec, path = self._local[name], self.directory / "logs" / f"{name}.log"
+        command = [sys.executable, "-m", "caviar_services", name]
+        command += ["--use", f"{spec.role}:{spec.use}", "--broker", self.endpoint]
+        with path.open("ab") as log:
+            process = subprocess.Popen(  # noqa: S603  # our own module with checked arguments
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+                env=self._key.environment(),
+            )
+        child = Child(name, process, path, os.pidfd_open(process.pid))
+        before, self._children[name] = self._children.get(name), child
+        if before is not None:
+            os.close(before.pidfd)
+        self._selector.register(child.pidfd, selectors.EVENT_READ, child)
+        self._give_up_at = None
+
+    def _start_again(self, name: str) -> None:
+        """Start a service that died and is waited for, unless that was in vain too often."""
+        self._restarts[name] = number = self._restarts.get(name, 0) + 1
+        if number <= MAX_RESTARTS:
+            self._start(name)
+            self._order({"restarted": name, "text": f"a new process was started, number {number}"})
 
     # --- while it runs -----------------------------------------------------------------------------
 
@@ -171,6 +204,9 @@ class Launcher:
         data = os.read(broker.stdout.fileno(), 65536)
         if not data:
             self._selector.unregister(broker.stdout)
+            if self._may_resume():
+                self._resume_broker(broker)
+                return
             self._finished = True
             yield self._broker_ended(broker)
             return
@@ -180,9 +216,56 @@ class Launcher:
             if event["event"] == "listening":
                 self.endpoint = event["endpoint"]
                 self._start_services()
+            if event["event"] == "notice" and event["service"] in self._children:
+                self._heed(event["kind"], event["service"])
+            if event["event"] == "frame":
+                self._brokers = 0
             if event["event"] == "finished":
                 self._over, self._frames = True, event["frames"]
             yield event
+
+    # --- another broker ----------------------------------------------------------------------------
+
+    def _may_resume(self) -> bool:
+        """Whether a broker that died is followed by another: the run waits for who is lost, the broker
+        had begun, and those before it got somewhere."""
+        waits = (self.scenario.timeouts.rejoin_s or 0.0) > 0.0
+        return (
+            waits
+            and not self._over
+            and not self._stopping
+            and bool(self.endpoint)
+            and self._brokers < MAX_RESTARTS
+        )
+
+    def _resume_broker(self, broker: subprocess.Popen[bytes]) -> None:
+        """Start a broker that goes on with the run, at the same address; services are started again
+        once it listens, since none of them is known to it."""
+        if broker.stdin is not None:
+            broker.stdin.close()
+        if broker.stdout is not None:
+            broker.stdout.close()
+        _wait([broker], KILL_AFTER_S)
+        if broker.poll() is None:
+            broker.kill()
+        verdict = describe_exit(broker.wait())
+        self._end_services()
+        self._brokers += 1
+        self.resume, self.bind, self._rest = True, self.endpoint, b""
+        self._awaited.clear()
+        self._restarts.clear()
+        self._start_broker()
+        text = f"the broker died ({verdict}); another one goes on with the run, number {self._brokers}"
+        self._order({"restarted": "", "text": text})
+
+    def _end_services(self) -> None:
+        processes = [child.process for child in self._children.values()]
+        _end(processes, KILL_AFTER_S)
+        for child in self._children.values():
+            if child.pidfd in self._selector.get_map():
+                self._selector.unregister(child.pidfd)
+            os.close(child.pidfd)
+        self._children.clear()
 
     def _broker_ended(self, broker: subprocess.Popen[bytes]) -> Mapping[str, Any]:
         _wait([broker], self.scenario.timeouts.shutdown_s + BROKER_S)
@@ -196,6 +279,23 @@ class Launcher:
             raise RunError(last.removeprefix("caviar broker: ") if told else f"the broker died: {last}")
         return {"event": "ended", "status": status}
 
+    def _heed(self, kind: str, name: str) -> None:
+        """The broker waits for a service to come back (``timeouts.rejoin_s``), or it has come."""
+        if kind == "back":
+            self._awaited.discard(name)
+            self._restarts.pop(name, None)
+        elif kind == "away" and not self._over:
+            self._awaited.add(name)
+            process = self._children[name].process
+            if process.poll() is None:
+                process.kill()  # stopped, or cut off; its end is seen like any other
+            elif name not in self._unseen():
+                self._start_again(name)
+
+    def _unseen(self) -> set[str]:
+        """Services whose end has not been seen to yet."""
+        return {key.data.name for key in self._selector.get_map().values() if isinstance(key.data, Child)}
+
     def _child_died(self, child: Child) -> None:
         self._selector.unregister(child.pidfd)
         status = child.process.wait()
@@ -205,6 +305,8 @@ class Launcher:
             verdict = describe_exit(status)
             tail = child.last_line()
             self._order({"lost": child.name, "verdict": f"{verdict}, saying: {tail}" if tail else verdict})
+            if child.name in self._awaited:
+                self._start_again(child.name)
 
     def _order(self, order: Mapping[str, str]) -> None:
         if self._broker is None or self._broker.stdin is None:
@@ -225,18 +327,23 @@ class Launcher:
         # Before the first frame some services may not have connected, so that no SHUTDOWN reached them.
         grace = self.scenario.timeouts.shutdown_s if self._frames else 0.0
         _wait(processes, grace)
-        for process in processes:
-            if process.poll() is None:
-                process.send_signal(signal.SIGTERM)
-        _wait(processes, self.scenario.timeouts.shutdown_s + KILL_AFTER_S)
-        for process in processes:
-            if process.poll() is None:
-                process.kill()
-            process.wait()
+        _end(processes, self.scenario.timeouts.shutdown_s + KILL_AFTER_S)
         for child in self._children.values():
             os.close(child.pidfd)
         if self._broker is not None and self._broker.stdout is not None:
             self._broker.stdout.close()
+
+
+def _end(processes: list[subprocess.Popen[bytes]], seconds: float) -> None:
+    """End all: SIGTERM, and after so long [s] SIGKILL."""
+    for process in processes:
+        if process.poll() is None:
+            process.send_signal(signal.SIGTERM)
+    _wait(processes, seconds)
+    for process in processes:
+        if process.poll() is None:
+            process.kill()
+        process.wait()
 
 
 def _wait(processes: list[subprocess.Popen[bytes]], seconds: float) -> None:

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.text import Text
 
 from caviar_clients.cli.keys import app as keys
-from caviar_protocol.errors import CaviarError
+from caviar_protocol.errors import CaviarError, RunError
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -29,47 +29,72 @@ RunDirectory = Annotated[Path, typer.Argument(help="directory of a run, or one s
 Frames = Annotated[int | None, typer.Option(min=1, help="frames of an episode, instead of the scenario's")]
 Seed = Annotated[int | None, typer.Option(min=0, max=2**63 - 1, help="seed, instead of the scenario's")]
 
+Resume = Annotated[Path | None, typer.Option(help="go on with the run in this directory, whose broker died")]
+ScenarioOrNone = Annotated[Path | None, typer.Argument(help="scenario file (TOML)", show_default=False)]
+ANY_PORT = "tcp://127.0.0.1:0"
+
+
+def _nothing_else(*values: object) -> None:
+    if any(value is not None for value in values):
+        raise RunError("a run goes on as it began: --resume takes no scenario, frames, seed or --embedded")
+
 
 @app.command()
 def run(
-    scenario: ScenarioFile,
+    scenario: ScenarioOrNone = None,
     frames: Frames = None,
     seed: Seed = None,
     json: Annotated[Path | None, typer.Option(help="write the summary to this file too")] = None,
     out: Annotated[Path, typer.Option(help="directory in which the run's own is made")] = Path("runs"),
-    bind: Annotated[str, typer.Option(help="address of the broker; port 0: any")] = "tcp://127.0.0.1:0",
+    bind: Annotated[str, typer.Option(help="address of the broker; port 0: any")] = ANY_PORT,
     keys: Annotated[
         Path | None, typer.Option(help="keys directory: only authorized keys take part (caviar keys)")
     ] = None,
     embedded: Annotated[
         bool, typer.Option("--embedded", help="all in this process, without sockets")
     ] = False,
+    resume: Resume = None,
 ) -> None:
     """Run a scenario: the broker and every service as processes of their own, or all in this one."""
-    from caviar_clients.cli.run import run_scenario
+    from caviar_clients.cli.run import resume_run, run_scenario
 
+    if resume is not None:
+        _nothing_else(scenario, frames, seed, embedded or None)
+        raise typer.Exit(resume_run(resume, _console, json, "" if bind == ANY_PORT else bind, keys))
+    if scenario is None:
+        raise RunError("give a scenario file, or --resume with the directory of a run")
     raise typer.Exit(run_scenario(scenario, out, _console, frames, seed, json, bind, embedded, keys))
 
 
 @app.command()
 def broker(
-    scenario: ScenarioFile,
-    bind: Annotated[str, typer.Option(help="address to listen on")] = "tcp://127.0.0.1:5570",
+    scenario: ScenarioOrNone = None,
+    bind: Annotated[
+        str,
+        typer.Option(help="address to listen on; by default port 5570 of this machine, or as before"),
+    ] = "",
     frames: Frames = None,
     seed: Seed = None,
     out: Annotated[Path, typer.Option(help="directory in which the run's own is made")] = Path("runs"),
     keys: Annotated[
         Path | None, typer.Option(help="keys directory: only authorized keys take part (caviar keys)")
     ] = None,
+    resume: Resume = None,
 ) -> None:
     """Run only the broker; start the services with `caviar service`, here or on other machines."""
-    from caviar_broker.__main__ import parser, serve
+    from caviar_broker.__main__ import DEFAULT_BIND, parser, serve
     from caviar_broker.security.local import check_bind
     from caviar_clients.cli.run import run_directory
     from caviar_clients.sessions.checking import checked_scenario
 
+    if resume is not None:
+        _nothing_else(scenario, frames, seed)
+        options = [] if keys is None else ["--keys", str(keys)]
+        raise typer.Exit(serve(parser().parse_args(["--resume", str(resume), "--bind", bind, *options])))
+    if scenario is None:
+        raise RunError("give a scenario file, or --resume with the directory of a run")
     checked = checked_scenario(scenario, frames, seed)
-    check_bind(bind, keys=keys is not None)
+    check_bind(bind or DEFAULT_BIND, keys=keys is not None)
     directory = run_directory(out, checked.run.name)
     typer.echo(f"run {directory}; start its services with --broker and this broker's address:")
     for name, spec in checked.services.items():

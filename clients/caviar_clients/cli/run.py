@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
+from caviar_broker.record import read_record
 from caviar_broker.security.local import check_bind
 from caviar_clients.cli.inside import EmbeddedLauncher
 from caviar_clients.cli.launch import Launcher
@@ -27,7 +28,7 @@ from caviar_protocol.scenario_checks import refuse_remote
 
 QUIET = frozenset({"stale", "note", "idle", "lag"})
 """Kinds of notices that are logged, and only counted on the screen."""
-REPEATED = frozenset({"away", "back"})
+REPEATED = frozenset({"away", "back", "restarted"})
 """Kinds of notices that are shown every time, since what they ask of the user is always new."""
 
 
@@ -76,6 +77,30 @@ def run_scenario(
         launcher = EmbeddedLauncher(scenario, directory)
     else:
         launcher = Launcher(scenario, path.resolve(), directory, frames, seed, bind, keys)
+    return _follow(launcher, scenario, directory, console, json_file, keys)
+
+
+def resume_run(
+    directory: Path, console: Console, json_file: Path | None = None, bind: str = "", keys: Path | None = None
+) -> int:
+    """Go on with a run whose broker died; the exit status: 0 exactly if it came to its end."""
+    scenario = read_record(directory).scenario
+    if json_file is not None:
+        _write(json_file, "")
+    console.print(Text(f"run {directory}"), soft_wrap=True)
+    launcher = Launcher(scenario, directory, directory.resolve(), bind=bind, keys=keys, resume=True)
+    return _follow(launcher, scenario, directory, console, json_file, keys)
+
+
+def _follow(
+    launcher: Launcher | EmbeddedLauncher,
+    scenario: Scenario,
+    directory: Path,
+    console: Console,
+    json_file: Path | None,
+    keys: Path | None,
+) -> int:
+    """Show a run to its end, and sum it up."""
     outcome: Mapping[str, Any] = {}
     interrupted = _Interruption(launcher)
     with launcher, interrupted, _progress_bar(console) as bar:

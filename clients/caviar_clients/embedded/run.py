@@ -71,7 +71,9 @@ class EmbeddedRun:
         folder = (directory or Path()).resolve()
         plan = plan_run(scenario, folder.name, briefings(scenario, folder))
         # Whoever runs ahead gains nothing in one process, and works in vain where an agent ends the episode.
-        plan = replace(plan, frames_in_flight=1, ephemeral=directory is None, imposed=imposed or {})
+        plan = replace(
+            plan, frames_in_flight=1, checkpoint_frames=0, ephemeral=directory is None, imposed=imposed or {}
+        )
         self.statistics = Statistics({s.name: s.budget_ns for s in plan.services})
         self._now = 0
         self._clock = FrameClock(plan, self._now)

@@ -32,7 +32,7 @@ from caviar_protocol.arrays import quantity
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.digest import payload_digest
 from caviar_protocol.errors import RunError
-from caviar_protocol.messages import GrantInput, Status
+from caviar_protocol.messages import GrantInput
 from caviar_protocol.recording_layout import (
     ASSET_FOLDER,
     FRAME_TOPIC,
@@ -43,7 +43,9 @@ from caviar_protocol.recording_layout import (
     RecordingMetadata,
     segment_name,
 )
+from caviar_protocol.segment import Segment
 from caviar_services.recorder.base import Recorder, copy_assets, failure, machine, versions
+from caviar_services.recorder.continuing import Continuation, RunTime, Stored
 from caviar_services.service import Frame, FrameInput, Preparation, Prepared, RunInfo, StepResult
 
 _SCHEMA_ENCODING = "x-caviar-text"
@@ -84,15 +86,17 @@ class McapRecorder(Recorder[McapSettings]):
         self._segment: _SegmentWriter | None = None
         self._segments = 0
         self._failure: RunError | None = None
-        self._base_ns: int | None = 0
-        self._last_ns: int | None = None
-        self._stored: dict[tuple[str, str], int] = {}
+        self._runtime = RunTime(run.sampling_period_ns)
+        self._stored = Stored()
+        self._goes_on = False
+        """Whether frames that another process recorded are still to be taken over."""
 
     def prepare(self, preparation: Preparation) -> Prepared:
         """Open the first segment. `RunError` where the directory is not writable or holds a run."""
         folder = self.run.directory
         existing = sorted(folder.glob(SEGMENT_PATTERN))
-        if existing:
+        self._goes_on = bool(existing) and self.run.again
+        if existing and not self.run.again:
             raise RunError(
                 f"{existing[0]} is there already: choose another directory with --out, or remove it"
             )
@@ -115,14 +119,9 @@ class McapRecorder(Recorder[McapSettings]):
             assets=copied,
             notes=self.settings.notes,
         )
-        self._open_segment()
+        if not self._goes_on:
+            self._open_segment()
         return Prepared(notes=(f"recording to {folder}",))
-
-    def reset(self, episode: int, seed: int, t0_ns: int) -> None:
-        """Begin an episode: its run time starts one sampling period after the last frame."""
-        self._stored.clear()
-        if self._last_ns is not None:
-            self._base_ns = None
 
     def step(self, frame: Frame) -> StepResult:
         """Write a frame; when this returns, the operating system has it.
@@ -132,10 +131,11 @@ class McapRecorder(Recorder[McapSettings]):
         begin = time.perf_counter_ns()
         if self._failure is not None:
             raise self._failure
+        if self._goes_on:
+            self._take_over((frame.episode, frame.number))
         segment = self._segment or self._open_segment()
-        if self._base_ns is None:
-            self._base_ns = (self._last_ns or 0) + self.run.sampling_period_ns - frame.t_ns
-        self._last_ns = self._base_ns + frame.t_ns
+        base_ns = self._runtime.base_of(frame.episode, frame.t_ns)
+        self._stored.begin(frame.episode)
         inputs = sorted(map(_encoded, frame.inputs), key=_canonical)
         entry = FrameEntry(
             episode=frame.episode,
@@ -146,7 +146,7 @@ class McapRecorder(Recorder[McapSettings]):
             reports=frame.reports,
         )
         try:
-            segment.write(entry, [item for item in inputs if self._to_store(item)], self._base_ns)
+            segment.write(entry, [i for i in inputs if self._stored.is_new(i.provenance)], base_ns)
             if (
                 segment.size >= self.settings.segment_mib * 2**20
                 or segment.frames >= self.settings.segment_frames
@@ -159,6 +159,8 @@ class McapRecorder(Recorder[McapSettings]):
 
     def close(self) -> None:
         """Write the index of the open segment. `RunError` naming path and errno where that fails."""
+        if self._goes_on:
+            self._take_over(None)
         segment, self._segment = self._segment, None
         if segment is not None:
             try:
@@ -166,23 +168,27 @@ class McapRecorder(Recorder[McapSettings]):
             except OSError as error:
                 raise self._failed(segment, error) from error
 
-    def _to_store(self, item: FrameInput) -> bool:
-        """Whether these bytes are not in the recording yet. A late product may be held later."""
-        entry = item.provenance
-        if entry.status is Status.ABSENT:
-            return False
-        key = (entry.topic, entry.source)
-        newest = self._stored.get(key, -1)
-        if entry.status is Status.HELD and newest == entry.frame:
-            return False
-        self._stored[key] = max(newest, entry.frame)
-        return True
+    def _take_over(self, until: tuple[int, int] | None) -> None:
+        """Go on behind what another process recorded, before the frame ``until``."""
+        self._goes_on = False
+        folder, compression = self.run.directory, self.settings.compression
+        before = Continuation(folder, self._runtime, self._stored)
+
+        def rewrite(path: Path, segment: Segment) -> _SegmentWriter:
+            path.unlink(missing_ok=True)
+            return _SegmentWriter(path, segment.metadata, compression)
+
+        try:
+            before.take_over(until, rewrite)
+        except OSError as error:
+            raise failure(Path(error.filename or folder), error) from error
+        self._segments = before.segments
 
     def _open_segment(self) -> _SegmentWriter:
         path = self.run.directory / segment_name(self._segments)
         metadata = msgspec.structs.replace(self._metadata, segment=self._segments)
         try:
-            self._segment = _SegmentWriter(path, metadata, self.settings.compression)
+            self._segment = _SegmentWriter(path, _as_text(metadata), self.settings.compression)
         except OSError as error:
             raise failure(path, error) from error
         self._segments += 1
@@ -198,7 +204,7 @@ class McapRecorder(Recorder[McapSettings]):
 class _SegmentWriter:
     """One MCAP file that grows by a chunk a frame."""
 
-    def __init__(self, path: Path, metadata: RecordingMetadata, compression: str) -> None:
+    def __init__(self, path: Path, metadata: dict[str, str], compression: str) -> None:
         from mcap.writer import CompressionType, Writer
 
         self.path = path
@@ -215,7 +221,7 @@ class _SegmentWriter:
         )
         try:
             self._writer.start(profile=PROFILE)
-            self._writer.add_metadata(METADATA_NAME, _as_text(metadata))
+            self._writer.add_metadata(METADATA_NAME, metadata)
             self._writer.flush()
         except OSError:
             self.abandon()
