@@ -77,7 +77,7 @@ def serve(arguments: argparse.Namespace) -> int:
             server.statistics.earlier = resumption.finished_before + resumption.finished
         if arguments.control:
             Control(server)
-        stop_on_signals(server)
+        stopped = stop_on_signals(server)
         reporter.listening(server.endpoint)
         tune_collector()
         outcome = server.run()
@@ -94,6 +94,8 @@ def serve(arguments: argparse.Namespace) -> int:
     )
     if outcome.error and not arguments.control:
         sys.stderr.write(f"caviar broker: {outcome.error}\n")
+    if arguments.restarted and stopped():
+        return 0
     return 1 if outcome.error else 0
 
 
@@ -150,6 +152,9 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--run", default="", help="id of the run; by default the directory's name")
     found.add_argument("--frames", type=int, default=None, help="instead of the scenario's")
     found.add_argument("--seed", type=int, default=None, help="instead of the scenario's")
+    found.add_argument(
+        "--restarted", action="store_true", help="started again whenever its status is not 0: 0 after SIGTERM"
+    )
     found.add_argument("--control", action="store_true", help="talk JSON lines with a launcher")
     found.add_argument("--supervised", nargs="*", default=[], help="services the launcher watches itself")
     return found
