@@ -74,7 +74,7 @@ def test_the_version_and_capabilities_are_those_of_the_package() -> None:
     assert TEXT.startswith(f"# The CAVIAR wire protocol, version {major}.{minor}\n")
     assert f"**({major}, {minor})**" in section("Versions")
     named = re.findall(r"^\| `(\w+)` \| 1\.", section("Versions"), re.MULTILINE)
-    assert set(named) == {*m.CAPABILITIES, "checkpoint"}
+    assert set(named) == set(m.CAPABILITIES)
 
 
 def test_every_error_code_is_in_the_table() -> None:

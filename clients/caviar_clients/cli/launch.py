@@ -215,8 +215,9 @@ class Launcher:
             event = json.loads(line)
             if event["event"] == "listening":
                 self.endpoint = event["endpoint"]
-                self._start_services()
-            if event["event"] == "notice" and event["service"] in self._children:
+                if not self._children:  # else they were started beside a broker that goes on
+                    self._start_services()
+            if event["event"] == "notice" and event.get("service") in self._children:
                 self._heed(event["kind"], event["service"])
             if event["event"] == "frame":
                 self._brokers = 0
@@ -240,7 +241,7 @@ class Launcher:
 
     def _resume_broker(self, broker: subprocess.Popen[bytes]) -> None:
         """Start a broker that goes on with the run, at the same address; services are started again
-        once it listens, since none of them is known to it."""
+        beside it, since none of them is known to it."""
         if broker.stdin is not None:
             broker.stdin.close()
         if broker.stdout is not None:
@@ -255,6 +256,7 @@ class Launcher:
         self._awaited.clear()
         self._restarts.clear()
         self._start_broker()
+        self._start_services()
         text = f"the broker died ({verdict}); another one goes on with the run, number {self._brokers}"
         self._order({"restarted": "", "text": text})
 
