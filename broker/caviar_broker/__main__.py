@@ -88,7 +88,7 @@ def serve(arguments: argparse.Namespace) -> int:
                 server.statistics.earlier = resumption.finished_before + resumption.finished
             if arguments.control:
                 Control(server)
-            stop_on_signals(server)
+            stopped = stop_on_signals(server)
             reporter.listening(server.endpoint)
             beside.start(server)
             tune_collector()
@@ -108,6 +108,8 @@ def serve(arguments: argparse.Namespace) -> int:
     )
     if outcome.error and not arguments.control:
         sys.stderr.write(f"caviar broker: {outcome.error}\n")
+    if arguments.restarted and stopped():
+        return 0
     return 1 if outcome.error else 0
 
 
@@ -168,6 +170,9 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--frames", type=int, default=None, help="instead of the scenario's")
     found.add_argument("--seed", type=int, default=None, help="instead of the scenario's")
     found.add_argument("--pace", default=None, help="instead of the scenario's: free, realtime or a factor")
+    found.add_argument(
+        "--restarted", action="store_true", help="started again whenever its status is not 0: 0 after SIGTERM"
+    )
     found.add_argument("--control", action="store_true", help="talk JSON lines with a launcher")
     found.add_argument("--supervised", nargs="*", default=[], help="services the launcher watches itself")
     return found

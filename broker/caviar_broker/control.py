@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from caviar_broker.core import events as ev
 from caviar_broker.outbox import Line, Outbox
 from caviar_broker.server import BrokerServer
 from caviar_broker.statistics import Statistics
+from caviar_protocol.messages import STOPPED_BY
 
 FRAME_REPORT_S = 0.1
 """[s] between ``frame`` events at least."""
@@ -127,8 +129,9 @@ class Control:
                 self._server.note("", f"the launcher gave an order that is none: {line[:200]!r}")
 
 
-def stop_on_signals(server: BrokerServer) -> None:
-    """SIGTERM and SIGINT end the run in order."""
+def stop_on_signals(server: BrokerServer) -> Callable[[], bool]:
+    """SIGTERM and SIGINT end the run in order; whether one came can be asked."""
+    came: list[int] = []
     read, write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: None)
@@ -136,6 +139,8 @@ def stop_on_signals(server: BrokerServer) -> None:
 
     def stop() -> None:
         for number in os.read(read, 64):
-            server.feed(ev.StopRequested(f"stopped by {signal.Signals(number).name}"))
+            came.append(number)
+            server.feed(ev.StopRequested(f"{STOPPED_BY} {signal.Signals(number).name}"))
 
     server.loop.watch(read, stop)
+    return lambda: bool(came)

@@ -29,6 +29,7 @@ from caviar_broker.security.guard import PeerLimits
 from caviar_broker.statistics import Statistics
 from caviar_broker.watchdog import CHECK_NS, Watchdog
 from caviar_protocol import messages as m
+from caviar_protocol.alive import SignOfLife
 from caviar_protocol.assets import AssetStore
 from caviar_protocol.codec import check_parts, decode_message, encode_message, message_type
 from caviar_protocol.errors import ProtocolError, RunError, VersionError
@@ -102,6 +103,7 @@ class BrokerServer:
         self.outcome: ev.Finished | None = None
         self._plan, self._journal, self._observer = plan, journal, observer
         self._grumbles = Grumbles()
+        self._sign = SignOfLife()
         self._scenery = SceneryDesk(
             exchange=SceneryExchange(store or AssetStore()),
             clock=self.clock,
@@ -197,6 +199,7 @@ class BrokerServer:
         if now >= self._next_check:
             self._next_check = now + CHECK_NS
             self._watchdog.check(now)
+            self._sign.give()
             self._guard.check(now)
             self._write_journal()
         deadline = self.clock.next_deadline()

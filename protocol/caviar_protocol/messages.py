@@ -314,6 +314,12 @@ class Restore(_Message, frozen=True, kw_only=True, tag="RESTORE"):
     frame: FrameIndex
 
 
+RUN_COMPLETE = "the run is complete"
+"""Reason of the SHUTDOWN behind the last frame."""
+STOPPED_BY = "stopped by"
+"""Begins the reason of a SHUTDOWN that a signal to the broker brought."""
+
+
 class Shutdown(_Message, frozen=True, kw_only=True, tag="SHUTDOWN"):
     """Broker to service: the run is over. Answered by BYE within ``grace_ns``."""
 

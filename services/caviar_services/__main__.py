@@ -19,6 +19,8 @@ def serve(
     connect_timeout_s: float = CONNECT_TIMEOUT_S,
     key: Path | None = None,
     broker_key: Path | None = None,
+    *,
+    restarted: bool = False,
 ) -> int:
     """Run the implementation ``use`` ("role:name") as the service ``name``; the exit status."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(message)s")
@@ -28,7 +30,7 @@ def serve(
         return 2
     try:
         found = credentials(key, broker_key)
-        return run_service(name, role, implementation, broker, connect_timeout_s, found)
+        return run_service(name, role, implementation, broker, connect_timeout_s, found, restarted=restarted)
     except CaviarError as error:
         sys.stderr.write(f"caviar service {name}: {error}\n")
         return 1
@@ -51,6 +53,12 @@ def main() -> int:
     parser.add_argument(
         "--broker-key", type=Path, help="public key of the broker, broker.pub; else $CAVIAR_BROKER_KEY"
     )
+    parser.add_argument(
+        "--restarted",
+        action="store_true",
+        help="this process is started again whenever its status is not 0: status 1 after a run that failed, "
+        "0 after SIGTERM",
+    )
     arguments = parser.parse_args()
     return serve(
         arguments.name,
@@ -59,6 +67,7 @@ def main() -> int:
         arguments.connect_timeout,
         arguments.key,
         arguments.broker_key,
+        restarted=arguments.restarted,
     )
 
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 import zmq
 
+from caviar_protocol.alive import SignOfLife
 from caviar_protocol.codec import decode_message, encode_message
 from caviar_protocol.errors import ProtocolError
 from caviar_protocol.keys import Credentials
@@ -44,6 +45,7 @@ class HeartbeatThread(threading.Thread):
         self._liveness = welcome.liveness_ns / 1e9
         self._lock = threading.Lock()
         self._progress, self._phase, self._grace_ns = 0, "", 0
+        self._sign = SignOfLife()
         self._halt = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self.broker_silence: float | None = None
         """For how long the broker has been silent [s], once that is too long; None while it lives."""
@@ -86,6 +88,7 @@ class HeartbeatThread(threading.Thread):
                 return
             if socket in ready and self._heard(socket):
                 answered, silence = sequence, 0.0
+                self._sign.give()
                 continue
             # Only time in which this thread really listened counts as silence: while somebody else
             # holds the interpreter's lock, answers wait in the socket.

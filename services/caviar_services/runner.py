@@ -36,6 +36,7 @@ from caviar_services.exchange import (
     run_info,
 )
 from caviar_services.registry import load
+from caviar_services.restarts import restart_status
 from caviar_services.service import Prepared, Service
 from caviar_services.termination import TERMINATED, SignalTermination, Termination
 
@@ -334,8 +335,15 @@ def run_service(
     endpoint: str,
     connect_timeout_s: float,
     credentials: Credentials | None = None,
+    *,
+    restarted: bool = False,
 ) -> int:
-    """Run a registered implementation as the service ``name``; the exit status."""
-    termination = SignalTermination()
+    """Run a registered implementation as the service ``name``; the exit status.
+
+    ``restarted``: somebody starts this process again whenever that is not 0.
+    """
+    termination = SignalTermination(0 if restarted else TERMINATED)
     cls = load(role, use)
-    return Runner(name, cls, use, endpoint, connect_timeout_s, termination, credentials=credentials).run()
+    runner = Runner(name, cls, use, endpoint, connect_timeout_s, termination, credentials=credentials)
+    status = runner.run()
+    return restart_status(status, runner.ended) if restarted else status

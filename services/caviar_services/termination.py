@@ -44,10 +44,12 @@ class SignalTermination(Termination):
     thread of its own hears of the signal through ``set_wakeup_fd``, and ends the process when the
     main thread has not done so in time. Against a call that holds the interpreter's lock not even
     that helps: then the process ends as soon as the lock is free, or is killed by whoever started it.
+    ``status`` is that of a process that ends so.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, status: int = TERMINATED) -> None:
         super().__init__()
+        self._status = status
         self._read, write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         signal.set_wakeup_fd(write, warn_on_full_buffer=False)
         for number in (signal.SIGTERM, signal.SIGINT):
@@ -63,5 +65,5 @@ class SignalTermination(Termination):
             if {signal.SIGTERM, signal.SIGINT} & set(os.read(self._read, 64)):
                 self.requested = True
                 words = "ended by SIGTERM in the middle of a call that does not return"
-                self.enforce(TERMINATION_GRACE_S, TERMINATED, words)
+                self.enforce(TERMINATION_GRACE_S, self._status, words)
                 return

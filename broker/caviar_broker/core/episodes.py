@@ -12,7 +12,7 @@ from caviar_broker.core.run import Run
 from caviar_broker.core.schedule import EpisodeSchedule
 from caviar_broker.core.tasks import GrantOrder
 from caviar_broker.core.transitions import RunEvent, RunState, ServiceEvent, ServiceState, TaskState
-from caviar_protocol.messages import Cancel, Done, EpisodeEnd, Fault, Grant, Report, Reset
+from caviar_protocol.messages import RUN_COMPLETE, Cancel, Done, EpisodeEnd, Fault, Grant, Report, Reset
 from caviar_protocol.tables import located
 
 _ACTIVE, _RUNNING = ServiceState.ACTIVE, RunState.RUNNING
@@ -115,7 +115,7 @@ class Episodes:
             run.enter(RunEvent.NEXT_EPISODE, now)
             self.begin(now)
         else:
-            run.stop("the run is complete", now)
+            run.stop(RUN_COMPLETE, now)
 
     def close(self, now: int) -> None:
         """The episode is over, or the run ended within it."""

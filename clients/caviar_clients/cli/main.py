@@ -40,6 +40,10 @@ Keys = Annotated[
 Http = Annotated[str, typer.Option(help="HOST:PORT: serve status, orders and WebSocket there")]
 Resume = Annotated[Path | None, typer.Option(help="go on with the run in this directory, whose broker died")]
 ScenarioOrNone = Annotated[Path | None, typer.Argument(help="scenario file (TOML)", show_default=False)]
+Restarted = Annotated[
+    bool,
+    typer.Option("--restarted", help="for a container that is started again whenever this status is not 0"),
+]
 ANY_PORT = "tcp://127.0.0.1:0"
 
 
@@ -92,33 +96,40 @@ def broker(
     keys: Keys = None,
     http: Http = "",
     resume: Resume = None,
+    restarted: Restarted = False,
 ) -> None:
     """Run only the broker; start the services with `caviar service`, here or on other machines."""
-    from caviar_broker.__main__ import parser, serve
+    from caviar_broker.__main__ import DEFAULT_BIND, parser, serve
     from caviar_broker.security.local import check_bind
+    from caviar_clients.cli.restarted import RunInProgress
     from caviar_clients.cli.run import run_directory
     from caviar_clients.sessions.checking import checked_scenario
 
+    options = ["--bind", bind] + (["--keys", str(keys)] if keys else []) + ["--restarted"] * restarted
+    options += ["--http", http] if http else []
     if resume is not None:
         _nothing_else(scenario, frames, seed, pace)
-        again = ["--resume", str(resume), "--bind", bind]
-        again += [] if keys is None else ["--keys", str(keys)]
-        again += ["--http", http] if http else []
-        raise typer.Exit(serve(parser().parse_args(again)))
+        raise typer.Exit(serve(parser().parse_args(["--resume", str(resume), *options])))
     if scenario is None:
         raise RunError("give a scenario file, or --resume with the directory of a run")
     checked = checked_scenario(scenario, frames, seed, pace)
-    check_bind(bind, keys=keys is not None)
+    check_bind(bind or DEFAULT_BIND, keys=keys is not None)
+    current = RunInProgress(out, checked.run.name) if restarted else None
+    left = current.directory() if current else None
+    if current is not None and left is not None:
+        typer.echo(f"run {left}: its broker died, another one goes on with it")
+        resumed = parser().parse_args(["--resume", str(left), *options])
+        raise typer.Exit(current.serve(left, lambda: serve(resumed)))
     directory = run_directory(out, checked.run.name)
     typer.echo(f"run {directory}; start its services with --broker and this broker's address:")
     for name, spec in checked.services.items():
         use = "IMPLEMENTATION" if spec.remote else spec.use
         typer.echo("  " + shlex.join(["caviar", "service", name, "--use", f"{spec.role}:{use}"]))
-    arguments = [str(scenario), "--bind", bind, "--directory", str(directory)]
-    told = {"--frames": frames, "--seed": seed, "--keys": keys, "--http": http or None, "--pace": pace}
-    for name, value in told.items():
-        arguments += [] if value is None else [name, str(value)]
-    raise typer.Exit(serve(parser().parse_args(arguments)))
+    options += [str(scenario), "--directory", str(directory)]
+    for name, value in (("--frames", frames), ("--seed", seed), ("--pace", pace)):
+        options += [] if value is None else [name, str(value)]
+    arguments = parser().parse_args(options)
+    raise typer.Exit(current.serve(directory, lambda: serve(arguments)) if current else serve(arguments))
 
 
 @app.command()
@@ -135,11 +146,12 @@ def service(
     broker_key: Annotated[
         Path | None, typer.Option(help="public key of the broker, broker.pub", envvar="CAVIAR_BROKER_KEY")
     ] = None,
+    restarted: Restarted = False,
 ) -> None:
     """Run one service and connect it to a broker."""
     from caviar_services.__main__ import serve
 
-    raise typer.Exit(serve(name, use, broker, connect_timeout, key, broker_key))
+    raise typer.Exit(serve(name, use, broker, connect_timeout, key, broker_key, restarted=restarted))
 
 
 @app.command()
