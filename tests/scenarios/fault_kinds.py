@@ -77,8 +77,8 @@ def stop(_: Any) -> None:
 
 def disconnect(_: Any) -> None:
     """Lose every TCP connection, as when a router between restarts."""
-    for entry in os.listdir("/proc/self/fd"):
-        with suppress(OSError), socket.socket(fileno=os.dup(int(entry))) as connection:
+    for entry in tuple(Path("/proc/self/fd").iterdir()):
+        with suppress(OSError), socket.socket(fileno=os.dup(int(entry.name))) as connection:
             if connection.family in (socket.AF_INET, socket.AF_INET6):
                 connection.getpeername()  # raises where it listens
                 connection.shutdown(socket.SHUT_RDWR)
@@ -115,11 +115,11 @@ def stranger(body: Callable[[Any], None]) -> Callable[[Any], None]:
                 if os.fork() == 0:  # nobody's child, so that nobody has to wait for it
                     import zmq
 
-                    dealer = zmq.Context().socket(zmq.DEALER)
-                    dealer.setsockopt(zmq.LINGER, 100)
-                    dealer.setsockopt(zmq.SNDTIMEO, 50)
-                    dealer.connect(endpoint)
-                    with suppress(zmq.Again):
+                    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+                    with context, context.socket(zmq.DEALER) as dealer, suppress(zmq.Again):
+                        dealer.setsockopt(zmq.LINGER, 200)
+                        dealer.setsockopt(zmq.SNDTIMEO, 50)
+                        dealer.connect(endpoint)
                         body(dealer)
             finally:
                 os._exit(0)

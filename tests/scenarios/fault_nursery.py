@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import importlib
 import os
 import select
 import signal
@@ -27,6 +28,19 @@ from typing import Any, BinaryIO
 
 import msgspec
 
+IMPORTED = (
+    "fault_kinds",
+    "stateful",
+    "caviar_broker.__main__",
+    "caviar_clients.cli.launch",
+    "caviar_services.__main__",
+    "caviar_services.agent.los_beam",
+    "caviar_services.channel.free_space",
+    "caviar_services.link.beams",
+    "caviar_services.recorder.mcap",
+    "caviar_services.world.trajectory",
+)
+"""What processes are forked for: they find it imported."""
 _SUBREAPER = 36
 """``PR_SET_CHILD_SUBREAPER`` of prctl(2): orphans below this process become its children."""
 
@@ -155,9 +169,10 @@ def _become(command: list[str], fds: list[int], session: bool, env: Mapping[str,
 
 
 def _run(module: str, arguments: list[str]) -> int:
+    import fault_kinds
+
     import caviar_broker.__main__ as broker
     import caviar_services.__main__ as services
-    import fault_kinds
 
     sys.argv = [module, *arguments]
     if module == "caviar_broker":
@@ -252,18 +267,8 @@ def _end_orphans(directory: Path) -> list[str]:
 def main() -> None:
     """Attend to one case after another."""
     ctypes.CDLL(None).prctl(_SUBREAPER, 1, 0, 0, 0)
-    import caviar_broker.__main__
-    import caviar_clients.cli.launch
-    import caviar_protocol.scenario_checks
-    import caviar_services.agent.los_beam
-    import caviar_services.channel.free_space
-    import caviar_services.link.beams
-    import caviar_services.recorder.mcap
-    import caviar_services.runner
-    import caviar_services.world.trajectory
-    import fault_kinds
-
-    assert fault_kinds is not None
+    for module in IMPORTED:
+        importlib.import_module(module)
     gc.collect()
     gc.freeze()
     answers = os.fdopen(os.dup(1), "w")
