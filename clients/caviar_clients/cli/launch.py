@@ -83,6 +83,8 @@ class Launcher:
     """Services that died and that the broker waits for."""
     _brokers: int = 0
     """That were started after others that died, since frames were last finished."""
+    _lost: set[str] = field(default_factory=set)
+    """Services that the broker gave up: no SHUTDOWN reaches them."""
     _restarts: dict[str, int] = field(default_factory=dict)
     """Processes that were started since a service was last there."""
     _over: bool = False
@@ -270,6 +272,7 @@ class Launcher:
         self._brokers += 1
         self.resume, self.bind, self._rest = True, self.endpoint, b""
         self._awaited.clear()
+        self._lost.clear()
         self._restarts.clear()
         self._start_broker()
         self._start_services()
@@ -299,7 +302,10 @@ class Launcher:
 
     def _heed(self, kind: str, name: str) -> None:
         """The broker waits for a service to come back (``timeouts.rejoin_s``), or it has come."""
-        if kind == "back":
+        if kind == "lost":
+            self._lost.add(name)
+        elif kind == "back":
+            self._lost.discard(name)
             self._awaited.discard(name)
             self._restarts.pop(name, None)
         elif kind == "away" and not self._over:
@@ -338,6 +344,8 @@ class Launcher:
 
     def _end_all(self) -> None:
         processes = [child.process for child in self._children.values()]
+        for name in self._lost & self._children.keys():
+            self._children[name].process.kill()  # stopped, or cut off
         if self._broker is not None:
             processes.append(self._broker)
             if self._broker.stdin is not None:
