@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import select
 import subprocess
@@ -14,10 +15,13 @@ import msgspec
 from fault_nursery import Case, Result
 from scenarios_support import HERE, SCENARIOS
 
+from caviar_protocol.digest import RunDigest
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import Recording
 
 FRAMES = 40
+LENIENT_FRAMES = 120
+"""Where frames go on without the victim, which needs time to come back."""
 FAULT_FRAME = 10
 CASE_S = 3.0
 """[s] that a case may last."""
@@ -96,11 +100,12 @@ def scenario(
     rejoin_s: float = 20.0,
     *,
     budget_ms: float = 0.0,
+    frames: int = FRAMES,
     remote: bool = False,
 ) -> Path:
     """Smoke with a sensor that has state, and the policy of one of its services."""
     text = (SCENARIOS / "smoke.toml").read_text()
-    text = text.replace("frames = 100\n", f"frames = {FRAMES}\ncheckpoint_frames = 7\n")
+    text = text.replace("frames = 100\n", f"frames = {frames}\ncheckpoint_frames = 7\n")
     text = text.replace('"action", "link"]', '"action", "link", "lidar"]') + SENSORS
     if victim:
         head, mark, tail = text.partition(f"[services.{victim}]\n")
@@ -133,14 +138,28 @@ def told_after_s(result: Result, kind: str, service: str) -> float:
 
 
 def assert_whole(result: Result, directory: Path, frames: int = FRAMES) -> Recording:
-    """No hang, no process left; the recording has every frame, and the digest that the broker chained."""
+    """No hang, no process left; the recording has every frame, and the digest that the broker chained.
+
+    Of a run that ended early the recorder may have a frame more, whose DONE the broker did not wait for.
+    """
     assert result.leftovers == []
     assert result.fault_at > 0.0, "nothing went wrong"
     recording = Recording(directory)
     report = recording.run_digest()
-    assert report.digest == result.digest, f"{report.frames} frames are recorded, {result.frames} were decided"
-    assert len(recording) == report.frames >= frames
+    assert report.damage == ()
+    assert frames <= result.frames <= len(recording)
+    assert digest_of(recording, result.frames) == result.digest
+    assert result.error or report.digest == result.digest
     return recording
+
+
+def digest_of(recording: Recording, frames: int) -> str:
+    """Of the first frames of a recording."""
+    chain = RunDigest()
+    for frame in itertools.islice(recording.frames(), frames):
+        fresh = [(i.topic, i.source, i.digest) for i in frame.inputs if i.status is Status.FRESH]
+        chain.add_frame(frame.episode, frame.number, fresh)
+    return chain.hexdigest()
 
 
 def assert_same(result: Result, directory: Path, digest: str) -> None:
@@ -161,7 +180,7 @@ def assert_blamed(result: Result, directory: Path, victim: str, words: Sequence[
 def assert_went_on(result: Result, directory: Path, victim: str, policy: str) -> None:
     """The run came to its end; frames that were decided without the victim say so, and blame it alone."""
     assert result.error == ""
-    recording = assert_whole(result, directory)
+    recording = assert_whole(result, directory, LENIENT_FRAMES)
     lacking = [
         entry for frame in recording.frames() for entry in frame.inputs if entry.status is not Status.FRESH
     ]
