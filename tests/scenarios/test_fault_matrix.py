@@ -1,13 +1,13 @@
-"""Whoever is wronged, and however: no hang, the culprit is named, nothing is lost (contract, clauses 9 to 18)."""
+"""Whoever is wronged, and however: no hang, the culprit is named, nothing is lost (clauses 9 to 18)."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from fault_matrix import (
-    CASE_S,
     FAULT_FRAME,
     FAULTS,
     HANG_S,
@@ -19,6 +19,7 @@ from fault_matrix import (
     assert_same,
     assert_went_on,
     assert_whole,
+    in_time,
     scenario,
     told,
     told_after_s,
@@ -67,7 +68,7 @@ def assert_named(result: Result, victim: str, fault: str) -> None:
     """The run says who was lost, and why; of a stopped one at once."""
     (text,) = told(result, "lost", victim)
     assert repr(victim) in text
-    assert f"frame {FAULT_FRAME}" in text
+    assert re.search(r"in frame \d+: .* since its grant", text)
     assert WORDS[fault] in text
     assert len(told(result, "back", victim)) == 1
 
@@ -80,7 +81,7 @@ def test_under_wait_the_run_ends_as_if_nothing_had_happened(
     result, directory = wronged(nursery, scenario(tmp_path), victim, fault)
     assert_same(result, directory, digest)
     assert_named(result, victim, fault)
-    assert result.seconds <= CASE_S
+    assert in_time(result)
 
 
 @pytest.mark.parametrize("fault", [fault for fault in FAULTS if fault != "garbage"])
@@ -92,7 +93,7 @@ def test_under_hold_and_drop_the_frames_go_on_and_say_what_they_lack(
     result, directory = wronged(nursery, path, victim, fault)
     assert_went_on(result, directory, victim, policy)
     assert_named(result, victim, fault)
-    assert result.seconds <= CASE_S
+    assert in_time(result)
 
 
 @pytest.mark.parametrize("fault", [fault for fault in FAULTS if fault != "garbage"])
@@ -103,7 +104,7 @@ def test_under_abort_the_run_ends_with_blame(
     path = scenario(tmp_path, victim, "abort", rejoin_s=0.0, budget_ms=1000.0)
     result, directory = wronged(nursery, path, victim, fault)
     assert_blamed(result, directory, victim, (WORDS[fault], f"frame {FAULT_FRAME}"))
-    assert result.seconds <= CASE_S
+    assert in_time(result)
 
 
 @pytest.mark.parametrize(("victim", "policy"), [(s, p) for s in SERVICES for p in POLICIES[s]])
@@ -114,7 +115,7 @@ def test_garbage_ends_the_run_with_blame_whatever_the_policy(
     path = scenario(tmp_path, victim, policy, budget_ms=1000.0)
     result, directory = wronged(nursery, path, victim, "garbage")
     assert_blamed(result, directory, victim, (WORDS["garbage"],))
-    assert result.seconds <= CASE_S
+    assert in_time(result)
 
 
 @pytest.mark.parametrize("policy", ["wait", "hold", "drop"])
@@ -126,7 +127,7 @@ def test_a_run_that_waits_for_nobody_ends_with_blame(
     path = scenario(tmp_path, "channel", policy, rejoin_s=0.0, budget_ms=1000.0)
     result, directory = wronged(nursery, path, "channel", fault)
     assert_blamed(result, directory, "channel", (WORDS[fault], f"frame {FAULT_FRAME}"))
-    assert result.seconds <= CASE_S
+    assert in_time(result)
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -144,7 +145,7 @@ def test_a_broker_that_is_wronged_goes_on_or_is_followed_by_another(
     else:
         words = {"garbage": "not in the protocol", "flood": "a connection from 127.0.0.1 was cut off"}
         assert any(words[fault] in text for text in told(result, "note"))
-    assert result.seconds <= CASE_S + 1.0
+    assert in_time(result)
 
 
 @pytest.mark.parametrize("fault", ["kill", "stop"])
@@ -153,7 +154,7 @@ def test_without_rejoining_a_broker_that_dies_is_named(nursery: Nursery, tmp_pat
     assert "the broker died" in result.error
     assert WORDS[fault] in result.error
     assert result.leftovers == []
-    assert result.seconds <= CASE_S
+    assert in_time(result)
     assert directory.is_dir()
 
 
