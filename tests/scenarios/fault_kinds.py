@@ -27,7 +27,11 @@ def arm_service(case: Case, name: str) -> None:
     """In the process of a service: go wrong in the frame of the case, unless somebody did before."""
     if name != case.victim:
         return
+    from caviar_services import runner
     from caviar_services.runner import Runner
+
+    if case.remote:
+        runner.host_identity = lambda: "another machine"  # type: ignore[attr-defined]
 
     granted = Runner._grant
 

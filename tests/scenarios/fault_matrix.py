@@ -114,8 +114,10 @@ def scenario(
         if budget_ms:
             line = next(number for number, told in enumerate(lines) if told.startswith("budget_ms"))
             lines[line] = f"budget_ms = {budget_ms:g}"
-        added = [f'policy = "{policy}"', *(["remote = true"] if remote else [])]
-        text = head + mark + "\n".join([*added, *lines]) + "\n"
+        if remote:
+            line = next(number for number, told in enumerate(lines) if told.startswith("use"))
+            lines[line] = 'use = "remote"'
+        text = head + mark + "\n".join([f'policy = "{policy}"', *lines]) + "\n"
     text += f"\n[timeouts]\nrejoin_s = {rejoin_s:g}\nstall_s = 5.0\n"
     path = folder / f"{victim or 'all'}-{policy}-{rejoin_s:g}-{budget_ms:g}{'-remote' * remote}.toml"
     path.write_text(text)

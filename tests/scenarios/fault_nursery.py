@@ -41,6 +41,8 @@ IMPORTED = (
     "caviar_services.world.trajectory",
 )
 """What processes are forked for: they find it imported."""
+REMOTE_ENDS_S = 5.0
+"""[s] that services started by hand get to end behind the run."""
 _SUBREAPER = 36
 """``PR_SET_CHILD_SUBREAPER`` of prctl(2): orphans below this process become its children."""
 
@@ -56,6 +58,8 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
     """Name of a function of `fault_kinds`."""
     frame: int = 10
     """In which frame, once in the run."""
+    remote: str = ""
+    """``ROLE:NAME`` of a victim that is started by hand, as if elsewhere, and again when it is away."""
     limit_s: float = 20.0
     """After which the case is ended by force."""
 
@@ -72,6 +76,8 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
     """As the broker told them, each with ``at``, the monotonic time of its arrival [s]."""
     fault_at: float = 0.0
     """Monotonic time of the fault [s]; 0: there was none."""
+    remotes: list[int] = msgspec.field(default_factory=list)
+    """Exit statuses of the processes that were started by hand."""
     leftovers: list[str] = msgspec.field(default_factory=list)
     """Processes that survived the run."""
 
@@ -198,6 +204,7 @@ def follow(case: Case) -> Result:
     path, directory = Path(case.scenario), Path(case.directory)
     launcher = launch.Launcher(load_scenario(path), path, directory)
     notices: list[dict[str, Any]] = []
+    remotes: list[Forked] = []
     outcome: Mapping[str, Any] = {}
     error = ""
     started = time.monotonic()
@@ -206,10 +213,16 @@ def follow(case: Case) -> Result:
             for event in launcher.events():
                 if event["event"] == "notice":
                     notices.append(dict(event) | {"at": time.monotonic()})
+                away = event["event"] == "notice" and event["kind"] == "away"
+                if case.remote and (away or event["event"] == "listening"):
+                    for before in remotes:
+                        before.send_signal(signal.SIGCONT)
+                    remotes.append(_remote(case, launcher))
                 elif event["event"] == "finished":
                     outcome = event
     except CaviarError as raised:
         error = str(raised)
+    statuses = [remote.wait(REMOTE_ENDS_S) for remote in remotes]
     mark = directory / "fault"
     return Result(
         error=error or outcome["error"],
@@ -218,8 +231,16 @@ def follow(case: Case) -> Result:
         frames=outcome.get("frames", 0),
         seconds=time.monotonic() - started,
         notices=notices,
+        remotes=statuses,
         fault_at=float(mark.read_text()) if mark.exists() else 0.0,
     )
+
+
+def _remote(case: Case, launcher: Any) -> Forked:
+    """The victim, started by hand."""
+    command = [sys.executable, "-m", "caviar_services", case.victim, "--use", case.remote]
+    with (Path(case.directory) / "remote.log").open("ab") as log:
+        return Forked([*command, "--broker", launcher.endpoint], stdout=log, stderr=log)
 
 
 def _attend(case: Case) -> Result:
