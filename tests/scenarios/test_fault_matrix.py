@@ -72,6 +72,7 @@ def assert_named(result: Result, victim: str, fault: str) -> None:
     assert re.search(r"in frame \d+: .* since its grant", text)
     assert WORDS[fault] in text
     assert len(told(result, "back", victim)) == 1
+    assert told(result, "restarted") == []  # the broker outlived it
 
 
 @pytest.mark.parametrize("fault", [fault for fault in FAULTS if fault != "garbage"])
