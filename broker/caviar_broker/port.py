@@ -56,6 +56,9 @@ class Port:
         self.socket.setsockopt(zmq.ROUTER_MANDATORY, 1)
         self.socket.setsockopt(zmq.HEARTBEAT_IVL, max(1, liveness_ms // 3))
         self.socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, max(1, liveness_ms // 2))
+        # What waits of a peer is bounded by the guard. A queue that is full would have libzmq 4.3.5 abort
+        # when the peer goes: its heartbeats then write to a connection that has ended (libzmq issue 4841).
+        self.socket.setsockopt(zmq.RCVHWM, 0)
         self.socket.setsockopt(zmq.MAXMSGSIZE, limits.MAX_BODY)
         self.socket.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
         self.socket.setsockopt(zmq.IPV6, int("[" in endpoint))

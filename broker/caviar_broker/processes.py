@@ -28,8 +28,7 @@ class LocalProcess:
     @property
     def stopped(self) -> bool:
         """Whether it is stopped by a signal (SIGSTOP, SIGTSTP), so that it cannot answer."""
-        fields = _stat(self.pid)
-        return fields is not None and fields[0] == "T"
+        return is_stopped(self.pid)
 
     def close(self) -> None:
         """Stop watching."""
@@ -49,6 +48,17 @@ def watch(pid: int) -> LocalProcess | None:
         raise ProcessLookupError(pid) from None
     except OSError:
         return None
+
+
+def is_stopped(pid: int) -> bool:
+    """Whether a process is stopped by a signal (SIGSTOP, SIGTSTP), so that it cannot answer."""
+    fields = _stat(pid)
+    return fields is not None and fields[0] == "T"
+
+
+def describe_stop(pid: int) -> str:
+    """A stopped process for people."""
+    return f"its process {pid} is stopped (SIGSTOP or SIGTSTP)"
 
 
 def describe_exit(code: int) -> str:

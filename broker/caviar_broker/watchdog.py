@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from caviar_broker.core.clock import FrameClock
-from caviar_broker.processes import LocalProcess, watch
+from caviar_broker.processes import LocalProcess, describe_stop, watch
 
 CHECK_NS = 50_000_000
 """[ns] between looks at whether a local process is stopped; its death shows at once."""
@@ -137,7 +137,7 @@ class Watchdog:
             if now - watched.died_at > SUPERVISOR_NS:
                 self.lost(service, process.verdict())
         elif process.stopped:
-            self.lost(service, f"its process {process.pid} is stopped (SIGSTOP or SIGTSTP)")
+            self.lost(service, describe_stop(process.pid))
         elif watched.cut_off_at is not None and now - watched.cut_off_at > SUPERVISOR_NS:
             self.lost(service, f"its process {process.pid} lives, but its connection is gone")
 

@@ -103,10 +103,23 @@ def test_a_broker_that_cannot_start_says_why(tmp_path: Path) -> None:
     assert alive(started) == []
 
 
+def test_a_broker_that_is_stopped_is_named_at_once(tmp_path: Path) -> None:
+    with launcher(tmp_path, frames=1_000_000) as started:
+        wait_for(started, "frame")
+        assert started._broker is not None
+        os.kill(started._broker.pid, signal.SIGSTOP)
+        began = time.monotonic()
+        with pytest.raises(RunError, match=f"the broker died: its process {started._broker.pid} is stopped"):
+            list(started.events())
+        assert time.monotonic() - began < 1.0
+    assert alive(started) == []
+
+
 def test_a_broker_that_hangs_is_given_up_once_its_services_have_left_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(launch, "BROKER_S", 0.3)
+    monkeypatch.setattr(launch, "is_stopped", lambda _: False)  # it hangs, and nobody can tell why
     with launcher(tmp_path, frames=1_000_000, extra="[timeouts]\nshutdown_s = 0.5\n") as started:
         wait_for(started, "frame")
         assert started._broker is not None

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from caviar_broker.processes import describe_exit
+from caviar_broker.processes import describe_exit, describe_stop, is_stopped
 from caviar_clients.cli.borrowed import BorrowedKey
 from caviar_protocol.errors import RunError
 from caviar_protocol.scenario import Scenario, ServiceSpec
@@ -27,6 +27,8 @@ BROKER_S = 10.0
 """[s] that the broker gets to end after its last service, beyond the run's ``shutdown_s``."""
 MAX_RESTARTS = 5
 """Processes that are started for a service that died, before it comes back."""
+LOOK_S = 0.05
+"""[s] between looks at whether the broker's process is stopped; its death shows at once."""
 TAIL = 1 << 16
 """[B] of a log that are looked at for its last line."""
 
@@ -74,12 +76,16 @@ class Launcher:
     _key: BorrowedKey = field(init=False)
     _children: dict[str, Child] = field(default_factory=dict)
     _broker: subprocess.Popen[bytes] | None = None
+    _verdict: str = ""
+    """Why the broker was ended by force; "" if it was not."""
     _selector: selectors.BaseSelector = field(default_factory=selectors.DefaultSelector)
     _rest: bytes = b""
     _awaited: set[str] = field(default_factory=set)
     """Services that died and that the broker waits for."""
     _brokers: int = 0
     """That were started after others that died, since frames were last finished."""
+    _lost: set[str] = field(default_factory=set)
+    """Services that the broker gave up: no SHUTDOWN reaches them."""
     _restarts: dict[str, int] = field(default_factory=dict)
     """Processes that were started since a service was last there."""
     _over: bool = False
@@ -113,11 +119,12 @@ class Launcher:
         if self._broker is None:
             self._start_broker()
         while not self._finished:
-            for key, _ in self._selector.select(timeout=1.0):
+            for key, _ in self._selector.select(LOOK_S):
                 if isinstance(key.data, Child):
                     self._child_died(key.data)
                 else:
                     yield from self._broker_said()
+            self._look_after_broker()
             if self._give_up_at is not None and time.monotonic() > self._give_up_at:
                 raise RunError("the broker does not answer: all services have ended, and it does not")
 
@@ -231,6 +238,13 @@ class Launcher:
                 self._over, self._frames = True, event["frames"]
             yield event
 
+    def _look_after_broker(self) -> None:
+        """End a broker that is stopped; that it has ended is then seen like any other end."""
+        broker = self._broker
+        if not self._verdict and broker is not None and broker.poll() is None and is_stopped(broker.pid):
+            self._verdict = describe_stop(broker.pid)
+            broker.kill()
+
     # --- another broker ----------------------------------------------------------------------------
 
     def _may_resume(self) -> bool:
@@ -255,11 +269,13 @@ class Launcher:
         _wait([broker], KILL_AFTER_S)
         if broker.poll() is None:
             broker.kill()
-        verdict = describe_exit(broker.wait())
+        status = broker.wait()
+        verdict, self._verdict = self._verdict or describe_exit(status), ""
         self._end_services()
         self._brokers += 1
         self.resume, self.bind, self._rest = True, self.endpoint, b""
         self._awaited.clear()
+        self._lost.clear()
         self._restarts.clear()
         self._start_broker()
         self._start_services()
@@ -282,14 +298,17 @@ class Launcher:
             raise RunError("the broker closed its output and does not end")
         if not self._over:
             log = (self.directory / "logs" / "broker.log").read_text(errors="replace").strip()
-            last = log.splitlines()[-1] if log else describe_exit(status)
+            last = self._verdict or (log.splitlines()[-1] if log else describe_exit(status))
             told = last.startswith("caviar broker: ")
             raise RunError(last.removeprefix("caviar broker: ") if told else f"the broker died: {last}")
         return {"event": "ended", "status": status}
 
     def _heed(self, kind: str, name: str) -> None:
         """The broker waits for a service to come back (``timeouts.rejoin_s``), or it has come."""
-        if kind == "back":
+        if kind == "lost":
+            self._lost.add(name)
+        elif kind == "back":
+            self._lost.discard(name)
             self._awaited.discard(name)
             self._restarts.pop(name, None)
         elif kind == "away" and not self._over:
@@ -328,6 +347,8 @@ class Launcher:
 
     def _end_all(self) -> None:
         processes = [child.process for child in self._children.values()]
+        for name in self._lost & self._children.keys():
+            self._children[name].process.kill()  # stopped, or cut off
         if self._broker is not None:
             processes.append(self._broker)
             if self._broker.stdin is not None:
