@@ -68,6 +68,7 @@ class Desk:
             "resume": self._resume,
             "step": self._step,
             "stop": self._stop,
+            "gateway": self._gateway,
             "serving": self._note_serving,
             "note": self._note,
         }
@@ -227,6 +228,14 @@ class Desk:
         self.server.feed(event)
         view = self.server.clock.look(time.monotonic_ns())
         return {"ok": True, "state": view.state, "paused": view.paused, "frame": view.frame}
+
+    def _gateway(self, _: Mapping[str, Any]) -> Answer:
+        """What the gateway needs to connect: whoever may ask here may read the keys directory as well."""
+        access = self.server.access
+        if access is None:
+            return {"ok": True, "keys": None}
+        pair = msgspec.to_builtins(access.gateway)
+        return {"ok": True, "keys": str(access.directory.resolve()), **pair, "broker": access.pair.public}
 
     def _note_serving(self, request: Mapping[str, Any]) -> Answer:
         url = request.get("http")

@@ -122,6 +122,8 @@ class BrokerServer:
         self._next_check = self._look_at = 0
         self._port = Port(endpoint, plan.limits.liveness, access, peer_limits)
         self._guard = self._port.guard
+        self.access = access
+        """The keys of those who may take part; None: every process of this machine may."""
         self.endpoint = self._port.endpoint
         """Where services connect to."""
         self.loop = Loop()

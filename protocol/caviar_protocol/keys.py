@@ -11,7 +11,7 @@ A keys directory holds, all of them TOML that a person can read:
 ``authorized.toml``
     The public keys that may take part, each with its name, role and, if need be, topics.
 ``tokens.toml``
-    SHA-256 of the tokens that may look at a run over HTTP, each with a name and a role.
+    SHA-256 of the tokens of the HTTP interface, each with a name and a role.
 
 Keys are CurveZMQ's (Curve25519), 32 B written as 40 characters of Z85 (ZeroMQ RFC 26 and 32).
 """
@@ -39,6 +39,9 @@ TOKENS = "tokens.toml"
 KEY_VARIABLE, BROKER_KEY_VARIABLE = "CAVIAR_KEY", "CAVIAR_BROKER_KEY"
 """Environment variables with the paths of a service's secret key and of its broker's public one."""
 ROLES: tuple[str, ...] = get_args(Role)
+VIEWER, OPERATOR = "viewer", "operator"
+TOKEN_ROLES = (VIEWER, OPERATOR, *ROLES)
+"""What the holder of a token may be over HTTP."""
 
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
 Z85 = Annotated[str, Meta(pattern=r"^[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}$")]
@@ -61,13 +64,24 @@ class Authorization(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class Token(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """One token that opens a run to a reader over HTTP."""
+    """One token of the HTTP interface."""
 
     name: Name
+    """Of who has it; of the service, where it is for one."""
     role: str
-    """What its holder may do; the HTTP interface says which words there are."""
+    """``viewer`` may read, ``operator`` may also pause, step and stop; a role of a service, such as
+    ``agent``, may take part through the gateway under that name and in that role, and nothing else."""
     sha256: Annotated[str, Meta(pattern=r"^[0-9a-f]{64}$")]
     """Of the token's text; the token itself is written nowhere."""
+
+    def may(self, role: str) -> bool:
+        """Whether it is good for what a viewer or an operator does."""
+        return self.role == OPERATOR or self.role == role
+
+    @property
+    def of_service(self) -> bool:
+        """Whether a service takes part with it."""
+        return self.role in ROLES
 
 
 class Pair(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -180,9 +194,32 @@ def write_authorized(directory: Path, entries: Sequence[Authorization]) -> None:
 
 
 def read_tokens(directory: Path) -> tuple[Token, ...]:
-    """Tokens that open runs to readers; none where there is no such file yet."""
+    """The tokens of the HTTP interface; none where there is no such file yet.
+
+    Raises `SetupError` naming file and line, where one of them has a role that there is not.
+    """
     path = directory / TOKENS
-    return _decoded(path, _TokenFile, "mend that line").token if path.exists() else ()
+    if not path.exists():
+        return ()
+    tokens = _decoded(path, _TokenFile, "mend that line").token
+    for number, token in enumerate(tokens):
+        if token.role not in TOKEN_ROLES:
+            raise SetupError(
+                f"{path}, line {_line_of_role(path, number)}: {token.name!r} has the role {token.role!r}; "
+                f"write one of {', '.join(TOKEN_ROLES)}"
+            )
+    return tokens
+
+
+def _line_of_role(path: Path, number: int) -> int:
+    """Line with the role of a token, or, where it is written in another way, the one where it begins."""
+    seen, begins = -1, 1
+    for line, text in enumerate(path.read_text(errors="replace").splitlines(), start=1):
+        if re.match(r"\s*\[\[\s*token\s*\]\]", text):
+            seen, begins = seen + 1, line if seen < number else begins
+        elif seen == number and re.match(r"""\s*["']?role["']?\s*=""", text):
+            return line
+    return begins
 
 
 def write_tokens(directory: Path, entries: Sequence[Token]) -> None:

@@ -1,4 +1,4 @@
-"""An agent that speaks ZeroMQ, over WebSockets: ``websocket_zmq.py AGENT.py ws://HOST:PORT/ws NAME``.
+"""An agent that speaks ZeroMQ, over WebSockets: ``websocket_zmq.py AGENT.py ws://HOST:PORT/ws NAME [TOKEN]``.
 
 What the agent takes for ``zmq`` is the few lines below, written from SPEC.md, section WebSocket, so that
 the very same agent is a peer over either transport.
@@ -15,6 +15,8 @@ from typing import Any
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
+TOKEN = sys.argv[4:]
+
 
 class Dealer:
     """The part of a DEALER socket that the agent uses."""
@@ -30,7 +32,8 @@ class Dealer:
         self._socket.close()
 
     def connect(self, url: str) -> None:
-        self._socket = connect(url, subprotocols=["caviar.v1"], max_size=None).__enter__()  # type: ignore[list-item]
+        offered = ["caviar.v1", *(f"bearer.{token}" for token in TOKEN)]
+        self._socket = connect(url, subprotocols=offered, max_size=None).__enter__()  # type: ignore[arg-type]
 
     def send_multipart(self, parts: list[bytes]) -> None:
         lengths = [len(part) for part in parts]
@@ -75,7 +78,7 @@ def main() -> None:
     module: Any = types.ModuleType("zmq")
     module.Context, module.DEALER = Context, None
     sys.modules["zmq"] = module
-    agent, *sys.argv[1:] = sys.argv[1:]
+    agent, *sys.argv[1:] = sys.argv[1:4]
     runpy.run_path(agent, run_name="__main__")
 
 

@@ -192,7 +192,10 @@ def test_what_is_no_address_is_refused(address: str) -> None:
 
 def test_a_token_with_an_unknown_role_is_refused_by_naming_the_known_ones(tmp_path: Path) -> None:
     (tmp_path / "tokens.toml").write_text(token_file(x=("x", "king")))
-    with pytest.raises(SetupError, match="'king'; write one of viewer, operator, world"):
+    with pytest.raises(
+        SetupError,
+        match=r"tokens.toml, line \d+: 'x' has the role 'king'; write one of viewer, operator, world",
+    ):
         Tokens(tmp_path)
 
 

@@ -12,8 +12,10 @@ import socket
 import sys
 from pathlib import Path
 
+from caviar_broker.api.link import DeskLink
 from caviar_broker.api.tokens import Tokens, http_address
 from caviar_protocol.errors import CaviarError, RunError
+from caviar_protocol.keys import Credentials, Pair
 
 UNREACHABLE_MS = 8000
 """[ms] for which a peer's machine may acknowledge nothing, or have no room, until its connection is gone."""
@@ -28,12 +30,13 @@ async def serve(run: Path, address: str, keys: Path | None) -> None:
     import uvicorn
 
     from caviar_broker.api.app import make_app
-    from caviar_broker.api.gateway import Gateway
-    from caviar_broker.api.link import DeskLink
+    from caviar_broker.api.gateway import REMEDY, Gateway
     from caviar_protocol.websocket import MAX_FRAME
 
+    desk = DeskLink(run)
+    keys, credentials = await _of_the_broker(desk, keys)
     host, port = http_address(address, keys)
-    tokens, desk = Tokens(keys), DeskLink(run)
+    tokens = Tokens(keys)
     status = (await desk.ask("status"))["status"]
 
     async def tell(service: str, text: str) -> None:
@@ -41,7 +44,8 @@ async def serve(run: Path, address: str, keys: Path | None) -> None:
         with contextlib.suppress(RunError):
             await desk.ask("note", service=service if service in known else "", text=text[:1000])
 
-    gateway = Gateway(_reachable(status["endpoint"]), tokens, tell)
+    remedy = f"{REMEDY} --directory {keys}" if keys is not None else REMEDY
+    gateway = Gateway(_reachable(status["endpoint"]), tokens, tell, credentials, remedy)
     listening = _listening(host, port)
     config = uvicorn.Config(
         make_app(desk, tokens, gateway),
@@ -74,6 +78,21 @@ async def serve(run: Path, address: str, keys: Path | None) -> None:
         follower.cancel()
         desk.close()
         gateway.close()
+
+
+async def _of_the_broker(desk: DeskLink, keys: Path | None) -> tuple[Path | None, Credentials | None]:
+    """Keys directory, and the gateway's own key where the broker has keys, whose directory it then is.
+
+    The key comes by the broker's desk, where only the broker's user can ask, and is written nowhere.
+    """
+    told = await desk.ask("gateway")
+    if told["keys"] is None:
+        return keys, None
+    directory = Path(told["keys"])
+    if keys is not None and keys.resolve() != directory:
+        raise RunError(f"the broker has its keys and tokens in {directory}, not in {keys}; leave out --keys")
+    pair = Pair(public=told["public"], secret=told["secret"])
+    return directory, Credentials(pair, told["broker"])
 
 
 def _listening(host: str, port: int) -> socket.socket:

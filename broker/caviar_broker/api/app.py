@@ -14,9 +14,10 @@ from caviar_broker.api.door import LocalOnly, token_of
 from caviar_broker.api.gateway import Gateway
 from caviar_broker.api.link import DeskLink, DeskRefusal
 from caviar_broker.api.metrics import CONTENT_TYPE, metrics
-from caviar_broker.api.tokens import OPERATOR, VIEWER, Tokens
+from caviar_broker.api.tokens import Tokens
 from caviar_broker.desk import MAX_STEPS
 from caviar_protocol.errors import RunError
+from caviar_protocol.keys import OPERATOR, VIEWER
 from caviar_protocol.messages import PROTOCOL_VERSION
 
 ABOUT = """Look at a running CAVIAR broker, and have it pause, step or stop.

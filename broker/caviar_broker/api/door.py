@@ -9,7 +9,8 @@ from starlette.datastructures import Headers
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from caviar_broker.api.tokens import Token, Tokens, is_loopback
+from caviar_broker.api.tokens import Tokens, is_loopback
+from caviar_protocol.keys import Token
 from caviar_protocol.websocket import SUBPROTOCOL
 
 BEARER = "bearer."
@@ -55,10 +56,20 @@ def _host(url: str) -> str:
 
 def token_of(headers: Headers, tokens: Tokens, subprotocols: Iterable[str] = ()) -> Token | None:
     """The token of ``Authorization: Bearer TOKEN``, or of the subprotocol ``bearer.TOKEN``."""
+    text = _text(headers, subprotocols)
+    return tokens.find(text) if text else None
+
+
+def token_shown(headers: Headers, subprotocols: Iterable[str]) -> bool:
+    """Whether a request shows a token, of whatever worth."""
+    return bool(_text(headers, subprotocols))
+
+
+def _text(headers: Headers, subprotocols: Iterable[str]) -> str:
     scheme, _, text = headers.get("authorization", "").partition(" ")
     if scheme.lower() != "bearer":
         text = next((p.removeprefix(BEARER) for p in subprotocols if p.startswith(BEARER)), "")
-    return tokens.find(text.strip()) if text.strip() else None
+    return text.strip()
 
 
 def subprotocol(offered: Iterable[str]) -> str | None:

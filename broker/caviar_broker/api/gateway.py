@@ -6,19 +6,23 @@ Each has a DEALER socket of its own, closed with it, so that the broker sees whe
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import Awaitable, Callable
 from typing import Any
 
 import msgspec
 import zmq
 import zmq.asyncio
+from starlette.responses import JSONResponse
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from caviar_broker.api.door import subprotocol, token_of
-from caviar_broker.api.tokens import Token, Tokens
+from caviar_broker.api.door import subprotocol, token_of, token_shown
+from caviar_broker.api.tokens import Tokens
+from caviar_broker.grumbles import Grumbles
 from caviar_protocol import messages as m
 from caviar_protocol.codec import decode_message, encode_message, message_type
 from caviar_protocol.errors import ProtocolError
+from caviar_protocol.keys import Credentials, Token
 from caviar_protocol.websocket import MAX_FRAME, join_parts, split_frame
 
 SLOW_S = 5.0
@@ -33,6 +37,7 @@ LOOK_S = 1.0
 """[s] between looks at whether a token still holds."""
 MAX_CONNECTIONS = 256
 TOO_LARGE = 1009
+REMEDY = "make one with  caviar keys token NAME --role ROLE"
 ABNORMAL = 1006
 """Close code of a connection that ended without a close frame."""
 
@@ -50,10 +55,23 @@ class Gateway:
         Who may take part.
     tell
         Called with a service, or "", and what the run's user should know about it.
+    credentials
+        Its key, which a broker with keys admits for the services that have a token, and that broker's.
+    remedy
+        What makes a token.
     """
 
-    def __init__(self, endpoint: str, tokens: Tokens, tell: Tell) -> None:
+    def __init__(
+        self,
+        endpoint: str,
+        tokens: Tokens,
+        tell: Tell,
+        credentials: Credentials | None = None,
+        remedy: str = REMEDY,
+    ) -> None:
         self._endpoint, self._tokens, self._tell = endpoint, tokens, tell
+        self._credentials, self._remedy = credentials, remedy
+        self._grumbles = Grumbles()
         self._context: zmq.asyncio.Context = zmq.asyncio.Context()
         self.connections = 0
         """How many are open."""
@@ -62,8 +80,8 @@ class Gateway:
         """Serve one WebSocket until it closes."""
         offered = socket.scope.get("subprotocols", [])
         token = token_of(socket.headers, self._tokens, offered)
-        if self._tokens.exist and (token is None or not token.of_service):
-            await socket.close(1008, "this asks for a token of a service")
+        if why := self._refusal(token, token_shown(socket.headers, offered)):
+            await self._refuse(socket, why)
             return
         if self.connections >= MAX_CONNECTIONS:
             await socket.close(1013, f"there are {MAX_CONNECTIONS} connections already")
@@ -75,10 +93,34 @@ class Gateway:
         finally:
             self.connections -= 1
 
+    def _refusal(self, token: Token | None, shown: bool) -> str:
+        """Why a request is refused; empty where it is not."""
+        if token is not None:
+            what = f"the token of {token.name!r} is for {token.role}, and a service takes part here"
+            return "" if token.of_service else f"{what}; {self._remedy}"
+        if not self._tokens.exist:
+            return "" if self._credentials is None else f"this broker has keys, and no tokens; {self._remedy}"
+        what = "this token is not, or no longer, known" if shown else "there is no token in the request"
+        return f"{what}; {self._remedy}"
+
+    async def _refuse(self, socket: WebSocket, why: str) -> None:
+        peer = socket.client.host if socket.client else "somebody"
+        text = self._grumbles.tell(
+            "refused", f"a WebSocket from {peer} was refused: {why}", time.monotonic_ns()
+        )
+        if text:
+            await self._tell("", text)
+        await socket.send_denial_response(JSONResponse({"detail": why}, 403))
+
     def _dealer(self) -> zmq.asyncio.Socket:
         dealer = self._context.socket(zmq.DEALER)
         dealer.linger = LINGER_MS
         dealer.sndhwm = dealer.rcvhwm = QUEUE
+        dealer.setsockopt(zmq.IPV6, int("[" in self._endpoint))
+        if self._credentials is not None:
+            dealer.curve_publickey = self._credentials.pair.public.encode()
+            dealer.curve_secretkey = self._credentials.pair.secret.encode()
+            dealer.curve_serverkey = self._credentials.broker.encode()
         dealer.connect(self._endpoint)
         return dealer
 

@@ -5,41 +5,9 @@ from __future__ import annotations
 import hashlib
 import ipaddress
 from pathlib import Path
-from typing import Annotated, get_args
-
-import msgspec
 
 from caviar_protocol.errors import SetupError
-from caviar_protocol.messages import Role
-
-FILE = "tokens.toml"
-VIEWER, OPERATOR = "viewer", "operator"
-SERVICE_ROLES: tuple[str, ...] = get_args(Role)
-ROLES = (VIEWER, OPERATOR, *SERVICE_ROLES)
-
-
-class Token(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One token, of which only the digest is known."""
-
-    name: Annotated[str, msgspec.Meta(min_length=1, max_length=200)]
-    """Of who has it; of the service, where it is for one."""
-    role: str
-    """``viewer`` may read, ``operator`` may also pause, step and stop; a role of a service, such as
-    ``agent``, may take part through the gateway under that name and in that role, and nothing else."""
-    sha256: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
-
-    def may(self, role: str) -> bool:
-        """Whether it is good for what a viewer or an operator does."""
-        return self.role == OPERATOR or self.role == role
-
-    @property
-    def of_service(self) -> bool:
-        """Whether a service takes part with it."""
-        return self.role in SERVICE_ROLES
-
-
-class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    token: tuple[Token, ...] = ()
+from caviar_protocol.keys import TOKENS, Token, read_tokens
 
 
 class Tokens:
@@ -52,8 +20,8 @@ class Tokens:
     """
 
     def __init__(self, directory: Path | None) -> None:
-        self._path = directory / FILE if directory is not None else None
-        self._stamp: tuple[int, int] | None = None
+        self._directory = directory
+        self._stamp: tuple[int, int, int] | None = None
         self._by_digest: dict[str, Token] = {}
         self._read()
 
@@ -75,33 +43,27 @@ class Tokens:
 
     def _read(self) -> None:
         """Take in the file, if it changed; one that cannot be used changes nothing."""
-        if self._path is None:
+        if self._directory is None:
             return
         try:
-            self._take_in(self._path)
+            self._take_in(self._directory)
         except SetupError:
             if self._stamp is None:
                 raise
 
-    def _take_in(self, path: Path) -> None:
+    def _take_in(self, directory: Path) -> None:
+        path = directory / TOKENS
         try:
             found = path.stat()
-            stamp = (found.st_mtime_ns, found.st_size)
-            if stamp == self._stamp:
-                return
-            tokens = msgspec.toml.decode(path.read_bytes(), type=_File).token
         except FileNotFoundError:
             self._by_digest = {}
             return
         except OSError as error:
             raise SetupError(f"cannot read {path}: {error.strerror}") from error
-        except msgspec.DecodeError as error:
-            raise SetupError(f"{path} is not what it should be: {error}; mend that line") from None
-        for token in tokens:
-            if token.role not in ROLES:
-                known = ", ".join(ROLES)
-                raise SetupError(f"{path}: {token.name!r} has the role {token.role!r}; write one of {known}")
-        self._stamp, self._by_digest = stamp, {token.sha256: token for token in tokens}
+        stamp = (found.st_mtime_ns, found.st_ino, found.st_size)
+        if stamp != self._stamp:
+            tokens = read_tokens(directory)
+            self._stamp, self._by_digest = stamp, {token.sha256: token for token in tokens}
 
 
 def http_address(text: str, keys: Path | None) -> tuple[str, int]:

@@ -1,4 +1,4 @@
-"""Which key may take part as what: the authorized file, asked at each handshake and at each HELLO."""
+"""Which key may take part as what: the authorized file and the tokens, asked at each handshake and HELLO."""
 
 from __future__ import annotations
 
@@ -6,15 +6,30 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import zmq
 from zmq.utils import z85
 
 from caviar_protocol.errors import SetupError
-from caviar_protocol.keys import AUTHORIZED, BROKER, Authorization, read_authorized, read_pair
+from caviar_protocol.keys import (
+    AUTHORIZED,
+    BROKER,
+    TOKENS,
+    Authorization,
+    Pair,
+    Token,
+    read_authorized,
+    read_pair,
+    read_tokens,
+)
 
 BAR_NS = 10_000_000_000
 """[ns] for which a key that was cut off for its behaviour is not let in again."""
 LOCAL = "services of this run"
 """What the key is called that a launcher gives to the services that it starts itself."""
+GATEWAY = "WebSocket gateway"
+"""What the key is called with which the gateway connects those who have a token."""
+
+_Stamp = tuple[int, int, int]
 
 
 class Access:
@@ -23,7 +38,8 @@ class Access:
     Parameters
     ----------
     directory
-        Keys directory, with ``broker.key`` and ``authorized.toml``, which may change at any time.
+        Keys directory, with ``broker.key``, and ``authorized.toml`` and ``tokens.toml``, which may change at
+        any time.
     local_key
         Public key of the services that a launcher starts itself; "" for none.
     local
@@ -41,8 +57,13 @@ class Access:
             )
         self.pair = read_pair(path)
         self._local_key, self._local = local_key, dict(local or {})
+        public, secret = zmq.curve_keypair()
+        self.gateway = Pair(public=public.decode(), secret=secret.decode())
+        """Pair of the gateway of this broker, which is written nowhere and ends with it."""
         self._stamp = self._look()
-        self._entries = {entry.public: entry for entry in read_authorized(directory)}
+        self._entries: dict[str, Authorization] = {}
+        self._tokens: tuple[Token, ...] = ()
+        self._read()
         self._barred: dict[str, int] = {}
         """Public key to the instant until which it is barred [ns]."""
 
@@ -50,6 +71,8 @@ class Access:
         """What a key is called; "" for one that is not authorized."""
         if key == self._local_key:
             return LOCAL
+        if key == self.gateway.public:
+            return GATEWAY
         entry = self._entries.get(key)
         return entry.name if entry else ""
 
@@ -69,6 +92,8 @@ class Access:
             if known is None:
                 return f"the key given to services that this run starts is not for {name!r}"
             return _role_refusal(name, known, role)
+        if key == self.gateway.public:
+            return self._token_refusal(name, role)
         entry = self._entries.get(key)
         if entry is None:
             return "its key is not authorized (caviar keys authorize)"
@@ -76,32 +101,58 @@ class Access:
             return f"its key is authorized for the name {entry.name!r}, not for {name!r}"
         return _role_refusal(name, entry.role, role) or _topic_refusal(entry, outputs)
 
-    def bar(self, key: str) -> None:
-        """Do not let a key in for `BAR_NS`."""
-        if key and key != self._local_key:
+    def bar(self, key: str, service: str = "") -> None:
+        """Do not let a key in for `BAR_NS`; of the gateway's, which all its peers share, only the service."""
+        if key == self.gateway.public:
+            self._barred[f"{GATEWAY} {service}"] = time.monotonic_ns() + BAR_NS
+        elif key and key != self._local_key:
             self._barred[key] = time.monotonic_ns() + BAR_NS
 
     def reload(self) -> str | None:
-        """Read the authorized file again if it changed: None if it did not, else why it cannot be used,
+        """Read the two files again if they changed: None if it did not, else why it cannot be used,
         in which case nothing changes, or an empty text."""
         stamp = self._look()
         if stamp == self._stamp:
             return None
         self._stamp = stamp
         try:
-            entries = read_authorized(self.directory)
+            self._read()
         except SetupError as error:
             return f"{error}; what stood there before goes on holding"
-        self._entries = {entry.public: entry for entry in entries}
         return ""
 
-    def _look(self) -> tuple[int, int, int]:
-        """Changes whenever the file does."""
+    def _read(self) -> None:
+        """Take in both files: each holds by itself, also where the other one cannot be used."""
         try:
-            found = (self.directory / AUTHORIZED).stat()
-        except OSError:
-            return (0, 0, 0)
-        return (found.st_mtime_ns, found.st_ino, found.st_size)
+            self._entries = {entry.public: entry for entry in read_authorized(self.directory)}
+        finally:
+            self._tokens = read_tokens(self.directory)
+
+    def _look(self) -> tuple[_Stamp, _Stamp]:
+        """Changes whenever one of the files does."""
+        return _stamp(self.directory / AUTHORIZED), _stamp(self.directory / TOKENS)
+
+    def _token_refusal(self, name: str, role: str) -> str:
+        """Why nobody may appear as that service by the gateway, which sees to whose token it is."""
+        roles = [token.role for token in self._tokens if token.name == name and token.of_service]
+        if not roles:
+            return f"there is no token of a service {name!r} ({self._remedy(name, role or 'ROLE')})"
+        if self._barred.get(f"{GATEWAY} {name}", 0) > time.monotonic_ns():
+            return f"the WebSocket of {name!r} was cut off, and it is barred for {BAR_NS // 10**9} s"
+        if role and role not in roles:
+            return f"the token of {name!r} is for {roles[0]}, not for {role}"
+        return ""
+
+    def _remedy(self, name: str, role: str) -> str:
+        return f"caviar keys token {name} --role {role} --directory {self.directory}"
+
+
+def _stamp(path: Path) -> _Stamp:
+    try:
+        found = path.stat()
+    except OSError:
+        return (0, 0, 0)
+    return (found.st_mtime_ns, found.st_ino, found.st_size)
 
 
 def answer(access: Access | None, request: Sequence[bytes]) -> tuple[list[bytes], str]:

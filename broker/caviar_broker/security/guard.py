@@ -321,7 +321,7 @@ class Guard:
         if peer.wire is not None:
             peer.wire.end()
         if bar and self.access is not None:
-            self.access.bar(peer.key)
+            self.access.bar(peer.key, peer.service)
         elif bar:
             self._bar(peer.address)
         if not self._lost(peer.route, why):

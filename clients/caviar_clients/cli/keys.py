@@ -94,12 +94,13 @@ def revoke(
 @app.command()
 def token(
     name: Annotated[str, typer.Argument(help="of who gets it", show_default=False)],
-    role: Annotated[str, typer.Option(help="what its holder may do")] = "reader",
+    role: Annotated[str, typer.Option(help="what its holder may do: " + ", ".join(k.TOKEN_ROLES))] = k.VIEWER,
     directory: Directory = DEFAULT,
 ) -> None:
     """Make a token for the HTTP interface. It is shown once; only its digest is kept."""
     k.check_name(name)
-    k.check_name(role)
+    if role not in k.TOKEN_ROLES:
+        raise SetupError(f"there is no role {role!r}; write one of: {', '.join(k.TOKEN_ROLES)}")
     tokens = k.read_tokens(directory)
     if any(other.name == name for other in tokens):
         raise SetupError(f"there is a token {name!r} already; revoke it first:  caviar keys revoke {name}")

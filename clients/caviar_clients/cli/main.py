@@ -15,14 +15,17 @@ from caviar_clients.cli import bench
 from caviar_clients.cli.keys import app as keys
 from caviar_protocol.errors import CaviarError, RunError
 
+RUN, LOOK, MEASURE, OPERATE = "Run", "Look", "Measure", "Operate"
+"""Groups of commands in the help."""
+
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     help="Co-simulation of machine-learning-based 6G in virtual worlds.",
 )
-app.add_typer(bench.app, name="bench")
-app.add_typer(keys, name="keys")
+app.add_typer(bench.app, name="bench", rich_help_panel=MEASURE)
+app.add_typer(keys, name="keys", rich_help_panel=OPERATE)
 _console = Console()
 _errors = Console(stderr=True)
 
@@ -52,7 +55,7 @@ def _nothing_else(*values: object) -> None:
         raise RunError("a run goes on as it began: --resume takes no scenario, frames, seed or --embedded")
 
 
-@app.command()
+@app.command(rich_help_panel=RUN)
 def run(
     scenario: ScenarioOrNone = None,
     frames: Frames = None,
@@ -82,7 +85,7 @@ def run(
     )
 
 
-@app.command()
+@app.command(rich_help_panel=RUN)
 def broker(
     scenario: ScenarioOrNone = None,
     bind: Annotated[
@@ -132,7 +135,7 @@ def broker(
     raise typer.Exit(current.serve(directory, lambda: serve(arguments)) if current else serve(arguments))
 
 
-@app.command()
+@app.command(rich_help_panel=RUN)
 def service(
     name: Annotated[str, typer.Argument(help="name of the service in the scenario")],
     use: Annotated[str, typer.Option(help="implementation, as ROLE:NAME, for example channel:sionna-rt")],
@@ -154,7 +157,7 @@ def service(
     raise typer.Exit(serve(name, use, broker, connect_timeout, key, broker_key, restarted=restarted))
 
 
-@app.command()
+@app.command(rich_help_panel=LOOK)
 def why(
     run: Annotated[
         Path | None, typer.Argument(help="directory of a run; by default the newest in ./runs")
@@ -166,7 +169,7 @@ def why(
     why_command(run, _console)
 
 
-@app.command()
+@app.command(rich_help_panel=OPERATE)
 def doctor() -> None:
     """Check what this machine has; for what is missing, say the command that mends it."""
     from caviar_clients.cli import doctor as checks
@@ -176,7 +179,7 @@ def doctor() -> None:
     raise typer.Exit(checks.exit_status(found))
 
 
-@app.command()
+@app.command(rich_help_panel=MEASURE)
 def stability(
     group: Annotated[list[str] | None, typer.Option(help="only this group of cases; may be repeated")] = None,
     json: Annotated[Path | None, typer.Option(help="write the results to this file")] = None,
@@ -189,7 +192,7 @@ def stability(
     raise typer.Exit(ask(_console, group or (), json, markdown, traced))
 
 
-@app.command()
+@app.command(rich_help_panel=OPERATE)
 def conform(
     listen: Annotated[str, typer.Option(help="address to listen on; port 0: any")] = "tcp://127.0.0.1:5590",
     role: Annotated[
@@ -221,7 +224,7 @@ def conform(
     raise typer.Exit(status)
 
 
-@app.command()
+@app.command(rich_help_panel=LOOK)
 def inspect(
     run: RunDirectory,
     digest: Annotated[bool, typer.Option("--digest", help="only the digest, from the payloads")] = False,
@@ -233,7 +236,7 @@ def inspect(
     raise typer.Exit(inspect_command(run, digest, json))
 
 
-@app.command()
+@app.command(rich_help_panel=LOOK)
 def plot(
     run: RunDirectory,
     out: Annotated[Path | None, typer.Option(help="where the PNGs go; by default into the run")] = None,
@@ -248,7 +251,7 @@ def plot(
         typer.echo(picture)
 
 
-@app.command()
+@app.command(rich_help_panel=LOOK)
 def video(
     run: RunDirectory,
     out: Annotated[
@@ -271,7 +274,7 @@ def video(
     typer.echo(f"{film.file}: {film.frames} frames of {film.size[0]}×{film.size[1]}, {pace}")
 
 
-@app.command()
+@app.command(rich_help_panel=RUN)
 def replay(
     run: RunDirectory,
     replace: Annotated[
@@ -302,7 +305,7 @@ def replay(
     raise typer.Exit(status)
 
 
-@app.command()
+@app.command(rich_help_panel=MEASURE)
 def budget(
     run: RunDirectory,
     json: Annotated[Path | None, typer.Option(help="write all figures to this file")] = None,
@@ -313,7 +316,7 @@ def budget(
     budget_run(run, _console, json)
 
 
-@app.command()
+@app.command(rich_help_panel=MEASURE)
 def tradeoff(
     source: Annotated[
         Path,
