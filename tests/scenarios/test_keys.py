@@ -34,7 +34,7 @@ def test_a_run_with_keys_lets_the_authorized_agent_in_and_writes_no_secret(
     tmp_path: Path, keys: Path
 ) -> None:
     """No file and no output holds the secrets of agent, broker, launcher or token."""
-    token = caviar("keys", "token", "visitor", "--role", "reader", "--directory", keys).output.strip()
+    token = caviar("keys", "token", "visitor", "--role", "viewer", "--directory", keys).output.strip()
     out, temporary = tmp_path / "runs", tmp_path / "tmp"
     temporary.mkdir()
     command = [sys.executable, "-m", "caviar_clients", "run", str(SCENARIOS / "remote.toml"), "--frames", "5"]
@@ -127,10 +127,10 @@ def test_keys_are_listed_revoked_and_not_made_twice(keys: Path) -> None:
 
 
 def test_of_a_token_only_its_digest_is_kept(keys: Path) -> None:
-    token = caviar("keys", "token", "visitor", "--role", "reader", "--directory", keys).output.strip()
+    token = caviar("keys", "token", "visitor", "--role", "viewer", "--directory", keys).output.strip()
     kept = k.read_tokens(keys)
     assert [(entry.name, entry.role) for entry in kept] == [("visitor", "reader")]
     assert token not in (keys / k.TOKENS).read_text()
-    again = caviar("keys", "token", "visitor", "--role", "reader", "--directory", keys)
+    again = caviar("keys", "token", "visitor", "--role", "viewer", "--directory", keys)
     assert again.status == 1
     assert "revoke it first" in again.output
