@@ -129,7 +129,7 @@ def test_keys_are_listed_revoked_and_not_made_twice(keys: Path) -> None:
 def test_of_a_token_only_its_digest_is_kept(keys: Path) -> None:
     token = caviar("keys", "token", "visitor", "--role", "viewer", "--directory", keys).output.strip()
     kept = k.read_tokens(keys)
-    assert [(entry.name, entry.role) for entry in kept] == [("visitor", "reader")]
+    assert [(entry.name, entry.role) for entry in kept] == [("visitor", "viewer")]
     assert token not in (keys / k.TOKENS).read_text()
     again = caviar("keys", "token", "visitor", "--role", "viewer", "--directory", keys)
     assert again.status == 1
