@@ -28,6 +28,7 @@ from caviar_broker.control import Control, Reporter, stop_on_signals
 from caviar_broker.core.plan import plan_run
 from caviar_broker.core.resumption import Resumption
 from caviar_broker.desk import Desk
+from caviar_broker.deskplace import refuse_second
 from caviar_broker.journal import JournalFile, mend_journal
 from caviar_broker.record import RunRecord, read_record
 from caviar_broker.replaying import with_replay
@@ -42,6 +43,7 @@ from caviar_protocol.scenario_checks import with_overrides
 from caviar_protocol.scenario_loader import load_scenario
 
 JOURNAL = "journal.msgpack"
+LATENCIES = "latency.npz"
 DEFAULT_BIND = "tcp://127.0.0.1:5570"
 
 
@@ -61,11 +63,13 @@ def serve(arguments: argparse.Namespace) -> int:
     local = {name: spec.role for name, spec in told.services.items() if not spec.remote}
     access = _access(arguments, local)
     check_bind(record.endpoint, keys=access is not None)
-    beside = HttpBeside(directory, arguments.http, arguments.keys)
+    beside = HttpBeside(directory, arguments.http, arguments.keys, again=bool(arguments.resume))
     plan = replace(plan_run(told, record.run, briefings(told, directory)), epoch=record.epoch)
     plan = with_replay(plan, told.replay)
     checkpoints = CheckpointFiles(directory)
-    resumption = _left(directory, checkpoints) if arguments.resume else None
+    # A launcher that starts its broker again has not summed the run up yet.
+    last, episodes = "summary.json" if arguments.control else LATENCIES, record.scenario.run.episodes
+    resumption = _left(directory, checkpoints, episodes, last) if arguments.resume else None
     scheduling = prefer()  # before the threads of the port are started, which inherit it
     reporter = Reporter(sys.stdout.fileno(), directory / "events.jsonl", arguments.control)
     with closing(JournalFile(directory / JOURNAL, plan.epoch, checkpoints)) as journal:
@@ -94,7 +98,7 @@ def serve(arguments: argparse.Namespace) -> int:
             tune_collector()
             outcome = server.run()
     statistics = server.statistics
-    statistics.save(directory / "latency.npz")
+    statistics.save(directory / LATENCIES)
     reporter.finished(
         error=outcome.error,
         culprit=outcome.culprit,
@@ -135,15 +139,26 @@ def _resumed(arguments: argparse.Namespace) -> tuple[RunRecord, Path]:
     """A run that another broker left, in the next epoch."""
     directory: Path = arguments.resume.resolve()
     before = read_record(directory)
+    refuse_second(directory)
     endpoint = arguments.bind or before.endpoint
     return msgspec.structs.replace(before, epoch=before.epoch + 1, endpoint=endpoint), directory
 
 
-def _left(directory: Path, checkpoints: CheckpointFiles) -> Resumption | None:
-    """What the journal says, which then is ready to be gone on with."""
+def _left(directory: Path, checkpoints: CheckpointFiles, episodes: int, last: str) -> Resumption | None:
+    """What the journal says, which then is ready to be gone on with.
+
+    Raises `RunError` where every frame is finished and there is the file that is written ``last``.
+    """
     journal = directory / JOURNAL
     mend_journal(journal)
-    return read_resumption(journal, checkpoints) if journal.exists() else None
+    found = read_resumption(journal, checkpoints) if journal.exists() else None
+    over = found is not None and found.finished >= found.frames and found.episode + 1 >= episodes
+    if over and (directory / last).exists():
+        raise RunError(
+            f"cannot go on with {directory}: all its frames are finished, and so is it; "
+            "to run its scenario again leave out --resume"
+        )
+    return found
 
 
 def _made(directory: Path) -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 from caviar_broker.api.tokens import http_address
 from caviar_broker.processes import describe_exit
 from caviar_broker.server import BrokerServer
+from caviar_protocol.errors import SetupError
 
 END_S = 3.0
 """[s] that it gets to end behind the broker's last frame, which it sees by itself."""
@@ -27,16 +29,20 @@ class HttpBeside:
         ``HOST:PORT``; "" for none.
     keys
         Keys directory with the tokens.
+    again
+        Whether the run goes on: then the process of the broker before may hold the address a moment longer.
 
-    Raises `SetupError` where the address is none, or open to others without tokens.
+    Raises `SetupError` where the address is none, taken, or open to others without tokens.
     """
 
-    def __init__(self, directory: Path, address: str, keys: Path | None) -> None:
+    def __init__(self, directory: Path, address: str, keys: Path | None, again: bool = False) -> None:
         self._directory, self._address, self._keys = directory, address, keys
         self._process: subprocess.Popen[bytes] | None = None
         self._fd = -1
         if address:
-            http_address(address, keys)
+            place = http_address(address, keys)
+            if not again:
+                _refuse_taken(*place)
 
     def start(self, server: BrokerServer) -> None:
         """Start it; the server's loop notes when it ends."""
@@ -70,3 +76,18 @@ class HttpBeside:
             self._process.kill()
             self._process.wait()
         os.close(self._fd)
+
+
+def _refuse_taken(host: str, port: int) -> None:
+    """`SetupError` where nothing can listen: the process itself would end beside a run that goes on."""
+    try:
+        family, kind, number, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, number) as trial:
+            trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            trial.bind(place)
+            trial.listen()
+    except OSError as error:
+        raise SetupError(
+            f"HTTP cannot be served at {host}:{port}: {error.strerror}; "
+            "choose another address, or port 0 for any"
+        ) from None

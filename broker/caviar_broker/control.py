@@ -86,7 +86,8 @@ def _words(line: Line) -> str:
     match line["event"]:
         case "notice":
             where = f" frame {line['frame']}" if line["frame"] >= 0 else ""
-            return f"{line['kind']}: {line['service']}{where}: {line['text']}"
+            who = f"{line['service']}{where}: " if line["service"] or where else ""
+            return f"{line['kind']}: {who}{line['text']}"
         case "listening":
             return f"listening on {line['endpoint']}"
         case _:

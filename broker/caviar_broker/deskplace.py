@@ -31,10 +31,7 @@ class DeskPlace:
     def __init__(self, directory: Path) -> None:
         self._directory, self._elsewhere = directory, ""
         self._told: dict[str, str | int] = {}
-        if _answers(directory):
-            raise RunError(
-                f"another broker runs in {directory} already; stop it, or choose another directory"
-            )
+        refuse_second(directory)
         self.socket = _listening()
         path = directory / SOCKET
         try:
@@ -70,6 +67,12 @@ class DeskPlace:
             shutil.rmtree(self._elsewhere, ignore_errors=True)
 
 
+def refuse_second(directory: Path) -> None:
+    """Raises `RunError` where a broker runs in a directory."""
+    if _answers(directory):
+        raise RunError(f"another broker runs in {directory} already; stop it, or choose another directory")
+
+
 def connect(directory: Path) -> socket.socket:
     """A connection to the desk of the broker that runs in a directory.
 
@@ -96,6 +99,8 @@ def connect(directory: Path) -> socket.socket:
                 connection.settimeout(REACH_S)
                 return connection
     connection.close()
+    if not directory.is_dir():
+        raise RunError(f"there is no directory {directory}; give that of a run, such as runs/NAME-DATE-TIME")
     raise RunError(f"no broker runs in {directory}: it has ended, or was never started there")
 
 

@@ -44,6 +44,11 @@ def read_record(directory: Path) -> RunRecord:
     try:
         return msgspec.json.decode(path.read_bytes(), type=RunRecord)
     except OSError as error:
+        if (directory / "journal.msgpack").exists():
+            raise RecordingError(
+                f"cannot go on with {directory}: it has no {NAME}, and an embedded run cannot be "
+                "gone on with; run its scenario again"
+            ) from error
         raise RecordingError(
             f"cannot go on with {directory}: {path}: {error.strerror}; give the directory of a run"
         ) from error

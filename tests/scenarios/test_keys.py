@@ -65,7 +65,7 @@ def test_a_run_with_keys_lets_the_authorized_agent_in_and_writes_no_secret(
     assert "refused the key: it is not authorized" in outcomes["stranger"].output
     assert outcomes["agent"].status == 0, outcomes["agent"].output
     assert process.returncode == 0, "".join(output)
-    assert f"CAVIAR_KEY=agent.key and CAVIAR_BROKER_KEY={keys}/broker.pub" in "".join(output)
+    assert f"CAVIAR_KEY={keys}/agent.key and CAVIAR_BROKER_KEY={keys}/broker.pub" in "".join(output)
     assert "a connection from 127.0.0.1 was refused: the key" in next(out.rglob("events.jsonl")).read_text()
     secrets = [k.read_pair(keys / f"{name}.key").secret for name in ("broker", "agent", "stranger")]
     said = "".join([*output, outcomes["stranger"].output, outcomes["agent"].output]).encode()

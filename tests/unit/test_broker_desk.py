@@ -294,7 +294,7 @@ def answered(directory: Path) -> bool:
 def test_why_says_where_no_broker_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(RunError, match=f"no broker runs in {tmp_path}"):
         why(tmp_path)
-    with pytest.raises(RunError, match=r"no broker runs in .*missing"):
+    with pytest.raises(RunError, match=r"there is no directory .*missing; give"):
         why(tmp_path / "missing")
     monkeypatch.chdir(tmp_path)
     with pytest.raises(RunError, match=r"no broker runs below .*runs; name the directory"):

@@ -26,7 +26,9 @@ def is_local(endpoint: str) -> bool:
 
 
 def check_bind(endpoint: str, keys: bool) -> None:
-    """Raises `RunError` where others could reach a broker that asks nobody for a key."""
+    """Raises `RunError` for what is no address, and where others could reach a broker without keys."""
+    if "://" not in endpoint:
+        raise RunError(f"{endpoint!r} is no address to listen at; write it as tcp://127.0.0.1:5570")
     if keys or is_local(endpoint):
         return
     raise RunError(

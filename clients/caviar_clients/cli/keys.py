@@ -13,6 +13,8 @@ import zmq
 from caviar_protocol import keys as k
 from caviar_protocol.errors import SetupError
 from caviar_protocol.messages import Role
+from caviar_protocol.tables import suggestion
+from caviar_protocol.topics import PAYLOADS
 
 app = typer.Typer(no_args_is_help=True, help="Keys: who may take part in a run, and as what.")
 
@@ -51,9 +53,11 @@ def authorize(
     """Let a key take part in the runs of the broker of this keys directory."""
     listed = None if topics is None else tuple(topic for topic in topics.split(",") if topic)
     for topic in listed or ():
-        k.check_name(topic)
+        if topic not in PAYLOADS:
+            raise SetupError(f"--topics {topics}: no topic is named {topic!r}; {suggestion(topic, PAYLOADS)}")
     _free(directory, name)
-    _add(directory, k.Authorization(name=name, role=_role(role), public=k.read_public(file), topics=listed))
+    public = k.read_public(_where_made(file, directory))
+    _add(directory, k.Authorization(name=name, role=_role(role), public=public, topics=listed))
 
 
 @app.command("list")
@@ -69,7 +73,8 @@ def list_keys(directory: Directory = DEFAULT) -> None:
     for row in rows:
         typer.echo("  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)))
     if not rows:
-        typer.echo(f"nobody is authorized in {directory}")
+        missing = "" if directory.is_dir() else ", which does not exist"
+        typer.echo(f"nobody is authorized in {directory}{missing}")
 
 
 @app.command()
@@ -94,13 +99,15 @@ def revoke(
 @app.command()
 def token(
     name: Annotated[str, typer.Argument(help="of who gets it", show_default=False)],
-    role: Annotated[str, typer.Option(help="what its holder may do: " + ", ".join(k.TOKEN_ROLES))] = k.VIEWER,
+    role: Annotated[
+        str, typer.Option(help="viewer: look on; operator: also pause, step, stop; or the role of a service")
+    ] = k.VIEWER,
     directory: Directory = DEFAULT,
 ) -> None:
     """Make a token for the HTTP interface. It is shown once; only its digest is kept."""
     k.check_name(name)
     if role not in k.TOKEN_ROLES:
-        raise SetupError(f"there is no role {role!r}; write one of: {', '.join(k.TOKEN_ROLES)}")
+        raise SetupError(f"no token has the role {role!r}; {suggestion(role, k.TOKEN_ROLES)}")
     tokens = k.read_tokens(directory)
     if any(other.name == name for other in tokens):
         raise SetupError(f"there is a token {name!r} already; revoke it first:  caviar keys revoke {name}")
@@ -108,6 +115,14 @@ def token(
     digest = hashlib.sha256(text.encode()).hexdigest()
     k.write_tokens(directory, [*tokens, k.Token(name=name, role=role, sha256=digest)])
     typer.echo(text)
+
+
+def _where_made(file: Path, directory: Path) -> Path:
+    """``file``. `SetupError` where it is not there but in the keys directory, into which `new` writes."""
+    made = directory / file.name
+    if not file.exists() and made != file and made.exists():
+        raise SetupError(f"{file} does not exist, but {made} does; write  caviar keys authorize {made}")
+    return file
 
 
 def _role(role: str) -> Role:

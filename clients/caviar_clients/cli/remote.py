@@ -43,8 +43,9 @@ def key_text(name: str, keys: Path | None) -> str:
     """What the user is told of the key that a service needs; nothing where the broker has none."""
     if keys is None:
         return ""
-    broker = keys / f"{BROKER}.pub"
-    return f"  with {KEY_VARIABLE}={name}.key and {BROKER_KEY_VARIABLE}={broker} in its environment"
+    broker, secret = keys / f"{BROKER}.pub", keys / f"{name}.key"
+    secret = secret if secret.exists() else Path(secret.name)  # made on the machine of the service
+    return f"  with {KEY_VARIABLE}={secret} and {BROKER_KEY_VARIABLE}={broker} in its environment"
 
 
 def _shown(path: Path) -> str:

@@ -221,7 +221,8 @@ class _Watcher:
         self._shown[key] = self._shown.get(key, 0) + 1
         if self._shown[key] == 1 or event["kind"] in REPEATED:
             frame = f" in frame {event['frame']}" if event["frame"] >= 0 else ""
-            text = f"{event['kind']}: {event['service']}{frame}: {event['text']}"
+            who = f"{event['service']}{frame}: " if event["service"] or frame else ""
+            text = f"{event['kind']}: {who}{event['text']}"
             self._tell(text + self._remedy(event), "yellow")
 
     def _remedy(self, event: Mapping[str, Any]) -> str:

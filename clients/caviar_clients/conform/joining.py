@@ -54,14 +54,15 @@ def _check_topics(said: Fields) -> None:
 def attach(kit: Kit) -> str:
     """After WELCOME the heartbeat connection is attached."""
     session = kit.at(JOINED)
-    attached = _attached(session)
+    attached = attached_heart(session)
     right = {"type": "ATTACH", "epoch": EPOCH, "attempt": ATTEMPT, "name": session.hello["name"]}
     if attached != right:
         raise Failed(str(right), str(attached))
     return f"ATTACH of {attached['name']!r} in epoch {EPOCH}, attempt {ATTEMPT}"
 
 
-def _attached(session: Session) -> Fields:
+def attached_heart(session: Session) -> Fields:
+    """ATTACH of this life, waited for; `Failed` where none comes."""
     for _ in range(round(session.rules.timeout_s / 0.05)):
         if session.pulse.attached:
             return session.pulse.attached[0]
@@ -80,7 +81,7 @@ def _attached(session: Session) -> Fields:
 def heartbeats(kit: Kit) -> str:
     """Heartbeats come as often as asked, also past an unasked HEARTBEAT_ACK."""
     session = kit.at(JOINED)
-    _attached(session)
+    attached_heart(session)
     session.listen(BEATS / 2 * session.heartbeat_s)
     session.beat_back("HEARTBEAT_ACK", {"sequence": 0})
     session.listen(BEATS / 2 * session.heartbeat_s)

@@ -16,6 +16,8 @@ from caviar_clients.conform.client import ByHand, Client, Started
 from caviar_clients.conform.session import CONNECTING, JOINED, PATIENCE, READY, Rules, Seen, Session
 from caviar_clients.conform.wire import Wire
 from caviar_protocol.errors import RunError, SetupError
+from caviar_protocol.keys import ROLES
+from caviar_protocol.tables import suggestion
 
 LONGEST = 600
 """Characters of what came, in a verdict."""
@@ -161,10 +163,12 @@ def conform(
     each
         Gets each verdict as soon as there is one.
 
-    Raises `SetupError` for an unknown case, `RunError` where the endpoint cannot be listened at or the
-    command cannot be started.
+    Raises `SetupError` for an unknown case or role, `RunError` where the endpoint cannot be
+    listened at or the command cannot be started.
     """
     picked, given = chosen(names), rules or Rules()
+    if given.role and given.role not in ROLES:
+        raise SetupError(f"no client has the role {given.role!r}; {suggestion(given.role, ROLES)}")
     wire = Wire(endpoint)
     verdicts = []
     with TemporaryDirectory(prefix="caviar-conform-", ignore_cleanup_errors=True) as folder:

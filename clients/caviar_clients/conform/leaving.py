@@ -143,6 +143,8 @@ def no_demand(kit: Kit) -> str:
 @case("canonical", "Canonical form; clause 20", "headers in canonical form, in every message")
 def canonical(kit: Kit) -> str:
     """Every header that came was in canonical form."""
+    if not kit.seen.headers:
+        raise NotApplicable("no message came")
     if kit.seen.odd:
         raise Failed("headers in canonical form", "; ".join(kit.seen.odd[:3]))
     return "all of them"

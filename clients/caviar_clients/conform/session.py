@@ -43,6 +43,8 @@ class Rules:
 class Seen:
     """What is remembered over all lives of a client."""
 
+    headers: int = 0
+    """How many messages came."""
     odd: list[str] = field(default_factory=list)
     """Headers that were not in canonical form, each kind once."""
     fetched: dict[str, int] = field(default_factory=dict)
@@ -128,6 +130,7 @@ class Session:
                 return None
         received = self._inbox.popleft()
         fields = forms.checked(received)
+        self._seen.headers += 1
         odd = forms.not_canonical(received)
         if odd and odd not in self._seen.odd:
             self._seen.odd.append(odd)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from caviar_clients.conform.case import Failed, NotApplicable, case
 from caviar_clients.conform.client import End
 from caviar_clients.conform.grants import Inputs
-from caviar_clients.conform.joining import BEATS
+from caviar_clients.conform.joining import BEATS, attached_heart
 from caviar_clients.conform.packing import pack
 from caviar_clients.conform.session import ACTIVE, ATTEMPT, EPOCH, Answer, Session
 from caviar_clients.conform.wire import Fields
@@ -292,6 +292,7 @@ def complaints(kit: Kit) -> str:
 def heartbeat_noise(kit: Kit) -> str:
     """Nonsense on the heartbeat connection does not silence the client."""
     session = kit.at(ACTIVE)
+    attached_heart(session)  # a slow client is active before its heart beats, and the noise would be lost
     since = len(session.pulse.beats)
     session.wire.send(session.pulse.route or b"", b"\xc1noise")
     session.listen(BEATS * session.heartbeat_s)
