@@ -146,7 +146,9 @@ def test_a_key_authorized_while_the_broker_runs_is_let_in(tmp_path: Path, keys: 
 def test_a_damaged_authorized_file_is_told_and_changes_nothing(tmp_path: Path, keys: Ring) -> None:
     own = keys.authorize("world", "world")
     with serving(plan("world"), tmp_path, access=keys.access()) as broker:
-        (keys.directory / k.AUTHORIZED).write_text("[[key")
+        damaged = tmp_path / "damaged"
+        damaged.write_text("[[key")
+        damaged.replace(keys.directory / k.AUTHORIZED)  # at once: a file cut to nothing is one without keys
         eventually(lambda: "goes on holding" in broker.witness.texts(), "the user is told", 1.0)
         with Client(broker.endpoint, "world", credentials=own) as client:
             client.join()
