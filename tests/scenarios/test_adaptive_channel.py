@@ -50,14 +50,14 @@ def scenario(frames: int, **settings: Any) -> Scenario:
 
 
 class ScaledClock:
-    """Wall time that goes faster or slower."""
+    """Time that this process computes for, which goes faster or slower: what else runs is not in it."""
 
     def __init__(self) -> None:
         self.scale = 1.0
-        self._last, self._now = time.perf_counter_ns(), 0.0
+        self._last, self._now = time.process_time_ns(), 0.0
 
     def __call__(self) -> int:
-        now = time.perf_counter_ns()
+        now = time.process_time_ns()
         self._now += (now - self._last) * self.scale
         self._last = now
         return round(self._now)
