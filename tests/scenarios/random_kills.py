@@ -33,7 +33,7 @@ from caviar_broker.deskplace import ask
 from caviar_protocol.errors import RunError
 from caviar_protocol.scenario_loader import load_scenario
 
-FRAMES_A_KILL = 14
+FRAMES_A_KILL = 24
 """Frames of the run for each kill."""
 GRANTED_SHARE = 0.8
 """Of the kills that wait until the victim has a grant."""
@@ -124,7 +124,7 @@ class Disturber:
         self.until(lambda status: finished(status) >= frame, GO_ON_S)
         victim = self.rng.choice(victims)
         if self.rng.random() < GRANTED_SHARE:
-            status = self.until(lambda status: bool(grants_of(status).get(victim, victim == "broker")), 1.0)
+            status = self.until(lambda status: bool(grants_of(status).get(victim, victim == "broker")), 0.3)
         else:
             select.select([], [], [], self.rng.uniform(0.0, 0.02))
             status = self.status()
@@ -162,7 +162,7 @@ class Disturber:
 
     def state_at_death(self, victim: str, before: int) -> tuple[str, int]:
         """What the broker says of the death: the frame that the victim owed."""
-        until = time.monotonic() + 3.0
+        until = time.monotonic() + 0.4
         while time.monotonic() < until and self.alive:
             for notice in self.told()[before:]:
                 if notice["kind"] == "lost" and notice["service"] == victim:
@@ -219,7 +219,8 @@ def disturb(
     """Run a scenario while its processes are killed: exit status, output, and who was killed."""
     victims = [*load_scenario(scenario).services, "broker"]
     rng = random.Random(seed)
-    at_frames = sorted(rng.sample(range(5, frames - 10), kills))
+    # Those that come late because somebody was waited for are made up for in the last third.
+    at_frames = sorted(rng.sample(range(5, frames * 2 // 3), kills))
     command = [
         sys.executable,
         "-m",
