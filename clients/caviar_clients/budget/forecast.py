@@ -173,7 +173,11 @@ def _under(service: ServicePlan, policy: Policy | None) -> ServicePlan:
 
 
 def _unexplained(run: RecordedRun, measured: float, predicted: float) -> list[str]:
-    if not measured or run.scenario.run.pace != "fast" or abs(predicted / measured - 1.0) <= TOLERANCE:
+    if (
+        not measured
+        or run.scenario.run.pace not in ("free", "fast")
+        or abs(predicted / measured - 1.0) <= TOLERANCE
+    ):
         return []
     text = f"the recorded run had {measured:.1f} frames/s where its latencies lead to {predicted:.1f}"
     return [f"{text}: services did not overlap, as in one process, or what is between them took time too"]

@@ -62,7 +62,7 @@ def plan_replay(run: RecordedRun, request: Request, frames: int | None = None) -
         run.scenario,
         run=replace(
             run.scenario.run,
-            pace="fast",
+            pace="free",
             episodes=len(run.lengths),
             seed=run.recording.metadata.seed,
             record=tuple(entry for entry in run.demand if entry.partition(".")[0] in produced),
