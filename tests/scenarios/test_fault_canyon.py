@@ -19,16 +19,12 @@ CHANGES = [
     ("samples = 100_000", "samples = 4_000"),
     ("budget_ms = 300", "budget_ms = 3000"),
 ]
-REJOIN = """
-[timeouts]
-rejoin_s = 60.0
-"""
 
 
 @pytest.fixture(scope="module")
 def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Street canyon with few rays, in which the dead are waited for."""
-    path = scenario_file(tmp_path_factory.mktemp("canyon"), CHANGES, REJOIN, base="street-canyon")
+    """Street canyon with few rays; as it is shipped, the dead are waited for."""
+    path = scenario_file(tmp_path_factory.mktemp("canyon"), CHANGES, base="street-canyon")
     folder = Path(__file__).resolve().parents[2] / "deploy" / "scenarios"
     path.write_text(path.read_text().replace('"file:', f'"file:{folder}/'))
     return path
