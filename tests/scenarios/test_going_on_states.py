@@ -55,9 +55,6 @@ role = "rx"
 on = "uav"
 position_m = [0.0, 0.0, -0.3]
 array = { columns = 4 }
-
-[timeouts]
-rejoin_s = 60.0
 """
 
 
