@@ -146,3 +146,13 @@ def test_a_barred_key_is_told_so_by_its_own_side(tmp_path: Path) -> None:
         with pytest.raises(RunError, match="or barred for a while"):
             connection.receive(10.0)
         connection.close()
+
+
+def test_a_connection_that_is_not_known_any_more_may_appear_as_nobody(tmp_path: Path) -> None:
+    keys = ring(tmp_path)
+    keys.authorize("world", "world")
+    port = Port("tcp://127.0.0.1:0", 300 * MS, keys.access())
+    try:
+        assert "not known any more" in port.guard.refusal(b"gone", "world", "world")
+    finally:
+        port.close()

@@ -174,9 +174,11 @@ class Guard:
 
     def refusal(self, route: bytes, name: str, role: str = "", outputs: Sequence[str] = ()) -> str:
         """Why the key of a connection may not appear as that service; empty where it may."""
-        peer = self._peers.get(route)
-        if self.access is None or peer is None:
+        if self.access is None:
             return ""
+        peer = self._peers.get(route)
+        if peer is None:
+            return "its connection is not known any more"
         return self.access.refusal(peer.key, name, role, outputs)
 
     def cut(self, route: bytes, why: str) -> None:
