@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import time
 import tracemalloc
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,17 @@ from caviar_services.channel import spherical
 pytestmark = pytest.mark.channel
 
 
+@pytest.fixture(autouse=True)
+def traced_memory() -> Iterator[None]:
+    """Trace memory for the whole test: to stop it while threads of the ray tracer still drop arrays that
+    they were lent ends the process (CPython's gh-128679), so that they get time to finish.
+    """
+    tracemalloc.start()
+    yield
+    time.sleep(1.0)
+    tracemalloc.stop()
+
+
 def diffuse(
     monkeypatch: pytest.MonkeyPatch, folder: Path, samples: int, memory_gib: float
 ) -> tuple[Channel, int]:
@@ -24,12 +37,12 @@ def diffuse(
     look = spherical.visibility
 
     def measured(*arguments: Any) -> Any:
-        tracemalloc.start()
+        tracemalloc.reset_peak()
+        before = tracemalloc.get_traced_memory()[0]
         try:
             return look(*arguments)
         finally:
-            peaks.append(tracemalloc.get_traced_memory()[1])
-            tracemalloc.stop()
+            peaks.append(tracemalloc.get_traced_memory()[1] - before)
 
     monkeypatch.setattr(spherical, "visibility", measured)
     ground = [(-60, -20, 0), (60, -20, 0), (60, 20, 0), (-60, 20, 0)]
