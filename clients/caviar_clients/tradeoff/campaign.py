@@ -24,8 +24,9 @@ ROUNDS = 3
 """Times that each scene is measured, where time allows: for the 99th percentile."""
 TOGETHER = 3
 """Settings that are loaded at a time, beside the baseline: each holds a scene of its own in memory."""
-PATIENCE = 3.0
-"""What is loading this many times longer than the time that is left of its block is ended."""
+PATIENCE = 4.0
+"""What is loading this many times longer than its share of the time left of its block is ended, so that no
+setting can eat what the others of its block, or all other blocks, need."""
 AFFORDABLE = 0.5
 """Share of the time left of its block that one scene of a setting may be expected to take."""
 AT_LEAST_S = 20.0
@@ -174,7 +175,8 @@ class Campaign:
         for number, wave in enumerate(waves):
             now = time.monotonic()
             with ExitStack() as stack:
-                entries = self._loaded(name, wave, costs, until, stack)
+                behind = len(settings) - TOGETHER * number
+                entries = self._loaded(name, wave, costs, (until, behind), stack)
                 self._by_turns(name, entries, now + max(0.0, until - now) / (len(waves) - number))
             baseline, *others = entries
             if not baseline.measured.times_ms:
@@ -220,11 +222,17 @@ class Campaign:
         return Worker(setting, self._scenes, self._receivers, self._noise, seconds)
 
     def _loaded(
-        self, name: Block, wave: Sequence[Setting], costs: list[Cost], until: float, stack: ExitStack
+        self,
+        name: Block,
+        wave: Sequence[Setting],
+        costs: list[Cost],
+        time_for: tuple[float, int],
+        stack: ExitStack,
     ) -> list[_Entry]:
-        """The baseline, and of a wave what can be loaded in time."""
+        """The baseline, and of a wave what can be loaded in time: until then, for so many settings."""
+        until, to_come = time_for
         entries = [self._entry(self._baseline)]
-        for setting in wave:
+        for number, setting in enumerate(wave):
             if setting == self.baseline:
                 continue
             self._tell(f"{name}: loading {setting.label}")
@@ -234,7 +242,9 @@ class Campaign:
                 self._skip(setting, name, _no_time(expected, left))
                 continue
             try:
-                worker = self._start(setting, max(AT_LEAST_S, min(PATIENCE * left, self._left_s)))
+                share = min(left, PATIENCE * left / (to_come - number))
+                whole = setting.label in self._whole
+                worker = self._start(setting, max(AT_LEAST_S, self._left_s if whole else share))
             except RunError as error:
                 self._skip(setting, name, str(error))
                 continue

@@ -55,6 +55,10 @@ _SIONNA = "sionna-rt"
 _COMPARABLE = {"normalization": "path-loss", "nlos": "geometry"}
 """Settings of ``geometric`` with which its gains mean the same as those of the others."""
 _DIFFUSE_PATHS = 2_000_000
+CHOSEN_PATHS = 500
+"""Diffuse paths that are chosen for a receiver, where they are chosen."""
+CHOSEN = f"{CHOSEN_PATHS} paths"
+_CHOSEN_EFFORT = 3
 _ALL = {"refraction": True, "diffraction": True}
 
 
@@ -62,6 +66,16 @@ def _traced(samples: int, depth: int, **more: Any) -> dict[str, Any]:
     """Settings of a ray-traced rung; what is not named is off."""
     off = {"refraction": False, "diffraction": False, "scattering": False}
     return {**off, "samples": samples, "max_depth": depth, **more}
+
+
+def chosen_diffuse(samples: int) -> dict[str, Any]:
+    """Settings of diffuse paths chosen among the points of ``samples`` rays of their own."""
+    return {
+        "scattering": True,
+        "scattering_samples": samples,
+        "scattering_paths": CHOSEN_PATHS,
+        "max_paths": _DIFFUSE_PATHS,
+    }
 
 
 LADDER: tuple[Setting, ...] = (
@@ -78,6 +92,12 @@ LADDER: tuple[Setting, ...] = (
         label="siso-rt 1e5 d3 +scattering 1e4",
         use=_SIONNA,
         settings=_traced(100_000, 3, scattering=True, scattering_samples=10_000, max_paths=_DIFFUSE_PATHS),
+        scattering=True,
+    ),
+    Setting(
+        label=f"siso-rt 1e5 d3 +scattering 1e4, {CHOSEN}",
+        use=_SIONNA,
+        settings=_traced(100_000, 3, **chosen_diffuse(10_000)),
         scattering=True,
     ),
     Setting(label="siso-rt 1e6 d5 +r+d", use=_SIONNA, settings=_traced(1_000_000, 5, **_ALL)),
@@ -116,14 +136,20 @@ FEW = frozenset({"mimo-rt"})
 SPACINGS_DEG = (1.0, 0.5, 0.25, 0.1)
 """Ray spacings of the paper's Table 3."""
 DIFFUSE_DEG = 0.5
-"""Ray spacing of its line with diffuse scattering."""
+"""Ray spacing of its line with diffuse scattering: by all rays, and by paths chosen among those of
+`CHOSEN_SAMPLES`."""
+DIFFUSE, DIFFUSE_CHOSEN = f"{DIFFUSE_DEG:g} (diffuse)", f"{DIFFUSE_DEG:g} (diffuse, {CHOSEN})"
+"""Rows of Table 3 with diffuse scattering."""
+CHOSEN_SAMPLES = 10_000
 ELEMENTS = ((64, 2), (64, 8), (64, 64))
 """(Nt, Nr) of the paper's Table 4."""
 
-CONVERGENCE_SCENES = 4
+CONVERGENCE_SCENES = 12
 """Scenes over which convergence is measured: each has as many users as it has receivers."""
 CONVERGENCE_SAMPLES = (10_000, 30_000, 100_000, 300_000, 1_000_000)
 DIFFUSE_SAMPLES = (10_000, 30_000, 100_000, 300_000)
+SPECULAR_BESIDE = 100_000
+"""Samples for specular paths while those of diffuse ones change."""
 TRUTH_SAMPLES = 3_000_000
 """Samples of what the convergence of specular paths is measured against."""
 
@@ -140,20 +166,29 @@ def samples_of(spacing_deg: float) -> int:
 @cache
 def spacing_settings() -> tuple[Setting, ...]:
     """The lines of the paper's Table 3, the cheapest first: what time is short for comes last."""
-    rows = [*((spacing, False) for spacing in SPACINGS_DEG), (DIFFUSE_DEG, True)]
-    return tuple(sorted((_spacing(rung, *row) for row in rows for rung in TABLE_RUNGS), key=_effort))
+    diffuse = {"scattering": True, "max_paths": _DIFFUSE_PATHS}
+    rows: list[tuple[float, str, dict[str, Any]]] = [
+        *((spacing, f"{spacing:g}", {}) for spacing in SPACINGS_DEG),
+        (DIFFUSE_DEG, DIFFUSE, diffuse),
+        (DIFFUSE_DEG, DIFFUSE_CHOSEN, chosen_diffuse(CHOSEN_SAMPLES)),
+    ]
+    made = (_spacing(rung, *row) for row in rows for rung in TABLE_RUNGS if (rung, row[1]) not in _NOT_MADE)
+    return tuple(sorted(made, key=_effort))
 
 
-def _spacing(rung: str, spacing_deg: float, diffuse: bool) -> Setting:
-    options: dict[str, Any] = {"max_paths": _DIFFUSE_PATHS} if diffuse else {}
+_NOT_MADE = frozenset({("mimo-rt", DIFFUSE_CHOSEN)})
+"""The rays of ``mimo-rt`` are those of the antenna pair: it has no launch of its own to choose from."""
+
+
+def _spacing(rung: str, spacing_deg: float, row: str, options: Mapping[str, Any]) -> Setting:
     return Setting(
-        label=f"{rung} {spacing_deg:g}°" + (" diffuse" if diffuse else ""),
+        label=f"{rung} {row.replace(' ', '° ', 1)}" if options else f"{rung} {row}°",
         use=_SIONNA,
-        settings=_traced(samples_of(spacing_deg), 3, scattering=diffuse, **options, **TABLE_RUNGS[rung]),
+        settings=_traced(samples_of(spacing_deg), 3, **options, **TABLE_RUNGS[rung]),
         block="ray spacing",
         column=rung,
-        row=f"{spacing_deg:g}" + (" (diffuse)" if diffuse else ""),
-        scattering=diffuse,
+        row=row,
+        scattering="scattering" in options,
         most_scenes=1 if rung in FEW else None,
         most_receivers=CHEAP if rung in FEW else None,
     )
@@ -167,7 +202,9 @@ def array_settings() -> tuple[Setting, ...]:
 
 def _effort(setting: Setting) -> float:
     """What a scene will cost, in rays; no more than an order."""
-    rays = float(setting.settings["samples"]) * (_DIFFUSE_EFFORT if setting.scattering else 1)
+    rays = float(setting.settings["samples"])
+    if setting.scattering:
+        rays *= _CHOSEN_EFFORT if "scattering_paths" in setting.settings else _DIFFUSE_EFFORT
     if setting.column not in FEW:
         return rays
     pairs = math.prod(setting.elements) if setting.elements else 1
@@ -214,7 +251,7 @@ def convergence_settings(seeds: int) -> tuple[Setting, ...]:
                     label=f"siso-rt {_power(samples)} d3 diffuse seed {seed}",
                     use=_SIONNA,
                     most_scenes=CONVERGENCE_SCENES,
-                    settings=_traced(samples, 3, launch_seed=seed, scattering=True, max_paths=_DIFFUSE_PATHS),
+                    settings=_traced(SPECULAR_BESIDE, 3, launch_seed=seed, **chosen_diffuse(samples)),
                     block="diffuse convergence",
                     column="diffuse",
                     row=str(samples),

@@ -9,7 +9,18 @@ from rich.text import Text
 
 from caviar_clients.tradeoff.campaign import Skipped
 from caviar_clients.tradeoff.errors import FLOOR_DB
-from caviar_clients.tradeoff.ladder import DIFFUSE_DEG, ELEMENTS, SPACINGS_DEG, TABLE_RUNGS, samples_of
+from caviar_clients.tradeoff.ladder import (
+    CHOSEN_PATHS,
+    CHOSEN_SAMPLES,
+    DIFFUSE,
+    DIFFUSE_CHOSEN,
+    DIFFUSE_DEG,
+    ELEMENTS,
+    SPACINGS_DEG,
+    SPECULAR_BESIDE,
+    TABLE_RUNGS,
+    samples_of,
+)
 from caviar_clients.tradeoff.report import Report
 from caviar_clients.tradeoff.rows import Row
 
@@ -18,7 +29,7 @@ PAPER_SPACING = {
     "0.5": (1.0, 1.0),
     "0.25": (2.4, 1.5),
     "0.1": (11.0, 4.0),
-    "0.5 (diffuse)": (84.7, 412.9),
+    DIFFUSE: (84.7, 412.9),
 }
 """Table 3 of the paper: factors of SISO-RT and MIMO-RT (64×8), each to its own 0.5°."""
 PAPER_ARRAYS = {"64×2": 1.0, "64×8": 2.2, "64×64": 12.0}
@@ -164,10 +175,11 @@ def _spacing(report: Report) -> list[str]:
     body = []
     for spacing, label in [
         *((s, f"{s:g}") for s in SPACINGS_DEG),
-        (DIFFUSE_DEG, f"{DIFFUSE_DEG:g} (diffuse)"),
+        (DIFFUSE_DEG, DIFFUSE),
+        (DIFFUSE_DEG, DIFFUSE_CHOSEN),
     ]:
         cells = [_relative(rows.get((c, label)), rows.get((c, f"{DIFFUSE_DEG:g}"))) for c in columns]
-        paper = (f"{value:g}" for value in PAPER_SPACING[label])
+        paper = (f"{value:g}" for value in PAPER_SPACING[label]) if label in PAPER_SPACING else [NOTHING] * 2
         body.append([label, f"{samples_of(spacing):,}", *cells, *paper])
     times = [
         f"{c} {significant(rows[c, f'{DIFFUSE_DEG:g}'].time_ms_median)} ms"
@@ -184,8 +196,10 @@ def _spacing(report: Report) -> list[str]:
         _table(header, body),
         (
             f"The paper: {_PAPER}. Here: {report.scenario} as above, Sionna RT, with the arrays of the "
-            "scenario in every column; N = 4π/Δ² rays for a spacing of Δ rad. Diffuse paths are no part of "
-            "the reference, so that the NMSE of that line says what they add."
+            "scenario in every column; N = 4π/Δ² rays for a spacing of Δ rad. Diffuse: every point that a "
+            f"ray meets is a path, or about {CHOSEN_PATHS} paths a receiver are chosen among those of "
+            f"{CHOSEN_SAMPLES:,} rays and stand for all. They are no part of the reference, so that the NMSE "
+            "of these lines says what they add."
         ),
         _notes(list(rows.values())),
     ]
@@ -249,7 +263,8 @@ def _convergence(report: Report) -> list[str]:
         "## Convergence over samples and seeds",
         (
             "NMSE: of each seed against 3e6 samples with a seed of its own (best … worst seed), for specular "
-            "paths. Between seeds: 95 % of users differ by less in path gain; top-1 is the share whose best "
+            f"paths. Diffuse: about {CHOSEN_PATHS} paths of a receiver, chosen among those of so many rays of "
+            f"their own, beside {SPECULAR_BESIDE:,} for the others. Between seeds: 95 % of users differ by less in path gain; top-1 is the share whose best "
             f"pair of beams is the same; {level(FLOOR_DB)} dB: equal, since rays leave along a lattice of "
             "directions, and the seed draws only what happens where they meet something."
         ),
