@@ -1,6 +1,7 @@
 """What a frame costs in the broker, beside a bare loop that forwards the same bytes, HELICS and mosaik.
 
-    python tests/bench/bench_broker.py [--services 2 4 8 32] [--payload 100] [--frames 2000] [--json FILE]
+    python tests/bench/bench_broker.py [--services 2 4 8 32] [--payload 100] [--frames 2000] [--curve]
+                                       [--json FILE]
 
 One hub and N - 1 others, each a process of its own. In every frame the hub takes a product of each of
 the others, and each of them takes the hub's. The kinds of loop take turns, round by round, so that a
@@ -9,6 +10,8 @@ machine's moods fall on all of them; ratios are medians of the ratios within eac
 - *bare*: a ROUTER loop that knows nothing but this pattern, and DEALER clients that send bytes back;
 - *broker*: `caviar bench broker`: frame clock, deadlines, journal, latency record, clients of the protocol;
 - *helics*, *mosaik*: where they are installed (``pip install helics mosaik``).
+
+With ``--curve`` the bare loop and the broker are encrypted; the others know no encryption, and are left out.
 """
 
 # ruff: noqa: T201 - a command that prints what it measured
@@ -37,17 +40,24 @@ HEADER = bytes(60)
 PEERS_LEAST = 100
 """Frames of HELICS and mosaik, which take longer, at least."""
 
-Seconds = Callable[[int, int, int], float]
-"""``kind(services, payload, frames)``: seconds that a frame takes."""
+PLAIN = ("helics", "mosaik")
+"""Kinds that know no encryption."""
+
+Seconds = Callable[[int, int, int, bool], float]
+"""``kind(services, payload, frames, curve)``: seconds that a frame takes."""
 
 
-def bare(services: int, payload: int, frames: int) -> float:
+def bare(services: int, payload: int, frames: int, curve: bool) -> float:
     """A loop that knows nothing but the pattern."""
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     socket = context.socket(zmq.ROUTER)
+    public_key = ""
+    if curve:
+        public, private = zmq.curve_keypair()
+        socket.curve_server, socket.curve_secretkey, public_key = True, private, public.decode()
     socket.bind("tcp://127.0.0.1:0")
     command = [sys.executable, __file__, "--echo", str(payload), socket.getsockopt_string(zmq.LAST_ENDPOINT)]
-    started = [subprocess.Popen([*command, str(number)]) for number in range(services)]
+    started = [subprocess.Popen([*command, str(number), public_key]) for number in range(services)]
     try:
         routes = {}
         while len(routes) < services:
@@ -80,9 +90,12 @@ def bare(services: int, payload: int, frames: int) -> float:
     return elapsed / frames
 
 
-def echo(payload: int, endpoint: str, name: str) -> None:
-    """A client of the bare loop."""
+def echo(payload: int, endpoint: str, name: str, public_key: str) -> None:
+    """A client of the bare loop; with a public key of the loop's, encrypted."""
     with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
+        if public_key:
+            socket.curve_publickey, socket.curve_secretkey = zmq.curve_keypair()
+            socket.curve_serverkey = public_key.encode()
         socket.connect(endpoint)
         socket.send(name.encode())
         body = bytes(payload)
@@ -93,15 +106,16 @@ def echo(payload: int, endpoint: str, name: str) -> None:
             socket.send_multipart([HEADER, b"\x80", body], copy=False)
 
 
-def broker(services: int, payload: int, frames: int) -> float:
+def broker(services: int, payload: int, frames: int, curve: bool) -> float:
     """The broker."""
-    return measure("hub", services, payload, frames).us_per_frame.mean / 1e6
+    return measure("hub", services, payload, frames, curve=curve).us_per_frame.mean / 1e6
 
 
 def peer(name: str) -> Seconds:
     """Another co-simulation, in a process of its own."""
 
-    def seconds(services: int, payload: int, frames: int) -> float:
+    def seconds(services: int, payload: int, frames: int, curve: bool) -> float:
+        assert not curve, f"{name} knows no encryption"
         script = Path(__file__).with_name(f"peer_{name}.py")
         command = [sys.executable, str(script), *map(str, (services, payload, max(PEERS_LEAST, frames // 4)))]
         done = subprocess.run(
@@ -122,7 +136,7 @@ KINDS: dict[str, Seconds] = {
 }
 
 
-def report(services: int, payload: int, rows: dict[str, list[float]]) -> list[dict[str, Any]]:
+def report(services: int, payload: int, rows: dict[str, list[float]], curve: bool) -> list[dict[str, Any]]:
     """Print and return a line for each kind of loop."""
     lines = []
     delivered = deliveries("hub", services) * payload
@@ -132,6 +146,7 @@ def report(services: int, payload: int, rows: dict[str, list[float]]) -> list[di
             "services": services,
             "payload": payload,
             "kind": kind,
+            "curve": curve,
             "us_per_frame": statistics.median(seconds) * 1e6,
             "bytes_per_second": delivered / statistics.median(seconds),
             "time_to_bare": statistics.median(to_bare),
@@ -140,8 +155,8 @@ def report(services: int, payload: int, rows: dict[str, list[float]]) -> list[di
         lines.append(line)
         low, high = line["time_to_bare_range"]
         print(
-            f"N = {services:3} {payload:8} B  {kind:7}{line['us_per_frame']:9.0f} µs a frame "
-            f"{line['time_to_bare']:7.2f} × bare ({low:.2f} to {high:.2f}) "
+            f"N = {services:3} {payload:8} B {' curve' * curve} {kind:7}{line['us_per_frame']:9.0f} µs "
+            f"a frame {line['time_to_bare']:7.2f} × bare ({low:.2f} to {high:.2f}) "
             f"{line['bytes_per_second'] / 1e6:9.3g} MB/s",
             flush=True,
         )
@@ -161,10 +176,11 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=2000)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--kinds", nargs="+", choices=list(KINDS), default=list(KINDS))
+    parser.add_argument("--curve", action="store_true", help="encrypted; without helics and mosaik")
     parser.add_argument("--json", type=Path)
     told = parser.parse_args()
-    kinds = ["bare", *(k for k in told.kinds if k != "bare")]
-    for kind in [k for k in kinds if k in ("helics", "mosaik") and importlib.util.find_spec(k) is None]:
+    kinds = ["bare", *(k for k in told.kinds if k != "bare" and not (told.curve and k in PLAIN))]
+    for kind in [k for k in kinds if k in PLAIN and importlib.util.find_spec(k) is None]:
         print(f"{kind} is left out: pip install {kind}")
         kinds.remove(kind)
     lines = []
@@ -173,8 +189,8 @@ def main() -> None:
             rows: dict[str, list[float]] = {kind: [] for kind in kinds}
             for _ in range(told.rounds):
                 for kind in kinds:
-                    rows[kind].append(KINDS[kind](services, payload, told.frames))
-            lines += report(services, payload, rows)
+                    rows[kind].append(KINDS[kind](services, payload, told.frames, told.curve))
+            lines += report(services, payload, rows, told.curve)
     if told.json:
         told.json.write_text(json.dumps(lines, indent=2) + "\n")
 

@@ -33,7 +33,8 @@ def test_deliveries_are_the_edges_of_the_graph(topology: Topology, services: int
     assert sum(len(edges) for edges in graph.inputs.values()) == deliveries(topology, services)
 
 
-def test_figures_of_a_run_agree(tmp_path: Path) -> None:
+@pytest.mark.parametrize("curve", [False, True])
+def test_figures_of_a_run_agree(tmp_path: Path, curve: bool) -> None:
     file = tmp_path / "figures.json"
     arguments = [
         "bench",
@@ -46,6 +47,7 @@ def test_figures_of_a_run_agree(tmp_path: Path) -> None:
         "60",
         "--json",
         str(file),
+        *["--curve"] * curve,
     ]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
@@ -56,6 +58,7 @@ def test_figures_of_a_run_agree(tmp_path: Path) -> None:
     assert figures["bytes_per_second"] == pytest.approx(4 * 1000 / per_frame["mean"] * 1e6)
     assert figures["broker_cpu_us_per_frame"] > 0
     assert figures["frames"] == 60
+    assert figures["curve"] is curve
     assert figures["misses"] == 0
 
 
@@ -66,3 +69,12 @@ def test_a_client_that_cannot_take_part_ends_the_measurement_with_its_name(
     monkeypatch.setattr("caviar_broker.bench.run.CLIENT", "caviar_broker.no_such_module")
     with pytest.raises(RunError, match="did not connect"):
         measure("hub", 2, 10, 20)
+
+
+def test_with_keys_a_client_without_one_is_not_let_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What `--curve` measures is a broker that refuses everybody else."""
+    monkeypatch.setattr("caviar_broker.bench.run.CONNECT_NS", 1_000_000_000)
+    monkeypatch.setattr("caviar_broker.bench.run.KEY_VARIABLE", "NOBODY_READS_THIS")
+    monkeypatch.setattr("caviar_broker.bench.run.BROKER_KEY_VARIABLE", "NOR_THIS")
+    with pytest.raises(RunError, match="did not connect"):
+        measure("hub", 2, 10, 20, curve=True)

@@ -1,6 +1,7 @@
 """A client of a measured run: the protocol, and nothing else.
 
-``python -m caviar_broker.bench.client TOPOLOGY SERVICES NUMBER PAYLOAD ENDPOINT``
+``python -m caviar_broker.bench.client TOPOLOGY SERVICES NUMBER PAYLOAD ENDPOINT``, with keys where
+CAVIAR_KEY and CAVIAR_BROKER_KEY name them.
 """
 
 from __future__ import annotations
@@ -16,11 +17,17 @@ from caviar_protocol import messages as m
 from caviar_protocol.codec import decode_message, encode_message
 from caviar_protocol.digest import payload_digest
 from caviar_protocol.host import host_identity
+from caviar_protocol.keys import credentials
 
 
 def speak(part: Part, payload: int, endpoint: str) -> None:
     """Take part in a run until the broker ends it, with a product of ``payload`` bytes in every frame."""
     with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
+        keys = credentials()
+        if keys is not None:
+            socket.curve_serverkey = keys.broker.encode()
+            socket.curve_publickey = keys.pair.public.encode()
+            socket.curve_secretkey = keys.pair.secret.encode()
         socket.connect(endpoint)
         socket.send(encode_message(_hello(part)))
         header, body = b"\x80", bytes(payload)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
@@ -12,16 +13,19 @@ from tempfile import TemporaryDirectory
 
 import msgspec
 import numpy as np
+import zmq
 
 from caviar_broker.__main__ import tune_collector
-from caviar_broker.bench.topology import Topology, deliveries, parts
+from caviar_broker.bench.topology import Part, Topology, deliveries, parts
 from caviar_broker.core import events as ev
 from caviar_broker.core.plan import SECOND, Limits, RunPlan, ServicePlan
 from caviar_broker.journal import JournalFile
+from caviar_broker.security.access import Access
 from caviar_broker.server import BrokerServer
 from caviar_broker.statistics import Statistics
 from caviar_protocol.assets import AssetStore
 from caviar_protocol.errors import RunError
+from caviar_protocol.keys import BROKER, BROKER_KEY_VARIABLE, KEY_VARIABLE, Pair, read_public, write_pair
 
 WARM_UP = 50
 """Frames at the start that do not count."""
@@ -30,6 +34,8 @@ BUDGET_NS = SECOND
 CLIENT = "caviar_broker.bench.client"
 CONNECT_NS = 30 * SECOND
 """Until all clients have to be there."""
+_CLIENTS = "clients"
+"""What the pair is called that all of them have."""
 END_S = 10.0
 """[s] that a client gets to end after the run."""
 
@@ -49,6 +55,8 @@ class Measured(msgspec.Struct, frozen=True, kw_only=True):
     services: int
     payload: int
     """[B]"""
+    curve: bool
+    """Whether with keys, encrypted."""
     frames: int
     """That were measured, behind the warm-up."""
     us_per_frame: MicrosecondsPerFrame
@@ -70,8 +78,10 @@ class _Silent:
         """Measured by the statistics."""
 
 
-def measure(topology: Topology, services: int, payload: int, frames: int) -> Measured:
+def measure(topology: Topology, services: int, payload: int, frames: int, *, curve: bool = False) -> Measured:
     """Run ``services`` clients, each a process, with products of ``payload`` bytes.
+
+    With ``curve`` each of them has a key, and what it says is encrypted, as in a run with keys.
 
     Raises `RunError` where the run, or one of the clients, does not come to its end.
     """
@@ -89,14 +99,16 @@ def measure(topology: Topology, services: int, payload: int, frames: int) -> Mea
         closing(JournalFile(Path(folder) / "journal", plan.epoch)) as journal,
     ):
         store = AssetStore(Path(folder) / "assets")
-        server = BrokerServer(plan, "tcp://127.0.0.1:0", journal, _Silent(), store)
+        access = _keys(Path(folder), declared) if curve else None
+        server = BrokerServer(plan, "tcp://127.0.0.1:0", journal, _Silent(), store, access=access)
         tune_collector()
-        with _clients(topology, services, payload, server.endpoint):
+        keys = Path(folder) if curve else None
+        with _clients(topology, services, payload, server.endpoint, keys):
             began = time.thread_time()
             outcome = server.run()
             cpu = time.thread_time() - began
-    if outcome.error:
-        raise RunError(f"the measured run did not come to its end: {outcome.error}")
+            if outcome.error:
+                raise RunError(f"the measured run did not come to its end: {outcome.error}")
     ends = np.asarray(server.statistics.finished_ns[WARM_UP - 1 :], np.int64)
     each = np.diff(ends) / 1e3
     mean = float(each.mean())
@@ -104,6 +116,7 @@ def measure(topology: Topology, services: int, payload: int, frames: int) -> Mea
         topology=topology,
         services=services,
         payload=payload,
+        curve=curve,
         frames=frames,
         us_per_frame=MicrosecondsPerFrame(mean, float(np.median(each)), float(np.percentile(each, 99))),
         bytes_per_second=deliveries(topology, services) * payload / mean * 1e6,
@@ -112,18 +125,40 @@ def measure(topology: Topology, services: int, payload: int, frames: int) -> Mea
     )
 
 
+def _keys(folder: Path, declared: Sequence[Part]) -> Access:
+    """A pair of the broker's, and one that all clients have."""
+    for name in (BROKER, _CLIENTS):
+        public, secret = zmq.curve_keypair()
+        write_pair(folder, name, Pair(public=public.decode(), secret=secret.decode()))
+    local = {part.name: part.role for part in declared}
+    return Access(folder, read_public(folder / f"{_CLIENTS}.pub"), local)
+
+
 @contextmanager
-def _clients(topology: Topology, services: int, payload: int, endpoint: str) -> Iterator[None]:
+def _clients(
+    topology: Topology, services: int, payload: int, endpoint: str, keys: Path | None
+) -> Iterator[None]:
     """The clients as processes; none of them outlives the block."""
     command = [sys.executable, "-m", CLIENT, topology, str(services)]
+    named = (
+        {}
+        if keys is None
+        else {KEY_VARIABLE: keys / f"{_CLIENTS}.key", BROKER_KEY_VARIABLE: keys / f"{BROKER}.pub"}
+    )
+    foreign = {KEY_VARIABLE, BROKER_KEY_VARIABLE}
+    environment = {k: v for k, v in os.environ.items() if k not in foreign} | {
+        k: str(v) for k, v in named.items()
+    }
     started: Sequence[subprocess.Popen[bytes]] = [
-        subprocess.Popen([*command, str(number), str(payload), endpoint])  # noqa: S603  # our own module
+        subprocess.Popen([*command, str(number), str(payload), endpoint], env=environment)  # noqa: S603  # our own module
         for number in range(services)
     ]
     try:
         yield
         for process in started:
             process.wait(END_S)
+    except subprocess.TimeoutExpired as error:
+        raise RunError(f"a client did not end within {END_S:g} s of the measured run") from error
     finally:
         for process in started:
             process.kill()

@@ -29,12 +29,13 @@ def broker(
     topology: Annotated[
         Topology, typer.Option(help="hub: one with all others; all: everyone with everyone")
     ] = "hub",
+    curve: Annotated[bool, typer.Option("--curve", help="with keys, encrypted")] = False,
     json: Annotated[Path | None, typer.Option(help="write the figures to this file")] = None,
 ) -> None:
     """A frame's way through the broker, with clients that do nothing but exchange products."""
     from caviar_broker.bench.run import measure
 
-    measured = measure(topology, services, payload, frames)
+    measured = measure(topology, services, payload, frames, curve=curve)
     table = Table(
         "services", "payload B", "µs a frame: mean", "p50", "p99", "MB/s", "broker CPU µs", "misses"
     )
