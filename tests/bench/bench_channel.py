@@ -26,7 +26,8 @@ from caviar_protocol.coordinates import quaternion_from_euler
 from caviar_protocol.digest import payload_digest
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Scene
-from caviar_services.channel.sionna_rt import SionnaChannel, SionnaSettings
+from caviar_services.channel.sionna_rt import SionnaChannel
+from caviar_services.channel.sionna_settings import SionnaSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 
 RECEIVERS = 10

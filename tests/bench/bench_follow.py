@@ -27,7 +27,8 @@ from caviar_protocol.coordinates import Pose
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.scene import device_pose
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Channel, Scene
-from caviar_services.channel.sionna_rt import SionnaChannel, SionnaSettings
+from caviar_services.channel.sionna_rt import SionnaChannel
+from caviar_services.channel.sionna_settings import SionnaSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 from caviar_services.world.assets import object_assets, scenery_assets
 

@@ -36,7 +36,8 @@ from caviar_protocol.scenario_loader import load_scenario
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Channel, Scene
 from caviar_services.channel.base import ChannelModel, ChannelSettings, Modelled
 from caviar_services.channel.mimo_rt import ElementTracer
-from caviar_services.channel.sionna_rt import SionnaChannel, SionnaSettings
+from caviar_services.channel.sionna_rt import SionnaChannel
+from caviar_services.channel.sionna_settings import SionnaSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 
 SCENARIO = Path(__file__).parents[2] / "deploy" / "scenarios" / "street-canyon.toml"

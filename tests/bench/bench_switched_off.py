@@ -25,6 +25,7 @@ from caviar_protocol.topics import AntennaDevice, Carrier, Channel, Scene
 from caviar_services.channel import sionna_rt
 from caviar_services.channel.contributing import UsedSurfaces
 from caviar_services.channel.sionna_launch import LaunchOptions
+from caviar_services.channel.sionna_settings import SionnaSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 from caviar_services.world.assets import scenery_assets
 
@@ -58,7 +59,7 @@ def prepared(scenery: str, settings: dict[str, Any]) -> tuple[sionna_rt.SionnaCh
     named = scenery_assets(f"sionna:{scenery}") if scenery else {}
     assets = {name: file for name, file in named.items() if isinstance(file, Path)}
     run = RunInfo(name="channel", seed=1, carriers=(Carrier(name="c", frequency_hz=28e9),))
-    model = sionna_rt.SionnaChannel(msgspec.convert({"bodies": 0, **settings}, sionna_rt.SionnaSettings), run)
+    model = sionna_rt.SionnaChannel(msgspec.convert({"bodies": 0, **settings}, SionnaSettings), run)
     notes = model.prepare(Preparation(demand={"channel": frozenset()}, assets=assets)).notes
     return model, tuple(note for note in notes if "switched off" in note)
 

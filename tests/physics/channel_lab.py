@@ -197,7 +197,8 @@ def geometric(*frequencies: float, seed: int = 1, **settings: Any) -> ChannelMod
 def sionna(
     frequency: float | Sequence[float], assets: Mapping[str, Path] | None = None, **settings: Any
 ) -> ChannelModel[Any]:
-    from caviar_services.channel.sionna_rt import SionnaChannel, SionnaSettings
+    from caviar_services.channel.sionna_rt import SionnaChannel
+    from caviar_services.channel.sionna_settings import SionnaSettings
 
     settings = {"samples": 20_000, "bodies": 2, "receivers_at_once": 8, **settings}
     frequencies = [frequency] if isinstance(frequency, int | float) else frequency

@@ -14,6 +14,7 @@ from caviar_protocol.topics import Channel, Interaction
 from caviar_services.channel import sionna_rt
 from caviar_services.channel.contributing import SurfaceMaterial, UsedSurfaces, contributing
 from caviar_services.channel.sionna_launch import LaunchOptions
+from caviar_services.channel.sionna_settings import SionnaSettings
 from caviar_services.service import Preparation, RunInfo
 
 pytestmark = pytest.mark.channel
@@ -166,9 +167,7 @@ def test_what_finds_paths_is_left_on(
 
 
 def test_each_switch_is_a_note(tmp_path: Path) -> None:
-    settings = sionna_rt.SionnaSettings(
-        samples=500, bodies=1, refraction=True, scattering=True, diffraction=True
-    )
+    settings = SionnaSettings(samples=500, bodies=1, refraction=True, scattering=True, diffraction=True)
     model = sionna_rt.SionnaChannel(settings, RunInfo(name="channel", carriers=carriers(28e9)))
     assets = write_scenery(tmp_path, slanted("concrete", 0.3))
     notes = [

@@ -7,48 +7,38 @@ They are one implementation with one scene and one set of options, so a rung is 
 
 from __future__ import annotations
 
-import importlib
-import itertools
-import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path, PurePosixPath
-from typing import Annotated, Any, ClassVar, Literal
+from typing import ClassVar
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
-from caviar_protocol.arrays import Int64Array, quantity
+from caviar_protocol.arrays import Int64Array
 from caviar_protocol.coordinates import SPEED_OF_LIGHT
-from caviar_protocol.errors import PayloadError, ScenarioError, SetupError
+from caviar_protocol.errors import PayloadError, SetupError
 from caviar_protocol.seeding import derive_seed
 from caviar_protocol.topics import AntennaDevice, ChannelOptions, Scene
-from caviar_services.channel.base import ChannelSettings, Found, PathModel
+from caviar_services.channel.base import Found, PathModel
 from caviar_services.channel.clearance import with_near_pairs
 from caviar_services.channel.contributing import contributing
 from caviar_services.channel.edge_range import EdgeRange
 from caviar_services.channel.matrices import Matrices
-from caviar_services.channel.mesh_detail import DetailSettings
 from caviar_services.channel.mimo_rt import ElementTracer
 from caviar_services.channel.paths import Antenna, PathTable
-from caviar_services.channel.sionna_follow import Followed
 from caviar_services.channel.sionna_following import Following, FollowingState
 from caviar_services.channel.sionna_launch import LaunchOptions
-from caviar_services.channel.sionna_materials import (
-    MaterialPolicy,
-    MaterialSettings,
-    OutsideRange,
-    OutsideUse,
-)
+from caviar_services.channel.sionna_materials import MaterialPolicy, OutsideUse
 from caviar_services.channel.sionna_reach import Corners
 from caviar_services.channel.sionna_scene import SceneSettings, SionnaScene
+from caviar_services.channel.sionna_settings import SionnaSettings
 from caviar_services.channel.sionna_sharing import scene_of
 from caviar_services.channel.sionna_table import Ends, path_ends, path_table
 from caviar_services.channel.sionna_thinning import Element
 from caviar_services.channel.sionna_traced import Traced
 from caviar_services.channel.sionna_tracer import LANE_BYTES, Tracer
+from caviar_services.channel.sionna_warming import compile_kernels
 from caviar_services.channel.spherical import SphericalWaves
 from caviar_services.channel.traced_surfaces import traced_surfaces
 from caviar_services.channel.visibility import outermost
@@ -56,105 +46,7 @@ from caviar_services.llvm import activate_llvm, choose_variant
 from caviar_services.service import Frame, Preparation, RunInfo, StepResult
 from caviar_services.state import restored, saved
 
-Array = NDArray[Any]
-
-_SAMPLES = 100_000
-
 _COMPILE_GRACE_S = 120.0
-
-
-class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
-    """What is modelled, and how finely."""
-
-    max_depth: Annotated[int, quantity("1", "interactions of a path at most", ge=0, le=16)] = 3
-    rung: Literal["siso-rt", "spherical", "mimo-rt"] = "siso-rt"
-    """How arrays are treated: plane waves, spherical waves, or every antenna pair traced."""
-    samples: (
-        Annotated[int, quantity("1", "rays launched per transmitter; absent: 100,000", ge=1, le=100_000_000)]
-        | None
-    ) = None
-    ray_spacing_deg: (
-        Annotated[float, quantity("°", "mean angle between rays, in place of samples", ge=0.03, le=90)] | None
-    ) = None
-    """N rays that share the sphere's 4π sr have a mean spacing Δ [rad] with N = 4π/Δ²."""
-    los: bool = True
-    reflection: bool = True
-    refraction: bool = False
-    diffraction: bool = False
-    edges_within_m: (
-        Annotated[float, quantity("m", "from an edge that diffracts to the nearer end of a path", gt=0)]
-        | None
-    ) = None
-    """Edges farther from both ends diffract nothing; where there is none in range of a transmitter and all
-    receivers, its rays are launched without diffraction. Absent: all edges count."""
-    scattering: bool = False
-    """Diffuse reflection; needs a scattering_coefficient above 0 in ``materials``."""
-    scattering_samples: (
-        Annotated[int, quantity("1", "rays of a launch of its own for diffuse paths", ge=1, le=100_000_000)]
-        | None
-    ) = None
-    """Every point that a ray meets is a path to whoever sees it, so diffuse paths take far longer than
-    others, and their power converges far sooner. Absent: the rays of ``samples`` scatter too."""
-    scattering_paths: (
-        Annotated[int, quantity("1", "diffuse paths of a receiver, about", ge=1, le=1_000_000)] | None
-    ) = None
-    """Of all points at which the rays of ``scattering_samples`` meet something rough, about so many are
-    chosen for each receiver, the stronger the likelier, and stand for the others: power is right in the mean.
-    Absent: every point at which a ray was drawn to be scattered."""
-    launch_seed: Annotated[int | None, quantity("1", "of the ray launch; absent: from the run's seed")] = None
-    max_paths: Annotated[
-        int, quantity("1", "candidates of a TX/RX pair; more are lost and counted", ge=1)
-    ] = 200_000
-    follow: (
-        Annotated[int, quantity("1", "frames in which all rays are launched, a part in each", ge=2, le=1000)]
-        | None
-    ) = None
-    """Reflections and transmissions are followed from frame to frame, not looked for with all rays in each:
-    new ones are found within this many frames, and a channel that is started again in the middle of an
-    episode cannot go on unless states are saved. Absent: each frame stands on its own."""
-    receivers_at_once: Annotated[
-        int | None, quantity("1", "receivers looked at together; absent: as many as fit")
-    ] = None
-    memory_gib: Annotated[
-        float, quantity("GiB", "for element pairs looked at or traced together", gt=0, le=1024)
-    ] = 4.0
-    bodies: Annotated[int, quantity("1", "moving objects of one mesh at most", ge=0, le=4096)] = 32
-    pool: dict[str, int] = msgspec.field(default_factory=dict)
-    """Bodies of single meshes where ``bodies`` does not fit, by file name without ending: ``car = 64``;
-    ``box`` for objects without a mesh."""
-    without_body: tuple[str, ...] = ()
-    """Classes of objects that the waves pass through."""
-    body_material: str = "metal"
-    """ITU-R P.2040 material of moving objects."""
-    materials: dict[str, MaterialSettings] = msgspec.field(default_factory=dict)
-    """Changes to materials of the scenery, by name."""
-    detail: DetailSettings = msgspec.field(default_factory=DetailSettings)
-    """What of the scenery is left out; absent, nothing is."""
-    outside_itu_range: OutsideRange = "error"
-    """Where ITU-R P.2040 does not define a material at a carrier: ``error``; ``nearest``, the constants of
-    the nearest end of a range; ``extrapolate``, the power law of that range."""
-
-    def __post_init__(self) -> None:
-        if self.scattering_samples is not None and not self.scattering:
-            raise ValueError("scattering_samples needs scattering = true; write both or neither")
-        if self.scattering_paths is not None and self.scattering_samples is None:
-            raise ValueError(
-                "scattering_paths chooses among the points of a launch of its own; give scattering_samples"
-            )
-        if self.scattering_samples is not None and self.rung == "mimo-rt":
-            raise ValueError(
-                'rung = "mimo-rt" traces all paths of an antenna pair at once; leave out scattering_samples'
-            )
-        if self.edges_within_m is not None and (not self.diffraction or self.rung == "mimo-rt"):
-            raise ValueError(
-                'edges_within_m needs diffraction = true and a rung other than "mimo-rt"; leave it out'
-            )
-        mixed = self.scattering and self.scattering_samples is None
-        if self.follow is not None and (self.diffraction or mixed):
-            raise ValueError(
-                "follow knows reflections and transmissions only; leave it out, or set diffraction to "
-                "false and give diffuse paths a launch of their own with scattering_samples"
-            )
 
 
 class SionnaChannel(PathModel[SionnaSettings]):
@@ -173,7 +65,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
     def __init__(self, settings: SionnaSettings, run: RunInfo) -> None:
         super().__init__(settings, run)
         self.rung = settings.rung
-        self._samples = _samples(settings, run.name)
+        self._samples = settings.launched_samples(run.name)
         self._variant = ""
         self._scene: SionnaScene
         self._tracer: Tracer
@@ -223,7 +115,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         frequencies = tuple(carrier.frequency_hz for carrier in self.run.carriers)
         self._scene = scene_of(
             preparation.assets,
-            self._pool_sizes(preparation.assets),
+            s.pool_sizes(preparation.assets, self.run.name),
             SceneSettings(
                 frequencies_hz=frequencies,
                 body_material=s.body_material,
@@ -413,58 +305,20 @@ class SionnaChannel(PathModel[SionnaSettings]):
             ) from error
         return (*notes, f"sionna-rt {sionna.rt.__version__}")
 
-    def _pool_sizes(self, assets: Mapping[str, Path]) -> dict[str, int]:
-        """Bodies of each mesh: those among the assets, and the box."""
-        by_stem = {PurePosixPath(name).stem: name for name in assets if name.startswith("objects/")}
-        by_stem["box"] = ""
-        unknown = sorted(self.settings.pool.keys() - by_stem.keys())
-        if unknown:
-            raise ScenarioError(
-                f"there is no object mesh {unknown[0]!r}; the run has: {', '.join(sorted(by_stem))}",
-                key=f"services.{self.run.name}.settings.pool",
-            )
-        return {name: self.settings.pool.get(stem, self.settings.bodies) for stem, name in by_stem.items()}
-
     def _warm_up(self) -> tuple[str, ...]:
-        """Compile every kernel that frames need: move the bodies, and trace what finds paths."""
+        """Compile every kernel that frames need; how long that took."""
         self.run.progress("compiling kernels", _COMPILE_GRACE_S)
         begin = time.monotonic()
-        if self._launched.diffraction:
-            importlib.import_module("scipy.special")  # which the first diffracted path would wait for
-        middle = (self._scene.low + self._scene.high) / 2
-        above = np.array([middle[0], middle[1], self._scene.high[2] + 10.0])
-        receivers = above + np.arange(1, 9)[:, None] * np.array([1.3, 0.7, -0.1])
-        followed = None if self.settings.follow is None else Followed(self.settings.follow)
-        tracers = [self._tracer] if self._edge_range is None else [self._tracer, self._unbent]
-        for shift, tracer in itertools.product((0.0, 0.5, 1.0), tracers):
-            tracer.trace(above + shift, receivers + shift / 2, followed=followed, names=self._scene.names)
-        if self._diffuse is not None:
-            for shift in (0.0, 0.5):
-                self._diffuse.trace(above + shift, receivers + shift / 2)
-        if self.rung != "siso-rt":
-            corners = Corners(above[None] + [[0, 0, 0.1], [0, 0.1, 0]], receivers[:, None] + np.eye(3)[:2])
-            for tracer in tracers:
-                tracer.trace(above, receivers, corners=corners)
-        if self.rung == "spherical":
-            look = self._tracer.look
-            look.nearest(receivers, receivers - 1.0)
-            chains = np.full((len(receivers), self._launched.max_depth), -1)
-            look.reflected(chains, receivers, receivers - 1.0)
+        compile_kernels(
+            self._scene,
+            self._launched,
+            [self._tracer] if self._edge_range is None else [self._tracer, self._unbent],
+            self._diffuse,
+            rung=self.rung,
+            followed_parts=self.settings.follow,
+        )
         self.run.progress("kernels compiled", 0.0)
         return (f"kernels compiled in {time.monotonic() - begin:.1f} s",)
-
-
-def _samples(settings: SionnaSettings, service: str) -> int:
-    """Rays of a launch, however they were given."""
-    if settings.ray_spacing_deg is None:
-        return _SAMPLES if settings.samples is None else settings.samples
-    if settings.samples is not None:
-        raise ScenarioError(
-            f"samples = {settings.samples} and ray_spacing_deg = {settings.ray_spacing_deg} both say "
-            "how many rays are launched; leave one out",
-            key=f"services.{service}.settings.ray_spacing_deg",
-        )
-    return round(4 * math.pi / math.radians(settings.ray_spacing_deg) ** 2)
 
 
 def _refuse_buried(scene: Scene, without_body: Sequence[str]) -> None:

@@ -80,7 +80,8 @@ class Bench:
         **settings: Any,
     ) -> Model:
         """Rung ``siso-rt`` in a scenery of plates, whose materials are made here."""
-        from caviar_services.channel.sionna_rt import SionnaChannel, SionnaSettings
+        from caviar_services.channel.sionna_rt import SionnaChannel
+        from caviar_services.channel.sionna_settings import SionnaSettings
 
         carriers = (frequencies,) if isinstance(frequencies, int | float) else tuple(frequencies)
         given: dict[str, Any] = {"samples": 20_000, "bodies": 1, "receivers_at_once": 4, "max_depth": 1}
