@@ -12,12 +12,12 @@ Implementations in the registry are tested without even that (``tests/conformanc
 from __future__ import annotations
 
 from caviar_services.testing.base import Played, ServiceConformance
+from caviar_services.testing.recorders import RecorderConformance
 from caviar_services.testing.roles import (
     CONFORMANCE,
     AgentConformance,
     ChannelConformance,
     LinkConformance,
-    RecorderConformance,
     SensorConformance,
     WorldConformance,
 )
