@@ -25,9 +25,9 @@ import msgspec
 
 from caviar_protocol.arrays import Payload
 from caviar_protocol.codec import decode_payload
-from caviar_protocol.digest import RunDigest
 from caviar_protocol.errors import ProtocolError, RecordingError
 from caviar_protocol.messages import GrantInput, Report, Status
+from caviar_protocol.recording_digest import RunDigestReport, recorded_digest
 from caviar_protocol.recording_layout import (
     ASSET_FOLDER,
     FORMAT,
@@ -40,15 +40,6 @@ from caviar_protocol.segment import Channel, Chunk, Segment
 from caviar_protocol.topics import Scene
 
 P = TypeVar("P", bound=Payload)
-
-
-class RunDigestReport(msgspec.Struct, frozen=True, kw_only=True):
-    """A run's digest as its recorded bytes give it, and what in them is damaged."""
-
-    digest: str
-    frames: int
-    damage: tuple[str, ...] = ()
-    """Each names file, frame, topic and source; empty: every byte is as it was written."""
 
 
 class RecordedProduct:
@@ -236,21 +227,7 @@ class Recording:
 
         It does not stop at damage: a changed payload gives another digest and is named.
         """
-        chain, damage = RunDigest(), []
-        for index in range(len(self)):
-            entry, (segment, chunk) = self.entry(index), self._place(index)
-            at = f"{self._at(entry.episode, entry.frame)} ({segment.path.name}, offset {chunk.offset})"
-            fresh, faults = _rehash(entry, segment, chunk)
-            if segment.damaged(chunk):
-                faults.append("the CRC-32 of its chunk differs")
-            if index and (gap := _gap(self.entry(index - 1), entry)):
-                faults.append(gap)
-            damage += [f"{at}: {fault}" for fault in faults]
-            chain.add_frame(entry.episode, entry.frame, fresh)
-        for segment in self._segments:
-            if segment.altered and not any(segment.path.name in place for place in damage):
-                damage.append(f"{segment.path}: the CRC-32 of the file differs, outside of the products")
-        return RunDigestReport(digest=chain.hexdigest(), frames=len(self), damage=tuple(damage))
+        return recorded_digest(self.path, self._segments)
 
     def entry(self, index: int) -> FrameEntry:
         """The frame record of the ``index``-th frame of the recording."""
@@ -326,33 +303,6 @@ class Recording:
 
     def _at(self, episode: int, frame: int) -> str:
         return f"{self.path}: episode {episode}, frame {frame}"
-
-
-def _rehash(
-    entry: FrameEntry, segment: Segment, chunk: Chunk
-) -> tuple[list[tuple[str, str, str]], list[str]]:
-    """(topic, source, digest) of the fresh products of a frame as stored, and what is wrong there."""
-    stored = {(message.channel, message.frame): message.data for message in segment.messages(chunk)}
-    fresh, faults = [], []
-    for item in entry.inputs:
-        if item.status not in (Status.FRESH, Status.LATE):
-            continue
-        data = stored.get((Channel(item.topic, item.source), item.frame))
-        if data is None:
-            faults.append(f"{item.topic} of {item.source!r}: its bytes are missing")
-            continue
-        digest = hashlib.sha256(data).hexdigest()
-        if digest != item.digest:
-            faults.append(f"{item.topic} of {item.source!r}: its digest is {digest}, was {item.digest}")
-        if item.status is Status.FRESH:
-            fresh.append((item.topic, item.source, digest))
-    return fresh, faults
-
-
-def _gap(earlier: FrameEntry, later: FrameEntry) -> str:
-    if later.episode != earlier.episode or later.frame == earlier.frame + 1:
-        return ""
-    return f"it follows frame {earlier.frame}: what was between is lost"
 
 
 def _metadata_of(segment: Segment) -> RecordingMetadata:
