@@ -17,13 +17,14 @@ from caviar_broker.core.gate import Gate
 from caviar_broker.core.graph import Graph
 from caviar_broker.core.inputs import Gathered, Inputs
 from caviar_broker.core.ledger import Ledger
+from caviar_broker.core.orders import Orders
 from caviar_broker.core.plan import RunPlan, ServicePlan
 from caviar_broker.core.resumption import Resumption
-from caviar_broker.core.tasks import Decision, GrantOrder, Task, milliseconds, provenance
+from caviar_broker.core.tasks import GrantOrder, Task, milliseconds
 from caviar_broker.core.transitions import OUTSTANDING, TaskEvent, TaskState
 from caviar_broker.core.turns import Turns
 from caviar_protocol.digest import RunDigest
-from caviar_protocol.messages import GrantInput, Report, Status
+from caviar_protocol.messages import Report
 
 # On the path of every frame: a member that is looked up in its class costs four times as much.
 _GRANTED, _OVERDUE, _ABANDONED = TaskState.GRANTED, TaskState.OVERDUE, TaskState.ABANDONED
@@ -76,19 +77,11 @@ class EpisodeSchedule:
         self._turns = Turns(graph, plan, self._book)
         self._completed = dict.fromkeys(graph.order, -1)
         self._outstanding: dict[str, list[Task]] = {name: [] for name in graph.order}
-        self._late: list[Product] = []
-        """Late products that the recorder has not been told of (clause 11)."""
+        self._orders = Orders(self._book, self._turns)
         self._paused: set[str] = set()
         self._saving: set[str] = set()
         self.deadlines = Deadlines(
-            plan,
-            episode,
-            self._book,
-            self._turns,
-            self._gate,
-            self._outstanding,
-            self._saving,
-            self.actions,
+            plan, episode, self._book, self._turns, self._gate, self._outstanding, self._saving, self.actions
         )
         """Pace and budgets, and what was overrun."""
 
@@ -208,7 +201,7 @@ class EpisodeSchedule:
 
     def close(self, now: int) -> None:
         """The episode is over, or the run ends within it: tell what was left unanswered or unused."""
-        for product in self._late:
+        for product in self._orders.late:
             text = f"{product.topic} came after the recorder's last grant; not recorded"
             self._notice("discarded", Task(product.source, product.frame), text)
         for owed in self._outstanding.values():
@@ -320,24 +313,9 @@ class EpisodeSchedule:
         previous = owed[-1].frame if owed else self._completed[task.service]
         task.move(_GRANT)
         task.started_at = now
-        task.order = self._order(task, inputs, previous)
+        task.order = self._orders.order(task, inputs, previous)
         owed.append(task)
         self.grants.append(task.order)
-
-    def _order(self, task: Task, gathered: Gathered, previous: int) -> GrantOrder:
-        inputs, products = gathered.provided(task.frame)
-        reports: list[Report] = []
-        if task.service in self._turns.recorders:
-            told = [product for product in self._late if product.frame <= task.frame]
-            self._late = [product for product in self._late if product.frame > task.frame]
-            inputs += [_late_input(product, task.frame) for product in told]
-            products += told
-            of_frame = (self._book.find(name, task.frame) for name in self._turns.others)
-            reports = sorted((t.report for t in of_frame if t and t.report), key=lambda r: r.source)
-        final = task.frame == self._book.frames
-        return GrantOrder(
-            task.service, task.frame, previous, final, tuple(inputs), tuple(products), tuple(reports)
-        )
 
     # --- answers -------------------------------------------------------------------------------------
 
@@ -356,7 +334,7 @@ class EpisodeSchedule:
         self._notice("late", task, f"answered after {elapsed}; its frame had gone on")
         self._book.late(task, products, now)
         if self._turns.recorders:
-            self._late += products.values()
+            self._orders.late += products.values()
         self._book.release(task)
 
     def _end_after(self, frame: int) -> None:
@@ -375,7 +353,3 @@ class EpisodeSchedule:
 
     def _notice(self, kind: str, task: Task, text: str) -> None:
         self.actions.append(Notice(kind, task.service, text, self.episode, task.frame))
-
-
-def _late_input(product: Product, frame: int) -> GrantInput:
-    return provenance(product.topic, product.source, Decision(Status.LATE, product), frame)
