@@ -9,17 +9,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import zmq
 
+from caviar_broker.connections import COMPLAINTS, Connections
 from caviar_broker.core import events as ev
 from caviar_broker.core.clock import FrameClock
 from caviar_broker.core.plan import RunPlan
 from caviar_broker.core.resumption import Resumption
 from caviar_broker.core.transitions import RunState
-from caviar_broker.grumbles import Grumbles
 from caviar_broker.journal import JournalFile
 from caviar_broker.loop import Loop
 from caviar_broker.port import Port
@@ -31,16 +30,13 @@ from caviar_broker.watchdog import CHECK_NS, Watchdog
 from caviar_protocol import messages as m
 from caviar_protocol.alive import SignOfLife
 from caviar_protocol.assets import AssetStore
-from caviar_protocol.codec import check_parts, decode_message, encode_message, message_type
-from caviar_protocol.errors import ProtocolError, RunError, VersionError
-from caviar_protocol.host import host_identity
+from caviar_protocol.codec import check_parts, decode_message, encode_message
+from caviar_protocol.errors import ProtocolError, RunError
 
 LOOK_NS = 1_000_000
 """[ns] until deadlines are looked at again, however busy the port is."""
 MESSAGES_A_TURN = 64
 """Messages taken before the clock is looked at again."""
-_COMPLAINTS = (m.Error, m.Stale, m.Refuse, m.HeartbeatAck)
-"""Messages that nobody answers: they give no right to a further message."""
 
 
 class Observer(Protocol):
@@ -51,14 +47,6 @@ class Observer(Protocol):
 
     def frame(self, frame: ev.FrameFinished, statistics: Statistics) -> None:
         """A frame is finished."""
-
-
-@dataclass(slots=True)
-class _Connection:
-    """What is known of one routing id."""
-
-    service: str
-    heartbeat: bool
 
 
 class BrokerServer:
@@ -102,19 +90,14 @@ class BrokerServer:
         self.statistics = Statistics({s.name: s.budget_ns for s in plan.services})
         self.outcome: ev.Finished | None = None
         self._plan, self._journal, self._observer = plan, journal, observer
-        self._grumbles = Grumbles()
         self._sign = SignOfLife()
         self._scenery = SceneryDesk(
             exchange=SceneryExchange(store or AssetStore()),
             clock=self.clock,
             feed=self.feed,
-            reply=lambda service, *parts: self._reply(self._routes[service], *parts),
+            reply=self._reply,
             note=self.note,
         )
-        self._connections: dict[bytes, _Connection] = {}
-        self._routes: dict[str, bytes] = {}
-        self._host = host_identity()
-        self._replying = b""
         self._taken = False
         """Whether the clock took answers that it has not acted upon yet."""
         self._entries: list[ev.Journal] = []
@@ -129,7 +112,6 @@ class BrokerServer:
         self.loop = Loop()
         """Others may have descriptors watched by it."""
         self.loop.watch(self._port.socket, self._receive_all)
-        self._guard.start(self.loop, self._cut_off, self._gone, self._grumble)
         self._watchdog = Watchdog(
             clock=self.clock,
             heartbeat_ns=plan.limits.heartbeat,
@@ -139,6 +121,19 @@ class BrokerServer:
             warn=self.note,
             supervised=set(supervised),
         )
+        self._connections = Connections(
+            clock=self.clock,
+            epoch=plan.epoch,
+            port=self._port,
+            loop=self.loop,
+            watchdog=self._watchdog,
+            scenery=self._scenery,
+            feed=self.feed,
+            perform=self._perform,
+            note=self.note,
+        )
+        # On the path of every frame: looked up without a detour.
+        self._known, self._routes = self._connections.known, self._connections.routes
         self._handlers: dict[type, Callable[[str, Any, Sequence[zmq.Frame]], None]] = {
             m.Done: self._done,
             m.Ready: self._scenery.ready,
@@ -159,7 +154,7 @@ class BrokerServer:
             ev.Notice: self._observer.notice,
             ev.FrameFinished: self._frame_finished,
             ev.EpisodeFinished: self._episode_finished,
-            ev.TurnAway: self._turn_away,
+            ev.TurnAway: self._connections.turn_away,
             ev.Finished: self._finished,
         }
 
@@ -231,136 +226,18 @@ class BrokerServer:
             message = decode_message(parts[0].buffer)
             check_parts(message, parts)
         except ProtocolError as error:
-            self._refuse_bytes(route, error)
+            self._connections.unreadable(route, error)
             return
-        connection = self._connections.get(route)
+        connection = self._known.get(route)
         if connection is None:
-            self._from_stranger(route, message)
+            self._connections.from_stranger(route, message)
         elif connection.heartbeat:
-            self._from_pulse(route, connection.service, message)
+            self._connections.from_pulse(route, connection.service, message)
         elif (handler := self._handlers.get(type(message))) is not None:
             handler(connection.service, message, parts[1:])
         else:
-            self._unexpected(route, message, "the ordered connection of a service that is in the run")
-
-    def _from_stranger(self, route: bytes, message: m.Message) -> None:
-        if isinstance(message, m.Hello):
-            self._hello(route, message)
-        elif isinstance(message, m.Attach):
-            self._attach(route, message)
-        else:
-            kind = message_type(message)
-            text = f"{kind} came before HELLO or ATTACH"
-            self._reply(route, m.Error(code="unknown-peer", of=kind, message=text))
-            self._grumble("strangers", f"{text} on a connection that nobody knows; not used")
-
-    def _from_pulse(self, route: bytes, service: str, message: m.Message) -> None:
-        if isinstance(message, m.Heartbeat):
-            self._reply(route, m.HeartbeatAck(sequence=message.sequence))
-            self._watchdog.heard(service)
-            self.feed(ev.Progressed(service, message.progress, message.phase, message.grace_ns))
-        else:
-            self._unexpected(route, message, "a heartbeat connection")
-
-    def _unexpected(self, route: bytes, message: m.Message, where: str) -> None:
-        kind = message_type(message)
-        self._reply(route, m.Error(code="unexpected", of=kind, message=f"{kind} has no place on {where}"))
-        service = self._connections[route].service
-        self._grumble(
-            f"unexpected {service}", f"sent {kind}, which has no place on {where}; not used", service
-        )
-
-    def _refuse_bytes(self, route: bytes, error: ProtocolError) -> None:
-        answer: m.Message = m.Error(code=error.code, message=str(error))
-        if isinstance(error, VersionError):
-            answer = m.Refuse(code=error.code, message=str(error))
-        self._reply(route, answer)
-        connection = self._connections.get(route)
-        if connection is not None:
-            self.feed(ev.Violated(connection.service, f"sent what is not in the protocol: {error}"))
-        else:
-            self._grumble(
-                "garbage", f"a connection that nobody knows sent what is not in the protocol: {error}"
-            )
-
-    def _hello(self, route: bytes, hello: m.Hello) -> None:
-        if why := self._guard.refusal(route, hello.name, hello.role, hello.outputs):
-            self._unauthorized(route, f"HELLO as {hello.name!r} ({hello.role}): {why}")
-            return
-        before = self.clock.peer(hello.name)
-        attempt = before.attempt if before else 0
-        self._replying = route
-        if before is not None and before.present:
-            self._watchdog.recheck(hello.name)  # one that was killed may be back before its death shows
-        self.clock.receive(ev.Joined(hello), time.monotonic_ns())
-        peer = self.clock.peer(hello.name)
-        if peer is not None and peer.attempt > attempt:
-            self._admit(route, hello)
-        self._perform()  # WELCOME goes to whom was admitted; one turned away changes nothing
-
-    def _admit(self, route: bytes, hello: m.Hello) -> None:
-        """A new incarnation is in the run: nothing counts any more that comes from the one before."""
-        name = hello.name
-        self._scenery.forget(name)
-        earlier = self._watchdog.forget(name)
-        if earlier is not None:
-            self.loop.unwatch(earlier)
-        for old in [r for r, c in self._connections.items() if c.service == name]:
-            del self._connections[old]
-        self._routes[name] = route
-        self._connections[route] = _Connection(name, heartbeat=False)
-        self._guard.known(route, name)
-        local = hello.pid and hello.host and hello.host == self._host
-        fd = self._watchdog.welcome(name, hello.pid if local else None)
-        if fd is not None:
-            self.loop.watch(fd, lambda: self._died(name, fd))
-
-    def _died(self, service: str, fd: int) -> None:
-        self.loop.unwatch(fd)
-        self._watchdog.died(service)
-
-    def _unauthorized(self, route: bytes, text: str) -> None:
-        self._reply(route, m.Refuse(code="unauthorized", message=text))
-        self._grumble("unauthorized", f"a connection was refused: {text}")
-
-    def _cut_off(self, route: bytes, why: str) -> bool:
-        """A peer took more than its share, or may not take part any more: whether it was a service."""
-        connection = self._connections.pop(route, None)
-        if connection is None:
-            return False
-        for other in [r for r, c in self._connections.items() if c.service == connection.service]:
-            self._guard.cut(other, why)
-        self.feed(ev.Lost(connection.service, f"it was cut off: {why}"))
-        return True
-
-    def _gone(self, route: bytes) -> None:
-        """A connection has ended: a remote service is lost; of a local one the operating system tells."""
-        connection = self._connections.get(route)
-        if connection is None:
-            return
-        service = connection.service
-        if connection.heartbeat:
-            self._watchdog.recheck(service)
-        elif not self._watchdog.cut_off(service):
-            self.feed(ev.Lost(service, "it is unreachable or stopped: its connection is gone"))
-
-    def _attach(self, route: bytes, attach: m.Attach) -> None:
-        if why := self._guard.refusal(route, attach.name):
-            self._unauthorized(route, f"ATTACH to {attach.name!r}: {why}")
-            return
-        name, peer = attach.name, self.clock.peer(attach.name)
-        current = peer is not None and peer.present and name in self._routes
-        if peer is None or not current or (attach.epoch, attach.attempt) != (self._plan.epoch, peer.attempt):
-            text = f"{name!r} is not in the run as attempt {attach.attempt} of epoch {attach.epoch}"
-            self._reply(route, m.Error(code="unknown-peer", of="ATTACH", message=text))
-            self._grumble("strangers", f"ATTACH was refused: {text}")
-            return
-        earlier = self._watchdog.attach(name, route)
-        if earlier is not None:
-            self._connections.pop(earlier, None)
-        self._connections[route] = _Connection(name, heartbeat=True)
-        self._guard.known(route, name, pulse=True)
-        self._reply(route, m.HeartbeatAck(sequence=0))
+            where = "the ordered connection of a service that is in the run"
+            self._connections.unexpected(route, message, where)
 
     # --- answers -------------------------------------------------------------------------------------
 
@@ -385,7 +262,7 @@ class BrokerServer:
         if self._scenery.undeliverable(service, message):
             return
         text = f"could not use {message.of or 'a message'}: {message.message}"
-        self._grumble(f"error {service}", text, service)
+        self._connections.grumble(f"error {service}", text, service)
 
     # --- what goes -------------------------------------------------------------------------------------
 
@@ -425,13 +302,6 @@ class BrokerServer:
     def _episode_finished(self, action: ev.EpisodeFinished) -> None:
         """Its frames are told one by one."""
 
-    def _turn_away(self, action: ev.TurnAway) -> None:
-        self._reply(self._replying, action.refusal)
-        text = f"a connection was turned away: {action.refusal.message}"
-        text = self._grumbles.tell(f"refused {action.refusal.code}", text, time.monotonic_ns())
-        if text:
-            self._observer.notice(ev.Notice("refused", action.name, text, self.clock.episode))
-
     def _finished(self, action: ev.Finished) -> None:
         self.outcome = action
 
@@ -440,29 +310,19 @@ class BrokerServer:
         if action.attachment is not None:
             parts.append(action.attachment)
         route, message = self._routes[action.service], action.message
-        reason = self._port.send(route, encode_message(message), parts, not isinstance(message, _COMPLAINTS))
+        reason = self._port.send(route, encode_message(message), parts, not isinstance(message, COMPLAINTS))
         if not reason or self.clock.state is RunState.FINISHED:
             return
         if not self._watchdog.cut_off(action.service):
             verdict = f"it is unreachable: {reason}"
             self.clock.receive(ev.Lost(action.service, verdict), time.monotonic_ns())
 
-    def _reply(self, route: bytes, message: m.Message, *parts: bytes) -> None:
-        """Answer a routing id; a peer that is gone meanwhile needs no answer."""
-        reason = self._port.send(route, encode_message(message), parts, not isinstance(message, _COMPLAINTS))
-        if reason:
-            connection = self._connections.get(route)
-            service = connection.service if connection else ""
-            self._grumble(f"reply {service}", f"{message_type(message)} reached nobody: {reason}", service)
+    def _reply(self, service: str, message: m.Message, *parts: bytes) -> None:
+        self._connections.reply(self._routes[service], message, *parts)
 
     def note(self, service: str, text: str, kind: str = "note") -> None:
         """Tell the observer something about a service, or in general."""
         self._observer.notice(ev.Notice(kind, service, text, self.clock.episode))
-
-    def _grumble(self, kind: str, text: str, service: str = "") -> None:
-        text = self._grumbles.tell(kind, text, time.monotonic_ns())
-        if text:
-            self.note(service, text)
 
 
 def _weight(payload: Sequence[zmq.Frame]) -> int:

@@ -14,7 +14,8 @@ from typing import Any
 import pytest
 
 from caviar_clients.cli import launch
-from caviar_clients.cli.launch import TAIL, Child, Launcher
+from caviar_clients.cli.children import TAIL, Child
+from caviar_clients.cli.launch import Launcher
 from caviar_protocol.errors import RunError
 from caviar_protocol.scenario_loader import load_scenario
 

@@ -84,7 +84,13 @@ def http_address(text: str, keys: Path | None) -> tuple[str, int]:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a host name or address always means this machine."""
+    """Whether a host name or address always means this machine.
+
+    Names are deliberately not resolved, other than ``localhost``: what a name stands for may change
+    between this check and the bind, or be decided by who runs the name server, and then HTTP without
+    tokens would be open to others. A name that happens to mean this machine is refused instead, and
+    its user writes the address.
+    """
     if host == "localhost":
         return True
     try:

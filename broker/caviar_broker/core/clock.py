@@ -90,7 +90,7 @@ class FrameClock:
     def expire(self, now: int) -> None:
         """Act on every deadline that has passed."""
         if self._episodes.schedule is not None:
-            self._episodes.schedule.expire(now)
+            self._episodes.schedule.deadlines.expire(now)
             self._episodes.pump(now)
         self._liveness.expire(now)
         self.settle(now)
@@ -99,7 +99,7 @@ class FrameClock:
         """When `expire` has to be called at the latest [ns]; None if nothing is awaited."""
         if not self._deadline_is_known:
             schedule = self._episodes.schedule
-            of_frames = schedule.next_deadline() if schedule is not None else None
+            of_frames = schedule.deadlines.next() if schedule is not None else None
             instants = (self._liveness.next_deadline(), of_frames)
             self._deadline = min((instant for instant in instants if instant is not None), default=None)
             self._deadline_is_known = True

@@ -283,8 +283,9 @@ class Episodes:
         run, schedule = self._run, self.schedule
         if schedule is None or run.state is not _RUNNING:
             return
+        deadlines = schedule.deadlines
         schedule.advance(now)
-        for task, remedy in schedule.overruns:
+        for task, remedy in deadlines.overruns:
             peer = run.peers[task.service]
             waiting = schedule.waiting_for(task.service)
             text = peer.blame_task(task, "overran its budget", now, waiting)
@@ -297,13 +298,13 @@ class Episodes:
             if peer.present:
                 ids = {"epoch": run.plan.epoch, "attempt": peer.attempt, "episode": run.episode}
                 run.send(peer, Cancel(**ids, frame=task.frame))
-        schedule.overruns.clear()
+        deadlines.overruns.clear()
         schedule.grants.clear()
         schedule.cut.clear()
-        if schedule.aborted is not None:
-            peer = run.peers[schedule.aborted.service]
+        if deadlines.aborted is not None:
+            peer = run.peers[deadlines.aborted.service]
             waiting = schedule.waiting_for(peer.name)
-            text = peer.blame_task(schedule.aborted, "overran its budget (policy abort)", now, waiting)
+            text = peer.blame_task(deadlines.aborted, "overran its budget (policy abort)", now, waiting)
             run.fail(text, peer.name, now)
         elif schedule.finished:
             self._over(schedule, now)

@@ -1,4 +1,4 @@
-"""The frames of one episode: who may be granted what, when, and what happens at a deadline.
+"""The frames of one episode: who may be granted what, and what becomes of answers.
 
 `EpisodeSchedule` implements clauses 6 to 13 and 16 of the contract for a fixed graph. It knows
 nothing of joining, dying or messages; `episodes.Episodes` does that around it.
@@ -10,20 +10,21 @@ from collections.abc import Collection, Iterable, Mapping
 
 from msgspec.structs import replace
 
+from caviar_broker.core.deadlines import Deadlines
 from caviar_broker.core.decisions import DecisionBook
-from caviar_broker.core.events import Action, Latency, Notice, Overdue, Product
+from caviar_broker.core.events import Action, Notice, Product
 from caviar_broker.core.gate import Gate
 from caviar_broker.core.graph import Graph
 from caviar_broker.core.inputs import Gathered, Inputs
 from caviar_broker.core.ledger import Ledger
-from caviar_broker.core.pace import Pacer
+from caviar_broker.core.orders import Orders
 from caviar_broker.core.plan import RunPlan, ServicePlan
 from caviar_broker.core.resumption import Resumption
-from caviar_broker.core.tasks import Decision, GrantOrder, Task, milliseconds, provenance
+from caviar_broker.core.tasks import GrantOrder, Task, milliseconds
 from caviar_broker.core.transitions import OUTSTANDING, TaskEvent, TaskState
 from caviar_broker.core.turns import Turns
 from caviar_protocol.digest import RunDigest
-from caviar_protocol.messages import GrantInput, Report, Status
+from caviar_protocol.messages import Report
 
 # On the path of every frame: a member that is looked up in its class costs four times as much.
 _GRANTED, _OVERDUE, _ABANDONED = TaskState.GRANTED, TaskState.OVERDUE, TaskState.ABANDONED
@@ -33,8 +34,8 @@ _GRANT, _ANSWER = TaskEvent.GRANT, TaskEvent.ANSWER
 class EpisodeSchedule:
     """Schedule of one episode.
 
-    What it wants done collects in `actions`, `grants`, `cut`, `overruns` and `aborted`, for the
-    caller to carry out.
+    What it wants done collects in `actions`, `grants` and `cut`, and in its `deadlines`, for the caller to
+    carry out.
 
     Parameters
     ----------
@@ -66,25 +67,23 @@ class EpisodeSchedule:
         self.grants: list[GrantOrder] = []
         self.cut: list[Task] = []
         """Granted tasks that an early end made useless; to be cancelled."""
-        self.overruns: list[tuple[Task, str]] = []
-        """Granted tasks whose budget is up, and what is done about it; to be blamed (clause 14)."""
-        self.aborted: Task | None = None
-        """A task of a service with policy abort that missed its deadline."""
         self._plans: Mapping[str, ServicePlan] = {p.name: p for p in plan.services}
         self._capacity, self._ledger = capacity, ledger
         self._first_entry = ledger.last
-        self._pacer, self._gate = Pacer(plan), gate or Gate()
+        self._gate = gate or Gate()
         sources = {edge.source for name in remembering for edge in graph.inputs[name]}
         self._book = DecisionBook(graph, plan, episode, digest, ledger, self.actions, sources)
-        self._book.lag_ns = lambda: self._pacer.lag_ns
         self._inputs = Inputs(graph, self._book)
         self._turns = Turns(graph, plan, self._book)
         self._completed = dict.fromkeys(graph.order, -1)
         self._outstanding: dict[str, list[Task]] = {name: [] for name in graph.order}
-        self._late: list[Product] = []
-        """Late products that the recorder has not been told of (clause 11)."""
+        self._orders = Orders(self._book, self._turns)
         self._paused: set[str] = set()
         self._saving: set[str] = set()
+        self.deadlines = Deadlines(
+            plan, episode, self._book, self._turns, self._gate, self._outstanding, self._saving, self.actions
+        )
+        """Pace and budgets, and what was overrun."""
 
     def go_on(self, resumption: Resumption, completed: Mapping[str, int]) -> None:
         """Go on behind the last finished frame; ``completed`` says how far services got that have state."""
@@ -113,7 +112,7 @@ class EpisodeSchedule:
             self._notice("discarded", task, "answered behind the end of the episode; not used")
             return
         self._completed[service] = max(self._completed[service], frame)
-        self._measure(task, now)
+        self.deadlines.measure(task, now)
         if state is _OVERDUE:
             self._came_late(task, by_topic, now)
         else:
@@ -138,7 +137,7 @@ class EpisodeSchedule:
         if state is _ABANDONED:
             self._book.release(task)
             return
-        self._measure(task, now)
+        self.deadlines.measure(task, now)
         if state is _OVERDUE:
             self._book.release(task)
         else:
@@ -200,35 +199,15 @@ class EpisodeSchedule:
                     concerned.discard(name)
                     self._advance_service(name, now)
 
-    def expire(self, now: int) -> None:
-        """Act on deadlines that have passed (clause 9)."""
-        for name in self.graph.order:
-            due = self._due(name)
-            if due is not None and due[0] <= now:
-                self.actions.append(Overdue(name, self.episode, due[1].frame, due[0]))
-                self._expired(due[1], now)
-        instant = self._next_release()
-        if instant is not None and instant <= now:
-            self._turns.wake(self._turns.waiting_for_pace)
-
-    def next_deadline(self) -> int | None:
-        """The earliest instant at which `expire` has something to do [ns]."""
-        instant = self._next_release()
-        for name in self.graph.order:
-            due = self._due(name)
-            if due is not None and (instant is None or due[0] < instant):
-                instant = due[0]
-        return instant
-
     def close(self, now: int) -> None:
         """The episode is over, or the run ends within it: tell what was left unanswered or unused."""
-        for product in self._late:
+        for product in self._orders.late:
             text = f"{product.topic} came after the recorder's last grant; not recorded"
             self._notice("discarded", Task(product.source, product.frame), text)
         for owed in self._outstanding.values():
             for task in owed:
                 if task.overran:
-                    self._measure(task, now)
+                    self.deadlines.measure(task, now)
                     self._notice("late", task, "was never answered")
 
     # --- what can be asked -------------------------------------------------------------------------
@@ -312,7 +291,7 @@ class EpisodeSchedule:
             if self._ledger.written < max(self._first_entry, inputs.entry):
                 self._turns.waiting_for_journal.add(name)
                 return
-            if (self.plan.realtime or self._gate.closed) and not self._released(task, now):
+            if (self.plan.realtime or self._gate.closed) and not self.deadlines.released(task, now):
                 self._turns.waiting_for_pace.add(name)
                 return
             if in_flight and inputs.cause is not None:
@@ -329,52 +308,16 @@ class EpisodeSchedule:
             else:
                 return
 
-    def _released(self, task: Task, now: int) -> bool:
-        """Whether the run is not paused, and real time has come to this frame (clause 8)."""
-        if task.frame >= self._book.frames:
-            return True
-        if not self._gate.admits(task.frame, now):
-            self._pacer.withdraw()
-            return False
-        self._pacer.shift(self._gate.held_ns(now))
-        slip = self._pacer.release(task.frame, now)
-        if slip is None:
-            return False
-        self._turns.wake(self._turns.waiting_for_pace)  # whoever asks first releases the frame for all
-        if self._pacer.tells(slip):
-            behind = milliseconds(self._pacer.lag_ns)
-            self._notice("lag", task, f"{milliseconds(slip)} behind real time, {behind} since the start")
-        return True
-
-    def _next_release(self) -> int | None:
-        """When the frame that somebody waits for will be due; None if nobody does."""
-        return self._pacer.next_instant() if self._turns.waiting_for_pace else None
-
     def _grant(self, task: Task, inputs: Gathered, now: int) -> None:
         owed = self._outstanding[task.service]
         previous = owed[-1].frame if owed else self._completed[task.service]
         task.move(_GRANT)
         task.started_at = now
-        task.order = self._order(task, inputs, previous)
+        task.order = self._orders.order(task, inputs, previous)
         owed.append(task)
         self.grants.append(task.order)
 
-    def _order(self, task: Task, gathered: Gathered, previous: int) -> GrantOrder:
-        inputs, products = gathered.provided(task.frame)
-        reports: list[Report] = []
-        if task.service in self._turns.recorders:
-            told = [product for product in self._late if product.frame <= task.frame]
-            self._late = [product for product in self._late if product.frame > task.frame]
-            inputs += [_late_input(product, task.frame) for product in told]
-            products += told
-            of_frame = (self._book.find(name, task.frame) for name in self._turns.others)
-            reports = sorted((t.report for t in of_frame if t and t.report), key=lambda r: r.source)
-        final = task.frame == self._book.frames
-        return GrantOrder(
-            task.service, task.frame, previous, final, tuple(inputs), tuple(products), tuple(reports)
-        )
-
-    # --- answers and deadlines -----------------------------------------------------------------------
+    # --- answers -------------------------------------------------------------------------------------
 
     def _answered(self, service: str, frame: int, now: int) -> Task:
         owed = self._outstanding[service]
@@ -391,7 +334,7 @@ class EpisodeSchedule:
         self._notice("late", task, f"answered after {elapsed}; its frame had gone on")
         self._book.late(task, products, now)
         if self._turns.recorders:
-            self._late += products.values()
+            self._orders.late += products.values()
         self._book.release(task)
 
     def _end_after(self, frame: int) -> None:
@@ -408,59 +351,5 @@ class EpisodeSchedule:
                 self.cut.append(task)
         self._turns.wake_all()
 
-    def _due(self, name: str) -> tuple[int, Task] | None:
-        """When the budget of what a service has to do next is up."""
-        task = self._book.find(name, self._book.next[name])
-        if task is None:
-            return None
-        budget = self._plans[name].budget_ns
-        if task.state is _GRANTED:
-            return None if task.overran else (task.started_at + budget, task)
-        if task.state is TaskState.PENDING and task.eligible_at is not None:
-            policy = self._plans[name].policy
-            waits = policy == "wait" or (policy == "abort" and name in self._saving)
-            return None if waits else (task.eligible_at + budget, task)
-        return None
-
-    def _expired(self, task: Task, now: int) -> None:
-        plan, granted = self._plans[task.service], task.state is _GRANTED
-        budget = milliseconds(plan.budget_ns)
-        task.overran = granted
-        if plan.policy == "abort":
-            self.aborted = self.aborted or task
-        elif plan.policy == "wait":
-            self.overruns.append((task, "the frame waits"))
-        elif granted:
-            cause = f"{task.service} missed frame {task.frame} ({plan.policy}, budget {budget})"
-            task.move(TaskEvent.DEADLINE)
-            self.overruns.append((task, f"the frame goes on ({plan.policy})"))
-            self._book.substitute(task, cause, "overdue", now)
-            self._turns.decided(task.service)
-        else:
-            owed = self._outstanding[task.service]
-            why = f"still busy with frame {owed[0].frame}" if owed else "not connected"
-            if not owed and task.service in self._saving:
-                why = "saving its state"
-            cause = f"{task.service} missed frame {task.frame} ({plan.policy}, budget {budget}), {why}"
-            elapsed = now - (task.eligible_at or now)
-            self.actions.append(Latency(task.service, self.episode, task.frame, elapsed, missed=True))
-            task.move(TaskEvent.DEADLINE)
-            self._notice("skipped", task, cause)
-            self._book.substitute(task, cause, "skipped", now)
-            self._turns.decided(task.service)
-
-    def _measure(self, task: Task, now: int) -> None:
-        if self.plan.ephemeral:
-            return
-        elapsed = now - task.started_at
-        missed = task.overran or elapsed > self._plans[task.service].budget_ns
-        if missed and not task.overran:
-            self.overruns.append((task, "answered before the frame went on"))
-        self.actions.append(Latency(task.service, self.episode, task.frame, elapsed, missed))
-
     def _notice(self, kind: str, task: Task, text: str) -> None:
         self.actions.append(Notice(kind, task.service, text, self.episode, task.frame))
-
-
-def _late_input(product: Product, frame: int) -> GrantInput:
-    return provenance(product.topic, product.source, Decision(Status.LATE, product), frame)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import selectors
-import signal
 import subprocess
 import sys
 import time
@@ -16,38 +15,18 @@ from typing import Any
 
 from caviar_broker.processes import describe_exit, describe_stop, is_stopped
 from caviar_clients.cli.borrowed import BorrowedKey
+from caviar_clients.cli.children import Child, end, wait
 from caviar_protocol.errors import RunError
 from caviar_protocol.scenario import Scenario, ServiceSpec
 
 KILL_AFTER_S = 1.0
 """[s] that a process gets after SIGTERM before SIGKILL, beyond the run's ``shutdown_s``."""
-
-
 BROKER_S = 10.0
 """[s] that the broker gets to end after its last service, beyond the run's ``shutdown_s``."""
 MAX_RESTARTS = 5
 """Processes that are started for a service that died, before it comes back."""
 LOOK_S = 0.05
 """[s] between looks at whether the broker's process is stopped; its death shows at once."""
-TAIL = 1 << 16
-"""[B] of a log that are looked at for its last line."""
-
-
-@dataclass
-class Child:
-    """One process of the run."""
-
-    name: str
-    process: subprocess.Popen[bytes]
-    log: Path
-    pidfd: int
-
-    def last_line(self) -> str:
-        """The last line it printed; empty if it printed nothing."""
-        with self.log.open("rb") as file:
-            file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL))
-            lines = file.read().decode(errors="replace").strip().splitlines()
-        return lines[-1] if lines else ""
 
 
 @dataclass
@@ -181,20 +160,10 @@ class Launcher:
             self._start(name)
 
     def _start(self, name: str) -> None:
-        """Start a service; its log goes on where one before it ended."""
         spec, path = self._local[name], self.directory / "logs" / f"{name}.log"
         command = [sys.executable, "-m", "caviar_services", name]
         command += ["--use", f"{spec.role}:{spec.use}", "--broker", self.endpoint]
-        with path.open("ab") as log:
-            process = subprocess.Popen(  # noqa: S603  # our own module with checked arguments
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                start_new_session=True,
-                env=self._key.environment(),
-            )
-        child = Child(name, process, path, os.pidfd_open(process.pid))
+        child = Child.start(name, command, path, self._key.environment())
         before, self._children[name] = self._children.get(name), child
         if before is not None:
             os.close(before.pidfd)
@@ -266,7 +235,7 @@ class Launcher:
             broker.stdin.close()
         if broker.stdout is not None:
             broker.stdout.close()
-        _wait([broker], KILL_AFTER_S)
+        wait([broker], KILL_AFTER_S)
         if broker.poll() is None:
             broker.kill()
         status = broker.wait()
@@ -284,7 +253,7 @@ class Launcher:
 
     def _end_services(self) -> None:
         processes = [child.process for child in self._children.values()]
-        _end(processes, KILL_AFTER_S)
+        end(processes, KILL_AFTER_S)
         for child in self._children.values():
             if child.pidfd in self._selector.get_map():
                 self._selector.unregister(child.pidfd)
@@ -292,7 +261,7 @@ class Launcher:
         self._children.clear()
 
     def _broker_ended(self, broker: subprocess.Popen[bytes]) -> Mapping[str, Any]:
-        _wait([broker], self.scenario.timeouts.shutdown_s + BROKER_S)
+        wait([broker], self.scenario.timeouts.shutdown_s + BROKER_S)
         status = broker.poll()
         if status is None:
             raise RunError("the broker closed its output and does not end")
@@ -355,31 +324,9 @@ class Launcher:
                 self._broker.stdin.close()
         # Before the first frame some services may not have connected, so that no SHUTDOWN reached them.
         grace = self.scenario.timeouts.shutdown_s if self._frames else 0.0
-        _wait(processes, grace)
-        _end(processes, self.scenario.timeouts.shutdown_s + KILL_AFTER_S)
+        wait(processes, grace)
+        end(processes, self.scenario.timeouts.shutdown_s + KILL_AFTER_S)
         for child in self._children.values():
             os.close(child.pidfd)
         if self._broker is not None and self._broker.stdout is not None:
             self._broker.stdout.close()
-
-
-def _end(processes: list[subprocess.Popen[bytes]], seconds: float) -> None:
-    """End all: SIGTERM, and after so long [s] SIGKILL."""
-    for process in processes:
-        if process.poll() is None:
-            process.send_signal(signal.SIGTERM)
-    _wait(processes, seconds)
-    for process in processes:
-        if process.poll() is None:
-            process.kill()
-        process.wait()
-
-
-def _wait(processes: list[subprocess.Popen[bytes]], seconds: float) -> None:
-    """Wait until all have ended, but no longer than that [s]."""
-    until = time.monotonic() + seconds
-    for process in processes:
-        try:
-            process.wait(max(0.0, until - time.monotonic()))
-        except subprocess.TimeoutExpired:
-            continue

@@ -13,6 +13,17 @@ from rich.text import Text
 
 from caviar_clients.cli import bench
 from caviar_clients.cli.keys import app as keys
+from caviar_clients.cli.options import (
+    Frames,
+    Http,
+    Keys,
+    Pace,
+    Restarted,
+    Resume,
+    RunDirectory,
+    ScenarioOrNone,
+    Seed,
+)
 from caviar_protocol.errors import CaviarError, RunError
 
 RUN, LOOK, MEASURE, OPERATE = "Run", "Look", "Measure", "Operate"
@@ -29,24 +40,6 @@ app.add_typer(keys, name="keys", rich_help_panel=OPERATE)
 _console = Console()
 _errors = Console(stderr=True)
 
-ScenarioFile = Annotated[Path, typer.Argument(help="scenario file (TOML)", show_default=False)]
-RunDirectory = Annotated[Path, typer.Argument(help="directory of a run, or one segment of its recording")]
-Frames = Annotated[int | None, typer.Option(min=1, help="frames of an episode, instead of the scenario's")]
-Seed = Annotated[int | None, typer.Option(min=0, max=2**63 - 1, help="seed, instead of the scenario's")]
-Pace = Annotated[
-    str | None, typer.Option(help="free, realtime or a number [times real time], instead of the scenario's")
-]
-
-Keys = Annotated[
-    Path | None, typer.Option(help="keys directory: only authorized keys take part (caviar keys)")
-]
-Http = Annotated[str, typer.Option(help="HOST:PORT: serve status, orders and WebSocket there")]
-Resume = Annotated[Path | None, typer.Option(help="go on with the run in this directory, whose broker died")]
-ScenarioOrNone = Annotated[Path | None, typer.Argument(help="scenario file (TOML)", show_default=False)]
-Restarted = Annotated[
-    bool,
-    typer.Option("--restarted", help="for a container that is started again whenever this status is not 0"),
-]
 ANY_PORT = "tcp://127.0.0.1:0"
 
 

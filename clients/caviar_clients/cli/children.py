@@ -1,0 +1,68 @@
+"""The processes of a run: starting a service's, and ending several."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+TAIL = 1 << 16
+"""[B] of a log that are looked at for its last line."""
+
+
+@dataclass
+class Child:
+    """The process of one service."""
+
+    name: str
+    process: subprocess.Popen[bytes]
+    log: Path
+    pidfd: int
+    """Readable once the process is dead."""
+
+    @classmethod
+    def start(cls, name: str, command: Sequence[str], log: Path, environment: Mapping[str, str]) -> Child:
+        """Start it; its log goes on where one before it ended."""
+        with log.open("ab") as file:
+            process = subprocess.Popen(  # noqa: S603  # our own module with checked arguments
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=file,
+                start_new_session=True,
+                env=environment,
+            )
+        return cls(name, process, log, os.pidfd_open(process.pid))
+
+    def last_line(self) -> str:
+        """The last line it printed; empty if it printed nothing."""
+        with self.log.open("rb") as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL))
+            lines = file.read().decode(errors="replace").strip().splitlines()
+        return lines[-1] if lines else ""
+
+
+def end(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> None:
+    """End all: SIGTERM, and after so long [s] SIGKILL."""
+    for process in processes:
+        if process.poll() is None:
+            process.send_signal(signal.SIGTERM)
+    wait(processes, seconds)
+    for process in processes:
+        if process.poll() is None:
+            process.kill()
+        process.wait()
+
+
+def wait(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> None:
+    """Wait until all have ended, but no longer than that [s]."""
+    until = time.monotonic() + seconds
+    for process in processes:
+        try:
+            process.wait(max(0.0, until - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            continue
