@@ -33,8 +33,8 @@ _GRANT, _ANSWER = TaskEvent.GRANT, TaskEvent.ANSWER
 class EpisodeSchedule:
     """Schedule of one episode.
 
-    What it wants done collects in `actions`, `grants`, `cut`, `overruns` and `aborted`, for the
-    caller to carry out.
+    What it wants done collects in `actions`, `grants`, `cut`, `overruns`, `skips` and `aborted`,
+    for the caller to carry out.
 
     Parameters
     ----------
@@ -68,6 +68,8 @@ class EpisodeSchedule:
         """Granted tasks that an early end made useless; to be cancelled."""
         self.overruns: list[tuple[Task, str]] = []
         """Granted tasks whose budget is up, and what is done about it; to be blamed (clause 14)."""
+        self.skips: list[tuple[Task, str]] = []
+        """Tasks that were never granted and whose budget is up, and why; to be blamed likewise."""
         self.aborted: Task | None = None
         """A task of a service with policy abort that missed its deadline."""
         self._plans: Mapping[str, ServicePlan] = {p.name: p for p in plan.services}
@@ -445,7 +447,7 @@ class EpisodeSchedule:
             elapsed = now - (task.eligible_at or now)
             self.actions.append(Latency(task.service, self.episode, task.frame, elapsed, missed=True))
             task.move(TaskEvent.DEADLINE)
-            self._notice("skipped", task, cause)
+            self.skips.append((task, cause))
             self._book.substitute(task, cause, "skipped", now)
             self._turns.decided(task.service)
 
