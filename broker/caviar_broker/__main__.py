@@ -35,6 +35,7 @@ from caviar_broker.replaying import with_replay
 from caviar_broker.resume import read_resumption
 from caviar_broker.scheduling import prefer
 from caviar_broker.security.access import Access
+from caviar_broker.security.guard import PeerLimits
 from caviar_broker.security.local import check_bind
 from caviar_broker.server import BrokerServer
 from caviar_protocol.errors import CaviarError, RunError
@@ -83,6 +84,7 @@ def serve(arguments: argparse.Namespace) -> int:
                 desk,
                 supervised=supervised,
                 access=access,
+                peer_limits=PeerLimits.of(record.scenario.limits),
                 resumption=resumption,
             )
             msgspec.structs.replace(record, endpoint=server.endpoint).save(directory)

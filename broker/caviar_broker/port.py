@@ -59,12 +59,12 @@ class Port:
         # What waits of a peer is bounded by the guard. A queue that is full would have libzmq 4.3.5 abort
         # when the peer goes: its heartbeats then write to a connection that has ended (libzmq issue 4841).
         self.socket.setsockopt(zmq.RCVHWM, 0)
-        self.socket.setsockopt(zmq.MAXMSGSIZE, limits.MAX_BODY)
         self.socket.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
         self.socket.setsockopt(zmq.IPV6, int("[" in endpoint))
         self.socket.linger = LINGER_MS
         self.guard = Guard(self._context, self.socket, access, peer_limits)
         """Watches over the peers."""
+        self.socket.setsockopt(zmq.MAXMSGSIZE, self.guard.limits.part)
         try:
             self.socket.bind(endpoint)
         except zmq.ZMQError as error:

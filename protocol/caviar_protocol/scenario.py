@@ -44,6 +44,27 @@ class Timeouts(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     liveness_s: Annotated[float, quantity("s", "silence after which a remote peer is gone", gt=0)] = 1.5
 
 
+class Limits(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What one peer may use of the broker; whoever takes more is cut off and named (broker/SECURITY.md)."""
+
+    connections: Annotated[int, quantity("1", "open connections in all", ge=1, le=1_000_000)] = 4096
+    connections_before_hello: Annotated[
+        int, quantity("1", "open connections of one address before HELLO", ge=1, le=1_000_000)
+    ] = 256
+    messages_before_hello: Annotated[int, quantity("1", "of one connection", ge=1, le=1_000_000)] = 16
+    waiting_before_hello_mib: Annotated[
+        int, quantity("MiB", "that wait of a connection before HELLO", ge=1, le=1024)
+    ] = 4
+    messages_at_once: Annotated[
+        int, quantity("1", "of a service, beyond one for each that it was sent", ge=1, le=1_000_000_000)
+    ] = 4000
+    messages_per_s: Annotated[
+        float, quantity("1/s", "of a service on and on, beyond the same", gt=0, le=1e9)
+    ] = 500.0
+    part_mib: Annotated[int, quantity("MiB", "of one part of a message, as a product", ge=1, le=1024)] = 1024
+    waiting_mib: Annotated[int, quantity("MiB", "that wait of a service, or for it", ge=2, le=2**20)] = 1088
+
+
 class Run(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The run as a whole."""
 
@@ -146,6 +167,7 @@ class Scenario(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     run: Run
     services: dict[str, ServiceSpec]
     timeouts: Timeouts = Timeouts()
+    limits: Limits = Limits()
     carriers: tuple[Carrier, ...] = ()
     devices: tuple[DeviceSpec, ...] = ()
     replay: ReplaySpec | None = None

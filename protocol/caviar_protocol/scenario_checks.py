@@ -43,6 +43,7 @@ def check_scenario(scenario: Scenario) -> None:
     root = Place("", scenario.source)
     _check_record(scenario, root.at("run").at("record"))
     _check_timeouts(scenario, root.at("timeouts"))
+    _check_limits(scenario, root.at("limits"))
     _unique((carrier.name for carrier in scenario.carriers), "carrier", root.at("carriers"))
     _unique((device.name for device in scenario.devices), "device", root.at("devices"))
     _check_services(scenario, root.at("services"))
@@ -217,6 +218,27 @@ def _check_timeouts(scenario: Scenario, place: Place) -> None:
         raise place.error(
             f"heartbeat_s = {timeouts.heartbeat_s} leaves no heartbeat within liveness_s = "
             f"{timeouts.liveness_s}; write at most {timeouts.liveness_s / 2}"
+        )
+
+
+def _check_limits(scenario: Scenario, place: Place) -> None:
+    """What services need to take part at all is not too much."""
+    limits, heartbeat_s = scenario.limits, scenario.timeouts.heartbeat_s
+    needed = 2 * len(scenario.services)
+    if limits.connections < needed:
+        raise place.at("connections").error(
+            f"is {limits.connections}, and each of the {len(scenario.services)} services has one and another "
+            f"for its heartbeats; write at least {needed}"
+        )
+    if limits.messages_per_s < 1.0 / heartbeat_s:
+        raise place.at("messages_per_s").error(
+            f"is {limits.messages_per_s:g}, and a heartbeat each {heartbeat_s:g} s (timeouts.heartbeat_s) is "
+            f"more; write at least {2.0 / heartbeat_s:g}"
+        )
+    if limits.waiting_mib <= limits.part_mib:
+        raise place.at("waiting_mib").error(
+            f"is {limits.waiting_mib}, so that a product of part_mib = {limits.part_mib} cannot come in; "
+            f"write at least {limits.part_mib + 1}, or part_mib = {limits.waiting_mib - 1}"
         )
 
 

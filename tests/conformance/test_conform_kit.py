@@ -262,3 +262,14 @@ def test_the_command_prints_a_table_writes_files_and_tells_by_its_status(tmp_pat
     ).read_text("utf-8")
     listed = CliRunner().invoke(app, ["conform", "--list"])
     assert all(case.name in listed.output for case in cases())
+
+
+@pytest.mark.parametrize("option", ["--json", "--markdown"])
+def test_a_file_that_cannot_be_written_is_named_before_the_first_case(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, option: str
+) -> None:
+    monkeypatch.setattr(
+        "caviar_clients.cli.conform.conform", lambda *_, **__: pytest.fail("a case was played")
+    )
+    with pytest.raises(RunError, match=r"cannot write .*: Is a directory; choose another file"):
+        app(["conform", "--listen", ANY, option, str(tmp_path)], standalone_mode=False)

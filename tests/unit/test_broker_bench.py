@@ -62,6 +62,15 @@ def test_figures_of_a_run_agree(tmp_path: Path, curve: bool) -> None:
     assert figures["misses"] == 0
 
 
+def test_a_file_that_cannot_be_written_is_named_before_anything_is_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("caviar_broker.bench.run.measure", lambda *_, **__: pytest.fail("measured"))
+    result = CliRunner().invoke(app, ["bench", "broker", "--json", str(tmp_path)])
+    assert isinstance(result.exception, RunError)
+    assert str(result.exception) == f"cannot write {tmp_path}: Is a directory; choose another file"
+
+
 def test_a_client_that_cannot_take_part_ends_the_measurement_with_its_name(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

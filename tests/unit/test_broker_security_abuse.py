@@ -124,6 +124,21 @@ def test_a_part_that_announces_more_than_any_may_have_ends_its_connection(tmp_pa
         unharmed(background)
 
 
+@pytest.mark.parametrize("size", [1 << 20, (1 << 20) + 1])
+def test_the_largest_part_is_what_the_limits_say(tmp_path: Path, size: int) -> None:
+    with (
+        eight_services(tmp_path, PeerLimits(part=1 << 20)) as background,
+        raw(background.broker.endpoint) as connection,
+    ):
+        connection.sendall(b"\x02" + struct.pack(">Q", size))
+        if size > 1 << 20:
+            eventually(lambda: is_ended(connection), "the connection is ended", 3.0)
+        else:
+            background.go_on_for(0.5)
+            assert not is_ended(connection)
+        unharmed(background)
+
+
 def test_bytes_that_are_no_zeromq_end_their_connection_and_are_told(tmp_path: Path) -> None:
     with eight_services(tmp_path) as background:
         with socket.create_connection(address(background.broker.endpoint)) as connection:

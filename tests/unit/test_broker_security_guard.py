@@ -13,14 +13,29 @@ import zmq
 from broker_harness import MS, Client, eventually, plan, serving
 from security_harness import ring
 
+from caviar_broker import __main__ as broker_main
 from caviar_broker.port import Port
 from caviar_broker.security.access import BAR_NS, Access
 from caviar_broker.security.guard import PeerLimits
 from caviar_broker.security.wire import Wire, Wires
 from caviar_protocol import messages as m
 from caviar_protocol.errors import RunError
+from caviar_protocol.scenario import Limits
 from caviar_services.connection import Connection
 from caviar_services.termination import Termination
+
+SMOKE = Path(__file__).parents[2] / "deploy" / "scenarios" / "smoke.toml"
+LIMITS = """
+[limits]
+connections = 51
+connections_before_hello = 52
+messages_before_hello = 53
+waiting_before_hello_mib = 54
+messages_at_once = 55
+messages_per_s = 56.5
+part_mib = 57
+waiting_mib = 58
+"""
 
 
 @pytest.fixture
@@ -156,3 +171,37 @@ def test_a_connection_that_is_not_known_any_more_may_appear_as_nobody(tmp_path: 
         assert "not known any more" in port.guard.refusal(b"gone", "world", "world")
     finally:
         port.close()
+
+
+def test_a_scenario_that_says_nothing_of_limits_has_the_usual_ones() -> None:
+    assert PeerLimits.of(Limits()) == PeerLimits()
+
+
+def test_the_limits_of_a_scenario_are_those_of_its_broker(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class MadeError(Exception):
+        pass
+
+    def made(*_: object, peer_limits: PeerLimits, **__: object) -> None:
+        assert peer_limits == PeerLimits(
+            connections=51,
+            strangers=52,
+            stranger_messages=53,
+            stranger_bytes=54 << 20,
+            burst=55.0,
+            rate=56.5,
+            queued=58 << 20,
+            part=57 << 20,
+        )
+        raise MadeError
+
+    monkeypatch.setattr(broker_main, "BrokerServer", made)
+    monkeypatch.setattr(broker_main, "Reporter", lambda *_: None)
+    monkeypatch.setattr(broker_main, "steady_memory", lambda: None)
+    monkeypatch.setattr(broker_main, "prefer", lambda: "")
+    scenario = tmp_path / "scenario.toml"
+    scenario.write_text(f"{SMOKE.read_text()}{LIMITS}")
+    arguments = broker_main.parser().parse_args([str(scenario), "--directory", str(tmp_path / "run")])
+    with pytest.raises(MadeError):
+        broker_main.serve(arguments)

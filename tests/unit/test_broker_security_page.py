@@ -6,9 +6,12 @@ import ast
 import re
 from pathlib import Path
 
+import msgspec
+
 from caviar_broker.port import HANDSHAKE_MS
 from caviar_broker.security.access import BAR_NS
 from caviar_broker.security.guard import PeerLimits
+from caviar_protocol.scenario import Limits
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "broker" / "SECURITY.md").read_text()
@@ -23,7 +26,8 @@ def known_tests() -> set[str]:
 
 
 def test_each_promise_names_tests_that_exist() -> None:
-    rows = [line for line in PAGE.splitlines() if line.startswith("| ") and "| test |" not in line]
+    held = PAGE[: PAGE.index("### Other limits")] + PAGE[PAGE.index("## What is secret") :]
+    rows = [line for line in held.splitlines() if line.startswith("| ") and "| test |" not in line]
     promises = [row for row in rows if not row.startswith("| ---")]
     assert len(promises) > 15
     for row in promises:
@@ -39,3 +43,8 @@ def test_its_figures_are_those_of_the_code() -> None:
     assert f"{limits.queued / 2**30:.2f} GiB" in PAGE
     assert f"after {HANDSHAKE_MS // 1000} s" in PAGE
     assert f"barred for {BAR_NS // 10**9} s" in PAGE
+
+
+def test_it_tells_every_limit_of_a_scenario_with_its_default() -> None:
+    told = re.findall(r"^\| `(\w+)` \| ([\d.]+) \|", PAGE, re.MULTILINE)
+    assert [(name, float(value)) for name, value in told] == list(msgspec.structs.asdict(Limits()).items())

@@ -9,6 +9,7 @@ import msgspec
 import pytest
 from typer.testing import CliRunner
 
+from caviar_clients.cli import stability as cli_stability
 from caviar_clients.cli.main import app
 from caviar_protocol.errors import AssetError, PayloadError
 from caviar_services.channel.stability import case as cases_module
@@ -113,9 +114,13 @@ class TestCommand:
         with pytest.raises(Exception, match=r"no group 'speeed' .* speed"):
             self.ask("--group", "speeed")
 
-    def test_a_file_that_cannot_be_written_is_named(self, tmp_path: Path) -> None:
-        with pytest.raises(Exception, match=r"cannot write .*nowhere"):
-            self.ask("--group", "jump", "--group", "speed", "--json", str(tmp_path / "nowhere" / "s.json"))
+    @pytest.mark.parametrize("option", ["--json", "--markdown"])
+    def test_a_file_that_cannot_be_written_is_named_before_the_first_case(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, option: str
+    ) -> None:
+        monkeypatch.setattr(cli_stability, "run", lambda *_: pytest.fail("a case was run"))
+        with pytest.raises(Exception, match=r"cannot write .*Is a directory"):
+            self.ask("--group", "speed", option, str(tmp_path))
 
 
 def test_no_case_is_registered_twice_by_asking_again() -> None:

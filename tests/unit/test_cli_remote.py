@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import socket
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from caviar_clients.cli import remote
 from caviar_clients.cli.main import app
 from caviar_clients.sessions.checking import TOPICS_OF, checked_scenario
 from caviar_protocol.errors import ScenarioError
+from caviar_protocol.keys import credentials, read_authorized, read_public
 from caviar_protocol.messages import Role
 from caviar_protocol.scenario import ServiceSpec
 from caviar_protocol.scenario_checks import refuse_remote
@@ -119,4 +121,54 @@ def test_the_broker_command_names_what_fills_the_place(tmp_path: Path) -> None:
         bind = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
         result = CliRunner().invoke(app, ["broker", str(REMOTE), "--bind", bind, "--out", str(tmp_path)])
     assert "caviar service agent --use agent:IMPLEMENTATION" in result.output
-    assert "caviar service link --use link:beams" in result.output
+    assert f"caviar service link --use link:beams --broker {bind}\n" in result.output
+
+
+def test_without_an_address_to_name_services_are_started_at_the_default_one() -> None:
+    services = {"agent": spec("agent")}
+    for bind in ("", "tcp://127.0.0.1:0", "tcp://127.0.0.1:*"):
+        assert remote.service_commands(services, bind, None) == [
+            "caviar service agent --use agent:IMPLEMENTATION"
+        ]
+
+
+def test_the_commands_of_a_broker_with_keys_let_the_services_in(tmp_path: Path) -> None:
+    """One service has no key, one has a key that is not authorized, one has its key on its own machine."""
+    keys, runner = tmp_path / "my keys", CliRunner()
+
+    def run(*arguments: str) -> None:
+        result = runner.invoke(app, ["keys", *arguments, "--directory", str(keys)])
+        assert result.exit_code == 0, result.output
+
+    for new in (["broker"], ["link"], ["world", "--role", "world"]):
+        run("new", *new)
+    (keys / "world.key").unlink()
+    roles: dict[str, Role] = {"agent": "agent", "link": "link", "world": "world"}
+    services = {name: spec(role) for name, role in roles.items()}
+    commands = [shlex.split(line) for line in remote.service_commands(services, ENDPOINT, keys)]
+    for command in commands[:-3]:
+        assert command[:2] == ["caviar", "keys"]
+        assert runner.invoke(app, command[1:]).exit_code == 0, command
+    assert {(entry.name, entry.role) for entry in read_authorized(keys)} == set(roles.items())
+    for name, command in zip(services, commands[-3:], strict=True):
+        assert command[:3] == ["caviar", "service", name]
+        options = dict(zip(command[3::2], command[4::2], strict=True))
+        assert options["--broker"] == ENDPOINT
+        if name == "world":
+            assert options["--key"] == "world.key"
+            continue
+        shown = credentials(Path(options["--key"]), Path(options["--broker-key"]), {})
+        assert shown is not None
+        assert shown.broker == read_public(keys / "broker.pub")
+        assert shown.pair.public in {entry.public for entry in read_authorized(keys) if entry.name == name}
+
+
+def test_the_broker_command_names_the_keys(tmp_path: Path) -> None:
+    keys = tmp_path / "keys"
+    arguments = ["keys", "new", "broker", "--directory", str(keys)]
+    assert CliRunner().invoke(app, arguments).exit_code == 0
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        bind = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
+        arguments = ["broker", str(REMOTE), "--bind", bind, "--out", str(tmp_path), "--keys", str(keys)]
+        result = CliRunner().invoke(app, arguments)
+    assert f" --broker {bind} --key {keys}/link.key --broker-key {keys}/broker.pub\n" in result.output

@@ -13,10 +13,11 @@ from rich.console import Console
 
 from caviar_clients.budget.forecast import forecast, rounded_up
 from caviar_clients.budget.timing import Timing, measured_rate, outcomes_of, timings_of
+from caviar_clients.cli import budget as cli_budget
 from caviar_clients.cli.budget import budget_run, lines
 from caviar_clients.embedded.run import EmbeddedRun
 from caviar_clients.replay.recorded import RecordedRun
-from caviar_protocol.errors import RecordingError
+from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.recording import Recording
 from caviar_protocol.scenario_loader import load_scenario
@@ -180,6 +181,14 @@ def test_figures_are_written_as_json(smoke: RecordedRun, tmp_path: Path) -> None
     screen = (tmp_path / "screen").read_text()
     assert "channel bounds the frame rate under wait" in screen
     assert "suggested" in screen
+
+
+def test_a_file_that_cannot_be_written_is_named_before_anything_is_worked_out(
+    smoke: RecordedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cli_budget, "forecast", lambda _: pytest.fail("worked out"))
+    with pytest.raises(RunError, match=r"cannot write .*: Is a directory; choose another file"):
+        budget_run(smoke.recording.path, Console(), tmp_path)
 
 
 @pytest.mark.parametrize("content", [None, b"", b"PK\x03\x04nonsense"])

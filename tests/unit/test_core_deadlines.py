@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import pytest
@@ -208,6 +209,18 @@ def test_clause_11_nobody_who_is_late_gets_a_new_grant() -> None:
     assert "still busy with frame 3" in skipped[0].text
     missed = [x.frame for x in run.seen(ev.Latency, "lidar") if x.missed]
     assert sorted(missed) == [3, *(n.frame for n in skipped)], "each frame that missed counts once"
+
+
+def test_clause_14_a_frame_that_is_skipped_for_a_busy_service_tells_its_last_heartbeat() -> None:
+    heart = {"heartbeat": (8 * MS, False), "phase": "tracing"}
+    run = lidar_run(frames=12, latency=slow_at(3), policy="hold", **heart)
+    skipped = [n for n in run.notices("skipped", "lidar") if "still busy with frame 3" in n.text]
+    assert skipped
+    for notice in skipped:
+        age = re.search(r"busy with frame 3; last heartbeat (\S+) ms ago: phase 'tracing', ", notice.text)
+        assert age is not None, notice.text
+        assert 0 <= float(age[1]) <= 8
+    assert not [n.text for n in run.notices("miss", "lidar") if "still busy" in n.text]
 
 
 def test_clause_11_previous_frame_tells_the_gap() -> None:

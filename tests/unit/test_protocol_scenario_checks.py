@@ -11,7 +11,7 @@ import pytest
 from caviar_broker.core.plan import plan_run
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import ScenarioError
-from caviar_protocol.scenario import DeviceSpec, Run, Scenario, ServiceSpec
+from caviar_protocol.scenario import DeviceSpec, Limits, Run, Scenario, ServiceSpec
 from caviar_protocol.scenario_checks import (
     check_scenario,
     devices_of,
@@ -150,6 +150,31 @@ def test_the_resolved_form_shows_defaults_and_reads_back() -> None:
     assert "source" not in plain
     assert msgspec.json.decode(msgspec.json.encode(plain)) == plain
     assert msgspec.convert(plain, Scenario) == msgspec.structs.replace(loaded, source=Source())
+
+
+@pytest.mark.parametrize(
+    ("limits", "told"),
+    [
+        ("conections = 9", r"x\.toml:\d+: limits\.conections: .*connections"),
+        ("connections = 1", r"x\.toml:16: limits\.connections: is 1, .* write at least 2"),
+        ("messages_per_s = 3", r"limits\.messages_per_s: is 3, and a heartbeat each 0\.25 s .* at least 8"),
+        (
+            "waiting_mib = 64",
+            r"limits\.waiting_mib: is 64, .* 1024 .* least 1025, or part_mib = 63",
+        ),
+        ("part_mib = 1025", r"limits\.part_mib"),
+    ],
+)
+def test_limits_that_no_service_could_keep_are_refused_with_the_remedy(limits: str, told: str) -> None:
+    with pytest.raises(ScenarioError, match=told):
+        parse_scenario(f"{TEXT}[limits]\n{limits}\n", "x.toml")
+
+
+def test_limits_are_read_and_the_others_keep_their_defaults() -> None:
+    found = parse_scenario(
+        f"{TEXT}[limits]\npart_mib = 8\nwaiting_mib = 9\nmessages_per_s = 4\n", "x.toml"
+    ).limits
+    assert found == Limits(part_mib=8, waiting_mib=9, messages_per_s=4.0)
 
 
 class Inner(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

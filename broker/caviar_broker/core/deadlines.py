@@ -20,7 +20,8 @@ _GRANTED = TaskState.GRANTED
 class Deadlines:
     """Pace and budgets of one episode (clauses 8, 9 and 13).
 
-    What has to be said about tasks whose budget is up collects in `overruns` and `aborted`.
+    What has to be said about tasks whose budget is up collects in `overruns`, `skips` and
+    `aborted`.
 
     Parameters
     ----------
@@ -51,6 +52,8 @@ class Deadlines:
     ) -> None:
         self.overruns: list[tuple[Task, str]] = []
         """Granted tasks whose budget is up, and what is done about it; to be blamed (clause 14)."""
+        self.skips: list[tuple[Task, str]] = []
+        """Tasks that were never granted and whose budget is up, and why; to be blamed likewise."""
         self.aborted: Task | None = None
         """A task of a service with policy abort that missed its deadline."""
         self._plan, self._episode, self._book, self._turns, self._gate = plan, episode, book, turns, gate
@@ -147,7 +150,7 @@ class Deadlines:
             elapsed = now - (task.eligible_at or now)
             self._actions.append(Latency(task.service, self._episode, task.frame, elapsed, missed=True))
             task.move(TaskEvent.DEADLINE)
-            self._notice("skipped", task, cause)
+            self.skips.append((task, cause))
             self._book.substitute(task, cause, "skipped", now)
             self._turns.decided(task.service)
 

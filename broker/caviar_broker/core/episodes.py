@@ -290,6 +290,9 @@ class Episodes:
             waiting = schedule.waiting_for(task.service)
             text = peer.blame_task(task, "overran its budget", now, waiting)
             run.notice("miss", task.service, f"{text}; {remedy}", task.frame)
+        for task, cause in deadlines.skips:
+            told = run.peers[task.service].last_words(now)
+            run.notice("skipped", task.service, f"{cause}; {told}", task.frame)
         self._tell(schedule)
         for order in schedule.grants:
             self._grant(order)
@@ -299,6 +302,7 @@ class Episodes:
                 ids = {"epoch": run.plan.epoch, "attempt": peer.attempt, "episode": run.episode}
                 run.send(peer, Cancel(**ids, frame=task.frame))
         deadlines.overruns.clear()
+        deadlines.skips.clear()
         schedule.grants.clear()
         schedule.cut.clear()
         if deadlines.aborted is not None:

@@ -15,6 +15,8 @@ from caviar_broker.loop import Loop
 from caviar_broker.security.access import BAR_NS, Access, answer
 from caviar_broker.security.local import is_local
 from caviar_broker.security.wire import Wire, Wires
+from caviar_protocol.limits import MAX_BODY
+from caviar_protocol.scenario import Limits
 
 ZAP = "inproc://zeromq.zap.01"
 SCAN_NS = 100_000_000
@@ -33,7 +35,8 @@ CHATTER = 1024
 
 @dataclass(frozen=True, kw_only=True)
 class PeerLimits:
-    """What a peer may use; far more than any service of a run needs."""
+    """What a peer may use; far more than any service of a run needs, unless a scenario's ``[limits]`` say
+    otherwise."""
 
     connections: int = 4096
     """Open connections in all; at most half the descriptors that this process may have."""
@@ -49,6 +52,22 @@ class PeerLimits:
     """[1/s] messages that a service may send on and on, beyond one for each that it was sent."""
     queued: int = (1 << 30) + (64 << 20)
     """[B] that wait of a service, or for it: the largest product and something."""
+    part: int = MAX_BODY
+    """[B] of one part of a message."""
+
+    @classmethod
+    def of(cls, limits: Limits) -> PeerLimits:
+        """As a scenario has them."""
+        return cls(
+            connections=limits.connections,
+            strangers=limits.connections_before_hello,
+            stranger_messages=limits.messages_before_hello,
+            stranger_bytes=limits.waiting_before_hello_mib << 20,
+            burst=float(limits.messages_at_once),
+            rate=limits.messages_per_s,
+            queued=limits.waiting_mib << 20,
+            part=limits.part_mib << 20,
+        )
 
 
 @dataclass(eq=False, slots=True)

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from caviar_broker.bench.topology import Topology
-from caviar_protocol.errors import RunError
+from caviar_clients.cli.files import write_file
 
 app = typer.Typer(no_args_is_help=True, help="Measure what the parts of a run cost on this machine.")
 
@@ -35,6 +35,8 @@ def broker(
     """A frame's way through the broker, with clients that do nothing but exchange products."""
     from caviar_broker.bench.run import measure
 
+    if json is not None:
+        write_file(json)
     measured = measure(topology, services, payload, frames, curve=curve)
     table = Table(
         "services", "payload B", "µs a frame: mean", "p50", "p99", "MB/s", "broker CPU µs", "misses"
@@ -50,9 +52,4 @@ def broker(
     )
     Console().print(table)
     if json is not None:
-        try:
-            json.write_bytes(msgspec.json.format(msgspec.json.encode(measured), indent=2) + b"\n")
-        except OSError as error:
-            raise RunError(
-                f"cannot write {json}: {error.strerror}; choose another file with --json"
-            ) from error
+        write_file(json, msgspec.json.format(msgspec.json.encode(measured), indent=2).decode() + "\n")

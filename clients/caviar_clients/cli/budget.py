@@ -11,23 +11,25 @@ from rich.table import Table
 from rich.text import Text
 
 from caviar_clients.budget.forecast import POLICIES, Forecast, ServiceForecast, forecast
+from caviar_clients.cli.files import write_file
 from caviar_clients.replay.recorded import RecordedRun
-from caviar_protocol.errors import RunError
 from caviar_protocol.recording import Recording
 
 
 def budget_run(run: Path, console: Console, json_file: Path | None = None) -> Forecast:
-    """Print what a recorded run tells about budgets, and write it to a file."""
-    found = forecast(RecordedRun(Recording(run)))
+    """Print what a recorded run tells about budgets, and write it to a file.
+
+    Raises `RunError` before anything is worked out where the file cannot be written.
+    """
+    recording = Recording(run)
+    if json_file is not None:
+        write_file(json_file)
+    found = forecast(RecordedRun(recording))
     console.print(_services(found))
     for line in lines(found):
         console.print(Text(line), soft_wrap=True)
     if json_file is not None:
-        try:
-            json_file.parent.mkdir(parents=True, exist_ok=True)
-            json_file.write_bytes(msgspec.json.format(msgspec.json.encode(found)) + b"\n")
-        except OSError as error:
-            raise RunError(f"cannot write {json_file}: {error.strerror}; choose another file") from error
+        write_file(json_file, msgspec.json.format(msgspec.json.encode(found)).decode() + "\n")
     return found
 
 

@@ -12,10 +12,11 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from caviar_clients.cli.files import write_file
 from caviar_clients.conform import Verdict, cases, conform
 from caviar_clients.conform.report import as_json, as_markdown, summary
 from caviar_clients.conform.session import Rules
-from caviar_protocol.errors import RunError, SetupError
+from caviar_protocol.errors import SetupError
 
 STYLES = {"pass": "green", "fail": "bold red", "not applicable": "dim"}
 
@@ -43,6 +44,9 @@ def conform_client(
         line = Text(f"{verdict.outcome:<15}", style=STYLES[verdict.outcome])
         console.print(line + Text(f"{verdict.case}: {verdict.title}", style="default"), soft_wrap=True)
 
+    for file in (json_file, markdown_file):
+        if file is not None:
+            write_file(file)
     verdicts = conform(listen, command=command, names=names, rules=rules, tell=tell, each=each)
     console.print()
     console.print(_table(verdicts))
@@ -50,7 +54,7 @@ def conform_client(
     console.print(summary(verdicts), style="bold red" if failed else "bold green", highlight=False)
     for file, text in ((json_file, as_json(verdicts)), (markdown_file, as_markdown(verdicts))):
         if file is not None:
-            _write(file, text)
+            write_file(file, text)
     return 1 if failed else 0
 
 
@@ -96,10 +100,3 @@ def _table(verdicts: Sequence[Verdict]) -> Table:
             Text(verdict.outcome, style=STYLES[verdict.outcome]),
         )
     return table
-
-
-def _write(file: Path, text: str) -> None:
-    try:
-        file.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise RunError(f"cannot write {file}: {error.strerror}; give another path") from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -97,6 +96,7 @@ def broker(
     """Run only the broker; start the services with `caviar service`, here or on other machines."""
     from caviar_broker.__main__ import DEFAULT_BIND, parser, serve
     from caviar_broker.security.local import check_bind
+    from caviar_clients.cli.remote import service_commands
     from caviar_clients.cli.restarted import RunInProgress
     from caviar_clients.cli.run import run_directory
     from caviar_clients.sessions.checking import checked_scenario
@@ -117,10 +117,9 @@ def broker(
         resumed = parser().parse_args(["--resume", str(left), *options])
         raise typer.Exit(current.serve(left, lambda: serve(resumed)))
     directory = run_directory(out, checked.run.name)
-    typer.echo(f"run {directory}; start its services with --broker and this broker's address:")
-    for name, spec in checked.services.items():
-        use = "IMPLEMENTATION" if spec.remote else spec.use
-        typer.echo("  " + shlex.join(["caviar", "service", name, "--use", f"{spec.role}:{use}"]))
+    typer.echo(f"run {directory}; start its services; from elsewhere, with --broker and its address:")
+    for command in service_commands(checked.services, bind, keys):
+        typer.echo(f"  {command}")
     options += [str(scenario), "--directory", str(directory)]
     for name, value in (("--frames", frames), ("--seed", seed), ("--pace", pace)):
         options += [] if value is None else [name, str(value)]

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import shlex
 import socket
+from collections.abc import Mapping
 from pathlib import Path
 
 import caviar_clients
-from caviar_protocol.keys import BROKER, BROKER_KEY_VARIABLE, KEY_VARIABLE
+from caviar_protocol.keys import BROKER, BROKER_KEY_VARIABLE, KEY_VARIABLE, read_authorized
 from caviar_protocol.scenario import ServiceSpec
 
 MINIMAL = Path(caviar_clients.__file__).parents[1] / "minimal" / "agent.py"
@@ -37,6 +38,37 @@ def waiting_text(name: str, spec: ServiceSpec, endpoint: str, seconds: float) ->
         f"waiting for {name!r} ({spec.role}) at {there}, for {seconds:g} s (timeouts.connect_s): "
         f"start it with  {start_command(name, spec, there)}"
     )
+
+
+def service_commands(services: Mapping[str, ServiceSpec], bind: str, keys: Path | None) -> list[str]:
+    """Commands that start the services of a run whose broker stands alone.
+
+    They name the broker's address where it is known before it listens, and where it has keys those of
+    each service. Before them stand the commands that let services in which nothing lets in yet.
+    """
+    place = reachable(bind) if bind.rpartition(":")[2].strip("0*!") else ""
+    address = ["--broker", place] if place else []
+    authorized = {entry.name for entry in read_authorized(keys)} if keys is not None else set()
+    before, commands = [], []
+    for name, spec in services.items():
+        use = "IMPLEMENTATION" if spec.remote else spec.use
+        command = ["caviar", "service", name, "--use", f"{spec.role}:{use}", *address]
+        if keys is not None:
+            before += [] if name in authorized else [_authorization(name, spec, keys)]
+            secret = keys / f"{name}.key"
+            elsewhere = name in authorized and not secret.exists()
+            secret = Path(secret.name) if elsewhere else secret  # made on the machine of the service
+            command += ["--key", str(secret), "--broker-key", str(keys / f"{BROKER}.pub")]
+        commands.append(command)
+    return [shlex.join(command) for command in before + commands]
+
+
+def _authorization(name: str, spec: ServiceSpec, keys: Path) -> list[str]:
+    """The command that lets a service in: with the key that it has, or with one that it makes."""
+    public, into = keys / f"{name}.pub", ["--role", spec.role, "--directory", str(keys)]
+    if public.exists():
+        return ["caviar", "keys", "authorize", str(public), "--name", name, *into]
+    return ["caviar", "keys", "new", name, *into]
 
 
 def key_text(name: str, keys: Path | None) -> str:

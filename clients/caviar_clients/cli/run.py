@@ -18,6 +18,7 @@ from rich.text import Text
 from caviar_broker.api.tokens import http_address
 from caviar_broker.record import read_record
 from caviar_broker.security.local import check_bind
+from caviar_clients.cli.files import write_file
 from caviar_clients.cli.inside import EmbeddedLauncher
 from caviar_clients.cli.launch import Launcher
 from caviar_clients.cli.remote import key_text, reachable, start_command, waiting_text
@@ -74,7 +75,7 @@ def run_scenario(
     if http:
         _check_http(http, keys, embedded)
     if json_file is not None:
-        _write(json_file, "")  # before the run, since after it an unwritable file would cost the figures
+        write_file(json_file)  # before the run, since after it an unwritable file would cost the figures
     directory = run_directory(out, scenario.run.name)
     console.print(Text(f"run {directory}"), soft_wrap=True)
     launcher: Launcher | EmbeddedLauncher
@@ -96,7 +97,7 @@ def resume_run(
     """Go on with a run whose broker died; the exit status: 0 exactly if it came to its end."""
     scenario = read_record(directory).scenario
     if json_file is not None:
-        _write(json_file, "")
+        write_file(json_file)
     console.print(Text(f"run {directory}"), soft_wrap=True)
     launcher = Launcher(
         scenario, directory, directory.resolve(), bind=bind, keys=keys, http=http, resume=True
@@ -124,9 +125,9 @@ def _follow(
     recorded = recorded_figures(directory) if outcome["frames"] else None
     summary = summary_of(outcome, recorded, scenario.run.name, directory, scenario.run.seed)
     text = json.dumps(summary, indent=2, ensure_ascii=False) + "\n"
-    _write(directory / "summary.json", text)
+    write_file(directory / "summary.json", text)
     if json_file is not None:
-        _write(json_file, text)
+        write_file(json_file, text)
     if outcome["frames"]:
         _show(console, summary)
         with (directory / "summary.txt").open("w") as file:
@@ -251,11 +252,3 @@ def _progress_bar(console: Console) -> Progress:
 def _show(console: Console, summary: Mapping[str, Any]) -> None:
     console.print(summary_table(summary))
     console.print(f"digest {summary['digest']}", highlight=False, soft_wrap=True)
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
-    except OSError as error:
-        raise RunError(f"cannot write {path}: {error.strerror}; choose another file") from error

@@ -11,7 +11,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.table import Table
 from rich.text import Text
 
-from caviar_protocol.errors import RunError, SetupError
+from caviar_clients.cli.files import write_file
+from caviar_protocol.errors import SetupError
 from caviar_services.channel.stability.case import Case, Result
 from caviar_services.channel.stability.run import cases, markdown, run, wrong
 
@@ -25,18 +26,23 @@ def stability(
 ) -> int:
     """Run the cases, print them, write them; status 1 where one is wrong.
 
-    Raises `SetupError` for a group that does not exist, `RunError` where a file cannot be written.
+    Raises `SetupError` for a group that does not exist, `RunError` where a file cannot be written:
+    both before the first case.
     """
-    results = _results(console, _chosen(groups, traced))
+    chosen = _chosen(groups, traced)
+    for file in (json_file, markdown_file):
+        if file is not None:
+            write_file(file)
+    results = _results(console, chosen)
     console.print(_table(results))
     faulty = wrong(results)
     seconds = sum(result.seconds for result in results)
     summary = f"{len(results) - len(faulty)} of {len(results)} right, in {seconds:.0f} s"
     console.print(summary, style="bold red" if faulty else "bold green", highlight=False)
     if json_file is not None:
-        _write(json_file, msgspec.json.format(msgspec.json.encode(results), indent=2).decode() + "\n")
+        write_file(json_file, msgspec.json.format(msgspec.json.encode(results), indent=2).decode() + "\n")
     if markdown_file is not None:
-        _write(markdown_file, markdown(results))
+        write_file(markdown_file, markdown(results))
     return 1 if faulty else 0
 
 
@@ -68,10 +74,3 @@ def _table(results: Sequence[Result]) -> Table:
         name = Text(f"{result.group}: {result.case}")
         table.add_row(name, Text(result.expected), Text(result.got), verdict)
     return table
-
-
-def _write(file: Path, text: str) -> None:
-    try:
-        file.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise RunError(f"cannot write {file}: {error.strerror}; give another path") from error

@@ -28,7 +28,11 @@ def recorded_figures(directory: Path) -> RunSummary | None:
 def summary_of(
     outcome: Mapping[str, Any], recorded: RunSummary | None, scenario: str, directory: Path, seed: int
 ) -> dict[str, Any]:
-    """Everything `--json` writes."""
+    """Everything `--json` writes.
+
+    Of a run that ended early ``frames_recorded`` may be one more than ``frames``: a frame that the recorder
+    had answered and that was not over for everybody. The digest is that of ``frames``.
+    """
     figures = recorded.link if recorded else None
     return {
         "run": directory.name,
@@ -37,6 +41,7 @@ def summary_of(
         "complete": not outcome["error"],
         "error": outcome["error"],
         "frames": outcome["frames"],
+        "frames_recorded": recorded.frames if recorded else None,
         "frames_per_second": outcome["frames_per_second"],
         "warm_up_frames": outcome["warm_up_frames"],
         "services": outcome["services"],
@@ -72,6 +77,11 @@ def summary_table(summary: Mapping[str, Any]) -> Table:
 
 def _caption(summary: Mapping[str, Any]) -> str:
     parts = [f"{summary['frames']} frames, {summary['frames_per_second']:.1f} frames/s"]
+    if summary["frames_recorded"] not in (None, summary["frames"]):
+        parts.append(
+            f"{summary['frames_recorded']} frames recorded, of which the run finished {summary['frames']}; "
+            "its digest is that of these"
+        )
     late, pace = summary["deadlines"], summary["pace"]
     if late["decisions"]:
         parts.append(

@@ -10,6 +10,7 @@ import msgspec
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+from caviar_clients.cli.files import write_file
 from caviar_clients.tradeoff.campaign import Told
 from caviar_clients.tradeoff.plot import draw_convergence, draw_pareto
 from caviar_clients.tradeoff.report import PARTS, Options, Report, compare
@@ -50,9 +51,9 @@ def trade(
     Raises `RunError` before anything is measured where a file cannot be written.
     """
     if json is not None:
-        _write(json, "")
+        write_file(json)
     if out is not None:
-        _write(out / "tradeoff.md", "")
+        write_file(out / "tradeoff.md")
     with _progress(console) as bar:
         task = bar.add_task("scenes", total=1.0, left="")
 
@@ -68,10 +69,10 @@ def trade(
     for reason, labels in by_reason(report.skipped).items():
         console.print(f"not measured: {', '.join(labels)}: {reason}", markup=False, highlight=False)
     if json is not None:
-        _write(json, msgspec.json.format(msgspec.json.encode(report), indent=2).decode() + "\n")
+        write_file(json, msgspec.json.format(msgspec.json.encode(report), indent=2).decode() + "\n")
         console.print(str(json), markup=False, highlight=False, soft_wrap=True)
     if out is not None:
-        _write(out / "tradeoff.md", markdown(report))
+        write_file(out / "tradeoff.md", markdown(report))
         files = [out / "tradeoff.md", draw_pareto(report, out / "pareto.png")]
         if report.convergence:
             files.append(draw_convergence(report, out / "convergence.png"))
@@ -90,11 +91,3 @@ def _progress(console: Console) -> Iterator[Progress]:
     )
     with Progress(*columns, console=console) as bar:
         yield bar
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
-    except OSError as error:
-        raise RunError(f"cannot write {path}: {error.strerror}; choose another file") from error

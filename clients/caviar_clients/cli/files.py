@@ -1,0 +1,20 @@
+"""Files that a command writes because it was asked to."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from caviar_protocol.errors import RunError
+
+
+def write_file(path: Path, text: str = "") -> None:
+    """Write a file, and the folders to it.
+
+    Called without text before the work: afterwards, a file that cannot be written would cost its results.
+    Raises `RunError` naming the file and why it cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise RunError(f"cannot write {path}: {error.strerror}; choose another file") from error
