@@ -1,4 +1,4 @@
-"""The one ROUTER port of a broker: parts in, parts out, and never a wait."""
+"""The one ROUTER port of a broker: parts in, parts out, and never a wait of more than a millisecond."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ _NOBLOCK = int(zmq.NOBLOCK)
 _POLLIN = int(zmq.POLLIN)
 _NOBLOCK_MORE = int(zmq.NOBLOCK) | int(zmq.SNDMORE)
 
+WAIT_MS = 1
+"""[ms] for which `Port.receive` waits, if it does."""
 LINGER_MS = 500
 """[ms] that closing waits until the last messages are on their way."""
 HANDSHAKE_MS = 5000
@@ -62,6 +64,7 @@ class Port:
         self.socket.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
         self.socket.setsockopt(zmq.IPV6, int("[" in endpoint))
         self.socket.linger = LINGER_MS
+        self.socket.rcvtimeo = WAIT_MS
         self.guard = Guard(self._context, self.socket, access, peer_limits)
         """Watches over the peers."""
         self.socket.setsockopt(zmq.MAXMSGSIZE, self.guard.limits.part)
@@ -87,14 +90,17 @@ class Port:
         """Whether a message is here; cheaper than `receive` where there is none."""
         return bool(int(self.socket.getsockopt(zmq.EVENTS)) & _POLLIN)
 
-    def receive(self) -> tuple[bytes, list[zmq.Frame]] | None:
+    def receive(self, wait: bool = False) -> tuple[bytes, list[zmq.Frame]] | None:
         """Routing id and parts of the next message; None where there is none now, or one to be dropped.
+
+        With ``wait`` there is none if none comes within `WAIT_MS`. That is far cheaper than any way to
+        wait for several sockets, or to a finer instant.
 
         Of a message with more parts than any may have, one part too many is returned.
         """
         receive = self.socket.recv
         try:
-            route = receive(_NOBLOCK)
+            route = receive(0 if wait else _NOBLOCK)
         except zmq.Again:
             return None
         parts: list[zmq.Frame] = []

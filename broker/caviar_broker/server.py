@@ -33,8 +33,12 @@ from caviar_protocol.assets import AssetStore
 from caviar_protocol.codec import check_parts, decode_message, encode_message
 from caviar_protocol.errors import ProtocolError, RunError
 
-LOOK_NS = 1_000_000
-"""[ns] until deadlines are looked at again, however busy the port is."""
+LOOK_NS, UNHURRIED_LOOK_NS = 1_000_000, 4_000_000
+"""[ns] until deadlines are looked at again, however busy the port is; where none can come soon, longer."""
+SOON_NS = 8_000_000
+"""[ns] What is due within this time is waited for exactly; else waits may be a millisecond longer."""
+LONG_NS = 10_000_000
+"""[ns] Budgets from here on bring nothing that would be due before deadlines are looked at again."""
 MESSAGES_A_TURN = 64
 """Messages taken before the clock is looked at again."""
 
@@ -103,6 +107,8 @@ class BrokerServer:
         self._entries: list[ev.Journal] = []
         """Decisions that are not in the journal yet."""
         self._next_check = self._look_at = 0
+        self._budgets_are_long = not plan.realtime and all(s.budget_ns >= LONG_NS for s in plan.services)
+        self._unhurried = False
         self._port = Port(endpoint, plan.limits.liveness, access, peer_limits)
         self._guard = self._port.guard
         self.access = access
@@ -180,12 +186,15 @@ class BrokerServer:
 
         Deadlines are looked for once in `LOOK_NS` at most: that costs as much as an answer.
         """
-        busy, now = self._port.readable, time.monotonic_ns()
+        now = time.monotonic_ns()
         if now >= self._look_at:
             wake = self._see_to_deadlines(now)
-            self._look_at = min(now + LOOK_NS, wake)
-            self.loop.call(self.loop.poll(0 if busy else wake - now))
-        elif busy:
+            self._unhurried = self._budgets_are_long and wake - now > SOON_NS
+            self._look_at = min(now + (UNHURRIED_LOOK_NS if self._unhurried else LOOK_NS), wake)
+            self.loop.call(self.loop.poll(0 if self._port.readable else wake - now))
+        elif self._unhurried:
+            self._receive_all(wait=True)
+        elif self._port.readable:
             self._receive_all()
         else:
             self.loop.call(self.loop.poll_sockets(self._look_at))
@@ -208,12 +217,15 @@ class BrokerServer:
             return now
         return min(deadline, self._next_check)
 
-    def _receive_all(self) -> None:
+    def _receive_all(self, wait: bool = False) -> None:
+        """Take what is there; with ``wait``, what comes within a millisecond."""
         for _ in range(MESSAGES_A_TURN):
-            received = self._port.receive()
-            if received is None:
+            received = self._port.receive(wait)
+            if received is not None:
+                self._handle(*received)
+            if not self._port.readable:
                 break
-            self._handle(*received)
+            wait = False
         if self._taken:  # what services answer together is acted upon once
             self._taken = False
             self.clock.settle(time.monotonic_ns())
