@@ -87,6 +87,8 @@ def test_what_traces_every_pair_comes_behind_what_is_cheap() -> None:
     labels = [setting.label for setting in spacing_settings()]
     assert labels.index("spherical 0.25°") < labels.index("mimo-rt 1°") < labels.index("mimo-rt 0.5°")
     assert labels.index("spherical 0.5° (diffuse, 500 paths)") < labels.index("mimo-rt 1°")
+    assert labels.index("mimo-rt 0.5°") < labels.index("siso-rt 0.5° (diffuse)")
+    assert labels.index("mimo-rt 0.25°") < labels.index("spherical 0.5° (diffuse)")
     assert labels[-1] == "mimo-rt 0.5° (diffuse)"
     assert [setting.label for setting in array_settings()][-3:] == [
         "mimo-rt 64×2",

@@ -44,9 +44,11 @@ SCATTERING = 0.4
 """Scattering coefficient S of Degli-Esposti et al., "Measurement and modelling of scattering from buildings",
 2007, who fitted S ≈ 0.4 to brick façades."""
 
-_DIFFUSE_EFFORT = 40
+_DIFFUSE_EFFORT = 120
+_ELEMENTS_EFFORT = 15
 _PAIRS_EFFORT = 100
-"""How much dearer diffuse scattering and the tracing of every pair are, about."""
+"""How much dearer diffuse scattering, H of each element over so many paths, and the tracing of every pair
+are, about."""
 
 CHEAP = 2
 """Receivers of a setting that traces every pair of antenna elements."""
@@ -204,7 +206,9 @@ def _effort(setting: Setting) -> float:
     """What a scene will cost, in rays; no more than an order."""
     rays = float(setting.settings["samples"])
     if setting.scattering:
-        rays *= _CHOSEN_EFFORT if "scattering_paths" in setting.settings else _DIFFUSE_EFFORT
+        chosen = "scattering_paths" in setting.settings
+        rays *= _CHOSEN_EFFORT if chosen else _DIFFUSE_EFFORT
+        rays *= 1 if chosen or setting.column == "siso-rt" else _ELEMENTS_EFFORT
     if setting.column not in FEW:
         return rays
     pairs = math.prod(setting.elements) if setting.elements else 1
