@@ -265,7 +265,8 @@ def _convergence(report: Report) -> list[str]:
             "NMSE: of each seed against 3e6 samples with a seed of its own (best … worst seed), for specular "
             f"paths. Diffuse: about {CHOSEN_PATHS} paths of a receiver, chosen among those of so many rays "
             f"of their own, beside {SPECULAR_BESIDE:,} for the others: the more rays, the less two choices "
-            "have in common. Between seeds: 95 % of users differ by less in path gain; top-1 is the share whose best pair of beams is the same; "
+            "have in common. Between seeds: 95 % of users differ by less in path gain; top-1 is the share "
+            "whose best pair of beams is the same; "
             f"{level(FLOOR_DB)} dB: equal, since rays leave along a lattice of directions, and the seed "
             "draws only what happens where they meet something."
         ),
