@@ -27,15 +27,22 @@ class JournalEntry(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
     service: str
     outcome: str
     decisions: tuple[GrantInput, ...] = ()
-    products: tuple[tuple[str, bytes, bytes], ...] = ()
-    """(topic, payload header, body) of products that a later frame may consume, or a service that
-    comes back (clause 18)."""
     chosen: dict[str, str] = {}
     """Decisions that the service took."""
     facts: dict[str, int] = {}
     members: tuple[str, ...] = ()
     file: str = ""
     """Of the service's state, in ``checkpoints/``."""
+    products: tuple[tuple[str, bytes, bytes], ...] = ()
+    """(topic, payload header, body) of products that a later frame may consume, or a service that
+    comes back (clause 18). Last, so that the body of the last one ends the entry: it is written from where
+    it lies."""
+
+
+_NO_BYTES = b"\xc4\x00"
+"""An empty body, as msgpack writes it."""
+_UNCOPIED = 1 << 16
+"""[B] from which a body is written without a copy; below, one more piece costs more."""
 
 
 class JournalFile:
@@ -59,13 +66,26 @@ class JournalFile:
         """Append entries. `RunError` naming the file where the system refuses them."""
         data = self._buffer
         data.clear()
+        pieces: list[bytes | memoryview] = []
         for entry in entries:
-            self._encoder.encode_into(self._record(entry), data, -1)
+            record = self._record(entry)
+            body = record.products[-1][2] if record.products else b""
+            if len(body) < _UNCOPIED:
+                self._encoder.encode_into(record, data, -1)
+                continue
+            topic, header, _ = record.products[-1]
+            products = (*record.products[:-1], (topic, header, b""))
+            self._encoder.encode_into(msgspec.structs.replace(record, products=products), data, -1)
+            del data[-len(_NO_BYTES) :]
+            data += b"\xc6" + len(body).to_bytes(4, "big")
+            pieces += [bytes(data), body]
+            data.clear()
+        pieces.append(bytes(data))
         try:
-            written = os.write(self._fd, data)
+            written = os.writev(self._fd, pieces)
         except OSError as error:
             raise RunError(f"cannot write the journal {self.path}: {error.strerror}") from error
-        if written != len(data):
+        if written != sum(map(len, pieces)):
             raise RunError(f"cannot write the journal {self.path}: no space left")
 
     def _record(self, entry: Journal) -> JournalEntry:

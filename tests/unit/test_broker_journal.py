@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import zmq
+from msgspec.structs import replace
 
 from caviar_broker.core.events import Journal, Product
 from caviar_broker.journal import JournalFile, read_journal
@@ -36,6 +37,22 @@ def test_entries_come_back_in_order_with_decisions_and_products(path: Path) -> N
     assert entries[0].decisions == entry(1).decisions
     assert entries[1].products == (("scene", b"\x80", b"x" * 2000),)
     assert entries[2].products == ()
+
+
+def test_large_bodies_are_written_from_where_they_lie_and_come_back_whole(tmp_path: Path) -> None:
+    """Sizes around that from which bodies are pieces of their own, several of them in one write."""
+    sizes = [0, 1, (1 << 16) - 1, 1 << 16, (1 << 16) + 1, 3_000_000, 5]
+    bodies = [bytes([65 + i]) * size for i, size in enumerate(sizes)]
+    entries = [entry(i, body) for i, body in enumerate(bodies, start=1)]
+    both = entry(len(bodies) + 1, b"y" * 100_000)
+    entries.append(replace(both, products=(*entries[5].products, *both.products)))
+    journal = JournalFile(tmp_path / "journal.msgpack", epoch=1)
+    journal.write(entries)
+    journal.close()
+    found = list(read_journal(tmp_path / "journal.msgpack"))
+    assert [e.number for e in found] == list(range(1, len(bodies) + 2))
+    assert [[p[2] for p in e.products] for e in found[:-1]] == [[body] if body else [] for body in bodies]
+    assert [p[2] for p in found[-1].products] == [bodies[5], b"y" * 100_000]
 
 
 def test_a_later_broker_appends(path: Path) -> None:
