@@ -19,6 +19,8 @@ LEADER_PT = 12.0
 CROSSING = 100.0
 """Area [pixels²] of overlap that is as bad as a step of such a line within something else."""
 STEPS = 12
+HIDING = 10.0
+"""How much worse it is to cover a point than a label or a line."""
 
 
 class Box(NamedTuple):
@@ -108,6 +110,7 @@ def place(
             spots(x, y, extent.width, extent.height, pixels_per_point),
             key=lambda spot: (
                 sum(spot.box.overlap(other) for other in (*taken, *lines))
+                + HIDING * sum(spot.box.overlap(other) for other in taken[: len(pixels)])
                 + 10 * spot.box.outside(frame)
                 + CROSSING * _crossed(x, y, spot, taken),
                 spot.distance,
