@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -81,12 +81,16 @@ class JournalFile:
             pieces += [bytes(data), body]
             data.clear()
         pieces.append(bytes(data))
-        try:
-            written = os.writev(self._fd, pieces)
-        except OSError as error:
-            raise RunError(f"cannot write the journal {self.path}: {error.strerror}") from error
-        if written != sum(map(len, pieces)):
-            raise RunError(f"cannot write the journal {self.path}: no space left")
+        self._put(pieces)
+
+    def _put(self, pieces: Sequence[bytes | memoryview]) -> None:
+        """Hand over all of it; Linux takes 2 GiB at once at most."""
+        while pieces:
+            try:
+                written = os.writev(self._fd, pieces)
+            except OSError as error:
+                raise RunError(f"cannot write the journal {self.path}: {error.strerror}") from error
+            pieces = _behind(pieces, written)
 
     def _record(self, entry: Journal) -> JournalEntry:
         products: tuple[tuple[str, Any, Any], ...] = tuple(
@@ -113,6 +117,16 @@ class JournalFile:
     def close(self) -> None:
         """Close the file."""
         os.close(self._fd)
+
+
+def _behind(pieces: Sequence[bytes | memoryview], written: int) -> list[bytes | memoryview]:
+    """What of these is left to be written."""
+    left: list[bytes | memoryview] = []
+    for piece in pieces:
+        if written < len(piece):
+            left.append(memoryview(piece)[written:])
+        written = max(0, written - len(piece))
+    return left
 
 
 def mend_journal(path: Path) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import zmq
 
 from caviar_broker.security.access import Access
-from caviar_broker.security.guard import Guard, PeerLimits
+from caviar_broker.security.guard import FRAMING, Guard, PeerLimits
 from caviar_broker.security.local import check_bind
 from caviar_protocol import limits
 from caviar_protocol.errors import RunError
@@ -67,7 +67,7 @@ class Port:
         self.socket.rcvtimeo = WAIT_MS
         self.guard = Guard(self._context, self.socket, access, peer_limits)
         """Watches over the peers."""
-        self.socket.setsockopt(zmq.MAXMSGSIZE, self.guard.limits.part)
+        self.socket.setsockopt(zmq.MAXMSGSIZE, self.guard.limits.part + FRAMING)
         try:
             self.socket.bind(endpoint)
         except zmq.ZMQError as error:

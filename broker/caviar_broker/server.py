@@ -184,7 +184,8 @@ class BrokerServer:
     def _turn(self) -> None:
         """Serve whoever is there; with nobody there, or after `LOOK_NS` at the latest, see to deadlines.
 
-        Deadlines are looked for once in `LOOK_NS` at most: that costs as much as an answer.
+        Deadlines are looked for once in `LOOK_NS` at most: that costs as much as an answer. Where nothing can
+        be due soon, it is `UNHURRIED_LOOK_NS`, and others than the port wait that long and a millisecond.
         """
         now = time.monotonic_ns()
         if now >= self._look_at:

@@ -56,12 +56,12 @@ class Limits(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
         int, quantity("MiB", "that wait of a connection before HELLO", ge=1, le=1024)
     ] = 4
     messages_at_once: Annotated[
-        int, quantity("1", "of a service, beyond one for each that it was sent", ge=1, le=1_000_000_000)
+        int, quantity("1", "of a service, beyond one for each that it was sent", ge=100, le=1_000_000_000)
     ] = 4000
     messages_per_s: Annotated[
         float, quantity("1/s", "of a service on and on, beyond the same", gt=0, le=1e9)
     ] = 500.0
-    part_mib: Annotated[int, quantity("MiB", "of one part of a message, as a product", ge=1, le=1024)] = 1024
+    part_mib: Annotated[int, quantity("MiB", "of one part of a message, as a product", ge=4, le=1024)] = 1024
     waiting_mib: Annotated[int, quantity("MiB", "that wait of a service, or for it", ge=2, le=2**20)] = 1088
 
 

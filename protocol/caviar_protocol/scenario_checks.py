@@ -225,11 +225,15 @@ def _check_limits(scenario: Scenario, place: Place) -> None:
     """What services need to take part at all is not too much."""
     limits, heartbeat_s = scenario.limits, scenario.timeouts.heartbeat_s
     needed = 2 * len(scenario.services)
-    if limits.connections < needed:
-        raise place.at("connections").error(
-            f"is {limits.connections}, and each of the {len(scenario.services)} services has one and another "
-            f"for its heartbeats; write at least {needed}"
-        )
+    for key, value in (
+        ("connections", limits.connections),
+        ("connections_before_hello", limits.connections_before_hello),
+    ):
+        if value < needed:
+            raise place.at(key).error(
+                f"is {value}, and each of the {len(scenario.services)} services has one and another "
+                f"for its heartbeats, perhaps at the same time; write at least {needed}"
+            )
     if limits.messages_per_s < 1.0 / heartbeat_s:
         raise place.at("messages_per_s").error(
             f"is {limits.messages_per_s:g}, and a heartbeat each {heartbeat_s:g} s (timeouts.heartbeat_s) is "

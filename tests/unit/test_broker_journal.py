@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -53,6 +55,23 @@ def test_large_bodies_are_written_from_where_they_lie_and_come_back_whole(tmp_pa
     assert [e.number for e in found] == list(range(1, len(bodies) + 2))
     assert [[p[2] for p in e.products] for e in found[:-1]] == [[body] if body else [] for body in bodies]
     assert [p[2] for p in found[-1].products] == [bodies[5], b"y" * 100_000]
+
+
+def test_what_the_system_takes_in_parts_is_written_whole(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """As Linux does from 2 GiB on."""
+    whole = os.writev
+
+    def partly(fd: int, pieces: Sequence[bytes]) -> int:
+        return whole(fd, [bytes(b"".join(pieces)[:40_000])])
+
+    monkeypatch.setattr(os, "writev", partly)
+    journal = JournalFile(tmp_path / "journal.msgpack", epoch=1)
+    journal.write([entry(1, b"a" * 100_000), entry(2), entry(3, b"b" * 70_000)])
+    journal.close()
+    found = list(read_journal(tmp_path / "journal.msgpack"))
+    assert [[p[2] for p in e.products] for e in found] == [[b"a" * 100_000], [], [b"b" * 70_000]]
 
 
 def test_a_later_broker_appends(path: Path) -> None:

@@ -31,7 +31,7 @@ connections = 51
 connections_before_hello = 52
 messages_before_hello = 53
 waiting_before_hello_mib = 54
-messages_at_once = 55
+messages_at_once = 155
 messages_per_s = 56.5
 part_mib = 57
 waiting_mib = 58
@@ -189,7 +189,7 @@ def test_the_limits_of_a_scenario_are_those_of_its_broker(
             strangers=52,
             stranger_messages=53,
             stranger_bytes=54 << 20,
-            burst=55.0,
+            burst=155.0,
             rate=56.5,
             queued=58 << 20,
             part=57 << 20,

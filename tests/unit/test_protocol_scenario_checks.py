@@ -163,6 +163,9 @@ def test_the_resolved_form_shows_defaults_and_reads_back() -> None:
             r"limits\.waiting_mib: is 64, .* 1024 .* least 1025, or part_mib = 63",
         ),
         ("part_mib = 1025", r"limits\.part_mib"),
+        ("part_mib = 3", r"limits\.part_mib"),  # assets travel in parts of 4 MiB
+        ("messages_at_once = 99", r"limits\.messages_at_once"),  # grants in flight are answered at once
+        ("connections_before_hello = 1", r"limits\.connections_before_hello: is 1, .* at least \d+"),
     ],
 )
 def test_limits_that_no_service_could_keep_are_refused_with_the_remedy(limits: str, told: str) -> None:

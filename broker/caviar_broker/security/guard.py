@@ -22,7 +22,7 @@ ZAP = "inproc://zeromq.zap.01"
 SCAN_NS = 100_000_000
 """[ns] between two looks at how much waits in the connections."""
 SCANNED = 128
-"""Connections looked at in one scan."""
+"""Connections looked at in one scan, or answered for at once."""
 KEPT_NS = 5_000_000_000
 """[ns] for which a peer is remembered whose connection has ended: messages of it may still come."""
 LAST_WORDS_NS = 200_000_000
@@ -361,16 +361,18 @@ class Guard:
             self._barred[address] = time.monotonic_ns() + BAR_NS
 
     def _authenticate(self) -> None:
-        """Answer libzmq, which asks about each new connection."""
-        try:
-            request = self._zap.recv_multipart(zmq.NOBLOCK)
-        except zmq.Again:
-            return
-        reply, why = answer(self.access, request)
-        self._zap.send_multipart(reply, zmq.NOBLOCK)
-        if why:
-            address = request[3].decode(errors="replace") if len(request) > 3 else ""
-            self._tell(f"key {address}", f"a connection from {address} was refused: {why}")
+        """Answer libzmq, which asks about each new connection, so that many that come at once wait for one
+        look at this socket."""
+        for _ in range(SCANNED):
+            try:
+                request = self._zap.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            reply, why = answer(self.access, request)
+            self._zap.send_multipart(reply, zmq.NOBLOCK)
+            if why:
+                address = request[3].decode(errors="replace") if len(request) > 3 else ""
+                self._tell(f"key {address}", f"a connection from {address} was refused: {why}")
 
 
 def _property(part: zmq.Frame, name: str) -> str:

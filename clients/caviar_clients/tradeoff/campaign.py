@@ -25,8 +25,8 @@ ROUNDS = 3
 TOGETHER = 3
 """Settings that are loaded at a time, beside the baseline: each holds a scene of its own in memory."""
 PATIENCE = 4.0
-"""What is loading this many times longer than its share of the time left of its block is ended, so that no
-setting can eat what the others of its block, or all other blocks, need."""
+"""What loads this many times longer than its share of the time left of its block, or measures longer than
+this many times that time, is ended: no setting can eat what the others of its block, or all blocks, need."""
 AFFORDABLE = 0.5
 """Share of the time left of its block that one scene of a setting may be expected to take."""
 AT_LEAST_S = 20.0
@@ -278,7 +278,8 @@ class Campaign:
             return
         index = self._order[turn % self._scenes_of(measured.setting)]
         try:
-            sample = entry.worker.step(index, max(AT_LEAST_S, self._left_s))
+            share = min(self._left_s, PATIENCE * (until - time.monotonic()))
+            sample = entry.worker.step(index, max(AT_LEAST_S, self._left_s if whole else share))
         except RunError as error:
             entry.count = 0
             measured.notes.append(f"ended early: {error}")

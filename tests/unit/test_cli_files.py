@@ -1,0 +1,26 @@
+"""Files that commands write: tried before the work, and left alone until there is something to write."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from caviar_clients.cli.files import write_file
+from caviar_protocol.errors import RunError
+
+
+def test_trying_a_file_makes_its_folders_and_leaves_what_is_in_it(tmp_path: Path) -> None:
+    file = tmp_path / "results" / "figures.json"
+    write_file(file)
+    assert file.read_bytes() == b""
+    write_file(file, "first")
+    write_file(file)  # what comes may fail
+    assert file.read_text() == "first"
+    write_file(file, "2nd")
+    assert file.read_text() == "2nd"
+
+
+def test_a_file_that_cannot_be_written_is_an_error_that_names_it(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=f"cannot write {tmp_path}: Is a directory; choose another file"):
+        write_file(tmp_path)
