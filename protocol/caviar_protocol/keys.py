@@ -24,9 +24,10 @@ import stat
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, TypeVar, get_args
+from typing import Annotated, Any, TypeVar, get_args
 
 import msgspec
+import zmq
 from msgspec import Meta
 
 from caviar_protocol.errors import SetupError
@@ -89,6 +90,12 @@ class Pair(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_d
 
     public: Z85
     secret: Z85
+
+    @classmethod
+    def new(cls) -> Pair:
+        """A pair that nobody else has."""
+        public, secret = zmq.curve_keypair()
+        return cls(public=public.decode(), secret=secret.decode())
 
     def __repr__(self) -> str:
         """Without the secret, which a traceback or a log might show."""
@@ -234,6 +241,12 @@ class Credentials(msgspec.Struct, frozen=True):
     pair: Pair
     broker: str
     """Public key of the broker."""
+
+    def give(self, socket: zmq.Socket[Any]) -> None:
+        """Give a socket what it needs before it connects. Raises `zmq.ZMQError` for impossible keys."""
+        socket.curve_publickey = self.pair.public.encode()
+        socket.curve_secretkey = self.pair.secret.encode()
+        socket.curve_serverkey = self.broker.encode()
 
 
 def credentials(

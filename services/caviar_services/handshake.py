@@ -26,9 +26,7 @@ def dress(socket: zmq.Socket[Any], endpoint: str, credentials: Credentials | Non
     """Give a socket what it needs before it connects. Raises `zmq.ZMQError` for impossible keys."""
     socket.setsockopt(zmq.IPV6, int("[" in endpoint))
     if credentials is not None:
-        socket.curve_publickey = credentials.pair.public.encode()
-        socket.curve_secretkey = credentials.pair.secret.encode()
-        socket.curve_serverkey = credentials.broker.encode()
+        credentials.give(socket)
 
 
 class Handshake:

@@ -118,9 +118,7 @@ class Gateway:
         dealer.sndhwm = dealer.rcvhwm = QUEUE
         dealer.setsockopt(zmq.IPV6, int("[" in self._endpoint))
         if self._credentials is not None:
-            dealer.curve_publickey = self._credentials.pair.public.encode()
-            dealer.curve_secretkey = self._credentials.pair.secret.encode()
-            dealer.curve_serverkey = self._credentials.broker.encode()
+            self._credentials.give(dealer)
         dealer.connect(self._endpoint)
         return dealer
 

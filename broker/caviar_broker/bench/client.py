@@ -30,9 +30,7 @@ def speak(part: Part, payload: int, endpoint: str) -> None:
     with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
         keys = credentials()
         if keys is not None:
-            socket.curve_serverkey = keys.broker.encode()
-            socket.curve_publickey = keys.pair.public.encode()
-            socket.curve_secretkey = keys.pair.secret.encode()
+            keys.give(socket)
         socket.connect(endpoint)
         socket.send(encode_message(_hello(part)))
         header, body = b"\x80", bytes(payload)

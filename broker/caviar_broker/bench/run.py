@@ -13,7 +13,6 @@ from tempfile import TemporaryDirectory
 
 import msgspec
 import numpy as np
-import zmq
 
 from caviar_broker.__main__ import tune_collector
 from caviar_broker.bench.topology import Part, Topology, deliveries, parts
@@ -25,7 +24,7 @@ from caviar_broker.server import BrokerServer
 from caviar_broker.statistics import Statistics
 from caviar_protocol.assets import AssetStore
 from caviar_protocol.errors import RunError
-from caviar_protocol.keys import BROKER, BROKER_KEY_VARIABLE, KEY_VARIABLE, Pair, read_public, write_pair
+from caviar_protocol.keys import BROKER, BROKER_KEY_VARIABLE, KEY_VARIABLE, Pair, write_pair
 
 WARM_UP = 50
 """Frames at the start that do not count."""
@@ -127,11 +126,10 @@ def measure(topology: Topology, services: int, payload: int, frames: int, *, cur
 
 def _keys(folder: Path, declared: Sequence[Part]) -> Access:
     """A pair of the broker's, and one that all clients have."""
-    for name in (BROKER, _CLIENTS):
-        public, secret = zmq.curve_keypair()
-        write_pair(folder, name, Pair(public=public.decode(), secret=secret.decode()))
-    local = {part.name: part.role for part in declared}
-    return Access(folder, read_public(folder / f"{_CLIENTS}.pub"), local)
+    write_pair(folder, BROKER, Pair.new())
+    clients = Pair.new()
+    write_pair(folder, _CLIENTS, clients)
+    return Access(folder, clients.public, {part.name: part.role for part in declared})
 
 
 @contextmanager
@@ -140,15 +138,11 @@ def _clients(
 ) -> Iterator[None]:
     """The clients as processes; none of them outlives the block."""
     command = [sys.executable, "-m", CLIENT, topology, str(services)]
-    named = (
-        {}
-        if keys is None
-        else {KEY_VARIABLE: keys / f"{_CLIENTS}.key", BROKER_KEY_VARIABLE: keys / f"{BROKER}.pub"}
-    )
-    foreign = {KEY_VARIABLE, BROKER_KEY_VARIABLE}
-    environment = {k: v for k, v in os.environ.items() if k not in foreign} | {
-        k: str(v) for k, v in named.items()
-    }
+    # Keys that the caller has for another broker are none of this one's.
+    environment = {k: v for k, v in os.environ.items() if k not in (KEY_VARIABLE, BROKER_KEY_VARIABLE)}
+    if keys is not None:
+        environment[KEY_VARIABLE] = str(keys / f"{_CLIENTS}.key")
+        environment[BROKER_KEY_VARIABLE] = str(keys / f"{BROKER}.pub")
     started: Sequence[subprocess.Popen[bytes]] = [
         subprocess.Popen([*command, str(number), str(payload), endpoint], env=environment)  # noqa: S603  # our own module
         for number in range(services)

@@ -6,7 +6,6 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import zmq
 from zmq.utils import z85
 
 from caviar_protocol.errors import SetupError
@@ -57,8 +56,7 @@ class Access:
             )
         self.pair = read_pair(path)
         self._local_key, self._local = local_key, dict(local or {})
-        public, secret = zmq.curve_keypair()
-        self.gateway = Pair(public=public.decode(), secret=secret.decode())
+        self.gateway = Pair.new()
         """Pair of the gateway of this broker, which is written nowhere and ends with it."""
         self._stamp = self._look()
         self._entries: dict[str, Authorization] = {}

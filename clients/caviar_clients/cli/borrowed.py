@@ -8,8 +8,6 @@ import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
-import zmq
-
 from caviar_protocol.keys import BROKER, BROKER_KEY_VARIABLE, KEY_VARIABLE, Pair, write_pair
 
 
@@ -53,7 +51,6 @@ class BorrowedKey:
 
     def _make(self) -> None:
         self._folder = Path(tempfile.mkdtemp(prefix="caviar-"))
-        public, secret = zmq.curve_keypair()
-        pair = Pair(public=public.decode(), secret=secret.decode())
+        pair = Pair.new()
         self.public = pair.public
         self._key, _ = write_pair(self._folder, "run", pair)

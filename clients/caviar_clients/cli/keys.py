@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, cast
 
 import typer
-import zmq
 
 from caviar_protocol import keys as k
 from caviar_protocol.errors import SetupError
@@ -32,8 +31,7 @@ def new(
     if role is not None:
         _free(directory, name)
         _role(role)
-    public, secret = zmq.curve_keypair()
-    pair = k.Pair(public=public.decode(), secret=secret.decode())
+    pair = k.Pair.new()
     key, pub = k.write_pair(directory, name, pair)
     typer.echo(f"{key}: secret, stays on its machine\n{pub}: for the others")
     if role is not None:
