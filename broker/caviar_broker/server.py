@@ -104,6 +104,8 @@ class BrokerServer:
         )
         self._taken = False
         """Whether the clock took answers that it has not acted upon yet."""
+        self._finished_frames = 0
+        """Frames of the episode that were finished when it last acted."""
         self._entries: list[ev.Journal] = []
         """Decisions that are not in the journal yet."""
         self._next_check = self._look_at = 0
@@ -153,8 +155,6 @@ class BrokerServer:
             m.AssetData: self._scenery.data,
         }
         self._performers: dict[type, Callable[[Any], None]] = {
-            ev.Send: self._send,
-            ev.Journal: lambda action: self._entries.append(action),
             ev.Latency: self._latency,
             ev.Overdue: self._overdue,
             ev.Notice: self._observer.notice,
@@ -199,7 +199,8 @@ class BrokerServer:
             self._receive_all()
         else:
             self.loop.call(self.loop.poll_sockets(self._look_at))
-        self._write_journal()
+        if self._entries and (self.clock.waits_for_journal or self.clock.over):
+            self._write_journal()
 
     def _see_to_deadlines(self, now: int) -> int:
         """Act on whatever is due; the instant of the next thing that will be [ns]."""
@@ -208,7 +209,7 @@ class BrokerServer:
             self._watchdog.check(now)
             self._sign.give()
             self._guard.check(now)
-            self._write_journal()
+        self._write_journal()
         deadline = self.clock.next_deadline()
         if deadline is None:
             return self._next_check
@@ -229,6 +230,10 @@ class BrokerServer:
             wait = False
         if self._taken:  # what services answer together is acted upon once
             self._taken = False
+            if self._finished_frames != self.clock.finished_frames:
+                self._finished_frames = self.clock.finished_frames
+                self._perform()
+                self._hand_over_entries()  # the next frame relies on them
             self.clock.settle(time.monotonic_ns())
             self._perform()
 
@@ -283,23 +288,35 @@ class BrokerServer:
         """Carry out the clock's actions, until there are no more."""
         while actions := self.clock.actions():
             # Whoever is granted something works while this process does the rest.
-            actions.sort(key=_is_no_send)
             for action in actions:
-                self._performers[type(action)](action)
+                if type(action) is ev.Send:
+                    self._send(action)
+            for action in actions:
+                if type(action) is ev.Journal:
+                    self._entries.append(action)
+                elif type(action) is not ev.Send:
+                    self._performers[type(action)](action)
 
     def _write_journal(self) -> None:
         """Clause 18: nothing that relies on an entry is granted before the system has it.
 
-        Once a turn, so that services that answer together cost one write.
+        Written once somebody waits for it, and whenever deadlines are looked at, so that services that
+        answer one after the other cost one write.
         """
         while self._entries:
+            self._hand_over_entries()
+            self.clock.settle(time.monotonic_ns())
+            self._perform()
+
+    def _hand_over_entries(self) -> None:
+        if self._entries:
             entries, self._entries = self._entries, []
             event: ev.Event = ev.Journaled(entries[-1].number)
             try:
                 self._journal.write(entries)
             except RunError as error:
                 event = ev.StopRequested(str(error))
-            self.feed(event)
+            self.clock.take(event, time.monotonic_ns())
 
     def _latency(self, action: ev.Latency) -> None:
         self.statistics.latency(action.service, action.elapsed_ns, action.missed)
@@ -340,7 +357,3 @@ class BrokerServer:
 
 def _weight(payload: Sequence[zmq.Frame]) -> int:
     return sum(map(len, payload))
-
-
-def _is_no_send(action: ev.Action) -> bool:
-    return type(action) is not ev.Send

@@ -107,7 +107,8 @@ class FrameClock:
 
     def actions(self) -> list[ev.Action]:
         """What the shell has to do, in order; each is handed out once."""
-        actions, self._run.actions = self._run.actions, []
+        actions = self._run.actions.copy()
+        self._run.actions.clear()
         return actions
 
     def settle(self, now: int) -> None:
@@ -157,6 +158,18 @@ class FrameClock:
     def episode(self) -> int:
         """The present episode, from 0."""
         return self._run.episode
+
+    @property
+    def finished_frames(self) -> int:
+        """Frames of the present episode that are finished; 0 between episodes."""
+        schedule = self._episodes.schedule
+        return 0 if schedule is None else schedule.finished_frames
+
+    @property
+    def waits_for_journal(self) -> bool:
+        """Whether somebody waits for the journal to be written; nobody does where no frames are granted."""
+        schedule = self._episodes.schedule
+        return schedule is not None and schedule.waits_for_journal
 
     @property
     def digest(self) -> RunDigest:

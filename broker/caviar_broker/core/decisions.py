@@ -63,6 +63,8 @@ class DecisionBook:
         self._holding = frozenset(p.name for p in plan.services if p.policy == "hold")
         self._kept = self._holding | graph.retained | frozenset(sources)
         self._tasks: dict[str, dict[int, Task]] = {name: {} for name in graph.order}
+        self._last = graph.order[-1]
+        """A service that has not decided the first frame yet that is not finished."""
         self._newest: dict[tuple[str, str], tuple[Product, int]] = {}
         """Newest product and its journal entry by (service, topic), late ones included (clause 12)."""
 
@@ -224,7 +226,8 @@ class DecisionBook:
             return
         products: tuple[Product, ...] = ()
         if task.service in self._kept:
-            products = tuple(d.product for d in decisions.values() if d.product and not d.journal)
+            products = tuple([d.product for d in decisions.values() if d.product and not d.journal])
+        told = [provenance(topic, task.service, d, task.frame) for topic, d in decisions.items()]
         self._actions.append(
             Journal(
                 number=number,
@@ -232,16 +235,15 @@ class DecisionBook:
                 frame=task.frame,
                 service=task.service,
                 outcome=outcome,
-                decisions=tuple(
-                    provenance(topic, task.service, decision, task.frame)
-                    for topic, decision in decisions.items()
-                ),
+                decisions=tuple(told),
                 products=products,
                 chosen=task.report.decisions if task.report else None,
             )
         )
 
     def _finish_frames(self) -> None:
+        if self.next[self._last] <= self.finished_frames:
+            return
         for frame in range(self.finished_frames, min(self.frames, *self.next.values())):
             if not self._plan.ephemeral:
                 self._digest.add_frame(self._episode, frame, self._fresh(frame))
@@ -252,6 +254,7 @@ class DecisionBook:
                 old = tasks.get(frame - 1)
                 if old is not None and old.state not in OUTSTANDING:
                     del tasks[frame - 1]
+        self._last = min(reversed(self.next), key=self.next.__getitem__)
 
     def _fresh(self, frame: int) -> Iterable[tuple[str, str, str]]:
         """(topic, source, digest) of the fresh products of a frame that everybody has decided."""

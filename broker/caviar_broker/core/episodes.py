@@ -85,7 +85,7 @@ class Episodes:
         assert run.graph is not None
         capacity = {p.name: _capacity(p) for p in self._members()}
         self.schedule = EpisodeSchedule(
-            run.graph, run.plan, capacity, run.episode, run.digest, run.ledger, run.gate, memories
+            run.graph, run.plan, capacity, run.episode, run.digest, run.ledger, run.actions, run.gate, memories
         )
         # Behind the schedule, so that frame 0 need not wait for these entries.
         facts = {"seed": run.seed, "seed_episode": run.seed_episode, "frames": self.schedule.frames}
@@ -121,7 +121,6 @@ class Episodes:
         """The episode is over, or the run ended within it."""
         if self.schedule is not None:
             self.schedule.close(now)
-            self._tell(self.schedule)
             self._ended, self.schedule = self.schedule, None
 
     def recorded(self, event: ev.DoneReceived, now: int) -> bool:
@@ -133,12 +132,7 @@ class Episodes:
         if ended is None or (message.epoch, message.attempt, message.episode, message.frame) != asked:
             return False
         ended.done(peer.name, message.frame, (), now)
-        self._tell(ended)
         return True
-
-    def _tell(self, schedule: EpisodeSchedule) -> None:
-        self._run.actions += schedule.actions
-        schedule.actions.clear()
 
     def _members(self) -> list[Peer]:
         assert self._run.graph is not None
@@ -155,12 +149,9 @@ class Episodes:
         schedule = self._owing(peer, message, "DONE")
         if schedule is None:
             return
-        topics = [header.topic for header in message.products]
-        declared = peer.hello.outputs if peer.hello else ()
-        strange = [t for t in topics if t not in declared or topics.count(t) > 1]
-        if strange:
-            problem = "twice" if strange[0] in declared else "which it did not declare"
-            run.fail(f"{peer} answered frame {message.frame} with {strange[0]!r}, {problem}", peer.name, now)
+        topics = {header.topic for header in message.products}
+        if len(topics) < len(message.products) or not topics <= peer.outputs:
+            self._strange_products(peer, message, now)
             return
         peer.losses = 0
         t_ns = run.plan.t_ns(message.frame)
@@ -178,13 +169,20 @@ class Episodes:
             )
         if message.seed >= 0:
             self._seed_chosen(peer, message, schedule, now)
-        if self.recall.of(peer.name) is not None:
+        remembers = self.recall.of(peer.name) is not None
+        if remembers:
             self._remember(peer, schedule, self.recall.digests(peer, message), message.decisions)
         schedule.done(peer.name, message.frame, products, now, told, end=message.end_episode)
         if message.end_episode and peer.role == "agent":
-            self._tell(schedule)  # entries in order
             run.enter_journal("end", peer.name, message.frame, now, facts={"frames": schedule.frames})
-        self._save_if_due(peer, schedule, now)
+        if remembers:
+            self._save_if_due(peer, schedule, now)
+
+    def _strange_products(self, peer: Peer, message: Done, now: int) -> None:
+        topics = [header.topic for header in message.products]
+        strange = next(t for t in topics if t not in peer.outputs or topics.count(t) > 1)
+        problem = "twice" if strange in peer.outputs else "which it did not declare"
+        self._run.fail(f"{peer} answered frame {message.frame} with {strange!r}, {problem}", peer.name, now)
 
     def _remember(
         self,
@@ -250,11 +248,12 @@ class Episodes:
         run, schedule = self._run, self.schedule
         owed = schedule.outstanding(peer.name) if schedule and run.takes_part(peer) else []
         outstanding = owed[0].frame if owed else -1
+        if owed and peer.state is _ACTIVE:
+            asked = (run.plan.epoch, peer.attempt, run.episode, outstanding)
+            if (answer.epoch, answer.attempt, answer.episode, answer.frame) == asked:
+                return schedule
         if not run.current(peer, answer.epoch, answer.attempt, kind, outstanding):
             return None
-        asked = (run.episode, outstanding) if owed and peer.state is _ACTIVE else None
-        if (answer.episode, answer.frame) == asked:
-            return schedule
         run.stale(peer, kind, f"{kind} for episode {answer.episode} frame {answer.frame}", outstanding)
         return None
 
@@ -293,9 +292,9 @@ class Episodes:
         for task, cause in deadlines.skips:
             told = run.peers[task.service].last_words(now)
             run.notice("skipped", task.service, f"{cause}; {told}", task.frame)
-        self._tell(schedule)
         for order in schedule.grants:
             self._grant(order)
+        schedule.grants.clear()
         for task in schedule.cut:
             peer = run.peers[task.service]
             if peer.present:
@@ -303,7 +302,6 @@ class Episodes:
                 run.send(peer, Cancel(**ids, frame=task.frame))
         deadlines.overruns.clear()
         deadlines.skips.clear()
-        schedule.grants.clear()
         schedule.cut.clear()
         if deadlines.aborted is not None:
             peer = run.peers[deadlines.aborted.service]

@@ -4,29 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-import msgspec
-
 from caviar_broker.core.decisions import DecisionBook
-from caviar_broker.core.events import Product
 from caviar_broker.core.graph import Edge, Graph
-from caviar_broker.core.tasks import Decision, Task, provenance
-from caviar_protocol.messages import GrantInput
-
-
-class Gathered(msgspec.Struct, frozen=True):
-    """Inputs of a task, all of them decided."""
-
-    decisions: list[tuple[Edge, Decision]]
-    cause: str | None
-    """Why the first required input is absent (clause 10); frame 0 has no earlier one."""
-    entry: int
-    """Number of the last journal entry that a grant relies on from before its frame (clause 18): the
-    service's own, lag 1 inputs and held products."""
-
-    def provided(self, frame: int) -> tuple[list[GrantInput], list[Product]]:
-        """Provenance of every input, and the products of those that are not absent."""
-        inputs = [provenance(edge.topic, edge.source, decision, frame) for edge, decision in self.decisions]
-        return inputs, [decision.product for _, decision in self.decisions if decision.product is not None]
+from caviar_broker.core.tasks import Gathered, Task
 
 
 class Inputs:
@@ -42,19 +22,22 @@ class Inputs:
         edges = self._all if task.frame < self._book.frames else self._lagged
         return edges[task.service]
 
-    def gathered(self, task: Task) -> Gathered | None:
-        """What is decided about its inputs; None while one of them is not (clause 7)."""
+    def undecided(self, task: Task) -> str | None:
+        """A source that has not decided yet what this task gets of it; None: all have (clause 7)."""
         frame, undecided = task.frame, self._book.next
-        edges = (self._all if frame < self._book.frames else self._lagged)[task.service]
-        for edge in edges:
+        for edge in self.taken(task):
             if frame - edge.lag >= undecided[edge.source] and frame >= edge.lag:
-                return None
+                return edge.source
+        return None
+
+    def gathered(self, task: Task) -> Gathered:
+        """What is decided about its inputs; all of them must be."""
         # The service's own last decision is relied on too. What was decided in this very frame would be
         # decided again. Entries become safe in order, so nothing is missing between them.
-        book = self._book
+        book, frame = self._book, task.frame
         cause, entry = None, book.entry(task.service, frame - 1)
         decisions = []
-        for edge in edges:
+        for edge in self.taken(task):
             decision = book.decision(edge, frame)
             decisions.append((edge, decision))
             if decision.product is None and edge.required and frame >= edge.lag and cause is None:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from caviar_broker.core.decisions import DecisionBook
 from caviar_broker.core.events import Product
-from caviar_broker.core.inputs import Gathered
-from caviar_broker.core.tasks import Decision, GrantOrder, Task, provenance
+from caviar_broker.core.tasks import Decision, Gathered, GrantOrder, Task, provenance
 from caviar_broker.core.turns import Turns
 from caviar_protocol.messages import GrantInput, Report, Status
 

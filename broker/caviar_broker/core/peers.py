@@ -31,6 +31,8 @@ class Peer:
     since: int = 0
     """When its state began [ns]."""
     hello: Hello | None = None
+    outputs: frozenset[str] = frozenset()
+    """Topics that it declared."""
     ready: Ready | None = None
     """Its last READY; kept when it is lost."""
     assets: tuple[Asset, ...] = ()
@@ -72,6 +74,7 @@ class Peer:
         """A new incarnation: what was heard of the one before does not count for it."""
         self.move(ServiceEvent.HELLO, now)
         self.hello, self.attempt = hello, self.attempt + 1
+        self.outputs = frozenset(hello.outputs)
         self.heard_at, self.progress, self.phase, self.grace_ns = None, 0, "", 0
         self.restored = False
 

@@ -71,7 +71,8 @@ class Resumption:
         book.go_on(self.finished, self.frames, self.tasks, self.newest)
 
     def _order(self, service: str, frame: int, previous: int, inputs: Inputs) -> GrantOrder:
-        gathered = inputs.gathered(Task(service, frame))
-        assert gathered is not None, f"frame {frame} is finished, and an input of {service} is not decided"
-        provenances, products = gathered.provided(frame)
+        task = Task(service, frame)
+        lacked = inputs.undecided(task)
+        assert lacked is None, f"frame {frame} is finished, and {service} lacks an input from {lacked}"
+        provenances, products = inputs.gathered(task).provided(frame)
         return GrantOrder(service, frame, previous, False, tuple(provenances), tuple(products), ())

@@ -15,12 +15,12 @@ from caviar_broker.core.decisions import DecisionBook
 from caviar_broker.core.events import Action, Notice, Product
 from caviar_broker.core.gate import Gate
 from caviar_broker.core.graph import Graph
-from caviar_broker.core.inputs import Gathered, Inputs
+from caviar_broker.core.inputs import Inputs
 from caviar_broker.core.ledger import Ledger
 from caviar_broker.core.orders import Orders
 from caviar_broker.core.plan import RunPlan, ServicePlan
 from caviar_broker.core.resumption import Resumption
-from caviar_broker.core.tasks import GrantOrder, Task, milliseconds
+from caviar_broker.core.tasks import Gathered, GrantOrder, Task, milliseconds
 from caviar_broker.core.transitions import OUTSTANDING, TaskEvent, TaskState
 from caviar_broker.core.turns import Turns
 from caviar_protocol.digest import RunDigest
@@ -34,7 +34,7 @@ _GRANT, _ANSWER = TaskEvent.GRANT, TaskEvent.ANSWER
 class EpisodeSchedule:
     """Schedule of one episode.
 
-    What it wants done collects in `actions`, `grants` and `cut`, and in its `deadlines`, for the caller to
+    What it wants done collects in ``actions``, `grants` and `cut`, and in its `deadlines`, for the caller to
     carry out.
 
     Parameters
@@ -45,8 +45,12 @@ class EpisodeSchedule:
         Grants that each service can have outstanding (clause 7).
     episode
         Number of the episode.
-    digest, ledger, gate
-        The run's digest and journal, and whether it is paused.
+    digest, ledger
+        The run's digest and journal.
+    actions
+        Where what is told, recorded and written goes, in order.
+    gate
+        Whether the run is paused.
     remembering
         Services that save their state.
     """
@@ -59,29 +63,30 @@ class EpisodeSchedule:
         episode: int,
         digest: RunDigest,
         ledger: Ledger,
+        actions: list[Action],
         gate: Gate | None = None,
         remembering: Collection[str] = (),
     ) -> None:
         self.graph, self.plan, self.episode = graph, plan, episode
-        self.actions: list[Action] = []
         self.grants: list[GrantOrder] = []
         self.cut: list[Task] = []
         """Granted tasks that an early end made useless; to be cancelled."""
         self._plans: Mapping[str, ServicePlan] = {p.name: p for p in plan.services}
-        self._capacity, self._ledger = capacity, ledger
+        self._capacity, self._ledger, self._actions = capacity, ledger, actions
         self._first_entry = ledger.last
         self._gate = gate or Gate()
         sources = {edge.source for name in remembering for edge in graph.inputs[name]}
-        self._book = DecisionBook(graph, plan, episode, digest, ledger, self.actions, sources)
+        self._book = DecisionBook(graph, plan, episode, digest, ledger, actions, sources)
         self._inputs = Inputs(graph, self._book)
         self._turns = Turns(graph, plan, self._book)
+        self._rank = {name: rank for rank, name in enumerate(graph.order)}
         self._completed = dict.fromkeys(graph.order, -1)
         self._outstanding: dict[str, list[Task]] = {name: [] for name in graph.order}
         self._orders = Orders(self._book, self._turns)
         self._paused: set[str] = set()
         self._saving: set[str] = set()
         self.deadlines = Deadlines(
-            plan, episode, self._book, self._turns, self._gate, self._outstanding, self._saving, self.actions
+            plan, episode, self._book, self._turns, self._gate, self._outstanding, self._saving, actions
         )
         """Pace and budgets, and what was overrun."""
 
@@ -104,8 +109,8 @@ class EpisodeSchedule:
         end: bool = False,
     ) -> None:
         """DONE for the oldest outstanding task. Products are of declared topics (checked by the caller)."""
-        task = self._answered(service, frame, now)
-        state, by_topic = task.state, {p.topic: p for p in products if p.topic in self.graph.outputs[service]}
+        task, wanted = self._answered(service, frame, now), self.graph.outputs[service]
+        state, by_topic = task.state, {p.topic: p for p in products if p.topic in wanted} if wanted else {}
         task.move(_ANSWER)
         if state is _ABANDONED:
             self._book.release(task)
@@ -143,6 +148,11 @@ class EpisodeSchedule:
         else:
             self._book.substitute(task, f"{service} failed in frame {frame}: {text}", "fault", now)
             self._turns.decided(task.service)
+
+    @property
+    def waits_for_journal(self) -> bool:
+        """Whether somebody can be granted nothing before more entries of the ledger are safe."""
+        return bool(self._turns.waiting_for_journal)
 
     def journal_written(self) -> None:
         """More entries of the ledger are safe; what waited for them may be granted."""
@@ -194,10 +204,10 @@ class EpisodeSchedule:
         """Grant and skip whatever can be, until nothing changes."""
         concerned = self._turns.concerned
         while concerned:
-            for name in self.graph.order:
-                if name in concerned:
-                    concerned.discard(name)
-                    self._advance_service(name, now)
+            names = sorted(concerned, key=self._rank.__getitem__) if len(concerned) > 1 else list(concerned)
+            concerned.clear()
+            for name in names:
+                self._advance_service(name, now)
 
     def close(self, now: int) -> None:
         """The episode is over, or the run ends within it: tell what was left unanswered or unused."""
@@ -211,6 +221,11 @@ class EpisodeSchedule:
                     self._notice("late", task, "was never answered")
 
     # --- what can be asked -------------------------------------------------------------------------
+
+    @property
+    def finished_frames(self) -> int:
+        """Frames that everybody has decided."""
+        return self._book.finished_frames
 
     @property
     def frames(self) -> int:
@@ -285,11 +300,18 @@ class EpisodeSchedule:
             if in_flight and not has_room:
                 return  # its answer brings it back
             task = self._turns.candidate(name, in_flight)
-            inputs = self._inputs.gathered(task) if task is not None else None
-            if task is None or inputs is None:
+            if task is None:
                 return
-            if self._ledger.written < max(self._first_entry, inputs.entry):
+            inputs, task.inputs = task.inputs, None
+            if inputs is None:
+                if (source := self._inputs.undecided(task)) is not None:
+                    self._turns.waits_for(source, name)
+                    return
+                inputs = self._inputs.gathered(task)
+            if self._ledger.written < inputs.entry or self._ledger.written < self._first_entry:
                 self._turns.waiting_for_journal.add(name)
+                # Behind another frame of the service, which is not decided yet, it will rely on more.
+                task.inputs = None if in_flight else inputs
                 return
             if (self.plan.realtime or self._gate.closed) and not self.deadlines.released(task, now):
                 self._turns.waiting_for_pace.add(name)
@@ -352,4 +374,4 @@ class EpisodeSchedule:
         self._turns.wake_all()
 
     def _notice(self, kind: str, task: Task, text: str) -> None:
-        self.actions.append(Notice(kind, task.service, text, self.episode, task.frame))
+        self._actions.append(Notice(kind, task.service, text, self.episode, task.frame))

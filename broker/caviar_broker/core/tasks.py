@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import msgspec
 
 from caviar_broker.core.events import Product
+from caviar_broker.core.graph import Edge
 from caviar_broker.core.transitions import TASK, TaskEvent, TaskState, step
 from caviar_protocol.messages import GrantInput, Report, Status
 
@@ -33,6 +34,22 @@ class GrantOrder(msgspec.Struct, frozen=True):
     reports: tuple[Report, ...]
 
 
+class Gathered(msgspec.Struct, frozen=True):
+    """Inputs of a task, all of them decided."""
+
+    decisions: list[tuple[Edge, Decision]]
+    cause: str | None
+    """Why the first required input is absent (clause 10); frame 0 has no earlier one."""
+    entry: int
+    """Number of the last journal entry that a grant relies on from before its frame (clause 18): the
+    service's own, lag 1 inputs and held products."""
+
+    def provided(self, frame: int) -> tuple[list[GrantInput], list[Product]]:
+        """Provenance of every input, and the products of those that are not absent."""
+        inputs = [provenance(edge.topic, edge.source, decision, frame) for edge, decision in self.decisions]
+        return inputs, [decision.product for _, decision in self.decisions if decision.product is not None]
+
+
 @dataclass(slots=True, eq=False)
 class Task:
     """One service's part of one frame."""
@@ -44,6 +61,8 @@ class Task:
     """When it could first have been granted, or skipped, had its service been there and not late [ns]."""
     started_at: int = 0
     """When it was granted or, where grants queue, when the one before it was answered [ns]."""
+    inputs: Gathered | None = None
+    """Kept while its grant waits for the journal."""
     overran: bool = False
     """Whether its budget is up."""
     order: GrantOrder | None = None

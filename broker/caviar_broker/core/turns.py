@@ -11,8 +11,10 @@ from caviar_broker.core.tasks import Task
 class Turns:
     """Turns of the services of one episode (clauses 7 and 16).
 
-    After something happened only services that may be concerned are looked at again; who waits for
-    the journal, for real time or for frames to be finished is remembered until that comes.
+    After something happened only services that may be concerned are looked at again. Who waits for another
+    service's decision, for the journal, for real time or for frames to be finished is remembered until that
+    comes. A service that lacks several inputs waits for one of them at a time, so an answer brings back only
+    those that it may let go on.
     """
 
     def __init__(self, graph: Graph, plan: RunPlan, book: DecisionBook) -> None:
@@ -27,10 +29,8 @@ class Turns:
         self._waiting_for_frames: set[str] = set()
         self._finished = 0
         """Finished frames when somebody was last woken for them."""
-        self._concern = {
-            name: {*graph.consumers[name], *self.recorders, *(self.agents if name in self.agents else ())}
-            for name in graph.order
-        }
+        self._awaiting: dict[str, set[str]] = {name: set() for name in graph.order}
+        """Who waits for the next decision of each service."""
         self._graph, self._plan, self._book = graph, plan, book
 
     def candidate(self, name: str, in_flight: int) -> Task | None:
@@ -45,27 +45,39 @@ class Turns:
         if frame >= book.finished_frames + self._plan.frames_in_flight + (frame == book.frames):
             self._waiting_for_frames.add(name)
             return None
-        if role == "agent" and any(book.next[agent] < frame for agent in self.agents):
-            return None
-        if role == "recorder" and any(book.next[other] <= frame for other in self.others):
-            return None
+        if role == "agent":
+            for agent in self.agents:
+                if book.next[agent] < frame:
+                    self.waits_for(agent, name)
+                    return None
+        elif role == "recorder":
+            for other in self.others:
+                if book.next[other] <= frame:
+                    self.waits_for(other, name)
+                    return None
         return book.task(name, frame)
+
+    def waits_for(self, source: str, name: str) -> None:
+        """A service can have no turn before the next decision of another."""
+        self._awaiting[source].add(name)
 
     def decided(self, name: str) -> None:
         """A service's task was decided: whom may that concern?"""
         self.concerned.add(name)
-        self.concerned.update(self._concern[name])
+        self.wake(self._awaiting[name])
         if self._book.finished_frames != self._finished:
             self._finished = self._book.finished_frames
             self.wake(self._waiting_for_frames)
 
     def wake(self, waiting: set[str]) -> None:
         """What these services waited for has come."""
-        self.concerned |= waiting
-        waiting.clear()
+        if waiting:
+            self.concerned |= waiting
+            waiting.clear()
 
     def wake_all(self) -> None:
         """Everything may have changed."""
-        for waiting in (self.waiting_for_journal, self.waiting_for_pace, self._waiting_for_frames):
+        decisions = self._awaiting.values()
+        for waiting in (self.waiting_for_journal, self.waiting_for_pace, self._waiting_for_frames, *decisions):
             waiting.clear()
         self.concerned.update(self._graph.order)
