@@ -108,6 +108,10 @@ class BrokerServer:
         """Frames of the episode that were finished when it last acted."""
         self._entries: list[ev.Journal] = []
         """Decisions that are not in the journal yet."""
+        self._later: list[ev.Action] = []
+        """What nobody waits for."""
+        self._has_sent = False
+        """Whether somebody was sent something since the journal was written."""
         self._next_check = self._look_at = 0
         self._budgets_are_long = not plan.realtime and all(s.budget_ns >= LONG_NS for s in plan.services)
         self._unhurried = False
@@ -199,7 +203,16 @@ class BrokerServer:
             self._receive_all()
         else:
             self.loop.call(self.loop.poll_sockets(self._look_at))
-        if self._entries and (self.clock.waits_for_journal or self.clock.over):
+        self._catch_up()
+
+    def _catch_up(self) -> None:
+        """What services need not wait for, once whoever was granted something is at work."""
+        if self._later:
+            later, self._later = self._later, []
+            for action in later:
+                self._performers[type(action)](action)
+        if self._entries and (self._has_sent or self.clock.waits_for_journal or self.clock.over):
+            self._has_sent = False
             self._write_journal()
 
     def _see_to_deadlines(self, now: int) -> int:
@@ -230,8 +243,9 @@ class BrokerServer:
             wait = False
         if self._taken:  # what services answer together is acted upon once
             self._taken = False
-            if self._finished_frames != self.clock.finished_frames:
-                self._finished_frames = self.clock.finished_frames
+            finished = self.clock.finished_frames
+            if finished != self._finished_frames:
+                self._finished_frames = finished
                 self._perform()
                 self._hand_over_entries()  # the next frame relies on them
             self.clock.settle(time.monotonic_ns())
@@ -287,21 +301,21 @@ class BrokerServer:
     def _perform(self) -> None:
         """Carry out the clock's actions, until there are no more."""
         while actions := self.clock.actions():
-            # Whoever is granted something works while this process does the rest.
             for action in actions:
                 if type(action) is ev.Send:
                     self._send(action)
-            for action in actions:
-                if type(action) is ev.Journal:
+                elif type(action) is ev.Journal:
                     self._entries.append(action)
-                elif type(action) is not ev.Send:
+                elif type(action) is ev.Latency or type(action) is ev.FrameFinished:
+                    self._later.append(action)
+                else:
                     self._performers[type(action)](action)
 
     def _write_journal(self) -> None:
         """Clause 18: nothing that relies on an entry is granted before the system has it.
 
-        Written once somebody waits for it, and whenever deadlines are looked at, so that services that
-        answer one after the other cost one write.
+        Written once somebody waits for it, while services are at work, and whenever deadlines are looked
+        at; so services that answer one after the other cost one write.
         """
         while self._entries:
             self._hand_over_entries()
@@ -325,6 +339,7 @@ class BrokerServer:
         self.statistics.decision(time.monotonic_ns() - action.due_ns)
 
     def _frame_finished(self, action: ev.FrameFinished) -> None:
+        self.clock.digest.fold()
         self._journal.checkpoints.finished = action.episode, action.frame
         self.statistics.frame(time.monotonic_ns(), action.episode, action.lag_ns)
         self._observer.frame(action, self.statistics)
@@ -336,9 +351,12 @@ class BrokerServer:
         self.outcome = action
 
     def _send(self, action: ev.Send) -> None:
-        parts = [part for product in action.products for part in product.payload]
+        parts: list[Any] = []
+        for product in action.products:
+            parts += product.payload
         if action.attachment is not None:
             parts.append(action.attachment)
+        self._has_sent = True
         route, message = self._routes[action.service], action.message
         reason = self._port.send(route, encode_message(message), parts, not isinstance(message, COMPLAINTS))
         if not reason or self.clock.state is RunState.FINISHED:

@@ -128,13 +128,12 @@ def check_parts(message: Message, parts: Sequence[Any]) -> None:
     if isinstance(message, AssetData):
         _check_chunk(message, len(parts[1]))
         return
-    has_products = isinstance(message, (Grant, Done))
-    for index in range(1, expected):
-        limit = limits.MAX_HEADER if has_products and index % 2 else limits.MAX_BODY
-        if len(parts[index]) > limit:
+    header = limits.MAX_HEADER if isinstance(message, (Grant, Done)) else limits.MAX_BODY
+    for index, part in enumerate(parts):
+        limit = header if index % 2 else limits.MAX_BODY
+        if len(part) > limit and index:
             raise LimitError(
-                f"part {index} of {message_type(message)} has {len(parts[index])} B, "
-                f"at most {limit} are accepted"
+                f"part {index} of {message_type(message)} has {len(part)} B, at most {limit} are accepted"
             )
 
 

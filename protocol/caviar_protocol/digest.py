@@ -7,6 +7,9 @@ from collections.abc import Iterable
 
 from caviar_protocol.messages import Asset
 
+MOST_WAITING = 64
+"""Frames that a `RunDigest` keeps unhashed."""
+
 
 def payload_digest(header: bytes | memoryview, body: bytes | memoryview) -> str:
     """SHA-256 of a product: header length (8 bytes, little-endian), header, body."""
@@ -37,13 +40,28 @@ class RunDigest:
 
     def __init__(self) -> None:
         self._state = hashlib.sha256(b"caviar-run-1").digest()
+        self._waiting: list[tuple[int, int, list[tuple[str, str, str]]]] = []
 
     def add_frame(self, episode: int, frame: int, products: Iterable[tuple[str, str, str]]) -> None:
-        """Add the fresh products of one frame, each (topic, source, payload digest)."""
-        for topic, source, digest in sorted(products):
-            prefix = f"{episode}\0{frame}\0{topic}\0{source}\0".encode()
-            self._state = hashlib.sha256(self._state + prefix + bytes.fromhex(digest)).digest()
+        """Add the fresh products of one frame, each (topic, source, payload digest).
+
+        They are hashed by the next `fold`, or once `MOST_WAITING` frames wait for it.
+        """
+        self._waiting.append((episode, frame, list(products)))
+        if len(self._waiting) >= MOST_WAITING:
+            self.fold()
+
+    def fold(self) -> None:
+        """Hash what was added: at a time when nobody waits."""
+        state = self._state
+        for episode, frame, products in self._waiting:
+            for topic, source, digest in sorted(products):
+                prefix = f"{episode}\0{frame}\0{topic}\0{source}\0".encode()
+                state = hashlib.sha256(state + prefix + bytes.fromhex(digest)).digest()
+        self._state = state
+        self._waiting.clear()
 
     def hexdigest(self) -> str:
         """The digest so far."""
+        self.fold()
         return self._state.hex()

@@ -37,32 +37,36 @@ def speak(part: Part, payload: int, endpoint: str) -> None:
         header, body = b"\x80", bytes(payload)
         # Hashed once, since it is the same in every frame: hashing is the producer's work, not the broker's.
         products = (m.ProductHeader(topic=part.output, digest=payload_digest(header, body)),)
-        epoch = attempt = 0
+        done = _Done(products=products)
+        receive, send = socket.recv, socket.send
         while True:
-            told = _received(socket)
+            first = rest = receive(0, False)
+            while rest.more:  # payloads come into this process, and are not looked at
+                rest = receive(0, False)
+            told = _decoder.decode(first.buffer)
+            if told.type == "GRANT":
+                done.episode, done.frame = told.episode, told.frame
+                send(_encoder.encode(done), _MORE)
+                send(header, _MORE)
+                send(body, 0, payload < _COPIED)
+                continue
+            epoch, attempt = done.epoch, done.attempt
             match told.type:
-                case "GRANT":
-                    done = m.Done(
-                        epoch=epoch, attempt=attempt, episode=told.episode, frame=told.frame, products=products
-                    )
-                    socket.send(encode_message(done), _MORE)
-                    socket.send(header, _MORE)
-                    socket.send(body, 0, payload < _COPIED)
                 case "WELCOME":
-                    epoch, attempt = told.epoch, told.attempt
+                    done.epoch, done.attempt = told.epoch, told.attempt
                 case "PREPARE":
-                    socket.send(encode_message(m.Ready(epoch=epoch, attempt=attempt)))
+                    send(encode_message(m.Ready(epoch=epoch, attempt=attempt)))
                 case "RESET":
-                    socket.send(encode_message(m.ResetDone(epoch=epoch, attempt=attempt, episode=told.episode)))
+                    send(encode_message(m.ResetDone(epoch=epoch, attempt=attempt, episode=told.episode)))
                 case "SHUTDOWN":
-                    socket.send(encode_message(m.Bye(epoch=epoch, attempt=attempt)))
+                    send(encode_message(m.Bye(epoch=epoch, attempt=attempt)))
                     return
                 case "REFUSE":
                     raise SystemExit(f"{part.name}: {told.message}")
 
 
 class _Told(msgspec.Struct):
-    """What this client reads of a message; what is done with provenance and payloads is a service's cost."""
+    """What is read of a message: enough to answer it. What a service does with its inputs is its own cost."""
 
     type: str
     epoch: int = 0
@@ -72,15 +76,18 @@ class _Told(msgspec.Struct):
     message: str = ""
 
 
+class _Done(msgspec.Struct, tag="DONE", omit_defaults=True):
+    """`caviar_protocol.messages.Done` with what changes from frame to frame."""
+
+    products: tuple[m.ProductHeader, ...]
+    epoch: int = -1
+    attempt: int = -1
+    episode: int = -1
+    frame: int = -1
+
+
 _decoder = msgspec.msgpack.Decoder(_Told)
-
-
-def _received(socket: zmq.Socket[bytes]) -> _Told:
-    """The next message; payloads come into this process, and are not looked at."""
-    first = part = socket.recv(0, False)
-    while part.more:
-        part = socket.recv(0, False)
-    return _decoder.decode(first.buffer)
+_encoder = msgspec.msgpack.Encoder()
 
 
 def _hello(part: Part) -> m.Hello:

@@ -85,7 +85,15 @@ class Episodes:
         assert run.graph is not None
         capacity = {p.name: _capacity(p) for p in self._members()}
         self.schedule = EpisodeSchedule(
-            run.graph, run.plan, capacity, run.episode, run.digest, run.ledger, run.actions, run.gate, memories
+            run.graph,
+            run.plan,
+            capacity,
+            run.episode,
+            run.digest,
+            run.ledger,
+            run.actions,
+            run.gate,
+            memories,
         )
         # Behind the schedule, so that frame 0 need not wait for these entries.
         facts = {"seed": run.seed, "seed_episode": run.seed_episode, "frames": self.schedule.frames}

@@ -78,6 +78,11 @@ class Turns:
     def wake_all(self) -> None:
         """Everything may have changed."""
         decisions = self._awaiting.values()
-        for waiting in (self.waiting_for_journal, self.waiting_for_pace, self._waiting_for_frames, *decisions):
+        for waiting in (
+            self.waiting_for_journal,
+            self.waiting_for_pace,
+            self._waiting_for_frames,
+            *decisions,
+        ):
             waiting.clear()
         self.concerned.update(self._graph.order)
