@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 
 from caviar_broker.core.decisions import DecisionBook
 from caviar_broker.core.graph import Edge, Graph
@@ -17,7 +17,7 @@ class Inputs:
         self._all, self._consumers = graph.inputs, graph.consumers
         self._lagged = {name: tuple(e for e in edges if e.lag) for name, edges in graph.inputs.items()}
 
-    def taken(self, task: Task) -> Iterable[Edge]:
+    def taken(self, task: Task) -> Sequence[Edge]:
         """Edges that count in this frame: behind the last frame only those with lag 1 (clause 16)."""
         edges = self._all if task.frame < self._book.frames else self._lagged
         return edges[task.service]
@@ -25,7 +25,8 @@ class Inputs:
     def undecided(self, task: Task) -> str | None:
         """A source that has not decided yet what this task gets of it; None: all have (clause 7)."""
         frame, undecided = task.frame, self._book.next
-        for edge in self.taken(task):
+        # From behind: who was granted last mostly answers last, and is the only one to be waited for then.
+        for edge in reversed(self.taken(task)):
             if frame - edge.lag >= undecided[edge.source] and frame >= edge.lag:
                 return edge.source
         return None

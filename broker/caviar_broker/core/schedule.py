@@ -112,6 +112,8 @@ class EpisodeSchedule:
         task, wanted = self._answered(service, frame, now), self.graph.outputs[service]
         state, by_topic = task.state, {p.topic: p for p in products if p.topic in wanted} if wanted else {}
         task.move(_ANSWER)
+        if state is not _GRANTED:
+            self._turns.concerned.add(service)
         if state is _ABANDONED:
             self._book.release(task)
             self._notice("discarded", task, "answered behind the end of the episode; not used")
@@ -138,6 +140,8 @@ class EpisodeSchedule:
         task = self._answered(service, frame, now)
         state = task.state
         task.move(TaskEvent.FAULT)
+        if state is not _GRANTED:
+            self._turns.concerned.add(service)
         self._notice("fault", task, text)
         if state is _ABANDONED:
             self._book.release(task)
@@ -348,7 +352,6 @@ class EpisodeSchedule:
         if owed:
             owed[0].started_at = now  # it was queued until now
         task.order = None
-        self._turns.concerned.add(service)
         return task
 
     def _came_late(self, task: Task, products: Mapping[str, Product], now: int) -> None:

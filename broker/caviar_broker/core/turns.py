@@ -63,11 +63,23 @@ class Turns:
 
     def decided(self, name: str) -> None:
         """A service's task was decided: whom may that concern?"""
-        self.concerned.add(name)
+        if not self._waits_for_last_input(name):
+            self.concerned.add(name)
         self.wake(self._awaiting[name])
         if self._book.finished_frames != self._finished:
             self._finished = self._book.finished_frames
             self.wake(self._waiting_for_frames)
+
+    def _waits_for_last_input(self, name: str) -> bool:
+        """Whether a service, which has just decided a frame, waits for its last input now, as most do."""
+        book, edges = self._book, self._graph.inputs[name]
+        frame = book.next[name]
+        if edges and frame < book.frames:
+            edge = edges[-1]
+            if frame - edge.lag >= book.next[edge.source]:
+                self._awaiting[edge.source].add(name)
+                return True
+        return False
 
     def wake(self, waiting: set[str]) -> None:
         """What these services waited for has come."""
