@@ -341,6 +341,28 @@ class Diary(JournalFile):
         self.events += [("written", entry.service, entry.frame) for entry in written]
 
 
+def test_a_decision_is_in_the_journal_soon_though_nobody_waits_for_it(tmp_path: Path) -> None:
+    """While another service keeps the frame from being finished, and nothing is sent."""
+    services = ("world", "sensors:left", "sensors:right")
+
+    def journaled(service: str) -> bool:
+        entries = read_journal(tmp_path / "journal.msgpack")
+        return any((e.service, e.frame) == (service, 0) for e in entries)
+
+    with (
+        serving(plan(*services, frames=2), tmp_path) as broker,
+        playing(broker.endpoint, *services) as clients,
+    ):
+        world, left, right = clients
+        world.answer()
+        left.answer()
+        eventually(lambda: journaled("left"), "an entry of left", within_s=2.0)
+        assert not journaled("right")
+        right.answer()
+        play_to_the_end(clients, 1)
+        assert finishes_well(broker)
+
+
 def test_no_grant_overtakes_the_journal_entries_that_it_relies_on(tmp_path: Path) -> None:
     """Clause 18, with a world that takes its own scene of the frame before."""
     diaries: list[Diary] = []

@@ -55,6 +55,21 @@ def chain(*frames: tuple[int, int, list[tuple[str, str, str]]]) -> str:
     return run.hexdigest()
 
 
+@pytest.mark.parametrize("every", [1, 3, 1000])
+def test_when_frames_are_hashed_does_not_matter(every: int) -> None:
+    """Also where more frames wait than `RunDigest` keeps."""
+    frames = [(0, k, [("scene", "a", f"{k:064x}"), ("link", "b", f"{k:064x}")]) for k in range(200)]
+    run, expected = RunDigest(), hashlib.sha256(b"caviar-run-1").digest()
+    for episode, frame, products in frames:
+        run.add_frame(episode, frame, products)
+        if frame % every == 0:
+            run.fold()
+        for topic, source, digest in sorted(products):
+            stated = f"{episode}\0{frame}\0{topic}\0{source}\0".encode()
+            expected = sha256(expected, stated, bytes.fromhex(digest))
+    assert run.hexdigest() == expected.hex()
+
+
 def test_a_run_without_products_has_the_digest_of_the_name_of_the_chain() -> None:
     assert RunDigest().hexdigest() == hashlib.sha256(b"caviar-run-1").hexdigest()
 

@@ -139,7 +139,7 @@ class Episodes:
         asked = (run.plan.epoch, peer.attempt, run.episode, owed[0].frame if owed else -1)
         if ended is None or (message.epoch, message.attempt, message.episode, message.frame) != asked:
             return False
-        ended.done(peer.name, message.frame, (), now)
+        ended.done(peer.name, message.frame, {}, now)
         return True
 
     def _members(self) -> list[Peer]:
@@ -157,16 +157,15 @@ class Episodes:
         schedule = self._owing(peer, message, "DONE")
         if schedule is None:
             return
-        topics = {header.topic for header in message.products}
-        if len(topics) < len(message.products) or not topics <= peer.outputs:
+        t_ns = run.plan.t_ns(message.frame)
+        products = {
+            h.topic: ev.Product(h.topic, peer.name, message.frame, t_ns, h.digest, h.fidelity, payload)
+            for h, payload in zip(message.products, event.payloads, strict=True)
+        }
+        if len(products) < len(message.products) or not products.keys() <= peer.outputs:
             self._strange_products(peer, message, now)
             return
         peer.losses = 0
-        t_ns = run.plan.t_ns(message.frame)
-        products = [
-            ev.Product(h.topic, peer.name, message.frame, t_ns, h.digest, h.fidelity, payload)
-            for h, payload in zip(message.products, event.payloads, strict=True)
-        ]
         told: Report | None = None
         if message.decisions or message.counts or message.measured:
             told = Report(

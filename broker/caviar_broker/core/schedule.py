@@ -6,7 +6,7 @@ nothing of joining, dying or messages; `episodes.Episodes` does that around it.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 
 from msgspec.structs import replace
 
@@ -79,6 +79,7 @@ class EpisodeSchedule:
         self._book = DecisionBook(graph, plan, episode, digest, ledger, actions, sources)
         self._inputs = Inputs(graph, self._book)
         self._turns = Turns(graph, plan, self._book)
+        self._wanted = {name: frozenset(topics) for name, topics in graph.outputs.items()}
         self._rank = {name: rank for rank, name in enumerate(graph.order)}
         self._completed = dict.fromkeys(graph.order, -1)
         self._outstanding: dict[str, list[Task]] = {name: [] for name in graph.order}
@@ -102,15 +103,17 @@ class EpisodeSchedule:
         self,
         service: str,
         frame: int,
-        products: Iterable[Product],
+        products: Mapping[str, Product],
         now: int,
         report: Report | None = None,
         *,
         end: bool = False,
     ) -> None:
         """DONE for the oldest outstanding task. Products are of declared topics (checked by the caller)."""
-        task, wanted = self._answered(service, frame, now), self.graph.outputs[service]
-        state, by_topic = task.state, {p.topic: p for p in products if p.topic in wanted} if wanted else {}
+        task, wanted = self._answered(service, frame, now), self._wanted[service]
+        if products.keys() != wanted:
+            products = {topic: product for topic, product in products.items() if topic in wanted}
+        state = task.state
         task.move(_ANSWER)
         if state is not _GRANTED:
             self._turns.concerned.add(service)
@@ -121,17 +124,17 @@ class EpisodeSchedule:
         self._completed[service] = max(self._completed[service], frame)
         self.deadlines.measure(task, now)
         if state is _OVERDUE:
-            self._came_late(task, by_topic, now)
+            self._came_late(task, products, now)
         else:
             task.report = report
             recorded = self.plan.recorded.get((service, self.episode, frame))
             if recorded is None:
-                self._book.fresh(task, by_topic, now)
+                self._book.fresh(task, products, now)
             else:
-                self._book.as_recorded(task, recorded, by_topic, now)
+                self._book.as_recorded(task, recorded, products, now)
             self._turns.decided(task.service)
-        if frame >= self._book.frames and by_topic:
-            self._notice("discarded", task, f"answered its final grant with {', '.join(sorted(by_topic))}")
+        if frame >= self._book.frames and products:
+            self._notice("discarded", task, f"answered its final grant with {', '.join(sorted(products))}")
         if end and service in self._turns.agents:
             self._end_after(frame)
 
@@ -246,7 +249,9 @@ class EpisodeSchedule:
     @property
     def finished(self) -> bool:
         """Whether every frame is decided, final grants are answered, and nobody is waited for."""
-        return self._over and not any(owed and self._binds(name) for name, owed in self._outstanding.items())
+        if self._book.finished_frames < self._book.frames or not self._over:
+            return False
+        return not any(owed and self._binds(name) for name, owed in self._outstanding.items())
 
     @property
     def _over(self) -> bool:
@@ -300,7 +305,9 @@ class EpisodeSchedule:
         while True:
             owed = self._outstanding[name]
             has_room = len(owed) < self._capacity[name]
-            in_flight = len([t for t in owed if t.state is _GRANTED]) if owed else 0
+            in_flight = 0
+            for granted in owed:
+                in_flight += granted.state is _GRANTED
             if in_flight and not has_room:
                 return  # its answer brings it back
             task = self._turns.candidate(name, in_flight)
