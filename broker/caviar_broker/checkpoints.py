@@ -21,7 +21,8 @@ class CheckpointFiles:
         self._folder = directory / FOLDER
         self.finished = (0, -1)
         """(episode, frame) that was finished last."""
-        self._kept: dict[str, list[tuple[int, int, Path]]] = {}
+        self._kept: dict[str, dict[tuple[int, int], Path]] = {}
+        """Files of each service by (episode, frame), in that order."""
 
     def save(self, service: str, episode: int, frame: int, state: Any) -> str:
         """Write a state; the name of its file. `RunError` naming the file where that fails."""
@@ -33,13 +34,15 @@ class CheckpointFiles:
             partial.replace(path)
         except OSError as error:
             raise RunError(f"cannot write the state of {service!r} to {path}: {error.strerror}") from error
-        kept = self._kept.setdefault(service, [])
-        kept.append((episode, frame, path))
-        safe = [entry for entry in kept if entry[:2] <= self.finished]
-        for entry in safe[:-1]:
-            kept.remove(entry)
-            entry[2].unlink(missing_ok=True)
+        self._kept.setdefault(service, {})[episode, frame] = path
         return path.name
+
+    def prune(self) -> None:
+        """Remove what nothing needs any more, now that the journal tells of what came since."""
+        for kept in self._kept.values():
+            safe = [instant for instant in kept if instant <= self.finished]
+            for instant in safe[:-1]:
+                kept.pop(instant).unlink(missing_ok=True)
 
     def known(self, service: str, episode: int, frame: int) -> bytes:
         """A state that was saved before a restart of the broker; it is kept like a new one.
@@ -53,5 +56,5 @@ class CheckpointFiles:
             raise RecordingError(
                 f"cannot read the state of {service!r} from {path}: {error.strerror}"
             ) from error
-        self._kept.setdefault(service, []).append((episode, frame, path))
+        self._kept.setdefault(service, {})[episode, frame] = path
         return state

@@ -67,8 +67,10 @@ class JournalFile:
         data = self._buffer
         data.clear()
         pieces: list[bytes | memoryview] = []
+        saved = False
         for entry in entries:
             record = self._record(entry)
+            saved |= bool(record.file)
             body = record.products[-1][2] if record.products else b""
             if len(body) < _UNCOPIED:
                 self._encoder.encode_into(record, data, -1)
@@ -82,6 +84,8 @@ class JournalFile:
             data.clear()
         pieces.append(bytes(data))
         self._put(pieces)
+        if saved:
+            self.checkpoints.prune()
 
     def _put(self, pieces: Sequence[bytes | memoryview]) -> None:
         """Hand over all of it; Linux takes 2 GiB at once at most."""

@@ -43,6 +43,9 @@ MESSAGES_A_TURN = 64
 """Messages taken before the clock is looked at again."""
 
 
+_CAN_WAIT = frozenset({ev.Notice, ev.Latency, ev.FrameFinished})
+
+
 class Observer(Protocol):
     """Who is told what happens in a run: the command line, a log, a page. Must not wait."""
 
@@ -109,9 +112,9 @@ class BrokerServer:
         self._entries: list[ev.Journal] = []
         """Decisions that are not in the journal yet."""
         self._later: list[ev.Action] = []
-        """What nobody waits for."""
+        """Notices, latencies and finished frames, in order: nobody waits for these."""
         self._has_sent = False
-        """Whether somebody was sent something since the journal was written."""
+        """Whether somebody was sent something in this turn."""
         self._next_check = self._look_at = 0
         self._budgets_are_long = not plan.realtime and all(s.budget_ns >= LONG_NS for s in plan.services)
         self._unhurried = False
@@ -194,6 +197,7 @@ class BrokerServer:
         now = time.monotonic_ns()
         if now >= self._look_at:
             wake = self._see_to_deadlines(now)
+            self._catch_up()
             self._unhurried = self._budgets_are_long and wake - now > SOON_NS
             self._look_at = min(now + (UNHURRIED_LOOK_NS if self._unhurried else LOOK_NS), wake)
             self.loop.call(self.loop.poll(0 if self._port.readable else wake - now))
@@ -206,14 +210,14 @@ class BrokerServer:
         self._catch_up()
 
     def _catch_up(self) -> None:
-        """What services need not wait for, once whoever was granted something is at work."""
-        if self._later:
+        """Write what somebody waits for, and do what nobody does, now that those who can be are at work."""
+        if self._has_sent or self.clock.waits_for_journal or self.clock.over:
+            self._write_journal()
+            self._has_sent = False
+        while self._later:
             later, self._later = self._later, []
             for action in later:
                 self._performers[type(action)](action)
-        if self._entries and (self._has_sent or self.clock.waits_for_journal or self.clock.over):
-            self._has_sent = False
-            self._write_journal()
 
     def _see_to_deadlines(self, now: int) -> int:
         """Act on whatever is due; the instant of the next thing that will be [ns]."""
@@ -299,14 +303,14 @@ class BrokerServer:
     # --- what goes -------------------------------------------------------------------------------------
 
     def _perform(self) -> None:
-        """Carry out the clock's actions, until there are no more."""
+        """Carry out the clock's actions, until there are no more; `_catch_up` sees to those that can wait."""
         while actions := self.clock.actions():
             for action in actions:
                 if type(action) is ev.Send:
                     self._send(action)
                 elif type(action) is ev.Journal:
                     self._entries.append(action)
-                elif type(action) is ev.Latency or type(action) is ev.FrameFinished:
+                elif type(action) in _CAN_WAIT:
                     self._later.append(action)
                 else:
                     self._performers[type(action)](action)

@@ -128,10 +128,10 @@ def check_parts(message: Message, parts: Sequence[Any]) -> None:
     if isinstance(message, AssetData):
         _check_chunk(message, len(parts[1]))
         return
-    header = limits.MAX_HEADER if isinstance(message, (Grant, Done)) else limits.MAX_BODY
+    payload_header = limits.MAX_HEADER if isinstance(message, (Grant, Done)) else limits.MAX_BODY
     for index, part in enumerate(parts):
-        limit = header if index % 2 else limits.MAX_BODY
-        if len(part) > limit and index:
+        limit = payload_header if index % 2 else limits.MAX_BODY
+        if len(part) > limit and index:  # the header is checked before it is decoded
             raise LimitError(
                 f"part {index} of {message_type(message)} has {len(part)} B, at most {limit} are accepted"
             )
@@ -209,7 +209,7 @@ _T = TypeVar("_T")
 
 
 def _decode(decoder: msgspec.msgpack.Decoder[_T], header: Buffer, what: str) -> _T:
-    if len(header) > HARMLESS:
+    if len(header) > HARMLESS:  # fewer bytes cannot nest deeper, and are no large header
         if len(header) > limits.MAX_HEADER:
             raise LimitError(f"{what} has {len(header)} B, at most {limits.MAX_HEADER} are accepted")
         check_nesting(header, what)

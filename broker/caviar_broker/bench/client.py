@@ -77,7 +77,8 @@ class _Told(msgspec.Struct):
 
 
 class _Done(msgspec.Struct, tag="DONE", omit_defaults=True):
-    """`caviar_protocol.messages.Done` with what changes from frame to frame."""
+    """`caviar_protocol.messages.Done`, to be filled in anew for every frame; −1 is nobody's default, so that
+    every number travels."""
 
     products: tuple[m.ProductHeader, ...]
     epoch: int = -1

@@ -31,6 +31,8 @@ class Graph:
     """Active services, producers before the consumers of their frame."""
     inputs: Mapping[str, tuple[Edge, ...]]
     """Edges into each active service, sorted by (topic, source)."""
+    latest: Mapping[str, tuple[Edge, ...]]
+    """The same edges, those first that are decided last in a frame."""
     consumers: Mapping[str, tuple[str, ...]]
     """Active services that take something from a service, at any lag."""
     outputs: Mapping[str, tuple[str, ...]]
@@ -68,9 +70,14 @@ def build_graph(hellos: Mapping[str, Hello], record: Iterable[str] = ()) -> Grap
         name: tuple(edge for edge in found if edge.topic in outputs[edge.source])
         for name, found in inputs.items()
     }
+    rank = {name: place for place, name in enumerate(order)}
     return Graph(
         order=tuple(name for name in order if name in active),
         inputs=inputs,
+        latest={
+            name: tuple(sorted(found, key=lambda edge: (edge.lag, -rank[edge.source])))
+            for name, found in inputs.items()
+        },
         consumers={
             name: tuple(sorted(c for c in active if any(e.source == name for e in inputs[c])))
             for name in active

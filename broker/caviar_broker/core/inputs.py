@@ -15,6 +15,7 @@ class Inputs:
     def __init__(self, graph: Graph, book: DecisionBook) -> None:
         self._book = book
         self._all, self._consumers = graph.inputs, graph.consumers
+        self._latest = graph.latest
         self._lagged = {name: tuple(e for e in edges if e.lag) for name, edges in graph.inputs.items()}
 
     def taken(self, task: Task) -> Sequence[Edge]:
@@ -25,8 +26,9 @@ class Inputs:
     def undecided(self, task: Task) -> str | None:
         """A source that has not decided yet what this task gets of it; None: all have (clause 7)."""
         frame, undecided = task.frame, self._book.next
-        # From behind: who was granted last mostly answers last, and is the only one to be waited for then.
-        for edge in reversed(self.taken(task)):
+        # From behind: once the last one is decided, so are mostly the others, and nobody looks in vain.
+        edges = self._latest[task.service] if frame < self._book.frames else self._lagged[task.service]
+        for edge in edges:
             if frame - edge.lag >= undecided[edge.source] and frame >= edge.lag:
                 return edge.source
         return None

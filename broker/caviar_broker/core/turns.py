@@ -13,15 +13,16 @@ class Turns:
 
     After something happened only services that may be concerned are looked at again. Who waits for another
     service's decision, for the journal, for real time or for frames to be finished is remembered until that
-    comes. A service that lacks several inputs waits for one of them at a time, so an answer brings back only
-    those that it may let go on.
+    comes. A service that lacks several inputs waits for one of them at a time, for the last one of a frame
+    first, so few answers bring it back in vain.
     """
 
     def __init__(self, graph: Graph, plan: RunPlan, book: DecisionBook) -> None:
         self._roles = roles = {service.name: service.role for service in plan.services}
         self.agents = tuple(name for name in graph.order if roles[name] == "agent")
         self.recorders = tuple(name for name in graph.order if roles[name] == "recorder")
-        self.others = tuple(name for name in graph.order if name not in self.recorders)
+        self.others = tuple(name for name in reversed(graph.order) if name not in self.recorders)
+        """All but the recorders, those behind others in the graph first."""
         self.concerned = set(graph.order)
         """Services for which something may have changed."""
         self.waiting_for_journal: set[str] = set()
@@ -72,10 +73,10 @@ class Turns:
 
     def _waits_for_last_input(self, name: str) -> bool:
         """Whether a service, which has just decided a frame, waits for its last input now, as most do."""
-        book, edges = self._book, self._graph.inputs[name]
+        book, edges = self._book, self._graph.latest[name]
         frame = book.next[name]
         if edges and frame < book.frames:
-            edge = edges[-1]
+            edge = edges[0]
             if frame - edge.lag >= book.next[edge.source]:
                 self._awaiting[edge.source].add(name)
                 return True
