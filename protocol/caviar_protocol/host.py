@@ -5,8 +5,11 @@ from __future__ import annotations
 import ctypes
 from pathlib import Path
 
-_M_MMAP_THRESHOLD = -3
-_LARGE = 128 * 1024
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
+_LARGE = 4 << 20
+"""[B] Buffers from here on come from the system and return to it; each of their pages costs a fault."""
+_SPARE = 64 << 20
+"""[B] that a heap may keep at its end."""
 
 
 def host_identity() -> str:
@@ -24,13 +27,15 @@ def host_identity() -> str:
 
 
 def steady_memory() -> None:
-    """Let glibc return every large buffer to the system when it is freed.
+    """Let glibc keep what products of some megabytes need, and return what is larger to the system.
 
-    By default it raises the size from which it does so, as large buffers come and go, and then keeps and
-    splits them: the memory of a process that handles megabytes in every frame creeps up for hours.
+    By default it raises the size from which it does so up to 32 MiB, as buffers come and go, and keeps and
+    splits all below: the memory of a process that handles megabytes in every frame creeps up for hours. With
+    a small fixed size it stays flat too, but a product of 1 MB costs 250 page faults each time it passes.
     Without glibc nothing happens.
     """
     _glibc("mallopt", _M_MMAP_THRESHOLD, _LARGE)
+    _glibc("mallopt", _M_TRIM_THRESHOLD, _SPARE)
 
 
 def trim_memory() -> None:

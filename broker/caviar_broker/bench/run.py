@@ -24,6 +24,7 @@ from caviar_broker.server import BrokerServer
 from caviar_broker.statistics import Statistics
 from caviar_protocol.assets import AssetStore
 from caviar_protocol.errors import RunError
+from caviar_protocol.host import steady_memory
 from caviar_protocol.keys import BROKER, BROKER_KEY_VARIABLE, KEY_VARIABLE, Pair, write_pair
 
 WARM_UP = 50
@@ -101,6 +102,7 @@ def measure(topology: Topology, services: int, payload: int, frames: int, *, cur
         access = _keys(Path(folder), declared) if curve else None
         server = BrokerServer(plan, "tcp://127.0.0.1:0", journal, _Silent(), store, access=access)
         tune_collector()
+        steady_memory()
         keys = Path(folder) if curve else None
         with _clients(topology, services, payload, server.endpoint, keys):
             began = time.thread_time()
