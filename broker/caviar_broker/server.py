@@ -41,9 +41,8 @@ LONG_NS = 10_000_000
 """[ns] Budgets from here on bring nothing that would be due before deadlines are looked at again."""
 MESSAGES_A_TURN = 64
 """Messages taken before the clock is looked at again."""
-
-
 _CAN_WAIT = frozenset({ev.Notice, ev.Latency, ev.FrameFinished})
+"""Actions that no service waits for: carried out once whoever can be is at work."""
 
 
 class Observer(Protocol):
