@@ -31,7 +31,7 @@ from caviar_protocol.messages import (
     Status,
     Welcome,
 )
-from caviar_protocol.nesting import HARMLESS, check_nesting
+from caviar_protocol.nesting import check_nesting
 from caviar_protocol.topics import PAYLOADS
 
 # On the path of every frame: a member that is looked up in its class costs four times as much.
@@ -129,9 +129,9 @@ def check_parts(message: Message, parts: Sequence[Any]) -> None:
         _check_chunk(message, len(parts[1]))
         return
     payload_header = limits.MAX_HEADER if isinstance(message, (Grant, Done)) else limits.MAX_BODY
-    for index, part in enumerate(parts):
+    for index, part in enumerate(parts[1:], 1):
         limit = payload_header if index % 2 else limits.MAX_BODY
-        if len(part) > limit and index:  # the header is checked before it is decoded
+        if len(part) > limit:
             raise LimitError(
                 f"part {index} of {message_type(message)} has {len(part)} B, at most {limit} are accepted"
             )
@@ -209,10 +209,9 @@ _T = TypeVar("_T")
 
 
 def _decode(decoder: msgspec.msgpack.Decoder[_T], header: Buffer, what: str) -> _T:
-    if len(header) > HARMLESS:  # fewer bytes cannot nest deeper, and are no large header
-        if len(header) > limits.MAX_HEADER:
-            raise LimitError(f"{what} has {len(header)} B, at most {limits.MAX_HEADER} are accepted")
-        check_nesting(header, what)
+    if len(header) > limits.MAX_HEADER:
+        raise LimitError(f"{what} has {len(header)} B, at most {limits.MAX_HEADER} are accepted")
+    check_nesting(header, what)
     try:
         return decoder.decode(header)
     except RecursionError as error:

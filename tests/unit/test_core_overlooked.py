@@ -9,9 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, settings
-from hypothesis.stateful import run_state_machine_as_test
-from test_core_stateful import PHASES, Runs
+from test_core_stateful import play
 
 from caviar_broker.core.schedule import EpisodeSchedule
 
@@ -58,13 +56,4 @@ def advance_twice(schedule: EpisodeSchedule, now: int) -> None:
 
 def test_a_look_at_everybody_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(EpisodeSchedule, "advance", advance_twice)
-    run_state_machine_as_test(
-        Runs,
-        settings=settings(
-            max_examples=150,
-            stateful_step_count=60,
-            deadline=None,
-            phases=PHASES,
-            suppress_health_check=list(HealthCheck),
-        ),
-    )
+    play(150)

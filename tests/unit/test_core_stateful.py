@@ -312,17 +312,22 @@ class Runs(RuleBasedStateMachine):
 PHASES = (Phase.explicit, Phase.reuse, Phase.generate)
 
 
-def test_any_order_and_lateness_of_events_keeps_the_invariants() -> None:
+def play(examples: int) -> None:
+    """So many random runs."""
     run_state_machine_as_test(
         Runs,
         settings=settings(
-            max_examples=400,
+            max_examples=examples,
             stateful_step_count=60,
             deadline=None,
             phases=PHASES,
             suppress_health_check=list(HealthCheck),
         ),
     )
+
+
+def test_any_order_and_lateness_of_events_keeps_the_invariants() -> None:
+    play(400)
 
 
 @given(

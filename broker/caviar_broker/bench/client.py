@@ -37,7 +37,7 @@ def speak(part: Part, payload: int, endpoint: str) -> None:
         header, body = b"\x80", bytes(payload)
         # Hashed once, since it is the same in every frame: hashing is the producer's work, not the broker's.
         products = (m.ProductHeader(topic=part.output, digest=payload_digest(header, body)),)
-        done = _Done(products=products)
+        done = _Done(epoch=0, attempt=0, episode=0, frame=0, products=products)
         receive, send = socket.recv, socket.send
         while True:
             first = rest = receive(0, False)
@@ -76,15 +76,14 @@ class _Told(msgspec.Struct):
     message: str = ""
 
 
-class _Done(msgspec.Struct, tag="DONE", omit_defaults=True):
-    """`caviar_protocol.messages.Done`, to be filled in anew for every frame; −1 is nobody's default, so that
-    every number travels."""
+class _Done(msgspec.Struct, tag="DONE"):
+    """What this client fills in of `caviar_protocol.messages.Done`, anew in every frame."""
 
+    epoch: int
+    attempt: int
+    episode: int
+    frame: int
     products: tuple[m.ProductHeader, ...]
-    epoch: int = -1
-    attempt: int = -1
-    episode: int = -1
-    frame: int = -1
 
 
 _decoder = msgspec.msgpack.Decoder(_Told)

@@ -115,8 +115,6 @@ class EpisodeSchedule:
             products = {topic: product for topic, product in products.items() if topic in wanted}
         state = task.state
         task.move(_ANSWER)
-        if state is not _GRANTED:
-            self._turns.concerned.add(service)
         if state is _ABANDONED:
             self._book.release(task)
             self._notice("discarded", task, "answered behind the end of the episode; not used")
@@ -143,8 +141,6 @@ class EpisodeSchedule:
         task = self._answered(service, frame, now)
         state = task.state
         task.move(TaskEvent.FAULT)
-        if state is not _GRANTED:
-            self._turns.concerned.add(service)
         self._notice("fault", task, text)
         if state is _ABANDONED:
             self._book.release(task)
@@ -211,7 +207,7 @@ class EpisodeSchedule:
         """Grant and skip whatever can be, until nothing changes."""
         concerned = self._turns.concerned
         while concerned:
-            names = sorted(concerned, key=self._rank.__getitem__) if len(concerned) > 1 else list(concerned)
+            names = sorted(concerned, key=self._rank.__getitem__)
             concerned.clear()
             for name in names:
                 self._advance_service(name, now)
@@ -249,9 +245,7 @@ class EpisodeSchedule:
     @property
     def finished(self) -> bool:
         """Whether every frame is decided, final grants are answered, and nobody is waited for."""
-        if self._book.finished_frames < self._book.frames or not self._over:
-            return False
-        return not any(owed and self._binds(name) for name, owed in self._outstanding.items())
+        return self._over and not any(owed and self._binds(name) for name, owed in self._outstanding.items())
 
     @property
     def _over(self) -> bool:
@@ -359,6 +353,8 @@ class EpisodeSchedule:
         if owed:
             owed[0].started_at = now  # it was queued until now
         task.order = None
+        if task.state is not _GRANTED:
+            self._turns.concerned.add(service)  # it was decided before; else that brings it back
         return task
 
     def _came_late(self, task: Task, products: Mapping[str, Product], now: int) -> None:

@@ -75,11 +75,9 @@ class Turns:
         """Whether a service, which has just decided a frame, waits for its last input now, as most do."""
         book, edges = self._book, self._graph.latest[name]
         frame = book.next[name]
-        if edges and frame < book.frames:
-            edge = edges[0]
-            if frame - edge.lag >= book.next[edge.source]:
-                self._awaiting[edge.source].add(name)
-                return True
+        if edges and frame < book.frames and not book.decided(edges[0], frame):
+            self.waits_for(edges[0].source, name)
+            return True
         return False
 
     def wake(self, waiting: set[str]) -> None:
