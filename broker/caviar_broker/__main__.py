@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import gc
+import signal
 import sys
 from collections.abc import Mapping
 from contextlib import closing
@@ -114,6 +115,8 @@ def serve(arguments: argparse.Namespace) -> int:
     )
     if outcome.error and not arguments.control:
         sys.stderr.write(f"caviar broker: {outcome.error}\n")
+    # The interpreter puts handlers back to the default while it ends: a late SIGTERM would be the status.
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
     if arguments.restarted and stopped():
         return 0
     return 1 if outcome.error else 0

@@ -211,7 +211,7 @@ class Connections:
         if connection.heartbeat:
             self.watchdog.recheck(service)
         elif not self.watchdog.cut_off(service):
-            self.feed(ev.Lost(service, "it is unreachable or stopped: its connection is gone"))
+            self.feed(ev.Lost(service, f"it is unreachable or stopped: {self._guard.gone_words}"))
 
     # --- what is said --------------------------------------------------------------------------------
 

@@ -137,7 +137,7 @@ class Port:
             send(parts[-1], _NOBLOCK, False)
         except zmq.ZMQError as error:
             if error.errno == zmq.EHOSTUNREACH:
-                return "its connection is gone"
+                return self.guard.gone_words
             if error.errno == zmq.EAGAIN:
                 return "it takes no messages"
             raise

@@ -133,6 +133,7 @@ class BrokerServer:
             probe=lambda route: self._port.send(route, encode_message(m.HeartbeatAck(sequence=0))),
             lost=lambda service, verdict: self.feed(ev.Lost(service, verdict)),
             warn=self.note,
+            gone_words=self._guard.gone_words,
             supervised=set(supervised),
         )
         self._connections = Connections(
@@ -361,8 +362,10 @@ class BrokerServer:
             parts.append(action.attachment)
         self._has_sent = True
         route, message = self._routes[action.service], action.message
-        reason = self._port.send(route, encode_message(message), parts, not isinstance(message, COMPLAINTS))
-        if not reason or self.clock.state is RunState.FINISHED:
+        complains = isinstance(message, COMPLAINTS)
+        reason = self._port.send(route, encode_message(message), parts, not complains)
+        # A complaint that does not go is no verdict: who floods gets one for each message, and reads none.
+        if not reason or complains or self.clock.state is RunState.FINISHED:
             return
         if not self._watchdog.cut_off(action.service):
             verdict = f"it is unreachable: {reason}"

@@ -47,6 +47,8 @@ class Watchdog:
         Is told service and verdict.
     warn
         Is told service and text.
+    gone_words
+        What is said of a service without a connection.
     """
 
     clock: FrameClock
@@ -55,6 +57,7 @@ class Watchdog:
     probe: Callable[[bytes], str]
     lost: Callable[[str, str], None]
     warn: Callable[[str, str], None]
+    gone_words: str
     supervised: set[str] = field(default_factory=set)
     """Services whose death a launcher reports, who knows their exit status and last words."""
     _watched: dict[str, _Watched] = field(default_factory=dict)
@@ -139,7 +142,7 @@ class Watchdog:
         elif process.stopped:
             self.lost(service, describe_stop(process.pid))
         elif watched.cut_off_at is not None and now - watched.cut_off_at > SUPERVISOR_NS:
-            self.lost(service, f"its process {process.pid} lives, but its connection is gone")
+            self.lost(service, f"its process {process.pid} lives, but {self.gone_words}")
 
     def _check_remote(self, service: str, watched: _Watched, now: int) -> None:
         if watched.pulse is None:

@@ -56,6 +56,12 @@ class SignalTermination(Termination):
             signal.signal(number, self._handle)
         threading.Thread(target=self._watch, name="termination", daemon=True).start()
 
+    def finished(self) -> None:
+        """Everything is closed; the process ends by itself, with a status of its own."""
+        super().finished()
+        # The interpreter puts handlers back to the default while it ends: a late SIGTERM would be the status.
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+
     def _handle(self, *_: object) -> None:
         self.requested = True
 

@@ -6,15 +6,20 @@ import json
 import shlex
 import subprocess
 import sys
+import threading
 import tomllib
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
+import zmq
 
 from caviar_clients.cli.main import app
 from caviar_clients.conform import Verdict, cases, conform, street
-from caviar_clients.conform.session import Rules
+from caviar_clients.conform.client import End
+from caviar_clients.conform.session import Rules, Seen, Session
+from caviar_clients.conform.wire import Wire
 from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.errors import RunError, SetupError
 
@@ -210,6 +215,36 @@ def test_a_client_that_never_says_hello_ends_every_case_at_once() -> None:
     assert {v.outcome for v in verdicts[:-1]} == {"fail"}
     assert "«I am no client»" in verdicts[0].got
     assert sum(v.seconds for v in verdicts) < 10
+
+
+def test_what_a_life_still_sends_when_it_is_over_is_not_taken_for_the_next_one() -> None:
+    class Gone:
+        """A client that has ended, of which a heartbeat is on its way."""
+
+        start_s = 0.0
+
+        def ended(self) -> End:
+            return End(0)
+
+        start = terminate = memory = dispose = Mock()
+
+    wire = Wire(ANY)
+    with zmq.Context() as context, context.socket(zmq.DEALER) as pulse:
+        pulse.connect(wire.endpoint)
+        pulse.send(b"first")
+        assert wire.poll(5.0)
+
+        def leave() -> None:
+            pulse.send(b"last")
+            pulse.close()
+
+        late = threading.Timer(0.2, leave)
+        late.start()
+        Session(wire, Gone(), Rules(), Seen()).close()
+        late.join()
+        assert wire.connections == 0
+        assert wire.poll(0.1) is None
+    wire.close()
 
 
 def test_an_unknown_case_a_bad_address_and_a_missing_program_are_named() -> None:

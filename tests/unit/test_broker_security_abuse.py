@@ -6,7 +6,7 @@ import socket
 import struct
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -200,6 +200,72 @@ def test_a_member_that_floods_is_cut_off_and_named(tmp_path: Path) -> None:
         for _ in range(6000):
             bad.send(m.ResetDone(**bad.ids, episode=77))
         named_and_cut_off(broker, "it sends messages faster than 500 a second")
+
+
+def test_a_member_that_sends_too_large_a_part_is_blamed_with_the_limit(tmp_path: Path) -> None:
+    with beside_a_bad_member(tmp_path, PeerLimits(part=4 << 20)) as (broker, bad):
+        bad.socket.send(bytes((4 << 20) + 100))
+        outcome = broker.outcome(5.0)
+        assert outcome.culprit == "bad"
+        assert "gone; a part of more than 4 MiB, part_mib in [limits], ends it too" in outcome.error
+
+
+@pytest.fixture
+def over_descriptors_used_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[tuple[Serving, Client]]:
+    """`beside_a_bad_member`, whose connections have descriptors of others that have just ended, as after a
+    broker was killed and all come back: whose a message is, is not certain in all of the test."""
+    monkeypatch.setattr("caviar_broker.security.wire.UNCLEAR_NS", 60_000_000_000)
+    limits = PeerLimits(strangers=20)
+    with (
+        serving(plan("world", "sensors:bad", frames=1000), tmp_path, peer_limits=limits) as broker,
+        ExitStack() as stack,
+    ):
+        guard = broker.server._guard
+        before = [stack.enter_context(raw(broker.endpoint)) for _ in range(20)]
+        for connection in before:
+            connection.shutdown(socket.SHUT_RDWR)
+        eventually(lambda: len(guard._wires._closed) == len(before), "all are seen to have ended")
+        with playing(broker.endpoint, "world", "sensors:bad") as (world, bad):
+            world.answer()
+            assert all(peer.wire is None for peer in list(guard._peers.values()))
+            bad.answer(8 << 20)
+            world.answer()
+            yield broker, bad
+
+
+def test_a_member_may_send_much_whatever_its_descriptor_was_before(
+    over_descriptors_used_before: tuple[Serving, Client],
+) -> None:
+    broker, bad = over_descriptors_used_before
+    grant = bad.expect(m.Grant)
+    threading.Event().wait(0.5)  # the broker looks at what waits every 0.1 s
+    assert "cut off" not in broker.witness.texts()
+    bad.done(grant, ("lidar", b"\x80", b"still here"))
+    eventually(lambda: broker.witness.frames == 2, "both frames are finished")
+
+
+def test_a_member_that_goes_is_missed_whatever_its_descriptor_was_before(
+    over_descriptors_used_before: tuple[Serving, Client],
+) -> None:
+    broker, bad = over_descriptors_used_before
+    bad.socket.close()
+    outcome = broker.outcome(3.0)
+    assert outcome.culprit == "bad"
+    assert "its connection is gone" in outcome.error
+
+
+def test_a_silent_member_does_not_make_room_for_strangers_whatever_its_descriptor_was_before(
+    over_descriptors_used_before: tuple[Serving, Client],
+) -> None:
+    broker, bad = over_descriptors_used_before
+    with ExitStack() as stack:
+        for _ in range(30):
+            stack.enter_context(raw(broker.endpoint))
+        told(broker, "that never said HELLO were ended")
+        bad.answer()
+        eventually(lambda: broker.witness.frames == 2, "both frames are finished")
 
 
 def test_heartbeats_too_are_counted(tmp_path: Path) -> None:

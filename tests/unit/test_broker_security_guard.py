@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import socket
 import time
 from collections.abc import Iterator
@@ -17,7 +18,7 @@ from caviar_broker import __main__ as broker_main
 from caviar_broker.port import Port
 from caviar_broker.security.access import BAR_NS, Access
 from caviar_broker.security.guard import PeerLimits
-from caviar_broker.security.wire import Wire, Wires
+from caviar_broker.security.wire import Wire, Wires, _identity
 from caviar_protocol import messages as m
 from caviar_protocol.errors import RunError
 from caviar_protocol.scenario import Limits
@@ -88,15 +89,41 @@ def test_a_descriptor_that_is_no_socket_is_left_alone(tmp_path: Path) -> None:
 def test_what_may_be_of_the_connection_before_is_not_taken_for_the_present_one(wires: Wires, couple) -> None:
     """A descriptor is used again at once: a late message of the one before must not end its successor."""
     _, far = couple
-    wires._begun(far.fileno())
+    first = wires._begun(far.fileno())
     wires._ended(far.fileno())
     second = wires._begun(far.fileno())
-    assert second is not None
-    assert wires.claim(far.fileno(), "127.0.0.1") is None
+    assert wires.at(far.fileno()) is second
+    assert not wires.claim(second, "127.0.0.1")
     second.unclear_until = 0
-    assert wires.claim(far.fileno(), "10.0.0.1") is None
-    assert wires.claim(far.fileno(), "127.0.0.1") is second
-    assert wires.claim(far.fileno(), "127.0.0.1") is None, "one routing id, one connection"
+    assert not wires.claim(first, "127.0.0.1"), "it has ended"
+    assert not wires.claim(second, "10.0.0.1")
+    assert wires.claim(second, "127.0.0.1")
+    assert not wires.claim(second, "127.0.0.1"), "one routing id, one connection"
+
+
+def test_a_connection_over_ipv4_to_an_ipv6_port_is_known(tmp_path: Path) -> None:
+    """libzmq tells of its address in one form, the operating system in another."""
+    mapped = "tcp://[::ffff:127.0.0.1]:0"
+    with (
+        serving(plan("world"), tmp_path, endpoint=mapped) as broker,
+        Client(f"tcp://127.0.0.1:{broker.endpoint.rpartition(':')[2]}", "world") as world,
+    ):
+        world.join()
+        (peer,) = broker.server._guard._peers.values()
+        assert peer.address == "127.0.0.1"
+        assert peer.wire is not None
+
+
+def test_a_connection_is_known_where_no_descriptor_is_left(couple) -> None:
+    _, far = couple
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (far.fileno() + 1, limits[1]))
+    try:
+        found = _identity(far.fileno())
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+    assert found == (os.fstat(far.fileno()).st_ino, "127.0.0.1")
+    assert far.send(b"x") == 1, "it is still open"
 
 
 def test_an_address_is_barred_unless_a_good_service_is_at_home_there() -> None:

@@ -62,3 +62,20 @@ def test_sigterm_ends_a_service_that_hangs_when_it_closes(broker: Broker) -> Non
     with service(broker.endpoint, "sensors:IgnoresClosing") as process:
         broker.start()
         terminated(process)
+
+
+LATE = """
+import os
+from caviar_services.termination import SignalTermination
+
+class Late:
+    def __del__(self, kill=os.kill, pid=os.getpid()):
+        kill(pid, 15)
+
+late = Late()  # gone when the interpreter clears this module
+SignalTermination(0).finished()
+"""
+
+
+def test_sigterm_while_the_interpreter_shuts_down_is_not_the_status() -> None:
+    assert subprocess.run([sys.executable, "-c", LATE], check=False).returncode == 0

@@ -14,7 +14,7 @@ import zmq
 from caviar_broker.loop import Loop
 from caviar_broker.security.access import BAR_NS, Access, answer
 from caviar_broker.security.local import is_local
-from caviar_broker.security.wire import Wire, Wires
+from caviar_broker.security.wire import Wire, Wires, plain
 from caviar_protocol.limits import MAX_BODY
 from caviar_protocol.scenario import Limits
 
@@ -75,15 +75,17 @@ class _Peer:
     """What is known of one routing id."""
 
     route: bytes
-    fd: int
+    maybe: Wire | None
+    """The connection that had the descriptor of its first message then: its own, or a later one."""
     address: str
     key: str
-    wire: Wire | None
     credit: float
     at: int
     """When `credit` was counted [ns]."""
     limit: int
     """[B] that may wait."""
+    wire: Wire | None = None
+    """Its connection, once that is certain."""
     service: str = ""
     taken: int = 0
     """[B] taken from it, and an allowance for framing."""
@@ -116,6 +118,11 @@ class Guard:
         limits: PeerLimits | None = None,
     ) -> None:
         self.access, self.limits = access, limits or PeerLimits()
+        self.gone_words = "its connection is gone"
+        """What is said of a peer that has none. libzmq ends one over too large a part, and tells nobody."""
+        if self.limits.part < MAX_BODY:
+            most = f"{self.limits.part >> 20} MiB"
+            self.gone_words += f"; a part of more than {most}, part_mib in [limits], ends it too"
         files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
         self._connections = min(self.limits.connections, max(16, files // 2))
         self._wires = Wires(context, socket)
@@ -173,6 +180,8 @@ class Guard:
         peer = self._peers.get(route)
         if peer is None:
             peer = self._meet(route, parts[0])
+        elif peer.wire is None:
+            self._claim(peer)
         peer.taken += size + FRAMING * len(parts)
         peer.credit -= 1.0
         return peer.credit >= 0.0 or self._has_more(peer)
@@ -209,22 +218,41 @@ class Guard:
     def _meet(self, route: bytes, part: zmq.Frame) -> _Peer:
         """The first message of a routing id says whose it is."""
         self._connections_changed()
-        fd, address = int(_property(part, "__fd") or -1), _property(part, "Peer-Address")
+        fd, address = int(_property(part, "__fd") or -1), plain(_property(part, "Peer-Address"))
         key = _property(part, "User-Id") if self.access is not None else ""
-        wire = self._wires.claim(fd, address)
         messages, waiting = self.limits.stranger_messages, self.limits.stranger_bytes
-        peer = _Peer(route, fd, address, key, wire, messages, time.monotonic_ns(), waiting)
-        self._peers[route] = peer
-        if wire is not None:
-            self._by_wire[wire] = peer
+        wire, now = self._wires.at(fd), time.monotonic_ns()
+        peer = self._peers[route] = _Peer(route, wire, address, key, messages, now, waiting)
+        if wire is None and fd >= 0:
+            peer.ended = now  # these are its last words
+        self._claim(peer)
         return peer
 
-    def _has_more(self, peer: _Peer) -> bool:
-        """Whether time has brought a peer new credit; otherwise it is cut off."""
-        if peer.wire is None and (wire := self._wires.claim(peer.fd, peer.address)) is not None:
+    def _claim(self, peer: _Peer) -> None:
+        """Make certain which connection a peer's messages come through, if that can be."""
+        wire = peer.maybe
+        if wire is not None and not peer.ended and self._wires.claim(wire, peer.address):
             peer.wire, self._by_wire[wire] = wire, peer
             if peer.cut:
                 wire.end()
+
+    def _unsure(self) -> list[tuple[_Peer, Wire]]:
+        """Peers whose connection is not certain yet, each with the one that it may be."""
+        peers = [peer for peer in self._peers.values() if peer.wire is None and not peer.ended]
+        return [(peer, peer.maybe) for peer in peers if peer.maybe is not None]
+
+    def _uncertain(self) -> dict[Wire, _Peer]:
+        """Connections of which it is not certain whose they are: each with the one of these that may use
+        most."""
+        found: dict[Wire, _Peer] = {}
+        for peer, wire in self._unsure():
+            other = found.get(wire)
+            if not peer.cut and (other is None or peer.taken + peer.limit > other.taken + other.limit):
+                found[wire] = peer
+        return found
+
+    def _has_more(self, peer: _Peer) -> bool:
+        """Whether time has brought a peer new credit; otherwise it is cut off."""
         if peer.cut:
             return False
         if not peer.service:
@@ -251,11 +279,15 @@ class Guard:
             if trouble:
                 self._tell("authorized", trouble)
             self._revoke()
+        for peer, wire in self._unsure():
+            if not wire.open or wire.claimed:
+                peer.ended = now
+        uncertain = self._uncertain()
         wires = list(self._wires)
         first = self._scan_from = self._scan_from if self._scan_from < len(wires) else 0
         self._scan_from += SCANNED
         for wire in wires[first : first + SCANNED]:
-            self._measure(wire, now)
+            self._measure(wire, uncertain.get(wire), now)
         self._barred = {address: until for address, until in self._barred.items() if until > now}
         self._miss([peer for peer in self._peers.values() if peer.ended], now)
 
@@ -267,13 +299,14 @@ class Guard:
             if now - peer.ended > KEPT_NS:
                 self._peers.pop(peer.route, None)
 
-    def _measure(self, wire: Wire, now: int) -> None:
-        """Cut off whoever has more waiting than it may."""
+    def _measure(self, wire: Wire, maybe: _Peer | None, now: int) -> None:
+        """Cut off whoever has more waiting than it may; ``maybe``: whose the connection may be."""
         acknowledged, received = wire.transferred()
         peer = self._by_wire.get(wire)
         chatter = CHATTER * (1 + (now - wire.since) // 10**9)
-        limit = peer.limit if peer else self.limits.stranger_bytes
-        waiting = received - (peer.taken if peer else 0) - chatter
+        whose = peer or maybe
+        taken, limit = (whose.taken, whose.limit) if whose else (0, self.limits.stranger_bytes)
+        waiting = received - taken - chatter
         if waiting > limit:
             self._end(
                 wire, peer, f"{waiting >> 20} MiB of it wait for being a message, more than it may send"
@@ -297,8 +330,9 @@ class Guard:
         now = time.monotonic_ns()
         for wire in [wire for wire in self._by_wire if not wire.open]:
             self._by_wire.pop(wire).ended = now
-        for address in failures:
-            what = "no authorized key" if self.access else "no ZMTP 3"
+        spoke = {peer.maybe for peer in self._peers.values()} if failures else ()
+        what = "no authorized key" if self.access else "no ZMTP 3"
+        for address in [wire.address for wire in failures if wire not in spoke]:
             text = f"a connection from {address} ended before it sent a message, like one that has {what}"
             self._tell(f"handshake {address}", text)
         for wire in fresh:
@@ -310,7 +344,8 @@ class Guard:
     def _make_room(self, addresses: set[str]) -> None:
         """End the oldest of those connections that have not said who they are, where there are too many:
         an honest one says so at once."""
-        idle = [wire for wire in self._wires if not self._is_service(wire)]
+        uncertain = {wire for wire, peer in self._uncertain().items() if peer.service}
+        idle = [wire for wire in self._wires if wire not in uncertain and not self._is_service(wire)]
         beyond = set[Wire]()
         for address in addresses:
             here = [wire for wire in idle if wire.address == address]

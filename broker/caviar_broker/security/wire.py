@@ -98,38 +98,42 @@ class Wires:
     def __len__(self) -> int:
         return len(self._open)
 
-    def update(self) -> tuple[list[Wire], list[str]]:
-        """Take note of what began and ended: the new connections, and the addresses of those that ended by
-        themselves before a message came, as those do that are not ZeroMQ's or have no key."""
+    def update(self) -> tuple[list[Wire], list[Wire]]:
+        """Take note of what began and ended: the new connections, and those that ended by themselves before
+        it was known whose they were, as those do that are not ZeroMQ's or have no key."""
         fresh: dict[int, Wire] = {}
-        failures = []
+        failures: list[Wire] = []
         while (event := self._next()) is not None:
             kind, fd = event
             if kind == zmq.EVENT_ACCEPTED:
                 self._ended(fd)
                 fresh.pop(fd, None)
                 wire = self._begun(fd)
-                if wire is not None:
+                if wire.open:
                     fresh[fd] = wire
                 else:
-                    failures.append(UNKNOWN)
+                    failures.append(wire)
                     self._closed[fd] = time.monotonic_ns()
             else:
                 ended = self._ended(fd)
                 fresh.pop(fd, None)
                 if ended is not None and not ended.claimed and not ended.dismissed:
-                    failures.append(ended.address)
+                    failures.append(ended)
         return list(fresh.values()), failures
 
-    def claim(self, fd: int, address: str) -> Wire | None:
-        """The connection that a routing id's first message came through; None where that is not certain."""
-        wire = self._open.get(fd)
-        if wire is None or wire.claimed or time.monotonic_ns() < wire.unclear_until:
-            return None
+    def at(self, fd: int) -> Wire | None:
+        """The open connection with this descriptor."""
+        return self._open.get(fd)
+
+    def claim(self, wire: Wire, address: str) -> bool:
+        """Whether a connection certainly is that of a routing id with such an address, which had a message
+        with its descriptor; it is nobody else's from then on."""
+        if not wire.open or wire.claimed or time.monotonic_ns() < wire.unclear_until:
+            return False
         if address and wire.address and address != wire.address:
-            return None
+            return False
         wire.claimed = True
-        return wire
+        return True
 
     def close(self) -> None:
         """Stop watching."""
@@ -144,21 +148,15 @@ class Wires:
         kind, value = _EVENT.unpack(header)
         return kind, value
 
-    def _begun(self, fd: int) -> Wire | None:
+    def _begun(self, fd: int) -> Wire:
+        """A new connection; not an open one where it has ended already."""
         now = time.monotonic_ns()
-        duplicate = _duplicate(fd)
-        if duplicate is None:
-            return None
-        with duplicate:
-            try:
-                name = duplicate.getpeername()
-            except OSError:
-                name = ""
-            inode = os.fstat(duplicate.fileno()).st_ino
-        address = str(name[0]) if isinstance(name, tuple) else ""
+        found = _identity(fd)
+        if found is None:
+            return Wire(fd, 0, UNKNOWN, now, open=False)
+        inode, address = found
         until = self._closed.pop(fd, -UNCLEAR_NS) + UNCLEAR_NS
-        wire = Wire(fd, inode, address.removeprefix("::ffff:"), now, until)
-        self._open[fd] = wire
+        wire = self._open[fd] = Wire(fd, inode, address, now, until)
         return wire
 
     def _ended(self, fd: int) -> Wire | None:
@@ -168,6 +166,30 @@ class Wires:
             if not wire.claimed:
                 self._closed[fd] = time.monotonic_ns()
         return wire
+
+
+def plain(address: str) -> str:
+    """An address as it is compared: of an IPv4 peer at an IPv6 port that of IPv4, and without a scope."""
+    return address.removeprefix("::ffff:").partition("%")[0]
+
+
+def _identity(fd: int) -> tuple[int, str] | None:
+    """Inode and peer address of somebody else's socket, also where no descriptor is left for one of our own;
+    None where it is no socket."""
+    try:
+        found = os.fstat(fd)
+        if not stat.S_ISSOCK(found.st_mode):
+            return None
+        borrowed = socket.socket(fileno=fd)
+    except OSError:
+        return None
+    try:
+        name = borrowed.getpeername()
+    except OSError:
+        name = ""
+    finally:
+        borrowed.detach()
+    return found.st_ino, plain(str(name[0])) if isinstance(name, tuple) else ""
 
 
 def _duplicate(fd: int) -> socket.socket | None:

@@ -20,6 +20,8 @@ EPOCH, ATTEMPT = 3, 2
 SEED = 11
 LEFT_OVER = 100_000
 """Messages of a life that are thrown away before the next one, at most."""
+LEAVING_S = 1.0
+"""[s] that the connections of a life that is over are given to end."""
 PATIENCE = 12
 """Times the time-out that a case, or a life in it, may take altogether."""
 CONNECTING, JOINED, READY, ACTIVE, OVER = range(5)
@@ -329,6 +331,9 @@ class Session:
                 self.stage = OVER
         self.stage = OVER
         self.client.dispose()
+        # What is on its way when a process ends comes before its connections are seen to end.
+        until = time.monotonic() + LEAVING_S
         for _ in range(LEFT_OVER):
-            if self.wire.poll(0.0) is None:
+            late = time.monotonic() > until
+            if self.wire.poll(0.0 if late else 0.01) is None and (late or not self.wire.connections):
                 break
