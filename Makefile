@@ -4,6 +4,7 @@ STAMP    := .venv/.setup-done
 SCENARIO ?= deploy/scenarios/street-canyon.toml
 FRAMES   ?= 120
 TESTS    ?= tests
+WORKERS  ?= 2
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test lint doctor clean
@@ -26,8 +27,8 @@ lint: setup ## Style, types and the imports that the architecture allows
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports
 
-test: lint ## Everything that CI checks; TESTS=tests/unit runs a part
-	@$(BIN)/pytest --durations=10 $(TESTS)
+test: lint ## Everything that CI checks; TESTS=tests/unit runs a part, in WORKERS processes
+	@$(BIN)/pytest --numprocesses=$(WORKERS) --dist=loadfile --durations=10 $(TESTS)
 
 doctor: setup ## What this machine has, and what mends what it lacks
 	@$(BIN)/caviar doctor

@@ -45,6 +45,7 @@ class LeftoverProcesses:
     def __init__(self) -> None:
         self.session = uuid.uuid4().hex
         self.owner: dict[int, str] = {}
+        self.told: list[str] = []
         os.environ[MARKER] = self.session
 
     def alive(self) -> list[psutil.Process]:
@@ -71,19 +72,32 @@ class LeftoverProcesses:
             for process in self.alive():
                 self.owner.setdefault(process.pid, item.nodeid)
 
+    @pytest.hookimpl(optionalhook=True)
+    def pytest_testnodedown(self, node: object, error: object) -> None:
+        """One of several test processes is through."""
+        self.told += getattr(node, "workeroutput", {}).get(MARKER, [])
+
     @pytest.hookimpl(trylast=True)
     def pytest_sessionfinish(self, session: pytest.Session) -> None:
-        _, left = psutil.wait_procs(self.alive(), timeout=2.0)
-        if not left:
-            return
-        reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+        config = session.config
+        is_one_of_several = hasattr(config, "workeroutput")
+        starts_others = not is_one_of_several and config.getoption("dist", "no") != "no"
+        left = [] if starts_others else psutil.wait_procs(self.alive(), timeout=2.0)[1]
         for process in left:
             first_seen = self.owner.get(process.pid, "an unknown test")
-            line = f"process {process.pid} is left over, first seen after {first_seen}: {_command(process)}"
-            if reporter is not None:
-                reporter.ensure_newline()
-                reporter.write_line(line, red=True)
+            self.told.append(
+                f"process {process.pid} is left over, first seen after {first_seen}: {_command(process)}"
+            )
             process.kill()
+        if not self.told:
+            return
+        if is_one_of_several:
+            config.workeroutput[MARKER] = self.told
+            return
+        reporter = config.pluginmanager.get_plugin("terminalreporter")
+        reporter.ensure_newline()
+        for line in self.told:
+            reporter.write_line(line, red=True)
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 
