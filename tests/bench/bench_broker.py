@@ -3,13 +3,14 @@
     python tests/bench/bench_broker.py [--services 2 4 8 32] [--payload 100] [--frames 2000] [--curve]
                                        [--json FILE]
 
-One hub and N - 1 others, each a process of its own. In every frame the hub takes a product of each of
-the others, and each of them takes the hub's. The kinds of loop take turns, round by round, so that a
-machine's moods fall on all of them; ratios are medians of the ratios within each round.
+One hub and N - 1 others, each a process of its own. In every frame the hub takes what each of the others
+made in it, and each of them takes what the hub made in the frame before. The kinds of loop take turns, round
+by round, so that a machine's moods fall on all of them; ratios are medians of the ratios within each round.
 
 - *bare*: a ROUTER loop that knows nothing but this pattern, and DEALER clients that send bytes back;
 - *broker*: `caviar bench broker`: frame clock, deadlines, journal, latency record, clients of the protocol;
-- *helics*, *mosaik*: where they are installed (``pip install helics mosaik``).
+- *helics*, *mosaik*: where they are installed (``pip install helics mosaik``);
+- *helics-lagged*: the hub too takes what was made in the frame before, which is less: nobody waits for it.
 
 With ``--curve`` the bare loop and the broker are encrypted; the others know no encryption, and are left out.
 """
@@ -45,8 +46,8 @@ COPIED = 1 << 16
 PEERS_LEAST = 100
 """Frames of HELICS and mosaik, which take longer, at least."""
 
-PLAIN = ("helics", "mosaik")
-"""Kinds that know no encryption."""
+PLAIN = {"helics": "helics", "helics-lagged": "helics", "mosaik": "mosaik"}
+"""Kinds that know no encryption, and what has to be installed for each."""
 
 Seconds = Callable[[int, int, int, bool], float]
 """``kind(services, payload, frames, curve)``: seconds that a frame takes."""
@@ -153,13 +154,14 @@ def broker(services: int, payload: int, frames: int, curve: bool) -> float:
     return mean / 1e6
 
 
-def peer(name: str) -> Seconds:
+def peer(name: str, *variant: str) -> Seconds:
     """Another co-simulation, in a process of its own."""
 
     def seconds(services: int, payload: int, frames: int, curve: bool) -> float:
         assert not curve, f"{name} knows no encryption"
         script = Path(__file__).with_name(f"peer_{name}.py")
-        command = [sys.executable, str(script), *map(str, (services, payload, max(PEERS_LEAST, frames // 4)))]
+        numbers = services, payload, max(PEERS_LEAST, frames // 4)
+        command = [sys.executable, str(script), *map(str, numbers), *variant]
         done = subprocess.run(
             command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, timeout=600, check=True
         )
@@ -174,6 +176,7 @@ KINDS: dict[str, Seconds] = {
     "bare": bare,
     "broker": broker,
     "helics": peer("helics"),
+    "helics-lagged": peer("helics", "lagged"),
     "mosaik": peer("mosaik"),
 }
 
@@ -197,7 +200,7 @@ def report(services: int, payload: int, rows: dict[str, list[float]], curve: boo
         lines.append(line)
         low, high = line["time_to_bare_range"]
         print(
-            f"N = {services:3} {payload:8} B {' curve' * curve} {kind:7}{line['us_per_frame']:9.0f} µs "
+            f"N = {services:3} {payload:8} B {' curve' * curve} {kind:13}{line['us_per_frame']:9.0f} µs "
             f"a frame {line['time_to_bare']:7.2f} × bare ({low:.2f} to {high:.2f}) "
             f"{line['bytes_per_second'] / 1e6:9.3g} MB/s",
             flush=True,
@@ -226,8 +229,8 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     told = parser.parse_args()
     kinds = ["bare", *(k for k in told.kinds if k != "bare" and not (told.curve and k in PLAIN))]
-    for kind in [k for k in kinds if k in PLAIN and importlib.util.find_spec(k) is None]:
-        print(f"{kind} is left out: pip install {kind}")
+    for kind in [k for k in kinds if k in PLAIN and importlib.util.find_spec(PLAIN[k]) is None]:
+        print(f"{kind} is left out: pip install {PLAIN[kind]}")
         kinds.remove(kind)
     lines = []
     for payload in told.payload:

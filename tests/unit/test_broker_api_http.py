@@ -53,7 +53,8 @@ def test_questions_and_orders(tmp_path: Path) -> None:
         status = http.get("/status").json
         assert (status["paused"], status["frames_finished"]) == (True, 2)
         figures = http.get("/latencies").json
-        assert (figures["world"]["grants_answered"], figures["world"]["misses"]) == (2, 1)
+        assert figures["world"]["grants_answered"] == 2
+        assert figures["world"]["misses"] in (1, 2)  # the other where the machine is busy
         assert http.post("/resume").json["paused"] is False
         world.expect(m.Grant)
         assert http.post("/stop?reason=lunch").json["state"] == "stopping"

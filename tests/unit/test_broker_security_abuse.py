@@ -20,6 +20,8 @@ from caviar_protocol.codec import encode_message
 
 BESIDE_S = 1.5
 """[s] for which the run goes on beside the peer that means ill."""
+STRETCHES = 5
+"""Of that length at most. Other work on the machine disturbs some of them, a peer that does harm all."""
 GREETING = b"\xff" + bytes(8) + b"\x7f" + b"\x03\x00" + b"NULL" + bytes(16) + b"\0" + bytes(31)
 READY = b"\x04\x1c\x05READY\x0bSocket-Type\0\0\0\x06DEALER"
 SMALL = PeerLimits(strangers=20)
@@ -66,13 +68,17 @@ def is_ended(connection: socket.socket) -> bool:
     return True
 
 
-def unharmed(background: Background, seconds: float = BESIDE_S) -> None:
-    """The run goes on in its pace, no frame late. One miss is left to a machine that is busy otherwise."""
-    misses, frames = background.misses, background.frames
-    background.go_on_for(seconds)
-    rate = (background.frames - frames) / seconds
-    assert background.misses - misses <= 1
-    assert rate > 0.8 / 0.020, f"{rate:.1f} frames/s"
+def unharmed(background: Background) -> None:
+    """The run goes on in its pace, no frame late; one miss is left to a machine that is busy otherwise."""
+    seen = []
+    for _ in range(STRETCHES):
+        misses, frames = background.misses, background.frames
+        background.go_on_for(BESIDE_S)
+        rate, missed = (background.frames - frames) / BESIDE_S, background.misses - misses
+        if missed <= 1 and rate > 0.8 / 0.020:
+            return
+        seen.append(f"{rate:.1f} frames/s, {missed} missed")
+    pytest.fail(f"in no stretch of {BESIDE_S:g} s the run went on in its pace: {'; '.join(seen)}")
 
 
 def told(broker: Serving, words: str) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from caviar_broker import __main__ as broker_main
 from caviar_broker.core.plan import SECOND, plan_run
 from caviar_clients.cli import remote
 from caviar_clients.cli.main import app
@@ -24,6 +25,12 @@ from caviar_services.registry import BUILT_IN, load
 SCENARIOS = Path(__file__).parents[2] / "deploy" / "scenarios"
 REMOTE = SCENARIOS / "remote.toml"
 ENDPOINT = "tcp://127.0.0.1:45123"
+
+
+@pytest.fixture(autouse=True)
+def _broker_keeps_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`caviar broker` runs in this process here, which stays in no better place."""
+    monkeypatch.setattr(broker_main, "prefer", lambda: "")
 
 
 def spec(role: Role) -> ServiceSpec:
