@@ -10,7 +10,7 @@ from caviar_broker.core import events as ev
 from caviar_broker.core.clock import FrameClock
 from caviar_broker.grumbles import Grumbles
 from caviar_broker.loop import Loop
-from caviar_broker.port import Port
+from caviar_broker.port import Port, is_assigned
 from caviar_broker.scenery import SceneryDesk
 from caviar_broker.watchdog import Watchdog
 from caviar_protocol import messages as m
@@ -82,15 +82,21 @@ class Connections:
 
     def from_stranger(self, route: bytes, message: m.Message) -> None:
         """A message on a connection that nobody knows."""
-        if isinstance(message, m.Hello):
-            self._hello(route, message)
-        elif isinstance(message, m.Attach):
-            self._attach(route, message)
-        else:
+        if not isinstance(message, m.Hello | m.Attach):
             kind = message_type(message)
             text = f"{kind} came before HELLO or ATTACH"
             self.reply(route, m.Error(code="unknown-peer", of=kind, message=text))
             self.grumble("strangers", f"{text} on a connection that nobody knows; not used")
+        elif not is_assigned(route):
+            # It could be one that somebody else has just had, and what is known of it would be of both.
+            text = f"{message_type(message)} of {message.name!r}: its socket has a routing id of its own; "
+            text += "leave ZMQ_ROUTING_ID unset: who it is, it says with HELLO and ATTACH"
+            self.reply(route, m.Refuse(code="declaration", message=text))
+            self.grumble("routing id", f"a connection was refused: {text}")
+        elif isinstance(message, m.Hello):
+            self._hello(route, message)
+        else:
+            self._attach(route, message)
 
     def from_pulse(self, route: bytes, service: str, message: m.Message) -> None:
         """A message on the heartbeat connection of a service."""

@@ -25,6 +25,14 @@ HANDSHAKE_MS = 5000
 """[ms] after which a connection is closed that has not shaken hands."""
 
 
+def is_assigned(route: bytes) -> bool:
+    """Whether a routing id is ROUTER's choice, and not the peer's: a zero byte and four others.
+
+    libzmq counts these from a random number, so a peer does not hit upon another's.
+    """
+    return len(route) == 5 and route[0] == 0
+
+
 class Port:
     """A bound ROUTER socket.
 

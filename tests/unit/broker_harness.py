@@ -153,12 +153,15 @@ class Client:
         inputs: Sequence[m.Input] | None = None,
         outputs: Sequence[str] | None = None,
         credentials: Credentials | None = None,
+        routing_id: bytes = b"",
         **hello: Any,
     ) -> None:
         role = role or name
         self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self.socket = self.context.socket(zmq.DEALER)
         self.socket.linger = 0
+        if routing_id:
+            self.socket.setsockopt(zmq.ROUTING_ID, routing_id)
         self.credentials = credentials
         dress(self.socket, endpoint, credentials)
         self.socket.connect(endpoint)

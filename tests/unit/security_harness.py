@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import zmq
-from broker_harness import INPUTS, MS, Client, Serving, plan, serving
+from broker_harness import INPUTS, MS, Client, Serving, eventually, plan, serving
 
 from caviar_broker.core.plan import RunPlan
 from caviar_broker.security.access import Access
@@ -68,12 +68,12 @@ class Background:
     failures: list[BaseException] = field(default_factory=list)
 
     def go_on_for(self, seconds: float) -> None:
-        """Let it run; AssertionError where the frames do not go on."""
+        """Let it run; AssertionError where the frames do not go on, if late on a busy machine."""
         before, until = self.frames, time.monotonic() + seconds
         while time.monotonic() < until:
             self.over.wait(0.02)
             assert not self.failures, self.failures
-        assert self.frames > before, "the frames do not go on"
+        eventually(lambda: self.frames > before, "the frames go on")
 
     @property
     def misses(self) -> int:

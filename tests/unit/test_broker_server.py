@@ -150,6 +150,24 @@ def test_a_name_that_the_run_does_not_have_is_refused_with_the_nearest(tmp_path:
         assert "did you mean 'sensors'?" in refusal.message
 
 
+def test_a_socket_with_a_routing_id_of_its_own_is_refused_with_the_remedy(tmp_path: Path) -> None:
+    """Also one that looks like ROUTER's, as nobody sets it by mistake, and on the heartbeat connection."""
+    with serving(plan(*PAIR), tmp_path) as broker, playing(broker.endpoint, *PAIR) as (world, sensors):
+        for own in (b"world", b"\0own", b"\0chosen"):
+            with Client(broker.endpoint, "world", routing_id=own) as again:
+                again.send(again.hello)
+                refusal = again.expect(m.Refuse)
+                assert (refusal.code, "leave ZMQ_ROUTING_ID unset" in refusal.message) == (
+                    "declaration",
+                    True,
+                )
+                again.send(m.Attach(**world.ids, name="world"))
+                assert again.expect(m.Refuse).message.startswith("ATTACH of 'world'")
+        assert "routing id of its own" in broker.witness.texts()
+        play_to_the_end([world, sensors], 3)
+        assert finishes_well(broker)
+
+
 def test_an_absurd_process_id_is_a_death_and_no_crash(tmp_path: Path) -> None:
     from caviar_protocol.host import host_identity
 
