@@ -281,6 +281,12 @@ def play_to_the_end(clients: Sequence[Client], frames: int) -> None:
         client.bye()
 
 
+def finishes_well(broker: Serving) -> bool:
+    """Whether a run came to its end, with all its frames."""
+    outcome = broker.outcome()
+    return outcome.error == "" and broker.witness.frames == broker.server.clock.plan.frames
+
+
 def eventually(condition: Callable[[], object], what: str, within_s: float = PATIENCE_S) -> None:
     """Wait until a condition holds."""
     until = time.monotonic() + within_s

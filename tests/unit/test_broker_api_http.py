@@ -54,7 +54,8 @@ def test_questions_and_orders(tmp_path: Path) -> None:
         assert (status["paused"], status["frames_finished"]) == (True, 2)
         figures = http.get("/latencies").json
         assert figures["world"]["grants_answered"] == 2
-        assert figures["world"]["misses"] in (1, 2)  # the other where the machine is busy
+        told = [n for n in http.broker.witness.notices if (n.kind, n.service) == ("miss", "world")]
+        assert figures["world"]["misses"] == len(told) >= 1  # a busy machine may have missed the second too
         assert http.post("/resume").json["paused"] is False
         world.expect(m.Grant)
         assert http.post("/stop?reason=lunch").json["state"] == "stopping"
