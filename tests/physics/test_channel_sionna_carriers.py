@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 from pathlib import Path
 from typing import Any
 
@@ -105,7 +104,6 @@ def test_no_frame_with_two_carriers_compiles_a_kernel(tmp_path: Path) -> None:
     """Also not the first: all kernels of both carriers are there when it begins."""
     import drjit as dr
 
-    gc.collect()  # kernels branch over all scenes, and those of earlier tests may go meanwhile
     model = sionna(FREQUENCIES, write_scenery(tmp_path, PLATES), receivers_at_once=2, max_depth=2)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()

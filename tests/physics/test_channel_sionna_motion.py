@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import subprocess
 import sys
 from pathlib import Path
@@ -170,7 +169,6 @@ def test_more_receivers_than_one_launch_takes(tmp_path: Path) -> None:
 def test_no_frame_compiles_a_kernel(tmp_path: Path, rung: str, everything: bool) -> None:
     """Neither moving, coming and going, nor numbers of objects, receivers, elements and paths: all was
     compiled while preparing. Kernels of single frames would also be a leak of memory."""
-    gc.collect()  # kernels branch over all scenes, and those of earlier tests may go meanwhile
     settings = {"rung": rung, "bodies": 6, **(ALL_ON if everything else {})}
     model = sionna(F, write_scenery(tmp_path, [GROUND, WALL]), **settings)
     arrays = AntennaArray(), AntennaArray(rows=2, columns=2), AntennaArray(columns=3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,9 @@ def loaded(description: Path | None) -> Any:
     """
     from sionna.rt import load_scene
 
+    # A scene refers to itself. Until one that nobody has any more is collected, kernels branch over what is
+    # in it too, and are compiled anew.
+    gc.collect()
     try:
         with any_frequency():
             scene = load_scene(None if description is None else str(description), merge_shapes=False)

@@ -230,14 +230,16 @@ class Tracer:
         candidates, launch, lost = offer.candidates(targets, len(receivers))
         if not len(candidates.ray):
             return nothing(len(self._wavelengths), self._options.max_depth, lost)
-        buffer = self._images(
-            scene=self._scene.mi_scene,
-            paths=self._buffer(launch, candidates.take(several(len(candidates.ray)))),
-            src_positions=source,
-            tgt_positions=targets,
-            diffraction=self._options.diffraction,
-            diffraction_lit_region=True,
-        )
+        buffer = self._buffer(launch, candidates.take(several(len(candidates.ray))))
+        if self._options.max_depth:  # its loops count down from there, below zero: 2^32 turns
+            buffer = self._images(
+                scene=self._scene.mi_scene,
+                paths=buffer,
+                src_positions=source,
+                tgt_positions=targets,
+                diffraction=self._options.diffraction,
+                diffraction_lit_region=True,
+            )
         at_centres = buffer.valid.numpy()[: len(candidates.ray)]
         hidden, settled = at_corners(self._faces, offer.planes, candidates, at_centres, corners)
         valid = np.flatnonzero(at_centres | hidden)
