@@ -20,7 +20,7 @@ from caviar_protocol import messages as m
 
 PEER = Path(__file__).with_name("broker_peer.py")
 LOCAL_S, REMOTE_S = 0.1, 1.5
-MARGIN_S = 0.6
+MARGIN_S = 0.4
 """[s] for a machine that is busy with other things."""
 
 

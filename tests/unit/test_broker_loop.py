@@ -27,7 +27,7 @@ def pair() -> Iterator[tuple[Socket, Socket]]:
         yield one, other
 
 
-def least_overshoot(loop: Loop, wait_ns: int, times: int = 50) -> int:
+def least_overshoot(loop: Loop, wait_ns: int, times: int = 20) -> int:
     """By how much a wait is late at least: what a busy machine adds comes and goes [ns]."""
     found = []
     for _ in range(times):

@@ -16,13 +16,13 @@ __all__ = ["played_broker"]
 
 
 def terminated(process: subprocess.Popen[str], number: int = signal.SIGTERM) -> str:
-    """What it says until it has ended, within 4 s."""
+    """What it says until it has ended, within 2 s."""
     started = time.monotonic()
     process.send_signal(number)
     said = ends(process, 143, within_s=5.0)
     elapsed = time.monotonic() - started
     sys.stdout.write(f"ended {elapsed:.2f} s after the signal\n")
-    assert elapsed < 4.0
+    assert elapsed < 2.0
     return said
 
 
