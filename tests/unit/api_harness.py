@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from broker_harness import PATIENCE_S, Serving, plan, serving
+from broker_harness import PAIR, PATIENCE_S, Serving, plan, serving
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
@@ -26,7 +26,6 @@ from caviar_protocol.websocket import join_parts, split_frame
 
 M = TypeVar("M", bound=m.Message)
 CAVIAR = Subprotocol("caviar.v1")
-PAIR = ("world", "sensors")
 
 
 @dataclass

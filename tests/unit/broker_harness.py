@@ -31,6 +31,7 @@ MS = 1_000_000
 PATIENCE_S = 10.0
 """[s] that a test waits for a message that must come."""
 
+PAIR = ("world", "sensors")
 INPUTS = {"world": (), "sensors": (m.Input(topic="scene"),), "link": (m.Input(topic="lidar"),)}
 OUTPUTS = {"world": ("scene",), "sensors": ("lidar",), "link": ("link",)}
 

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 import zmq
 import zmq.asyncio
-from api_harness import PAIR, Peer, Site, opened, site
-from broker_harness import MS, PATIENCE_S, eventually, plan, playing, serving
+from api_harness import Peer, Site, opened, site
+from broker_harness import MS, PAIR, PATIENCE_S, eventually, plan, playing, serving
 from starlette.datastructures import Headers
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect

@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from api_harness import PAIR, Site, site
-from broker_harness import PATIENCE_S, eventually, playing
+from api_harness import Site, site
+from broker_harness import PAIR, PATIENCE_S, eventually, playing
 
 from caviar_broker.api.tokens import Tokens, http_address
 from caviar_protocol import messages as m

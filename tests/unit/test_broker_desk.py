@@ -16,7 +16,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from broker_harness import PATIENCE_S, Client, Serving, eventually, plan, play_to_the_end, playing, serving
+from broker_harness import (
+    PAIR,
+    PATIENCE_S,
+    Client,
+    Serving,
+    eventually,
+    plan,
+    play_to_the_end,
+    playing,
+    serving,
+)
 from rich.console import Console
 
 from caviar_broker.desk import MAX_CONNECTIONS, MAX_REQUEST, MAX_WAITING
@@ -24,8 +34,6 @@ from caviar_broker.deskplace import NOTE, SOCKET, ask, connect
 from caviar_clients.cli.why import newest_run, why_command
 from caviar_protocol import messages as m
 from caviar_protocol.errors import RunError
-
-PAIR = ("world", "sensors")
 
 
 @contextmanager

@@ -12,6 +12,7 @@ import pytest
 import zmq
 from broker_harness import (
     MS,
+    PAIR,
     Client,
     eventually,
     finishes_well,
@@ -26,9 +27,6 @@ from caviar_broker.server import MESSAGES_A_TURN
 from caviar_protocol import messages as m
 from caviar_protocol.codec import decode_message, encode_message
 from caviar_protocol.digest import RunDigest, payload_digest
-
-PAIR = ("world", "sensors")
-
 
 # --- the ordinary course -------------------------------------------------------------------------------
 

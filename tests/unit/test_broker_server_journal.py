@@ -6,15 +6,13 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from broker_harness import Client, eventually, finishes_well, plan, play_to_the_end, playing, serving
+from broker_harness import PAIR, Client, eventually, finishes_well, plan, play_to_the_end, playing, serving
 
 from caviar_broker.core.events import Journal
 from caviar_broker.journal import JournalFile, read_journal
 from caviar_protocol import messages as m
 from caviar_protocol.codec import decode_message
 from caviar_protocol.errors import RunError
-
-PAIR = ("world", "sensors")
 
 
 class Diary(JournalFile):

@@ -231,7 +231,7 @@ class Tracer:
         if not len(candidates.ray):
             return nothing(len(self._wavelengths), self._options.max_depth, lost)
         buffer = self._buffer(launch, candidates.take(several(len(candidates.ray))))
-        if self._options.max_depth:  # its loops count down from there, below zero: 2^32 turns
+        if self._options.max_depth:  # from 0 its unsigned loops count on below: 2^32 turns
             buffer = self._images(
                 scene=self._scene.mi_scene,
                 paths=buffer,
