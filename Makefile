@@ -1,7 +1,7 @@
 # make demo: a co-simulation of a street with traffic, with pictures. make test: every check.
 BIN      := .venv/bin
 STAMP    := .venv/.setup-done
-SCENARIO ?= deploy/scenarios/street-canyon.toml
+SCENARIO ?= deploy/caviar_scenarios/street-canyon.toml
 FRAMES   ?= 120
 TESTS    ?= tests
 WORKERS  ?= 2

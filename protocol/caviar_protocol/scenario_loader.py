@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 import tomllib
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +21,32 @@ from caviar_protocol.toml_lines import dotted, key_lines
 _FILE = "file:"
 
 
+def shipped_scenarios() -> dict[str, Path]:
+    """Files of the scenarios that ship with this installation, by their names, in order of name."""
+    folder = Path(str(resources.files("caviar_scenarios")))
+    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+
+
+def find_scenario(scenario: Path | str) -> Path:
+    """File of a scenario that is given as a path, or as the name of one that ships: ``smoke``.
+
+    A file of that path comes first. What is neither is returned as it is; reading it says what is wrong.
+    """
+    path = Path(scenario)
+    if path.is_file() or path.name != str(scenario):
+        return path
+    return shipped_scenarios().get(str(scenario), path)
+
+
 def load_scenario(path: Path | str) -> Scenario:
-    """Read and check a scenario file.
+    """Read and check a scenario, given as a path or as the name of one that ships (`find_scenario`).
 
     Strings that begin with ``file:`` in settings of services are paths relative to the file's
     folder; they come out as absolute paths.
 
     Raises `ScenarioError` naming file, line, key, value and what to write instead.
     """
-    path = Path(path)
+    path = find_scenario(path)
     try:
         text = path.read_bytes().decode()
     except OSError as error:
@@ -65,7 +84,14 @@ def _syntax_error(error: tomllib.TOMLDecodeError, text: str, file: str) -> Scena
 
 
 def _beside(path: Path) -> str:
-    """The scenarios that stand where one was looked for."""
+    """The scenarios that stand where one was looked for, or those that ship."""
+    shipped = shipped_scenarios()
+    if not path.exists() and path.stem in shipped and path.suffix in ("", ".toml"):
+        return f"; the scenario that ships is called by its name: {path.stem}"
+    if path.name == str(path) and not path.suffix:
+        close = difflib.get_close_matches(path.name, shipped, n=1)
+        meant = f"; did you mean {close[0]!r}?" if close else ""
+        return f"{meant}; scenarios that ship: {', '.join(shipped)}"
     if not path.parent.is_dir():
         return ""
     if path.is_dir():

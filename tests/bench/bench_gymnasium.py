@@ -22,7 +22,7 @@ import caviar_clients.envs
 
 gymnasium.register_envs(caviar_clients.envs)
 
-SCENARIOS = Path(__file__).resolve().parents[2] / "deploy" / "scenarios"
+SCENARIOS = Path(__file__).resolve().parents[2] / "deploy" / "caviar_scenarios"
 
 
 def steps_per_second(env: gymnasium.Env[Any, Any], count: int) -> float:

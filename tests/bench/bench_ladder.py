@@ -2,7 +2,7 @@
 
     python tests/bench/bench_ladder.py --json ladder.json
 
-Takes frames of ``deploy/scenarios/street-canyon.toml`` with more receivers and arrays of other sizes, and
+Takes frames of ``deploy/caviar_scenarios/street-canyon.toml`` with more receivers and arrays of other sizes, and
 gives the same frames to every rung. Prints the time of ``spherical`` beyond ``siso-rt`` as a part of the
 time of ``mimo-rt``, the NMSE of H of both against ``mimo-rt`` for receivers whose paths all element pairs
 have and for the rest, and the time of a whole ``spherical`` frame with 64×64 elements in ratio to 64×2.
@@ -40,7 +40,7 @@ from caviar_services.channel.sionna_rt import SionnaChannel
 from caviar_services.channel.sionna_settings import SionnaSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 
-SCENARIO = Path(__file__).parents[2] / "deploy" / "scenarios" / "street-canyon.toml"
+SCENARIO = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "street-canyon.toml"
 
 
 class Anything(ChannelSettings, frozen=True, kw_only=True):

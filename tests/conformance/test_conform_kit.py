@@ -26,7 +26,7 @@ from caviar_protocol.errors import RunError, SetupError
 ROOT = Path(__file__).resolve().parents[2]
 BROKEN = Path(__file__).with_name("broken_client.py")
 ANY = "tcp://127.0.0.1:0"
-TRAJECTORY = tomllib.loads((ROOT / "deploy/scenarios/remote.toml").read_text())["services"]["world"]
+TRAJECTORY = tomllib.loads((ROOT / "deploy/caviar_scenarios/remote.toml").read_text())["services"]["world"]
 
 
 def python(*words: object) -> str:

@@ -17,7 +17,7 @@ from caviar_protocol.scenario_loader import load_scenario
 from caviar_services.registry import BUILT_IN, load
 from caviar_services.testing import CONFORMANCE, ServiceConformance
 
-SCENARIOS = Path(__file__).resolve().parents[2] / "deploy" / "scenarios"
+SCENARIOS = Path(__file__).resolve().parents[2] / "deploy" / "caviar_scenarios"
 
 EXTRAS = {
     "channel:adaptive": "sionna",

@@ -58,7 +58,7 @@ def test_the_flight_keeps_clear_and_is_out_of_sight_three_times(repository: Path
         activate_llvm()
     except SetupError as error:
         pytest.skip(str(error))
-    scenario = load_scenario(repository / "deploy" / "scenarios" / "uav-munich.toml")
+    scenario = load_scenario(repository / "deploy" / "caviar_scenarios" / "uav-munich.toml")
     settings = scenario.services["world"].settings
     track = Track(read_waypoints(settings["objects"][0]["waypoints"]))
     period = scenario.run.sampling_period_ns / 1e9

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-SCENARIOS = ROOT / "deploy" / "scenarios"
+SCENARIOS = ROOT / "deploy" / "caviar_scenarios"
 HERE = Path(__file__).parent
 MARK = "CAVIAR_TEST_RUN"
 

@@ -25,7 +25,7 @@ CHANGES = [
 def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Street canyon with few rays; as it is shipped, the dead are waited for."""
     path = scenario_file(tmp_path_factory.mktemp("canyon"), CHANGES, base="street-canyon")
-    folder = Path(__file__).resolve().parents[2] / "deploy" / "scenarios"
+    folder = Path(__file__).resolve().parents[2] / "deploy" / "caviar_scenarios"
     path.write_text(path.read_text().replace('"file:', f'"file:{folder}/'))
     return path
 

@@ -12,7 +12,7 @@ from scenarios_support import eventually, pid_of, recorded_below, run, running
 
 pytestmark = pytest.mark.sumo
 
-SCENARIOS = Path(__file__).resolve().parents[2] / "deploy" / "scenarios"
+SCENARIOS = Path(__file__).resolve().parents[2] / "deploy" / "caviar_scenarios"
 FRAMES = 40
 CHANGES = [
     ("frames = 100\n", f"frames = {FRAMES}\ncheckpoint_frames = 7\n"),

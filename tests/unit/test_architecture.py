@@ -60,11 +60,13 @@ def built(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_wheel_has_the_four_packages_typed_and_licensed(built: Path) -> None:
+def test_the_wheel_has_the_four_packages_typed_and_licensed_and_the_scenarios(built: Path) -> None:
     (wheel,) = built.glob("*.whl")
     names = zipfile.ZipFile(wheel).namelist()
     tops = {name.partition("/")[0] for name in names}
-    assert tops - {f"{wheel.name.split('-py3')[0]}.dist-info"} == set(PACKAGES)
+    assert tops - {f"{wheel.name.split('-py3')[0]}.dist-info"} == {*PACKAGES, "caviar_scenarios"}
+    assert "caviar_scenarios/smoke.toml" in names
+    assert "caviar_scenarios/street-canyon/canyon.net.xml" in names
     for package in PACKAGES:
         assert f"{package}/py.typed" in names
     assert any(name.endswith("licenses/LICENSE") for name in names)

@@ -12,7 +12,7 @@ from caviar_protocol.host import host_identity
 from caviar_protocol.messages import Welcome
 from caviar_protocol.scenario_loader import load_scenario, parse_scenario
 
-SMOKE = Path(__file__).parents[2] / "deploy" / "scenarios" / "smoke.toml"
+SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
 SECOND_AGENT = """
 [services.other]
 role = "agent"

@@ -28,7 +28,7 @@ from caviar_broker.server import BrokerServer
 from caviar_broker.statistics import Statistics
 from caviar_protocol.assets import AssetStore
 
-SMOKE = Path(__file__).parents[2] / "deploy" / "scenarios" / "smoke.toml"
+SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
 
 
 @pytest.fixture

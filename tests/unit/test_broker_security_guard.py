@@ -25,7 +25,7 @@ from caviar_protocol.scenario import Limits
 from caviar_services.connection import Connection
 from caviar_services.termination import Termination
 
-SMOKE = Path(__file__).parents[2] / "deploy" / "scenarios" / "smoke.toml"
+SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
 LIMITS = """
 [limits]
 connections = 51

@@ -15,7 +15,7 @@ from caviar_services.channel.adaptive.channel import AdaptiveChannel
 from caviar_services.registry import load
 from caviar_services.service import Preparation
 
-SCENARIO = Path(__file__).parents[2] / "deploy" / "scenarios" / "adaptive.toml"
+SCENARIO = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "adaptive.toml"
 
 
 class TestLadder:

@@ -14,7 +14,7 @@ from caviar_protocol.replay import Imposed, recorded_decisions
 from caviar_protocol.scenario_loader import load_scenario
 from caviar_services.channel.adaptive.channel import AdaptiveChannel
 
-SMOKE = Path(__file__).parents[2] / "deploy" / "scenarios" / "smoke.toml"
+SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
 
 
 def digest(directory: Path, load: float, imposed: Imposed | None = None) -> str:

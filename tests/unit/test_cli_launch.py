@@ -20,7 +20,7 @@ from caviar_protocol.errors import RunError
 from caviar_protocol.scenario_loader import load_scenario
 
 ROOT = Path(__file__).parents[2]
-SMOKE = ROOT / "deploy" / "scenarios" / "smoke.toml"
+SMOKE = ROOT / "deploy" / "caviar_scenarios" / "smoke.toml"
 
 
 def launcher(tmp_path: Path, frames: int = 10, extra: str = "", **values: Any) -> Launcher:

@@ -10,7 +10,7 @@ import pytest
 
 from caviar_clients.cli import main as command
 
-SMOKE = Path(__file__).parents[2] / "deploy" / "scenarios" / "smoke.toml"
+SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
 
 
 def complaint(

@@ -14,7 +14,7 @@ from caviar_clients.conform import conform
 from caviar_clients.conform.session import Rules
 from caviar_protocol.errors import SetupError
 
-SMOKE = Path(__file__).parents[2] / "deploy" / "scenarios" / "smoke.toml"
+SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
 
 
 def caviar(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:

@@ -22,7 +22,7 @@ from caviar_protocol.scenario_checks import refuse_remote
 from caviar_protocol.scenario_loader import load_scenario
 from caviar_services.registry import BUILT_IN, load
 
-SCENARIOS = Path(__file__).parents[2] / "deploy" / "scenarios"
+SCENARIOS = Path(__file__).parents[2] / "deploy" / "caviar_scenarios"
 REMOTE = SCENARIOS / "remote.toml"
 ENDPOINT = "tcp://127.0.0.1:45123"
 

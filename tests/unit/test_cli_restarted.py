@@ -18,7 +18,7 @@ from caviar_services.restarts import restart_status
 from caviar_services.termination import TERMINATED
 
 ROOT = Path(__file__).parents[2]
-SMOKE = ROOT / "deploy" / "scenarios" / "smoke.toml"
+SMOKE = ROOT / "deploy" / "caviar_scenarios" / "smoke.toml"
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
 
 

@@ -22,7 +22,7 @@ from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.recording import Recording
 from caviar_protocol.scenario_loader import load_scenario
 
-SMOKE = Path(__file__).parents[2] / "deploy" / "scenarios" / "smoke.toml"
+SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
 FRAMES = 40
 MS = 1_000_000
 

@@ -18,7 +18,7 @@ from caviar_protocol.recording import Recording
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario_loader import load_scenario, parse_scenario
 
-SCENARIOS = Path(__file__).parents[2] / "deploy" / "scenarios"
+SCENARIOS = Path(__file__).parents[2] / "deploy" / "caviar_scenarios"
 FRAMES = 6
 
 

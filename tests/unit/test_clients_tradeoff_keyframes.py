@@ -23,7 +23,7 @@ from caviar_protocol.topics import Channel
 NOISE = Noise(figure_db=9.0, temperature_k=290.0)
 FREE_SPACE = Setting(label="free-space", use="free-space")
 PERIOD_NS = 100_000_000
-SMOKE = Path(__file__).parents[2] / "deploy" / "scenarios" / "smoke.toml"
+SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
 
 
 def driving(frames: int) -> Scenes:

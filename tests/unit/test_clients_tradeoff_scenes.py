@@ -11,7 +11,7 @@ from caviar_clients.tradeoff.scenes import KEEPER, scenes_of, worlds_only
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.scenario_loader import load_scenario
 
-SCENARIOS = Path(__file__).parents[2] / "deploy" / "scenarios"
+SCENARIOS = Path(__file__).parents[2] / "deploy" / "caviar_scenarios"
 
 
 def test_a_recording_without_scenes_says_what_to_record(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from caviar_protocol.errors import CaviarError, PayloadError, RunError, Scenario
 from caviar_protocol.recording import Recording
 from caviar_protocol.topics import Action, BeamChoice, Link
 
-SCENARIOS = Path(__file__).parents[2] / "deploy" / "scenarios"
+SCENARIOS = Path(__file__).parents[2] / "deploy" / "caviar_scenarios"
 GEOMETRIC, SMOKE = SCENARIOS / "geometric.toml", SCENARIOS / "smoke.toml"
 PARTS = ("aoa", "aod", "position", "velocity", "last_abs_y")
 BEAMS = 64

@@ -18,7 +18,7 @@ from caviar_protocol.errors import PayloadError, RunError, ScenarioError
 from caviar_protocol.recording import Recording
 from caviar_protocol.topics import Action, BeamChoice, VelocityCommand
 
-SHIPPED = Path(__file__).parents[2] / "deploy" / "scenarios"
+SHIPPED = Path(__file__).parents[2] / "deploy" / "caviar_scenarios"
 MAX_SPEED = 15.0
 START = (-2.0, 140.0, 18.0)
 Changes = tuple[tuple[str, str], ...]

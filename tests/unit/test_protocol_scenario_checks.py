@@ -253,7 +253,7 @@ def test_users_are_matched_by_pattern() -> None:
     assert not owned_by([], "car.1")
 
 
-SMOKE = Path(__file__).parents[2] / "deploy" / "scenarios" / "smoke.toml"
+SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
 
 
 def smoke_with(users: str, *changes: tuple[str, str]) -> str:

@@ -26,7 +26,7 @@ with_sumo = [
 
 
 def scenario_named(repository: Path, name: str) -> Scenario:
-    return load_scenario(repository / "deploy" / "scenarios" / f"{name}.toml")
+    return load_scenario(repository / "deploy" / "caviar_scenarios" / f"{name}.toml")
 
 
 def world_of(scenario: Scenario) -> World:
@@ -70,7 +70,7 @@ def test_settings_of_all_services_are_known_to_their_implementations(repository:
 @pytest.mark.parametrize("name", NAMES)
 def test_frames_stand_at_the_start_of_a_line(repository: Path, name: str) -> None:
     """So that the number of frames can be found and changed without a TOML parser."""
-    text = (repository / "deploy" / "scenarios" / f"{name}.toml").read_text()
+    text = (repository / "deploy" / "caviar_scenarios" / f"{name}.toml").read_text()
     assert sum(line.startswith("frames = ") for line in text.splitlines()) == 1
 
 

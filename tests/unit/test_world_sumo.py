@@ -85,7 +85,7 @@ world.close()
 def make(repository: Path) -> Iterator[Make]:
     """Worlds in the street of the canyon. Making one closes the one before, and the test's end the
     last: libsumo holds one simulation."""
-    folder = repository / "deploy" / "scenarios" / "street-canyon"
+    folder = repository / "deploy" / "caviar_scenarios" / "street-canyon"
     worlds: list[SumoWorld] = []
 
     def create(
@@ -256,7 +256,7 @@ def test_seed_episode_and_name_each_change_the_traffic(make: Make) -> None:
 
 
 def test_fresh_processes_agree_and_another_seed_differs(repository: Path) -> None:
-    folder = str(repository / "deploy" / "scenarios" / "street-canyon")
+    folder = str(repository / "deploy" / "caviar_scenarios" / "street-canyon")
 
     def digest(seed: int) -> str:
         done = subprocess.run(
@@ -456,7 +456,7 @@ def test_a_configuration_file_is_run_and_settings_go_before_it(
 
 def test_a_process_that_is_killed_is_gone_on_for_by_another(repository: Path, tmp_path: Path) -> None:
     """60 frames in one process, and with a kill behind frame 16: the same bytes."""
-    folder = repository / "deploy" / "scenarios" / "street-canyon"
+    folder = repository / "deploy" / "caviar_scenarios" / "street-canyon"
 
     def run(scratch: Path, first: int, last: int, *, kill: bool) -> int:
         scratch.mkdir(exist_ok=True)

@@ -27,6 +27,7 @@ from caviar_clients.sessions.checking import checked_scenario
 from caviar_protocol.errors import RunError, SetupError
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario_checks import refuse_remote
+from caviar_protocol.scenario_loader import find_scenario
 
 QUIET = frozenset({"stale", "note", "idle", "lag"})
 """Kinds of notices that are logged, and only counted on the screen."""
@@ -82,7 +83,9 @@ def run_scenario(
     if embedded:
         launcher = EmbeddedLauncher(scenario, directory)
     else:
-        launcher = Launcher(scenario, path.resolve(), directory, frames, seed, bind, keys, http, pace=pace)
+        launcher = Launcher(
+            scenario, find_scenario(path).resolve(), directory, frames, seed, bind, keys, http, pace=pace
+        )
     return _follow(launcher, scenario, directory, console, json_file, keys)
 
 

@@ -1,0 +1,44 @@
+"""Scenarios that ship with the package are found by their names, from any folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from caviar_protocol.errors import ScenarioError
+from caviar_protocol.scenario_loader import find_scenario, load_scenario, shipped_scenarios
+
+
+def test_every_shipped_scenario_is_loaded_by_its_name_from_any_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert {"smoke", "street-canyon", "geometric"} <= set(shipped_scenarios())
+    for name, path in shipped_scenarios().items():
+        assert load_scenario(name) == load_scenario(path)
+
+
+def test_a_file_comes_before_the_shipped_scenario_of_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("smoke").write_text("x")
+    assert find_scenario("smoke") == Path("smoke")
+    assert find_scenario("./geometric") == Path("geometric")
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ("smok", "did you mean 'smoke'\\?.*street-canyon"),
+        ("deploy/scenarios/smoke.toml", "called by its name: smoke"),
+        ("smoke.toml", "called by its name: smoke"),
+    ],
+)
+def test_what_is_neither_a_file_nor_a_name_is_refused_with_what_was_meant(
+    given: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ScenarioError, match=said):
+        load_scenario(given)
