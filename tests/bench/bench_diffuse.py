@@ -2,7 +2,7 @@
 
     python tests/bench/bench_diffuse.py --samples 10000 30000 --paths 500 0 --json diffuse.json
 
-Takes scenes of ``deploy/caviar_scenarios/street-canyon.toml``, every material with the scattering coefficient that
+Takes scenes of ``street-canyon``, every material with the scattering coefficient that
 the trade of speed for accuracy takes (0.4), and steps by turns a channel without diffuse paths and two with
 them, which differ in the seed of their launch alone. For each number of rays: median times of a scene, H
 included; the median over the scenes of their ratio, and the ratio of processor times, which what else the

@@ -2,7 +2,7 @@
 
     python tests/bench/bench_ladder.py --json ladder.json
 
-Takes frames of ``deploy/caviar_scenarios/street-canyon.toml`` with more receivers and arrays of other sizes, and
+Takes frames of ``street-canyon`` with more receivers and arrays of other sizes, and
 gives the same frames to every rung. Prints the time of ``spherical`` beyond ``siso-rt`` as a part of the
 time of ``mimo-rt``, the NMSE of H of both against ``mimo-rt`` for receivers whose paths all element pairs
 have and for the rest, and the time of a whole ``spherical`` frame with 64×64 elements in ratio to 64×2.

@@ -87,7 +87,8 @@ class Worker:
 
     def step(self, index: int, seconds: float) -> Sample:
         """The scene with this index. Raises `RunError` with the reason where it fails or takes too long."""
-        self._pipe.send(index)
+        with suppress(OSError):  # a process that died before is named by the read of its answer
+            self._pipe.send(index)
         sample: Sample = self._answer(seconds)
         return sample
 
