@@ -112,6 +112,29 @@ def test_an_answer_at_the_very_deadline_is_in_time() -> None:
         assert run.outcome.error == ""
 
 
+@pytest.mark.parametrize(
+    ("policy", "status"),
+    [("hold", Status.HELD), ("drop", Status.ABSENT), ("wait", Status.FRESH), ("abort", None)],
+)
+def test_clause_11_an_answer_behind_its_deadline_is_late_though_the_shell_looked_at_no_deadline_since(
+    policy: str, status: Status | None
+) -> None:
+    slow = sensors(latency=slow_at(3, takes=None), budget=20 * MS, policy=policy)
+    takes = (m.Input(topic="lidar", required=False), m.Input(topic="scene"))
+    run = Simulation([world(), slow, agent(inputs=takes), recorder()]).join()
+    run.run(lambda run: len(run.grants("lidar")) == 4)
+    run.now = run.time_of("lidar", 3) + 20 * MS + 1
+    run.answer("lidar", run.grants("lidar")[3])
+    run.run()
+    late = [x for x in run.seen(ev.Latency, "lidar") if x.frame == 3]
+    assert [(x.elapsed_ns, x.missed) for x in late] == [(20 * MS + 1, True)]
+    if status is None:
+        assert "overran its budget (policy abort) in frame 3" in run.outcome.error
+    else:
+        assert got(run, 3).status is status
+        assert run.outcome.error == ""
+
+
 def test_clause_13_an_overrun_that_no_deadline_caught_is_counted_and_told() -> None:
     run = Simulation(loop(channel={"latency": slow_at(0, takes=None)})).join()
     run.run(lambda run: bool(run.grants("channel")))

@@ -94,11 +94,21 @@ class Deadlines:
         for name in self._outstanding:
             due = self._due(name)
             if due is not None and due[0] <= now:
-                self._actions.append(Overdue(name, self._episode, due[1].frame, due[0]))
-                self._expired(due[1], now)
+                self._expired(due[1], due[0], now)
         instant = self._next_release()
         if instant is not None and instant <= now:
             self._turns.wake(self._turns.waiting_for_pace)
+
+    def expire_before_answer(self, task: Task, now: int) -> None:
+        """Act on the budget of a task whose answer comes now, if it is up: that answer is late (clause 11).
+
+        The shell looks at deadlines every few milliseconds; an answer must not gain by coming in between.
+        Under ``wait`` there is nothing to decide: `measure` counts the miss.
+        """
+        plan = self._plans[task.service]
+        deadline = task.started_at + plan.budget_ns
+        if now > deadline and plan.policy != "wait" and task.state is _GRANTED and not task.overran:
+            self._expired(task, deadline, now)
 
     def next(self) -> int | None:
         """The earliest instant at which `expire` has something to do [ns]."""
@@ -127,7 +137,8 @@ class Deadlines:
             return None if waits else (task.eligible_at + budget, task)
         return None
 
-    def _expired(self, task: Task, now: int) -> None:
+    def _expired(self, task: Task, deadline: int, now: int) -> None:
+        self._actions.append(Overdue(task.service, self._episode, task.frame, deadline))
         plan, granted = self._plans[task.service], task.state is _GRANTED
         budget = milliseconds(plan.budget_ns)
         task.overran = granted

@@ -154,7 +154,7 @@ class Episodes:
         if peer.state is ServiceState.RESTORING:
             self.recall.repeated(peer, message, now)
             return
-        schedule = self._owing(peer, message, "DONE")
+        schedule = self._owing(peer, message, "DONE", now)
         if schedule is None:
             return
         t_ns = run.plan.t_ns(message.frame)
@@ -239,7 +239,7 @@ class Episodes:
         if peer.state is ServiceState.RESTORING:
             self.recall.repeated(peer, message, now)
             return
-        schedule = self._owing(peer, message, "FAULT")
+        schedule = self._owing(peer, message, "FAULT", now)
         if schedule is None:
             return
         needed = schedule.outstanding(peer.name)[0].state is not TaskState.ABANDONED
@@ -250,14 +250,15 @@ class Episodes:
             schedule.fault(peer.name, message.frame, text, now)
             self._save_if_due(peer, schedule, now)
 
-    def _owing(self, peer: Peer, answer: Done | Fault, kind: str) -> EpisodeSchedule | None:
-        """The schedule, if this answers the oldest outstanding grant (clause 1)."""
+    def _owing(self, peer: Peer, answer: Done | Fault, kind: str, now: int) -> EpisodeSchedule | None:
+        """The schedule, if this answers the oldest outstanding grant (clause 1), in time or late."""
         run, schedule = self._run, self.schedule
         owed = schedule.outstanding(peer.name) if schedule and run.takes_part(peer) else []
         outstanding = owed[0].frame if owed else -1
-        if owed and peer.state is _ACTIVE:
+        if schedule is not None and owed and peer.state is _ACTIVE:
             asked = (run.plan.epoch, peer.attempt, run.episode, outstanding)
             if (answer.epoch, answer.attempt, answer.episode, answer.frame) == asked:
+                schedule.deadlines.expire_before_answer(owed[0], now)
                 return schedule
         if not run.current(peer, answer.epoch, answer.attempt, kind, outstanding):
             return None
