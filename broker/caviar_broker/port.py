@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import secrets
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import zmq
 
@@ -23,6 +25,30 @@ LINGER_MS = 500
 """[ms] that closing waits until the last messages are on their way."""
 HANDSHAKE_MS = 5000
 """[ms] after which a connection is closed that has not shaken hands."""
+
+
+PORT_RANGE = Path("/proc/sys/net/ipv4/ip_local_port_range")
+"""Where Linux says which ports it gives to outgoing connections."""
+TRIES = 50
+"""Ports that are tried before the operating system is left to choose one."""
+
+
+def free_endpoints(endpoint: str) -> Iterator[str]:
+    """Addresses to try for one that asks for any free port (port 0); any other address as it is.
+
+    They lie outside the range of ports for outgoing connections: a broker that is started again has to listen
+    where its services know it, and must not find that port taken by a connection that somebody opened in
+    between. The last address leaves the choice to the operating system.
+    """
+    if endpoint.endswith(":0"):
+        try:
+            first, last = map(int, PORT_RANGE.read_text().split())
+        except (OSError, ValueError):
+            first, last = 32768, 60999  # Linux by default
+        ports = [port for port in range(10_000, 65_536) if not first <= port <= last]
+        for _ in range(TRIES if ports else 0):
+            yield f"{endpoint[:-1]}{secrets.choice(ports)}"
+    yield endpoint
 
 
 def is_assigned(route: bytes) -> bool:
@@ -78,15 +104,7 @@ class Port:
         self.guard = Guard(self._context, self.socket, access, peer_limits)
         """Watches over the peers."""
         self.socket.setsockopt(zmq.MAXMSGSIZE, self.guard.limits.part + FRAMING)
-        try:
-            self.socket.bind(endpoint)
-        except zmq.ZMQError as error:
-            self.close()
-            remedy = "end what uses that port, or choose" if error.errno == zmq.EADDRINUSE else "choose"
-            raise RunError(
-                f"cannot listen on {endpoint}: {error.strerror}; {remedy} another "
-                "with --bind tcp://127.0.0.1:PORT (0: any free one)"
-            ) from error
+        self._bind(endpoint)
         self.endpoint = self.socket.getsockopt_string(zmq.LAST_ENDPOINT)
         """Where services connect to."""
         try:
@@ -94,6 +112,21 @@ class Port:
         except RunError:
             self.close()
             raise
+
+    def _bind(self, endpoint: str) -> None:
+        for candidate in free_endpoints(endpoint):
+            try:
+                self.socket.bind(candidate)
+            except zmq.ZMQError as error:
+                if error.errno == zmq.EADDRINUSE and candidate != endpoint:
+                    continue
+                self.close()
+                remedy = "end what uses that port, or choose" if error.errno == zmq.EADDRINUSE else "choose"
+                raise RunError(
+                    f"cannot listen on {candidate}: {error.strerror}; {remedy} another "
+                    "with --bind tcp://127.0.0.1:PORT (0: any free one)"
+                ) from error
+            return
 
     @property
     def readable(self) -> bool:
