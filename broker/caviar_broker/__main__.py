@@ -31,6 +31,7 @@ from caviar_broker.core.resumption import Resumption
 from caviar_broker.desk import Desk
 from caviar_broker.deskplace import refuse_second
 from caviar_broker.journal import JournalFile, mend_journal
+from caviar_broker.processes import reserve_descriptors
 from caviar_broker.record import RunRecord, read_record
 from caviar_broker.replaying import with_replay
 from caviar_broker.resume import read_resumption
@@ -62,6 +63,7 @@ def serve(arguments: argparse.Namespace) -> int:
     steady_memory()
     record, directory = _resumed(arguments) if arguments.resume else _begun(arguments)
     told = with_ownership(record.scenario)
+    reserve_descriptors(len(told.services))
     local = {name: spec.role for name, spec in told.services.items() if not spec.remote}
     access = _access(arguments, local)
     check_bind(record.endpoint, keys=access is not None)

@@ -1,10 +1,41 @@
-"""What the operating system knows of services on this machine (contract, clause 15)."""
+"""What the operating system knows of services on this machine (clause 15), and grants the broker."""
 
 from __future__ import annotations
 
 import os
+import resource
 import signal
 from pathlib import Path
+
+from caviar_protocol.errors import RunError
+
+OWN_DESCRIPTORS = 40
+"""Open files of a broker without services: 27 of its own, and a few strangers that connect."""
+SERVICE_DESCRIPTORS = 4
+"""Open files for each service: two connections, its process, and an asset or checkpoint that is written."""
+WANTED_DESCRIPTORS = 16_384
+"""Open files that a broker asks for where the system grants them: connections that it lets wait."""
+
+
+def reserve_descriptors(services: int) -> None:
+    """Ask the system for as many open files as a broker of that many services may need.
+
+    Raises `RunError` naming the limit and the remedy where fewer are granted than a run takes: accepting a
+    connection without a free descriptor fails in silence, and the service that made it seems dead.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft == resource.RLIM_INFINITY:
+        return
+    granted = WANTED_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, WANTED_DESCRIPTORS)
+    if soft < granted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (granted, hard))
+        soft = granted
+    needed = OWN_DESCRIPTORS + SERVICE_DESCRIPTORS * services
+    if soft < needed:
+        raise RunError(
+            f"this process may have {soft} files open, and a run of {services} services needs {needed}; "
+            "raise the limit with  ulimit -n 1024  (LimitNOFILE= of systemd, --ulimit nofile of Docker)"
+        )
 
 
 class LocalProcess:
