@@ -13,6 +13,7 @@ import msgspec
 from msgspec import Meta
 
 from caviar_protocol.arrays import Vector3, quantity
+from caviar_protocol.durability import Durability
 from caviar_protocol.messages import Policy, Role
 from caviar_protocol.tables import Source
 from caviar_protocol.topics.channel import Carrier
@@ -86,6 +87,9 @@ class Run(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
         int, quantity("frame", "after which services that can do so save their state; 0: never", ge=0)
     ] = 20
     frames_in_flight: Annotated[int, quantity("frame", "frames that may overlap at most", ge=1, le=64)] = 4
+    durability: Durability = "periodic"
+    """What a loss of power costs: ``frame`` at most the frame in progress, ``periodic`` at most
+    `caviar_protocol.durability.SYNC_PERIOD_S` and a frame, ``none`` what the system had not written yet."""
 
 
 class DeviceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
