@@ -7,7 +7,7 @@ TESTS    ?= tests
 WORKERS  ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint doctor clean
+.PHONY: help setup demo test test-all lint doctor clean
 
 help: ## List these targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -29,6 +29,11 @@ lint: setup ## Style, types and the imports that the architecture allows
 
 test: lint ## Everything that CI checks; TESTS=tests/unit runs a part, in WORKERS processes
 	@$(BIN)/pytest --numprocesses=$(WORKERS) --dist=loadfile --durations=10 $(TESTS)
+
+test-all: lint ## The same and the long forms: a million fuzzed inputs, the whole fault matrix, containers
+	@if docker info >/dev/null 2>&1 && command -v docker-compose >/dev/null; then \
+	  (cd deploy && docker-compose build --quiet) || echo "the images of deploy/ were not built"; fi
+	@$(BIN)/pytest --all --numprocesses=$(WORKERS) --dist=loadfile --durations=20 $(TESTS)
 
 doctor: setup ## What this machine has, and what mends what it lacks
 	@$(BIN)/caviar doctor

@@ -120,6 +120,20 @@ def _command(process: psutil.Process) -> str:
         return process.name()
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """``--all``: what ``make test-all`` runs beyond ``make test``."""
+    parser.addoption("--all", action="store_true", help="run the tests marked `exhaustive`, too")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Skip what is marked `exhaustive` unless ``--all`` is given; the summary lists it."""
+    if not config.getoption("--all"):
+        left_out = pytest.mark.skip(reason="exhaustive: make test-all runs it")
+        for item in items:
+            if item.get_closest_marker("exhaustive"):
+                item.add_marker(left_out)
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Watch for processes that outlive their test."""
     config.pluginmanager.register(LeftoverProcesses(), "leftover-processes")

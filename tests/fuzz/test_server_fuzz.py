@@ -37,6 +37,6 @@ def test_a_run_is_the_same_beside_ten_thousand_wrong_messages() -> None:
     fuzzed(10_000, 60)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_run_is_the_same_beside_a_million_wrong_messages() -> None:
     fuzzed(1_000_000, 300)

@@ -199,7 +199,6 @@ def test_these_are_all_bundled_scenes() -> None:
     assert str(caught.value).endswith(f"known: {', '.join(BUNDLED)}")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", BUNDLED)
 def test_bundled_scenes_run_on_four_carriers(name: str) -> None:
     """2.8, 28, 60 and 100 GHz in one product: a free line of sight, and a reflection from below on all four,
@@ -216,7 +215,6 @@ def test_bundled_scenes_run_on_four_carriers(name: str) -> None:
         assert encode_payload(nearest)[1] == encode_payload(extrapolated)[1]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(WITH_BRICK))
 def test_bundled_scenes_with_brick_are_refused_at_60_ghz_by_default(name: str) -> None:
     with pytest.raises(ScenarioError, match=r"'brick' \(ITU brick\) is defined for 1–40 GHz, 110–330 GHz"):

@@ -19,7 +19,7 @@ from caviar_services.channel.base import ChannelModel
 from caviar_services.channel.sionna_candidates import Planes
 from caviar_services.channel.sionna_chains import Chains
 
-pytestmark = [pytest.mark.channel, pytest.mark.slow]
+pytestmark = pytest.mark.channel
 
 TEN = [f"r{i}" for i in range(10)]
 

@@ -14,7 +14,6 @@ DOCUMENT = Path(__file__).parents[2] / "services" / "STABILITY.md"
 GROUPS = sorted({case.group for case in cases() if case.traced})
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("group", GROUPS)
 def test_cases_that_trace_are_right(group: str) -> None:
     assert wrong(run([case for case in cases() if case.group == group and case.traced])) == []

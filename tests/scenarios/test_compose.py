@@ -39,7 +39,7 @@ def test_docker_compose_accepts_the_file_alone_and_with_each_override(override: 
     }
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.timeout(900)
 def test_containers_complete_their_run_in_any_order_and_over_kills_and_stop_in_order() -> None:
     """One cold start, the broker and a service killed, one stop; deploy/compose-test does the rest."""

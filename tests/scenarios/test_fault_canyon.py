@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from scenarios_support import caviar, eventually, pid_of, recorded_below, run, running, scenario_file
 
-pytestmark = [pytest.mark.slow, pytest.mark.sumo, pytest.mark.channel]
+pytestmark = [pytest.mark.sumo, pytest.mark.channel]
 
 FRAMES = 12
 FAULT_FRAME = 4

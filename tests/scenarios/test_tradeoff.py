@@ -104,7 +104,6 @@ def test_receivers_can_be_few(tmp_path: Path) -> None:
     assert [row["users"] for row in report["rows"]] == [3, 3]
 
 
-@pytest.mark.slow
 @pytest.mark.channel
 @pytest.mark.sumo
 def test_deeper_tracing_comes_nearer_and_takes_longer(
