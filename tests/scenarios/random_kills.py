@@ -1,11 +1,13 @@
-"""One run whose processes are killed again and again, at random; its digest is that of one in peace.
+"""One run whose processes are killed again and again, several at once; its digest is that of one in peace.
 
     python tests/scenarios/random_kills.py --kills 200 --seed 1
 
-SIGKILL meets any service, the recorder and the broker, most of the time while it has a grant to answer,
-sometimes while another one is away already. Each kill is a line of JSON, with the victim's state; a table
-is at the end. The exit status is 0 exactly if the run came to its end with the digest of the undisturbed
-run, `caviar inspect --digest` says the same, and at least half of the kills met an outstanding grant.
+SIGKILL meets 1 to 7 processes at the same time: any services, the recorder and the broker, most of the time
+while one of them has a grant to answer, sometimes while the run has not gone on after the kill before. The
+launcher is suspended (SIGSTOP) during some kills, and continues (SIGCONT) when all of it is over. Each kill
+is a line of JSON; a table is at the end. The exit status is 0 exactly if the run came to its end with the
+digest of the undisturbed run, `caviar inspect --digest` says the same, and at least half of the kills met an
+outstanding grant.
 """
 
 from __future__ import annotations
@@ -21,7 +23,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -39,6 +40,10 @@ GRANTED_SHARE = 0.8
 """Of the kills that wait until the victim has a grant."""
 OVERLAP_SHARE = 0.15
 """Of the kills that are followed by another one before the run has gone on."""
+SUSPENDED_SHARE = 0.15
+"""Of the kills during which the launcher is suspended."""
+SUSPENDED_S = 1.5
+"""[s] of that at most: longer than the broker waits for what the launcher knows of a death."""
 GO_ON_S = 60.0
 """[s] within which a run has to go on."""
 ADDER = """
@@ -56,17 +61,16 @@ rejoin_s = 30.0
 
 @dataclass
 class Kill:
-    """One kill."""
+    """Processes that were killed at the same time."""
 
     number: int
-    victim: str
-    pid: int
+    victims: list[str]
     frame: int
     """Frames that were finished."""
-    state: str
-    """``granted``: it owed an answer; ``idle``: it did not; ``away``: it had not come back yet;
-    ``broker``: how many grants were outstanding is in `grants`."""
     grants: int
+    """Outstanding: of the victims, or of all services where the broker is among the victims."""
+    suspended_s: float
+    """For how long the launcher was suspended meanwhile; 0: it was not."""
     overlap: bool
     """Whether the run had not gone on after the kill before."""
     at: float
@@ -94,7 +98,7 @@ class Disturber:
         """The first status for which a condition holds, or the last one; empty once the run is over."""
         end, status = time.monotonic() + seconds, self.status()
         while not (status and condition(status)) and time.monotonic() < end and self.alive:
-            select.select([], [], [], 0.001 if status else 0.02)
+            wait(0.001 if status else 0.02)
             status = self.status()
         return status
 
@@ -119,32 +123,30 @@ class Disturber:
                 found[words[words.index("caviar_services") + 1]] = pid
         return found
 
-    def kill_one(self, number: int, frame: int, victims: list[str], *, overlap: bool) -> Kill | None:
-        """Kill somebody, at the frame or behind it; None where the run is over."""
+    def kill_some(self, number: int, frame: int, names: list[str], *, overlap: bool) -> Kill | None:
+        """Kill one to all of these, at the frame or behind it; None where no victim lives."""
         self.until(lambda status: finished(status) >= frame, GO_ON_S)
-        victim = self.rng.choice(victims)
+        victims = self.rng.sample(names, self.rng.randint(1, len(names)))
+        suspended_s = self.rng.uniform(0.0, SUSPENDED_S) if self.rng.random() < SUSPENDED_SHARE else 0.0
         if self.rng.random() < GRANTED_SHARE:
-            status = self.until(lambda status: bool(grants_of(status).get(victim, victim == "broker")), 0.3)
+            status = self.until(lambda status: owed_by(victims, status) > 0, 0.3)
         else:
-            select.select([], [], [], self.rng.uniform(0.0, 0.02))
+            wait(self.rng.uniform(0.0, 0.02))
             status = self.status()
-        pid = self.processes().get(victim)
-        if pid is None or not self.alive:
+        pids, before, at = self.processes(), len(self.told()), time.monotonic()
+        victims = [victim for victim in victims if victim in pids]
+        if suspended_s and self.alive:
+            self.process.send_signal(signal.SIGSTOP)
+        struck = [victim for victim in victims if kill(pids[victim])]
+        if suspended_s and self.alive:
+            wait(suspended_s)
+            self.process.send_signal(signal.SIGCONT)
+        if not struck:
             return None
-        before = len(self.told())
-        at = time.monotonic()
-        try:
-            os.kill(pid, signal.SIGKILL)
-        except ProcessLookupError:
-            return None
-        granted = grants_of(status)
-        if victim == "broker":
-            state, outstanding = "broker", sum(granted.values())
-        else:
-            state, outstanding = self.state_at_death(victim, before)
-        kill = Kill(number, victim, pid, finished(status), state, outstanding, overlap, at)
-        self.kills.append(kill)
-        return kill
+        grants = owed_by(struck, status) if "broker" in struck else self.owed_at_death(struck, before)
+        done = Kill(number, struck, finished(status), grants, suspended_s, overlap, at)
+        self.kills.append(done)
+        return done
 
     def told(self) -> list[Mapping[str, Any]]:
         """The run's notices."""
@@ -160,15 +162,15 @@ class Disturber:
                 continue
         return found
 
-    def state_at_death(self, victim: str, before: int) -> tuple[str, int]:
-        """What the broker says of the death: the frame that the victim owed."""
-        until = time.monotonic() + 0.4
-        while time.monotonic() < until and self.alive:
+    def owed_at_death(self, victims: list[str], before: int) -> int:
+        """How many of the victims owed an answer, by what the broker says of their deaths."""
+        until, lost = time.monotonic() + 0.4, dict[str, int]()
+        while len(lost) < len(victims) and time.monotonic() < until and self.alive:
             for notice in self.told()[before:]:
-                if notice["kind"] == "lost" and notice["service"] == victim:
-                    return ("granted", 1) if notice["frame"] >= 0 else ("idle", 0)
-            select.select([], [], [], 0.005)
-        return "away", 0
+                if notice["kind"] == "lost" and notice["service"] in victims:
+                    lost[notice["service"]] = notice["frame"]
+            wait(0.005)
+        return sum(frame >= 0 for frame in lost.values())
 
     def wait_until_it_goes_on(self, kill: Kill) -> None:
         """Until frames are finished again, and everybody is there."""
@@ -181,6 +183,20 @@ class Disturber:
         kill.go_on_s = time.monotonic() - kill.at
 
 
+def wait(seconds: float) -> None:
+    """Leave the processor to others."""
+    select.select([], [], [], seconds)
+
+
+def kill(pid: int) -> bool:
+    """Whether a process was there to be killed."""
+    try:
+        os.kill(pid, signal.SIGKILL)
+    except ProcessLookupError:
+        return False
+    return True
+
+
 def finished(status: Mapping[str, Any]) -> int:
     """The frame that the run has come to, by all its brokers."""
     return int(status["frame"]) if status else -1
@@ -189,6 +205,12 @@ def finished(status: Mapping[str, Any]) -> int:
 def grants_of(status: Mapping[str, Any]) -> dict[str, int]:
     """Outstanding grants by service."""
     return {service["name"]: len(service["grants"]) for service in status.get("services", ())}
+
+
+def owed_by(victims: list[str], status: Mapping[str, Any]) -> int:
+    """Grants that nobody will answer once these are gone: without a broker, all of them."""
+    grants = grants_of(status)
+    return sum(number for name, number in grants.items() if name in victims or "broker" in victims)
 
 
 def scenario_for(folder: Path, given: Path | None, frames: int) -> Path:
@@ -217,7 +239,7 @@ def disturb(
     scenario: Path, out: Path, frames: int, kills: int, seed: int, say: Callable[[str], None]
 ) -> tuple[int, str, Disturber]:
     """Run a scenario while its processes are killed: exit status, output, and who was killed."""
-    victims = [*load_scenario(scenario).services, "broker"]
+    names = [*load_scenario(scenario).services, "broker"]
     rng = random.Random(seed)
     # Those that come late because somebody was waited for are made up for in the last third.
     at_frames = sorted(rng.sample(range(5, frames * 2 // 3), kills))
@@ -238,19 +260,19 @@ def disturb(
         process = subprocess.Popen(command, env=env, stdout=file, stderr=file, text=True)
     try:
         while not (found := list(out.glob("*/"))) and process.poll() is None:
-            select.select([], [], [], 0.05)
+            wait(0.05)
         disturber = Disturber(process, found[0], rng)
         overlap = False
         for number, frame in enumerate(at_frames, 1):
-            kill = None
-            while kill is None and disturber.alive:
-                kill = disturber.kill_one(number, frame, victims, overlap=overlap)
-            if kill is None:
+            done = None
+            while done is None and disturber.alive:
+                done = disturber.kill_some(number, frame, names, overlap=overlap)
+            if done is None:
                 break
             overlap = rng.random() < OVERLAP_SHARE
             if not overlap:
-                disturber.wait_until_it_goes_on(kill)
-            say(json.dumps({k: round(v, 3) if isinstance(v, float) else v for k, v in vars(kill).items()}))
+                disturber.wait_until_it_goes_on(done)
+            say(json.dumps({k: round(v, 3) if isinstance(v, float) else v for k, v in vars(done).items()}))
         process.wait(300)
     finally:
         process.kill()
@@ -265,18 +287,22 @@ def digest_of(directory: Path) -> str:
 
 
 def table(kills: list[Kill]) -> Iterator[str]:
-    """Kills by victim and state."""
-    yield f"{'victim':<10} {'kills':>6} {'granted':>8} {'idle':>6} {'away':>6}   s to go on: median, most"
-    by_victim = defaultdict(list)
-    for kill in kills:
-        by_victim[kill.victim].append(kill)
-    for victim in [*sorted(by_victim), "all"]:
-        own = kills if victim == "all" else by_victim[victim]
-        granted = sum(kill.grants > 0 for kill in own)
-        away = sum(kill.state == "away" for kill in own)
-        times = [kill.go_on_s for kill in own if kill.go_on_s is not None]
-        told = f"{statistics.median(times):.2f}, {max(times):.2f}" if times else "-"
-        yield f"{victim:<10} {len(own):>6} {granted:>8} {len(own) - granted - away:>6} {away:>6}   {told}"
+    """Kills by the number of processes, and by victim."""
+    yield f"{'':<12} {'kills':>6} {'broker':>7} {'granted':>8} {'suspended':>10}   s to go on: median, most"
+    for count in sorted({len(kill.victims) for kill in kills}):
+        yield row(f"{count} at once", [kill for kill in kills if len(kill.victims) == count])
+    for victim in sorted({victim for kill in kills for victim in kill.victims}):
+        yield row(victim, [kill for kill in kills if victim in kill.victims])
+    yield row("all", kills)
+
+
+def row(name: str, kills: list[Kill]) -> str:
+    """Some kills in figures."""
+    broker = sum("broker" in kill.victims for kill in kills)
+    granted, suspended = sum(kill.grants > 0 for kill in kills), sum(kill.suspended_s > 0 for kill in kills)
+    times = [kill.go_on_s for kill in kills if kill.go_on_s is not None]
+    told = f"{statistics.median(times):.2f}, {max(times):.2f}" if times else "-"
+    return f"{name:<12} {len(kills):>6} {broker:>7} {granted:>8} {suspended:>10}   {told}"
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -130,6 +130,24 @@ def test_a_broker_that_hangs_is_given_up_once_its_services_have_left_it(
     assert alive(started) == []
 
 
+def test_services_that_die_with_their_broker_are_each_started_again_once(tmp_path: Path) -> None:
+    """Their deaths are seen together with the broker's, when others have taken their places already."""
+    extra = "[timeouts]\nrejoin_s = 5.0\n"
+    with launcher(tmp_path, frames=100, extra=extra) as started:
+        wait_for(started, "frame")
+        assert started._broker is not None
+        children = [started._broker, *(child.process for child in started._children.values())]
+        for process in children:
+            process.kill()
+            os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+        events = list(started.events())
+    kinds = [(event["kind"], event["service"]) for event in events if event["event"] == "notice"]
+    assert [kind for kind in kinds if kind[0] in ("lost", "restarted")] == [("restarted", "")]
+    finished = next(event for event in events if event["event"] == "finished")
+    assert (finished["error"], finished["frames"]) == ("", 100)
+    assert alive(started) == []
+
+
 STUBBORN = """
 [services.sick]
 role = "sensors"

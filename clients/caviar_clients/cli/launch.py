@@ -99,6 +99,10 @@ class Launcher:
             self._start_broker()
         while not self._finished:
             for key, _ in self._selector.select(LOOK_S):
+                if self._selector.get_map().get(key.fd) is not key:
+                    # An earlier event of this batch, the broker's end, replaced all services, and one of
+                    # the new ones may have the same descriptor.
+                    continue
                 if isinstance(key.data, Child):
                     self._child_died(key.data)
                 else:
