@@ -76,23 +76,23 @@ class Connections:
         self._host = host_identity()
         self._replying = b""
         """Whose HELLO the clock looks at."""
-        self._guard.start(self.loop, self._cut_off, self._gone, self.grumble)
+        self._guard.start(self.loop, self._cut_off, self._gone, self._refused)
 
     # --- what comes ----------------------------------------------------------------------------------
 
     def from_stranger(self, route: bytes, message: m.Message) -> None:
-        """A message on a connection that nobody knows."""
+        """A message on a connection that has not said who it is."""
         if not isinstance(message, m.Hello | m.Attach):
             kind = message_type(message)
             text = f"{kind} came before HELLO or ATTACH"
             self.reply(route, m.Error(code="unknown-peer", of=kind, message=text))
-            self.grumble("strangers", f"{text} on a connection that nobody knows; not used")
+            self._refused("strangers", f"{self._stranger(route)}: {text}; not used")
         elif not is_assigned(route):
             # It could be one that somebody else has just had, and what is known of it would be of both.
             text = f"{message_type(message)} of {message.name!r}: its socket has a routing id of its own; "
             text += "leave ZMQ_ROUTING_ID unset: who it is, it says with HELLO and ATTACH"
             self.reply(route, m.Refuse(code="declaration", message=text))
-            self.grumble("routing id", f"a connection was refused: {text}")
+            self._refused("routing id", f"{self._stranger(route)} was refused: {text}")
         elif isinstance(message, m.Hello):
             self._hello(route, message)
         else:
@@ -126,9 +126,7 @@ class Connections:
         if connection is not None:
             self.feed(ev.Violated(connection.service, f"sent what is not in the protocol: {error}"))
         else:
-            self.grumble(
-                "garbage", f"a connection that nobody knows sent what is not in the protocol: {error}"
-            )
+            self._refused("garbage", f"{self._stranger(route)} sent what is not in the protocol: {error}")
 
     # --- who comes -----------------------------------------------------------------------------------
 
@@ -173,7 +171,7 @@ class Connections:
         if peer is None or not current or (attach.epoch, attach.attempt) != (self.epoch, peer.attempt):
             text = f"{name!r} is not in the run as attempt {attach.attempt} of epoch {attach.epoch}"
             self.reply(route, m.Error(code="unknown-peer", of="ATTACH", message=text))
-            self.grumble("strangers", f"ATTACH was refused: {text}")
+            self._refused("strangers", f"ATTACH of {self._stranger(route)} was refused: {text}")
             return
         earlier = self.watchdog.attach(name, route)
         if earlier is not None:
@@ -184,12 +182,12 @@ class Connections:
 
     def _unauthorized(self, route: bytes, text: str) -> None:
         self.reply(route, m.Refuse(code="unauthorized", message=text))
-        self.grumble("unauthorized", f"a connection was refused: {text}")
+        self._refused("unauthorized", f"{self._stranger(route)} was refused: {text}")
 
     def turn_away(self, action: ev.TurnAway) -> None:
         """The clock does not take whose HELLO it looks at."""
         self.reply(self._replying, action.refusal)
-        text = f"a connection was turned away: {action.refusal.message}"
+        text = f"HELLO of {self._stranger(self._replying)} was refused: {action.refusal.message}"
         self._tell(f"refused {action.refusal.code}", text, action.name, "refused")
 
     # --- who goes ------------------------------------------------------------------------------------
@@ -232,6 +230,15 @@ class Connections:
     def grumble(self, kind: str, text: str, service: str = "") -> None:
         """Tell the user something that may come often: the same kind is told once in a while."""
         self._tell(kind, text, service, "note")
+
+    def _refused(self, kind: str, text: str) -> None:
+        """Show on the console that a connection which is no service's was refused, as often as `grumble`."""
+        self._tell(kind, text, "", "refused")
+
+    def _stranger(self, route: bytes) -> str:
+        """What to call a connection that is no service's."""
+        address = self._guard.address(route)
+        return f"a connection from {address}" if address else "a connection"
 
     def _tell(self, kind: str, text: str, service: str, notice: str) -> None:
         text = self._grumbles.tell(kind, text, time.monotonic_ns())

@@ -31,6 +31,8 @@ MAX_CONNECTIONS = 32
 FRAME_EVENT_NS = 50_000_000
 """[ns] between ``frame`` events at least."""
 MAX_STEPS = 1_000_000_000
+NOTED = ("note", "refused")
+"""Kinds of notices that can be given at the desk."""
 BLAMES = frozenset({"miss", "lost", "away", "fault", "skipped"})
 """Kinds of notices that name a culprit."""
 
@@ -247,11 +249,15 @@ class Desk:
         return {"ok": True}
 
     def _note(self, request: Mapping[str, Any]) -> Answer:
-        service, text = request.get("service", ""), request.get("text", "")
+        service, text, kind = (
+            request.get(k, d) for k, d in (("service", ""), ("text", ""), ("kind", "note"))
+        )
         known = isinstance(service, str) and (not service or self.server.clock.peer(service) is not None)
         if not known or not isinstance(text, str) or not 0 < len(text) <= 1000:
             return _refusal("a note has a text of 1 to 1000 characters, and a service of the run or none")
-        self.server.note(service, text)
+        if kind not in NOTED:
+            return _refusal(f"a note is of one of the kinds {', '.join(NOTED)}")
+        self.server.note(service, text, kind)
         return {"ok": True}
 
 

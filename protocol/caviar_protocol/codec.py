@@ -18,6 +18,7 @@ from caviar_protocol import limits
 from caviar_protocol.arrays import Payload
 from caviar_protocol.body import BodyReader, BodyWriter
 from caviar_protocol.canonical import plain
+from caviar_protocol.choices import choices
 from caviar_protocol.errors import DecodeError, LimitError, PayloadError, VersionError
 from caviar_protocol.fields import Version
 from caviar_protocol.messages import (
@@ -84,6 +85,11 @@ def decode_message(header: Buffer) -> Message:
     DecodeError
         The bytes are not a message of this protocol.
     """
+    if not len(header):
+        raise DecodeError(
+            "message header: the first part is empty; send the header first, from a DEALER socket: the empty "
+            "delimiter of a REQ socket has no place in front of it"
+        )
     try:
         message = _decode(_message_decoder, header, "message header")
     except DecodeError:
@@ -217,7 +223,9 @@ def _decode(decoder: msgspec.msgpack.Decoder[_T], header: Buffer, what: str) -> 
     except RecursionError as error:
         raise LimitError(f"{what} nests deeper than {limits.MAX_NESTING} levels") from error
     except (PayloadError, msgspec.MsgspecError, ValueError, TypeError, OverflowError) as error:
-        raise DecodeError(f"{what}: {error}") from error
+        possible = choices(decoder.type, header, str(error))
+        hint = f"; write one of {', '.join(possible)}" if possible else ""
+        raise DecodeError(f"{what}: {error}{hint}") from error
 
 
 def _check_opening(header: Buffer) -> None:

@@ -20,6 +20,8 @@ SUBPROTOCOL = "caviar.v1"
 """What a client may ask for in ``Sec-WebSocket-Protocol``."""
 MAX_FRAME = 1 << 28
 """Bytes of a frame."""
+BIG_ENDIAN = "; these numbers are big-endian, write them little-endian"
+"""What is said of a frame whose numbers are right with their bytes reversed."""
 _COUNT = struct.Struct("<I")
 
 
@@ -41,13 +43,17 @@ def split_frame(frame: Buffer) -> list[memoryview]:
         raise DecodeError(f"a frame has {len(view)} B, it begins with the number of its parts in 4 B")
     (count,) = _COUNT.unpack_from(view)
     if not 1 <= count <= limits.MAX_PARTS:
-        raise LimitError(f"a frame announces {count} parts, a message has 1 to {limits.MAX_PARTS}")
+        swapped = 1 <= int.from_bytes(view[: _COUNT.size], "big") <= limits.MAX_PARTS
+        text = f"a frame announces {count} parts, a message has 1 to {limits.MAX_PARTS}"
+        raise LimitError(text + BIG_ENDIAN * swapped)
     place = _COUNT.size * (1 + count)
     if len(view) < place:
         raise DecodeError(f"a frame of {len(view)} B has no room for the lengths of {count} parts")
     lengths = struct.unpack_from(f"<{count}I", view, _COUNT.size)
     if place + sum(lengths) != len(view):
-        raise DecodeError(f"a frame has {len(view)} B, its lengths add up to {place + sum(lengths)}")
+        swapped = place + sum(struct.unpack_from(f">{count}I", view, _COUNT.size)) == len(view)
+        text = f"a frame has {len(view)} B, its lengths add up to {place + sum(lengths)}"
+        raise DecodeError(text + BIG_ENDIAN * swapped)
     parts = []
     for length in lengths:
         parts.append(view[place : place + length])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,7 +10,7 @@ import pytest
 from api_harness import Peer
 from scenarios_support import caviar, running, scenario_file
 from test_websocket_agent import FRAMES, WITHIN_S, WebRun, over_zeromq, python_agent
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.exceptions import ConnectionClosed
 
 from caviar_protocol import messages as m
 
@@ -41,11 +40,14 @@ def token_of(keys: Path, name: str, *role: str) -> str:
 
 
 def refused(url: str, token: str = "") -> str:
-    """Why a WebSocket is not opened."""
-    with pytest.raises(InvalidStatus) as answer:
-        Peer(url, "agent", token=token)
-    assert answer.value.response.status_code == 403
-    return str(json.loads(answer.value.response.body or b"")["detail"])
+    """Why a WebSocket is closed at once."""
+    with Peer(url, "agent", token=token) as peer:
+        told = peer.expect(m.Refuse)
+        with pytest.raises(ConnectionClosed) as ended:
+            peer.receive()
+        assert ended.value.rcvd is not None
+        assert ended.value.rcvd.code == 1008
+        return told.message
 
 
 def test_an_agent_with_its_token_plays_the_run_of_the_one_without_keys(

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 from broker_harness import PAIR, PATIENCE_S, Serving, plan, serving
 from websockets.sync.client import ClientConnection, connect
-from websockets.typing import Subprotocol
+from websockets.typing import Origin, Subprotocol
 
 from caviar_broker.deskplace import ask
 from caviar_protocol import messages as m
@@ -112,11 +112,14 @@ def opened(url: str, **options: Any) -> ClientConnection:
 class Peer:
     """A service over a WebSocket."""
 
-    def __init__(self, url: str, name: str, role: str = "", token: str = "", **hello: Any) -> None:
+    def __init__(
+        self, url: str, name: str, role: str = "", token: str = "", origin: str | None = None, **hello: Any
+    ) -> None:
         role = role or name
         headers = {"Authorization": f"Bearer {token}"} if token else {}
         self.socket = opened(
             url,
+            origin=Origin(origin) if origin else None,
             additional_headers=headers,
             max_size=None,
             compression=None,

@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 import zmq
 import zmq.asyncio
-from api_harness import Peer, Site, opened, site
+from api_harness import Peer, Site, site
 from broker_harness import MS, PAIR, PATIENCE_S, eventually, plan, playing, serving
 from starlette.datastructures import Headers
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
@@ -79,6 +79,35 @@ def play_sensors(http: Site) -> None:
             assert sensors.parts[1] == bytes(range(frame, 200)) * 1000
         sensors.expect(m.EpisodeEnd)
         sensors.bye()
+
+
+def refused_after_accept(peer: Peer, why: str) -> None:
+    """REFUSE, which every page and engine can read, and then the end."""
+    refusal = peer.expect(m.Refuse)
+    assert refusal.code == "unauthorized"
+    assert why in refusal.message
+    code, reason = closed(peer)
+    assert code == 1008
+    assert reason == refusal.message.encode()[:123].decode()
+
+
+def test_a_closing_handshake_counts_as_bye(tmp_path: Path) -> None:
+    with site(tmp_path, limits=LIMITS) as http, playing_world(http) as world:
+        world.expect(m.Grant)
+        world.socket.close()
+        outcome = http.broker.outcome(PATIENCE_S)
+        assert outcome.culprit == "world"
+        assert "it left: it closed its WebSocket (code 1000)" in outcome.error
+
+
+def test_a_reason_of_the_peers_own_letters_fits_into_a_close_frame(tmp_path: Path) -> None:
+    with site(tmp_path) as http, Peer(http.url, "world") as world:
+        world.join()
+        world.send(m.Hello(version=(1, 0), name="ä" * 120, role="sensors"))
+        assert closed(world) == (
+            1008,
+            ("it said that it is '" + "ä" * 120).encode()[:123].decode(errors="ignore"),
+        )
 
 
 def test_heartbeats_over_a_second_websocket_count(tmp_path: Path) -> None:
@@ -148,6 +177,7 @@ def test_a_process_id_told_over_a_websocket_is_not_watched(tmp_path: Path) -> No
     ("frame", "code", "told"),
     [
         (b"", 1007, "begins with the number of its parts"),
+        (struct.pack(">II", 1, 1) + b"x", 1007, "big-endian"),
         (struct.pack("<II", 1, 9) + b"x", 1007, "its lengths add up to"),
         (join_parts([b"\xc1"]), 1007, "not in the protocol"),
         (join_parts([encode_message(m.Heartbeat(sequence=1))]), 1008, "before HELLO or ATTACH"),
@@ -205,7 +235,7 @@ def test_one_who_does_not_read_is_cut_off_and_named(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("caviar_broker.api.gateway.SLOW_S", 0.1)
     told: list[tuple[str, str]] = []
 
-    async def tell(service: str, text: str) -> None:
+    async def tell(service: str, text: str, _: str) -> None:
         told.append((service, text))
 
     async def serve() -> MuteSocket:
@@ -234,7 +264,7 @@ class MuteSocket:
         hello = m.Hello(version=(1, 0), name="sensors", role="sensors")
         self._frames = [join_parts([encode_message(hello)])]
         self.scope: dict[str, object] = {}
-        self.headers = Headers({})
+        self.headers = Headers({"host": "127.0.0.1"})
         self.closed: tuple[int, str] | None = None
 
     async def accept(self, _: object) -> None:
@@ -257,10 +287,9 @@ class MuteSocket:
 
 def test_with_tokens_a_service_takes_part_as_what_its_token_says(tmp_path: Path) -> None:
     with site(tmp_path, tokens=TOKENS) as http:
-        with pytest.raises(InvalidStatus):
-            Peer(http.url, "world")
-        with pytest.raises(InvalidStatus):
-            Peer(http.url, "world", token=SECRET[1:])
+        for token, why in (("", "there is no token"), (SECRET[1:], "not, or no longer, known")):
+            with Peer(http.url, "world", token=token) as stranger:
+                refused_after_accept(stranger, why)
         with Peer(http.url, "sensors", token=SECRET) as other:
             other.send(other.hello)
             refused = other.expect(m.Refuse)
@@ -293,7 +322,9 @@ def test_a_revoked_token_ends_the_connection_that_came_in_with_it(tmp_path: Path
 
 def test_without_tokens_no_page_of_another_machine_gets_a_websocket(tmp_path: Path) -> None:
     with site(tmp_path) as http:
-        with pytest.raises(InvalidStatus):
-            opened(http.url, origin="https://evil.example")
+        with Peer(http.url, "world", origin="https://evil.example") as page:
+            refused_after_accept(page, "without tokens no page of another machine is served")
+        shown = [notice.text for notice in http.broker.witness.notices if notice.kind == "refused"]
+        assert any("from 127.0.0.1 was refused: without tokens no page" in text for text in shown)
         with connect(http.url, origin="http://localhost:8000"):
             pass

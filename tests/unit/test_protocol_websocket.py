@@ -64,6 +64,12 @@ def test_what_is_no_frame_is_refused(frame: bytes, error: type[ProtocolError]) -
         split_frame(frame)
 
 
+@pytest.mark.parametrize("frame", [struct.pack(">II", 1, 3) + b"abc", struct.pack("<I", 1) + b"\0\0\0\3abc"])
+def test_big_endian_numbers_are_called_so(frame: bytes) -> None:
+    with pytest.raises(ProtocolError, match="big-endian"):
+        split_frame(frame)
+
+
 @given(st.binary(max_size=40))
 def test_any_bytes_are_a_frame_or_are_refused(frame: bytes) -> None:
     try:

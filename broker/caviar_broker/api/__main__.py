@@ -39,10 +39,10 @@ async def serve(run: Path, address: str, keys: Path | None) -> None:
     tokens = Tokens(keys)
     status = (await desk.ask("status"))["status"]
 
-    async def tell(service: str, text: str) -> None:
+    async def tell(service: str, text: str, kind: str) -> None:
         known = [entry["name"] for entry in status["services"]]
         with contextlib.suppress(RunError):
-            await desk.ask("note", service=service if service in known else "", text=text[:1000])
+            await desk.ask("note", service=service if service in known else "", text=text[:1000], kind=kind)
 
     remedy = f"{REMEDY} --directory {keys}" if keys is not None else REMEDY
     gateway = Gateway(_reachable(status["endpoint"]), tokens, tell, credentials, remedy)

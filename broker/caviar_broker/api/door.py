@@ -20,8 +20,7 @@ BEARER = "bearer."
 class LocalOnly:
     """Refuses what a page from elsewhere has a browser send here, where no token protects from that.
 
-    Such a page gives itself away by its ``Origin``, or, where it has had its own name point to this
-    machine, by ``Host``.
+    WebSockets pass: the gateway refuses those itself, in a way that a page can read.
     """
 
     def __init__(self, app: ASGIApp, tokens: Tokens) -> None:
@@ -29,16 +28,21 @@ class LocalOnly:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, or answer it."""
-        reason = "" if self._tokens.exist or scope["type"] == "lifespan" else _strange(Headers(scope=scope))
-        if not reason:
-            await self._app(scope, receive, send)
-        elif scope["type"] == "http":
+        reason = foreign(Headers(scope=scope), self._tokens) if scope["type"] == "http" else ""
+        if reason:
             await JSONResponse({"detail": reason}, 403)(scope, receive, send)
         else:
-            await send({"type": "websocket.close", "code": 1008, "reason": reason})
+            await self._app(scope, receive, send)
 
 
-def _strange(headers: Headers) -> str:
+def foreign(headers: Headers, tokens: Tokens) -> str:
+    """Why a request is that of a page of elsewhere, and refused; empty where there are tokens, or it is not.
+
+    Such a page gives itself away by its ``Origin``, or, where it has had its own name point to this
+    machine, by ``Host``.
+    """
+    if tokens.exist:
+        return ""
     if not is_loopback(_host(f"//{headers.get('host', '')}")):
         return "without tokens only this machine's own names and addresses are served"
     origin = headers.get("origin")

@@ -6,6 +6,7 @@ Each has a DEALER socket of its own, closed with it, so that the broker sees whe
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
 from collections.abc import Awaitable, Callable
 from typing import Any
@@ -13,10 +14,9 @@ from typing import Any
 import msgspec
 import zmq
 import zmq.asyncio
-from starlette.responses import JSONResponse
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from caviar_broker.api.door import subprotocol, token_of, token_shown
+from caviar_broker.api.door import foreign, subprotocol, token_of, token_shown
 from caviar_broker.api.tokens import Tokens
 from caviar_broker.grumbles import Grumbles
 from caviar_protocol import messages as m
@@ -40,8 +40,15 @@ TOO_LARGE = 1009
 REMEDY = "make one with  caviar keys token NAME --role ROLE"
 ABNORMAL = 1006
 """Close code of a connection that ended without a close frame."""
+FAREWELLS = (1000, 1001, 1005)
+"""Close codes of a peer that leaves: done, going away (a page that is closed), none given."""
+MAX_REASON = 123
+"""[B] of the reason in a close frame (RFC 6455, section 5.5)."""
 
-Tell = Callable[[str, str], Awaitable[None]]
+NOTE, REFUSED = "note", "refused"
+"""Kinds of notices; the second is shown on the run's console."""
+
+Tell = Callable[[str, str, str], Awaitable[None]]
 
 
 class Gateway:
@@ -54,7 +61,7 @@ class Gateway:
     tokens
         Who may take part.
     tell
-        Called with a service, or "", and what the run's user should know about it.
+        Called with a service, or "", what the run's user should know about it, and the kind of the notice.
     credentials
         Its key, which a broker with keys admits for the services that have a token, and that broker's.
     remedy
@@ -80,21 +87,24 @@ class Gateway:
         """Serve one WebSocket until it closes."""
         offered = socket.scope.get("subprotocols", [])
         token = token_of(socket.headers, self._tokens, offered)
-        if why := self._refusal(token, token_shown(socket.headers, offered)):
+        if why := self._refusal(socket, token, token_shown(socket.headers, offered)):
             await self._refuse(socket, why)
             return
         if self.connections >= MAX_CONNECTIONS:
-            await socket.close(1013, f"there are {MAX_CONNECTIONS} connections already")
+            await socket.accept(subprotocol(offered))
+            await _close(socket, 1013, f"there are {MAX_CONNECTIONS} connections already")
             return
         self.connections += 1
         try:
             await socket.accept(subprotocol(offered))
-            await _Bridge(socket, self._dealer(), self._tokens, token, self._tell).run()
+            await _Bridge(socket, self._dealer(), self._tokens, token, self._tell, self._refused).run()
         finally:
             self.connections -= 1
 
-    def _refusal(self, token: Token | None, shown: bool) -> str:
+    def _refusal(self, socket: WebSocket, token: Token | None, shown: bool) -> str:
         """Why a request is refused; empty where it is not."""
+        if strange := foreign(socket.headers, self._tokens):
+            return strange
         if token is not None:
             what = f"the token of {token.name!r} is for {token.role}, and a service takes part here"
             return "" if token.of_service else f"{what}; {self._remedy}"
@@ -104,13 +114,17 @@ class Gateway:
         return f"{what}; {self._remedy}"
 
     async def _refuse(self, socket: WebSocket, why: str) -> None:
-        peer = socket.client.host if socket.client else "somebody"
-        text = self._grumbles.tell(
-            "refused", f"a WebSocket from {peer} was refused: {why}", time.monotonic_ns()
-        )
-        if text:
-            await self._tell("", text)
-        await socket.send_denial_response(JSONResponse({"detail": why}, 403))
+        """Accept, send REFUSE, close: pages and engines cannot read the answer to a request that fails."""
+        peer = socket.client.host if socket.client else "an unknown address"
+        await self._refused(why, f"a WebSocket from {peer} was refused: {why}")
+        await socket.accept(subprotocol(socket.scope.get("subprotocols", [])))
+        await _send(socket, m.Refuse(code="unauthorized", message=why))
+        await _close(socket, 1008, why)
+
+    async def _refused(self, kind: str, text: str) -> None:
+        """Show a refusal on the run's console, each kind once in a while."""
+        if shown := self._grumbles.tell(kind, text, time.monotonic_ns()):
+            await self._tell("", shown, REFUSED)
 
     def _dealer(self) -> zmq.asyncio.Socket:
         dealer = self._context.socket(zmq.DEALER)
@@ -139,10 +153,19 @@ class _Bridge:
     """One WebSocket and its DEALER."""
 
     def __init__(
-        self, socket: WebSocket, dealer: zmq.asyncio.Socket, tokens: Tokens, token: Token | None, tell: Tell
+        self,
+        socket: WebSocket,
+        dealer: zmq.asyncio.Socket,
+        tokens: Tokens,
+        token: Token | None,
+        tell: Tell,
+        refused: Callable[[str, str], Awaitable[None]],
     ) -> None:
-        self._socket, self._dealer, self._tell = socket, dealer, tell
+        self._socket, self._dealer, self._tell, self._refused = socket, dealer, tell, refused
         self._tokens, self._token = tokens, token
+        self._welcome: m.Welcome | None = None
+        """What the peer is told on its ordered connection; None before, and once it has said BYE."""
+        self._awaits_welcome = False
         self._name = ""
         """What the peer is called, once it said so."""
         self._sent = 0
@@ -166,13 +189,13 @@ class _Bridge:
                 raise error
 
     async def _cut(self, why: _CutOff) -> None:
-        who = f"the WebSocket of {self._name!r}" if self._name else "a WebSocket that has not said who it is"
-        await self._tell(self._name, f"{who} was cut off: {why.reason}")
-        try:
-            async with asyncio.timeout(LOOK_S):
-                await self._socket.close(why.code, why.reason[:100])
-        except (TimeoutError, RuntimeError, WebSocketDisconnect):
-            return  # it does not read, or has gone
+        if self._name:
+            text = f"the WebSocket of {self._name!r} was cut off: {why.reason}"
+            await self._tell(self._name, text, NOTE)
+        else:
+            text = f"a WebSocket that has not said who it is was cut off: {why.reason}"
+            await self._refused(f"cut off with code {why.code}", text)
+        await _close(self._socket, why.code, why.reason)
 
     # --- from the peer ------------------------------------------------------------------------------
 
@@ -194,13 +217,20 @@ class _Bridge:
             await self._dealer.send_multipart(parts)
 
     async def _note_end(self, code: int) -> None:
-        """A peer that is gone without a word; the broker sees so, but not why."""
+        """The peer is gone: a closing handshake counts as BYE; without one the broker sees that, not why."""
+        if code in FAREWELLS:
+            if self._welcome is not None:
+                who = {"epoch": self._welcome.epoch, "attempt": self._welcome.attempt}
+                bye = m.Bye(**who, reason=f"it closed its WebSocket (code {code})")
+                await self._dealer.send_multipart([encode_message(bye)])
+            return
         reason = {
             ABNORMAL: "its process ended, its machine is unreachable, or it has not read for long",
             TOO_LARGE: f"it sent a message of more than {MAX_FRAME} B",
         }.get(code, "")
         if reason and self._name:
-            await self._tell(self._name, f"a WebSocket of {self._name!r} ended with code {code}: {reason}")
+            text = f"a WebSocket of {self._name!r} ended with code {code}: {reason}"
+            await self._tell(self._name, text, NOTE)
 
     async def _header(self, header: memoryview) -> Any:
         """The header as the broker gets it.
@@ -218,11 +248,14 @@ class _Bridge:
         match message:
             case m.Hello():
                 await self._identify(message.name, message.role)
+                self._awaits_welcome = True
                 # A process id means nothing here: this connection tells whether the peer is there.
                 fields = msgspec.msgpack.decode(header)
                 return msgspec.msgpack.encode({k: v for k, v in fields.items() if k not in ("pid", "host")})
             case m.Attach():
                 await self._identify(message.name, "")
+            case m.Bye():
+                self._welcome = None
             case _ if not self._name:
                 text = f"{message_type(message)} came before HELLO or ATTACH"
                 await self._answer(m.Error(code="unknown-peer", of=message_type(message), message=text))
@@ -243,17 +276,15 @@ class _Bridge:
 
     async def _answer(self, message: m.Message) -> None:
         """An answer of the gateway's own, in front of a cut."""
-        try:
-            async with asyncio.timeout(LOOK_S):
-                await self._socket.send_bytes(join_parts([encode_message(message)]))
-        except (TimeoutError, WebSocketDisconnect):
-            return
+        await _send(self._socket, message)
 
     # --- to the peer --------------------------------------------------------------------------------
 
     async def _down(self) -> None:
         while True:
             parts = await self._dealer.recv_multipart(copy=False)
+            if self._awaits_welcome:
+                self._read_welcome(parts[0].buffer)
             frame = join_parts([part.buffer for part in parts])
             patience = SLOW_S + self._sent / SLOW_RATE
             try:
@@ -263,9 +294,29 @@ class _Bridge:
                 raise _CutOff(1008, f"it has not read for {patience:.3g} s") from error
             self._sent = len(frame)
 
+    def _read_welcome(self, header: memoryview) -> None:
+        message = decode_message(header)
+        if isinstance(message, m.Welcome):
+            self._welcome, self._awaits_welcome = message, False
+
     async def _watch_token(self) -> None:
         """A token that is revoked ends what came in with it."""
         while True:
             await asyncio.sleep(LOOK_S)
             if self._token is not None and not self._tokens.holds(self._token):
                 raise _CutOff(1008, "its token was revoked")
+
+
+async def _send(socket: WebSocket, message: m.Message) -> None:
+    """Send a message of one part; a peer that does not take it within `LOOK_S` goes without."""
+    with contextlib.suppress(TimeoutError, RuntimeError, WebSocketDisconnect):
+        async with asyncio.timeout(LOOK_S):
+            await socket.send_bytes(join_parts([encode_message(message)]))
+
+
+async def _close(socket: WebSocket, code: int, reason: str) -> None:
+    """Close a WebSocket; one that does not read, or has gone, is left to end by itself."""
+    short = reason.encode()[:MAX_REASON].decode(errors="ignore")
+    with contextlib.suppress(TimeoutError, RuntimeError, WebSocketDisconnect):
+        async with asyncio.timeout(LOOK_S):
+            await socket.close(code, short)

@@ -209,6 +209,11 @@ class Guard:
             return "its connection is not known any more"
         return self.access.refusal(peer.key, name, role, outputs)
 
+    def address(self, route: bytes) -> str:
+        """Where a peer connects from; empty for one that is not remembered."""
+        peer = self._peers.get(route)
+        return peer.address if peer is not None else ""
+
     def cut(self, route: bytes, why: str) -> None:
         """End the connection of a peer, and bar it for a while."""
         peer = self._peers.get(route)

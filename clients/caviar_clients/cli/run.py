@@ -31,7 +31,7 @@ from caviar_protocol.scenario_loader import find_scenario
 
 QUIET = frozenset({"stale", "note", "idle", "lag"})
 """Kinds of notices that are logged, and only counted on the screen."""
-REPEATED = frozenset({"away", "back", "restarted"})
+REPEATED = frozenset({"away", "back", "restarted", "refused"})
 """Kinds of notices that are shown every time, since what they ask of the user is always new."""
 
 
