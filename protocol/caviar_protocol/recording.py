@@ -1,10 +1,14 @@
 """Reading what a run recorded.
 
-::
+>>> from caviar_protocol.recording import Recording
+>>> recording = Recording("runs/smoke-20261122-101500")
+>>> recording["channel"].h.shape  # frames × users × Nr × Nt
+(100, 2, 4, 32)
+>>> recording.frame(episode=0, frame=7).scene().names
+('car', 'uav')
 
-    recording = Recording("runs/street-canyon-1")
-    for frame in recording.frames():
-        scene, link = frame.scene(), frame.only("link", Link)
+`Recording.__getitem__` gives a topic as arrays over all frames, `Recording.frames` the products frame by
+frame; docs/reading-recordings.md has more.
 
 A recording is a directory with ``recording-0000.mcap``, ``recording-0001.mcap``, … and the
 scenery in ``assets/``. After a crash it is readable up to the last frame whose record was
@@ -15,18 +19,20 @@ from __future__ import annotations
 
 import hashlib
 from bisect import bisect_right
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Any, Literal, TypeAlias, TypeVar, cast, overload
 
 import msgspec
+import numpy as np
 
 from caviar_protocol.arrays import Payload
 from caviar_protocol.codec import decode_payload
 from caviar_protocol.errors import ProtocolError, RecordingError
 from caviar_protocol.messages import GrantInput, Report, Status
+from caviar_protocol.recording_arrays import TopicArrays
 from caviar_protocol.recording_digest import RunDigestReport, recorded_digest
 from caviar_protocol.recording_layout import (
     ASSET_FOLDER,
@@ -35,11 +41,37 @@ from caviar_protocol.recording_layout import (
     RecordingMetadata,
     segment_files,
 )
+from caviar_protocol.recording_sensors import CameraArrays, DepthArrays, LidarArrays, SegmentationArrays
+from caviar_protocol.recording_topics import ActionArrays, ChannelArrays, LinkArrays, SceneArrays
 from caviar_protocol.scene import merge_scenes
 from caviar_protocol.segment import Channel, Chunk, Segment
-from caviar_protocol.topics import Scene
+from caviar_protocol.tables import suggestion
+from caviar_protocol.topics import PAYLOADS, Scene
 
 P = TypeVar("P", bound=Payload)
+T = TypeVar("T", bound=str)
+Key: TypeAlias = T | tuple[T, str]
+"""A topic, or a topic and a source."""
+
+
+TOPIC_ARRAYS: dict[str, type[TopicArrays[Any, Any]]] = {
+    "scene": SceneArrays,
+    "channel": ChannelArrays,
+    "lidar": LidarArrays,
+    "camera": CameraArrays,
+    "depth": DepthArrays,
+    "segmentation": SegmentationArrays,
+    "action": ActionArrays,
+    "link": LinkArrays,
+}
+"""Class of the arrays of each topic."""
+
+
+def check_topic(topic: str) -> str:
+    """The topic; `RecordingError` with a suggestion where there is none of this name."""
+    if topic not in PAYLOADS:
+        raise RecordingError(f"there is no topic {topic!r}; {suggestion(topic, PAYLOADS)}")
+    return topic
 
 
 class RecordedProduct:
@@ -116,7 +148,13 @@ class RecordedFrame:
         return self._recording.products_of(self._index)
 
     def of(self, topic: str, cls: type[P]) -> dict[str, P]:
-        """Payloads of a topic by source, fresh and held ones."""
+        """Payloads of a topic by source, fresh and held ones.
+
+        Raises `RecordingError` where there is no such topic, or ``cls`` is not its payload class.
+        """
+        if PAYLOADS.get(topic) is not cls:
+            check_topic(topic)
+            raise RecordingError(f"payloads of {topic!r} are {PAYLOADS[topic].__name__}, not {cls.__name__}")
         return {
             product.provenance.source: cast(P, product.payload)
             for product in self.products
@@ -193,6 +231,60 @@ class Recording:
                     found.setdefault(channel.topic, set()).add(channel.source)
         return {topic: tuple(sorted(found[topic])) for topic in sorted(found)}
 
+    @overload
+    def __getitem__(self, key: Key[Literal["scene"]]) -> SceneArrays: ...
+    @overload
+    def __getitem__(self, key: Key[Literal["channel"]]) -> ChannelArrays: ...
+    @overload
+    def __getitem__(self, key: Key[Literal["lidar"]]) -> LidarArrays: ...
+    @overload
+    def __getitem__(self, key: Key[Literal["camera"]]) -> CameraArrays: ...
+    @overload
+    def __getitem__(self, key: Key[Literal["depth"]]) -> DepthArrays: ...
+    @overload
+    def __getitem__(self, key: Key[Literal["segmentation"]]) -> SegmentationArrays: ...
+    @overload
+    def __getitem__(self, key: Key[Literal["action"]]) -> ActionArrays: ...
+    @overload
+    def __getitem__(self, key: Key[Literal["link"]]) -> LinkArrays: ...
+    @overload
+    def __getitem__(self, key: Key[str]) -> TopicArrays[Any, Any]: ...
+    def __getitem__(self, key: Key[str]) -> TopicArrays[Any, Any]:
+        """A topic as arrays over all frames: ``recording["channel"].h``, ``recording["lidar", "l1"].range``.
+
+        Parameters
+        ----------
+        key
+            A topic; with the source where several services produce it. The scenes of several worlds are one.
+
+        Raises
+        ------
+        RecordingError
+            There is no such topic, none of its products is in the recording, or the source is not one of it.
+        """
+        topic, source = (key, "") if isinstance(key, str) else key
+        return TOPIC_ARRAYS[check_topic(topic)](
+            self, topic, self._sources(topic, source), np.arange(len(self), dtype=np.int64)
+        )
+
+    def _sources(self, topic: str, source: str) -> tuple[str, ...]:
+        """The services to take a topic from."""
+        known = self.topics.get(topic, ())
+        if not known:
+            raise RecordingError(
+                f"{self.path} holds no product of {topic!r}; it holds {', '.join(self.topics) or 'none'}"
+            )
+        if source:
+            if source not in known:
+                raise RecordingError(f"{self.path} has no {topic} of {source!r}; {suggestion(source, known)}")
+            return (source,)
+        if len(known) > 1 and topic != "scene":
+            raise RecordingError(
+                f"{self.path} has {topic} of {', '.join(map(repr, known))}: choose one, as in "
+                f"recording[{topic!r}, {known[0]!r}]"
+            )
+        return known
+
     def frames(self) -> Iterator[RecordedFrame]:
         """All frames, in the order of (episode, frame)."""
         return (RecordedFrame(self, index) for index in range(len(self)))
@@ -209,6 +301,7 @@ class Recording:
 
     def product(self, episode: int, frame: int, topic: str, source: str) -> Payload:
         """The payload of one product, fresh or held. Raises `RecordingError` where absent."""
+        check_topic(topic)
         for product in self.frame(episode, frame).products:
             entry = product.provenance
             if (entry.topic, entry.source) == (topic, source) and entry.status is not Status.LATE:
@@ -216,7 +309,13 @@ class Recording:
         raise RecordingError(f"{self._at(episode, frame)} has no {topic} of {source!r}")
 
     def of(self, topic: str) -> Iterator[tuple[RecordedFrame, RecordedProduct]]:
-        """Every fresh or held product of a topic, with its frame."""
+        """Every fresh or held product of a topic, with its frame.
+
+        Raises `RecordingError` where there is no topic of this name.
+        """
+        return self._products(check_topic(topic))
+
+    def _products(self, topic: str) -> Iterator[tuple[RecordedFrame, RecordedProduct]]:
         for frame in self.frames():
             for product in frame.products:
                 if product.provenance.topic == topic and product.provenance.status is not Status.LATE:
@@ -236,20 +335,29 @@ class Recording:
 
     def products_of(self, index: int) -> tuple[RecordedProduct, ...]:
         """The products of the ``index``-th frame, held ones fetched from where they stand."""
-        entry, own = self.entry(index), self._messages(index)
-        found = []
-        for item in entry.inputs:
-            if item.status is Status.ABSENT:
-                continue
-            key = (Channel(item.topic, item.source), item.frame)
-            place = f"{self._at(entry.episode, entry.frame)}, {item.topic} of {item.source!r}"
-            data = own.get(key)
-            if data is None and item.status is Status.HELD:
-                data = self._held(entry.episode, *key)
-            if data is None:
-                raise RecordingError(f"{place}: its bytes, of frame {item.frame}, are not in {self.path}")
-            found.append(RecordedProduct(item, data, place))
-        return tuple(found)
+        own = self._messages(index)
+        return tuple(
+            self._product(index, item, own)
+            for item in self.entry(index).inputs
+            if item.status is not Status.ABSENT
+        )
+
+    def recorded_product(self, index: int, item: GrantInput) -> RecordedProduct:
+        """One product of the ``index``-th frame, which is not absent, wherever it stands."""
+        return self._product(index, item, self._messages(index))
+
+    def _product(
+        self, index: int, item: GrantInput, own: Mapping[tuple[Channel, int], memoryview]
+    ) -> RecordedProduct:
+        entry, key = self.entry(index), (Channel(item.topic, item.source), item.frame)
+        place = f"{self._at(entry.episode, entry.frame)}, {item.topic} of {item.source!r}"
+        data = own.get(key)
+        if data is None and item.status is Status.HELD:
+            data = self._held(entry.episode, *key)
+        if data is None:
+            remedy = "" if self.path.is_dir() else f"; open {self.directory}, which may have them"
+            raise RecordingError(f"{place}: its bytes, of frame {item.frame}, are not in {self.path}{remedy}")
+        return RecordedProduct(item, data, place)
 
     def _held(self, episode: int, channel: Channel, frame: int) -> memoryview | None:
         for index in (self._index.get((episode, frame)), self._late.get((episode, channel, frame))):

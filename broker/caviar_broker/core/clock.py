@@ -1,12 +1,13 @@
 """The frame clock: one run from the first HELLO to the last BYE, without I/O.
 
 A shell feeds events and the time, performs the actions, and calls `FrameClock.expire` at
-`FrameClock.next_deadline`::
+`FrameClock.next_deadline`:
 
-    clock = FrameClock(plan, now)
-    clock.receive(event, now)      # as often as something happens
-    clock.expire(now)              # when next_deadline() has come
-    for action in clock.actions(): ...
+>>> clock = FrameClock(plan, now)
+>>> clock.receive(event, now)  # as often as something happens
+>>> clock.expire(now)  # when next_deadline() has come
+>>> [type(action).__name__ for action in clock.actions()]
+['Send', 'Send']
 
 Real time is one such shell, the embedded run and the tests in virtual time are others.
 """

@@ -1,10 +1,10 @@
 """Conformance tests that every implementation of a service passes.
 
-Subclass the class of the role in a test file and name the implementation; pytest runs the tests::
+Subclass the class of the role in a test file and name the implementation; pytest runs the tests:
 
-    class TestMyChannel(ChannelConformance):
-        service_class = MyChannel
-        settings = {"samples": 1000}
+>>> class TestMyChannel(ChannelConformance):
+...     service_class = MyChannel
+...     settings = {"samples": 1000}
 
 Implementations in the registry are tested without even that (``tests/conformance``).
 """

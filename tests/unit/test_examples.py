@@ -1,0 +1,163 @@
+"""Examples in docstrings and pages run, and print what they say.
+
+In a docstring an example is a doctest; in a page it is a fenced block of ``python``, and the blocks of a page
+are run one after the other. There ``value  # → text`` says what ``print(value)`` prints. They run in a folder
+with a recorded run, `RUN`; names that the text around an example takes for granted are those of `GIVEN`.
+"""
+
+from __future__ import annotations
+
+import ast
+import doctest
+import importlib
+import re
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from caviar_clients.embedded.run import EmbeddedRun
+from caviar_protocol.scenario_loader import load_scenario
+
+PACKAGES = ("caviar_protocol", "caviar_broker", "caviar_services", "caviar_clients")
+ROOT = Path(__file__).parents[2]
+RUN = "runs/smoke-20261122-101500"
+ELSEWHERE = {
+    "README.md": "tests/scenarios/test_readme.py",
+    "protocol/SPEC.md": "tests/unit/test_protocol_spec.py",
+}
+"""Pages whose examples need processes of their own, and the test that runs them."""
+
+
+def _clock() -> dict[str, Any]:
+    from core_harness import Simulation, agent
+
+    from caviar_broker.core.events import Joined
+    from caviar_protocol.messages import PROTOCOL_VERSION, Hello
+
+    hello = Hello(version=PROTOCOL_VERSION, name="agent", role="agent")
+    return {"plan": Simulation([agent()]).plan, "now": 0, "event": Joined(hello)}
+
+
+def _keyframes() -> dict[str, Any]:
+    """Free space between a base station and a car, at 0 s, 0.2 s and 0.5 s."""
+    from recording_samples import channel, scene
+
+    return {
+        "channel_0": channel(0, 2),
+        "channel_1": channel(5, 2),
+        "scene_0": scene(0, 2),
+        "scene_1": scene(5, 2),
+        "scene_at_200_ms": scene(2, 2),
+    }
+
+
+def _channel_model() -> dict[str, Any]:
+    from caviar_services.channel.free_space import FreeSpaceChannel
+
+    return {"MyModel": FreeSpaceChannel, "MyChannel": FreeSpaceChannel}
+
+
+GIVEN: dict[str, Callable[[], dict[str, Any]]] = {
+    "CONTRIBUTING.md": _channel_model,
+    "services/CHANNEL.md": _keyframes,
+    "caviar_broker.core.clock": _clock,
+    "caviar_services.testing": _channel_model,
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a recorded run of `smoke`."""
+    place = tmp_path_factory.mktemp("examples")
+    (place / RUN).mkdir(parents=True)
+    EmbeddedRun(load_scenario("smoke"), place / RUN).run()
+    return place
+
+
+def pages() -> list[str]:
+    """Pages with examples, below the checkout."""
+    found = [
+        file
+        for folder in ("", "docs", "protocol", "broker", "services", "clients", "deploy", "examples")
+        for file in ((ROOT / folder).rglob("*.md") if folder else ROOT.glob("*.md"))
+    ]
+    return [str(file.relative_to(ROOT)) for file in sorted(found) if "```python\n" in file.read_text()]
+
+
+@pytest.mark.parametrize("page", [page for page in pages() if page not in ELSEWHERE])
+def test_the_examples_of_a_page_run(page: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    names = GIVEN.get(page, dict)()
+    for line, code in blocks((ROOT / page).read_text()):
+        for expression, printed, number in run_block(code, page, line, names):
+            expected = re.search(r"# → (.*)", code.splitlines()[number - line])
+            if expected:
+                assert str(printed) == expected[1], f"{page}:{number}: {expression}"
+
+
+def blocks(text: str) -> Iterator[tuple[int, str]]:
+    """Each fenced block of Python with the number of its first line."""
+    for found in re.finditer(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
+        yield text.count("\n", 0, found.start(1)) + 1, found[1]
+
+
+def run_block(code: str, page: str, line: int, names: dict[str, Any]) -> Iterator[tuple[str, Any, int]]:
+    """Execute it statement by statement; of each expression its source, value and line."""
+    tree = ast.parse(code)
+    ast.increment_lineno(tree, line - 1)
+    for statement in tree.body:
+        if isinstance(statement, ast.Expr):
+            value = eval(compile(ast.Expression(statement.value), page, "eval"), names)  # noqa: S307
+            yield ast.unparse(statement), value, statement.lineno
+        else:
+            exec(compile(ast.Module([statement], []), page, "exec"), names)  # noqa: S102
+
+
+def sources() -> Iterator[tuple[str, str]]:
+    """Name and text of every module of the packages."""
+    for package in PACKAGES:
+        folder = ROOT / package.removeprefix("caviar_") / package
+        for file in sorted(folder.rglob("*.py")):
+            parts = file.relative_to(folder.parent).with_suffix("").parts
+            yield ".".join(parts).removesuffix(".__init__"), file.read_text()
+
+
+def test_the_examples_of_docstrings_run(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    finder, runner = doctest.DocTestFinder(exclude_empty=True), doctest.DocTestRunner(verbose=False)
+    ran = set()
+    for name in [name for name, text in sources() if ">>> " in text]:
+        for test in finder.find(importlib.import_module(name)):
+            if test.examples:
+                test.globs = {**test.globs, **GIVEN.get(test.name, dict)()}
+                assert not runner.run(test, out=sys.stdout.write).failed, f"the example of {test.name}"
+                ran.add(test.name)
+    assert "caviar_protocol.recording" in ran
+
+
+def test_no_docstring_has_code_that_is_not_run() -> None:
+    """A literal block of Python that is no doctest would grow wrong in silence."""
+    unrun = []
+    for name, text in sources():
+        for node in ast.walk(ast.parse(text)) if "::\n" in text else ():
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+                docstring = ast.get_docstring(node) or ""
+                unrun += [f"{name}: {code}" for code in literal_blocks(docstring) if is_python(code)]
+    assert not unrun, "\n".join(unrun)
+
+
+def literal_blocks(text: str) -> list[str]:
+    """What stands indented behind ``::``."""
+    return [found[1] for found in re.finditer(r"::\n\n((?:    .*\n|\n)+)", text + "\n")]
+
+
+def is_python(code: str) -> bool:
+    """Whether it is Python; a doctest is not."""
+    try:
+        ast.parse("\n".join(line[4:] for line in code.splitlines()))
+    except SyntaxError:
+        return False
+    return True
