@@ -69,6 +69,7 @@ def _struct(cls: type[msgspec.Struct]) -> Convert:
 
 
 def _converter(hint: Any) -> Convert:
+    hint = _without_alias(hint)
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Annotated:
         return _converter(arguments[0])
@@ -83,6 +84,15 @@ def _converter(hint: Any) -> Convert:
     if isinstance(hint, type) and issubclass(hint, msgspec.Struct):
         return lambda value, writer: _struct(hint)(_instance(value, hint), writer)
     return _SCALARS[hint]
+
+
+def _without_alias(hint: Any) -> Any:
+    """What a hint stands for where it is a `TypeAliasType`, as NDArray is from NumPy 2.5 on."""
+    alias = get_origin(hint) or hint
+    if not hasattr(alias, "__value__"):
+        return hint
+    arguments = get_args(hint)
+    return _without_alias(alias.__value__[arguments] if arguments else alias.__value__)
 
 
 def _instance(value: Any, cls: type) -> Any:
@@ -108,6 +118,7 @@ def _union(members: tuple[Any, ...]) -> Convert:
 
 
 def _runtime_type(hint: Any) -> type:
+    hint = _without_alias(hint)
     if get_origin(hint) is Annotated:
         return _runtime_type(get_args(hint)[0])
     found: type = get_origin(hint) or hint

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
+from typing_extensions import TypeAliasType, TypeVar
 
 from caviar_protocol import limits
 from caviar_protocol.arrays import (
@@ -24,6 +25,7 @@ from caviar_protocol.arrays import (
     require_finite,
 )
 from caviar_protocol.body import BodyReader, BodyWriter
+from caviar_protocol.canonical import plain
 from caviar_protocol.errors import DecodeError, LimitError, PayloadError, ProtocolError
 
 
@@ -31,6 +33,22 @@ class Inner(Payload, frozen=True, kw_only=True, omit_defaults=True):
     """A payload inside a payload."""
 
     x: Annotated[Float64Array, array("<f8", "N", unit="m", doc="x")]
+
+
+_Scalar = TypeVar("_Scalar", bound=np.generic)
+AliasedArray = TypeAliasType(
+    "AliasedArray", np.ndarray[tuple[Any, ...], np.dtype[_Scalar]], type_params=(_Scalar,)
+)
+"""What `numpy.typing.NDArray` is from NumPy 2.5 on, on any version of Python."""
+AliasedNumber = TypeAliasType("AliasedNumber", float)
+
+
+class Aliased(Payload, frozen=True, kw_only=True, omit_defaults=True):
+    """A payload whose fields are declared by aliases."""
+
+    p: Annotated[AliasedArray[np.float64], array("<f8", "N", unit="m", doc="positions")]
+    k: Annotated[AliasedArray[np.int32], array("<i4", "K", unit="1", doc="indices")] | None = None
+    scale: AliasedNumber = 1.0
 
 
 class Point(msgspec.Struct, frozen=True, kw_only=True):
@@ -217,3 +235,10 @@ def test_a_body_is_little_endian_wherever_it_is_written() -> None:
     writer = BodyWriter()
     assert writer.place(np.array([1.0], ">f8"))["dtype"] == "<f8"
     assert writer.body() == bytes.fromhex("000000000000f03f")
+
+
+def test_fields_declared_by_type_aliases_travel_like_the_types_that_they_stand_for() -> None:
+    writer = BodyWriter()
+    found = plain(Aliased(p=np.arange(2.0), k=np.array([7], np.int32), scale=3.0), writer)
+    assert (found["p"]["dtype"], found["k"]["dtype"], found["scale"]) == ("<f8", "<i4", 3.0)
+    assert writer.body() == np.arange(2.0).tobytes() + np.array([7], np.int32).tobytes()
