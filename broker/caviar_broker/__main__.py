@@ -27,19 +27,19 @@ from caviar_broker.briefing import briefings, with_ownership
 from caviar_broker.checkpoints import CheckpointFiles
 from caviar_broker.control import Control, Reporter, stop_on_signals
 from caviar_broker.core.plan import plan_run
-from caviar_broker.core.resumption import Resumption
 from caviar_broker.desk import Desk
 from caviar_broker.deskplace import refuse_second
-from caviar_broker.journal import JournalFile, mend_journal
+from caviar_broker.journal import JournalFile
 from caviar_broker.processes import reserve_descriptors
 from caviar_broker.record import RunRecord, read_record
 from caviar_broker.replaying import with_replay
-from caviar_broker.resume import read_resumption
+from caviar_broker.resume import Left, read_resumption
 from caviar_broker.scheduling import prefer
 from caviar_broker.security.access import Access
 from caviar_broker.security.guard import PeerLimits
 from caviar_broker.security.local import check_bind
 from caviar_broker.server import BrokerServer
+from caviar_broker.versions import changes, versions_of
 from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.host import steady_memory
 from caviar_protocol.scenario_checks import with_overrides
@@ -61,7 +61,7 @@ def tune_collector() -> None:
 def serve(arguments: argparse.Namespace) -> int:
     """Run the broker; the exit status: 0 exactly if the run came to its end."""
     steady_memory()
-    record, directory = _resumed(arguments) if arguments.resume else _begun(arguments)
+    record, directory, forced = _resumed(arguments) if arguments.resume else _begun(arguments)
     told = with_ownership(record.scenario)
     reserve_descriptors(len(told.services))
     local = {name: spec.role for name, spec in told.services.items() if not spec.remote}
@@ -70,13 +70,18 @@ def serve(arguments: argparse.Namespace) -> int:
     beside = HttpBeside(directory, arguments.http, arguments.keys, again=bool(arguments.resume))
     plan = replace(plan_run(told, record.run, briefings(told, directory)), epoch=record.epoch)
     plan = with_replay(plan, told.replay)
-    checkpoints = CheckpointFiles(directory)
+    durability = record.scenario.run.durability
+    checkpoints = CheckpointFiles(directory, durable=durability != "none")
     # A launcher that starts its broker again has not summed the run up yet.
     last, episodes = "summary.json" if arguments.control else LATENCIES, record.scenario.run.episodes
-    resumption = _left(directory, checkpoints, episodes, last) if arguments.resume else None
+    left = _left(directory, checkpoints, episodes, last) if arguments.resume else _NOTHING
+    resumption = left.resumption
     scheduling = prefer()  # before the threads of the port are started, which inherit it
     reporter = Reporter(sys.stdout.fileno(), directory / "events.jsonl", arguments.control)
-    with closing(JournalFile(directory / JOURNAL, plan.epoch, checkpoints)) as journal:
+    journal_file = JournalFile(
+        directory / JOURNAL, plan.epoch, checkpoints, left.end, durable=durability != "none"
+    )
+    with closing(journal_file) as journal:
         supervised = arguments.supervised if arguments.control else ()
         desk = Desk(directory, reporter)
         with closing(beside), closing(desk):
@@ -99,6 +104,8 @@ def serve(arguments: argparse.Namespace) -> int:
                 Control(server)
             stopped = stop_on_signals(server)
             reporter.listening(server.endpoint)
+            for line in (*forced, *left.losses):
+                server.note("", line)
             beside.start(server)
             tune_collector()
             outcome = server.run()
@@ -130,7 +137,7 @@ def _access(arguments: argparse.Namespace, local: Mapping[str, str]) -> Access |
     return Access(arguments.keys, arguments.local_key, local)
 
 
-def _begun(arguments: argparse.Namespace) -> tuple[RunRecord, Path]:
+def _begun(arguments: argparse.Namespace) -> tuple[RunRecord, Path, tuple[str, ...]]:
     """A new run, and its directory."""
     if arguments.scenario is None or arguments.directory is None:
         raise RunError("give a scenario and a --directory, or --resume with the directory of a run")
@@ -139,33 +146,49 @@ def _begun(arguments: argparse.Namespace) -> tuple[RunRecord, Path]:
     )
     directory = _made(arguments.directory)
     run, endpoint = arguments.run or directory.name, arguments.bind or DEFAULT_BIND
-    return RunRecord(run=run, epoch=1, endpoint=endpoint, scenario=scenario), directory
+    versions = versions_of(scenario)
+    return (
+        RunRecord(run=run, epoch=1, endpoint=endpoint, scenario=scenario, versions=versions),
+        directory,
+        (),
+    )
 
 
-def _resumed(arguments: argparse.Namespace) -> tuple[RunRecord, Path]:
-    """A run that another broker left, in the next epoch."""
+def _resumed(arguments: argparse.Namespace) -> tuple[RunRecord, Path, tuple[str, ...]]:
+    """A run that another broker left, in the next epoch; and what of it is different by ``--force``."""
     directory: Path = arguments.resume.resolve()
     before = read_record(directory)
     refuse_second(directory)
+    versions = versions_of(before.scenario)
+    different = changes(before.versions, versions)
+    if different and not arguments.force:
+        raise RunError(
+            f"cannot go on with {directory}: it was begun with other versions, and its results may differ: "
+            f"{different}. Go on with the versions that began it, or with these by --force"
+        )
     endpoint = arguments.bind or before.endpoint
-    return msgspec.structs.replace(before, epoch=before.epoch + 1, endpoint=endpoint), directory
+    record = msgspec.structs.replace(before, epoch=before.epoch + 1, endpoint=endpoint, versions=versions)
+    return record, directory, (f"the run goes on with other versions: {different}",) if different else ()
 
 
-def _left(directory: Path, checkpoints: CheckpointFiles, episodes: int, last: str) -> Resumption | None:
-    """What the journal says, which then is ready to be gone on with.
+_NOTHING = Left(None, None, ())
+
+
+def _left(directory: Path, checkpoints: CheckpointFiles, episodes: int, last: str) -> Left:
+    """What the journal says.
 
     Raises `RunError` where every frame is finished and there is the file that is written ``last``.
     """
     journal = directory / JOURNAL
-    mend_journal(journal)
-    found = read_resumption(journal, checkpoints) if journal.exists() else None
+    left = read_resumption(journal, checkpoints) if journal.exists() else _NOTHING
+    found = left.resumption
     over = found is not None and found.finished >= found.frames and found.episode + 1 >= episodes
     if over and (directory / last).exists():
         raise RunError(
             f"cannot go on with {directory}: all its frames are finished, and so is it; "
             "to run its scenario again leave out --resume"
         )
-    return found
+    return left
 
 
 def _made(directory: Path) -> Path:
@@ -188,6 +211,7 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--http", default="", help="HOST:PORT: serve HTTP and WebSocket there")
     found.add_argument("--directory", type=Path, help="where the run is written")
     found.add_argument("--resume", type=Path, help="go on with the run in this directory, and nothing else")
+    found.add_argument("--force", action="store_true", help="with --resume: though versions have changed")
     found.add_argument("--run", default="", help="id of the run; by default the directory's name")
     found.add_argument("--frames", type=int, default=None, help="instead of the scenario's")
     found.add_argument("--seed", type=int, default=None, help="instead of the scenario's")

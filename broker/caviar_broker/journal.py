@@ -1,113 +1,156 @@
-"""The journal: every decision of a run, handed to the operating system before it is relied on."""
+"""The journal: every decision of a run, handed to the operating system before it is relied on.
+
+`JournalFile` writes entries, puts them on the disk and compacts itself, in the thread that calls it.
+"""
 
 from __future__ import annotations
 
+import errno
 import os
-from collections.abc import Iterable, Iterator, Sequence
+import zlib
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
-import msgpack  # type: ignore[import-untyped]
 import msgspec
 
 from caviar_broker.checkpoints import CheckpointFiles
 from caviar_broker.core.events import Journal
-from caviar_protocol.errors import RecordingError, RunError
-from caviar_protocol.messages import GrantInput
+from caviar_broker.core.resumption import Snapshot
+from caviar_broker.journal_format import (
+    HEAD,
+    MAGIC,
+    MAGIC_CRC,
+    JournalEntry,
+    JournalReader,
+    framed,
+)
+from caviar_broker.retention import Located, needed
+from caviar_protocol.durability import sync_file
+from caviar_protocol.errors import RunError
 
-
-class JournalEntry(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """One entry of the journal: what became of one service's part of one frame, or a turn of the run;
-    see `caviar_broker.core.events.Journal`."""
-
-    number: int
-    epoch: int
-    episode: int
-    frame: int
-    service: str
-    outcome: str
-    decisions: tuple[GrantInput, ...] = ()
-    chosen: dict[str, str] = {}
-    """Decisions that the service took."""
-    facts: dict[str, int] = {}
-    members: tuple[str, ...] = ()
-    file: str = ""
-    """Of the service's state, in ``checkpoints/``."""
-    products: tuple[tuple[str, bytes, bytes], ...] = ()
-    """(topic, payload header, body) of products that a later frame may consume, or a service that
-    comes back (clause 18). Last, so that the body of the last one ends the entry: it is written from where
-    it lies."""
-
-
+COMPACT_BYTES = 16 << 20
+"""[B] that a journal grows by before it is compacted."""
+CUT_SUFFIX = ".cut"
+"""Of the file that keeps what was cut off a damaged journal."""
+_NO_HEAD = bytes(HEAD.size)
 _NO_BYTES = b"\xc4\x00"
 """An empty body, as msgpack writes it."""
+_UNSYNCABLE = frozenset({errno.EINVAL, errno.EROFS, errno.ENOTSUP})
+"""Errors of `os.fsync` for what no disk is behind: a pipe, a device, a file system in memory."""
 _UNCOPIED = 1 << 16
 """[B] from which a body is written without a copy; below, one more piece costs more."""
 
 
 class JournalFile:
-    """Append-only msgpack stream of `JournalEntry`.
+    """Append-only file of `JournalEntry`, in the format of `caviar_broker.journal_format`.
 
-    ``os.write`` returns once the kernel has the bytes, so they outlive this process; that, and not
-    a flush to the disk for each frame, is what clause 18 asks for.
+    When `write` returns the kernel has the bytes, so they outlive this process. `sync` puts them on the
+    disk. Both and `compact` may be called from different threads, `write` and `compact` from one.
+
+    Parameters
+    ----------
+    path
+        The file; one that exists is gone on with behind its last whole entry.
+    epoch
+        Of the broker that writes.
+    checkpoints
+        Where the states of services go; by default beside the journal.
+    end
+        Where to go on [B]; what is behind it is kept in a file of its own. By default the end of the log.
+    durable
+        Whether what is compacted has to be on the disk before it takes the place of what was there.
+
+    Raises `RunError` naming the file where it cannot be opened, `RecordingError` where it is no journal.
     """
 
-    def __init__(self, path: Path, epoch: int, checkpoints: CheckpointFiles | None = None) -> None:
-        self.path, self._epoch = path, epoch
-        self.checkpoints = checkpoints or CheckpointFiles(path.parent)
+    def __init__(
+        self,
+        path: Path,
+        epoch: int,
+        checkpoints: CheckpointFiles | None = None,
+        end: int | None = None,
+        *,
+        durable: bool = False,
+    ) -> None:
+        self.path, self._epoch, self._durable = path, epoch, durable
+        self.checkpoints = checkpoints or CheckpointFiles(path.parent, durable=durable)
         self._encoder = msgspec.msgpack.Encoder()
         self._buffer = bytearray()
+        self._lock = Lock()
+        """Held while the file is replaced, or its descriptor taken."""
+        self._entries: list[Located] = []
+        self._number, self._crc, self.size = 0, MAGIC_CRC, 0
+        self._compacted_size = 0
+        if path.is_file() and path.stat().st_size:
+            self._take_over(end)
         try:
-            self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
+            self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
         except OSError as error:
-            raise RunError(f"cannot write the journal {path}: {error.strerror}") from error
+            raise self._failed(error) from error
+        if not self.size:
+            self._put([MAGIC])
+            self.size = len(MAGIC)
+
+    # --- writing -------------------------------------------------------------------------------------
 
     def write(self, entries: Iterable[Journal]) -> None:
-        """Append entries. `RunError` naming the file where the system refuses them."""
-        data = self._buffer
+        """Append entries. `RunError` naming the file where the system refuses them; then none is in it."""
+        data, crc, located = self._buffer, self._crc, list[Located]()
         data.clear()
         pieces: list[bytes | memoryview] = []
-        saved = False
+        size, saved = self.size, False
         for entry in entries:
             record = self._record(entry)
             saved |= bool(record.file)
             body = record.products[-1][2] if record.products else b""
-            if len(body) < _UNCOPIED:
-                self._encoder.encode_into(record, data, -1)
-                continue
-            topic, header, _ = record.products[-1]
-            products = (*record.products[:-1], (topic, header, b""))
-            self._encoder.encode_into(msgspec.structs.replace(record, products=products), data, -1)
-            del data[-len(_NO_BYTES) :]
-            data += b"\xc6" + len(body).to_bytes(4, "big")
-            pieces += [bytes(data), body]
-            data.clear()
+            large = len(body) >= _UNCOPIED
+            if large:
+                topic, header, _ = record.products[-1]
+                products = (*record.products[:-1], (topic, header, b""))
+                record = msgspec.structs.replace(record, products=products)
+            start = len(data)
+            data += _NO_HEAD
+            self._encoder.encode_into(record, data, -1)
+            if large:
+                del data[-len(_NO_BYTES) :]
+                data += b"\xc6" + len(body).to_bytes(4, "big")
+            length = len(data) - start - HEAD.size
+            crc = zlib.crc32((length + len(body) * large).to_bytes(8, "little"), crc)
+            with memoryview(data) as view:
+                crc = zlib.crc32(view[start + HEAD.size :], crc)
+            if large:
+                length += len(body)
+                crc = zlib.crc32(body, crc)
+            HEAD.pack_into(data, start, length, crc)
+            located.append(Located.of(record, size + HEAD.size, length))
+            size += HEAD.size + length
+            if large:
+                pieces += [bytes(data), body]
+                data.clear()
         pieces.append(bytes(data))
         self._put(pieces)
+        self._crc, self.size = crc, size
+        self._entries += located
         if saved:
-            self.checkpoints.prune()
-
-    def _put(self, pieces: Sequence[bytes | memoryview]) -> None:
-        """Hand over all of it; Linux takes 2 GiB at once at most."""
-        while pieces:
-            try:
-                written = os.writev(self._fd, pieces)
-            except OSError as error:
-                raise RunError(f"cannot write the journal {self.path}: {error.strerror}") from error
-            pieces = _behind(pieces, written)
+            self.checkpoints.entered()
 
     def _record(self, entry: Journal) -> JournalEntry:
         products: tuple[tuple[str, Any, Any], ...] = tuple(
             (p.topic, memoryview(p.payload[0]), memoryview(p.payload[1])) for p in entry.products
         )
-        file = ""
+        file = digest = ""
         if entry.state is not None:
-            file = self.checkpoints.save(entry.service, entry.episode, entry.frame, entry.state)
+            file, digest = self.checkpoints.save(entry.service, entry.episode, entry.frame, entry.state)
+        self._number = entry.number
         return JournalEntry(
             chosen=dict(entry.chosen or {}),
             facts=dict(entry.facts or {}),
             members=entry.members,
             file=file,
+            digest=digest,
             number=entry.number,
             epoch=self._epoch,
             episode=entry.episode,
@@ -117,6 +160,129 @@ class JournalFile:
             decisions=entry.decisions,
             products=products,
         )
+
+    def _put(self, pieces: Sequence[bytes | memoryview]) -> None:
+        """Hand over all of it, or nothing; Linux takes 2 GiB at once at most."""
+        try:
+            while pieces:
+                pieces = _behind(pieces, os.writev(self._fd, pieces))
+        except OSError as error:
+            with suppress(OSError):
+                os.ftruncate(self._fd, self.size)  # half an entry would end the log for what may follow
+            raise self._failed(error) from error
+
+    # --- on the disk ---------------------------------------------------------------------------------
+
+    def sync(self) -> None:
+        """Put on the disk what was written when this was called: states first, which entries name.
+
+        `RunError` naming the file where the system cannot.
+        """
+        states = self.checkpoints.sync()
+        with self._lock:
+            fd = os.dup(self._fd)
+        try:
+            os.fsync(fd)
+        except OSError as error:
+            if error.errno not in _UNSYNCABLE:
+                raise self._failed(error) from error
+        finally:
+            os.close(fd)
+        self.checkpoints.synced(states)
+
+    @property
+    def is_long(self) -> bool:
+        """Whether it is time to compact."""
+        return self.size >= max(COMPACT_BYTES + self._compacted_size, 2 * self._compacted_size)
+
+    def compact(self, snapshot: Snapshot) -> None:
+        """Drop what nothing needs any more, now that the frames of a snapshot are safe in the recording.
+
+        The new file takes the place of the old one in one step. `RunError` naming it where that fails.
+        """
+        base, kept = needed(self._entries, snapshot)
+        partial = self.path.with_name(self.path.name + ".partial")
+        try:
+            fd = os.open(partial, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_CLOEXEC, 0o644)
+            try:
+                crc, size, moved = self._copy(fd, self._opening(snapshot, base), kept)
+                if self._durable:
+                    os.fsync(fd)
+                with self._lock:
+                    partial.replace(self.path)
+                    self._fd, fd = fd, self._fd
+            finally:
+                os.close(fd)
+            if self._durable:
+                sync_file(self.path.parent)
+        except OSError as error:
+            raise self._failed(error) from error
+        self._crc, self.size, self._entries = crc, size, moved
+        self._compacted_size = size
+
+    def _opening(self, snapshot: Snapshot, base: int) -> JournalEntry:
+        return JournalEntry(
+            number=self._number,
+            epoch=self._epoch,
+            episode=snapshot.episode,
+            frame=snapshot.finished,
+            service="",
+            outcome="snapshot",
+            facts={
+                "seed": snapshot.seed,
+                "seed_episode": snapshot.seed_episode,
+                "frames": snapshot.frames,
+                "finished_before": snapshot.finished_before,
+                "base": base,
+            },
+            members=snapshot.members,
+            digest=snapshot.digest,
+        )
+
+    def _copy(
+        self, fd: int, opening: JournalEntry, kept: Sequence[Located]
+    ) -> tuple[int, int, list[Located]]:
+        """Write a new journal; its CRC, its size and where its entries are."""
+        payload = self._encoder.encode(opening)
+        head, crc = framed(MAGIC_CRC, payload)
+        os.writev(fd, [MAGIC, head, payload])
+        size, moved = len(MAGIC) + len(head) + len(payload), list[Located]()
+        for entry in kept:
+            payload = os.pread(self._fd, entry.length, entry.offset)
+            head, crc = framed(crc, payload)
+            pieces: Sequence[bytes | memoryview] = [head, payload]
+            while pieces:
+                pieces = _behind(pieces, os.writev(fd, pieces))
+            moved.append(entry._replace(offset=size + HEAD.size))
+            size += HEAD.size + entry.length
+        return crc, size, moved
+
+    # --- opening and closing ---------------------------------------------------------------------------
+
+    def _take_over(self, end: int | None) -> None:
+        """Go on with what another broker wrote; what is cut off is kept beside it."""
+        reader = JournalReader(self.path)
+        self.size = reader.end
+        for entry in reader:
+            if end is not None and reader.end > end:
+                break
+            offset = self.size + HEAD.size
+            self._entries.append(Located.of(entry, offset, reader.end - offset))
+            self._crc, self._number, self.size = reader.crc, max(self._number, entry.number), reader.end
+        if reader.size > self.size:
+            cut = self.path.with_name(self.path.name + CUT_SUFFIX)
+            try:
+                with self.path.open("rb") as file:
+                    file.seek(self.size)
+                    rest = file.read()
+                if any(rest):
+                    cut.write_bytes(rest)
+                os.truncate(self.path, self.size)
+            except OSError as error:
+                raise self._failed(error) from error
+
+    def _failed(self, error: OSError) -> RunError:
+        return RunError(f"cannot write the journal {self.path}: {error.strerror}")
 
     def close(self) -> None:
         """Close the file."""
@@ -131,46 +297,3 @@ def _behind(pieces: Sequence[bytes | memoryview], written: int) -> list[bytes | 
             left.append(memoryview(piece)[written:])
         written = max(0, written - len(piece))
     return left
-
-
-def mend_journal(path: Path) -> None:
-    """Cut off an entry that was not written whole, so that others can follow.
-
-    Raises `RecordingError` naming the place of what is no entry.
-    """
-    if not path.exists():
-        return
-    whole = 0
-    with path.open("rb") as file:
-        unpacker = msgpack.Unpacker(file, max_buffer_size=0)
-        while True:
-            try:
-                unpacker.skip()
-            except msgpack.OutOfData:
-                break
-            except (ValueError, msgpack.UnpackException) as error:
-                raise RecordingError(f"{path}: no entry of a journal at byte {whole}: {error}") from error
-            whole = unpacker.tell()
-    os.truncate(path, whole)
-
-
-def read_journal(path: Path) -> Iterator[JournalEntry]:
-    """The entries of a journal, in the order in which they were written.
-
-    An entry that is cut off at the end, as a crash in the middle of writing leaves it, ends the
-    sequence. Raises `RecordingError` naming the place of what is no entry.
-    """
-    try:
-        file = path.open("rb")
-    except OSError as error:
-        raise RecordingError(f"cannot read the journal {path}: {error.strerror}") from error
-    with file:
-        unpacker = msgpack.Unpacker(file, max_buffer_size=0)
-        while True:
-            place = unpacker.tell()
-            try:
-                yield msgspec.convert(unpacker.unpack(), JournalEntry)
-            except msgpack.OutOfData:
-                return
-            except (ValueError, msgpack.UnpackException) as error:
-                raise RecordingError(f"{path}: no entry of a journal at byte {place}: {error}") from error

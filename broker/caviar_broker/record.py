@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import hashlib
+import re
 from pathlib import Path
 
 import msgspec
 
+from caviar_protocol.durability import replace_file
 from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.tables import Source
 
 NAME = "run.json"
+_UNSET = "0" * 64
+_CHECK = re.compile(rb'\n "check": "([0-9a-f]{64})"\n}\n$')
+"""The last line of the file."""
 
 
 class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """``run.json``: who runs what, where."""
+    """``run.json``: who runs what, where, and with which code."""
 
     run: str
     epoch: int
@@ -23,26 +29,29 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     """Where that broker listened."""
     scenario: Scenario
     """As resolved, with the command line's values and absolute paths."""
+    versions: dict[str, str] = {}
+    """Of all that the results depend on, as `caviar_broker.versions.versions_of` finds them."""
+    check: str = _UNSET
+    """SHA-256 of the file with zeros in this place."""
 
     def save(self, directory: Path) -> None:
-        """Write it, in one step. `RunError` naming the file where that fails."""
+        """Write it, in one step and to the disk. `RunError` naming the file where that fails."""
         path = directory / NAME
-        plain = msgspec.structs.replace(
-            self, scenario=msgspec.structs.replace(self.scenario, source=Source())
-        )
-        partial = path.with_suffix(".partial")
+        source_left_out = msgspec.structs.replace(self.scenario, source=Source())
+        plain = msgspec.structs.replace(self, scenario=source_left_out, check=_UNSET)
+        data = msgspec.json.format(msgspec.json.encode(plain), indent=1) + b"\n"
+        check = hashlib.sha256(data).hexdigest()
         try:
-            partial.write_bytes(msgspec.json.format(msgspec.json.encode(plain), indent=1) + b"\n")
-            partial.replace(path)
+            replace_file(path, data.replace(_UNSET.encode(), check.encode()))
         except OSError as error:
             raise RunError(f"cannot write {path}: {error.strerror}") from error
 
 
 def read_record(directory: Path) -> RunRecord:
-    """The record of a run. `RecordingError` naming the file where it is none."""
+    """The record of a run. `RecordingError` naming the file where it is none, or not as it was written."""
     path = directory / NAME
     try:
-        return msgspec.json.decode(path.read_bytes(), type=RunRecord)
+        data = path.read_bytes()
     except OSError as error:
         if (directory / "journal.msgpack").exists():
             raise RecordingError(
@@ -52,5 +61,17 @@ def read_record(directory: Path) -> RunRecord:
         raise RecordingError(
             f"cannot go on with {directory}: {path}: {error.strerror}; give the directory of a run"
         ) from error
+    found = _CHECK.search(data)
+    if found is None or hashlib.sha256(_blanked(data, found)).hexdigest() != found[1].decode():
+        why = "it is empty" if not data.strip(b"\0") else "its content is not that of its SHA-256"
+        if found is None and b'"scenario"' in data and b'"check"' not in data:
+            why = "it has no check value; a run that another version began is gone on with by that version"
+        raise RecordingError(f"cannot go on with {directory}: {path} is damaged: {why}")
+    try:
+        return msgspec.json.decode(data, type=RunRecord)
     except msgspec.MsgspecError as error:
         raise RecordingError(f"cannot go on with {directory}: {path} is damaged: {error}") from error
+
+
+def _blanked(data: bytes, found: re.Match[bytes]) -> bytes:
+    return data[: found.start(1)] + _UNSET.encode() + data[found.end(1) :]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,9 @@ from caviar_broker.core.events import Product
 from caviar_broker.core.resumption import Resumption
 from caviar_broker.core.tasks import Decision, Task
 from caviar_broker.core.transitions import TaskState
-from caviar_broker.journal import JournalEntry, read_journal
-from caviar_protocol.digest import RunDigest
+from caviar_broker.journal_format import JournalEntry, JournalReader
+from caviar_protocol.digest import RunDigest, payload_digest
+from caviar_protocol.errors import RecordingError
 from caviar_protocol.messages import GrantInput, Status
 
 _STATES = {
@@ -23,24 +25,62 @@ _STATES = {
 }
 
 
-def read_resumption(journal: Path, checkpoints: CheckpointFiles) -> Resumption | None:
-    """The run up to the last frame that was finished; None where no episode had begun.
+@dataclass(frozen=True)
+class Left:
+    """What another broker left of a run."""
 
-    Raises `RecordingError` naming what cannot be read.
+    resumption: Resumption | None
+    """None where no episode had begun."""
+    end: int | None
+    """Where the journal goes on [B]; None: where its log ends."""
+    losses: tuple[str, ...]
+    """What is lost, a line each."""
+
+
+def read_resumption(
+    journal: Path, checkpoints: CheckpointFiles, recorded: tuple[int, int] | None = None
+) -> Left:
+    """The run up to the last frame that was finished and, where there is a recording, is in it.
+
+    Parameters
+    ----------
+    journal, checkpoints
+        Files of the run.
+    recorded
+        Last episode in the recording, and how many of its frames are; None: nothing is known of one.
+
+    Raises `RecordingError` naming what cannot be read, or what would be needed and is gone.
     """
-    found = _Reader()
-    for entry in read_journal(journal):
+    reader, found = JournalReader(journal), _Reader(checkpoints, recorded)
+    end = reader.end
+    for entry in reader:
+        if recorded is not None and entry.outcome == "episode" and entry.episode > recorded[0]:
+            found.is_cut = True  # what the recording lacks will be decided anew
+            break
         found.take(entry)
-    return found.resumption(checkpoints)
+        end = reader.end
+    resumption = found.resumption()
+    losses = []
+    at = f"episode {resumption.episode}, frame {resumption.finished}" if resumption else "the first frame"
+    if reader.problem:
+        losses.append(f"{reader.problem}; {reader.lost} B behind it are lost, and the run goes on with {at}")
+    if found.is_cut:
+        losses.append(f"the recording ends before {at}, later frames of the journal are run again")
+    return Left(resumption, end, tuple(losses))
 
 
 class _Reader:
     """Takes the entries of a journal in order, and keeps of them what may be needed."""
 
-    def __init__(self) -> None:
+    def __init__(self, checkpoints: CheckpointFiles, recorded: tuple[int, int] | None) -> None:
+        self._checkpoints, self._recorded = checkpoints, recorded
+        self.is_cut = False
+        """Whether the journal has finished frames that the recording lacks."""
         self._digest = RunDigest()
         self._entries = 0
         self._finished_before = 0
+        self._complete_from = -1
+        """Frame from which the journal has all entries."""
         self._begin: JournalEntry | None = None
         self._clear()
 
@@ -51,8 +91,10 @@ class _Reader:
         """By (service, topic) and frame: those in the journal, and their entries."""
         self._answered: dict[str, dict[int, Mapping[str, str] | None]] = {}
         self._chosen: dict[str, dict[int, Mapping[str, str]]] = {}
-        self._states: dict[str, list[tuple[int, str]]] = {}
-        """Checkpoints by service: frame, file."""
+        self._states: dict[str, dict[int, JournalEntry]] = {}
+        """Checkpoints of each service by frame."""
+        self._contents: dict[str, bytes | None] = {}
+        """Of the files of states that were looked at; None where one is gone, or damaged."""
         self._ends: list[JournalEntry] = []
         """Frames in which agents ended the episode, or chose the next one's seed."""
 
@@ -62,16 +104,31 @@ class _Reader:
         match entry.outcome:
             case "episode":
                 self._finished_before += self._finished
-                self._begin = entry
+                self._begin, self._complete_from = entry, -1
                 self._clear()
+            case "snapshot":
+                self._open(entry)
             case "resumed":
                 self._forget(entry.frame)
             case "checkpoint":
-                self._states.setdefault(entry.service, []).append((entry.frame, entry.file))
+                self._states.setdefault(entry.service, {})[entry.frame] = entry
             case "end" | "seed":
                 self._ends.append(entry)
             case _:
                 self._decided(entry)
+
+    def _open(self, entry: JournalEntry) -> None:
+        """A compacted journal: the run up to a frame."""
+        if self._recorded is not None and self._recorded < (entry.episode, entry.frame):
+            raise RecordingError(
+                f"the recording has {self._recorded[1]} frames of episode {self._recorded[0]}, and the "
+                f"journal begins behind frame {entry.frame - 1} of episode {entry.episode}: what is "
+                "between is lost, and the run cannot go on"
+            )
+        self._begin, self._digest = entry, RunDigest(entry.digest)
+        self._clear()
+        self._finished, self._finished_before = entry.frame, entry.facts["finished_before"]
+        self._complete_from = entry.facts["base"]
 
     def _forget(self, frame: int) -> None:
         """The run went on with this frame: what had been decided from there on does not count."""
@@ -80,12 +137,11 @@ class _Reader:
             *self._products.values(),
             *self._answered.values(),
             *self._chosen.values(),
+            *self._states.values(),
         ]
         for table in tables:
             for late in [number for number in table if number >= frame]:
                 del table[late]
-        for states in self._states.values():
-            states[:] = [state for state in states if state[0] < frame]
         self._ends = [entry for entry in self._ends if entry.frame < frame]
 
     # --- decisions -----------------------------------------------------------------------------------
@@ -93,6 +149,11 @@ class _Reader:
     def _decided(self, entry: JournalEntry) -> None:
         told = {decision.topic: decision for decision in entry.decisions}
         for topic, header, body in entry.products:
+            if payload_digest(header, body) != told[topic].digest:
+                raise RecordingError(
+                    f"{topic} of {entry.service!r} in frame {told[topic].frame} is not the one whose "
+                    "digest the journal has: it cannot be granted again, and the run cannot go on"
+                )
             product = _product(entry.service, told[topic], (header, body))
             self._products.setdefault((entry.service, topic), {})[product.frame] = product, entry.number
         if entry.outcome in ("done", "late"):
@@ -121,6 +182,9 @@ class _Reader:
             frame = [self._tasks.get(name, {}).get(self._finished) for name in begin.members]
             decided = [task for task in frame if task is not None]
             if len(decided) < len(frame):
+                return
+            if self._recorded is not None and (begin.episode, self._finished) >= self._recorded:
+                self.is_cut = True
                 return
             fresh = [
                 (topic, task.service, decision.product.digest)
@@ -156,13 +220,24 @@ class _Reader:
                 for old in [number for number in of_frames if number <= base]:
                     del of_frames[old]
 
-    def _base(self, states: list[tuple[int, str]]) -> tuple[int, str]:
-        """The newest checkpoint of a finished frame."""
-        return max((state for state in states if state[0] < self._finished), default=(-1, ""))
+    def _base(self, states: dict[int, JournalEntry]) -> tuple[int, bytes | None]:
+        """Frame and content of the newest usable state of a finished frame; −1 where there is none."""
+        for frame in sorted((f for f in states if 0 <= f < self._finished), reverse=True):
+            state = self._content(states[frame])
+            if state is not None:
+                return frame, state
+            del states[frame]  # it was removed behind a newer one, or is damaged
+        return -1, None
+
+    def _content(self, saved: JournalEntry) -> bytes | None:
+        if saved.file not in self._contents:
+            state = self._checkpoints.known(saved.service, saved.file, saved.digest)
+            self._contents[saved.file] = state
+        return self._contents[saved.file]
 
     # --- the outcome ---------------------------------------------------------------------------------
 
-    def resumption(self, checkpoints: CheckpointFiles) -> Resumption | None:
+    def resumption(self) -> Resumption | None:
         """All that was taken."""
         begin, finished = self._begin, self._finished
         if begin is None:
@@ -172,11 +247,14 @@ class _Reader:
             frames = [number for number in products if number < finished]
             if frames:
                 newest[key] = products[max(frames)]
-        states = {}
-        for name, saved in self._states.items():
-            frame, file = self._base(saved)
-            states[name] = frame, checkpoints.known(name, begin.episode, frame) if file else None
-        checkpoints.finished = begin.episode, finished - 1
+        states = {name: self._base(saved) for name, saved in self._states.items()}
+        for name, (frame, _) in states.items():
+            if frame < self._complete_from:
+                raise RecordingError(
+                    f"the states of {name!r} in checkpoints/ are gone or damaged, from frame "
+                    f"{self._complete_from} of episode {begin.episode} on: the run cannot go on"
+                )
+        self._checkpoints.finished = begin.episode, finished - 1
         wishes = [e for e in self._ends if e.outcome == "seed" and e.frame < finished]
         return Resumption(
             episode=begin.episode,

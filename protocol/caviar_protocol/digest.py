@@ -38,8 +38,9 @@ class RunDigest:
     numbers and raw digests, frames in order, within a frame sorted by (topic, source).
     """
 
-    def __init__(self) -> None:
-        self._state = hashlib.sha256(b"caviar-run-1").digest()
+    def __init__(self, begun: str = "") -> None:
+        """Begin a chain, or go on behind the digest ``begun``."""
+        self._state = bytes.fromhex(begun) or hashlib.sha256(b"caviar-run-1").digest()
         self._waiting: list[tuple[int, int, list[tuple[str, str, str]]]] = []
 
     def add_frame(self, episode: int, frame: int, products: Iterable[tuple[str, str, str]]) -> None:

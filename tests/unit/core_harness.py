@@ -24,6 +24,7 @@ from caviar_broker.core.resumption import Resumption
 from caviar_broker.core.transitions import RunState
 from caviar_broker.journal import JournalFile
 from caviar_protocol import messages as m
+from caviar_protocol.digest import payload_digest
 
 MS = 1_000_000
 SECOND = 1000 * MS
@@ -125,10 +126,9 @@ def loop(**overrides: Mapping[str, Any]) -> list[Sim]:
     return [make(**overrides.get(name, {})) for name, make in makers.items()]
 
 
-def product_digest(source: str, topic: str, episode: int, frame: int, inputs: Iterable[m.GrantInput]) -> str:
-    """What a deterministic service makes of its inputs."""
-    said = f"{source} {topic} {episode} {frame} {[(i.topic, i.source, i.digest) for i in inputs]}"
-    return hashlib.sha256(said.encode()).hexdigest()
+def product_of(source: str, topic: str, episode: int, frame: int, inputs: Iterable[m.GrantInput]) -> bytes:
+    """What a deterministic service makes of its inputs: the header of a product without arrays."""
+    return f"{source} {topic} {episode} {frame} {[(i.topic, i.source, i.digest) for i in inputs]}".encode()
 
 
 class Simulation:
@@ -339,11 +339,10 @@ class Simulation:
             self.states[name] = hashlib.sha256(text.encode()).hexdigest()
             said = [m.GrantInput(topic="", source=self.states[name], status=m.Status.ABSENT)]
         topics = () if grant.final or at in sim.omits else sim.outputs
-        headers = tuple(m.ProductHeader(topic=t, digest=product_digest(name, t, *at, said)) for t in topics)
+        made = {t: product_of(name, t, *at, said) for t in topics}
+        headers = tuple(m.ProductHeader(topic=t, digest=payload_digest(h, b"")) for t, h in made.items())
         fields = {"products": headers, "end_episode": at in sim.ends, **sim.report(*at)} | ids
-        self.feed(
-            ev.DoneReceived(name, m.Done(**fields), tuple((f"{name} {t} {at}".encode(), b"") for t in topics))
-        )
+        self.feed(ev.DoneReceived(name, m.Done(**fields), tuple((header, b"") for header in made.values())))
 
     def kill(self, name: str, verdict: str = "exit status 1") -> None:
         self.alive.discard(name)

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import random
 from collections.abc import Sequence
 from pathlib import Path
 
+import msgspec
 import pytest
 import zmq
 from msgspec.structs import replace
 
 from caviar_broker.core.events import Journal, Product
-from caviar_broker.journal import JournalFile, read_journal
+from caviar_broker.journal import JournalFile
+from caviar_broker.journal_format import MAGIC, JournalReader, read_journal
 from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.messages import GrantInput, Status
 
@@ -91,14 +95,68 @@ def test_wherever_it_is_cut_off_the_whole_entries_before_are_read(path: Path) ->
     assert set(ends) <= {47, 48, 49}
 
 
-def test_what_is_no_entry_is_named_with_its_place(path: Path) -> None:
+@pytest.mark.parametrize(
+    "junk", [b"\0" * 3600, b"\x93\x01\x02\x03", b"\xff" * 100], ids=["zeros", "list", "ones"]
+)
+def test_what_is_no_entry_ends_the_log_and_is_named_with_its_place(path: Path, junk: bytes) -> None:
     size = path.stat().st_size
     with path.open("ab") as file:
-        file.write(b"\x93\x01\x02\x03")
-    with pytest.raises(RecordingError, match=f"no entry of a journal at byte {size}"):
-        list(read_journal(path))
+        file.write(junk)
+    reader = JournalReader(path)
+    assert [entry.number for entry in reader] == list(range(1, 51))
+    assert f"the entry at byte {size} is" in reader.problem
+    assert reader.lost == len(junk)
     with pytest.raises(RecordingError, match="No such file"):
         list(read_journal(path.with_name("other")))
+
+
+def test_no_bit_that_flips_goes_unnoticed(path: Path) -> None:
+    """500 of them, anywhere; what is before it is read as it was."""
+    data = bytearray(path.read_bytes())
+    whole = list(read_journal(path))
+    rng = random.Random(1)
+    for bit in rng.sample(range(len(data) * 8), 500):
+        data[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(data)
+        reader = JournalReader(path)
+        found = list(reader)
+        assert reader.problem, f"bit {bit} was flipped, and nothing is said"
+        assert found == whole[: len(found)]
+        assert reader.end <= bit // 8 < reader.size
+        data[bit // 8] ^= 1 << bit % 8
+
+
+@pytest.mark.parametrize("lost", [0, 1, 20, 48])
+def test_an_entry_that_is_lost_or_out_of_its_place_ends_the_log(path: Path, lost: int) -> None:
+    reader, ends = JournalReader(path), [len(MAGIC)]
+    for _ in reader:
+        ends.append(reader.end)
+    data = path.read_bytes()
+    path.write_bytes(data[: ends[lost]] + data[ends[lost + 1] :])
+    again = JournalReader(path)
+    assert len(list(again)) == lost
+    assert "damaged" in again.problem
+
+
+def test_a_journal_without_checksums_is_refused_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "journal.msgpack"
+    path.write_bytes(msgspec.msgpack.encode({"number": 1, "epoch": 1, "episode": 0, "frame": 0}))
+    with pytest.raises(RecordingError, match="without checksums, of a version before this one"):
+        JournalReader(path)
+
+
+def test_what_is_cut_off_a_damaged_journal_is_kept_beside_it(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    whole = list(read_journal(path))
+    journal = JournalFile(path, epoch=4)
+    journal.write([entry(51)])
+    journal.close()
+    assert list(read_journal(path))[:-1] == whole
+    cut = path.with_name("journal.msgpack.cut").read_bytes()
+    assert data.endswith(cut)
+    assert len(data) - len(cut) < len(data) // 2
 
 
 def test_an_entry_is_with_the_system_when_write_returns(tmp_path: Path) -> None:
@@ -111,10 +169,29 @@ def test_an_entry_is_with_the_system_when_write_returns(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_is_an_error_that_names_the_file() -> None:
-    journal = JournalFile(Path("/dev/full"), epoch=1)
     with pytest.raises(RunError, match="cannot write the journal /dev/full: No space left"):
-        journal.write([entry(1)])
+        JournalFile(Path("/dev/full"), epoch=1)
+
+
+def test_an_entry_that_the_system_takes_in_part_is_not_in_the_journal(
+    monkeypatch: pytest.MonkeyPatch, path: Path
+) -> None:
+    """What is written when there is room again can be read."""
+    whole = os.writev
+
+    def partly(fd: int, pieces: Sequence[bytes]) -> int:
+        if len(pieces[0]) < 1000:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return whole(fd, [bytes(pieces[0][:700])])
+
+    journal = JournalFile(path, epoch=4)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "writev", partly)
+        with pytest.raises(RunError, match="No space left"):
+            journal.write([entry(51, b"x" * 1000)])
+    journal.write([entry(52)])
     journal.close()
+    assert [e.number for e in read_journal(path)] == [*range(1, 51), 52]
 
 
 def test_a_journal_that_cannot_be_opened_is_an_error_that_names_it(tmp_path: Path) -> None:

@@ -14,7 +14,8 @@ from caviar_broker.checkpoints import CheckpointFiles
 from caviar_broker.core import events as ev
 from caviar_broker.core.plan import Limits
 from caviar_broker.core.resumption import Resumption
-from caviar_broker.journal import JournalFile, mend_journal, read_journal
+from caviar_broker.journal import JournalFile
+from caviar_broker.journal_format import read_journal
 from caviar_broker.resume import read_resumption
 from caviar_protocol import messages as m
 from caviar_protocol.digest import RunDigest
@@ -49,8 +50,7 @@ class Runs:
         path = self.folder / "journal.msgpack"
         before: Resumption | None = None
         if self.epoch > 1:
-            mend_journal(path)
-            before = read_resumption(path, files)
+            before = read_resumption(path, files).resumption
         with closing(JournalFile(path, self.epoch, files)) as journal:
             settings = {"journal": journal, "resumption": before, "epoch": self.epoch, "strict": False}
             run = Simulation(loop(**self.services), **settings, **self.plan).join()
@@ -141,7 +141,7 @@ def test_services_that_come_back_while_a_resumed_run_goes_on_are_restored_too(tm
     runs.go(50 * MS)
     files = CheckpointFiles(tmp_path)
     path = tmp_path / "journal.msgpack"
-    before = read_resumption(path, files)
+    before = read_resumption(path, files).resumption
     with closing(JournalFile(path, 2, files)) as journal:
         run = Simulation(
             loop(**STATEFUL), journal=journal, resumption=before, epoch=2, strict=False, **runs.plan
@@ -168,7 +168,7 @@ def test_what_a_broker_decided_anew_counts_and_not_what_the_one_before_had_decid
         journal.write([entry(1, "episode", facts=facts, members=("a", "b")), entry(2, "done", "a", "before")])
         journal.write([entry(3, "resumed", facts=facts), entry(4, "done", "b", "b")])
         journal.write([entry(5, "done", "a", "anew")])
-    found = read_resumption(path, CheckpointFiles(tmp_path))
+    found = read_resumption(path, CheckpointFiles(tmp_path)).resumption
     expected = RunDigest()
     said = {"a": "anew", "b": "b"}
     products = [("lidar", name, hashlib.sha256(text.encode()).hexdigest()) for name, text in said.items()]

@@ -9,7 +9,8 @@ from typing import Any
 from broker_harness import PAIR, Client, eventually, finishes_well, plan, play_to_the_end, playing, serving
 
 from caviar_broker.core.events import Journal
-from caviar_broker.journal import JournalFile, read_journal
+from caviar_broker.journal import JournalFile
+from caviar_broker.journal_format import read_journal
 from caviar_protocol import messages as m
 from caviar_protocol.codec import decode_message
 from caviar_protocol.errors import RunError

@@ -25,7 +25,7 @@ from caviar_broker.core.liveness import Liveness
 from caviar_broker.core.memory import Weigh
 from caviar_broker.core.peers import Peer
 from caviar_broker.core.plan import RunPlan
-from caviar_broker.core.resumption import Resumption
+from caviar_broker.core.resumption import Resumption, Snapshot
 from caviar_broker.core.run import Run
 from caviar_broker.core.transitions import RunState, ServiceState
 from caviar_broker.core.view import RunView, look
@@ -165,6 +165,22 @@ class FrameClock:
         """Frames of the present episode that are finished; 0 between episodes."""
         schedule = self._episodes.schedule
         return 0 if schedule is None else schedule.finished_frames
+
+    def snapshot(self) -> Snapshot | None:
+        """The run up to its last finished frame; None between episodes. Actions that wait come later."""
+        run, schedule = self._run, self._episodes.schedule
+        if schedule is None:
+            return None
+        return Snapshot(
+            episode=run.episode,
+            finished=schedule.finished_frames,
+            finished_before=run.finished_before,
+            digest=run.digest.hexdigest(),
+            seed=run.seed,
+            seed_episode=run.seed_episode,
+            frames=schedule.frames,
+            members=schedule.graph.order,
+        )
 
     @property
     def waits_for_journal(self) -> bool:

@@ -110,6 +110,7 @@ class Episodes:
         run = self._run
         self.close(now)
         run.actions.append(ev.EpisodeFinished(run.episode, schedule.frames))
+        run.finished_before += schedule.frames
         for peer in self._members():
             if peer.state in (ServiceState.ACTIVE, ServiceState.RESETTING, ServiceState.RESTORING):
                 peer.move(ServiceEvent.EPISODE_END, now)

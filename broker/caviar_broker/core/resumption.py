@@ -22,6 +22,26 @@ from caviar_protocol.digest import RunDigest
 
 
 @dataclass(frozen=True, kw_only=True)
+class Snapshot:
+    """A run up to a finished frame, as a compacted journal opens with it."""
+
+    episode: int
+    finished: int
+    """Frames of the episode that are finished."""
+    finished_before: int
+    """Frames of the episodes before."""
+    digest: str
+    """Of all finished frames."""
+    seed: int
+    """Of the episode."""
+    seed_episode: int
+    frames: int
+    """Of the episode."""
+    members: tuple[str, ...]
+    """Services of the run."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Resumption:
     """A run up to a frame."""
 

@@ -37,6 +37,8 @@ class Run:
         self._wished: tuple[int, Peer] | None = None
         """Seed of the next episode, and the agent that chose it."""
         self.digest = RunDigest()
+        self.finished_before = 0
+        """Frames of the episodes that are over."""
         self.gate = Gate()
         self.ledger = Ledger(kept=not plan.ephemeral)
         self.over = False
@@ -49,7 +51,7 @@ class Run:
 
     def _take_over(self, before: Resumption) -> None:
         self.episode, self.seed, self.seed_episode = before.episode, before.seed, before.seed_episode
-        self.digest = before.digest
+        self.digest, self.finished_before = before.digest, before.finished_before
         self.ledger.last = self.ledger.written = before.entries
         if before.wish is not None:
             self._wished = before.wish[0], self.peers[before.wish[1]]

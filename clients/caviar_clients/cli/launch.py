@@ -50,6 +50,8 @@ class Launcher:
     """``HOST:PORT`` at which the broker has HTTP served; "" for none."""
     resume: bool = False
     """Whether to go on with the run in the directory, whatever ``path``, ``frames`` and ``seed`` say."""
+    force: bool = False
+    """Whether to do so though code, libraries or files have changed."""
     pace: str | None = None
     endpoint: str = ""
     _key: BorrowedKey = field(init=False)
@@ -131,7 +133,7 @@ class Launcher:
     def _broker_arguments(self) -> list[str]:
         if self.resume:
             bind = ["--bind", self.bind] if self.bind else []
-            return ["--resume", str(self.directory), *bind]
+            return ["--resume", str(self.directory), *bind, *["--force"] * self.force]
         arguments = [str(self.path), "--bind", self.bind, "--directory", str(self.directory)]
         if self.frames is not None:
             arguments += ["--frames", str(self.frames)]

@@ -13,6 +13,7 @@ from rich.text import Text
 from caviar_clients.cli import bench
 from caviar_clients.cli.keys import app as keys
 from caviar_clients.cli.options import (
+    Force,
     Frames,
     Http,
     Keys,
@@ -62,6 +63,7 @@ def run(
     keys: Keys = None,
     http: Http = "",
     resume: Resume = None,
+    force: Force = False,
 ) -> None:
     """Run a scenario: the broker and every service as processes of their own, or all in this one."""
     from caviar_clients.cli.run import resume_run, run_scenario
@@ -69,7 +71,7 @@ def run(
     if resume is not None:
         _nothing_else(scenario, frames, seed, embedded or None, pace)
         bind = "" if bind == ANY_PORT else bind
-        raise typer.Exit(resume_run(resume, _console, json, bind, keys, http))
+        raise typer.Exit(resume_run(resume, _console, json, bind, keys, http, force=force))
     if scenario is None:
         raise RunError("give a scenario file, or --resume with the directory of a run")
     raise typer.Exit(
@@ -91,6 +93,7 @@ def broker(
     keys: Keys = None,
     http: Http = "",
     resume: Resume = None,
+    force: Force = False,
     restarted: Restarted = False,
 ) -> None:
     """Run only the broker; start the services with `caviar service`, here or on other machines."""
@@ -103,6 +106,7 @@ def broker(
 
     options = ["--bind", bind] + (["--keys", str(keys)] if keys else []) + ["--restarted"] * restarted
     options += ["--http", http] if http else []
+    options += ["--force"] if force else []
     if resume is not None:
         _nothing_else(scenario, frames, seed, pace)
         raise typer.Exit(serve(parser().parse_args(["--resume", str(resume), *options])))

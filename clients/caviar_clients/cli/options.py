@@ -18,6 +18,9 @@ Keys = Annotated[
 ]
 Http = Annotated[str, typer.Option(help="HOST:PORT: serve status, orders and WebSocket there")]
 Resume = Annotated[Path | None, typer.Option(help="go on with the run in this directory, whose broker died")]
+Force = Annotated[
+    bool, typer.Option("--force", help="with --resume: though code, libraries or files have changed")
+]
 ScenarioOrNone = Annotated[Path | None, typer.Argument(help="scenario file (TOML)", show_default=False)]
 Restarted = Annotated[
     bool,

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from caviar_broker.record import NAME as RECORD
+from caviar_protocol.durability import replace_file
 from caviar_protocol.errors import RunError
 
 
@@ -29,10 +30,8 @@ class RunInProgress:
 
     def serve(self, directory: Path, serve: Callable[[], int]) -> int:
         """Serve a run to its end, whatever that is; the exit status of ``serve``."""
-        partial = self._file.with_suffix(".partial")
         try:
-            partial.write_text(f"{directory.name}\n")
-            partial.replace(self._file)
+            replace_file(self._file, f"{directory.name}\n".encode())
         except OSError as error:
             raise RunError(f"cannot write {self._file}: {error.strerror}; choose another --out") from error
         try:

@@ -96,6 +96,8 @@ def resume_run(
     bind: str = "",
     keys: Path | None = None,
     http: str = "",
+    *,
+    force: bool = False,
 ) -> int:
     """Go on with a run whose broker died; the exit status: 0 exactly if it came to its end."""
     scenario = read_record(directory).scenario
@@ -103,7 +105,7 @@ def resume_run(
         write_file(json_file)
     console.print(Text(f"run {directory}"), soft_wrap=True)
     launcher = Launcher(
-        scenario, directory, directory.resolve(), bind=bind, keys=keys, http=http, resume=True
+        scenario, directory, directory.resolve(), bind=bind, keys=keys, http=http, resume=True, force=force
     )
     return _follow(launcher, scenario, directory, console, json_file, keys)
 

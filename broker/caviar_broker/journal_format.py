@@ -1,0 +1,147 @@
+"""The bytes of a journal: entries with a checksum each, chained, so that the log ends at the first bad one.
+
+A journal begins with `MAGIC`. An entry is its length [B] (8 bytes, little-endian), a CRC-32 (4 bytes) and a
+msgpack map, `JournalEntry`. The CRC covers length and map, and starts from the CRC of the entry before (the
+first one's from that of `MAGIC`). So an entry that is changed, cut off, missing or out of its place ends the
+log, and so do zeros, which a file system may leave at the end of a file after a loss of power.
+"""
+
+from __future__ import annotations
+
+import mmap
+import struct
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+
+from caviar_protocol.errors import RecordingError
+from caviar_protocol.messages import GrantInput
+
+MAGIC = b"CAVIAR journal 2\n"
+HEAD = struct.Struct("<QI")
+"""Length and CRC-32 of an entry."""
+MAGIC_CRC = zlib.crc32(MAGIC)
+
+
+class JournalEntry(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """One entry of the journal: what became of one service's part of one frame, or a turn of the run;
+    see `caviar_broker.core.events.Journal`.
+
+    ``snapshot`` opens a compacted journal: the run up to ``frame``. Entries of earlier frames behind it are
+    those that a grant may still need.
+    """
+
+    number: int
+    epoch: int
+    episode: int
+    frame: int
+    service: str
+    outcome: str
+    decisions: tuple[GrantInput, ...] = ()
+    chosen: dict[str, str] = {}
+    """Decisions that the service took."""
+    facts: dict[str, int] = {}
+    members: tuple[str, ...] = ()
+    file: str = ""
+    """Of the service's state, in ``checkpoints/``."""
+    digest: str = ""
+    """SHA-256 of that state; of a snapshot, the digest of the run."""
+    products: tuple[tuple[str, bytes, bytes], ...] = ()
+    """(topic, payload header, body) of products that a later frame may consume, or a service that
+    comes back (clause 18). Last, so that the body of the last one ends the entry: it is written from where
+    it lies."""
+
+
+class JournalReader:
+    """The whole entries of a journal, in the order in which they were written.
+
+    ``problem`` says why the log ends before the file does; it is empty where it does not.
+
+    Raises `RecordingError` where the file cannot be read or is a journal of another format.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.problem = ""
+        self._data = _mapped(path)
+        self.size = len(self._data)
+        """Of the file [B]."""
+        self.end, self.crc = 0, MAGIC_CRC
+        """Behind the last whole entry [B], and its CRC."""
+        self.is_blank = not any(self._data[: len(MAGIC)])
+        """Whether the file was made and nothing of it reached the disk."""
+        if self._data[: len(MAGIC)] == MAGIC:
+            self.end = len(MAGIC)
+        elif self.size and (self._data[0] & 0xF0 == 0x80 or self._data[0] == 0xDE):
+            raise RecordingError(
+                f"{path} is a journal without checksums, of a version before this one: "
+                "go on with that run with the version that began it"
+            )
+        elif self.size:
+            self.problem = f"{path}: it does not begin as a journal"
+
+    @property
+    def lost(self) -> int:
+        """Bytes behind the end of the log."""
+        return self.size - self.end
+
+    def __iter__(self) -> Iterator[JournalEntry]:
+        decoder = msgspec.msgpack.Decoder(JournalEntry)
+        for payload in self.payloads():
+            try:
+                entry = decoder.decode(payload)
+            except msgspec.MsgspecError as error:
+                # Its CRC is right: not damage, but another program.
+                place = f"before byte {self.end}"
+                raise RecordingError(f"{self.path}: the entry {place} is none: {error}") from error
+            yield entry
+
+    def payloads(self) -> Iterator[memoryview]:
+        """The bytes of the entries, each with `end` behind it."""
+        while self.end >= len(MAGIC) and self.end < self.size:
+            start = self.end + HEAD.size
+            if start > self.size:
+                self.problem = f"{self.path}: the entry at byte {self.end} is cut off"
+                return
+            length, crc = HEAD.unpack_from(self._data, self.end)
+            if length > self.size - start:
+                self.problem = f"{self.path}: the entry at byte {self.end} is cut off or damaged"
+                return
+            payload = self._data[start : start + length]
+            if checksum(self.crc, length, payload) != crc:
+                self.problem = f"{self.path}: the entry at byte {self.end} is damaged, its CRC-32 differs"
+                return
+            self.end, self.crc = start + length, crc
+            yield payload
+
+
+def checksum(before: int, length: int, payload: bytes | memoryview) -> int:
+    """CRC-32 of an entry behind the one with the CRC ``before``."""
+    return zlib.crc32(payload, zlib.crc32(length.to_bytes(8, "little"), before))
+
+
+def framed(before: int, payload: bytes | memoryview) -> tuple[bytes, int]:
+    """The head of an entry, and its CRC."""
+    crc = checksum(before, len(payload), payload)
+    return HEAD.pack(len(payload), crc), crc
+
+
+def read_journal(path: Path) -> Iterator[JournalEntry]:
+    """The entries of a journal up to its end, or to the first that is damaged.
+
+    Raises `RecordingError` like `JournalReader`.
+    """
+    return iter(JournalReader(path))
+
+
+def _mapped(path: Path) -> memoryview:
+    try:
+        with path.open("rb") as file:
+            if not file.seek(0, 2):
+                return memoryview(b"")
+            return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise RecordingError(f"cannot read the journal {path}: {reason}") from error
