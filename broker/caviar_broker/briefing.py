@@ -9,15 +9,16 @@ from typing import Any
 import msgspec
 
 from caviar_protocol.scenario import Scenario, ServiceSpec
-from caviar_protocol.scenario_checks import devices_of, resolved
+from caviar_protocol.scenario_checks import resolved, world_of
 
 
 def briefings(scenario: Scenario, directory: Path) -> dict[str, dict[str, Any]]:
     """By service: carriers, devices, timing, and for the recorder where to write what.
 
-    Worlds are told the devices that they publish, everybody else all of them.
+    Worlds are told the devices that they publish, all other services all of them, with their worlds.
     """
     plain = resolved(scenario)
+    devices = [device | {"world": world_of(scenario, index)} for index, device in enumerate(plain["devices"])]
     common = {
         "carriers": plain["carriers"],
         "sampling_period_ns": scenario.run.sampling_period_ns,
@@ -26,10 +27,9 @@ def briefings(scenario: Scenario, directory: Path) -> dict[str, dict[str, Any]]:
     }
     told = {}
     for name, spec in scenario.services.items():
-        told[name] = common | {"devices": plain["devices"]}
+        told[name] = common | {"devices": devices}
         if spec.role == "world":
-            own = {device.name for device in devices_of(scenario, name)}
-            told[name]["devices"] = [d for d in plain["devices"] if d["name"] in own]
+            told[name]["devices"] = [device for device in devices if device["world"] == name]
         if spec.role == "recorder":
             told[name] |= {"directory": str(directory), "resolved": plain}
     return told

@@ -19,7 +19,19 @@ import zmq
 ENDPOINT, NAME, FAULT = sys.argv[1:4]
 ROLE = sys.argv[4] if len(sys.argv) > 4 else "agent"
 MAX_HEADER = 1 << 20
-KNOWN = {"RESET", "GRANT", "PREPARE", "CANCEL", "EPISODE_END", "SHUTDOWN", "STALE", "ERROR", "ASSET_GET"}
+KNOWN = {
+    "CHECKPOINT",
+    "RESTORE",
+    "RESET",
+    "GRANT",
+    "PREPARE",
+    "CANCEL",
+    "EPISODE_END",
+    "SHUTDOWN",
+    "STALE",
+    "ERROR",
+    "ASSET_GET",
+}
 KNOWN_TO_BROKERS = {"HELLO", "READY", "RESET_DONE", "DONE", "FAULT", "BYE", "WELCOME", "REFUSE", "ASSET_DATA"}
 INPUTS = {
     "agent": [{"topic": "scene"}, {"topic": "link", "lag": 1, "required": False}],
@@ -87,6 +99,8 @@ class Client:
         self.broker.connect(ENDPOINT)
         self.who: dict[str, int] = {}
         self.episode, self.last, self.lived = -1, -1, 0
+        self.counted = 0
+        """Frames answered in this episode, on which products depend: its state."""
         self.stored: dict[int, list[bytes]] = {}
         self.queue: list[list[bytes]] = []
         self.heart: Beat | None = None
@@ -103,7 +117,7 @@ class Client:
             role="channel" if bad("has another role") else ROLE,
             **({"inputs": INPUTS[ROLE]} if INPUTS[ROLE] else {}),
             **({"outputs": outputs} if outputs else {}),
-            capabilities=["assets", "episodes"],
+            capabilities=["assets", "episodes", "checkpoint"],
             **({"implementation": ""} if bad("writes out a default") else {}),
             max_in_flight=4,
         )
@@ -226,7 +240,7 @@ class Client:
         self.say("ASSET_GET", digest=fields["digest"])
 
     def on_reset(self, fields: dict[str, Any], parts: list[bytes]) -> None:
-        self.episode, self.last, self.stored = fields["episode"], -1, {}
+        self.episode, self.last, self.stored, self.counted = fields["episode"], -1, {}, 0
         episode = 9 if bad("resets another episode") else self.episode
         if bad("stops beating in frames") and self.heart:
             self.heart.quiet = True
@@ -235,6 +249,22 @@ class Client:
     def on_cancel(self, fields: dict[str, Any], parts: list[bytes]) -> None:
         if bad("complains of CANCEL"):
             self.say("ERROR", code="unexpected", message="CANCEL")
+
+    def on_checkpoint(self, fields: dict[str, Any], parts: list[bytes]) -> None:
+        saved = {key: fields[key] for key in ("episode", "frame")}
+        if bad("saves the state of another frame"):
+            saved["frame"] += 1
+        if not bad("saves no state"):
+            self.say("CHECKPOINT_DONE", self.counted.to_bytes(8, "little"), **self.who, **saved)
+
+    def on_restore(self, fields: dict[str, Any], parts: list[bytes]) -> None:
+        if len(parts[1]) != 8 and not bad("takes any state"):
+            self.say("FAULT", **self.who, phase="restore", message="this is no state of mine")
+            return
+        if not bad("forgets its state"):
+            self.counted = int.from_bytes(parts[1][:8], "little")
+        if not bad("is not READY after RESTORE"):
+            self.say("READY", **self.who)
 
     def on_episode_end(self, fields: dict[str, Any], parts: list[bytes]) -> None:
         pass
@@ -281,7 +311,7 @@ class Client:
             self.broker.send_multipart(self.queue.pop())
 
     def answer(self, grant: dict[str, Any], parts: list[bytes]) -> list[bytes]:
-        self.lived += 1
+        self.lived, self.counted = self.lived + 1, self.counted + 1
         frame, episode = grant["frame"], self.episode
         done: dict[str, Any] = {"type": "DONE", **self.who, "episode": episode, "frame": frame}
         if bad("answers another frame"):
@@ -313,7 +343,7 @@ class Client:
     def product(self, frame: int) -> tuple[bytes, bytes]:
         if ROLE == "world":
             return self.scene()
-        beam = self.lived if bad("remembers the episode before") else frame % 4
+        beam = self.lived if bad("remembers the episode before") else self.counted % 4
         command: dict[str, Any] = {"type": "beam", "tx": "bs", "rx": "car.1/rx", "tx_beam": beam}
         if bad("writes out a default in a payload"):
             command["rx_beam"] = 0

@@ -26,6 +26,9 @@ from caviar_protocol.errors import RunError, SetupError
 ROOT = Path(__file__).resolve().parents[2]
 BROKEN = Path(__file__).with_name("broken_client.py")
 ANY = "tcp://127.0.0.1:0"
+FLIGHT = {
+    "flown": [{"name": "uav", "start_m": [1.0, 2.0, 3.0], "max_speed_m_s": 5.0, "max_acceleration_m_s2": 2.0}]
+}
 TRAJECTORY = tomllib.loads((ROOT / "deploy/caviar_scenarios/remote.toml").read_text())["services"]["world"]
 
 
@@ -49,9 +52,16 @@ RIGHT = {
 } | {
     use: (
         python("-m", "caviar_services", "{name}", "--use", use, "--broker", "{endpoint}"),
-        TRAJECTORY["settings"] if use == "world:trajectory" else {},
+        {"world:trajectory": TRAJECTORY["settings"], "world:flight": FLIGHT}.get(use, {}),
     )
-    for use in ("world:trajectory", "channel:free-space", "link:beams", "agent:los-beam", "recorder:mcap")
+    for use in (
+        "world:trajectory",
+        "world:flight",
+        "channel:free-space",
+        "link:beams",
+        "agent:los-beam",
+        "recorder:mcap",
+    )
 }
 
 
@@ -156,6 +166,9 @@ FAULTS: dict[str, tuple[str, ...]] = {
     "oversized": ("takes oversized headers",),
     "heartbeat-noise": ("stops beating at noise",),
     "complaints": ("answers complaints",),
+    "checkpoint": ("saves no state", "saves the state of another frame"),
+    "restore": ("forgets its state", "is not READY after RESTORE"),
+    "wrong-state": ("takes any state",),
     "shutdown": (
         "stays after SHUTDOWN",
         "leaves without BYE",

@@ -295,9 +295,11 @@ class _Bridge:
             self._sent = len(frame)
 
     def _read_welcome(self, header: memoryview) -> None:
-        message = decode_message(header)
-        if isinstance(message, m.Welcome):
-            self._welcome, self._awaits_welcome = message, False
+        """Learn epoch and attempt from WELCOME; what cannot be read here is the peer's to judge."""
+        with contextlib.suppress(ProtocolError):
+            message = decode_message(header)
+            if isinstance(message, m.Welcome):
+                self._welcome, self._awaits_welcome = message, False
 
     async def _watch_token(self) -> None:
         """A token that is revoked ends what came in with it."""

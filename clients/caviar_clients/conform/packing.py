@@ -19,3 +19,10 @@ def pack(value: Any) -> bytes:
 def unpack(data: bytes) -> Any:
     """The value of all these bytes; raises one of `BROKEN`."""
     return msgpack.unpackb(data, raw=False)
+
+
+def in_order(value: Any) -> Any:
+    """A plain value whose maps have their keys in the order of the canonical form."""
+    if isinstance(value, dict):
+        return {key: in_order(value[key]) for key in sorted(value, key=str.encode)}
+    return [in_order(item) for item in value] if isinstance(value, list) else value

@@ -13,11 +13,16 @@ from caviar_clients.conform import forms, scenery, street
 from caviar_clients.conform.case import Failed
 from caviar_clients.conform.client import BY_HAND_S, Client, End
 from caviar_clients.conform.grants import Inputs
+from caviar_clients.conform.packing import in_order
 from caviar_clients.conform.wire import Fields, Received, Wire
 
 EPOCH, ATTEMPT = 3, 2
 """Not 1, so that a client which does not repeat what it is told shows."""
 SEED = 11
+VERSION = (1, 2)
+"""Of the protocol that the kit plays."""
+CAPABILITIES = ("assets", "checkpoint", "episodes", "parts")
+"""What a broker of that version has."""
 LEFT_OVER = 100_000
 """Messages of a life that are thrown away before the next one, at most."""
 LEAVING_S = 1.0
@@ -209,23 +214,21 @@ class Session:
     def welcome(self, heartbeat_s: float = 0.05, liveness_s: float = 3.0, **more: Any) -> None:
         """WELCOME; ``more`` are other values of its fields."""
         self.heartbeat_s, self.liveness_s = heartbeat_s, liveness_s
-        recorder = (
-            {"directory": tempfile.mkdtemp(dir=self.rules.directory)}
-            if self.hello["role"] == "recorder"
-            else {}
-        )
-        common = [c for c in ("assets", "episodes", "parts") if c in self.hello.get("capabilities", [])]
-        fields = {
-            "version": [1, 1],
+        is_recorder = self.hello["role"] == "recorder"
+        directory = tempfile.mkdtemp(dir=self.rules.directory) if is_recorder else ""
+        common = [name for name in self.hello.get("capabilities", []) if name in CAPABILITIES]
+        fields: Fields = {
+            "version": list(VERSION),
             "run": "conformance",
             **self.who,
             "capabilities": common,
             "heartbeat_ns": round(heartbeat_s * 1e9),
             "liveness_ns": round(liveness_s * 1e9),
             "seed": SEED,
-            "settings": self.rules.settings,
-            "scenario": street.RUN | recorder,
+            "settings": in_order(self.rules.settings),
+            "scenario": in_order(street.briefing(self.hello, directory)),
         }
+        fields = {key: value for key, value in fields.items() if value not in ([], {})}
         self.send("WELCOME", fields | more)
         self.stage = JOINED
 

@@ -12,8 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from caviar_clients.conform.wire import Fields
 from caviar_protocol.arrays import Payload
 from caviar_protocol.codec import encode_payload
+from caviar_protocol.scenario_checks import resolved
+from caviar_protocol.scenario_loader import parse_scenario
 from caviar_protocol.topics import (
     Action,
     AntennaArray,
@@ -41,18 +44,58 @@ PERIOD_NS = 100_000_000
 FREQUENCY_HZ = 28e9
 C = 299_792_458.0
 
-RUN: dict[str, Any] = {
-    "carriers": [{"name": "mmwave", "frequency_hz": FREQUENCY_HZ, "bandwidth_hz": 100e6}],
-    "devices": [
-        {"name": "bs", "kind": "antenna", "position_m": [0.0, -10.0, 9.0], "role": "tx"},
-        {"name": "rx", "kind": "antenna", "on": "*", "count": 2, "role": "rx"},
-        {"name": "lidar", "kind": "lidar", "on": "*"},
-        {"name": "camera", "kind": "camera", "on": "*"},
-    ],
-    "sampling_period_ns": PERIOD_NS,
-    "frames": 1000,
-}
-"""``scenario`` of WELCOME."""
+SCENARIO = """
+[run]
+name = "conformance"
+frames = 1000
+
+[[carriers]]
+name = "mmwave"
+frequency_hz = 28e9
+
+[[devices]]
+name = "bs"
+kind = "antenna"
+role = "tx"
+position_m = [0.0, -10.0, 9.0]
+array = { columns = 4 }
+
+[[devices]]
+name = "rx"
+kind = "antenna"
+role = "rx"
+on = "*"
+count = 2
+mount = "roof"
+position_m = [0.2, 0.0, 0.15]
+array = { columns = 2 }
+
+[[devices]]
+name = "lidar"
+kind = "lidar"
+on = "*"
+position_m = [0.0, 0.2, 1.3]
+beams = 2
+azimuth_steps = 12
+
+[[devices]]
+name = "camera"
+kind = "camera"
+on = "*"
+position_m = [2.0, 0.0, 0.5]
+size_px = [16, 8]
+
+[services]
+traffic = { role = "world", use = "remote", budget_ms = 1000 }
+propagation = { role = "channel", use = "remote", budget_ms = 1000 }
+eyes = { role = "sensors", use = "remote", budget_ms = 1000 }
+pilot = { role = "agent", use = "remote", budget_ms = 1000 }
+radio = { role = "link", use = "remote", budget_ms = 1000 }
+archive = { role = "recorder", use = "remote", budget_ms = 1000 }
+"""
+"""The scenario of which WELCOME tells each client its part, as a broker does that reads this file."""
+WORLD = "traffic"
+"""The world that publishes the devices."""
 
 SOURCES = {
     "scene": ["traffic"],
@@ -73,6 +116,20 @@ DOUBLED = {**SOURCES, "scene": ["air", "traffic"], "action": ["copilot", "pilot"
 def product(topic: str, source: str, frame: int) -> tuple[bytes, bytes]:
     """Header and body of a product."""
     return encode_payload(_payload(topic, source, frame))
+
+
+def briefing(hello: Fields, directory: str = "") -> Fields:
+    """``scenario`` of WELCOME for the client that said this HELLO; ``directory`` is for recorders."""
+    plain = resolved(parse_scenario(SCENARIO))
+    world = hello["name"] if hello["role"] == "world" else WORLD
+    told: Fields = {
+        "carriers": plain["carriers"],
+        "devices": [device | {"world": world} for device in plain["devices"]],
+        "episodes": plain["run"]["episodes"],
+        "frames": plain["run"]["frames"],
+        "sampling_period_ns": plain["run"]["sampling_period_ns"],
+    }
+    return told | ({"directory": directory, "resolved": plain} if hello["role"] == "recorder" else {})
 
 
 def scenery(mark: str) -> dict[str, bytes]:
