@@ -106,6 +106,37 @@ def test_a_world_that_brings_scenery_is_asked_for_all_of_it(tmp_path: Path) -> N
     assert next(v.got for v in verdicts if v.case == "scenery").startswith("offers 4 files")
 
 
+def test_a_right_client_that_speaks_websocket_fails_nothing(tmp_path: Path) -> None:
+    """The same agent, over WebSockets: the kit plays behind the gateway."""
+    from typer.testing import CliRunner
+
+    agent = python(ROOT / "tests/scenarios/websocket_zmq.py", ROOT / "clients/minimal/agent.py")
+    file = tmp_path / "verdicts.json"
+    words = ["--ws", "--listen", "ws://127.0.0.1:0/ws", "--name", "mine", "--json", str(file)]
+    result = CliRunner().invoke(app, ["conform", *words, "--command", f"{agent} {{endpoint}} {{name}}"])
+    found = json.loads(file.read_text())
+    assert failures([Verdict(**verdict) for verdict in found["verdicts"]]) == {}, result.output
+    assert found["pass"] >= 30
+
+
+def test_what_the_gateway_says_of_a_client_is_shown_with_the_verdicts() -> None:
+    from caviar_broker.api.front import gateway_in_front
+
+    script = (
+        "import struct, sys; from websockets.sync.client import connect; "
+        "connect(sys.argv[1]).__enter__().send(struct.pack('>II', 1, 3) + b'abc')"
+    )
+    told: list[str] = []
+    verdicts = conform(
+        ANY,
+        command=python("-c", script, "{endpoint}"),
+        names=["hello"],
+        front=lambda endpoint: gateway_in_front(endpoint, "127.0.0.1:0", told.append),
+    )
+    assert [verdict.outcome for verdict in verdicts] == ["fail"]
+    assert "big-endian" in "".join(told)
+
+
 # --- clients that are not ---------------------------------------------------------------------------
 
 FAULTS: dict[str, tuple[str, ...]] = {

@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
-import socket
 import sys
 from pathlib import Path
 
@@ -17,21 +16,12 @@ from caviar_broker.api.tokens import Tokens, http_address
 from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.keys import Credentials, Pair
 
-UNREACHABLE_MS = 8000
-"""[ms] for which a peer's machine may acknowledge nothing, or have no room, until its connection is gone."""
-SEND_BUFFER = 1 << 18
-"""[B] that the system keeps for a peer at most, so that one that does not read is noticed soon."""
-BACKLOG = 128
-MAX_CONNECTIONS = 512
-
 
 async def serve(run: Path, address: str, keys: Path | None) -> None:
     """Serve until the broker ends. Raises `RunError` where none runs there, or the address is taken."""
-    import uvicorn
-
     from caviar_broker.api.app import make_app
     from caviar_broker.api.gateway import REMEDY, Gateway
-    from caviar_protocol.websocket import MAX_FRAME
+    from caviar_broker.api.http_server import http_server, listening_socket
 
     desk = DeskLink(run)
     keys, credentials = await _of_the_broker(desk, keys)
@@ -46,23 +36,8 @@ async def serve(run: Path, address: str, keys: Path | None) -> None:
 
     remedy = f"{REMEDY} --directory {keys}" if keys is not None else REMEDY
     gateway = Gateway(_reachable(status["endpoint"]), tokens, tell, credentials, remedy)
-    listening = _listening(host, port)
-    config = uvicorn.Config(
-        make_app(desk, tokens, gateway),
-        loop="asyncio",
-        http="h11",
-        ws="websockets-sansio",
-        ws_max_size=MAX_FRAME,
-        ws_ping_interval=None,  # a busy peer answers no pings, and is not gone
-        ws_per_message_deflate=False,
-        lifespan="off",
-        log_level="warning",
-        access_log=False,
-        server_header=False,
-        limit_concurrency=MAX_CONNECTIONS,
-        timeout_graceful_shutdown=1,
-    )
-    server = uvicorn.Server(config)
+    listening = listening_socket(host, port)
+    server = http_server(make_app(desk, tokens, gateway))
 
     async def end_with_the_broker() -> None:
         async for _ in desk.events():
@@ -93,29 +68,6 @@ async def _of_the_broker(desk: DeskLink, keys: Path | None) -> tuple[Path | None
         raise RunError(f"the broker has its keys and tokens in {directory}, not in {keys}; leave out --keys")
     pair = Pair(public=told["public"], secret=told["secret"])
     return directory, Credentials(pair, told["broker"])
-
-
-def _listening(host: str, port: int) -> socket.socket:
-    """A listening socket; what is accepted from it has its options."""
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    found = socket.socket(family, socket.SOCK_STREAM)
-    found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    # The peer's kernel answers for a peer that is busy or stopped, so this tells only of what is unreachable.
-    found.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
-    found.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, UNREACHABLE_MS)
-    found.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    found.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 1)
-    found.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 1)
-    found.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    try:
-        found.bind((host, port))
-        found.listen(BACKLOG)
-    except OSError as error:
-        found.close()
-        raise RunError(
-            f"cannot serve HTTP at {host}:{port}: {error.strerror}; choose another --http HOST:PORT (0: any)"
-        ) from error
-    return found
 
 
 def _reachable(endpoint: str) -> str:

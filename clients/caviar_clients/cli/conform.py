@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -28,10 +29,13 @@ def conform_client(
     *,
     command: str = "",
     names: Sequence[str] = (),
+    websocket: bool = False,
     json_file: Path | None = None,
     markdown_file: Path | None = None,
 ) -> int:
     """Play the cases, print and write the verdicts; status 1 where one is «fail».
+
+    With ``websocket`` the kit plays behind a gateway that serves WebSockets at the address of ``listen``.
 
     Raises `SetupError` for an unknown case, `RunError` where nothing can be listened at, the command
     cannot be started or a file cannot be written.
@@ -47,7 +51,11 @@ def conform_client(
     for file in (json_file, markdown_file):
         if file is not None:
             write_file(file)
-    verdicts = conform(listen, command=command, names=names, rules=rules, tell=tell, each=each)
+    options: dict[str, Any] = {"command": command, "names": names, "rules": rules, "tell": tell, "each": each}
+    if websocket:
+        options["front"] = _gateway(listen, tell)
+        listen = "tcp://127.0.0.1:0"
+    verdicts = conform(listen, **options)
     console.print()
     console.print(_table(verdicts))
     failed = any(verdict.outcome == "fail" for verdict in verdicts)
@@ -56,6 +64,14 @@ def conform_client(
         if file is not None:
             write_file(file, text)
     return 1 if failed else 0
+
+
+def _gateway(listen: str, tell: Callable[[str], None]) -> Callable[[str], AbstractContextManager[str]]:
+    """What serves WebSockets at ``listen``, an address of this machine, for the kit."""
+    from caviar_broker.api.front import gateway_in_front
+
+    address = listen.partition("://")[2].partition("/")[0] or listen
+    return lambda endpoint: gateway_in_front(endpoint, address, tell)
 
 
 def list_cases(console: Console) -> None:

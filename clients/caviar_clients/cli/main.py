@@ -200,6 +200,10 @@ def conform(
         str,
         typer.Option(help="starts the client for each life, with {endpoint} and {name} filled in"),
     ] = "",
+    ws: Annotated[
+        bool,
+        typer.Option("--ws", help="clients speak WebSocket: {endpoint} is ws://HOST:PORT/ws of --listen"),
+    ] = False,
     timeout: Annotated[float, typer.Option(min=0.1, help="seconds in which the client has to answer")] = 5.0,
     settings: Annotated[Path | None, typer.Option(help="TOML or JSON file: its settings in WELCOME")] = None,
     json: Annotated[Path | None, typer.Option(help="write the verdicts to this file")] = None,
@@ -215,7 +219,14 @@ def conform(
         return
     rules = Rules(timeout_s=timeout, name=name, role=role, settings=kit.settings_of(settings))
     status = kit.conform_client(
-        _console, listen, rules, command=command, names=case or (), json_file=json, markdown_file=markdown
+        _console,
+        listen,
+        rules,
+        command=command,
+        names=case or (),
+        websocket=ws,
+        json_file=json,
+        markdown_file=markdown,
     )
     raise typer.Exit(status)
 

@@ -61,7 +61,7 @@ def wrong_state(kit: Kit) -> str:
     session = kit.fresh()
     _begin(session)
     session.send("RESTORE", {**session.who, "episode": session.episode, "frame": 0}, NO_STATE)
-    got = session.take()
+    got = session.reaction()
     kit.discard()
     if isinstance(got, Answer):
         if got.kind != "FAULT":

@@ -136,14 +136,14 @@ class ByHand:
 
     start_s = BY_HAND_S
 
-    def __init__(self, wire: Wire, tell: Callable[[str], None], timeout_s: float) -> None:
-        self._wire, self._tell, self._timeout_s = wire, tell, timeout_s
+    def __init__(self, wire: Wire, address: str, tell: Callable[[str], None], timeout_s: float) -> None:
+        self._wire, self._address, self._tell, self._timeout_s = wire, address, tell, timeout_s
         self._started = False
 
     def start(self) -> None:
         """Ask the user."""
         again = "start your client again" if self._started else "start your client"
-        self._tell(f"{again}, with the broker's address {self._wire.endpoint}")
+        self._tell(f"{again}, with the broker's address {self._address}")
         self._started = True
 
     def ended(self) -> End | None:

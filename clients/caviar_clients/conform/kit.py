@@ -6,6 +6,7 @@ import difflib
 import os
 import time
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -147,6 +148,7 @@ def conform(
     command: str = "",
     names: Sequence[str] = (),
     rules: Rules | None = None,
+    front: Callable[[str], AbstractContextManager[str]] = nullcontext,
     tell: Callable[[str], None] = lambda text: None,
     each: Callable[[Verdict], None] = lambda verdict: None,
 ) -> list[Verdict]:
@@ -161,6 +163,9 @@ def conform(
         Cases to play; by default all.
     rules
         What is known of the client.
+    front
+        Serves clients in front of the kit's own endpoint, as a gateway does; yields the address that clients
+        are given.
     each
         Gets each verdict as soon as there is one.
 
@@ -172,10 +177,11 @@ def conform(
         raise SetupError(f"no client has the role {given.role!r}; {suggestion(given.role, ROLES)}")
     wire = Wire(endpoint)
     verdicts = []
-    with TemporaryDirectory(prefix="caviar-conform-", ignore_cleanup_errors=True) as folder:
-        client: Client = ByHand(wire, tell, given.timeout_s)
+    temporary = TemporaryDirectory(prefix="caviar-conform-", ignore_cleanup_errors=True)
+    with closing(wire), front(wire.endpoint) as address, temporary as folder:
+        client: Client = ByHand(wire, address, tell, given.timeout_s)
         if command:
-            client = Started(command, wire.endpoint, given.name or "client", Path(folder))
+            client = Started(command, address, given.name or "client", Path(folder))
         kit = Kit(wire, client, replace(given, directory=folder, mark=os.urandom(8).hex()))
         try:
             for case in picked:
@@ -185,5 +191,4 @@ def conform(
         finally:
             if command:
                 client.dispose()
-            wire.close()
     return verdicts

@@ -143,6 +143,13 @@ class Session:
             self._seen.odd.append(odd)
         return Answer(fields["type"], fields, received.parts)
 
+    def reaction(self) -> Answer | End | None:
+        """As `take`; a client that says BYE first, as closing a WebSocket does, has ended all the same."""
+        got = self.take()
+        if isinstance(got, Answer) and got.kind == "BYE":
+            return self.ended(self.rules.timeout_s, "its end after BYE")
+        return got
+
     def pump(self, seconds: float) -> bool:
         """Take one message from the wire, and answer it where it is a heartbeat; whether there was one."""
         received = self.wire.poll(seconds)

@@ -47,14 +47,14 @@ def survive(kit: Kit, variants: Iterable[Variant], codes: tuple[str, ...], *, pa
 
 def _survived(session: Session, name: str, codes: tuple[str, ...], pardoned: bool) -> str:
     probe = session.grant()
-    got = session.take()
+    got = session.reaction()
     if isinstance(got, Answer) and got.kind == "ERROR" and got.fields["code"] in codes:
         way = f"ERROR {got.fields['code']}"
-        got = session.take()
+        got = session.reaction()
     elif isinstance(got, Answer) and got.kind == "DONE" and pardoned:
         way = "passed over"
         session.judge(got, probe)
-        got = session.take()
+        got = session.reaction()
     elif isinstance(got, Answer):
         raise Failed(f"for {name}: {GOES_ON}", str(got))
     else:
@@ -201,7 +201,7 @@ def _victim(fields: Fields, parts: list[bytes]) -> list[str]:
 
 
 def _faulted(session: Session, frame: int, names: list[str]) -> str:
-    got = session.take()
+    got = session.reaction()
     expected = "FAULT that names topic and source"
     if isinstance(got, End):
         right_end(got, expected)
@@ -273,7 +273,7 @@ def complaints(kit: Kit) -> str:
         session = kit.at(ACTIVE)
         session.send(kind, fields)
         probe = session.grant()
-        got = session.take()
+        got = session.reaction()
         if isinstance(got, Answer):
             session.judge(got, probe)
             ways["the next frame"] = None

@@ -1,0 +1,61 @@
+"""The socket and the server behind every HTTP address of this package."""
+
+from __future__ import annotations
+
+import socket
+from typing import Any
+
+import uvicorn
+
+from caviar_protocol.errors import RunError
+from caviar_protocol.websocket import MAX_FRAME
+
+UNREACHABLE_MS = 8000
+"""[ms] for which a peer's machine may acknowledge nothing, or have no room, until its connection is gone."""
+SEND_BUFFER = 1 << 18
+"""[B] that the system keeps for a peer at most, so that one that does not read is noticed soon."""
+BACKLOG = 128
+MAX_CONNECTIONS = 512
+
+
+def http_server(app: Any) -> uvicorn.Server:
+    """A server of an ASGI application, WebSockets included, that has not begun to serve."""
+    config = uvicorn.Config(
+        app,
+        loop="asyncio",
+        http="h11",
+        ws="websockets-sansio",
+        ws_max_size=MAX_FRAME,
+        ws_ping_interval=None,  # a busy peer answers no pings, and is not gone
+        ws_per_message_deflate=False,
+        lifespan="off",
+        log_level="warning",
+        access_log=False,
+        server_header=False,
+        limit_concurrency=MAX_CONNECTIONS,
+        timeout_graceful_shutdown=1,
+    )
+    return uvicorn.Server(config)
+
+
+def listening_socket(host: str, port: int) -> socket.socket:
+    """A listening socket; what is accepted from it has its options."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    found = socket.socket(family, socket.SOCK_STREAM)
+    found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    # The peer's kernel answers for a peer that is busy or stopped, so this tells only of what is unreachable.
+    found.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+    found.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, UNREACHABLE_MS)
+    found.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    found.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 1)
+    found.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 1)
+    found.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    try:
+        found.bind((host, port))
+        found.listen(BACKLOG)
+    except OSError as error:
+        found.close()
+        raise RunError(
+            f"cannot serve HTTP at {host}:{port}: {error.strerror}; choose another --http HOST:PORT (0: any)"
+        ) from error
+    return found
