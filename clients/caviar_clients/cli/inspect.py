@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, cast
 
 import msgspec
+import numpy as np
 import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from caviar_clients.cli.decided import Decided, Decisions, decided_lines
+from caviar_clients.cli.outages import Outages, OutageSummary, outage_lines
 from caviar_clients.cli.unserved import Unserved
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import RecordingError
@@ -43,6 +46,10 @@ class LinkSummary(msgspec.Struct, kw_only=True):
     """None where no user ever had a path."""
     mean_abs_y_best: float | None
     mean_abs_y_baseline: float | None
+    mean_snr_db: Annotated[float | None, quantity("dB", "mean of the linear SNR of the chosen pairs")]
+    """None where no user had a path, or none was served."""
+    mean_snr_best_db: Annotated[float | None, quantity("dB", "the same of the best pairs")]
+    mean_bit_rate: Annotated[float | None, quantity("bit/s", "of a user with the chosen pair")]
     no_path_share: float | None
     """Share of users without a path; None where there was no user."""
     users: int
@@ -66,6 +73,8 @@ class RunSummary(msgspec.Struct, kw_only=True):
     bytes: Annotated[int, quantity("B", "size of the segments")]
     sources: list[SourceSummary]
     link: LinkSummary | None
+    outage: OutageSummary | None
+    """Why users had no path; None where all had one."""
     decided: list[Decided]
     warnings: list[str]
     """What the user probably did not mean."""
@@ -88,12 +97,13 @@ def summarise(recording: Recording) -> RunSummary:
     """The summary of a recording. Damaged frames are listed and count as if they had no products."""
     metadata, damage = recording.metadata, []
     sources: dict[tuple[str, str], SourceSummary] = {}
-    totals, decisions, unserved = _LinkTotals(), Decisions(), Unserved()
+    totals, decisions, unserved, outages = _LinkTotals(), Decisions(), Unserved(), Outages()
     episodes: dict[int, int] = {}  # to the last instant [ns]
     for frame in recording.frames():
         episodes[frame.episode] = max(frame.t_ns, episodes.get(frame.episode, 0))
         decisions.add(frame.episode, frame.reports)
         unserved.add(frame.reports)
+        outages.add(frame.reports)
         for entry in frame.inputs:
             key = (entry.topic, entry.source)
             source = sources.setdefault(key, SourceSummary(topic=entry.topic, source=entry.source))
@@ -116,6 +126,7 @@ def summarise(recording: Recording) -> RunSummary:
         bytes=sum(file.stat().st_size for file in recording.files),
         sources=[sources[key] for key in sorted(sources)],
         link=totals.summary(),
+        outage=outages.summary(totals.users - totals.served),
         decided=decisions.summary(),
         warnings=unserved.warnings(),
         versions=metadata.versions,
@@ -126,33 +137,42 @@ def summarise(recording: Recording) -> RunSummary:
 
 
 class _LinkTotals:
-    """Sums of |y| over users that have a path, and how many users had none."""
+    """Sums over users that have a path, and how many users had none."""
 
     def __init__(self) -> None:
         self.users = self.served = 0
-        self.abs_y = self.best = self.baseline = 0.0
+        self._sums = np.zeros(6)
+        """Of |y|, best and baseline |y|, SNR, best SNR, bit rate."""
 
     def add(self, link: Link) -> None:
         with_path = link.has_path
         self.users += len(link.rx)
         self.served += int(with_path.sum())
-        self.abs_y += float(link.abs_y[with_path].sum())
-        self.best += float(link.top_abs_y[with_path, :1].sum())
-        self.baseline += float(link.baseline_abs_y[with_path].sum())
+        best = link.top_abs_y[:, :1].sum(axis=1)  # no column where there is no user
+        figures = (link.abs_y, best, link.baseline_abs_y, link.snr, link.snr_best, link.bit_rate)
+        self._sums += [values[with_path].sum() for values in figures]
 
     def summary(self) -> LinkSummary | None:
         if not self.users:
             return None
-        means = [
-            total / self.served if self.served else None for total in (self.abs_y, self.best, self.baseline)
-        ]
+        means: list[float | None] = [None] * len(self._sums)
+        if self.served:
+            means = (self._sums / self.served).tolist()
+        abs_y, best, baseline, snr, snr_best, bit_rate = means
         return LinkSummary(
-            mean_abs_y=means[0],
-            mean_abs_y_best=means[1],
-            mean_abs_y_baseline=means[2],
+            mean_abs_y=abs_y,
+            mean_abs_y_best=best,
+            mean_abs_y_baseline=baseline,
+            mean_snr_db=_db(snr),
+            mean_snr_best_db=_db(snr_best),
+            mean_bit_rate=bit_rate,
             no_path_share=1 - self.served / self.users,
             users=self.users,
         )
+
+
+def _db(ratio: float | None) -> float | None:
+    return 10 * math.log10(ratio) if ratio else None
 
 
 def _measure(
@@ -218,8 +238,12 @@ def _facts(summary: RunSummary) -> Table:
             f"{link.mean_abs_y:.4g}, best {link.mean_abs_y_best:.4g}, straight line "
             f"{link.mean_abs_y_baseline:.4g} (over users with a path)",
         )
+    if link is not None and link.mean_bit_rate is not None:
+        table.add_row("mean SNR", link_quality(link.mean_snr_db, link.mean_snr_best_db, link.mean_bit_rate))
     if link is not None:
         table.add_row("no path", f"{link.no_path_share:.2%} of {_count(link.users, 'user')} over all frames")
+    for line in [] if summary.outage is None else outage_lines(summary.outage):
+        table.add_row("no path", escape(line))
     for line in decided_lines(summary.decided):
         table.add_row("decided", escape(line))
     for line in summary.warnings:
@@ -230,6 +254,20 @@ def _facts(summary: RunSummary) -> Table:
     for note in summary.notes:
         table.add_row("note", escape(note))
     return table
+
+
+def link_quality(snr_db: float | None, snr_best_db: float | None, bit_rate: float) -> str:
+    """SNR [dB] against the best beams', and the rate [bit/s] of a user, in words."""
+    snr, best = ("none" if value is None else f"{value:.1f} dB" for value in (snr_db, snr_best_db))
+    return f"{snr} of {best} at best, mean rate {_rate(bit_rate)} a user"
+
+
+def _rate(bit_rate: float) -> str:
+    for unit in ("bit/s", "kbit/s", "Mbit/s"):
+        if bit_rate < 1000:
+            return f"{bit_rate:.3g} {unit}"
+        bit_rate /= 1000
+    return f"{bit_rate:.3g} Gbit/s"
 
 
 def _topics(sources: Iterable[SourceSummary]) -> Table:

@@ -103,6 +103,7 @@ def broker(
     from caviar_clients.cli.restarted import RunInProgress
     from caviar_clients.cli.run import run_directory
     from caviar_clients.sessions.checking import checked_scenario
+    from caviar_clients.sessions.plausibility import implausible_values
 
     options = ["--bind", bind] + (["--keys", str(keys)] if keys else []) + ["--restarted"] * restarted
     options += ["--http", http] if http else []
@@ -121,6 +122,8 @@ def broker(
         resumed = parser().parse_args(["--resume", str(left), *options])
         raise typer.Exit(current.serve(left, lambda: serve(resumed)))
     directory = run_directory(out, checked.run.name)
+    for warning in implausible_values(checked):
+        typer.echo(f"warning: {warning}", err=True)
     typer.echo(f"run {directory}; start its services; from elsewhere, with --broker and its address:")
     for command in service_commands(checked.services, bind, keys):
         typer.echo(f"  {command}")

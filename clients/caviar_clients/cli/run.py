@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from types import FrameType
@@ -24,6 +24,7 @@ from caviar_clients.cli.launch import Launcher
 from caviar_clients.cli.remote import key_text, reachable, start_command, waiting_text
 from caviar_clients.cli.summary import recorded_figures, summary_of, summary_table
 from caviar_clients.sessions.checking import checked_scenario
+from caviar_clients.sessions.plausibility import implausible_values
 from caviar_protocol.errors import RunError, SetupError
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario_checks import refuse_remote
@@ -79,6 +80,9 @@ def run_scenario(
         write_file(json_file)  # before the run, since after it an unwritable file would cost the figures
     directory = run_directory(out, scenario.run.name)
     console.print(Text(f"run {directory}"), soft_wrap=True)
+    warnings = implausible_values(scenario)
+    for warning in warnings:
+        console.print(Text(f"warning: {warning}", style="yellow"), soft_wrap=True)
     launcher: Launcher | EmbeddedLauncher
     if embedded:
         launcher = EmbeddedLauncher(scenario, directory)
@@ -86,7 +90,7 @@ def run_scenario(
         launcher = Launcher(
             scenario, find_scenario(path).resolve(), directory, frames, seed, bind, keys, http, pace=pace
         )
-    return _follow(launcher, scenario, directory, console, json_file, keys)
+    return _follow(launcher, scenario, directory, console, json_file, keys, warnings)
 
 
 def resume_run(
@@ -117,8 +121,9 @@ def _follow(
     console: Console,
     json_file: Path | None,
     keys: Path | None,
+    warnings: Sequence[str] = (),
 ) -> int:
-    """Show a run to its end, and sum it up."""
+    """Show a run to its end, and sum it up; ``warnings`` are those of its scenario."""
     outcome: Mapping[str, Any] = {}
     interrupted = _Interruption(launcher)
     with launcher, interrupted, _progress_bar(console) as bar:
@@ -128,7 +133,7 @@ def _follow(
             if event["event"] == "finished":
                 outcome = event
     recorded = recorded_figures(directory) if outcome["frames"] else None
-    summary = summary_of(outcome, recorded, scenario.run.name, directory, scenario.run.seed)
+    summary = summary_of(outcome, recorded, scenario.run.name, directory, scenario.run.seed, warnings)
     text = json.dumps(summary, indent=2, ensure_ascii=False) + "\n"
     write_file(directory / "summary.json", text)
     if json_file is not None:

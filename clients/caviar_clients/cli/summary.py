@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,8 @@ from rich.table import Table
 from rich.text import Text
 
 from caviar_clients.cli.decided import Decided, decided_lines
-from caviar_clients.cli.inspect import RunSummary, summarise
+from caviar_clients.cli.inspect import RunSummary, link_quality, summarise
+from caviar_clients.cli.outages import OutageSummary, outage_lines
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.recording import Recording
 
@@ -26,9 +27,14 @@ def recorded_figures(directory: Path) -> RunSummary | None:
 
 
 def summary_of(
-    outcome: Mapping[str, Any], recorded: RunSummary | None, scenario: str, directory: Path, seed: int
+    outcome: Mapping[str, Any],
+    recorded: RunSummary | None,
+    scenario: str,
+    directory: Path,
+    seed: int,
+    warnings: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Everything `--json` writes.
+    """Everything `--json` writes; ``warnings`` are those of the scenario, beside what the recording warns of.
 
     Of a run that ended early ``frames_recorded`` may be one more than ``frames``: a frame that the recorder
     had answered and that was not over for everybody. The digest is that of ``frames``.
@@ -51,9 +57,13 @@ def summary_of(
         "mean_abs_y": figures.mean_abs_y if figures else None,
         "mean_abs_y_best": figures.mean_abs_y_best if figures else None,
         "mean_abs_y_baseline": figures.mean_abs_y_baseline if figures else None,
+        "mean_snr_db": figures.mean_snr_db if figures else None,
+        "mean_snr_best_db": figures.mean_snr_best_db if figures else None,
+        "mean_bit_rate": figures.mean_bit_rate if figures else None,
         "no_path_share": figures.no_path_share if figures else None,
+        "outage": msgspec.to_builtins(recorded.outage) if recorded else None,
         "decided": msgspec.to_builtins(recorded.decided) if recorded else [],
-        "warnings": recorded.warnings if recorded else [],
+        "warnings": [*warnings, *(recorded.warnings if recorded else ())],
     }
 
 
@@ -99,8 +109,12 @@ def _caption(summary: Mapping[str, Any]) -> str:
             f"mean |y| {summary['mean_abs_y']:.3g} of {summary['mean_abs_y_best']:.3g} at best "
             f"({share:.1%}), straight line {summary['mean_abs_y_baseline']:.3g}"
         )
-    if summary["no_path_share"]:
-        parts.append(f"{summary['no_path_share']:.1%} of users without a path")
+    if summary["mean_bit_rate"] is not None:
+        quality = link_quality(summary["mean_snr_db"], summary["mean_snr_best_db"], summary["mean_bit_rate"])
+        parts.append(f"mean SNR {quality}")
+    if summary["outage"] is not None:
+        causes, *inside = outage_lines(msgspec.convert(summary["outage"], OutageSummary))
+        parts += [f"{summary['no_path_share']:.1%} of users without a path: {causes}", *inside]
     parts += decided_lines(msgspec.convert(summary["decided"], list[Decided]))
     parts += [f"warning: {warning}" for warning in summary["warnings"]]
     return "\n".join(parts)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from abc import abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,6 +20,7 @@ from caviar_clients.envs.users import Users
 from caviar_clients.sessions.base import Frame, Session
 from caviar_clients.sessions.checking import checked_scenario
 from caviar_clients.sessions.opening import agent_of, open_session
+from caviar_clients.sessions.plausibility import implausible_values
 from caviar_protocol.errors import RunError, ScenarioError
 from caviar_protocol.keys import credentials
 from caviar_protocol.messages import Input
@@ -82,6 +84,8 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         if not observe:
             raise ScenarioError("observe names no part; write observe=('aoa',)")
         self.scenario = checked_scenario(Path(scenario))
+        for text in implausible_values(self.scenario):
+            warnings.warn(text, stacklevel=2)
         self.agent = agent_of(self.scenario, agent)
         self.render_mode = render_mode
         self.users = Users(self.scenario, (users,) if isinstance(users, str) else users)

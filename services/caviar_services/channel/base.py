@@ -23,6 +23,7 @@ from caviar_protocol.topics.scene import Device
 from caviar_services.channel.assemble import Product, assemble
 from caviar_services.channel.atmosphere import Atmosphere, specific_attenuation
 from caviar_services.channel.matrices import Matrices
+from caviar_services.channel.outage import outage_counts
 from caviar_services.channel.paths import Antenna, PathTable
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
 
@@ -106,6 +107,16 @@ class ChannelModel(Service[S]):
         absorption = tuple(self.absorption_db_per_km.tolist())
         return msgspec.structs.replace(self.options, absorption_db_per_km=absorption)
 
+    @property
+    def extent(self) -> tuple[Float64Array, Float64Array] | None:
+        """Lowest and highest corner [m] of the scenery, Shape ``[3]`` each; None: the model has none."""
+        return None
+
+    def enclosing(self, position: Float64Array) -> str:
+        """Name of the object of the last frame that a point [m], Shape ``[3]``, is inside; empty: none that
+        the model knows."""
+        return ""
+
     def load(self, preparation: Preparation) -> tuple[str, ...]:
         """Load scenery, compile, warm up; notes for the user."""
         return ()
@@ -135,7 +146,12 @@ class ChannelModel(Service[S]):
         return StepResult(
             products={"channel": channel},
             fidelity=self.rung,
-            counts={"paths": len(channel.tau), "dropped": channel.dropped, **made.counts},
+            counts={
+                "paths": len(channel.tau),
+                "dropped": channel.dropped,
+                **made.counts,
+                **outage_counts(channel, scene, self),
+            },
             measured=made.measured,
         )
 

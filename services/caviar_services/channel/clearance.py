@@ -8,7 +8,7 @@ it, from the outside. Points, lengths and directions are then those of its true 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -27,6 +27,12 @@ _ON_SURFACE = 1e-6
 
 _MARGIN = 1e-3
 """[m] beyond the edges of a triangle that still are at it."""
+
+RISING_RAYS = 6
+_RISES = np.radians(np.linspace(10.0, 85.0, RISING_RAYS))
+_TURNS = 1.0 + 2.4 * np.arange(RISING_RAYS)
+_RISING = np.stack([np.cos(_TURNS), np.sin(_TURNS), np.tan(_RISES)], axis=-1)
+"""Directions of the rays of `Surfaces.above`: upwards, from shallow to steep, each of another azimuth."""
 
 
 class Surfaces:
@@ -85,6 +91,14 @@ class Surfaces:
                 return True
         return False
 
+    def above(self, position: Float64Array) -> Iterator[Int64Array]:
+        """Triangles that each of some rising rays from a point [m], Shape ``[3]``, meets, nearest first."""
+        height = max(float(self._high[2].max(initial=position[2]) - position[2]), 0.0)
+        for direction in _RISING:
+            end = position + height / direction[2] * direction
+            near = self._within(np.minimum(position, end), np.maximum(position, end), _MARGIN)
+            yield near[_met(self._triangles[near], position, direction)]
+
     def _within(self, low: Float64Array, high: Float64Array, reach: float) -> Int64Array:
         """Triangles whose bounding box meets a box."""
         found = np.flatnonzero((self._low[0] <= high[0] + reach) & (self._high[0] >= low[0] - reach))
@@ -98,6 +112,24 @@ def _boxes(triangles: Float64Array) -> Float64Array:
     """Lowest and highest corners, Shape ``[3, F, 2]``."""
     boxes: Float64Array = np.stack([triangles.min(1).T, triangles.max(1).T], axis=-1)
     return boxes
+
+
+def _met(triangles: Float64Array, origin: Float64Array, direction: Float64Array) -> Int64Array:
+    """Rows of the triangles, Shape ``[F, 3, 3]``, that a ray meets, nearest first (Möller and Trumbore,
+    "Fast, minimum storage ray/triangle intersection", 1997)."""
+    first = triangles[:, 1] - triangles[:, 0]
+    second = triangles[:, 2] - triangles[:, 0]
+    across = np.cross(direction, second)
+    volume = (first * across).sum(1)
+    inverse = np.divide(1.0, volume, out=np.zeros_like(volume), where=volume != 0)
+    offset = origin - triangles[:, 0]
+    u = (offset * across).sum(1) * inverse
+    turned = np.cross(offset, first)
+    v = (turned @ direction) * inverse
+    along = (second * turned).sum(1) * inverse
+    met = np.flatnonzero((volume != 0) & (u >= 0) & (v >= 0) & (u + v <= 1) & (along > 0))
+    nearest: Int64Array = met[np.argsort(along[met], kind="stable")]
+    return nearest
 
 
 def _covers(corners: Float64Array, normal: Float64Array, foot: Float64Array) -> bool:

@@ -7,6 +7,7 @@ in a plane of it.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -84,6 +85,33 @@ class NumberedTriangles:
         self.plane_table.update(self._corners - self.centre, self._moving_plane)
         self.surfaces.move(self._first_moving, self._corners[self._faces[self._first_moving :]])
         return True
+
+    def enclosing(self, position: Float64Array) -> int:
+        """Piece that a point [m], Shape ``[3]``, is inside; −1: none.
+
+        A ray from inside of a closed surface crosses it an odd number of times. Walls and roof of one
+        building may be pieces of their own, and houses mostly have no floor: so all pieces at rest count as
+        one surface, and rays go upwards, from shallow to steep. All but one have to agree, so that a roof
+        without walls, a screen or a slit does not count.
+        """
+        found: Counter[int] = Counter()
+        for met in self.surfaces.above(position):
+            found[self._left(met)] += 1
+            if found[-1] > 1:
+                return -1
+        del found[-1]
+        return found.most_common(1)[0][0]
+
+    def _left(self, met: Int64Array) -> int:
+        """Piece that a ray leaves for good which meets these triangles, nearest first; −1: none."""
+        pieces = np.searchsorted(self._first_triangles, met, side="right") - 1
+        is_body = pieces >= len(self._first_triangles) - len(self._bodies)
+        bodies, crossings = np.unique(pieces[is_body], return_counts=True)
+        odd = bodies[crossings % 2 == 1]
+        if len(odd):
+            return int(odd[0])
+        scenery = pieces[~is_body]
+        return int(scenery[0]) if len(scenery) % 2 else -1
 
     def planes(self, shapes: Int64Array, primitives: Int64Array) -> tuple[Float64Array, Float64Array]:
         """A corner [m] and the normal (of any length) of triangles, each of Shape ``[..., 3]``, in float64.

@@ -15,7 +15,7 @@ from typing import ClassVar
 import msgspec
 import numpy as np
 
-from caviar_protocol.arrays import Int64Array
+from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.errors import PayloadError, SetupError
 from caviar_protocol.seeding import derive_seed
@@ -79,6 +79,8 @@ class SionnaChannel(PathModel[SionnaSettings]):
         self._following: Following | None = None
         self._outside: tuple[OutsideUse, ...] = ()
         self._detail = ""
+        self._names: tuple[str, ...] = ()
+        """Of the pieces of the scene in the last frame."""
         seed = settings.launch_seed
         self._asked = LaunchOptions(
             max_depth=settings.max_depth,
@@ -106,6 +108,15 @@ class SionnaChannel(PathModel[SionnaSettings]):
             materials_outside=tuple(use.brief(self.run.carriers[use.carrier].name) for use in self._outside),
             detail=self._detail,
         )
+
+    @property
+    def extent(self) -> tuple[Float64Array, Float64Array] | None:
+        return (self._scene.low, self._scene.high) if self._scene.has_scenery else None
+
+    def enclosing(self, position: Float64Array) -> str:
+        """See `ChannelModel.enclosing`; an antenna at a surface is on the side that it is traced from."""
+        piece = self._scene.enclosing(self._scene.surfaces.cleared(position))
+        return self._names[piece] if piece >= 0 else ""
 
     def load(self, preparation: Preparation) -> tuple[str, ...]:
         s = self.settings
@@ -206,6 +217,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
             names, velocity = self._following.place(scene)
         else:
             names, velocity = self._scene.place(scene, frozenset(self.settings.without_body))
+        self._names = names
         clear = [self._cleared(antenna) for antenna in (*transmitters, *receivers)]
         sources, targets = clear[: len(transmitters)], clear[len(transmitters) :]
         self._without_edge = 0

@@ -249,6 +249,17 @@ class SionnaScene(NumberedTriangles):
         self._standing = frozenset(standing)
         return tuple(names), velocity
 
+    @property
+    def has_scenery(self) -> bool:
+        """Whether anything stands still; `low` and `high` are its corners."""
+        return bool(self._scenery)
+
+    def enclosing(self, position: Float64Array) -> int:
+        """See `NumberedTriangles.enclosing`; below its lowest point, no scenery is around anything."""
+        piece = super().enclosing(position)
+        is_body = piece >= len(self.names) - len(self._bodies)
+        return piece if is_body or position[2] >= self.low[2] else -1
+
     def is_parking(self, names: tuple[str, ...], objects: Int32Array) -> BoolArray:
         """Which of the objects of paths, Shape ``[P, D]``, are the box around parked receivers.
 

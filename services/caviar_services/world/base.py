@@ -68,6 +68,15 @@ class World(Service[W]):
         self._mounts = Mounts(run.devices)
         self._t0_ns = 0
 
+    @classmethod
+    def placements(cls, settings: W) -> Iterable[tuple[str, str, Sequence[Vector]]]:
+        """Where settings put objects, so that what is implausible is warned of before the run.
+
+        Key within the settings, name of the object, positions [m] in world axes; none where the world learns
+        them from elsewhere.
+        """
+        return ()
+
     @abstractmethod
     def prefixes(self) -> tuple[str, ...]:
         """What the names of this world's objects begin with; whole names where they are known."""

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Annotated, ClassVar
 
 import msgspec
 from msgspec.structs import replace
 
 from caviar_protocol.arrays import quantity
-from caviar_protocol.coordinates import quaternion_from_euler
+from caviar_protocol.coordinates import Vector, quaternion_from_euler
 from caviar_protocol.errors import PayloadError, RunError, ScenarioError
 from caviar_protocol.messages import Input
 from caviar_protocol.topics import Action, VelocityCommand, WaypointCommand
@@ -87,6 +87,14 @@ class FlightWorld(TrajectoryWorld):
                 raise ScenarioError(f"a second object is named {name!r}; give it another name", key=key)
             self._flown[name] = thing
             self._flyers[name] = Flyer(_limits(thing, key))
+
+    @classmethod
+    def placements(cls, settings: TrajectorySettings) -> Iterable[tuple[str, str, Sequence[Vector]]]:
+        """The waypoints of scripted objects, and where flown ones start."""
+        yield from super().placements(settings)
+        if isinstance(settings, FlightSettings):
+            for index, thing in enumerate(settings.flown):
+                yield f"flown[{index}].start_m", thing.name, [thing.start_m]
 
     def prefixes(self) -> tuple[str, ...]:
         """The setting, or all names, which are known."""

@@ -63,6 +63,13 @@ class TrajectoryWorld(World[TrajectorySettings]):
                 raise ScenarioError(f"a second object is named {name!r}; give it another name", key=key)
             self._tracks[name] = (thing, Track(read_waypoints(thing.waypoints, f"{key}.waypoints")))
 
+    @classmethod
+    def placements(cls, settings: TrajectorySettings) -> Iterable[tuple[str, str, Sequence[Vector]]]:
+        """The waypoints of all objects."""
+        for index, thing in enumerate(settings.objects):
+            key = f"objects[{index}].waypoints"
+            yield key, thing.name, [waypoint.position for waypoint in read_waypoints(thing.waypoints, key)]
+
     def prefixes(self) -> tuple[str, ...]:
         """The setting, or all names, which are known."""
         return (self.settings.prefix,) if self.settings.prefix else tuple(self._tracks)

@@ -25,6 +25,7 @@ from caviar_services.channel.adaptive.errors_stated import ErrorState, StatedErr
 from caviar_services.channel.adaptive.rehearsal import rehearsal_scene
 from caviar_services.channel.adaptive.settings import AdaptiveSettings, Rung, built, models, rung_of
 from caviar_services.channel.base import Modelled
+from caviar_services.channel.outage import outage_counts
 from caviar_services.channel.sionna_sharing import shared_scenes
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
 from caviar_services.state import restored, saved
@@ -149,6 +150,7 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
                 "paths": len(channel.tau),
                 "dropped": channel.dropped,
                 **made.counts,
+                **outage_counts(channel, scene, rung.model),
                 **{name: count for name, count in counts.items() if count},
             },
             measured=measured,

@@ -1,0 +1,70 @@
+"""What a summary says about users without a path."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from recording_samples import frame, link, product, recorder, scene
+
+from caviar_clients.cli.inspect import summarise
+from caviar_clients.cli.outages import SHOWN_INSIDE, Outages, outage_lines
+from caviar_protocol.messages import Report
+from caviar_protocol.recording import Recording
+
+
+def channel(**counts: int) -> Report:
+    named = {name.replace("__", "/").replace("_", "-"): count for name, count in counts.items()}
+    return Report(source="channel", counts=named)
+
+
+def test_causes_are_summed_over_frames_and_the_most_frequent_stands_first() -> None:
+    outages = Outages()
+    outages.add([channel(no_path__blocked=1, too_close=7), Report(source="link", counts={"x": 9})])
+    outages.add([channel(no_path__blocked=1, no_path__out_of_range=3)])
+    found = outages.summary(users=5)
+    assert found is not None
+    assert list(found.causes.items()) == [("out of range", 3), ("blocked", 2)]
+    assert found.unexplained == 0
+    assert outage_lines(found) == ["3 out of range, 2 blocked"]
+
+
+def test_users_whose_channel_gave_no_cause_are_said_to_have_none() -> None:
+    outages = Outages()
+    outages.add([channel(no_path__blocked=2)])
+    found = outages.summary(users=6)
+    assert found is not None
+    assert outage_lines(found) == ["2 blocked, 4 for a cause that the channel did not report"]
+
+
+def test_what_stands_inside_of_what_is_named_and_the_list_is_bounded() -> None:
+    outages = Outages()
+    names = [f"inside/car-{number}/rx in car-{number}" for number in range(SHOWN_INSIDE + 3)]
+    for _ in range(2):
+        outages.add([Report(source="channel", counts=dict.fromkeys(names, 1))])
+    found = outages.summary(users=9)
+    assert found is not None
+    lines = outage_lines(found)
+    assert lines[1] == "inside an object: car-0/rx in car-0, in 2 frames"
+    assert lines[-1] == "inside an object: 3 more antennas"
+
+
+def test_where_all_users_had_a_path_nothing_is_said() -> None:
+    assert Outages().summary(users=0) is None
+
+
+def test_a_recording_tells_snr_rate_and_users_without_a_path(tmp_path: Path) -> None:
+    made = recorder(tmp_path)
+    for number in range(2):
+        sources = (
+            product("scene", "world", scene(number), number),
+            product("link", "link", link(number, without_path=(2,)), number),
+        )
+        made.step(frame(number, *sources))
+    made.close()
+    links = [link(number, without_path=(2,)) for number in range(2)]
+    rates = [rate for one in links for rate in one.bit_rate[one.has_path].tolist()]
+    summary = summarise(Recording(tmp_path))
+    assert summary.link is not None
+    assert summary.outage is not None
+    assert summary.link.mean_bit_rate == sum(rates) / len(rates)
+    assert (summary.outage.users, summary.outage.unexplained) == (2, 2)
