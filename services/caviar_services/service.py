@@ -227,6 +227,8 @@ class Service(ABC, Generic[S]):
     """Whether the assets of the run are fetched for this service before `prepare` (clause 4)."""
     checkpoints: ClassVar[bool] = False
     """Whether `checkpoint` and `restore` are implemented: the service has state that outlives a frame."""
+    extra: ClassVar[str] = ""
+    """Extra of the distribution that brings the libraries of this service; empty: the base install does."""
     Settings: ClassVar[type[msgspec.Struct]]
     """Settings from the scenario: a frozen struct, ``forbid_unknown_fields=True``, units in names."""
 

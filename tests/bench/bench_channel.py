@@ -24,6 +24,7 @@ import psutil
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.coordinates import quaternion_from_euler
 from caviar_protocol.digest import payload_digest
+from caviar_protocol.extras import install_command
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Scene
 from caviar_services.channel.sionna_rt import SionnaChannel
@@ -37,7 +38,7 @@ def canyon() -> dict[str, Path]:
     """The bundled street canyon as assets."""
     spec = importlib.util.find_spec("sionna")
     if spec is None or spec.origin is None:
-        raise SystemExit("sionna-rt is not installed; pip install 'caviar-sim[channel]'")
+        raise SystemExit(f"sionna-rt is not installed; run: {install_command('channel')}")
     folder = Path(spec.origin).parent / "rt" / "scenes" / "simple_street_canyon"
     xml = next(folder.glob("*.xml"))
     meshes = {f"scenery/meshes/{file.name}": file for file in (folder / "meshes").glob("*.ply")}

@@ -43,6 +43,28 @@ def test_looking_imports_nothing_heavy() -> None:
     }
 
 
+def test_two_frames_of_the_base_install_are_computed_and_compared(monkeypatch: pytest.MonkeyPatch) -> None:
+    check = doctor.check_frames()
+    assert check.ok, check
+    monkeypatch.setattr(doctor, "FRAME_DIGESTS", {})
+    assert doctor.check_frames().ok, "right numbers that are rounded otherwise are said, and no error"
+    monkeypatch.setattr(doctor, "FRAME_ABS_Y", doctor.FRAME_ABS_Y * (1 + 1e-9))
+    check = doctor.check_frames()
+    assert not check.ok
+    assert "expected" in check.found
+
+
+def test_a_dependency_with_which_no_frame_is_computed_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*_: object) -> object:
+        raise KeyError("NDArray[numpy.float64]")
+
+    monkeypatch.setattr("caviar_protocol.codec.plain", refused)
+    check = doctor.check_frames()
+    assert not check.ok
+    assert "NDArray[numpy.float64]" in check.found
+    assert "pip install" in check.remedy
+
+
 def test_the_exit_status_is_1_as_soon_as_one_thing_is_missing() -> None:
     good, bad = Check("a", True, "1"), Check("b", False, "none", "make b")
     assert doctor.exit_status([good, good]) == 0

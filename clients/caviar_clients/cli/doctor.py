@@ -14,6 +14,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import metadata
@@ -24,10 +25,14 @@ from packaging.requirements import Requirement
 from rich.console import Console
 from rich.table import Table
 
-from caviar_protocol.errors import SetupError
+from caviar_broker.core.events import Finished
+from caviar_clients.cli.summary import recorded_figures
+from caviar_clients.embedded.run import EmbeddedRun
+from caviar_clients.sessions.checking import checked_scenario
+from caviar_protocol.errors import CaviarError, SetupError
+from caviar_protocol.extras import DISTRIBUTION
 from caviar_services import llvm
 
-DISTRIBUTION = "caviar-sim"
 EXTRAS = ("channel", "sensors", "world", "plot")
 MINIMUM_PYTHON = (3, 11)
 MINIMUM_FREE_GB = 2.0
@@ -42,6 +47,17 @@ x = dr.arange(Float, 64)
 print(dr.sum(dr.maximum(dr.sin(x), 0.5))[0])
 """
 """A kernel with a floating-point maximum, the instruction that LLVM before 16 cannot select."""
+
+FRAME_DIGESTS = {
+    "bcc5e9da09faa7a27a118a76526a9713645f14428dca010e48b8de901d7f33ed": "AVX-512",
+    "538d5611c3e701d80d6fc95516fec6a5b5b9cb360785e18cf4fb4d0601b1a336": "AVX2",
+    "d511d480b3f03ac518d71ceaf09d437d109d9502ff4205bae405c93630e773b9": "SSE",
+}
+"""Digests of two frames of `smoke`, by the instructions for which NumPy and OpenBLAS round: kernels for wider
+registers sum in another order."""
+FRAME_ABS_Y = 0.00011088124487901756
+"""Mean |y| of these frames, which another order of sums changes in its 16th digit."""
+ABS_Y_TOLERANCE = 1e-12
 
 _SUMO = "import libsumo; print(libsumo.getVersion()[1])"
 
@@ -69,6 +85,7 @@ class _Outcome:
 def doctor() -> list[Check]:
     """Look at everything that a shipped scenario needs. Takes a few seconds; imports nothing heavy."""
     checks = [check_python(), check_base()]
+    checks += [check_frames()]
     checks += [check_extra(extra) for extra in EXTRAS]
     checks += [check_llvm(), check_gpu(), check_sumo(), check_zmq(), check_loopback()]
     checks += [check_disk(Path.cwd()), check_kernel_cache(Path.home()), check_open_files()]
@@ -109,6 +126,35 @@ def check_python() -> Check:
 def check_base() -> Check:
     """The packages that every part needs."""
     return _check_requirements("base install", "")
+
+
+def check_frames() -> Check:
+    """Two frames of `smoke` in this process: that the base install computes, and computes the right thing."""
+    remedy = f"{sys.executable} -m pip install --upgrade --upgrade-strategy eager {DISTRIBUTION}"
+    try:
+        with tempfile.TemporaryDirectory(prefix="caviar-doctor-") as folder:
+            outcome, abs_y = _two_frames(Path(folder))
+    except Exception as error:  # whatever a dependency that does not fit raises
+        text = str(error) if isinstance(error, CaviarError) else f"{type(error).__name__}: {error}"
+        return Check("frames", False, text, remedy)
+    if outcome.error:
+        return Check("frames", False, outcome.error, remedy)
+    rounding = FRAME_DIGESTS.get(outcome.digest)
+    if rounding:
+        return Check("frames", True, f"two frames of smoke have a known digest ({rounding})")
+    off = abs(abs_y / FRAME_ABS_Y - 1)
+    if off <= ABS_Y_TOLERANCE:
+        found = f"two frames of smoke are right, rounded in a way of their own: digest {outcome.digest:.12}…"
+        return Check("frames", True, f"{found}; digests of this machine compare with each other only")
+    found = f"two frames of smoke have mean |y| {abs_y:.6g}, expected {FRAME_ABS_Y:.6g}"
+    return Check("frames", False, f"{found}; digest {outcome.digest:.12}…", remedy)
+
+
+def _two_frames(folder: Path) -> tuple[Finished, float]:
+    """How two embedded frames of `smoke` end, and their mean |y|."""
+    outcome = EmbeddedRun(checked_scenario(Path("smoke"), frames=2), folder).run()
+    figures = recorded_figures(folder)
+    return outcome, (figures.link.mean_abs_y if figures and figures.link else None) or 0.0
 
 
 def check_extra(extra: str) -> Check:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from importlib import metadata
 from pathlib import Path
 from typing import Annotated
 
@@ -24,23 +25,43 @@ from caviar_clients.cli.options import (
     ScenarioOrNone,
     Seed,
 )
+from caviar_clients.cli.scenarios import complete_scenario
 from caviar_protocol.errors import CaviarError, RunError
+from caviar_protocol.extras import DISTRIBUTION
 
 RUN, LOOK, MEASURE, OPERATE = "Run", "Look", "Measure", "Operate"
 """Groups of commands in the help."""
 
 app = typer.Typer(
     no_args_is_help=True,
-    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
-    help="Co-simulation of machine-learning-based 6G in virtual worlds.",
 )
 app.add_typer(bench.app, name="bench", rich_help_panel=MEASURE)
 app.add_typer(keys, name="keys", rich_help_panel=OPERATE)
 _console = Console()
 _errors = Console(stderr=True)
 
+_WHAT_TO_RUN = (
+    "give a scenario, by its name (caviar scenarios) or a file, or --resume with the directory of a run"
+)
 ANY_PORT = "tcp://127.0.0.1:0"
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"caviar {metadata.version(DISTRIBUTION)}")
+        raise typer.Exit
+
+
+@app.callback()
+def caviar(
+    version: Annotated[
+        bool,
+        typer.Option("--version", help="Show the version and exit.", callback=_show_version, is_eager=True),
+    ] = False,
+) -> None:
+    """Co-simulation of machine-learning-based 6G in virtual worlds."""
 
 
 def _nothing_else(*values: object) -> None:
@@ -73,10 +94,31 @@ def run(
         bind = "" if bind == ANY_PORT else bind
         raise typer.Exit(resume_run(resume, _console, json, bind, keys, http, force=force))
     if scenario is None:
-        raise RunError("give a scenario file, or --resume with the directory of a run")
+        raise RunError(
+            "give a scenario, by name (caviar scenarios) or file, or --resume with the directory of a run"
+        )
     raise typer.Exit(
         run_scenario(scenario, out, _console, frames, seed, json, bind, embedded, keys, http, pace)
     )
+
+
+@app.command(rich_help_panel=RUN)
+def scenarios() -> None:
+    """List the scenarios that ship: what each is, and which extras it needs."""
+    from caviar_clients.cli.scenarios import list_scenarios
+
+    list_scenarios(_console)
+
+
+@app.command(rich_help_panel=RUN)
+def new(
+    name: Annotated[str, typer.Argument(help="name of the scenario, or path of its file")],
+) -> None:
+    """Write a scenario of your own to edit, with comments; it runs as it is, on the base install."""
+    from caviar_clients.cli.scenarios import new_scenario
+
+    path = new_scenario(name)
+    typer.echo(f"{path} is a scenario to edit; run it with: caviar run {path}")
 
 
 @app.command(rich_help_panel=RUN)
@@ -112,7 +154,9 @@ def broker(
         _nothing_else(scenario, frames, seed, pace)
         raise typer.Exit(serve(parser().parse_args(["--resume", str(resume), *options])))
     if scenario is None:
-        raise RunError("give a scenario file, or --resume with the directory of a run")
+        raise RunError(
+            "give a scenario, by name (caviar scenarios) or file, or --resume with the directory of a run"
+        )
     checked = checked_scenario(scenario, frames, seed, pace)
     check_bind(bind or DEFAULT_BIND, keys=keys is not None)
     current = RunInProgress(out, checked.run.name) if restarted else None
@@ -330,7 +374,11 @@ def budget(
 def tradeoff(
     source: Annotated[
         Path,
-        typer.Argument(help="scenario file, or directory of a run that recorded `scene`", show_default=False),
+        typer.Argument(
+            help="scenario, by name or file, or directory of a run that recorded `scene`",
+            show_default=False,
+            autocompletion=complete_scenario,
+        ),
     ],
     json: Annotated[Path | None, typer.Option(help="write all figures to this file")] = None,
     out: Annotated[Path | None, typer.Option(help="directory for tables and pictures")] = None,

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from caviar_clients.cli.scenarios import complete_scenario
+
 RunDirectory = Annotated[Path, typer.Argument(help="directory of a run, or one segment of its recording")]
 Frames = Annotated[int | None, typer.Option(min=1, help="frames of an episode, instead of the scenario's")]
 Seed = Annotated[int | None, typer.Option(min=0, max=2**63 - 1, help="seed, instead of the scenario's")]
@@ -21,7 +23,14 @@ Resume = Annotated[Path | None, typer.Option(help="go on with the run in this di
 Force = Annotated[
     bool, typer.Option("--force", help="with --resume: though code, libraries or files have changed")
 ]
-ScenarioOrNone = Annotated[Path | None, typer.Argument(help="scenario file (TOML)", show_default=False)]
+ScenarioOrNone = Annotated[
+    Path | None,
+    typer.Argument(
+        help="scenario that ships, by name (caviar scenarios), or a file (TOML)",
+        show_default=False,
+        autocompletion=complete_scenario,
+    ),
+]
 Restarted = Annotated[
     bool,
     typer.Option("--restarted", help="for a container that is started again whenever this status is not 0"),

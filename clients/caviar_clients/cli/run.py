@@ -22,6 +22,7 @@ from caviar_clients.cli.files import write_file
 from caviar_clients.cli.inside import EmbeddedLauncher
 from caviar_clients.cli.launch import Launcher
 from caviar_clients.cli.remote import key_text, reachable, start_command, waiting_text
+from caviar_clients.cli.scenarios import require_extras
 from caviar_clients.cli.summary import recorded_figures, summary_of, summary_table
 from caviar_clients.sessions.checking import checked_scenario
 from caviar_clients.sessions.plausibility import implausible_values
@@ -72,6 +73,7 @@ def run_scenario(
     """Run a scenario; the exit status: 0 exactly if it came to its end."""
     scenario = checked_scenario(path, frames, seed, pace)
     check_bind(bind, keys=keys is not None)
+    require_extras(scenario)
     if embedded:
         refuse_remote(scenario)
     if http:

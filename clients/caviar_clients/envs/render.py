@@ -11,6 +11,7 @@ from caviar_clients.plots.style import GREY
 from caviar_protocol.arrays import UInt8Array
 from caviar_protocol.beams import beam_gain
 from caviar_protocol.errors import SetupError
+from caviar_protocol.extras import install_command
 from caviar_protocol.pairs import Pair
 from caviar_protocol.scene import device_pose
 from caviar_protocol.topics import Link, Scene
@@ -29,7 +30,7 @@ class MapRenderer:
             from matplotlib.backends.backend_agg import FigureCanvasAgg
             from matplotlib.figure import Figure
         except ImportError as error:
-            raise SetupError("pictures need Matplotlib: pip install 'caviar-sim[plot]'") from error
+            raise SetupError(f"pictures need Matplotlib; run: {install_command('plot')}") from error
         self._figure = Figure(SIZE_IN, dpi=DPI, layout="compressed")
         self._canvas = FigureCanvasAgg(self._figure)
         self._axes: Any = self._figure.subplots()

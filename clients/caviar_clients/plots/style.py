@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from caviar_protocol.errors import RunError, SetupError
+from caviar_protocol.extras import install_command
 
 # Okabe and Ito, "Color Universal Design", 2008.
 BLACK, GREY, LIGHT_GREY = "#222222", "#8c8c8c", "#dcdcdc"
@@ -42,7 +43,7 @@ def styled() -> Iterator[None]:
         from matplotlib import rc_context
     except ModuleNotFoundError as error:
         raise SetupError(
-            f"pictures need {error.name!r}, which is not installed; run: pip install 'caviar-sim[plot]'"
+            f"pictures need {error.name!r}, which is not installed; run: {install_command('plot')}"
         ) from error
     with rc_context(_SETTINGS):
         yield

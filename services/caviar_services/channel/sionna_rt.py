@@ -18,6 +18,7 @@ import numpy as np
 from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.errors import PayloadError, SetupError
+from caviar_protocol.extras import install_command
 from caviar_protocol.seeding import derive_seed
 from caviar_protocol.topics import AntennaDevice, ChannelOptions, Scene
 from caviar_services.channel.base import Found, PathModel
@@ -59,6 +60,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
 
     Settings: ClassVar[type[msgspec.Struct]] = SionnaSettings
     rung = "siso-rt"
+    extra: ClassVar[str] = "channel"
     uses_scenery: ClassVar[bool] = True
     checkpoints: ClassVar[bool] = True
 
@@ -313,7 +315,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
             import sionna.rt
         except ImportError as error:
             raise SetupError(
-                f"sionna-rt cannot be imported ({error}); install it: pip install 'caviar-sim[channel]'"
+                f"sionna-rt cannot be imported ({error}); run: {install_command('channel')}"
             ) from error
         return (*notes, f"sionna-rt {sionna.rt.__version__}")
 

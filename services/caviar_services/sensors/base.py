@@ -19,6 +19,7 @@ import numpy as np
 from caviar_protocol.arrays import Float64Array, Payload, quantity
 from caviar_protocol.coordinates import Pose, rotation_matrix
 from caviar_protocol.errors import PayloadError, ScenarioError, SetupError
+from caviar_protocol.extras import install_command
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.scene import device_pose
 from caviar_protocol.topics import Scene
@@ -50,6 +51,7 @@ class Sensors(Service[S]):
     """
 
     role: ClassVar[Role] = "sensors"
+    extra: ClassVar[str] = "sensors"
     inputs: ClassVar[tuple[Input, ...]] = (Input(topic="scene"),)
 
     traced: TracedScene | None = None
@@ -73,7 +75,7 @@ class Sensors(Service[S]):
             return Prepared(notes=("nobody asks for what these sensors see: not run",))
         if importlib.util.find_spec("mitsuba") is None:
             raise SetupError(
-                "Mitsuba, which traces the rays, is not installed; run: pip install 'caviar-sim[sensors]'"
+                f"Mitsuba, which traces the rays, is not installed; run: {install_command('sensors')}"
             )
         device = "a CUDA device" if cuda_devices() else activate_llvm()
         # The channel's variant: rays and triangles are the same in all, and an embedded run with both

@@ -9,6 +9,7 @@ from pathlib import Path, PurePosixPath
 from xml.parsers import expat
 
 from caviar_protocol.errors import AssetError, ScenarioError, SetupError
+from caviar_protocol.extras import install_command
 from caviar_services.world.shapes import SHAPES, ply
 
 _BUNDLED = "sionna:"
@@ -50,7 +51,7 @@ def _bundled(name: str) -> Path:
     if folder is None:
         raise SetupError(
             f'scenery "{_BUNDLED}{name}" comes with sionna-rt, which is not installed; run: '
-            "pip install 'caviar-sim[world]'"
+            + install_command("world")
         )
     xml = folder / name / f"{name}.xml"
     if "/" in name or not xml.is_file():

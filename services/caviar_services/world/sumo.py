@@ -90,6 +90,7 @@ class SumoWorld(World[SumoSettings]):
     """
 
     Settings = SumoSettings
+    extra: ClassVar[str] = "world"
     checkpoints: ClassVar[bool] = True
 
     def __init__(self, settings: SumoSettings, run: RunInfo) -> None:

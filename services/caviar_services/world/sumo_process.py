@@ -19,6 +19,7 @@ from typing import Any
 from xml.parsers import expat
 
 from caviar_protocol.errors import RunError, ScenarioError, SetupError
+from caviar_protocol.extras import install_command
 
 _ROOTS = {
     "net": ("net",),
@@ -44,7 +45,7 @@ def load_libsumo() -> ModuleType:
         import libsumo
     except ImportError as error:
         raise SetupError(
-            f"the world `sumo` needs libsumo ({error}); run: pip install 'caviar-sim[world]'"
+            f"the world `sumo` needs libsumo ({error}); run: {install_command('world')}"
         ) from error
     return libsumo  # type: ignore[no-any-return]  # an untyped module
 

@@ -1,0 +1,119 @@
+"""`caviar scenarios`, which lists what ships, and `caviar new`, which writes a scenario to edit."""
+
+from __future__ import annotations
+
+import re
+from importlib import resources
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from caviar_protocol.errors import RunError, SetupError
+from caviar_protocol.extras import has_extra, install_command
+from caviar_protocol.scenario import Scenario, ServiceSpec
+from caviar_protocol.scenario_loader import load_scenario, shipped_scenarios
+from caviar_services.registry import load
+
+TEMPLATE = "new/scenario.toml"
+"""The scenario that `caviar new` writes, in the package of scenarios."""
+_TEMPLATE_NAME = 'name = "my-scenario"'
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
+
+
+def description(text: str) -> str:
+    """What a scenario is: the first sentence of the comment at the head of its file."""
+    lines = []
+    for line in text.splitlines():
+        comment = line.removeprefix("#").strip()
+        if not line.startswith("#") or not comment:
+            break
+        lines.append(comment)
+    return re.split(r"(?<=\.) (?=[A-Z])", " ".join(lines), maxsplit=1)[0].rstrip(".")
+
+
+def extras_of(scenario: Scenario) -> tuple[str, ...]:
+    """Extras of the distribution that the services of a scenario need, in order of name.
+
+    Remote services need theirs where they run.
+    """
+    return tuple(sorted(set().union(*(_extras(spec) for spec in scenario.services.values()))))
+
+
+def _extras(spec: ServiceSpec) -> set[str]:
+    if spec.remote:
+        return set()
+    found = {load(spec.role, spec.use).extra}
+    scenery = spec.settings.get("scenery", "")
+    if isinstance(scenery, str) and scenery.startswith("sionna:"):
+        found.add("world")
+    for rung in spec.settings.get("ladder", ()):  # models that an adaptive channel chooses among
+        found.add(load(spec.role, rung.get("use", "sionna-rt")).extra)
+    return found - {""}
+
+
+def require_extras(scenario: Scenario) -> None:
+    """Raise `SetupError` with one command that installs every extra which a scenario needs and that lacks."""
+    missing = [extra for extra in extras_of(scenario) if not has_extra(extra)]
+    if missing:
+        raise SetupError(
+            f"scenario {scenario.run.name!r} needs what is not installed ({', '.join(missing)}); "
+            f"run: {install_command(*missing)}"
+        )
+
+
+def list_scenarios(console: Console) -> None:
+    """Print the scenarios that ship, each with a line and the extras that it needs."""
+    table = Table(box=None, pad_edge=False)
+    table.add_column("name", no_wrap=True)
+    table.add_column("what it is", overflow="fold")
+    table.add_column("needs", overflow="fold")
+    lacking: set[str] = set()
+    for name, path in shipped_scenarios().items():
+        extras = extras_of(load_scenario(path))
+        lacking.update(extra for extra in extras if not has_extra(extra))
+        table.add_row(name, Text(description(path.read_text())), _needs(extras))
+    console.print(table)
+    console.print("\ncaviar run NAME runs one; caviar new NAME writes one of your own to edit.")
+    if lacking:
+        console.print("[yellow]*[/] is not installed; what installs all of it:")
+        console.print(f"  {install_command(*sorted(lacking))}", soft_wrap=True, markup=False, highlight=False)
+
+
+def _needs(extras: tuple[str, ...]) -> Text:
+    if not extras:
+        return Text("base install")
+    marks = [(extra if has_extra(extra) else f"{extra}*") for extra in extras]
+    text = Text(", ".join(marks))
+    text.highlight_regex(r"\*", "yellow")
+    return text
+
+
+def complete_scenario(incomplete: str) -> list[tuple[str, str]]:
+    """Names of shipped scenarios that begin so, for completion in a shell, which adds files by itself."""
+    return [
+        (name, description(path.read_text()))
+        for name, path in shipped_scenarios().items()
+        if name.startswith(incomplete)
+    ]
+
+
+def new_scenario(name: str) -> Path:
+    """Write a commented scenario to edit: ``NAME.toml`` in this folder, or the path that ``name`` is.
+
+    Raises `RunError` where the file exists or cannot be written, or the name is none of a run.
+    """
+    path = Path(name if name.endswith(".toml") else f"{name}.toml")
+    if _NAME.fullmatch(path.stem) is None:
+        raise RunError(f"{path.stem!r} is no name of a scenario: use letters, digits, '_', '.' and '-'")
+    text = (resources.files("caviar_scenarios") / TEMPLATE).read_text()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text.replace(_TEMPLATE_NAME, f'name = "{path.stem}"', 1))
+    except OSError as error:
+        if path.is_file():
+            raise RunError(f"{path} is there already: choose another name, or remove it") from error
+        raise RunError(f"cannot write {path}: {error.strerror}; choose another folder") from error
+    return path

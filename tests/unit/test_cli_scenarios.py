@@ -1,0 +1,137 @@
+"""`caviar scenarios` and `caviar new`, and what else a user meets first: names, help, version, completion."""
+
+from __future__ import annotations
+
+import io
+import re
+import shlex
+import sys
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+from caviar_clients.cli import scenarios
+from caviar_clients.cli.main import app
+from caviar_clients.embedded.run import EmbeddedRun
+from caviar_clients.sessions.checking import check_implementations, checked_scenario
+from caviar_protocol import extras
+from caviar_protocol.errors import RunError, SetupError
+from caviar_protocol.scenario_loader import load_scenario, parse_scenario, shipped_scenarios
+
+runner = CliRunner()
+ENVIRONMENT = {"COLUMNS": "150", "TERM": "dumb"}
+
+
+def listed(monkeypatch: pytest.MonkeyPatch, installed: bool) -> str:
+    monkeypatch.setattr(scenarios, "has_extra", lambda extra: installed)
+    console = Console(file=io.StringIO(), width=120)
+    scenarios.list_scenarios(console)
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue()
+
+
+def test_every_shipped_scenario_is_listed_with_a_line_and_what_it_needs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    text = listed(monkeypatch, installed=True)
+    for name, path in shipped_scenarios().items():
+        assert re.search(rf"^{name} +\w", text, re.MULTILINE), name
+        assert 20 < len(scenarios.description(path.read_text())) < 160, name
+    assert re.search(r"^smoke .* base install *$", text, re.MULTILINE)
+    assert re.search(r"^street-canyon .* channel, sensors, world *$", text, re.MULTILINE)
+    assert "pip install" not in text
+
+
+def test_the_list_marks_what_is_not_installed_and_names_one_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = listed(monkeypatch, installed=False)
+    assert "channel*, sensors*, world*" in text
+    assert f"{sys.executable} -m pip install 'caviar-sim[channel,sensors,world]'" in text
+
+
+@pytest.mark.parametrize(
+    ("name", "needed"),
+    [
+        ("smoke", ()),
+        ("geometric", ()),
+        ("remote", ()),
+        ("uav-munich", ("channel", "world")),
+        ("adaptive", ("channel", "world")),
+        ("cameras", ("channel", "sensors", "world")),
+    ],
+)
+def test_what_a_scenario_needs_follows_from_its_services(name: str, needed: tuple[str, ...]) -> None:
+    assert scenarios.extras_of(load_scenario(name)) == needed
+
+
+def test_a_run_without_its_extras_is_refused_with_one_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scenarios, "has_extra", lambda extra: extra == "world")
+    with pytest.raises(SetupError, match=re.escape("'caviar-sim[channel,sensors]'")):
+        scenarios.require_extras(load_scenario("street-canyon"))
+    scenarios.require_extras(load_scenario("smoke"))
+
+
+def test_the_install_command_names_this_interpreter_and_an_extra_that_exists(repository: Path) -> None:
+    python, *_, wanted = shlex.split(extras.install_command("plot"))
+    assert (python, wanted) == (sys.executable, "caviar-sim[plot]")
+    provided = metadata.metadata("caviar-sim").get_all("Provides-Extra") or []
+    assert {*extras._MODULES} <= {*provided}
+
+
+def test_a_new_scenario_runs_as_it_is_and_has_the_name_that_was_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = runner.invoke(app, ["new", "first"])
+    assert done.exit_code == 0
+    assert "caviar run first.toml" in done.output
+    scenario = checked_scenario(Path("first.toml"), frames=3)
+    assert (scenario.run.name, scenarios.extras_of(scenario)) == ("first", ())
+    outcome = EmbeddedRun(scenario, None).run()
+    assert not outcome.error
+
+
+def test_a_new_scenario_overwrites_nothing_and_makes_its_folder(tmp_path: Path) -> None:
+    path = scenarios.new_scenario(str(tmp_path / "deep" / "mine"))
+    assert path == tmp_path / "deep" / "mine.toml"
+    path.write_text("edited")
+    with pytest.raises(RunError, match=r"mine\.toml is there already"):
+        scenarios.new_scenario(str(path))
+    assert path.read_text() == "edited"
+    with pytest.raises(RunError, match="'a b' is no name"):
+        scenarios.new_scenario(str(tmp_path / "a b"))
+    with pytest.raises(RunError, match="cannot write"):
+        scenarios.new_scenario(str(path / "below-a-file"))
+
+
+def test_every_alternative_that_a_new_scenario_comments_out_is_accepted(tmp_path: Path) -> None:
+    text = scenarios.new_scenario(str(tmp_path / "mine")).read_text()
+    commented = re.compile(r"^# (\[|\w+ = )", re.MULTILINE)
+    assert len(commented.findall(text)) >= 15
+    (tmp_path / "my-city.xml").write_text("<scene/>")
+    scenario = parse_scenario(commented.sub(r"\1", text), folder=tmp_path)
+    check_implementations(scenario)
+    assert scenario.run.pace == "realtime"
+    assert "lidar" in scenario.services
+
+
+@pytest.mark.parametrize("command", [[], ["run"], ["keys", "new"], ["bench", "broker"]])
+def test_h_is_help_everywhere(command: list[str]) -> None:
+    short = runner.invoke(app, [*command, "-h"], env=ENVIRONMENT)
+    assert short.exit_code == 0
+    assert short.output == runner.invoke(app, [*command, "--help"], env=ENVIRONMENT).output
+    assert "Usage: " in short.output
+
+
+def test_the_version_is_that_of_the_distribution() -> None:
+    done = runner.invoke(app, ["--version"])
+    assert (done.exit_code, done.output) == (0, f"caviar {metadata.version('caviar-sim')}\n")
+
+
+def test_a_shell_completes_names_of_scenarios() -> None:
+    environment = {"_CAVIAR_COMPLETE": "complete_bash", "COMP_WORDS": "caviar run street", "COMP_CWORD": "2"}
+    done = runner.invoke(app, [], prog_name="caviar", env=environment)
+    assert done.output.split() == ["street-canyon"]
+    assert "--install-completion" in runner.invoke(app, ["-h"], env=ENVIRONMENT).output
