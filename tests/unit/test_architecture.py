@@ -67,6 +67,7 @@ def test_the_wheel_has_the_four_packages_typed_and_licensed_and_the_scenarios(bu
     assert tops - {f"{wheel.name.split('-py3')[0]}.dist-info"} == {*PACKAGES, "caviar_scenarios"}
     assert "caviar_scenarios/smoke.toml" in names
     assert "caviar_scenarios/street-canyon/canyon.net.xml" in names
+    assert "caviar_scenarios/new/scenario.toml" in names
     for package in PACKAGES:
         assert f"{package}/py.typed" in names
     assert any(name.endswith("licenses/LICENSE") for name in names)
