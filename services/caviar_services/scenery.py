@@ -13,11 +13,22 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from xml.etree import ElementTree
+from xml.parsers import expat
 
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import AssetError
+from caviar_protocol.tables import suggestion
+
+ITU_MATERIALS = frozenset(
+    (
+        "asphalt_concrete", "brick", "carpet_tile", "ceiling_board", "chipboard", "clear_acrylic", "concrete",
+        "floorboard", "glass", "marble", "medium_dry_ground", "metal", "plasterboard", "plywood", "vacuum",
+        "very_dry_ground", "vinyl_tile", "wet_ground", "wood",
+    )
+)  # fmt: skip
+"""Materials of Recommendation ITU-R P.2040-3, table 3, by the names that Sionna RT has for them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +47,10 @@ class SceneryShape:
     """Name of that material in ITU-R P.2040 (``concrete``); empty where it is not one of those."""
     colour: tuple[float, float, float] | None = None
     """Linear sRGB, 0…1, that the description gives its material; None where it gives none."""
+    material_type: str = ""
+    """Type of that material in the description (``diffuse``); empty where it has none."""
+    place: str = ""
+    """Where it stands, for messages: file, line and name."""
 
 
 @dataclass(frozen=True)
@@ -59,63 +74,105 @@ def find_scenery(assets: Mapping[str, Path]) -> Path | None:
     return assets[found[0]] if found else None
 
 
-def read_scenery(file: Path) -> Scenery:
+def asset_name(description: Path | None) -> str:
+    """What errors call a description that came from another service: its file is a copy in a cache."""
+    return f"scenery/{description.name}" if description else "the empty scene"
+
+
+def read_scenery(file: Path, called: str = "") -> Scenery:
     """Read a scene description; every mesh it names lies in its folder or below.
 
-    Raises `AssetError` naming the file, the shape and the remedy where the XML is broken, a shape
-    is of another type than ``ply``, a mesh is missing, or a name occurs twice.
+    ``called`` is what errors call the file, where its path would mean nothing to the user: a copy.
+
+    Raises `AssetError` naming the file, the line, the shape or material and the remedy where the XML is
+    broken, a shape is of another type than ``ply``, a mesh is missing, an id occurs twice, or ITU-R P.2040
+    has no such material.
     """
-    root = _parse(file)
+    called = called or str(file)
+    root, lines = _parse(file, called)
+    _check_ids(called, root, lines)
     defaults = {d.get("name", ""): d.get("value", "") for d in root.iter("default")}
     materials = {b.get("id", ""): b for b in root.findall("bsdf")}
+    for element in (*root.findall("bsdf"), *root.findall("shape/bsdf")):
+        _check_material(f"{called}:{lines[element]}: material {element.get('id', '')!r}", element, defaults)
     shapes: dict[str, SceneryShape] = {}
     for element in root.findall("shape"):
-        shape = _shape(file, element, defaults, materials)
+        given = element.get("id") or element.get("name") or ""
+        where = f"{called}:{lines[element]}: shape {given!r}"
+        shape = _shape(where, file.parent, element, defaults, materials)
         if shape.name in shapes:
-            raise AssetError(f"{file}: two shapes are named {shape.name!r}; give each an id of its own")
+            raise AssetError(
+                f"{where}: another shape is named {shape.name!r}, too; give each an id of its own"
+            )
         shapes[shape.name] = shape
     return Scenery(file, tuple(shapes.values()))
 
 
-class _Builder(ElementTree.TreeBuilder):
-    """Refuses document types, and with them entities, before any is expanded."""
-
-    def doctype(self, name: str, _public: str | None, _system: str | None) -> None:
-        raise AssetError(f"document type {name!r} is refused; remove the <!DOCTYPE …> declaration")
+_Lines = Mapping[ElementTree.Element, int]
+"""Line of each element's start tag, from 1."""
 
 
-def _parse(file: Path) -> ElementTree.Element:
+def _parse(file: Path, called: str) -> tuple[ElementTree.Element, _Lines]:
+    """The root element; document types, and with them entities, are refused before any is expanded."""
+    builder, lines = ElementTree.TreeBuilder(), dict[ElementTree.Element, int]()
+    parser = expat.ParserCreate()
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        lines[builder.start(tag, attributes)] = parser.CurrentLineNumber
+
+    def doctype(name: str, *_: object) -> None:
+        raise AssetError(
+            f"{called}:{parser.CurrentLineNumber}: document type {name!r} is refused; remove "
+            "the <!DOCTYPE …> declaration"
+        )
+
+    parser.StartElementHandler, parser.EndElementHandler = start, builder.end
+    parser.CharacterDataHandler, parser.StartDoctypeDeclHandler = builder.data, doctype
     try:
-        data = file.read_bytes()
+        parser.Parse(file.read_bytes(), True)
     except OSError as error:
-        raise AssetError(f"{file}: cannot be read ({error.strerror}); check the scenery's path") from error
-    parser = ElementTree.XMLParser(target=_Builder())  # noqa: S314 - the builder refuses entities
-    try:
-        parser.feed(data)
-        root: ElementTree.Element = parser.close()
-    except ElementTree.ParseError as error:
-        raise AssetError(f"{file}: broken XML, {error}; export the scene again") from error
-    except AssetError as error:
-        raise AssetError(f"{file}: {error}") from error
+        raise AssetError(f"{called}: cannot be read ({error.strerror}); check the scenery's path") from error
+    except expat.ExpatError as error:
+        raise AssetError(f"{called}:{error.lineno}: broken XML, {error}; export the scene again") from error
+    root = builder.close()
     if root.tag != "scene":
-        raise AssetError(f"{file}: the root element is <{root.tag}>, expected <scene>")
-    return root
+        raise AssetError(f"{called}:{lines[root]}: the root element is <{root.tag}>, expected <scene>")
+    return root, lines
+
+
+def _check_ids(called: str, root: ElementTree.Element, lines: _Lines) -> None:
+    """Refuse an id that two elements have: renderers would take one of them, or none."""
+    first: dict[str, ElementTree.Element] = {}
+    for element in root.iter():
+        name = element.get("id", "")
+        if name and element.tag != "ref" and first.setdefault(name, element) is not element:
+            raise AssetError(
+                f"{called}:{lines[element]}: <{element.tag}> has the id {name!r}, which line "
+                f"{lines[first[name]]} has, too; give each an id of its own"
+            )
+
+
+def _check_material(where: str, bsdf: ElementTree.Element, defaults: Mapping[str, str]) -> None:
+    """Refuse a material that is to be one of ITU-R P.2040 and is none."""
+    name = _resolved(where, _itu_material(bsdf), defaults)
+    if name and name not in ITU_MATERIALS:
+        raise AssetError(f"{where}: ITU-R P.2040 has no material {name!r}; {suggestion(name, ITU_MATERIALS)}")
 
 
 def _shape(
-    file: Path,
+    where: str,
+    folder: Path,
     element: ElementTree.Element,
     defaults: Mapping[str, str],
     materials: Mapping[str, ElementTree.Element],
 ) -> SceneryShape:
     given = element.get("id") or element.get("name") or ""
-    where = f"{file}: shape {given!r}"
     if element.get("type") != "ply":
         raise AssetError(f"{where} is of type {element.get('type')!r}; export it as a PLY mesh, type='ply'")
     filename = element.find("string[@name='filename']")
     if filename is None or not filename.get("value"):
         raise AssetError(f"{where} names no file; give it <string name='filename' value='meshes/….ply'/>")
-    mesh = _mesh_file(where, file.parent, _resolved(where, filename.get("value", ""), defaults))
+    mesh = _mesh_file(where, folder, _resolved(where, filename.get("value", ""), defaults))
     transform = element.find("transform[@name='to_world']")
     material = _material_of(where, element, materials)
     return SceneryShape(
@@ -124,6 +181,8 @@ def _shape(
         to_world=np.eye(4) if transform is None else _to_world(where, transform, defaults),
         material="" if material is None else material.get("id", ""),
         itu_material="" if material is None else _itu_material(material),
+        material_type="" if material is None else material.get("type", ""),
+        place=where,
         colour=None if material is None else _colour(where, material),
     )
 

@@ -66,7 +66,7 @@ def test_a_directory_that_cannot_be_made_is_named_with_the_option(monkeypatch, c
     file.write_text("")
     err = complaint(monkeypatch, capsys, "run", SMOKE, "--out", file)
     assert f"{file}/smoke-" in err
-    assert "Not a directory; choose another with --out" in err
+    assert "is a file, not a folder; choose another folder" in err
 
 
 def test_a_summary_that_cannot_be_written_ends_the_command_before_the_run(monkeypatch, capsys, tmp_path):

@@ -259,7 +259,7 @@ def test_a_fault_while_drawing_leaves_no_file_and_the_old_one_as_it_was(tmp_path
 def test_a_folder_that_cannot_be_written_is_named(tmp_path):
     run = record(tmp_path / "run", 2)
     (tmp_path / "file").write_text("")
-    with pytest.raises(RunError, match=r"cannot write .*file/a\.gif: .*; choose another with --out"):
+    with pytest.raises(RunError, match=r"cannot write .*file/a\.gif: .* is a file, not a folder"):
         film_run(run, tmp_path / "file" / "a.gif", width=320)
 
 

@@ -353,6 +353,7 @@ def test_an_action_of_several_users_has_an_index_for_each(action: Any) -> None:
         ({"observe": ("camera",)}, ["'camera'", "no device of kind 'camera'"]),
         ({"observe": ("aoa:left",)}, ["'aoa:left'", "write 'aoa'"]),
         ({"observe": ()}, ["write observe=('aoa',)"]),
+        ({"observe": "aod"}, ["observe is the text 'aod'", "observe=('aod',)"]),
         ({"reward": "absy"}, ["'absy'", "abs_y, normalised, snr, spectral_efficiency"]),
         ({"agent": "agnet"}, ["'agnet'", "its agents are: agent"]),
         ({"agent": "link"}, ["no agent 'link'", "its agents are: agent"]),

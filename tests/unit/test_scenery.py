@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from caviar_protocol.errors import AssetError
-from caviar_services.scenery import SceneryShape, find_scenery, read_scenery
+from caviar_services.channel.sionna_meshes import file_vertices
+from caviar_services.scenery import ITU_MATERIALS, SceneryShape, find_scenery, read_scenery
+from caviar_services.world.assets import scenery_assets
 
 SHAPE = '<shape type="ply" id="mesh-{0}"><string name="filename" value="meshes/{0}.ply"/>{1}</shape>'
 
@@ -133,7 +135,7 @@ def test_defaults_are_filled_in(tmp_path: Path) -> None:
         (SHAPE.format("gone", ""), ["mesh-gone", "meshes/gone.ply", "missing"]),
         (SHAPE.format("../../wall", ""), ["meshes/../../wall.ply", "below its folder"]),
         (SHAPE.format("wall", '<ref id="m" name="bsdf"/>'), ["mesh-wall", "'m'", "not defined"]),
-        (SHAPE.format("wall", "") * 2, ["two shapes", "'wall'"]),
+        (SHAPE.format("wall", "") * 2, ["has the id 'mesh-wall'", "line 1 has, too"]),
         (
             SHAPE.format("wall", '<transform name="to_world"><lookat origin="0,0,0"/></transform>'),
             ["mesh-wall", "lookat", "rotate"],
@@ -190,3 +192,57 @@ def test_the_description_is_found_among_the_assets() -> None:
 def test_two_descriptions_in_one_run_are_refused() -> None:
     with pytest.raises(AssetError, match=r"scenery/a\.xml, scenery/b\.xml"):
         find_scenery({"scenery/b.xml": Path("b"), "scenery/a.xml": Path("a")})
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        (
+            '\n<bsdf type="itu-radio-material" id="m">\n<string name="type" value="concret"/></bsdf>',
+            r"scene\.xml:2: material 'm': ITU-R P\.2040 has no material 'concret'; did you mean 'concrete'",
+        ),
+        ('\n\n<bsdf type="diffuse" id="mat-itu_bric"/>', r"scene\.xml:3: material .* did you mean 'brick'"),
+        (
+            '\n<shape type="cube" id="block"/>',
+            r"scene\.xml:2: shape 'block' is of type 'cube'; export it as a PLY",
+        ),
+        (
+            SHAPE.format("wall", "") + "\n" + SHAPE.format("wall", ""),
+            r"scene\.xml:2: <shape> has the id 'mesh-wall', which line 1 has, too; give each an id",
+        ),
+        (
+            '<bsdf type="diffuse" id="a"/>\n<bsdf type="diffuse" id="a"/>',
+            r"scene\.xml:2: <bsdf> has the id 'a', which line 1 has, too",
+        ),
+        (
+            SHAPE.format("wall", '<ref id="m" name="bsdf"/>'),
+            r"scene\.xml:1: shape 'mesh-wall' refers to material",
+        ),
+        ("\n<shape", r"scene\.xml:2: broken XML"),
+    ],
+)
+def test_a_mistake_is_told_with_file_and_line(tmp_path: Path, body: str, message: str) -> None:
+    file = described(tmp_path, body, "wall")
+    with pytest.raises(AssetError, match=message):
+        read_scenery(file)
+    with pytest.raises(AssetError, match=message.replace(r"scene\.xml", "^scenery/mine")):
+        read_scenery(file, "scenery/mine")
+
+
+def test_the_world_refuses_it_under_the_path_of_the_user(tmp_path: Path) -> None:
+    file = described(tmp_path, '<bsdf type="diffuse" id="itu_concret"/>')
+    with pytest.raises(AssetError, match=rf"^{file}:1: material 'itu_concret': .* did you mean 'concrete'"):
+        scenery_assets(str(file))
+
+
+def test_the_materials_are_those_of_the_ray_tracer() -> None:
+    itu = pytest.importorskip("sionna.rt.radio_materials.itu", reason="needs the extra `channel`")
+    assert frozenset(itu.ITU_MATERIALS_PROPERTIES) == ITU_MATERIALS
+
+
+def test_the_ray_tracer_refuses_a_shape_without_radio_constants(tmp_path: Path) -> None:
+    body = '<bsdf type="diffuse" id="paint"/>\n' + SHAPE.format("wall", '<ref id="paint" name="bsdf"/>')
+    with pytest.raises(
+        AssetError, match=r"^scenery/scene\.xml:2: shape 'mesh-wall' has material 'paint' of type"
+    ):
+        file_vertices(described(tmp_path, body, "wall"))

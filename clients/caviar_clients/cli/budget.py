@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from caviar_clients.budget.forecast import POLICIES, Forecast, ServiceForecast, forecast
-from caviar_clients.cli.files import write_file
+from caviar_clients.files import write_file
 from caviar_clients.replay.recorded import RecordedRun
 from caviar_protocol.recording import Recording
 

@@ -13,10 +13,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from caviar_clients.cli.files import write_file
 from caviar_clients.conform import Verdict, cases, conform
 from caviar_clients.conform.report import as_json, as_markdown, summary
 from caviar_clients.conform.session import Rules
+from caviar_clients.files import write_file
 from caviar_protocol.errors import SetupError
 
 STYLES = {"pass": "green", "fail": "bold red", "not applicable": "dim"}

@@ -12,6 +12,11 @@ from caviar_protocol.arrays import quantity
 from caviar_protocol.messages import Report
 
 
+def counted(number: int, what: str) -> str:
+    """``1 frame``, ``2 frames``."""
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
 class Decided(msgspec.Struct, kw_only=True):
     """One decision of one service over all frames: the rung of an adaptive channel, say."""
 
@@ -68,8 +73,8 @@ def decided_lines(found: Sequence[Decided]) -> list[str]:
     for entry in found:
         total = sum(entry.frames.values())
         shares = ", ".join(f"{value} {count / total:.0%}" for value, count in entry.frames.items())
-        line = f"{entry.service}: {entry.decision} {shares}; {entry.changes} changes"
+        line = f"{entry.service}: {entry.decision} {shares}; {counted(entry.changes, 'change')}"
         if entry.error_checks:
-            line += f"; stated error held in {entry.error_covered} of {entry.error_checks} checks"
+            line += f"; stated error held in {entry.error_covered} of {counted(entry.error_checks, 'check')}"
         lines.append(line)
     return lines

@@ -28,6 +28,7 @@ class EmbeddedLauncher:
         self._directory = directory
         self._told: deque[dict[str, Any]] = deque()
         self._told_frame = 0.0
+        self._log_error = ""
         self._run = EmbeddedRun(scenario, directory, self._notice, self._frame)
 
     def __enter__(self) -> EmbeddedLauncher:
@@ -38,17 +39,20 @@ class EmbeddedLauncher:
 
     def events(self) -> Iterator[Mapping[str, Any]]:
         """What happens, until the run is over."""
-        with closing(self._run.steps()) as steps, (self._directory / "events.jsonl").open("w") as log:
+        with closing(self._run.steps()) as steps:
             for _ in steps:
                 while self._told:
                     event = self._told.popleft()
                     if event["event"] == "notice":
-                        log.write(json.dumps(event, ensure_ascii=False) + "\n")
+                        self._log(event)
                     yield event
         outcome, statistics = self._run.outcome, self._run.statistics
         if outcome is None:
             raise RunError("the run ended without an outcome")
         statistics.save(self._directory / "latency.npz")
+        if self._log_error:
+            text = f"the log of notices is incomplete: {self._log_error}"
+            yield {"event": "notice", "kind": "note", "service": "", "frame": -1, "text": text}
         yield {
             "event": "finished",
             "error": outcome.error,
@@ -69,6 +73,14 @@ class EmbeddedLauncher:
     def log_of(self, service: str) -> Path | None:
         """Services have no logs of their own here."""
         return None
+
+    def _log(self, event: Mapping[str, Any]) -> None:
+        """Keep a notice; a disk that is full costs the log, not the run."""
+        try:
+            with (self._directory / "events.jsonl").open("a", encoding="utf-8") as log:
+                log.write(json.dumps(event, ensure_ascii=False) + "\n")
+        except OSError as error:
+            self._log_error = self._log_error or str(error)
 
     def _notice(self, notice: ev.Notice) -> None:
         fields = ("kind", "service", "episode", "frame", "text")

@@ -7,6 +7,7 @@ import signal
 import time
 from collections.abc import Mapping, Sequence
 from datetime import datetime
+from io import StringIO
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -18,12 +19,12 @@ from rich.text import Text
 from caviar_broker.api.tokens import http_address
 from caviar_broker.record import read_record
 from caviar_broker.security.local import check_bind
-from caviar_clients.cli.files import write_file
 from caviar_clients.cli.inside import EmbeddedLauncher
 from caviar_clients.cli.launch import Launcher
 from caviar_clients.cli.remote import key_text, reachable, start_command, waiting_text
 from caviar_clients.cli.scenarios import require_extras
 from caviar_clients.cli.summary import recorded_figures, summary_of, summary_table
+from caviar_clients.files import reason, write_file
 from caviar_clients.sessions.checking import checked_scenario
 from caviar_clients.sessions.plausibility import implausible_values
 from caviar_protocol.errors import RunError, SetupError
@@ -51,7 +52,7 @@ def run_directory(root: Path, name: str) -> Path:
             continue
         except OSError as error:
             raise RunError(
-                f"cannot make the run's directory {directory}: {error.strerror}; choose another with --out"
+                f"cannot make the run's directory {directory}: {reason(directory, error)}"
             ) from error
         return directory
     raise RunError(f"{root} has a thousand runs named {stem}; choose another directory with --out")
@@ -136,21 +137,27 @@ def _follow(
                 outcome = event
     recorded = recorded_figures(directory) if outcome["frames"] else None
     summary = summary_of(outcome, recorded, scenario.run.name, directory, scenario.run.seed, warnings)
-    text = json.dumps(summary, indent=2, ensure_ascii=False) + "\n"
-    write_file(directory / "summary.json", text)
-    if json_file is not None:
-        write_file(json_file, text)
     if outcome["frames"]:
         _show(console, summary)
-        with (directory / "summary.txt").open("w") as file:
-            _show(Console(file=file, width=100), summary)
     if outcome["error"]:
         told = Text.assemble(("the run ended early:", "red"), f" {outcome['error']}")
         console.print(told, soft_wrap=True)
         log = launcher.log_of(outcome["culprit"])
         if log is not None:
             console.print(Text(f"its log: {log}"), soft_wrap=True)
+    _write_summary(summary, directory, json_file)  # last: a disk that is full leaves the screen
     return 130 if interrupted.came else 1 if outcome["error"] else 0
+
+
+def _write_summary(summary: Mapping[str, Any], directory: Path, json_file: Path | None) -> None:
+    text = json.dumps(summary, indent=2, ensure_ascii=False) + "\n"
+    if json_file is not None:
+        write_file(json_file, text)
+    write_file(directory / "summary.json", text)
+    if summary["frames"]:
+        table = StringIO()
+        _show(Console(file=table, width=100), summary)
+        write_file(directory / "summary.txt", table.getvalue())
 
 
 def _check_http(http: str, keys: Path | None, embedded: bool) -> None:

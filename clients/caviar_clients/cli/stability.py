@@ -11,7 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.table import Table
 from rich.text import Text
 
-from caviar_clients.cli.files import write_file
+from caviar_clients.files import write_file
 from caviar_protocol.errors import SetupError
 from caviar_services.channel.stability.case import Case, Result
 from caviar_services.channel.stability.run import cases, markdown, run, wrong

@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from caviar_clients.cli.decided import Decided, decided_lines
+from caviar_clients.cli.decided import Decided, counted, decided_lines
 from caviar_clients.cli.inspect import RunSummary, link_quality, summarise
 from caviar_clients.cli.outages import OutageSummary, outage_lines
 from caviar_protocol.errors import RecordingError
@@ -86,22 +86,22 @@ def summary_table(summary: Mapping[str, Any]) -> Table:
 
 
 def _caption(summary: Mapping[str, Any]) -> str:
-    parts = [f"{summary['frames']} frames, {summary['frames_per_second']:.1f} frames/s"]
+    parts = [f"{counted(summary['frames'], 'frame')}, {summary['frames_per_second']:.1f} frames/s"]
     if summary["frames_recorded"] not in (None, summary["frames"]):
         parts.append(
-            f"{summary['frames_recorded']} frames recorded, of which the run finished {summary['frames']}; "
-            "its digest is that of these"
+            f"{counted(summary['frames_recorded'], 'frame')} recorded, of which the run finished "
+            f"{summary['frames']}; its digest is that of these"
         )
     late, pace = summary["deadlines"], summary["pace"]
     if late["decisions"]:
         parts.append(
-            f"{late['decisions']} missed deadlines, decided {late['p99_ms']:.2f} ms (p99) behind them, "
+            f"{counted(late['decisions'], 'missed deadline')}, decided {late['p99_ms']:.2f} ms (p99) behind, "
             f"{late['worst_ms']:.2f} ms at worst"
         )
     if pace["slips"]:
         parts.append(
-            f"{pace['slips']} frames slipped behind real time, by {pace['worst_slip_ms']:.1f} ms at worst, "
-            f"{pace['lag_ms']:.1f} ms in all; none was skipped"
+            f"{counted(pace['slips'], 'frame')} slipped behind real time, "
+            f"by {pace['worst_slip_ms']:.1f} ms at worst, {pace['lag_ms']:.1f} ms in all; none was skipped"
         )
     if summary["mean_abs_y"] is not None:
         share = summary["mean_abs_y"] / summary["mean_abs_y_best"] if summary["mean_abs_y_best"] else 0.0

@@ -10,7 +10,7 @@ import msgspec
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from caviar_clients.cli.files import write_file
+from caviar_clients.files import write_file
 from caviar_clients.tradeoff.campaign import Told
 from caviar_clients.tradeoff.plot import draw_convergence, draw_pareto
 from caviar_clients.tradeoff.report import PARTS, Options, Report, compare

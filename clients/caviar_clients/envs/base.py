@@ -81,6 +81,10 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
             raise ScenarioError(f"no reward is called {reward!r}; there are: {', '.join(KINDS)}")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ScenarioError(f"render_mode is {render_mode!r}; write 'rgb_array' or None")
+        if isinstance(observe, str):
+            raise ScenarioError(
+                f"observe is the text {observe!r}; write a tuple of names: observe=({observe!r},)"
+            )
         if not observe:
             raise ScenarioError("observe names no part; write observe=('aoa',)")
         self.scenario = checked_scenario(Path(scenario))

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from caviar_clients.files import writing
 from caviar_protocol.arrays import Int64Array, UInt8Array
 from caviar_protocol.errors import RunError, SetupError
 
@@ -167,16 +168,12 @@ def _encoder(ffmpeg: str) -> list[str]:
 def _part_of(file: Path) -> Iterator[Path]:
     """A place beside ``file`` to write to; it becomes ``file`` if the block ends well."""
     part = file.with_name(f".{file.name}.part")
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
+    with writing(file):
         try:
             yield part
             part.replace(file)
         finally:
             part.unlink(missing_ok=True)
-    except OSError as error:
-        said = error.strerror or error
-        raise RunError(f"cannot write {file}: {said}; choose another with --out") from error
 
 
 def durations_ms(fps: float, count: int) -> list[int]:

@@ -7,7 +7,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
-from caviar_protocol.errors import RunError, SetupError
+from caviar_clients.files import writing
+from caviar_protocol.errors import SetupError
 from caviar_protocol.extras import install_command
 
 # Okabe and Ito, "Color Universal Design", 2008.
@@ -61,11 +62,8 @@ def figure(file: Path, width: float, height: float, layout: Layout = "constraine
 
         drawn = Figure(figsize=(width, height), layout=layout)
         yield drawn
-        try:
-            file.parent.mkdir(parents=True, exist_ok=True)
+        with writing(file):
             drawn.savefig(file, format="png", bbox_inches="tight", pad_inches=0.15)
-        except OSError as error:
-            raise RunError(f"cannot write {file}: {error.strerror}; choose another folder") from error
 
 
 def legend_below(drawn: Any, axes: Any, columns: int = 3) -> None:

@@ -12,12 +12,13 @@ from caviar_services.channel.mesh_detail import DetailEffect, DetailSettings, de
 from caviar_services.channel.sionna_materials import any_frequency, freeze
 from caviar_services.channel.sionna_meshes import Shape
 from caviar_services.meshes import Mesh
+from caviar_services.scenery import asset_name
 
 
 def loaded(description: Path | None) -> Any:
     """The `sionna.rt.Scene` of a description, or an empty one.
 
-    Raises `AssetError` where it cannot be read.
+    Raises `AssetError` where the ray tracer cannot take it.
     """
     from sionna.rt import load_scene
 
@@ -28,7 +29,7 @@ def loaded(description: Path | None) -> Any:
         with any_frequency():
             scene = load_scene(None if description is None else str(description), merge_shapes=False)
     except (ValueError, TypeError, RuntimeError) as error:
-        raise AssetError(f"{description}: the ray tracer cannot load it: {error}") from error
+        raise AssetError(f"{asset_name(description)}: the ray tracer cannot load it: {error}") from error
     freeze(scene)
     return scene
 

@@ -14,7 +14,7 @@ from caviar_protocol.errors import AssetError
 from caviar_services.columns import aligned_columns
 from caviar_services.meshes import Mesh, unit_box
 from caviar_services.ply import ply_vertices
-from caviar_services.scenery import read_scenery
+from caviar_services.scenery import SceneryShape, asset_name, read_scenery
 
 _SAME_VERTEX = 1e-5
 """By how much of its size a mesh in float32 may differ from its file."""
@@ -33,13 +33,25 @@ class Shape:
 def file_vertices(description: Path) -> dict[str, Float64Array]:
     """World vertices [m] of a scenery's shapes as they stand in its files, by name.
 
-    Raises `AssetError` naming what is wrong with the description or with a mesh.
+    Raises `AssetError` naming what is wrong with the description, a material or a mesh.
     """
     vertices = {}
-    for shape in read_scenery(description).shapes:
+    for shape in read_scenery(description, asset_name(description)).shapes:
+        _check_material(shape)
         turned, moved = shape.to_world[:3, :3], shape.to_world[:3, 3]
         vertices[shape.name] = ply_vertices(shape.file) @ turned.T + moved
     return vertices
+
+
+def _check_material(shape: SceneryShape) -> None:
+    """Refuse a shape that has nothing to reflect radio waves with."""
+    if not shape.itu_material and not shape.material_type.endswith("radio-material"):
+        named = f"material {shape.material!r} of type {shape.material_type!r}"
+        raise AssetError(
+            f"{shape.place} has {named if shape.material else 'no material'}, of which the ray tracer has no "
+            "radio constants; give it one of ITU-R P.2040, such as <bsdf type='itu-radio-material' "
+            "id='itu_concrete'><string name='type' value='concrete'/></bsdf>"
+        )
 
 
 def file_meshes(scene: Any, vertices: Mapping[str, Float64Array], weld: bool) -> dict[str, Mesh]:

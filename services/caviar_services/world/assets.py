@@ -10,6 +10,7 @@ from xml.parsers import expat
 
 from caviar_protocol.errors import AssetError, ScenarioError, SetupError
 from caviar_protocol.extras import install_command
+from caviar_services.scenery import read_scenery
 from caviar_services.world.shapes import SHAPES, ply
 
 _BUNDLED = "sionna:"
@@ -21,7 +22,7 @@ def scenery_assets(scenery: str) -> dict[str, Path | bytes]:
     Raises
     ------
     AssetError
-        The XML, or a file that it names, is missing or cannot travel.
+        The XML, or a file that it names, is missing or cannot travel, or the XML is wrong (`read_scenery`).
     SetupError
         A scene of sionna-rt is asked for, and sionna-rt is not installed.
     """
@@ -34,7 +35,9 @@ def scenery_assets(scenery: str) -> dict[str, Path | bytes]:
         )
     if not xml.is_file():
         raise AssetError(f"scenery {xml} is not there; mend the path in settings.scenery")
-    return {f"scenery/{xml.name}": xml, **{f"scenery/{name}": xml.parent / name for name in _named_in(xml)}}
+    named = _named_in(xml)
+    read_scenery(xml)  # what is wrong with it is told with the user's file, not with a copy at its consumers
+    return {f"scenery/{xml.name}": xml, **{f"scenery/{name}": xml.parent / name for name in named}}
 
 
 def object_assets(classes: Iterable[str]) -> dict[str, Path | bytes]:

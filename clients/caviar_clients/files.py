@@ -1,0 +1,56 @@
+"""Files that a command writes because it was asked to: results, tables, pictures."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from caviar_protocol.errors import RunError
+
+_NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Make the folders to a file that the block writes.
+
+    Raises `RunError` naming the file, why it cannot be written, and what mends that.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield
+    except OSError as error:
+        raise RunError(f"cannot write {path}: {reason(path, error)}") from error
+
+
+def write_file(path: Path, text: str = "") -> None:
+    """Write a file, and the folders to it; where that fails, the file stays as it was.
+
+    Called without text before the work, which leaves what is there: afterwards, a file that cannot be written
+    would cost the results. Raises `RunError` as `writing` does.
+    """
+    with writing(path):
+        if not text:
+            path.open("ab").close()
+        elif path.exists() and not path.is_file():  # a device, a pipe
+            path.write_text(text, encoding="utf-8")
+        else:
+            target = path.resolve()
+            part = target.with_name(f".{target.name}.part")
+            try:
+                part.write_text(text, encoding="utf-8")
+                part.replace(target)
+            finally:
+                part.unlink(missing_ok=True)
+
+
+def reason(path: Path, error: OSError) -> str:
+    """Why a file or folder cannot be written, and what mends that."""
+    if error.errno in _NO_SPACE:
+        return f"{error.strerror}; free space there, or choose another folder"
+    in_the_way = next((folder for folder in path.parents if folder.exists() and not folder.is_dir()), None)
+    if in_the_way is not None:
+        return f"{in_the_way} is a file, not a folder; choose another folder"
+    return f"{error.strerror or error}; choose another file"
