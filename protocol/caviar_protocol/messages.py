@@ -106,7 +106,9 @@ class Welcome(_Message, frozen=True, kw_only=True, tag="WELCOME"):
     settings: dict[str, Any] = {}
     """Settings of this service from the scenario, as they stand there."""
     scenario: dict[str, Any] = {}
-    """What concerns every service: ``carriers``, ``devices``, ``sampling_period_ns``, ``frames``."""
+    """What concerns every service: ``carriers``, ``devices``, ``episodes``, ``frames``,
+    ``sampling_period_ns``; a recorder is also told its ``directory`` and, in ``resolved``, the whole
+    scenario."""
 
 
 class Refuse(_Message, frozen=True, kw_only=True, tag="REFUSE"):

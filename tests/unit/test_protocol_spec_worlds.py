@@ -1,0 +1,61 @@
+"""What SPEC.md tells the author of a world: its examples are read by the readers of this repository."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import msgspec
+
+from caviar_protocol.host import host_identity
+from caviar_protocol.keys import Pair, read_pair
+from caviar_protocol.ply import read_ply
+from caviar_protocol.scenario import DeviceSpec
+from caviar_services.scenery import find_scenery, read_scenery
+
+SPEC = (Path(__file__).parents[2] / "protocol" / "SPEC.md").read_text("utf-8")
+
+
+def block(beginning: str) -> str:
+    """The code block that begins so."""
+    (found,) = re.findall(rf"```\w*\n({re.escape(beginning)}.*?)```", SPEC, re.DOTALL)
+    return str(found)
+
+
+def test_the_example_of_scenery_and_its_mesh_are_read(tmp_path: Path) -> None:
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "ground.ply").write_text(block("ply\n"))
+    (tmp_path / "street.xml").write_text(block("<scene "))
+    file = find_scenery({"scenery/street.xml": tmp_path / "street.xml"})
+    assert file is not None
+    (shape,) = read_scenery(file).shapes
+    assert (shape.name, shape.itu_material) == ("ground", "concrete")
+    vertices, faces = read_ply(shape.file)
+    assert vertices.shape == (4, 3)
+    assert faces.tolist() == [[0, 1, 2], [0, 2, 3]]
+
+
+def test_every_key_of_a_device_is_in_the_table() -> None:
+    section = SPEC[SPEC.index("### Which devices") : SPEC.index("### Geometry of several worlds")]
+    rows = "".join(re.findall(r"^\| (`.*?) \|", section, re.MULTILINE))
+    assert set(re.findall(r"`(\w+)`", rows)) == set(DeviceSpec.__struct_fields__)
+
+
+def test_the_key_file_is_one(tmp_path: Path) -> None:
+    file = tmp_path / "agent.key"
+    file.write_text(block("# Secret key"))
+    file.chmod(0o600)
+    assert msgspec.structs.asdict(read_pair(file)).keys() == set(Pair.__struct_fields__)
+
+
+def test_the_host_has_the_form_that_is_told() -> None:
+    (example,) = re.findall(r"`([0-9a-f-]{36}:pid:\[\d+\])`", SPEC)
+    assert re.fullmatch(r"[0-9a-f-]{36}:pid:\[\d+\]", host_identity()), example
+
+
+def test_materials_are_those_that_the_ray_tracer_knows() -> None:
+    import pytest
+
+    itu = pytest.importorskip("sionna.rt.radio_materials.itu")
+    text = SPEC[SPEC.index("Recommendation ITU-R P.2040:") :].partition(";")[0]
+    assert set(re.findall(r"`(\w+)`", text)) == set(itu.ITU_MATERIALS_PROPERTIES)
