@@ -86,6 +86,9 @@ def _syntax_error(error: tomllib.TOMLDecodeError, text: str, file: str) -> Scena
 def _beside(path: Path) -> str:
     """The scenarios that stand where one was looked for, or those that ship."""
     shipped = shipped_scenarios()
+    file = path.with_name(path.name + ".toml")
+    if file.is_file():
+        return f"; there is a {file}"
     if not path.exists() and path.stem in shipped and path.suffix in ("", ".toml"):
         return f"; the scenario that ships is called by its name: {path.stem}"
     if path.name == str(path) and not path.suffix:

@@ -34,11 +34,13 @@ def test_a_file_comes_before_the_shipped_scenario_of_its_name(
         ("smok", "did you mean 'smoke'\\?.*street-canyon"),
         ("deploy/scenarios/smoke.toml", "called by its name: smoke"),
         ("smoke.toml", "called by its name: smoke"),
+        ("mine", "there is a mine.toml"),
     ],
 )
 def test_what_is_neither_a_file_nor_a_name_is_refused_with_what_was_meant(
     given: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    Path("mine.toml").write_text("")
     with pytest.raises(ScenarioError, match=said):
         load_scenario(given)
