@@ -80,7 +80,7 @@ def test_the_source_distribution_builds_and_carries_no_recordings(built: Path) -
         names = [name.partition("/")[2] for name in content.getnames()]
     assert {"pyproject.toml", "LICENSE", "README.md", "Makefile"} <= set(names)
     folders = {name.partition("/")[0] for name in names if "/" in name}
-    assert folders <= {"protocol", "broker", "services", "clients", "deploy", "tests", "tools"}
+    assert folders <= {"protocol", "broker", "services", "clients", "deploy", "docs", "tests", "tools"}
     assert not [name for name in names if name.endswith((".mcap", ".pyc", ".png"))]
 
 

@@ -1,0 +1,211 @@
+"""Measured figures of the documentation: one file holds them, and pages show what is in it.
+
+`docs/figures.json` has a table by name, each with the command that measured it, the date, the commit and the
+machine. A page shows a table, or some of its columns, between two comments::
+
+    <!-- table: keyframes | setting; time ms; NMSE dB -->
+    <!-- end -->
+
+and a single figure, by table, row and column, within a sentence::
+
+    about <!-- figure: keyframes | siso-rt 1e5 d3, keyframes every 2 | NMSE dB -->−7.4<!-- end --> dB
+
+``python docs/figures.py record NAME FILE`` takes a table over from the Markdown that a command wrote
+(``caviar tradeoff --out``, ``caviar stability --markdown``, ``tests/bench``), and
+``python docs/figures.py render`` writes into all pages what the file says. A test compares pages and file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, TypedDict
+
+ROOT = Path(__file__).resolve().parents[1]
+FIGURES = ROOT / "docs" / "figures.json"
+FOLDERS = ("docs", "protocol", "broker", "services", "clients", "deploy", "examples")
+"""Where pages are, beside the root."""
+
+_TABLE = re.compile(
+    r"^(?P<indent> *)(?P<begin><!-- table: (?P<what>.*?) -->\n).*?(?P<end><!-- end -->)$",
+    re.DOTALL | re.MULTILINE,
+)
+_FIGURE = re.compile(r"(?P<begin><!-- figure: (?P<what>.*?) -->)[^<\n]*(?P<end><!-- end -->)")
+
+
+class Table(TypedDict):
+    """One measured table."""
+
+    command: str
+    date: str
+    commit: str
+    """Of the code that was measured."""
+    machine: str
+    columns: list[str]
+    rows: list[list[str]]
+    """Cells as they are shown; the first of a row is its name."""
+
+
+class FigureError(Exception):
+    """A page asks for a figure that is not there, or a file has no such table."""
+
+
+def load() -> dict[str, Table]:
+    """All figures."""
+    tables: dict[str, Table] = json.loads(FIGURES.read_text(encoding="utf-8"))
+    return tables
+
+
+def save(tables: Mapping[str, Table]) -> None:
+    """Write all figures, sorted by name."""
+    text = json.dumps(dict(sorted(tables.items())), indent=1, ensure_ascii=False)
+    # A row a line: a new measurement then is a change that can be read.
+    text = re.sub(r"\[\n\s+(\"[^\]]*?\")\n\s+\]", lambda m: "[" + re.sub(r"\n\s+", " ", m[1]) + "]", text)
+    FIGURES.write_text(text + "\n", encoding="utf-8")
+
+
+# --- pages --------------------------------------------------------------------------------------
+
+
+def pages() -> Iterator[Path]:
+    """All pages of the documentation."""
+    yield from sorted(ROOT.glob("*.md"))
+    for folder in FOLDERS:
+        yield from sorted((ROOT / folder).rglob("*.md"))
+
+
+def rendered(text: str, tables: Mapping[str, Table]) -> str:
+    """A page with the figures of the file in their places. Raises `FigureError` for one that is not there."""
+
+    def table(found: re.Match[str]) -> str:
+        indent, body = found["indent"], _as_markdown(found["what"], tables)
+        lines = [indent + line if line else "" for line in body.split("\n")]
+        return "".join([indent, found["begin"], "\n".join(lines), indent, found["end"]])
+
+    def figure(found: re.Match[str]) -> str:
+        return found["begin"] + _cell(found["what"], tables) + found["end"]
+
+    return _FIGURE.sub(figure, _TABLE.sub(table, text))
+
+
+def _as_markdown(what: str, tables: Mapping[str, Table]) -> str:
+    name, _, chosen = (part.strip() for part in what.partition("|"))
+    table = _known(name, tables, "table")
+    places = list(range(len(table["columns"])))
+    if chosen:
+        places = [_column(name, column.strip(), table) for column in chosen.split(";")]
+    numbers = [sum(bool(re.match(r"[−–\d]", row[i])) for row in table["rows"]) for i in places]
+    lines = [
+        [table["columns"][i] for i in places],
+        ["---:" if at and 2 * count > len(table["rows"]) else "---" for at, count in enumerate(numbers)],
+        *([row[i] for i in places] for row in table["rows"]),
+    ]
+    body = "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
+    source = f"*`{table['command']}`, {table['date']}, commit {table['commit']}, on {table['machine']}.*"
+    return f"\n{body}\n\n{source}\n\n"
+
+
+def _cell(what: str, tables: Mapping[str, Table]) -> str:
+    name, row, column = (part.strip() for part in what.split("|"))
+    table = _known(name, tables, "table")
+    cells = _known(row, {r[0]: r for r in table["rows"]}, f"row of {name}")
+    return cells[_column(name, column, table)]
+
+
+def _column(name: str, column: str, table: Table) -> int:
+    if table["columns"].count(column) > 1:
+        raise FigureError(f"{name} has {column!r} more than once; show the whole table")
+    return _known(column, {c: i for i, c in enumerate(table["columns"])}, f"column of {name}")
+
+
+def _known(name: str, among: Mapping[str, Any], what: str) -> Any:
+    if name not in among:
+        near = difflib.get_close_matches(name, among, n=1)
+        hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(among)}"
+        raise FigureError(f"there is no {what} {name!r}; {hint}")
+    return among[name]
+
+
+# --- measurements -------------------------------------------------------------------------------
+
+
+def markdown_tables(text: str) -> Iterator[tuple[str, list[str], list[list[str]]]]:
+    """Each table of a Markdown text: the heading above it, its columns and its rows."""
+    heading = ""
+    for block in re.split(r"\n\s*\n", text):
+        lines = [line.strip() for line in block.strip().splitlines()]
+        heading = next((line.lstrip("# ") for line in reversed(lines) if line.startswith("#")), heading)
+        rows = [_cells(line) for line in lines if line.startswith("|")]
+        if len(rows) > 2 and set("".join(rows[1])) <= set("-: "):
+            yield heading, rows[0], rows[2:]
+
+
+def _cells(line: str) -> list[str]:
+    return [cell.strip() for cell in re.split(r"(?<!\\)\|", line.strip().strip("|"))]
+
+
+def record(name: str, file: Path, heading: str, command: str, commit: str, machine: str, date: str) -> None:
+    """Take a table over from what a command wrote: the one below this heading, or the only one."""
+    found = [table for table in markdown_tables(file.read_text(encoding="utf-8")) if heading in table[0]]
+    if len(found) != 1:
+        below = f" below a heading with {heading!r}" if heading else ""
+        raise FigureError(f"{file} has {len(found)} tables{below}; name one by --heading")
+    _, columns, rows = found[0]
+    tables = load() if FIGURES.is_file() else {}
+    tables[name] = Table(
+        command=command, date=date, commit=commit, machine=machine, columns=columns, rows=rows
+    )
+    save(tables)
+
+
+def _commit() -> str:
+    command = ["git", "-C", str(ROOT), "describe", "--always", "--dirty", "--abbrev=7"]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()  # noqa: S603
+
+
+def _machine() -> str:
+    from caviar_services.recorder.base import machine
+
+    found = machine()
+    return f"{found.get('cpu_count', '?')} cores of {found.get('cpu', '?')}, {found.get('gpu', 'no GPU')}"
+
+
+def main() -> int:
+    """Entry point; status 1 with a line on what is wrong."""
+    parser = argparse.ArgumentParser(description="Measured figures of the documentation.")
+    commands = parser.add_subparsers(dest="action", required=True)
+    commands.add_parser("render", help="write the figures into all pages")
+    recording = commands.add_parser("record", help="take a table over from Markdown that a command wrote")
+    recording.add_argument("name", help="name of the table")
+    recording.add_argument("file", type=Path, help="what the command wrote")
+    recording.add_argument("--command", required=True, help="the command, for the reader")
+    recording.add_argument("--heading", default="", help="part of the heading above the table")
+    recording.add_argument("--commit", help="that was measured; by default the checkout's")
+    recording.add_argument("--machine", help="by default this one")
+    recording.add_argument("--date", default=f"{datetime.now(UTC):%Y-%m-%d}", help="by default today")
+    options = parser.parse_args()
+    try:
+        if options.action == "record":
+            where = (options.commit or _commit(), options.machine or _machine(), options.date)
+            record(options.name, options.file, options.heading, options.command, *where)
+        tables = load()
+        for page in pages():
+            text = page.read_text(encoding="utf-8")
+            if (new := rendered(text, tables)) != text:
+                page.write_text(new, encoding="utf-8")
+                sys.stdout.write(f"{page.relative_to(ROOT)}\n")
+    except FigureError as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
