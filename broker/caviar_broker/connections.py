@@ -139,13 +139,14 @@ class Connections:
         self._replying = route
         if before is not None and before.present:
             self.watchdog.recheck(hello.name)  # one that was killed may be back before its death shows
-        self.clock.receive(ev.Joined(hello), time.monotonic_ns())
+        local = bool(hello.pid and hello.host and hello.host == self._host)
+        self.clock.receive(ev.Joined(hello, local), time.monotonic_ns())
         peer = self.clock.peer(hello.name)
         if peer is not None and peer.attempt > attempt:
-            self._admit(route, hello)
+            self._admit(route, hello, local)
         self.perform()  # WELCOME goes to whom was admitted; one turned away changes nothing
 
-    def _admit(self, route: bytes, hello: m.Hello) -> None:
+    def _admit(self, route: bytes, hello: m.Hello, local: bool) -> None:
         """A new incarnation is in the run: nothing counts any more that comes from the one before."""
         name = hello.name
         self.scenery.forget(name)
@@ -157,7 +158,6 @@ class Connections:
         self.routes[name] = route
         self.known[route] = Connection(name, heartbeat=False)
         self._guard.known(route, name)
-        local = hello.pid and hello.host and hello.host == self._host
         fd = self.watchdog.welcome(name, hello.pid if local else None)
         if fd is not None:
             self.loop.watch(fd, lambda: self._died(name, fd))

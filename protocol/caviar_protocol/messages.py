@@ -46,7 +46,7 @@ from caviar_protocol.items import Report as Report
 from caviar_protocol.items import Role as Role
 from caviar_protocol.items import Status as Status
 
-PROTOCOL_VERSION = (1, 2)
+PROTOCOL_VERSION = (1, 3)
 """Major and minor version of the protocol that this package speaks."""
 
 CAPABILITIES: tuple[str, ...] = ("assets", "checkpoint", "episodes", "parts")
@@ -109,6 +109,9 @@ class Welcome(_Message, frozen=True, kw_only=True, tag="WELCOME"):
     """What concerns every service: ``carriers``, ``devices``, ``episodes``, ``frames``,
     ``sampling_period_ns``; a recorder is also told its ``directory`` and, in ``resolved``, the whole
     scenario."""
+    rejoin_ns: Duration = 0
+    """How long the broker waits for this service once its connections are lost: until then it may say HELLO
+    again on new ones. 0: it ends."""
 
 
 class Refuse(_Message, frozen=True, kw_only=True, tag="REFUSE"):

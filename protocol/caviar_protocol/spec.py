@@ -32,6 +32,7 @@ SINCE: dict[str, str] = {
     "ChannelOptions.materials_outside": "1.1",
     "ChannelOptions.absorption_db_per_km": "1.1",
     "ChannelOptions.detail": "1.1",
+    "Welcome.rejoin_ns": "1.3",
 }
 """Minor version that brought a field (``Grant.reports``) or a class (``Grant``); 1.0 unless said here."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -30,7 +31,8 @@ SEND_TIMEOUT_MS = 5000
 LINGER_MS = 500
 """[ms] that closing waits until the last DONE and BYE are on their way."""
 SILENCE_GRACE_S = 1.0
-"""[s] from the broker's death until a service that is still busy is ended by force."""
+"""[s] from the broker's death, or from the end of the time in which it could be reached again, until a
+service that is still busy is ended by force."""
 
 
 class Terminated(BaseException):
@@ -40,6 +42,15 @@ class Terminated(BaseException):
 
 class RunOver(BaseException):
     """SHUTDOWN came; the text is its reason. An order too."""
+
+
+class Disconnected(BaseException):
+    """The connections to the broker are lost; the text says how that is known. An order too, to the runner,
+    which comes back or gives up."""
+
+
+class UnansweredError(RunError):
+    """The broker did not answer in time; it may later."""
 
 
 class Connection:
@@ -61,6 +72,9 @@ class Connection:
         self._socket.sndtimeo = SEND_TIMEOUT_MS
         self._socket.setsockopt(zmq.MAXMSGSIZE, limits.MAX_BODY)
         self._heartbeat: HeartbeatThread | None = None
+        self._rejoin_s = 0.0
+        self._end: threading.Event | None = None
+        """Calls off the end of the process that the broker's silence brings about."""
         self._handshake = Handshake(self._context, self._socket, endpoint, credentials is not None)
         try:
             dress(self._socket, endpoint, credentials)
@@ -73,6 +87,7 @@ class Connection:
 
     def beat(self, welcome: m.Welcome) -> None:
         """Start the heartbeats."""
+        self._rejoin_s = welcome.rejoin_ns / 1e9
         self._heartbeat = HeartbeatThread(
             self._context, self.endpoint, self.name, welcome, self._broker_is_gone, self._credentials
         )
@@ -84,7 +99,7 @@ class Connection:
             self._heartbeat.progress(phase, grace_s)
 
     def send(self, message: m.Message, *parts: bytes) -> None:
-        """Send a message. `RunError` where the broker takes none any more."""
+        """Send a message. Raises `Disconnected` where the broker takes none any more."""
         self.send_parts([encode_message(message), *parts])
 
     def send_parts(self, parts: Sequence[Any]) -> None:
@@ -95,15 +110,14 @@ class Connection:
                 send(part, _MORE, len(part) < COPIED)
             send(parts[-1], 0, len(parts[-1]) < COPIED)
         except zmq.Again as error:
-            raise RunError(
-                f"the broker at {self.endpoint} takes no messages; {self.name!r} gives up"
-            ) from error
+            raise Disconnected(f"the broker at {self.endpoint} takes no messages") from error
 
     def receive(self, timeout_s: float | None = None) -> tuple[m.Message, Sequence[zmq.Frame]]:
         """Next message and its further parts.
 
-        Raises `Terminated` after SIGTERM, `RunOver` at SHUTDOWN, `RunError` when the broker is silent
-        for longer than its liveness, does not know this service any more, or ``timeout_s`` is over.
+        Raises `Terminated` after SIGTERM, `RunOver` at SHUTDOWN, `Disconnected` when the broker is silent
+        for longer than its liveness or does not know this service any more, and `UnansweredError` when
+        ``timeout_s`` is over.
         """
         until = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
@@ -115,12 +129,19 @@ class Connection:
             self._handshake.check()
             silence = self._heartbeat.broker_silence if self._heartbeat else None
             if silence is not None:
-                raise RunError(self._silence(silence))
+                raise Disconnected(self._silence(silence))
             if until is not None and time.monotonic() > until:
-                raise RunError(
+                raise UnansweredError(
                     f"no answer from a broker at {self.endpoint} within {timeout_s:g} s; "
                     "is `caviar broker` running there?"
                 )
+
+    def abandon(self) -> None:
+        """Close both connections, which are lost, at once."""
+        self._socket.linger = 0
+        self.close()
+        if self._end is not None:  # asked behind the end of the heartbeat thread, which sets it
+            self._end.set()
 
     def close(self) -> None:
         """End the heartbeats and close both connections."""
@@ -150,20 +171,20 @@ class Connection:
         if isinstance(message, m.Error | m.Stale):
             _log.warning("the broker says: %s", message)
         if isinstance(message, m.Error) and message.code == "unknown-peer":
-            raise RunError(
+            raise Disconnected(
                 f"the broker at {self.endpoint} does not know {self.name!r} any more ({message.message}): "
                 "the connection was lost or the broker restarted"
             )
         return message, parts[1:]
 
     def _silence(self, seconds: float) -> str:
-        return f"the broker at {self.endpoint} has been silent for {seconds:.1f} s; {self.name!r} gives up"
+        return f"the broker at {self.endpoint} has been silent for {seconds:.1f} s"
 
     def _broker_is_gone(self) -> None:
         """Called by the heartbeat thread: the service may be in a call that never returns."""
         silence = (self._heartbeat.broker_silence if self._heartbeat else None) or 0.0
-        words = f"caviar service {self.name}: {self._silence(silence)}"
-        self._termination.enforce(SILENCE_GRACE_S, 1, words)
+        words = f"caviar service {self.name}: {self._silence(silence)}; {self.name!r} gives up"
+        self._end = self._termination.enforce(self._rejoin_s + SILENCE_GRACE_S, 1, words)
 
 
 def describe(message: m.Message) -> str:

@@ -60,6 +60,8 @@ class HeartbeatThread(threading.Thread):
         """End the thread and wait for it."""
         os.eventfd_write(self._halt, 1)
         self.join(timeout=1.0)
+        if not self.is_alive():
+            os.close(self._halt)
 
     def run(self) -> None:
         """Send heartbeats until told to stop, or until the broker is silent for too long."""

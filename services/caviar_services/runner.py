@@ -1,13 +1,14 @@
 """The one runner that all services share: a `Service` on one side, the broker on the other.
 
 It connects, negotiates, fetches scenery, warms up, steps, repeats a stored DONE, beats, turns
-faults into messages, and stops within 2 s of SIGTERM. Every wait has a deadline: what may last
-as long as the run does is bounded by the broker's heartbeats.
+faults into messages, comes back after a lost connection, and stops within 2 s of SIGTERM. Every
+wait has a deadline: what may last as long as the run does is bounded by the broker's heartbeats.
 """
 
 from __future__ import annotations
 
 import gc
+import logging
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -24,7 +25,14 @@ from caviar_protocol.keys import Credentials
 from caviar_protocol.keys import credentials as find_credentials
 from caviar_protocol.tables import convert_settings
 from caviar_services.answers import Answers, Guard
-from caviar_services.connection import Connection, RunOver, Terminated, describe
+from caviar_services.connection import (
+    Connection,
+    Disconnected,
+    RunOver,
+    Terminated,
+    UnansweredError,
+    describe,
+)
 from caviar_services.exchange import (
     done_of,
     frame_of,
@@ -46,6 +54,18 @@ other sizes, and what they leave behind would creep up for hours; in each frame 
 
 CONNECT_TIMEOUT_S = 30.0
 """[s] until the broker has to answer HELLO, or a request for scenery."""
+RETRY_S = 0.1
+"""[s] between the first two attempts to take part again after the connections were lost; then twice that."""
+MAX_RETRY_S = 1.0
+"""[s] between attempts at most."""
+ANSWER_S = 5.0
+"""[s] that the broker gets to answer one attempt. One that it answers later counts as a loss for it."""
+
+_log = logging.getLogger("caviar.service")
+
+
+class NameTakenError(RunError):
+    """The broker has a service of this name; perhaps it has yet to learn that its connection is lost."""
 
 
 class Runner:
@@ -88,7 +108,10 @@ class Runner:
         self._timeout_s = connect_timeout_s
         self._store = AssetStore()
         self._termination = termination or Termination()
-        self._broker = Connection(name, endpoint, self._termination, credentials or find_credentials())
+        self._endpoint, self._credentials = endpoint, credentials or find_credentials()
+        self._broker = self._connection()
+        self._rejoin_s = 0.0
+        """For how long the broker waits for this service once it has lost its connections [s]."""
         self._service: Service[Any] | None = None
         self._identity: dict[str, Any] = {}
         """``epoch`` and ``attempt``, which stand in every message (clause 1)."""
@@ -107,12 +130,16 @@ class Runner:
     def run(self) -> int:
         """Serve until SHUTDOWN; the exit status: 0 after it, 143 after SIGTERM.
 
-        Raises `RunError` where there is no broker, it refuses this service, or it is gone.
+        Raises `RunError` where there is no broker, it refuses this service, or it is gone for longer than it
+        waits for this service to come back.
         """
         try:
-            self._join()
+            self._join(self._timeout_s)
             while True:
-                self._handle(*self._broker.receive())
+                try:
+                    self._handle(*self._broker.receive())
+                except Disconnected as loss:
+                    self._rejoin(str(loss))
         except RunOver as order:
             if self._service is None and not self._identity:
                 raise RunError(f"the run ended before {self.name!r} was in it: {order}") from order
@@ -146,24 +173,71 @@ class Runner:
 
     # --- joining -----------------------------------------------------------------------------------
 
-    def _join(self) -> None:
+    def _connection(self) -> Connection:
+        return Connection(self.name, self._endpoint, self._termination, self._credentials)
+
+    def _join(self, timeout_s: float) -> None:
         broker = self._broker
         broker.send(hello_of(self.name, self.use, self.cls, host_identity(), os.getpid()))
-        message, _ = broker.receive(self._timeout_s)
+        message, _ = broker.receive(timeout_s)
         if isinstance(message, m.Refuse):
             raise self._refused(message)
         if not isinstance(message, m.Welcome):
             raise ProtocolError(f"the broker answered HELLO with {describe(message)}, not with WELCOME")
         check_version(message.version)
         self._identity = {"epoch": message.epoch, "attempt": message.attempt}
+        self._rejoin_s = message.rejoin_ns / 1e9
         broker.beat(message)
         with self._reporting("settings"):
             settings = convert_settings(self.cls.Settings, message.settings)
             self._service = self.cls(settings, run_info(self.name, message, broker.progress))
 
     def _refused(self, message: m.Refuse) -> RunError:
-        endpoint = self._broker.endpoint
-        return RunError(f"the broker at {endpoint} refused {self.name!r} ({message.code}): {message.message}")
+        kind = NameTakenError if message.code == "name-taken" else RunError
+        return kind(
+            f"the broker at {self._endpoint} refused {self.name!r} ({message.code}): {message.message}"
+        )
+
+    def _rejoin(self, loss: str) -> None:
+        """Take part again as a new incarnation, on new connections, within the time that the broker waits.
+
+        What this service was is dropped, as where its process is started again: the broker has it prepared
+        and reset anew, restored where it has state, and grants what it owes.
+        """
+        if not self._rejoin_s:
+            raise RunError(
+                f"{loss}; {self.name!r} gives up: the run does not wait until it has connected again "
+                "(timeouts.rejoin_s of the scenario)"
+            )
+        hold_s, pause_s = self._rejoin_s, RETRY_S
+        began = time.monotonic()
+        _log.warning("%s; trying to come back for at most %g s (timeouts.rejoin_s)", loss, hold_s)
+        self._forget()
+        while True:
+            self._broker.abandon()
+            self._broker = self._connection()
+            try:
+                self._join(min(ANSWER_S, max(RETRY_S, began + hold_s - time.monotonic())))
+            except (UnansweredError, NameTakenError, Disconnected) as failure:
+                if time.monotonic() + pause_s > began + hold_s:
+                    raise RunError(
+                        f"{loss}; {self.name!r} gives up, it could not come back within {hold_s:g} s: "
+                        f"{failure}; timeouts.rejoin_s of the scenario says for how long the run waits"
+                    ) from failure
+                time.sleep(pause_s)
+                pause_s = min(2 * pause_s, MAX_RETRY_S)
+            else:
+                away_s, attempt = time.monotonic() - began, self._identity["attempt"]
+                _log.warning("back after %.1f s as attempt %d", away_s, attempt)
+                return
+
+    def _forget(self) -> None:
+        """Drop what this service was in the run."""
+        service, self._service = self._service, None
+        self._identity, self._reset_to = {}, None
+        self._answers.clear()
+        if service is not None:
+            service.close()
 
     # --- preparing ---------------------------------------------------------------------------------
 

@@ -20,21 +20,30 @@ class Termination:
 
     def __init__(self) -> None:
         self.requested = False
-        self._ended = threading.Event()
+        self._called_off: list[threading.Event] = []
 
-    def enforce(self, grace_s: float, status: int, last_words: str) -> None:
-        """See to it that the process ends with ``status`` unless it does so itself within ``grace_s``."""
+    def enforce(self, grace_s: float, status: int, last_words: str) -> threading.Event:
+        """See to it that the process ends with ``status`` unless it does so itself within ``grace_s``, or
+        the event that is returned is set."""
+        called_off = threading.Event()
+        self._called_off.append(called_off)
 
         def end() -> None:
-            if not self._ended.wait(grace_s):
-                sys.stderr.write(f"{last_words}\n")
-                os._exit(status)
+            if not called_off.wait(grace_s):
+                self.end(status, last_words)
 
         threading.Thread(target=end, name="end", daemon=True).start()
+        return called_off
+
+    def end(self, status: int, last_words: str) -> None:
+        """End the process at once."""
+        sys.stderr.write(f"{last_words}\n")
+        os._exit(status)
 
     def finished(self) -> None:
         """Everything is closed; the process ends by itself."""
-        self._ended.set()
+        for called_off in self._called_off:
+            called_off.set()
 
 
 class SignalTermination(Termination):

@@ -236,6 +236,26 @@ def test_a_broker_that_is_killed_ends_the_next_step_and_not_this_process(tmp_pat
         assert run.ended()[0] != 0
 
 
+def test_an_environment_outlives_its_broker_and_decides_nothing_twice(tmp_path: Path) -> None:
+    def steps(env: BeamSelectionEnv, disturb: int = -1) -> list[float]:
+        env.reset(seed=1)
+        rewards = []
+        for number in range(FRAMES):
+            if number == disturb:
+                os.kill(pid_of(run.mark, "caviar_broker"), signal.SIGKILL)
+            rewards.append(float(env.step(np.int64(number % BEAMS))[1]))
+        return rewards
+
+    with waiting(tmp_path, episodes=1, rejoin_s=WITHIN_S) as run:
+        with closing(run.environment()) as env:
+            disturbed = steps(env, disturb=20)
+        status, output = run.ended()
+        assert status == 0, output
+        assert "another one goes on with the run" in output
+        with closing(BeamSelectionEnv(run.scenario, observe=PARTS)) as env:
+            assert steps(env) == disturbed
+
+
 def test_a_session_that_is_closed_before_its_first_reset_lets_go_at_once(tmp_path: Path) -> None:
     with waiting(tmp_path) as run:
         session = ConnectedSession(run.endpoint, "agent", (Input(topic="scene"),))

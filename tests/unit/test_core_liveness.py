@@ -312,6 +312,25 @@ def test_only_the_remote_service_of_a_run_may_come_back_where_the_run_says_nothi
     assert not run.notices("away", "channel")
 
 
+@pytest.mark.parametrize(
+    ("remote", "local", "rejoin", "told"),
+    [
+        (True, True, 0, 10 * SECOND),
+        (True, False, 0, 10 * SECOND),
+        (False, False, SECOND, SECOND),
+        (False, False, 0, 0),
+        (False, True, SECOND, 0),
+    ],
+)
+def test_welcome_says_for_how_long_a_service_may_come_back_by_itself(
+    remote: bool, local: bool, rejoin: int, told: int
+) -> None:
+    """A local one is started again with its broker, and must not keep its successor out."""
+    run = Simulation(loop(agent=REMOTE if remote else {}), limits=Limits(rejoin=rejoin))
+    run.feed(ev.Joined(m.Hello(version=m.PROTOCOL_VERSION, name="agent", role="agent"), local))
+    assert run.seen(m.Welcome, "agent")[0].rejoin_ns == told
+
+
 def test_a_run_is_the_same_after_a_remote_service_came_back() -> None:
     run = Simulation(loop(agent={**REMOTE, "latency": 20 * MS}), frames=8).join().run(granted("agent", 3))
     run.kill("agent")

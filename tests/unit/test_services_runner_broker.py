@@ -70,7 +70,7 @@ def test_a_broker_of_another_major_version_is_left_naming_both(broker: Broker) -
         broker.send(welcome)
         said = ends(process, 1)
     assert "3.1" in said
-    assert "1.2" in said
+    assert "1.3" in said
 
 
 def test_a_run_that_is_over_before_it_began_ends_it(broker: Broker) -> None:
@@ -96,6 +96,7 @@ def test_a_service_ends_when_its_broker_dies(broker: Broker) -> None:
         elapsed = time.monotonic() - started
     sys.stdout.write(f"the death of the broker was noticed after {elapsed:.2f} s with a liveness of 1 s\n")
     assert "has been silent for 1." in said
+    assert "the run does not wait until it has connected again (timeouts.rejoin_s of the scenario)" in said
     assert "closed" in said
     assert "Traceback" not in said
     assert 0.9 < elapsed < 2.0
@@ -122,3 +123,80 @@ def test_a_service_that_held_the_interpreter_does_not_take_its_broker_for_dead(b
             broker.expect(m.Done)
         broker.shutdown()
         ends(process, 0)
+
+
+def comes_back(broker: Broker) -> None:
+    """Up to the first grant of the incarnation that follows upon the one of `runner_harness.IDS`."""
+    hello = broker.expect(m.Hello)
+    assert hello.name == "sick"
+    told = {"heartbeat_ns": 100 * MS, "liveness_ns": 400 * MS, "rejoin_ns": 10_000 * MS}
+    broker.send(m.Welcome(version=m.PROTOCOL_VERSION, **NEXT, run="test", **told))
+    broker.send(m.Prepare(**NEXT, demand=(m.Demand(topic="lidar"),)))
+    assert broker.expect(m.Ready).attempt == NEXT["attempt"]
+    broker.send(m.Reset(**NEXT, episode=0, seed=9, t0_ns=0))
+    assert broker.expect(m.ResetDone) == m.ResetDone(**NEXT, episode=0)
+
+
+NEXT = IDS | {"attempt": IDS["attempt"] + 1}
+
+
+def test_a_service_whose_place_is_held_comes_back_when_it_lost_its_broker(broker: Broker) -> None:
+    with service(broker.endpoint) as process:
+        broker.start(heartbeat_ns=100 * MS, liveness_ns=400 * MS, rejoin_ns=10_000 * MS)
+        broker.grant(0)
+        broker.expect(m.Done)
+        lost, broker.answering = broker.route, False
+        broker.expect(m.Hello)
+        assert broker.route != lost
+        broker.answering = True
+        broker.send(m.Refuse(code="name-taken", message="a service named 'sick' takes part already"))
+        comes_back(broker)
+        broker.grant(0, **NEXT)
+        assert broker.expect(m.Done).attempt == NEXT["attempt"]
+        broker.shutdown()
+        said = ends(process, 0)
+    assert "trying to come back for at most 10 s (timeouts.rejoin_s)" in said
+    assert "as attempt 3" in said
+
+
+def test_a_service_that_its_broker_forgot_comes_back(broker: Broker) -> None:
+    """As where the broker was started again: it is another epoch, or another attempt, than before."""
+    with service(broker.endpoint) as process:
+        broker.start(rejoin_ns=10_000 * MS)
+        broker.send(m.Error(code="unknown-peer", of="DONE", message="DONE came before HELLO"))
+        comes_back(broker)
+        broker.shutdown()
+        ends(process, 0)
+
+
+def test_a_service_that_cannot_come_back_gives_up_naming_the_setting(broker: Broker) -> None:
+    with service(broker.endpoint) as process:
+        broker.start(heartbeat_ns=100 * MS, liveness_ns=400 * MS, rejoin_ns=1_000 * MS)
+        broker.socket.unbind(broker.endpoint)
+        started = time.monotonic()
+        said = ends(process, 1)
+        assert 1.0 < time.monotonic() - started < 4.0
+    assert "has been silent for 0." in said
+    assert "it could not come back within 1 s" in said
+    assert "timeouts.rejoin_s of the scenario says for how long the run waits" in said
+    assert "Traceback" not in said
+
+
+def test_a_refusal_is_the_end_of_coming_back(broker: Broker) -> None:
+    with service(broker.endpoint) as process:
+        broker.start(rejoin_ns=10_000 * MS)
+        broker.send(m.Error(code="unknown-peer", of="DONE", message="DONE came before HELLO"))
+        broker.expect(m.Hello)
+        broker.send(m.Refuse(code="late", message="the run is over"))
+        assert "(late): the run is over" in ends(process, 1)
+
+
+def test_a_stuck_service_ends_once_its_place_is_given_up(broker: Broker) -> None:
+    with service(broker.endpoint, "sensors:SleepsInC") as process:
+        broker.start(heartbeat_ns=100 * MS, liveness_ns=400 * MS, rejoin_ns=1_000 * MS)
+        broker.grant(0)
+        hears(process, "stuck")
+        broker.answering = False
+        started = time.monotonic()
+        assert "has been silent" in ends(process, 1)
+        assert 1.0 < time.monotonic() - started < 0.4 + 1.0 + 1.0 + 2.0

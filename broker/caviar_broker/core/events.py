@@ -40,6 +40,8 @@ class Joined(msgspec.Struct, frozen=True):
     """HELLO of a service came."""
 
     hello: Hello
+    local: bool = False
+    """Whether the operating system says when its process ends."""
 
 
 class AssetsOffered(msgspec.Struct, frozen=True):

@@ -60,6 +60,7 @@ class Joining:
                 seed=run.plan.seed,
                 settings=dict(peer.plan.settings),
                 scenario=dict(peer.plan.scenario),
+                rejoin_ns=self._held_open(peer, event.local),
             ),
         )
         if run.state is RunState.JOINING:
@@ -67,6 +68,14 @@ class Joining:
                 self._all_joined(now)
         else:
             self._prepare_whoever_can(now)
+
+    def _held_open(self, peer: Peer, local: bool) -> int:
+        """How long a service may try to come back by itself once its connections are lost [ns].
+
+        A connection within one machine is lost with the broker alone. Whoever started that starts the local
+        services again too, and one that tried to come back would take the place of its successor.
+        """
+        return peer.rejoin(self._run.plan.limits) if peer.plan.remote or not local else 0
 
     def _refusal(self, hello: Hello) -> Refuse | None:
         peer = self._run.peers.get(hello.name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections import OrderedDict
 from contextlib import suppress
 from queue import Empty, SimpleQueue
 
@@ -10,6 +11,7 @@ from caviar_clients.sessions.agent import declared
 from caviar_clients.sessions.base import Frame, Session
 from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.keys import Credentials
+from caviar_protocol.limits import MAX_IN_FLIGHT
 from caviar_protocol.messages import Input
 from caviar_services.connection import Terminated
 from caviar_services.runner import CONNECT_TIMEOUT_S, Runner
@@ -54,6 +56,10 @@ class ConnectedSession(Session):
         self._grants: SimpleQueue[Frame | CaviarError] = SimpleQueue()
         self._results: SimpleQueue[StepResult | None] = SimpleQueue()
         self._seeds: SimpleQueue[int | None] = SimpleQueue()
+        self._seed: int | None = None
+        """Of the first episode, once it is known."""
+        self._decisions: OrderedDict[tuple[int, int], StepResult] = OrderedDict()
+        """The newest, by episode and frame: a broker that lost the connection may ask for them again."""
         self._termination = _Leaving(self)
         cls = declared(inputs, self._first_seed, self._decided)
         runner = Runner(
@@ -121,17 +127,23 @@ class ConnectedSession(Session):
             self._grants.put(RunError(f"the broker ended the run: {runner.ended}{more}"))
 
     def _first_seed(self) -> int:
-        seed = self._seeds.get()
-        if seed is None:
+        if self._seed is None:
+            self._seed = self._seeds.get()
+        if self._seed is None:
             raise Terminated("the session was closed before its first reset")
-        return seed
+        return self._seed
 
     def _decided(self, frame: Frame) -> StepResult:
-        self._grants.put(frame)
-        result = self._results.get()
-        if result is None:
-            raise Terminated("the session was closed")
-        return result
+        key = frame.episode, frame.number
+        if key not in self._decisions:
+            self._grants.put(frame)
+            result = self._results.get()
+            if result is None:
+                raise Terminated("the session was closed")
+            self._decisions[key] = result
+            if len(self._decisions) > MAX_IN_FLIGHT:
+                self._decisions.popitem(last=False)
+        return self._decisions[key]
 
 
 class _Leaving(Termination):
@@ -141,5 +153,5 @@ class _Leaving(Termination):
         super().__init__()
         self._session = session
 
-    def enforce(self, grace_s: float, status: int, last_words: str) -> None:
+    def end(self, status: int, last_words: str) -> None:
         self._session.leave(RunError(last_words))
