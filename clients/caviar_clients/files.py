@@ -25,6 +25,12 @@ def writing(path: Path) -> Iterator[None]:
         raise RunError(f"cannot write {path}: {reason(path, error)}") from error
 
 
+def make_folder_of(path: Path) -> None:
+    """Make the folders to a file before the work that it takes. Raises `RunError` as `writing` does."""
+    with writing(path):
+        pass
+
+
 def write_file(path: Path, text: str = "") -> None:
     """Write a file, and the folders to it; where that fails, the file stays as it was.
 

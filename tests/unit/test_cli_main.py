@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 
 from caviar_clients.cli import main as command
+from caviar_clients.embedded.run import EmbeddedRun
+from caviar_protocol.scenario_loader import load_scenario
 
 SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
 
@@ -73,3 +75,48 @@ def test_a_summary_that_cannot_be_written_ends_the_command_before_the_run(monkey
     err = complaint(monkeypatch, capsys, "run", SMOKE, "--out", tmp_path / "runs", "--json", tmp_path)
     assert f"cannot write {tmp_path}: Is a directory" in err
     assert not (tmp_path / "runs").exists()
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A recorded run of `smoke`."""
+    folder = tmp_path_factory.mktemp("run")
+    run = EmbeddedRun(load_scenario(SMOKE), folder)
+    run.run()
+    run.statistics.save(folder / "latency.npz")
+    return folder
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("run", SMOKE, "--embedded", "--out", "FILE/out"),
+        ("run", SMOKE, "--embedded", "--json", "FILE/x.json"),
+        ("broker", SMOKE, "--out", "FILE/out"),
+        ("plot", "RUN", "--out", "FILE/pictures"),
+        ("video", "RUN", "--out", "FILE/x.gif"),
+        ("budget", "RUN", "--json", "FILE/x.json"),
+        ("replay", "RUN", "--embedded", "--json", "FILE/x.json"),
+        ("tradeoff", SMOKE, "--json", "FILE/x.json"),
+        ("tradeoff", SMOKE, "--out", "FILE/out"),
+        ("stability", "--no-traced", "--json", "FILE/x.json"),
+        ("stability", "--no-traced", "--markdown", "FILE/x.md"),
+        ("bench", "broker", "--json", "FILE/x.json"),
+        ("conform", "--json", "FILE/x.json"),
+    ],
+    ids=lambda arguments: f"{arguments[0]} {arguments[-2]}",
+)
+def test_every_command_answers_alike_where_a_file_is_in_the_way_of_a_folder(
+    monkeypatch, capsys, tmp_path, recorded, arguments
+):
+    """And before its work: nothing but the message is printed. Missing folders are made by the same code."""
+    file = tmp_path / "file"
+    file.touch()
+    words = [str(word).replace("FILE", str(file)).replace("RUN", str(recorded)) for word in arguments]
+    monkeypatch.setattr(sys, "argv", ["caviar", *words])
+    with pytest.raises(SystemExit) as ended:
+        command.main()
+    assert ended.value.code == 1
+    err = capsys.readouterr().err
+    assert f"{file} is a file, not a folder; choose another folder" in err
+    assert "Traceback" not in err

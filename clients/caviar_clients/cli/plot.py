@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from caviar_clients.files import make_folder_of
 from caviar_clients.plots.camera import CameraView, draw_view
 from caviar_clients.plots.fig8 import choose_user, draw_over_angle, draw_over_time, series
 from caviar_clients.plots.footprints import Footprints, footprints
@@ -59,6 +60,7 @@ def plot_run(
     """
     recording = Recording(run)
     folder = out or recording.directory
+    make_folder_of(folder / "map.png")
     topics = recording.topics
     chosen = choose_user(recording, user or "") if "link" in topics else None
     files: list[Path] = []

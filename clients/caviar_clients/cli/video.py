@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from caviar_clients.cli.plot import agent_names, map_data, scenery
+from caviar_clients.files import make_folder_of
 from caviar_clients.plots.fig8 import UserSeries, choose_user, series
 from caviar_clients.plots.film import GIF_FPS, WRITERS, Reel, find_ffmpeg, needed_ffmpeg
 from caviar_clients.plots.map import View, chosen_beam, common_prefix, view_of
@@ -90,6 +91,7 @@ def film_run(
     recording = Recording(run)
     file = out or recording.directory / ("video.mp4" if find_ffmpeg() else "video.gif")
     suffix = file.suffix.lower()
+    make_folder_of(file)
     rate, pixels = _format(file, suffix, fps, width, recording.metadata.sampling_period_ns)
     chosen = choose_user(recording, user or "") if "link" in recording.topics else None
     survey = _survey(recording, _indices(recording, frames), chosen, camera)
