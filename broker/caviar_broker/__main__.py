@@ -32,6 +32,7 @@ from caviar_broker.deskplace import refuse_second
 from caviar_broker.journal import JournalFile
 from caviar_broker.processes import reserve_descriptors
 from caviar_broker.record import RunRecord, read_record
+from caviar_broker.recorded import sync_recording
 from caviar_broker.replaying import with_replay
 from caviar_broker.resume import Left, read_resumption
 from caviar_broker.scheduling import prefer
@@ -94,6 +95,8 @@ def serve(arguments: argparse.Namespace) -> int:
                 access=access,
                 peer_limits=PeerLimits.of(record.scenario.limits),
                 resumption=resumption,
+                durability=durability,
+                sync_recording=lambda: sync_recording(directory),
             )
             msgspec.structs.replace(record, endpoint=server.endpoint).save(directory)
             reporter.attach(server)

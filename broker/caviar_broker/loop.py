@@ -32,21 +32,35 @@ class Loop:
         self._poller = zmq.Poller()
         self._sockets: dict[int, zmq.Socket[Any]] = {}
         self._callbacks: dict[Source, Callable[[], None]] = {}
+        self._prompt: set[int] = set()
 
-    def watch(self, source: Source, callback: Callable[[], None], events: int = zmq.POLLIN) -> None:
-        """Call back when ``source`` is readable, or as ``events`` say."""
+    def watch(
+        self,
+        source: Source,
+        callback: Callable[[], None],
+        events: int = zmq.POLLIN,
+        *,
+        prompt: bool = False,
+    ) -> None:
+        """Call back when ``source`` is readable, or as ``events`` say.
+
+        A descriptor that is ``prompt`` is waited for with the sockets.
+        """
         if self._callbacks.get(source) != callback:
             self._callbacks[source] = callback
             self._poller.register(source, events)
             if isinstance(source, zmq.Socket) and events == zmq.POLLIN:
                 fd = int(source.getsockopt(zmq.FD))
                 self._sockets |= {fd: source} if fd < SELECTABLE else {}
+            elif prompt and isinstance(source, int) and source < SELECTABLE:
+                self._prompt.add(source)
 
     def unwatch(self, source: Source) -> None:
         """Undo `watch`; nothing where it was not watched."""
         if self._callbacks.pop(source, None) is not None:
             self._poller.unregister(source)
             self._sockets = {fd: socket for fd, socket in self._sockets.items() if socket is not source}
+            self._prompt -= {fd for fd in self._prompt if fd == source}
 
     def poll(self, wait_ns: int = 0) -> list[Source]:
         """What is ready, after at most that long [ns]."""
@@ -55,14 +69,16 @@ class Loop:
         return ready if ready or wait_ns <= 0 else self.poll_sockets(until)
 
     def poll_sockets(self, until: int) -> list[Source]:
-        """Which sockets can be read, until that instant of the monotonic clock [ns] at the latest."""
+        """Which sockets and prompt descriptors can be read, until that instant [ns] at the latest."""
         while True:
             # Asked before it is waited for: only then does a socket's descriptor tell of what comes.
             ready: list[Source] = [s for s in self._sockets.values() if int(s.getsockopt(_EVENTS)) & _POLLIN]
             rest = until - time.monotonic_ns()
             if ready or rest <= 0:
                 return ready
-            select.select(self._sockets, (), (), rest / 1e9)
+            readable, _, _ = select.select([*self._sockets, *self._prompt], (), (), rest / 1e9)
+            if found := self._prompt.intersection(readable):
+                return [*found]
 
     def call(self, ready: list[Source]) -> None:
         """Call back for what `poll` returned, unless it is not watched any more."""

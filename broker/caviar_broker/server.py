@@ -20,6 +20,7 @@ from caviar_broker.core.plan import RunPlan
 from caviar_broker.core.resumption import Resumption
 from caviar_broker.core.transitions import RunState
 from caviar_broker.journal import JournalFile
+from caviar_broker.journal_thread import JournalThread
 from caviar_broker.loop import Loop
 from caviar_broker.port import Port
 from caviar_broker.scenery import SceneryDesk, SceneryExchange
@@ -31,7 +32,8 @@ from caviar_protocol import messages as m
 from caviar_protocol.alive import SignOfLife
 from caviar_protocol.assets import AssetStore
 from caviar_protocol.codec import check_parts, decode_message, encode_message
-from caviar_protocol.errors import ProtocolError, RunError
+from caviar_protocol.durability import Durability, file_system_of
+from caviar_protocol.errors import ProtocolError
 
 LOOK_NS, UNHURRIED_LOOK_NS = 1_000_000, 4_000_000
 """[ns] until deadlines are looked at again, however busy the port is; where none can come soon, longer."""
@@ -39,6 +41,8 @@ SOON_NS = 8_000_000
 """[ns] What is due within this time is waited for exactly; else waits may be a millisecond longer."""
 LONG_NS = 10_000_000
 """[ns] Budgets from here on bring nothing that would be due before deadlines are looked at again."""
+DISK_NOTE_S = 2.0
+"""[s] that the disk may take for an entry of the journal before that is told."""
 MESSAGES_A_TURN = 64
 """Messages taken before the clock is looked at again."""
 _CAN_WAIT = frozenset({ev.Notice, ev.Latency, ev.FrameFinished})
@@ -78,6 +82,10 @@ class BrokerServer:
         What each peer may use of the broker.
     resumption
         What another broker left of the run.
+    durability
+        When entries of the journal have to be on the disk.
+    sync_recording
+        Puts on the disk what is recorded here.
     """
 
     def __init__(
@@ -91,11 +99,17 @@ class BrokerServer:
         access: Access | None = None,
         peer_limits: PeerLimits | None = None,
         resumption: Resumption | None = None,
+        durability: Durability = "none",
+        sync_recording: Callable[[], None] = lambda: None,
     ) -> None:
         self.clock = FrameClock(plan, time.monotonic_ns(), weigh=_weight, resumption=resumption)
         self.statistics = Statistics({s.name: s.budget_ns for s in plan.services})
         self.outcome: ev.Finished | None = None
-        self._plan, self._journal, self._observer = plan, journal, observer
+        self._plan, self._observer = plan, observer
+        self._confirmed = 0
+        """Number of the last journal entry that the clock knows to be handed over."""
+        self._disk_told = 0.0
+        """[s] for which the disk had taken nothing when that was told; 0: it takes what comes."""
         self._sign = SignOfLife()
         self._scenery = SceneryDesk(
             exchange=SceneryExchange(store or AssetStore()),
@@ -121,11 +135,15 @@ class BrokerServer:
         self._guard = self._port.guard
         self.access = access
         """The keys of those who may take part; None: every process of this machine may."""
+        self.disk_answers = True
+        """Whether the disk took all of the journal by the end of the run."""
         self.endpoint = self._port.endpoint
         """Where services connect to."""
         self.loop = Loop()
         """Others may have descriptors watched by it."""
         self.loop.watch(self._port.socket, self._receive_all)
+        self._journal = JournalThread(journal, durability, sync_recording)
+        self.loop.watch(self._journal.fd, self._journal_answered, prompt=True)
         self._watchdog = Watchdog(
             clock=self.clock,
             heartbeat_ns=plan.limits.heartbeat,
@@ -186,6 +204,7 @@ class BrokerServer:
         finally:
             self._watchdog.close()
             self._port.close()
+            self.disk_answers = self._journal.close()
         return self.outcome
 
     def _turn(self) -> None:
@@ -201,7 +220,7 @@ class BrokerServer:
             self._unhurried = self._budgets_are_long and wake - now > SOON_NS
             self._look_at = min(now + (UNHURRIED_LOOK_NS if self._unhurried else LOOK_NS), wake)
             self.loop.call(self.loop.poll(0 if self._port.readable else wake - now))
-        elif self._unhurried:
+        elif self._unhurried and not self._journal.busy:
             self._receive_all(wait=True)
         elif self._port.readable:
             self._receive_all()
@@ -226,6 +245,7 @@ class BrokerServer:
             self._watchdog.check(now)
             self._sign.give()
             self._guard.check(now)
+            self._look_at_disk()
         self._write_journal()
         deadline = self.clock.next_deadline()
         if deadline is None:
@@ -321,20 +341,46 @@ class BrokerServer:
         Written once somebody waits for it, while services are at work, and whenever deadlines are looked
         at; so services that answer one after the other cost one write.
         """
-        while self._entries:
+        while self._entries and not self._journal.busy:
             self._hand_over_entries()
             self.clock.settle(time.monotonic_ns())
             self._perform()
 
+    def _journal_answered(self) -> None:
+        """A batch that took its time is confirmed, or failed."""
+        self._journal.take_note()
+        self._take_confirmed()
+        self.clock.settle(time.monotonic_ns())
+        self._perform()
+        self._write_journal()
+
     def _hand_over_entries(self) -> None:
-        if self._entries:
+        if self._entries and not self._journal.busy:
             entries, self._entries = self._entries, []
-            event: ev.Event = ev.Journaled(entries[-1].number)
-            try:
-                self._journal.write(entries)
-            except RunError as error:
-                event = ev.StopRequested(str(error))
-            self.clock.take(event, time.monotonic_ns())
+            finished = self.clock.episode, self.clock.finished_frames - 1
+            snapshot = self.clock.snapshot() if self._journal.wants_snapshot else None
+            self._journal.submit(entries, finished, snapshot)
+            self._take_confirmed()
+
+    def _take_confirmed(self) -> None:
+        confirmed, error = self._journal.confirmed, self._journal.error
+        if error is not None:
+            self.clock.take(ev.StopRequested(str(error)), time.monotonic_ns())
+        elif confirmed > self._confirmed:
+            self._confirmed = confirmed
+            self.clock.take(ev.Journaled(confirmed), time.monotonic_ns())
+
+    def _look_at_disk(self) -> None:
+        """Tell of a disk that takes nothing, and that it does again."""
+        waited, doing = self._journal.waiting_s()
+        if waited >= DISK_NOTE_S and not self._disk_told:
+            place = f"{self._journal.path} ({file_system_of(self._journal.path)})"
+            limit = f"at most {self._plan.limits.stall / 1e9:g} s (timeouts.stall_s)"
+            text = f"the disk does not answer: {doing} of {place} has waited for {waited:.1f} s"
+            self.note("", f"{text}; the run waits for it, {limit}", "disk")
+        elif self._disk_told and not waited:
+            self.note("", f"the disk answers again, after some {self._disk_told:.1f} s", "disk")
+        self._disk_told = waited if waited >= DISK_NOTE_S else 0.0
 
     def _latency(self, action: ev.Latency) -> None:
         self.statistics.latency(action.service, action.elapsed_ns, action.missed)
@@ -344,7 +390,6 @@ class BrokerServer:
 
     def _frame_finished(self, action: ev.FrameFinished) -> None:
         self.clock.digest.fold()
-        self._journal.checkpoints.finished = action.episode, action.frame
         self.statistics.frame(time.monotonic_ns(), action.episode, action.lag_ns)
         self._observer.frame(action, self.statistics)
 

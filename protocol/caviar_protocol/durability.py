@@ -49,3 +49,22 @@ def replace_file(path: Path, data: bytes | memoryview, *, durable: bool = True) 
     partial.replace(path)
     if durable:
         sync_file(path.parent)
+
+
+def file_system_of(path: Path) -> str:
+    """The file system that holds a path, for people: ``ext4 on /dev/sda1, mounted at /data``.
+
+    It reads what the kernel lists and asks no disk, so it answers for one that does not.
+    """
+    found, best = "its file system is unknown", ""
+    try:
+        lines = Path("/proc/self/mountinfo").read_text().splitlines()
+    except OSError:
+        return found
+    place = f"{os.path.abspath(path)}/"  # noqa: PTH100  # Path.resolve would ask the disk
+    for line in lines:
+        fields, _, rest = line.partition(" - ")
+        mount, kind = fields.split()[4], rest.split()
+        if place.startswith(mount.rstrip("/") + "/") and len(mount) >= len(best):
+            found, best = f"{kind[0]} on {kind[1]}, mounted at {mount}", mount
+    return found
