@@ -12,12 +12,14 @@ frame; docs/reading-recordings.md has more.
 
 A recording is a directory with ``recording-0000.mcap``, ``recording-0001.mcap``, … and the
 scenery in ``assets/``. After a crash it is readable up to the last frame whose record was
-written whole; `Recording.complete` then is false.
+written whole; `Recording.complete` then is false. What is damaged or missing is in `Recording.damage`, and
+said by a `RecordingWarning`.
 """
 
 from __future__ import annotations
 
 import hashlib
+import warnings
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping
 from functools import cached_property
@@ -25,7 +27,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, TypeVar, cast, overload
 
-import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Payload
@@ -36,11 +37,10 @@ from caviar_protocol.recording_arrays import TopicArrays
 from caviar_protocol.recording_digest import RunDigestReport, recorded_digest
 from caviar_protocol.recording_layout import (
     ASSET_FOLDER,
-    FORMAT,
     FrameEntry,
     RecordingMetadata,
-    segment_files,
 )
+from caviar_protocol.recording_segments import RecordedSegments, metadata_of
 from caviar_protocol.recording_sensors import CameraArrays, DepthArrays, LidarArrays, SegmentationArrays
 from caviar_protocol.recording_topics import ActionArrays, ChannelArrays, LinkArrays, SceneArrays
 from caviar_protocol.scene import merge_scenes
@@ -72,6 +72,10 @@ def check_topic(topic: str) -> str:
     if topic not in PAYLOADS:
         raise RecordingError(f"there is no topic {topic!r}; {suggestion(topic, PAYLOADS)}")
     return topic
+
+
+class RecordingWarning(UserWarning):
+    """A recording is damaged, and only a part of it can be read; the text says which."""
 
 
 class RecordedProduct:
@@ -178,23 +182,26 @@ class Recording:
     Raises
     ------
     RecordingError
-        It is not a recording, a segment is missing, or the content contradicts itself. A last
-        segment that breaks off is not an error.
+        It is not a recording, nothing of it can be read, or the content contradicts itself.
+
+    Warns
+    -----
+    RecordingWarning
+        It is damaged, or a segment is missing. What precedes can be read, and `damage` says what cannot.
+        A last segment that breaks off, as a killed recorder leaves it, is no damage.
     """
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        self._segments = [Segment(file) for file in segment_files(self.path)]
-        for segment in self._segments[:-1]:
-            if not segment.finished:
-                raise RecordingError(
-                    f"{segment.path} breaks off at {len(segment)} B, although later segments follow"
-                )
-        if len(self._segments) > 1 and not self._segments[-1].metadata:
-            self._segments.pop()  # killed while it opened the next segment
-            self.complete = False
-        else:
-            self.complete = self._segments[-1].finished
+        self._found = RecordedSegments(self.path)
+        self._segments = self._found.segments
+        self.complete = self._found.closed
+        """Whether the recorder closed it, and nothing of it is missing."""
+        self.damage = tuple(self._found.damage)
+        """What is missing or cannot be read: a line each. `run_digest` looks at every byte."""
+        if self.damage:
+            more = f" (and {len(self.damage) - 1} more)" if len(self.damage) > 1 else ""
+            warnings.warn(f"the recording is damaged: {self.damage[0]}{more}", RecordingWarning, stacklevel=2)
         self.metadata = self._read_metadata()
         self._starts = [0]
         for segment in self._segments:
@@ -326,7 +333,7 @@ class Recording:
 
         It does not stop at damage: a changed payload gives another digest and is named.
         """
-        return recorded_digest(self.path, self._segments)
+        return recorded_digest(self._found)
 
     def entry(self, index: int) -> FrameEntry:
         """The frame record of the ``index``-th frame of the recording."""
@@ -400,7 +407,7 @@ class Recording:
         return {key: index for index, key in enumerate(order)}
 
     def _read_metadata(self) -> RecordingMetadata:
-        found = [_metadata_of(segment) for segment in self._segments]
+        found = [metadata_of(segment) for segment in self._segments]
         for segment, metadata in zip(self._segments, found, strict=True):
             if (metadata.run, metadata.seed) != (found[0].run, found[0].seed):
                 raise RecordingError(
@@ -411,18 +418,3 @@ class Recording:
 
     def _at(self, episode: int, frame: int) -> str:
         return f"{self.path}: episode {episode}, frame {frame}"
-
-
-def _metadata_of(segment: Segment) -> RecordingMetadata:
-    if not segment.metadata:
-        raise RecordingError(f"{segment.path} breaks off at {len(segment)} B, before its metadata")
-    try:
-        raw = {key: msgspec.json.decode(text) for key, text in segment.metadata.items()}
-        metadata = msgspec.convert(raw, RecordingMetadata)
-    except msgspec.MsgspecError as error:
-        raise RecordingError(f"{segment.path}: the metadata are damaged: {error}") from error
-    if metadata.format != FORMAT:
-        raise RecordingError(
-            f"{segment.path} has format {metadata.format}, this version reads format {FORMAT}"
-        )
-    return metadata

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
 
 from caviar_protocol.arrays import quantity
-from caviar_protocol.errors import RecordingError
 from caviar_protocol.messages import Asset, GrantInput, Report
 
 FORMAT = 1
@@ -76,21 +74,3 @@ class FrameEntry(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     reports: tuple[Report, ...] = ()
     """What services reported beside their products: decisions that a replay imposes, counts of what
     was dropped, and wall times, which no digest covers."""
-
-
-def segment_files(path: Path) -> list[Path]:
-    """The segments of a run directory in order, or the one that ``path`` is.
-
-    Raises `RecordingError` where there is none, or one in the middle is missing.
-    """
-    if path.is_file():
-        return [path]
-    if not path.is_dir():
-        raise RecordingError(f"{path} does not exist: give a run directory or a {SEGMENT_PATTERN} file")
-    files = sorted(path.glob(SEGMENT_PATTERN), key=lambda file: (len(file.name), file.name))
-    if not files:
-        raise RecordingError(f"{path} holds no recording: there is no {SEGMENT_PATTERN} in it")
-    for index, file in enumerate(files):
-        if file.name != segment_name(index):
-            raise RecordingError(f"{path / segment_name(index)} is missing, although {file.name} is there")
-    return files

@@ -42,6 +42,9 @@ def test_a_changed_byte_gives_another_digest_a_warning_and_status_1(tmp_path, ca
 def test_a_recording_that_breaks_off_has_a_digest_and_a_note(tmp_path, capsys):
     file = record(tmp_path) / "recording-0000.mcap"
     file.write_bytes(file.read_bytes()[: Segment(file).chunks[3].offset + 50])
+    assert inspect_command(tmp_path, digest=True) == 1
+    assert "lost are all frames behind frame 2 of episode 0 up to frame 4" in capsys.readouterr().err
+    (tmp_path / "recording.json").unlink()  # which a recorder that was killed does not say it closed
     assert inspect_command(tmp_path, digest=True) == 0
     out, err = capsys.readouterr()
     assert out.strip() == Recording(record(tmp_path / "three", frames=3)).run_digest().digest

@@ -33,6 +33,8 @@ def started(folder: Path, *, again: bool, **settings: object) -> McapRecorder:
 
 def killed(made: McapRecorder) -> None:
     """What is buffered is lost, and no index is written."""
+    if made._persistence is not None:
+        made._persistence.abandon()
     if made._segment is not None:
         made._segment.abandon()
 

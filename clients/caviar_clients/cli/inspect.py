@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, cast
@@ -20,7 +21,7 @@ from caviar_clients.cli.unserved import Unserved
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.messages import Status
-from caviar_protocol.recording import RecordedFrame, Recording
+from caviar_protocol.recording import RecordedFrame, Recording, RecordingWarning
 from caviar_protocol.topics import Link
 
 SHOWN_DAMAGE = 20
@@ -89,13 +90,15 @@ def inspect_command(run: Path, digest: bool = False, as_json: bool = False) -> i
 
     Raises `RecordingError` where it is no recording.
     """
-    recording = Recording(run)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RecordingWarning)  # its lines are printed as damage
+        recording = Recording(run)
     return _print_digest(recording) if digest else _print_summary(summarise(recording), as_json)
 
 
 def summarise(recording: Recording) -> RunSummary:
     """The summary of a recording. Damaged frames are listed and count as if they had no products."""
-    metadata, damage = recording.metadata, []
+    metadata, damage = recording.metadata, list(recording.damage)
     sources: dict[tuple[str, str], SourceSummary] = {}
     totals, decisions, unserved, outages = _LinkTotals(), Decisions(), Unserved(), Outages()
     episodes: dict[int, int] = {}  # to the last instant [ns]
@@ -196,7 +199,10 @@ def _print_digest(recording: Recording) -> int:
     report = recording.run_digest()
     typer.echo(report.digest)
     if not recording.complete:
-        typer.echo(f"note: the recording breaks off; the digest is that of {report.frames} frames", err=True)
+        last = recording.entry(len(recording) - 1) if len(recording) else None
+        behind = f" behind frame {last.frame} of episode {last.episode}" if last is not None else ""
+        note = f"note: the recording breaks off{behind}; the digest is that of {report.frames} frames"
+        typer.echo(note, err=True)
     return _print_damage(report.damage)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated
@@ -404,8 +405,13 @@ def tradeoff(
     trade(source, frames, options, json, out, _console)
 
 
+def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
+    _errors.print(Text.assemble(("caviar: warning:", "yellow"), f" {message}"), soft_wrap=True)
+
+
 def main() -> None:
-    """Entry point: errors meant for the user become one line and status 1."""
+    """Entry point: errors meant for the user become one line and status 1, warnings a line."""
+    warnings.showwarning = _show_warning
     try:
         app()
     except CaviarError as error:

@@ -8,6 +8,7 @@ and ``abort`` are allowed (clause 9).
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import platform
@@ -20,6 +21,7 @@ from typing import ClassVar, Generic, TypeVar
 
 import msgspec
 
+from caviar_protocol.durability import sync_file
 from caviar_protocol.errors import AssetError, RunError
 from caviar_protocol.messages import Asset, Input, Role
 from caviar_services.service import Service
@@ -36,11 +38,26 @@ class Recorder(Service[S], Generic[S]):
     inputs: ClassVar[tuple[Input, ...]] = (Input(topic="*", required=False),)
 
 
+_REMEDIES = {
+    errno.ENOSPC: "free space on its file system, then go on with caviar run --resume {folder}, "
+    "or choose another directory with --out",
+    errno.EDQUOT: "free space within your quota, then go on with caviar run --resume {folder}, "
+    "or choose another directory with --out",
+    errno.EFBIG: "raise the limit of file sizes (ulimit -f), or set segment_mib of the recorder below it",
+    errno.EMFILE: "raise the limit of open files (ulimit -n)",
+    errno.ENFILE: "the machine has too many open files: end programs, or raise fs.file-max",
+    errno.EROFS: "its file system can only be read: choose another directory with --out",
+    errno.EACCES: "allow writing there, or choose another directory with --out",
+    errno.ENOENT: "the run's directory was removed or renamed while the run wrote to it: leave it there",
+}
+
+
 def failure(path: Path, error: OSError) -> RunError:
-    """The error that ends a run whose recording cannot be written."""
+    """The error that ends a run whose recording cannot be written: path, reason and remedy."""
+    remedy = _REMEDIES.get(error.errno or 0, "choose another directory with --out")
     return RunError(
         f"the recorder cannot write {path}: {error.strerror or error} (errno {error.errno}); "
-        "free space there or choose another directory with --out"
+        f"{remedy.format(folder=path.parent)}"
     )
 
 
@@ -83,9 +100,10 @@ def _after(key: str, file: Path) -> str:
     return next((line.partition(":")[2].strip() for line in lines if line.startswith(key)), "")
 
 
-def copy_assets(assets: Mapping[str, Path], folder: Path) -> tuple[Asset, ...]:
+def copy_assets(assets: Mapping[str, Path], folder: Path, *, sync: bool = False) -> tuple[Asset, ...]:
     """Copy files of scenery to ``folder`` at their names; their digests and sizes, sorted by name.
 
+    With ``sync`` they are on disk when this returns.
     Raises `AssetError` for a name that leads out of ``folder``.
     """
     copied = []
@@ -99,4 +117,8 @@ def copy_assets(assets: Mapping[str, Path], folder: Path) -> tuple[Asset, ...]:
         with target.open("rb") as stream:
             digest = hashlib.file_digest(stream, "sha256").hexdigest()
         copied.append(Asset(name=name, digest=digest, size=target.stat().st_size))
+    if sync and copied:
+        files = [folder / asset.name for asset in copied]
+        for path in [*files, *{file.parent for file in files}, folder, folder.parent]:
+            sync_file(path)
     return tuple(copied)

@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import TypeAlias
 
-from caviar_protocol.errors import RecordingError
+import msgspec
+
+from caviar_protocol.durability import sync_file
+from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.messages import GrantInput, Status
-from caviar_protocol.recording_layout import FrameEntry, segment_files
+from caviar_protocol.recording_layout import SEGMENT_PATTERN
+from caviar_protocol.recording_manifest import SegmentRecord, frame_name
+from caviar_protocol.recording_segments import RecordedSegments, follows
 from caviar_protocol.segment import Channel, Segment
+from caviar_services.recorder.segment_writer import SegmentWriter
 from caviar_services.service import FrameInput
+
+Rewrite: TypeAlias = Callable[[Path, Segment], SegmentWriter]
+"""Opens a file that takes the place of a segment."""
 
 
 class RunTime:
@@ -21,6 +31,10 @@ class RunTime:
         self._period = sampling_period_ns
         self._episode = -1
         self._base_ns, self._last_ns = 0, 0
+
+    def continue_from(self, episode: int, base_ns: int, t_ns: int) -> None:
+        """A frame was recorded already."""
+        self._episode, self._base_ns, self._last_ns = episode, base_ns, base_ns + t_ns
 
     def base_of(self, episode: int, t_ns: int) -> int:
         """Run time of the episode's zero, for its next frame [ns]."""
@@ -55,16 +69,6 @@ class Stored:
         return True
 
 
-class Writer(Protocol):
-    """What writes one segment."""
-
-    def write(self, entry: FrameEntry, products: list[FrameInput], base_ns: int) -> None:
-        """Write one frame."""
-
-    def finish(self) -> None:
-        """Write index and summary, and close."""
-
-
 @dataclass
 class Continuation:
     """What an earlier process recorded, up to the frame that is granted next.
@@ -80,43 +84,103 @@ class Continuation:
     folder: Path
     runtime: RunTime
     stored: Stored
-    segments: int = 0
-    """That are there, all of them finished."""
+    records: list[SegmentRecord] = field(default_factory=list)
+    """The segments that are there, all of them finished."""
 
-    def take_over(self, until: tuple[int, int] | None, rewrite: Callable[[Path, Segment], Writer]) -> None:
+    def take_over(self, until: tuple[int, int] | None, rewrite: Rewrite, *, sync: bool) -> None:
         """Keep the frames before ``until`` (episode, frame), or all of them.
 
         A segment that breaks off, or has later frames, is written anew from its whole records and takes
-        its place in one step; one with nothing to keep is removed.
+        its place in one step; one with nothing to keep is removed. Of finished segments, which the manifest
+        knows, only the last one is opened.
+
+        Raises `RunError` where frames before ``until`` are missing; then nothing is changed.
         """
-        for path in _files(self.folder):
-            segment = Segment(path)
-            keep = [i for i, e in enumerate(segment.entries) if until is None or (e.episode, e.frame) < until]
-            if not segment.metadata or not keep:
-                path.unlink()
-                continue
-            whole = segment.finished and len(keep) == len(segment.chunks)
-            mended = path.with_suffix(".mending")
-            writer = None if whole else rewrite(mended, segment)
-            for index in keep:
-                entry = segment.entries[index]
-                self.stored.begin(entry.episode)
-                for item in entry.inputs:
-                    self.stored.is_new(item)
-                base_ns = self.runtime.base_of(entry.episode, entry.t_ns)
-                if writer is not None:
-                    writer.write(entry, list(_products(segment, index)), base_ns)
+        files, damage = list(self.folder.glob(SEGMENT_PATTERN)), list[str]()
+        try:
+            found = RecordedSegments(self.folder, trusted_before=until or _END) if files else None
+        except RecordingError as error:
+            found, damage = None, [str(error)]  # it may have died before it wrote anything
+        records = found.trusted if found is not None else []
+        last = records[-1].last if records else None
+        keep: list[tuple[Segment, list[int]]] = []
+        for segment in found.segments if found is not None else ():
+            frames, last = _frames_to_keep(segment, last, until)
+            keep += [(segment, frames)] if frames else []
+        damage += found.damage if found is not None else []
+        if until is None and damage:
+            raise self._gap(last, None, damage)
+        if until is not None and until != (0, 0) and (last is None or not follows(last, until)):
+            raise self._gap(last, until, damage)
+        self.records = [*records]
+        for segment, frames in keep:
+            self.records.append(self._take(segment, frames, rewrite, found, sync=sync))
+        kept = {record.name for record in self.records}
+        for file in files:
+            if file.name not in kept:
+                file.unlink(missing_ok=True)
+
+    def _take(
+        self,
+        segment: Segment,
+        frames: list[int],
+        rewrite: Rewrite,
+        found: RecordedSegments | None,
+        *,
+        sync: bool,
+    ) -> SegmentRecord:
+        """Take over these frames of a segment; its part of the manifest."""
+        known = found.record(segment) if found is not None else None
+        whole = segment.finished and not segment.damage and len(frames) == len(segment.chunks)
+        mended = segment.path.with_suffix(".mending")
+        writer = None if whole else rewrite(mended, segment)
+        for index in frames:
+            entry, base_ns = segment.entries[index], segment.base_of(index)
+            self.runtime.continue_from(entry.episode, base_ns, entry.t_ns)
+            self.stored.begin(entry.episode)
+            for item in entry.inputs:
+                self.stored.is_new(item)
             if writer is not None:
-                writer.finish()
-                mended.replace(path)
-            self.segments += 1
+                writer.write(entry, list(_products(segment, index)), base_ns)
+        if writer is None:
+            return known or segment.record()
+        record = writer.finish()
+        if sync:
+            writer.sync()
+        writer.close()
+        mended.replace(segment.path)
+        if sync:
+            sync_file(self.folder)
+        return msgspec.structs.replace(record, name=segment.path.name)
+
+    def _gap(
+        self, last: tuple[int, int] | None, until: tuple[int, int] | None, damage: list[str]
+    ) -> RunError:
+        ends = f"ends with {frame_name(last)}" if last else "has no frame"
+        goes_on = f", and the run goes on with {frame_name(until)}" if until else ""
+        why = f" ({damage[0]})" if damage else ""
+        return RunError(
+            f"the recording in {self.folder} {ends}{goes_on}: what is between is lost{why}; nothing was "
+            f"changed, and caviar doctor {self.folder} says what can be read; to have all frames, run the "
+            "scenario again"
+        )
 
 
-def _files(folder: Path) -> list[Path]:
-    try:
-        return segment_files(folder)
-    except RecordingError:
-        return []  # it died before it wrote anything
+_END = (sys.maxsize, 0)
+
+
+def _frames_to_keep(
+    segment: Segment, last: tuple[int, int] | None, until: tuple[int, int] | None
+) -> tuple[list[int], tuple[int, int] | None]:
+    """Frames of a segment that are before ``until`` and follow ``last`` without a gap; the last one then."""
+    frames = []
+    for index, entry in enumerate(segment.entries):
+        instant = (entry.episode, entry.frame)
+        if (until is not None and instant >= until) or (last is not None and not follows(last, instant)):
+            break
+        frames.append(index)
+        last = instant
+    return frames, last
 
 
 def _products(segment: Segment, index: int) -> Iterator[FrameInput]:

@@ -13,15 +13,18 @@ scenery in ``assets/``. In a segment:
 * ``log_time`` is run time in nanoseconds: ``t_ns`` of the frame in the first episode; a later
   episode begins one sampling period after the end of the one before. ``publish_time`` is the
   same for the instant the product was computed for.
-* One chunk a frame, handed to the operating system before DONE. MCAP's indexes, statistics and
-  CRCs of the whole are written when a segment is full or the run ends.
+* One chunk a frame, and behind it a seal with the CRC-32 of all bytes before it
+  (`caviar_protocol.segment`), handed to the operating system before DONE, and on disk as the run's
+  ``durability`` says (`persistence`). MCAP's index and statistics are written when a segment is full or the
+  run ends; then the manifest ``recording.json`` lists it as finished
+  (`caviar_protocol.recording_manifest`).
 * Metadata record ``caviar``: `caviar_protocol.recording_layout.RecordingMetadata`, a JSON text a field.
 """
 
 from __future__ import annotations
 
-import sys
 import time
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -31,33 +34,23 @@ import msgspec
 from caviar_protocol.arrays import quantity
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.digest import payload_digest
-from caviar_protocol.errors import RunError
+from caviar_protocol.durability import Durability, sync_file
+from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.messages import GrantInput
 from caviar_protocol.recording_layout import (
     ASSET_FOLDER,
-    FRAME_TOPIC,
-    METADATA_NAME,
-    PROFILE,
     SEGMENT_PATTERN,
     FrameEntry,
     RecordingMetadata,
     segment_name,
 )
+from caviar_protocol.recording_manifest import SegmentRecord
 from caviar_protocol.segment import Segment
 from caviar_services.recorder.base import Recorder, copy_assets, failure, machine, versions
 from caviar_services.recorder.continuing import Continuation, RunTime, Stored
+from caviar_services.recorder.persistence import Persistence
+from caviar_services.recorder.segment_writer import SegmentWriter
 from caviar_services.service import Frame, FrameInput, Preparation, Prepared, RunInfo, StepResult
-
-_SCHEMA_ENCODING = "x-caviar-text"
-_PRODUCT_SCHEMA = (
-    "Topic {topic!r} of the CAVIAR protocol, version 1: 8 bytes little-endian with the length of the header, "
-    "the header (a msgpack map), the body (the arrays that the header refers to by dtype, shape and offset)."
-)
-_FRAME_SCHEMA = (
-    "msgpack map: episode, frame, t_ns [ns], seed, inputs; inputs lists the provenance of every product of "
-    "the frame, sorted by (topic, source, frame): topic, source, status (fresh, held, absent, late), "
-    "frame and t_ns it was computed for, age [frames], fidelity, digest (SHA-256), cause."
-)
 
 
 class McapSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -83,8 +76,10 @@ class McapRecorder(Recorder[McapSettings]):
     def __init__(self, settings: McapSettings, run: RunInfo) -> None:
         super().__init__(settings, run)
         self._metadata = RecordingMetadata()
-        self._segment: _SegmentWriter | None = None
+        self._segment: SegmentWriter | None = None
         self._segments = 0
+        self._durability = durability_of(run.scenario)
+        self._persistence: Persistence | None = None
         self._failure: RunError | None = None
         self._runtime = RunTime(run.sampling_period_ns)
         self._stored = Stored()
@@ -95,7 +90,7 @@ class McapRecorder(Recorder[McapSettings]):
         """Open the first segment. `RunError` where the directory is not writable or holds a run."""
         folder = self.run.directory
         existing = sorted(folder.glob(SEGMENT_PATTERN))
-        self._goes_on = bool(existing) and self.run.again
+        self._goes_on = self.run.again
         if existing and not self.run.again:
             raise RunError(
                 f"{existing[0]} is there already: choose another directory with --out, or remove it"
@@ -104,7 +99,7 @@ class McapRecorder(Recorder[McapSettings]):
         assets = preparation.assets if self.settings.copy_assets else {}
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            copied = copy_assets(assets, folder / ASSET_FOLDER)
+            copied = copy_assets(assets, folder / ASSET_FOLDER, sync=self._durability != "none")
         except OSError as error:
             raise failure(Path(error.filename or folder), error) from error
         self._metadata = RecordingMetadata(
@@ -120,13 +115,14 @@ class McapRecorder(Recorder[McapSettings]):
             notes=self.settings.notes,
         )
         if not self._goes_on:
+            self._persistence = self._persisted([])
             self._open_segment()
         return Prepared(notes=(f"recording to {folder}",))
 
     def step(self, frame: Frame) -> StepResult:
-        """Write a frame; when this returns, the operating system has it.
+        """Write a frame; when this returns, the operating system has it, under ``frame`` the disk.
 
-        Raises `RunError` naming path and errno where it cannot be written.
+        Raises `RunError` naming path, errno and remedy where it cannot be written.
         """
         begin = time.perf_counter_ns()
         if self._failure is not None:
@@ -147,26 +143,39 @@ class McapRecorder(Recorder[McapSettings]):
         )
         try:
             segment.write(entry, [i for i in inputs if self._stored.is_new(i.provenance)], base_ns)
+            self._kept.written(segment)
             if (
                 segment.size >= self.settings.segment_mib * 2**20
                 or segment.frames >= self.settings.segment_frames
             ):
                 self._segment = None
-                segment.finish()
+                self._kept.finished(segment)
         except OSError as error:
             raise self._failed(segment, error) from error
         return StepResult(measured={"write": time.perf_counter_ns() - begin})
 
     def close(self) -> None:
-        """Write the index of the open segment. `RunError` naming path and errno where that fails."""
-        if self._goes_on:
+        """Close the recording, so that it is complete. `RunError` naming path and errno where that fails."""
+        if self._goes_on and self._failure is None:
             self._take_over(None)
         segment, self._segment = self._segment, None
-        if segment is not None:
-            try:
-                segment.finish()
-            except OSError as error:
-                raise self._failed(segment, error) from error
+        if self._persistence is None or self._failure is not None:
+            return
+        try:
+            if segment is not None:
+                self._persistence.finished(segment)
+            self._persistence.close()
+        except OSError as error:
+            raise self._failed(segment, error) from error
+
+    @property
+    def _kept(self) -> Persistence:
+        if self._persistence is None:
+            raise RunError("the recorder was granted a frame before it was prepared")
+        return self._persistence
+
+    def _persisted(self, earlier: list[SegmentRecord]) -> Persistence:
+        return Persistence(self.run.directory, self._durability, self.run.run, self.run.seed, earlier)
 
     def _take_over(self, until: tuple[int, int] | None) -> None:
         """Go on behind what another process recorded, before the frame ``until``."""
@@ -174,110 +183,49 @@ class McapRecorder(Recorder[McapSettings]):
         folder, compression = self.run.directory, self.settings.compression
         before = Continuation(folder, self._runtime, self._stored)
 
-        def rewrite(path: Path, segment: Segment) -> _SegmentWriter:
+        def rewrite(path: Path, segment: Segment) -> SegmentWriter:
             path.unlink(missing_ok=True)
-            return _SegmentWriter(path, segment.metadata, compression)
+            return SegmentWriter(path, segment.metadata, compression)
 
         try:
-            before.take_over(until, rewrite)
+            before.take_over(until, rewrite, sync=self._durability != "none")
         except OSError as error:
             raise failure(Path(error.filename or folder), error) from error
-        self._segments = before.segments
+        except CaviarError as error:
+            self._failure = RunError(str(error))
+            raise self._failure from error
+        self._segments = len(before.records)
+        self._persistence = self._persisted(before.records)
 
-    def _open_segment(self) -> _SegmentWriter:
+    def _open_segment(self) -> SegmentWriter:
         path = self.run.directory / segment_name(self._segments)
         metadata = msgspec.structs.replace(self._metadata, segment=self._segments)
         try:
-            self._segment = _SegmentWriter(path, _as_text(metadata), self.settings.compression)
+            self._segment = SegmentWriter(path, _as_text(metadata), self.settings.compression)
+            if self._durability == "frame":
+                sync_file(self.run.directory)
         except OSError as error:
-            raise failure(path, error) from error
+            raise self._failed(None, error) from error
         self._segments += 1
         return self._segment
 
-    def _failed(self, segment: _SegmentWriter, error: OSError) -> RunError:
-        segment.abandon()
+    def _failed(self, segment: SegmentWriter | None, error: OSError) -> RunError:
+        """Give up after an error of the system: what is written stays as it is."""
+        if self._persistence is not None:
+            self._persistence.abandon()
+        if segment is not None:
+            segment.abandon()
         self._segment = None
-        self._failure = failure(segment.path, error)
+        path = Path(error.filename) if error.filename else segment.path if segment else self.run.directory
+        self._failure = failure(path, error)
         return self._failure
 
 
-class _SegmentWriter:
-    """One MCAP file that grows by a chunk a frame."""
-
-    def __init__(self, path: Path, metadata: dict[str, str], compression: str) -> None:
-        from mcap.writer import CompressionType, Writer
-
-        self.path = path
-        self.frames = 0
-        self._channels: dict[tuple[str, str], int] = {}
-        self._schemas: dict[str, int] = {}
-        self._stream = path.open("xb")
-        # A chunk ends where we flush, after each frame, and never by its size.
-        self._writer = Writer(
-            self._stream,
-            chunk_size=sys.maxsize,
-            compression=CompressionType[compression.upper()],
-            enable_data_crcs=True,
-        )
-        try:
-            self._writer.start(profile=PROFILE)
-            self._writer.add_metadata(METADATA_NAME, metadata)
-            self._writer.flush()
-        except OSError:
-            self.abandon()
-            raise
-
-    @property
-    def size(self) -> int:
-        """Bytes written so far."""
-        return self._stream.tell()
-
-    def write(self, entry: FrameEntry, products: list[FrameInput], base_ns: int) -> None:
-        """Write one frame and hand it to the operating system."""
-        frame_channel = self._channel(FRAME_TOPIC, "")
-        keyed = [(self._channel(p.provenance.topic, p.provenance.source), p) for p in products]
-        log_time = base_ns + entry.t_ns
-
-        def add(channel: int, sequence: int, t_ns: int, data: bytes) -> None:
-            self._writer.add_message(
-                channel, log_time=log_time, data=data, publish_time=base_ns + t_ns, sequence=sequence
-            )
-
-        add(frame_channel, entry.frame, entry.t_ns, msgspec.msgpack.encode(entry))
-        for channel, product in keyed:
-            length = len(product.header).to_bytes(8, "little")
-            data = b"".join((length, product.header, product.body))
-            add(channel, product.provenance.frame, product.provenance.t_ns, data)
-        self._writer.flush()
-        self.frames += 1
-
-    def finish(self) -> None:
-        """Write index and summary, and close."""
-        self._writer.finish()
-        self._stream.close()
-
-    def abandon(self) -> None:
-        """Close after a failed write: what is buffered would fail again."""
-        self._stream.raw.close()
-
-    def _channel(self, topic: str, source: str) -> int:
-        channel = self._channels.get((topic, source))
-        if channel is None:
-            product = bool(source)
-            channel = self._channels[topic, source] = self._writer.register_channel(
-                topic=f"{topic}/{source}" if product else topic,
-                message_encoding="caviar-product" if product else "msgpack",
-                schema_id=self._schema(topic, _PRODUCT_SCHEMA if product else _FRAME_SCHEMA),
-                metadata={"topic": topic, "source": source},
-            )
-        return channel
-
-    def _schema(self, topic: str, text: str) -> int:
-        if topic not in self._schemas:
-            self._schemas[topic] = self._writer.register_schema(
-                name=f"caviar.{topic}/1", encoding=_SCHEMA_ENCODING, data=text.format(topic=topic).encode()
-            )
-        return self._schemas[topic]
+def durability_of(scenario: Mapping[str, object]) -> Durability:
+    """``run.durability`` of a scenario as resolved; by default ``periodic``."""
+    run = scenario.get("run")
+    durability: Durability = run.get("durability", "periodic") if isinstance(run, Mapping) else "periodic"
+    return durability
 
 
 def _as_text(metadata: RecordingMetadata) -> dict[str, str]:

@@ -1,0 +1,193 @@
+"""The segments of a recording: which are there, how far they can be read, and what is missing."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+
+import msgspec
+
+from caviar_protocol.errors import RecordingError
+from caviar_protocol.recording_layout import FORMAT, SEGMENT_PATTERN, RecordingMetadata, segment_name
+from caviar_protocol.recording_manifest import Manifest, SegmentRecord, frame_name, read_manifest
+from caviar_protocol.segment import Segment
+
+
+@dataclass
+class RecordedSegments:
+    """A recording up to the first segment that is missing or broken.
+
+    Raises `RecordingError` where there is no recording, or nothing of it can be read.
+    """
+
+    path: Path
+    """The run directory, or one ``.mcap`` file of it."""
+    trusted_before: tuple[int, int] | None = None
+    """Finished segments all of whose frames are before this (episode, frame), and whose size is that of the
+    manifest, are not opened, the last one excepted; None: all are opened."""
+    trusted: list[SegmentRecord] = field(default_factory=list)
+    """Those before `segments`."""
+    manifest: Manifest | None = None
+    """None where there is none, or it is damaged."""
+    segments: list[Segment] = field(default_factory=list)
+    damage: list[str] = field(default_factory=list)
+    """What is missing or cannot be read, as far as can be told without reading products: a line each."""
+    closed: bool = False
+    """Whether the recorder closed the recording, and all of it is there."""
+
+    def __post_init__(self) -> None:
+        alone = self.path.is_file()
+        folder = self.path.parent if alone else self.path
+        files = [self.path] if alone else _files(self.path)
+        try:
+            self.manifest = read_manifest(folder)
+        except RecordingError as error:
+            self.damage.append(str(error))
+        known = {record.name: record for record in self.manifest.segments} if self.manifest else {}
+        expected = files if alone else _expected(folder, files, known)
+        if self.trusted_before is not None:
+            self._trust(expected, known, self.trusted_before)
+        for number, file in enumerate(expected):
+            if number < len(self.trusted):
+                continue
+            if not self._open(file, known.get(file.name), expected[number + 1 :]):
+                break
+        there = len(self.trusted) + len(self.segments)
+        self.closed = there == len(expected) and self.segments[-1].finished and not self.damage
+        if self.manifest is not None and not alone:
+            self.closed &= self.manifest.closed
+
+    @property
+    def instants(self) -> list[tuple[int, int]]:
+        """(episode, frame) of every frame in `segments`."""
+        return [(entry.episode, entry.frame) for segment in self.segments for entry in segment.entries]
+
+    def record(self, segment: Segment) -> SegmentRecord | None:
+        """What the manifest says about a segment, where it was finished."""
+        records = self.manifest.segments if self.manifest else ()
+        found = next((record for record in records if record.name == segment.path.name), None)
+        return found if found is not None and found.finished else None
+
+    def _trust(self, files: list[Path], known: dict[str, SegmentRecord], before: tuple[int, int]) -> None:
+        for file, later in pairwise(files):
+            record = known.get(file.name)
+            if record is None or record.last is None or record.last >= before or not later.exists():
+                return
+            if not file.exists() or file.stat().st_size != record.size:
+                return
+            self.trusted.append(record)
+
+    def _open(self, file: Path, record: SegmentRecord | None, later: list[Path]) -> bool:
+        """Add a segment; whether the next one may follow it."""
+        if not file.exists():
+            if not self.segments and not self.trusted:
+                raise RecordingError(f"{file} is missing, although {_first_there(later)} is there")
+            self._lost(f"{file} is missing", record, later)
+            return False
+        try:
+            segment = _opened(file)
+        except RecordingError as error:
+            if not self.segments and not self.trusted:
+                raise
+            if record is not None or later:  # else it was killed while it opened this segment
+                self._lost(str(error), record, later)
+            return False
+        self.segments.append(segment)
+        self.damage += [f"{file}: {line}" for line in segment.damage]
+        if record is not None and record.finished and len(segment) != record.size:
+            what = f"{file} has {len(segment)} B of {record.size} B"
+        elif record is not None and record.finished and not segment.finished:
+            what = f"{file} breaks off at byte {segment.readable}"
+        else:
+            what = ""
+        if what and record is not None and self.instants[-1:] == [record.last]:
+            self.damage.append(f"{what}: its index is damaged, and no frame is lost")
+            return True
+        if what:
+            self._lost(what, record, later)
+            return False
+        if not segment.finished and later:
+            self._lost(f"{file} breaks off at byte {segment.readable}", record, later)
+            return False
+        if not segment.finished and segment.damage:
+            self._lost(f"{file} is readable up to byte {segment.readable} of {len(segment)}", record, later)
+        return True
+
+    def _lost(self, what: str, record: SegmentRecord | None, later: list[Path]) -> None:
+        """Say what is lost, and from which frame."""
+        instants = self.instants or [record.last for record in self.trusted[-1:] if record.last]
+        since = f"all frames behind {frame_name(instants[-1])}" if instants else "every frame"
+        until = f" up to {frame_name(record.last)}" if record is not None and record.last else ""
+        if later:
+            until += f", and those of {later[0].name}" + (" and later segments" if len(later) > 1 else "")
+        self.damage.insert(0, f"{what}: lost are {since}{until}")
+
+
+def recorded_until(path: Path) -> tuple[tuple[int, int] | None, tuple[str, ...]]:
+    """How far a recording goes without a gap.
+
+    Returns
+    -------
+    last
+        (episode, frame) of the last frame before anything is missing; None: there is no frame.
+    damage
+        What is missing or cannot be read: a line each.
+    """
+    try:
+        found = RecordedSegments(path, trusted_before=(sys.maxsize, 0))
+    except RecordingError as error:
+        return None, (str(error),)
+    last = found.trusted[-1].last if found.trusted else None
+    for instant in found.instants:
+        if last is not None and not follows(last, instant):
+            break
+        last = instant
+    return last, tuple(found.damage)
+
+
+def metadata_of(segment: Segment) -> RecordingMetadata:
+    """The metadata of a segment. `RecordingError` naming the file where they cannot be read."""
+    try:
+        raw = {key: msgspec.json.decode(text) for key, text in segment.metadata.items()}
+        metadata = msgspec.convert(raw, RecordingMetadata)
+    except (msgspec.MsgspecError, RecursionError) as error:
+        raise RecordingError(f"{segment.path}: the metadata are damaged: {error}") from error
+    if metadata.format != FORMAT:
+        raise RecordingError(
+            f"{segment.path} has format {metadata.format}, this version reads format {FORMAT}"
+        )
+    return metadata
+
+
+def _opened(file: Path) -> Segment:
+    segment = Segment(file)
+    if not segment.metadata:
+        raise RecordingError(f"{file} breaks off at {len(segment)} B, before its metadata")
+    return segment
+
+
+def follows(earlier: tuple[int, int], later: tuple[int, int]) -> bool:
+    """Whether no frame is between two (episode, frame), as far as they tell: episodes may end early."""
+    return later in ((earlier[0], earlier[1] + 1), (earlier[0] + 1, 0))
+
+
+def _files(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        raise RecordingError(f"{folder} does not exist: give a run directory or a {SEGMENT_PATTERN} file")
+    files = sorted(folder.glob(SEGMENT_PATTERN), key=lambda file: (len(file.name), file.name))
+    if not files:
+        raise RecordingError(f"{folder} holds no recording: there is no {SEGMENT_PATTERN} in it")
+    return files
+
+
+def _expected(folder: Path, files: list[Path], known: dict[str, SegmentRecord]) -> list[Path]:
+    """The segments by number, up to the last one that is there or that the manifest lists."""
+    names = {file.name for file in files} | set(known)
+    numbered = [number for number in range(2 * len(names) + 1) if segment_name(number) in names]
+    return [folder / segment_name(number) for number in range(max(numbered, default=-1) + 1)]
+
+
+def _first_there(files: list[Path]) -> str:
+    return next((file.name for file in files if file.exists()), "another one")

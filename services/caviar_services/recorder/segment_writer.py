@@ -1,0 +1,172 @@
+"""One MCAP file that grows by a chunk a frame, with a checksum over every byte."""
+
+from __future__ import annotations
+
+import os
+import sys
+import zlib
+from pathlib import Path
+from typing import BinaryIO
+
+import msgspec
+
+from caviar_protocol.recording_layout import FRAME_TOPIC, METADATA_NAME, PROFILE, FrameEntry
+from caviar_protocol.recording_manifest import SegmentRecord
+from caviar_protocol.segment import seal
+from caviar_services.service import FrameInput
+
+_SCHEMA_ENCODING = "x-caviar-text"
+_PRODUCT_SCHEMA = (
+    "Topic {topic!r} of the CAVIAR protocol, version 1: 8 bytes little-endian with the length of the header, "
+    "the header (a msgpack map), the body (the arrays that the header refers to by dtype, shape and offset)."
+)
+_FRAME_SCHEMA = (
+    "msgpack map: episode, frame, t_ns [ns], seed, inputs; inputs lists the provenance of every product of "
+    "the frame, sorted by (topic, source, frame): topic, source, status (fresh, held, absent, late), "
+    "frame and t_ns it was computed for, age [frames], fidelity, digest (SHA-256), cause."
+)
+
+
+class _ChecksummedStream:
+    """What the MCAP library writes to; nothing reaches the system before `hand_over`."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream = stream
+        self.crc = 0
+        """CRC-32 of all bytes so far."""
+
+    def write(self, data: bytes) -> int:
+        self.crc = zlib.crc32(data, self.crc)
+        return self._stream.write(data)
+
+    def tell(self) -> int:
+        return self._stream.tell()
+
+    def flush(self) -> None:
+        """Ignored: the library flushes before the seal is written."""
+
+    def hand_over(self) -> None:
+        self._stream.flush()
+
+
+class SegmentWriter:
+    """A segment that is being written. All methods raise `OSError` where the system refuses.
+
+    Parameters
+    ----------
+    path
+        The file; there must be none yet.
+    metadata
+        Texts of the metadata record.
+    compression
+        ``none``, ``lz4`` or ``zstd``.
+    """
+
+    def __init__(self, path: Path, metadata: dict[str, str], compression: str) -> None:
+        from mcap.writer import CompressionType, Writer
+
+        self.path = path
+        self.frames = 0
+        self.first: tuple[int, int] | None = None
+        self.last: tuple[int, int] | None = None
+        """(episode, frame) of the first and the last frame; None: there is none yet."""
+        self._channels: dict[tuple[str, str], int] = {}
+        self._schemas: dict[str, int] = {}
+        self._file = path.open("xb")
+        self._stream = _ChecksummedStream(self._file)
+        # A chunk ends where we flush, after each frame, and never by its size. The seals take the place of
+        # MCAP's CRC of the data section, which can be checked only in a file that was finished.
+        self._writer = Writer(
+            self._stream,
+            chunk_size=sys.maxsize,
+            compression=CompressionType[compression.upper()],
+            enable_data_crcs=False,
+        )
+        try:
+            self._writer.start(profile=PROFILE)
+            self._writer.add_metadata(METADATA_NAME, metadata)
+            self._seal()
+        except OSError:
+            self.abandon()
+            raise
+
+    @property
+    def size(self) -> int:
+        """Bytes written so far."""
+        return self._file.tell()
+
+    @property
+    def removed(self) -> bool:
+        """Whether the file has no name any more: what is written to it is lost."""
+        return os.fstat(self._file.fileno()).st_nlink == 0
+
+    def write(self, entry: FrameEntry, products: list[FrameInput], base_ns: int) -> None:
+        """Write one frame and hand it to the operating system."""
+        frame_channel = self._channel(FRAME_TOPIC, "")
+        keyed = [(self._channel(p.provenance.topic, p.provenance.source), p) for p in products]
+        log_time = base_ns + entry.t_ns
+
+        def add(channel: int, sequence: int, t_ns: int, data: bytes) -> None:
+            self._writer.add_message(
+                channel, log_time=log_time, data=data, publish_time=base_ns + t_ns, sequence=sequence
+            )
+
+        add(frame_channel, entry.frame, entry.t_ns, msgspec.msgpack.encode(entry))
+        for channel, product in keyed:
+            length = len(product.header).to_bytes(8, "little")
+            data = b"".join((length, product.header, product.body))
+            add(channel, product.provenance.frame, product.provenance.t_ns, data)
+        self._seal()
+        self.frames += 1
+        self.last = entry.episode, entry.frame
+        self.first = self.first or self.last
+
+    def finish(self) -> SegmentRecord:
+        """Write index and summary, for `close` to follow; what the manifest says about the segment."""
+        self._writer.finish()
+        self._stream.hand_over()
+        return SegmentRecord(
+            name=self.path.name,
+            first=self.first,
+            last=self.last,
+            frames=self.frames,
+            finished=True,
+            size=self.size,
+            crc=self._stream.crc,
+        )
+
+    def sync(self) -> None:
+        """Bring what was handed to the operating system to disk."""
+        os.fdatasync(self._file.fileno())
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def abandon(self) -> None:
+        """Close after a failed write: what is buffered would fail again."""
+        self._file.raw.close()
+
+    def _seal(self) -> None:
+        self._writer.flush()
+        self._stream.write(seal(self._stream.crc))
+        self._stream.hand_over()
+
+    def _channel(self, topic: str, source: str) -> int:
+        channel = self._channels.get((topic, source))
+        if channel is None:
+            product = bool(source)
+            channel = self._channels[topic, source] = self._writer.register_channel(
+                topic=f"{topic}/{source}" if product else topic,
+                message_encoding="caviar-product" if product else "msgpack",
+                schema_id=self._schema(topic, _PRODUCT_SCHEMA if product else _FRAME_SCHEMA),
+                metadata={"topic": topic, "source": source},
+            )
+        return channel
+
+    def _schema(self, topic: str, text: str) -> int:
+        if topic not in self._schemas:
+            self._schemas[topic] = self._writer.register_schema(
+                name=f"caviar.{topic}/1", encoding=_SCHEMA_ENCODING, data=text.format(topic=topic).encode()
+            )
+        return self._schemas[topic]
