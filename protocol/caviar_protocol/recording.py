@@ -83,8 +83,9 @@ class RecordedProduct:
 
     def __init__(self, provenance: GrantInput, data: memoryview, place: str) -> None:
         self.provenance = provenance
+        self.place = place
+        """Recording, frame, topic and source, as errors name them."""
         self._data = data
-        self._place = place
 
     @property
     def size(self) -> int:
@@ -105,7 +106,7 @@ class RecordedProduct:
     def _header_length(self) -> int:
         length = int.from_bytes(self._data[:8], "little")
         if len(self._data) < 8 or 8 + length > len(self._data):
-            raise RecordingError(f"{self._place}: a header of {length} B does not fit {len(self._data)} B")
+            raise RecordingError(f"{self.place}: a header of {length} B does not fit {len(self._data)} B")
         return length
 
     @cached_property
@@ -114,7 +115,7 @@ class RecordedProduct:
         try:
             return decode_payload(self.provenance.topic, self.header, self.body)
         except ProtocolError as error:
-            raise RecordingError(f"{self._place}: {error}") from error
+            raise RecordingError(f"{self.place}: {error}") from error
 
     @property
     def digest(self) -> str:
@@ -350,8 +351,14 @@ class Recording:
         )
 
     def recorded_product(self, index: int, item: GrantInput) -> RecordedProduct:
-        """One product of the ``index``-th frame, which is not absent, wherever it stands."""
-        return self._product(index, item, self._messages(index))
+        """One product of the ``index``-th frame, which is not absent, wherever it stands.
+
+        Of the frame only this product's bytes are read; `RecordingError` where their digest is another.
+        """
+        product = self._product(index, item, self._stored(index))
+        if product.digest != item.digest:
+            raise RecordingError(f"{product.place}: its bytes are damaged, their digest is not {item.digest}")
+        return product
 
     def _product(
         self, index: int, item: GrantInput, own: Mapping[tuple[Channel, int], memoryview]
@@ -380,6 +387,11 @@ class Recording:
                 f"{self._at(entry.episode, entry.frame)}: the chunk at offset {chunk.offset} of "
                 f"{segment.path} is damaged, its CRC-32 differs; `caviar inspect --digest` names the product"
             )
+        return self._stored(index)
+
+    def _stored(self, index: int) -> dict[tuple[Channel, int], memoryview]:
+        """The products in a frame's chunk, whose CRC is not looked at."""
+        segment, chunk = self._place(index)
         return {(m.channel, m.frame): m.data for m in segment.messages(chunk)}
 
     def _place(self, index: int) -> tuple[Segment, Chunk]:

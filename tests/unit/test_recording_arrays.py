@@ -218,6 +218,19 @@ def test_a_held_product_of_another_segment_says_what_to_open(tmp_path: Path) -> 
         links.abs_y  # noqa: B018  # it is read here
 
 
+def test_a_damaged_product_is_named_and_those_beside_it_are_read(street: Path) -> None:
+    file = street / "recording-0000.mcap"
+    stored = next(p for p in Recording(street).frame(0, 1).products if p.provenance.topic == "link")
+    data = bytearray(file.read_bytes())
+    data[data.index(bytes(stored.body)) + 5] ^= 1
+    file.write_bytes(data)
+    recording = Recording(street)
+    assert recording["channel"].h.shape == (6, 3, 2, 4)
+    assert recording["link"][2:].abs_y.shape == (4, 3)
+    with pytest.raises(RecordingError, match=r"episode 0, frame 1, link of 'link': its bytes are damaged"):
+        recording["link"].abs_y  # noqa: B018
+
+
 def test_lidar_scans_are_padded_and_objects_renumbered(tmp_path: Path) -> None:
     made = recorder(tmp_path)
     other = lidar(1)
