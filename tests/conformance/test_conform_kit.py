@@ -8,22 +8,27 @@ import subprocess
 import sys
 import threading
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
+import msgspec
 import pytest
 import zmq
 
 from caviar_clients.cli.main import app
 from caviar_clients.conform import Verdict, cases, conform, street
-from caviar_clients.conform.client import End
+from caviar_clients.conform.client import End, Started
+from caviar_clients.conform.packing import unpack
 from caviar_clients.conform.session import Rules, Seen, Session
 from caviar_clients.conform.wire import Wire
 from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.errors import RunError, SetupError
+from caviar_protocol.topics import Scene
 
 ROOT = Path(__file__).resolve().parents[2]
+VECTORS = ROOT / "protocol" / "vectors"
 BROKEN = Path(__file__).with_name("broken_client.py")
 ANY = "tcp://127.0.0.1:0"
 FLIGHT = {
@@ -80,17 +85,80 @@ def test_a_right_client_fails_nothing(client: str) -> None:
     assert sum(v.outcome == "pass" for v in verdicts) >= 25
 
 
-def test_the_node_agent_fails_nothing(
+@pytest.fixture
+def node_client(
     tmp_path_factory: pytest.TempPathFactory, pytestconfig: pytest.Config
-) -> None:
+) -> Callable[[str], str]:
+    """Command line of a script of ``clients/minimal/node``; skips by name where Node or npm is missing."""
     from node_project import node_project
 
-    source = ROOT / "clients/minimal/node"
     cache = pytestconfig.cache
     folder = cache.mkdir("minimal-node") if cache is not None else tmp_path_factory.mktemp("node")
-    script = node_project(source, "agent.mjs", folder) / "agent.mjs"
-    command = shlex.join(["node", str(script), "{endpoint}", "{name}"])
-    assert failures(conform(ANY, command=command, rules=Rules(name="mine"))) == {}
+
+    def command(script: str) -> str:
+        project = node_project(ROOT / "clients/minimal/node", script, folder)
+        return shlex.join(["node", str(project / script), "{endpoint}", "{name}"])
+
+    return command
+
+
+@pytest.mark.parametrize(("script", "role"), [("agent.mjs", "agent"), ("world.mjs", "world")])
+def test_the_clients_for_node_fail_nothing(node_client: Callable[[str], str], script: str, role: str) -> None:
+    verdicts = conform(ANY, command=node_client(script), rules=Rules(name="mine", role=role))
+    assert failures(verdicts) == {}
+
+
+def test_the_world_for_node_mounts_the_devices_of_the_vectors(
+    node_client: Callable[[str], str], tmp_path: Path
+) -> None:
+    """`welcome_mounts` and the first four of its scenes; an object of this world does not come back."""
+    dimensions = {
+        "car.2": [5.0, 2.0, 2.5],
+        "uav": [0.5, 0.5, 0.25],
+        "car.1": [4.25, 1.75, 1.25],
+        "car.0": [4.5, 1.8, 1.5],
+    }
+    stay = {"car.2": (0.0, 0.25), "uav": (0.0, 9.0), "car.1": (0.05, 9.0), "car.0": (0.15, 9.0)}
+    circle = {"class": "car", "centre_m": [0.0, 0.0, 1.0], "radius_m": 9.0, "speed_m_s": 3.0}
+    objects = [
+        circle | {"name": name, "dimensions_m": size, "from_s": stay[name][0], "until_s": stay[name][1]}
+        for name, size in dimensions.items()
+    ]
+    welcome = unpack((VECTORS / "welcome_mounts.msgpack").read_bytes())
+    wire = Wire(ANY)
+    client = Started(node_client("world.mjs"), wire.endpoint, "city", tmp_path)
+    session = Session(wire, client, Rules(name="city"), Seen())
+    try:
+        session.begin()
+        session.welcome(scenario=welcome["scenario"], settings={"objects": objects})
+        session.prepare()
+        session.reset(0)
+        for frame in range(4):
+            answer = session.step()
+            scene = decode_payload("scene", *answer.parts[1:3])
+            expected = decode_payload("scene", *(read_vector(f"mounts_{frame}")))
+            assert isinstance(scene, Scene)
+            assert isinstance(expected, Scene)
+            assert scene.names == expected.names
+            assert_same_devices(scene.devices, expected.devices)
+    finally:
+        session.close()
+        wire.close()
+
+
+def read_vector(name: str) -> tuple[bytes, bytes]:
+    return (VECTORS / f"{name}.msgpack").read_bytes(), (VECTORS / f"{name}.body").read_bytes()
+
+
+def assert_same_devices(got: tuple[Any, ...], expected: tuple[Any, ...]) -> None:
+    """Equal, where the last digit of a quaternion may differ."""
+    plain = [
+        [msgspec.structs.replace(device, orientation=(1.0, 0.0, 0.0, 0.0)) for device in devices]
+        for devices in (got, expected)
+    ]
+    assert plain[0] == plain[1]
+    for mine, theirs in zip(got, expected, strict=True):
+        assert mine.orientation == pytest.approx(theirs.orientation, abs=1e-15)
 
 
 def test_a_world_that_brings_scenery_is_asked_for_all_of_it(tmp_path: Path) -> None:
