@@ -99,12 +99,17 @@ def test_the_user_is_told_who_is_awaited_where_and_what_to_type(monkeypatch: pyt
     monkeypatch.chdir(REMOTE.parents[2])
     assert remote.waiting_text("agent", spec("agent"), ENDPOINT, 30.0) == (
         f"waiting for 'agent' (agent) at {ENDPOINT}, for 30 s (timeouts.connect_s): "
-        f"start it with  python clients/minimal/agent.py {ENDPOINT} agent"
+        "start your own client with this address and name (protocol/SPEC.md), "
+        f"or  python clients/minimal/agent.py {ENDPOINT} agent"
     )
     assert remote.start_command("my world", spec("world"), ENDPOINT) == (
-        f"caviar service 'my world' --use world:IMPLEMENTATION --broker {ENDPOINT}"
+        f"node clients/minimal/node/world.mjs {ENDPOINT} 'my world'"
     )
-    monkeypatch.setattr(remote, "MINIMAL", Path("/nowhere/agent.py"))
+    told = remote.waiting_text("link", spec("link"), ENDPOINT, 30.0)
+    assert told.endswith(
+        f"caviar service link --use link:IMPLEMENTATION --broker {ENDPOINT} (IMPLEMENTATION: beams)"
+    )
+    monkeypatch.setattr(remote, "MINIMAL", Path("/nowhere"))
     assert "caviar service agent --use agent:IMPLEMENTATION" in remote.start_command(
         "agent", spec("agent"), ENDPOINT
     )

@@ -10,9 +10,12 @@ from pathlib import Path
 import caviar_clients
 from caviar_protocol.keys import BROKER, BROKER_KEY_VARIABLE, KEY_VARIABLE, read_authorized
 from caviar_protocol.scenario import ServiceSpec
+from caviar_services.registry import registered
 
-MINIMAL = Path(caviar_clients.__file__).parents[1] / "minimal" / "agent.py"
-"""The example agent; it comes with the sources and not with an installed package."""
+MINIMAL = Path(caviar_clients.__file__).parents[1] / "minimal"
+"""The example clients; they come with the sources and not with an installed package."""
+EXAMPLES = {"agent": ("python", "agent.py"), "world": ("node", "node/world.mjs")}
+"""Role to the program and the script of its example."""
 _EVERYWHERE = ("0.0.0.0", "[::]", "*")  # noqa: S104  # recognised, not bound
 
 
@@ -25,8 +28,9 @@ def reachable(endpoint: str) -> str:
 
 def start_command(name: str, spec: ServiceSpec, endpoint: str) -> str:
     """A command that fills the place of a remote service, as far as it can be known."""
-    if spec.role == "agent" and MINIMAL.exists():
-        return f"python {_shown(MINIMAL)} {endpoint} {shlex.quote(name)}"
+    program, script = EXAMPLES.get(spec.role, ("", ""))
+    if script and (MINIMAL / script).exists():
+        return f"{program} {_shown(MINIMAL / script)} {endpoint} {shlex.quote(name)}"
     use = f"{spec.role}:IMPLEMENTATION"
     return f"caviar service {shlex.quote(name)} --use {use} --broker {endpoint}"
 
@@ -34,9 +38,12 @@ def start_command(name: str, spec: ServiceSpec, endpoint: str) -> str:
 def waiting_text(name: str, spec: ServiceSpec, endpoint: str, seconds: float) -> str:
     """What the user is told while a remote service is waited for."""
     there = reachable(endpoint)
+    command = start_command(name, spec, there)
+    known = sorted(key.partition(":")[2] for key in registered() if key.startswith(f"{spec.role}:"))
+    where = f" (IMPLEMENTATION: {', '.join(known)})" if "IMPLEMENTATION" in command else ""
     return (
         f"waiting for {name!r} ({spec.role}) at {there}, for {seconds:g} s (timeouts.connect_s): "
-        f"start it with  {start_command(name, spec, there)}"
+        f"start your own client with this address and name (protocol/SPEC.md), or  {command}{where}"
     )
 
 
