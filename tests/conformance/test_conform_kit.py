@@ -187,6 +187,15 @@ def test_a_right_client_that_speaks_websocket_fails_nothing(tmp_path: Path) -> N
     assert found["pass"] >= 30
 
 
+def test_python_in_a_command_is_the_one_that_runs_where_no_environment_is_activated(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("PATH", "/nowhere")
+    command = f"python {ROOT}/clients/minimal/agent.py {{endpoint}} {{name}}"
+    verdicts = conform(ANY, command=command, names=["hello"], rules=Rules(name="mine"))
+    assert failures(verdicts) == {}
+
+
 def test_what_the_gateway_says_of_a_client_is_shown_with_the_verdicts() -> None:
     from caviar_broker.api.front import gateway_in_front
 

@@ -6,6 +6,7 @@ import os
 import shlex
 import signal
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -68,6 +69,11 @@ class Client(Protocol):
         """Its highest resident memory so far [B], where that can be told."""
 
 
+def _search_path() -> str:
+    """Folders of commands: ``python`` is the running interpreter, also where no environment is activated."""
+    return os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
+
+
 class Started:
     """A client that the kit starts with a command line; ``{endpoint}`` and ``{name}`` are filled in."""
 
@@ -90,7 +96,12 @@ class Started:
         self._log = Path(name)
         try:
             self._process = subprocess.Popen(  # noqa: S603 - the command is the user's own
-                self._words, stdin=subprocess.DEVNULL, stdout=handle, stderr=handle, start_new_session=True
+                self._words,
+                stdin=subprocess.DEVNULL,
+                stdout=handle,
+                stderr=handle,
+                start_new_session=True,
+                env=os.environ | {"PATH": _search_path()},
             )
         except OSError as error:
             raise RunError(f"cannot start {self._words[0]!r}: {error.strerror}; see --command") from error
