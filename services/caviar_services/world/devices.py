@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
-from caviar_protocol.coordinates import Vector, quaternion_from_euler
-from caviar_protocol.errors import ScenarioError
+from caviar_protocol.coordinates import Vector
+from caviar_protocol.devices import carries, fixed_device, mounted_device
 from caviar_protocol.scenario import DeviceSpec
-from caviar_protocol.scenario_checks import owned_by
-from caviar_protocol.topics.scene import AntennaArray, AntennaDevice, CameraDevice, Device, LidarDevice
-
-_HEIGHT = {"centre": 0.0, "roof": 0.5, "floor": -0.5}
+from caviar_protocol.topics.scene import Device
 
 
 class Mounts:
@@ -22,7 +18,7 @@ class Mounts:
     """
 
     def __init__(self, specs: Sequence[DeviceSpec]) -> None:
-        self._fixed = tuple(_device(spec, spec.name, "", (0.0, 0.0, 0.0)) for spec in specs if not spec.on)
+        self._fixed = tuple(fixed_device(spec) for spec in specs if not spec.on)
         self._mounted = tuple(spec for spec in specs if spec.on)
         self._arrived: list[str] = []
         self._objects: Sequence[tuple[str, Vector]] | None = None
@@ -58,58 +54,7 @@ class Mounts:
         self._arrived += [name for name, _ in objects if name not in known]
         found = list(self._fixed)
         for spec in self._mounted:
-            carriers = [name for name in self._arrived if _matches(spec, name)][: spec.count]
-            found += [_device(spec, f"{name}/{spec.name}", name, dimensions[name]) for name in carriers]
+            carriers = [name for name in self._arrived if carries(spec, name)][: spec.count]
+            found += [mounted_device(spec, name, dimensions[name]) for name in carriers]
         self._objects, self._devices = objects, tuple(sorted(found, key=lambda device: device.name))
         return self._devices
-
-
-def _matches(spec: DeviceSpec, name: str) -> bool:
-    # The whole name comes first: names of objects may hold brackets, which are special in patterns.
-    return name == spec.on or owned_by((spec.on,), name)
-
-
-def _device(spec: DeviceSpec, name: str, parent: str, dimensions: Vector) -> Device:
-    x, y, z = spec.position_m
-    position = (x, y, z + _HEIGHT[spec.mount] * dimensions[2])
-    orientation = quaternion_from_euler(
-        math.radians(spec.yaw_deg), math.radians(spec.pitch_deg), math.radians(spec.roll_deg)
-    )
-    match spec.kind:
-        case "antenna":
-            if not spec.role:
-                raise ScenarioError(
-                    f'antenna {spec.name!r} lacks its role; write role = "tx", "rx" or "both"', key="devices"
-                )
-            return AntennaDevice(
-                name=name,
-                parent=parent,
-                position=position,
-                orientation=orientation,
-                role=spec.role,
-                array=spec.array or AntennaArray(),
-                power_dbm=spec.power_dbm,
-            )
-        case "lidar":
-            return LidarDevice(
-                name=name,
-                parent=parent,
-                position=position,
-                orientation=orientation,
-                beams=spec.beams,
-                azimuth_steps=spec.azimuth_steps,
-                elevation_min=math.radians(spec.elevation_deg[0]),
-                elevation_max=math.radians(spec.elevation_deg[1]),
-                min_range=spec.range_m[0],
-                max_range=spec.range_m[1],
-            )
-        case "camera":
-            return CameraDevice(
-                name=name,
-                parent=parent,
-                position=position,
-                orientation=orientation,
-                width=spec.size_px[0],
-                height=spec.size_px[1],
-                field_of_view=math.radians(spec.field_of_view_deg),
-            )
