@@ -6,7 +6,8 @@
     ├── ProtocolError          a peer sent something that the protocol does not allow
     │   ├── DecodeError        bytes that are not the message or payload they claim to be
     │   ├── LimitError         a size or nesting limit was passed
-    │   └── VersionError       the peers share no major version
+    │   ├── VersionError       the peers share no major version
+    │   └── ProductError       a product says what its topic does not allow; names its producer
     ├── PayloadError           our own product is malformed (shape, dtype, non-finite)
     ├── DeclarationError       services do not fit together: cycle, clash, missing source
     ├── ScenarioError          a scenario file is wrong; names file, key, line, remedy
@@ -48,6 +49,27 @@ class VersionError(ProtocolError):
     """The peer speaks another major version of the protocol."""
 
     code = "version"
+
+
+class ProductError(ProtocolError):
+    """A product that another service made cannot be read, or says what its topic does not allow.
+
+    A service that raises it answers with a FAULT that names the producer, on which the run then lays the
+    blame.
+
+    Parameters
+    ----------
+    topic, source, frame
+        Which product: its topic, the service that made it, and the frame it is for.
+    problem
+        What is wrong: object, field and value, and what would be right.
+    """
+
+    code = "product"
+
+    def __init__(self, topic: str, source: str, frame: int, problem: str) -> None:
+        self.topic, self.source, self.frame, self.problem = topic, source, frame, problem
+        super().__init__(f"{topic} of {source!r}, frame {frame}: {problem}")
 
 
 class PayloadError(CaviarError):

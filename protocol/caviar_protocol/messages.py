@@ -135,6 +135,8 @@ class Prepare(_Message, frozen=True, kw_only=True, tag="PREPARE"):
     """All scenery of the run; empty for worlds, which announce it."""
     producers: dict[str, tuple[Name, ...]] = {}
     """Topic to the names of its sources in this run."""
+    prefixes: dict[str, tuple[Text, ...]] = {}
+    """World to the prefixes of its READY; empty for worlds."""
 
 
 class AssetOffer(_Message, frozen=True, kw_only=True, tag="ASSET_OFFER"):
@@ -267,6 +269,9 @@ class Fault(_Message, frozen=True, kw_only=True, tag="FAULT"):
     """One line for the user. ``KEY: …``, where a key of the scenario is wrong, is told with file and line."""
     detail: Text = ""
     """Traceback, for the log."""
+    culprit: Text = ""
+    """Source of an input that cannot be read, or says what its topic does not allow: the run ends, and names
+    it."""
 
 
 class Cancel(_Message, frozen=True, kw_only=True, tag="CANCEL"):

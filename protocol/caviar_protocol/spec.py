@@ -33,6 +33,8 @@ SINCE: dict[str, str] = {
     "ChannelOptions.absorption_db_per_km": "1.1",
     "ChannelOptions.detail": "1.1",
     "Welcome.rejoin_ns": "1.3",
+    "Prepare.prefixes": "1.3",
+    "Fault.culprit": "1.3",
 }
 """Minor version that brought a field (``Grant.reports``) or a class (``Grant``); 1.0 unless said here."""
 

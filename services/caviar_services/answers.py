@@ -10,7 +10,7 @@ from typing import Any
 
 from caviar_protocol import limits
 from caviar_protocol import messages as m
-from caviar_protocol.errors import CaviarError
+from caviar_protocol.errors import CaviarError, ProductError
 
 _log = logging.getLogger("caviar.service")
 
@@ -94,6 +94,7 @@ class Guard:
                 phase=self.phase,
                 message=_sendable(text[:MAX_MESSAGE]),
                 detail=_sendable(detail[-MAX_DETAIL:]),
+                culprit=error.source if isinstance(error, ProductError) else "",
             )
         )
         return True

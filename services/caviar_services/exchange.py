@@ -12,9 +12,11 @@ import msgspec
 from caviar_protocol import limits
 from caviar_protocol import messages as m
 from caviar_protocol.arrays import Payload
+from caviar_protocol.content import ContentCheck
 from caviar_protocol.digest import geometry_digest, payload_digest
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.scene_content import SceneRules
 from caviar_protocol.topics import PAYLOADS, Carrier
 from caviar_services.encoded import Encoded, decoded, encoded
 from caviar_services.service import (
@@ -107,14 +109,28 @@ def frame_of(service: Service[Any], reset: m.Reset, grant: m.Grant, inputs: tupl
     )
 
 
-def inputs_of(grant: m.Grant, parts: Sequence[Any]) -> tuple[FrameInput, ...]:
+def scene_rules_of(run: RunInfo, order: m.Prepare) -> SceneRules:
+    """What WELCOME and PREPARE say about the scenes that a service is going to get."""
+    worlds = order.producers.get("scene", ())
+    devices: dict[str, list[DeviceSpec]] = {world: [] for world in worlds}
+    for device in run.devices:
+        world = device.world or (worlds[0] if len(worlds) == 1 else "")
+        devices.setdefault(world, []).append(device)
+    return SceneRules(
+        prefixes=order.prefixes,
+        devices={world: tuple(specs) for world, specs in devices.items()},
+        assets=frozenset(asset.name for asset in order.assets) if order.prefixes else None,
+    )
+
+
+def inputs_of(grant: m.Grant, parts: Sequence[Any], check: ContentCheck) -> tuple[FrameInput, ...]:
     """Inputs of a grant; ``parts`` are header and body of each one that is present."""
     inputs, taken = [], 0
     for entry in grant.inputs:
         if entry.status is m.Status.ABSENT:
             inputs.append(FrameInput(entry))
         else:
-            inputs.append(FrameInput(entry, parts[taken], parts[taken + 1]))
+            inputs.append(FrameInput(entry, parts[taken], parts[taken + 1], check=check))
             taken += 2
     return tuple(inputs)
 

@@ -19,6 +19,7 @@ import zmq
 from caviar_protocol import messages as m
 from caviar_protocol.assets import AssetStore, Incoming
 from caviar_protocol.codec import check_version, encode_message, message_type
+from caviar_protocol.content import ContentCheck
 from caviar_protocol.errors import AssetError, ProtocolError, RunError
 from caviar_protocol.host import host_identity, trim_memory
 from caviar_protocol.keys import Credentials
@@ -42,6 +43,7 @@ from caviar_services.exchange import (
     preparation_of,
     ready_of,
     run_info,
+    scene_rules_of,
 )
 from caviar_services.registry import load
 from caviar_services.restarts import restart_status
@@ -117,6 +119,7 @@ class Runner:
         """``epoch`` and ``attempt``, which stand in every message (clause 1)."""
         self._reset_to: m.Reset | None = None
         self._answers = Answers()
+        self._check = ContentCheck()
         self._handlers: Mapping[type, Callable[[Any, Sequence[zmq.Frame]], None]] = {
             m.Prepare: self._prepare,
             m.AssetGet: self._serve_asset,
@@ -243,6 +246,7 @@ class Runner:
 
     def _prepare(self, message: m.Prepare, _: Sequence[zmq.Frame]) -> None:
         service = self._running
+        self._check.rules = scene_rules_of(service.run, message)
         with self._reporting("prepare"):
             prepared: Prepared | None = None
             assets: list[m.Asset] = []
@@ -333,7 +337,7 @@ class Runner:
             answer.append(encode_message(fault))
 
         with Guard(self._identity, failed, "step", grant.episode, grant.frame) as guard:
-            inputs = inputs_of(grant, [part.buffer for part in parts])
+            inputs = inputs_of(grant, [part.buffer for part in parts], self._check)
             frame = frame_of(self._running, reset, grant, inputs)
             started = time.monotonic_ns()
             result = self._running.step(frame)

@@ -24,7 +24,8 @@ import numpy as np
 
 from caviar_protocol.arrays import Payload
 from caviar_protocol.codec import decode_payload
-from caviar_protocol.errors import PayloadError, ProtocolError
+from caviar_protocol.content import SMALL_PRODUCT, ContentCheck, check_digest
+from caviar_protocol.errors import PayloadError, ProductError, ProtocolError
 from caviar_protocol.messages import GrantInput, Input, Report, Role, Status
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.scene import merge_scenes
@@ -96,9 +97,21 @@ class Prepared:
 
 
 class FrameInput:
-    """One input of a frame: its provenance, and its payload decoded on first use."""
+    """One input of a frame: its provenance, and its payload, decoded and checked on first use.
 
-    __slots__ = ("_payload", "body", "header", "provenance")
+    Parameters
+    ----------
+    provenance
+        Where it comes from.
+    header, body
+        The product as it travels; empty where it never did.
+    payload
+        The product as it is, of a producer in this process.
+    check
+        Looks at what the payload says, before the service does; None: it is trusted.
+    """
+
+    __slots__ = ("_check", "_payload", "body", "header", "provenance")
 
     def __init__(
         self,
@@ -106,11 +119,13 @@ class FrameInput:
         header: bytes | memoryview = b"",
         body: bytes | memoryview = b"",
         payload: Payload | None = None,
+        check: ContentCheck | None = None,
     ) -> None:
         self.provenance = provenance
         self.header = header
         self.body = body
         self._payload = payload
+        self._check = check
 
     @property
     def present(self) -> bool:
@@ -121,18 +136,31 @@ class FrameInput:
     def payload(self) -> Payload:
         """The payload; its arrays are read-only.
 
-        `PayloadError` where absent, `ProtocolError` naming topic and source where it cannot be decoded.
+        `PayloadError` where absent, `ProductError` naming topic and source where it cannot be decoded or
+        says what its topic does not allow.
         """
+        payload, check = self._payload, self._check
+        if payload is not None and check is None:
+            return payload
+        entry = self.provenance
         if not self.present:
-            entry = self.provenance
             raise PayloadError(f"{entry.topic} of {entry.source} is absent: {entry.cause}")
-        if self._payload is None:
-            entry = self.provenance
-            try:
-                self._payload = decode_payload(entry.topic, self.header, self.body)
-            except ProtocolError as error:
-                raise type(error)(f"{entry.topic} of {entry.source!r} cannot be read: {error}") from error
-        return self._payload
+        if payload is None:
+            payload = self._decoded(entry)
+        if check is not None:
+            check(entry, payload, bytes(self.header))
+        self._payload, self._check = payload, None
+        return payload
+
+    def _decoded(self, entry: GrantInput) -> Payload:
+        # A product that is small is also compared with its digest. The recorder does so with all of them.
+        if self._check is not None and len(self.header) + len(self.body) <= SMALL_PRODUCT:
+            check_digest(entry, self.header, self.body)
+        try:
+            return decode_payload(entry.topic, self.header, self.body)
+        except ProtocolError as error:
+            problem = f"cannot be read: {error}"
+            raise ProductError(entry.topic, entry.source, entry.frame, problem) from error
 
 
 class Frame(msgspec.Struct, frozen=True, kw_only=True):

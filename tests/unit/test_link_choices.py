@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from link_builders import CARRIER, antenna, choices, frame_of, scene_of
 
-from caviar_protocol.errors import PayloadError
+from caviar_protocol.errors import PayloadError, ProductError
 from caviar_protocol.messages import Status
 from caviar_protocol.topics import Carrier, UserSchedule, WaypointCommand
 from caviar_services.link.choices import Choices, choices_of
@@ -87,27 +87,27 @@ def test_a_held_action_may_name_a_user_that_left_and_is_counted() -> None:
         ),
         (
             (choices("dqn", ("bs", "a/rx", 1, 1), ("bs", "a/rx", 2, 1)),),
-            r"two commands of agent 'dqn' choose beams for bs → a/rx",
+            r"action of 'dqn', frame .*: two commands choose beams for bs → a/rx",
         ),
         (
             (choices("dqn", ("bs", "a/rx", 4, 0)),),
-            r"agent 'dqn' chose TX beam 4 for bs → a/rx; the codebook of 'bs' has beams 0 to 3",
+            r"of 'dqn', frame .*: it chose TX beam 4 for bs → a/rx; the codebook of 'bs' has beams 0 to 3",
         ),
         (
             (choices("dqn", ("bs", "b/rx", 0, 2)),),
-            r"agent 'dqn' chose RX beam 2 for bs → b/rx; the codebook of 'b/rx' has beams 0 to 1",
+            r"of 'dqn', frame .*: it chose RX beam 2 for bs → b/rx; the codebook of 'b/rx' has beams 0 to 1",
         ),
         (
             (choices("dqn", ("bs", "c/rx", 0, 0)),),
-            r"agent 'dqn' commands bs → c/rx, which does not exist .* there are: bs → a/rx, bs → b/rx",
+            r"of 'dqn', frame .*: it commands bs → c/rx, which does not exist .* are: bs → a/rx, bs → b/rx",
         ),
         (
             (choices("dqn", ("bs", "a/rx", 0, 0, "x-band")),),
-            r"agent 'dqn' commands bs → a/rx on carrier 'x-band', which does not exist",
+            r"action of 'dqn', frame .*: it commands bs → a/rx on carrier 'x-band', which does not exist",
         ),
         (
             (choices("dqn", UserSchedule(tx="bs2", rx="a/rx")),),
-            r"agent 'dqn' commands bs2 → a/rx, which does not exist",
+            r"action of 'dqn', frame .*: it commands bs2 → a/rx, which does not exist",
         ),
         (
             (
@@ -119,5 +119,6 @@ def test_a_held_action_may_name_a_user_that_left_and_is_counted() -> None:
     ],
 )
 def test_contradictions_and_strangers_are_refused_by_name(inputs: Any, message: str) -> None:
-    with pytest.raises(PayloadError, match=message):
+    error = PayloadError if message.startswith("agents") else ProductError
+    with pytest.raises(error, match=message):
         chosen(*inputs)

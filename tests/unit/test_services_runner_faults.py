@@ -5,7 +5,9 @@ from __future__ import annotations
 import pytest
 from runner_harness import IDS, Broker, ends, played_broker, service
 
+from caviar_clients.conform.street import product
 from caviar_protocol import messages as m
+from caviar_protocol.digest import payload_digest
 
 __all__ = ["played_broker"]
 
@@ -58,16 +60,29 @@ def test_a_service_that_cannot_be_made_is_a_fault_and_leaves_when_told(broker: B
         ends(process, 0)
 
 
-def test_an_input_that_cannot_be_decoded_is_a_fault(broker: Broker) -> None:
+def test_an_input_that_cannot_be_decoded_is_a_fault_that_names_its_producer(broker: Broker) -> None:
+    fault = refused(broker, b"\xff", b"")
+    assert "scene of 'world', frame 0: cannot be read: scene payload" in fault.message
+
+
+def test_an_input_with_another_digest_is_a_fault_that_names_its_producer(broker: Broker) -> None:
+    header, body = product("scene", "traffic", 0)
+    fault = refused(broker, header, body, digest="0" * 64)
+    assert f"scene of 'world', frame 0: its digest is {payload_digest(header, body)}" in fault.message
+
+
+def refused(broker: Broker, header: bytes, body: bytes, digest: str = "") -> m.Fault:
+    """The FAULT of a service that reads a scene with these bytes."""
     with service(broker.endpoint, "link:Reader") as process:
         broker.start()
-        entry = m.GrantInput(topic="scene", source="world", status=m.Status.FRESH, frame=0, digest="0" * 64)
-        broker.send(m.Grant(**IDS, episode=0, frame=0, t_ns=0, inputs=(entry,)), b"\xff", b"")
+        digest = digest or payload_digest(header, body)
+        entry = m.GrantInput(topic="scene", source="world", status=m.Status.FRESH, frame=0, digest=digest)
+        broker.send(m.Grant(**IDS, episode=0, frame=0, t_ns=0, inputs=(entry,)), header, body)
         fault = broker.expect(m.Fault)
-        assert fault.phase == "step"
-        assert "scene payload" in fault.message
+        assert (fault.phase, fault.culprit) == ("step", "world")
         broker.shutdown()
         ends(process, 0)
+    return fault
 
 
 def test_a_process_that_ends_itself_ends_with_that_status(broker: Broker) -> None:

@@ -243,7 +243,13 @@ class Episodes:
         schedule = self._owing(peer, message, "FAULT", now)
         if schedule is None:
             return
-        needed = schedule.outstanding(peer.name)[0].state is not TaskState.ABANDONED
+        task = schedule.outstanding(peer.name)[0]
+        if message.culprit and task.order and any(i.source == message.culprit for i in task.order.inputs):
+            wrong = run.peers[message.culprit]
+            text = f"{wrong} made a wrong product: {message.message} (refused by {peer})"
+            run.fail(text, wrong.name, now)
+            return
+        needed = task.state is not TaskState.ABANDONED
         if needed and peer.plan.policy in ("wait", "abort"):
             run.fail(f"{peer} failed in frame {message.frame}, {text}", peer.name, now)
         else:

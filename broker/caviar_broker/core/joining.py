@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+from collections.abc import Iterable
 
 from caviar_broker.core import events as ev
 from caviar_broker.core.episodes import Episodes
@@ -132,6 +133,7 @@ class Joining:
                     demand=run.graph.demand[peer.name],
                     assets=() if peer.role == "world" else self._scenery(),
                     producers=dict(run.graph.producers),
+                    prefixes={} if peer.role == "world" else _prefixes(worlds),
                 )
                 run.send(peer, prepare)
 
@@ -207,6 +209,11 @@ class Joining:
     def _refuse(self, peer: Peer, code: str, text: str, now: int) -> None:
         self._run.send(peer, Refuse(code=code, message=text))
         self._run.fail(text, peer.name, now)
+
+
+def _prefixes(worlds: Iterable[Peer]) -> dict[str, tuple[str, ...]]:
+    """What each world that is ready declared of the names of its objects."""
+    return {world.name: world.ready.prefixes for world in worlds if world.ready}
 
 
 def _contradiction(peer: Peer, hello: Hello) -> str:

@@ -9,6 +9,7 @@ from typing import Any, TypeAlias
 from caviar_broker.core import events as ev
 from caviar_protocol import messages as m
 from caviar_protocol.assets import AssetStore
+from caviar_protocol.content import ContentCheck
 from caviar_protocol.errors import RunError
 from caviar_protocol.tables import convert_settings
 from caviar_services.answers import Guard
@@ -22,6 +23,7 @@ from caviar_services.exchange import (
     preparation_of,
     ready_of,
     run_info,
+    scene_rules_of,
 )
 from caviar_services.runner import TRIM_EVERY
 from caviar_services.service import Frame, FrameInput, Service, StepResult
@@ -35,9 +37,19 @@ class Place:
     """One service, and what it is told by the clock and tells it."""
 
     def __init__(
-        self, name: str, use: str, cls: type[Service[Any]], store: AssetStore, feed: Feed, *, digests: bool
+        self,
+        name: str,
+        use: str,
+        cls: type[Service[Any]],
+        store: AssetStore,
+        feed: Feed,
+        check: ContentCheck,
+        *,
+        digests: bool,
     ) -> None:
         self._name, self._use, self._cls, self._store, self._feed = name, use, cls, store, feed
+        self._check = check
+        """Of all services of the run, so that a product which several of them consume is checked once."""
         self._digests = digests
         """Whether products are encoded, for their digests; else they are handed over as they are."""
         self._service: Service[Any] | None = None
@@ -90,6 +102,8 @@ class Place:
         answer: ev.Event | None = None
         with self._guard("prepare"):
             service, assets = self._running, list(message.assets)
+            if self._cls.role != "world":  # which are prepared before anything is known about scenes
+                self._check.rules = scene_rules_of(service.run, message)
             prepared = None
             if is_needed(service, message):
                 offered = [self._store.add(n, c) for n, c in sorted(service.scenery().items())]
@@ -133,12 +147,14 @@ class Place:
 
     def _frame(self, grant: m.Grant, products: Products) -> Frame:
         if self._digests:
-            inputs = inputs_of(grant, [part for product in products for part in product.payload])
+            inputs = inputs_of(grant, [part for product in products for part in product.payload], self._check)
         else:
-            left = iter(products)
+            left, check = iter(products), self._check
             inputs = tuple(
                 [
-                    FrameInput(e) if e.status is ABSENT else FrameInput(e, payload=next(left).payload)
+                    FrameInput(e)
+                    if e.status is ABSENT
+                    else FrameInput(e, payload=next(left).payload, check=check)
                     for e in grant.inputs
                 ]
             )
@@ -173,7 +189,12 @@ class Seat(Place):
         self._feed(self._done(grant, result, 0))
 
     def _grant(self, grant: m.Grant, products: Products) -> None:
-        self._granted, self.frame = grant, self._frame(grant, products)
+        with self._guard("step", grant.episode, grant.frame):
+            frame = self._frame(grant, products)
+            for item in frame.inputs:
+                if item.present:
+                    item.payload  # noqa: B018 - checked here, where a wrong one ends the run with blame
+            self._granted, self.frame = grant, frame
 
 
 def _unwatched(phase: str, grace_s: float = 0.0) -> None:

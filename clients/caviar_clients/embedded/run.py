@@ -26,6 +26,7 @@ from caviar_broker.statistics import Statistics
 from caviar_clients.embedded.place import Place, Seat
 from caviar_protocol import messages as m
 from caviar_protocol.assets import AssetStore
+from caviar_protocol.content import ContentCheck
 from caviar_protocol.errors import RunError
 from caviar_protocol.replay import Imposed
 from caviar_protocol.scenario import Scenario
@@ -86,10 +87,16 @@ class EmbeddedRun:
         """How it ended; None until then."""
         self._stop_reason = ""
         self._orders: deque[ev.Send] = deque()
-        store, seats = AssetStore(), seats or {}
+        store, check, seats = AssetStore(), ContentCheck(), seats or {}
         self.seats = {
             name: Seat(
-                name, scenario.services[name].use, cls, store, self._feed, digests=directory is not None
+                name,
+                scenario.services[name].use,
+                cls,
+                store,
+                self._feed,
+                check,
+                digests=directory is not None,
             )
             for name, cls in seats.items()
         }
@@ -97,7 +104,13 @@ class EmbeddedRun:
         self._places: dict[str, Place] = {
             name: self.seats.get(name)
             or Place(
-                name, spec.use, load(spec.role, spec.use), store, self._feed, digests=directory is not None
+                name,
+                spec.use,
+                load(spec.role, spec.use),
+                store,
+                self._feed,
+                check,
+                digests=directory is not None,
             )
             for name, spec in scenario.services.items()
         }

@@ -33,6 +33,7 @@ import msgspec
 
 from caviar_protocol.arrays import quantity
 from caviar_protocol.codec import encode_payload
+from caviar_protocol.content import check_digest
 from caviar_protocol.digest import payload_digest
 from caviar_protocol.durability import Durability, sync_file
 from caviar_protocol.errors import CaviarError, RunError
@@ -51,6 +52,9 @@ from caviar_services.recorder.continuing import Continuation, RunTime, Stored
 from caviar_services.recorder.persistence import Persistence
 from caviar_services.recorder.segment_writer import SegmentWriter
 from caviar_services.service import Frame, FrameInput, Preparation, Prepared, RunInfo, StepResult
+
+_LOOKED_INTO = frozenset({"scene", "lidar", "camera", "depth", "segmentation"})
+"""Topics that may have no other consumer: a data set needs no agent. All others have one that checks them."""
 
 
 class McapSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -122,7 +126,8 @@ class McapRecorder(Recorder[McapSettings]):
     def step(self, frame: Frame) -> StepResult:
         """Write a frame; when this returns, the operating system has it, under ``frame`` the disk.
 
-        Raises `RunError` naming path, errno and remedy where it cannot be written.
+        Raises `RunError` naming path, errno and remedy where it cannot be written, `ProductError` naming the
+        producer of a product that is not that of its digest: the recording would be damaged.
         """
         begin = time.perf_counter_ns()
         if self._failure is not None:
@@ -141,8 +146,11 @@ class McapRecorder(Recorder[McapSettings]):
             inputs=tuple(_with_digest(item) for item in inputs),
             reports=frame.reports,
         )
+        new = [item for item in inputs if self._stored.is_new(item.provenance)]
+        for item in new:
+            _check(item)
         try:
-            segment.write(entry, [i for i in inputs if self._stored.is_new(i.provenance)], base_ns)
+            segment.write(entry, new, base_ns)
             self._kept.written(segment)
             if (
                 segment.size >= self.settings.segment_mib * 2**20
@@ -235,6 +243,14 @@ def _as_text(metadata: RecordingMetadata) -> dict[str, str]:
 
 def _canonical(item: FrameInput) -> tuple[str, str, int]:
     return item.provenance.topic, item.provenance.source, item.provenance.frame
+
+
+def _check(item: FrameInput) -> None:
+    """Raise `ProductError` where a product is not that of its digest, or a world's or sensor's cannot be."""
+    if item.provenance.digest:
+        check_digest(item.provenance, item.header, item.body)
+    if item.provenance.topic in _LOOKED_INTO:
+        item.payload  # noqa: B018 - decoded and checked on first use
 
 
 def _with_digest(item: FrameInput) -> GrantInput:

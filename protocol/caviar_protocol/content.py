@@ -1,0 +1,200 @@
+"""The check of content on the consumer's side: whether a product says what its topic allows.
+
+The broker never looks into a payload, and a decoder checks types and shapes only. What a service
+consumes therefore passes through one `ContentCheck` before the service sees it: a product with a
+quaternion of norm 2, a negative dimension, a name twice or a number that is none is refused in the first
+frame, and the error names the service that made it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import cache
+from typing import Any, cast
+
+import msgspec
+import numpy as np
+
+from caviar_protocol import scene_content as scenes
+from caviar_protocol.arrays import Payload, array_fields, require_finite
+from caviar_protocol.digest import payload_digest
+from caviar_protocol.errors import PayloadError, ProductError
+from caviar_protocol.messages import GrantInput
+from caviar_protocol.scene_content import SceneRules
+from caviar_protocol.topics import Action, Camera, Channel, Depth, Lidar, Link, Scene, Segmentation
+
+SMALL_PRODUCT = 16 << 10
+"""[B] of a product of which a consumer checks the digest: SHA-256 takes 10 µs for that. The recorder checks
+all that it writes."""
+
+
+class ContentCheck:
+    """Checks the products that one process consumes; one object for all frames of a run.
+
+    Names, meshes and devices of a scene are looked at where they differ from those of the scene before,
+    numbers in every frame.
+
+    Parameters
+    ----------
+    rules
+        What the run says about scenes, once that is known.
+    """
+
+    def __init__(self, rules: SceneRules | None = None) -> None:
+        self.rules = rules or SceneRules()
+        self._passed: dict[tuple[str, str], Payload] = {}
+        """By (topic, source), the last product without bytes: in one process all consumers get one object."""
+        self._described: dict[str, bytes | Scene] = {}
+        """By world, the last header, or scene, of which names and devices are right."""
+
+    def __call__(self, entry: GrantInput, payload: Payload, header: bytes = b"") -> None:
+        """Raise `ProductError` where the payload cannot be.
+
+        ``header`` are the payload's encoded fields, where there are any.
+        """
+        key = entry.topic, entry.source
+        if not header and self._passed.get(key) is payload:
+            return
+        if isinstance(payload, Scene):
+            found = self._wrong_scene(payload, entry.source, header)
+        else:
+            found = wrong_values(payload)
+        if found:
+            raise ProductError(entry.topic, entry.source, entry.frame, found)
+        if not header:
+            self._passed[key] = payload
+
+    def _wrong_scene(self, scene: Scene, world: str, header: bytes) -> str:
+        if not scenes.numbers_are_right(scene) and (found := scenes.wrong_number(scene)):
+            return found
+        known = self._described.get(world)
+        if header:
+            is_known = known == header  # every field but the arrays stands in the header
+        else:
+            is_known = isinstance(known, Scene) and _describe_the_same(known, scene)
+        if not is_known:
+            if found := wrong_description(scene, world, self.rules):
+                return found
+            self._described[world] = header or scene
+        return ""
+
+
+def _describe_the_same(a: Scene, b: Scene) -> bool:
+    return a.names == b.names and a.assets == b.assets and a.devices == b.devices
+
+
+def wrong_description(scene: Scene, world: str, rules: SceneRules) -> str:
+    """What is wrong with names, meshes and devices of a world's scene; empty: nothing."""
+    return (
+        scenes.wrong_order(scene)
+        or scenes.wrong_prefix(scene, world, rules)
+        or scenes.wrong_asset(scene, rules)
+        or scenes.wrong_device(scene)
+        or scenes.wrong_mount(scene, world, rules)
+    )
+
+
+def check_digest(entry: GrantInput, header: bytes | memoryview, body: bytes | memoryview) -> None:
+    """Raise `ProductError` where the bytes are not those of the digest that their producer stated."""
+    digest = payload_digest(header, body)
+    if digest != entry.digest:
+        raise ProductError(
+            entry.topic,
+            entry.source,
+            entry.frame,
+            f"its digest is {digest}, its DONE said {entry.digest or 'none'}: hash the length of the header "
+            "(8 bytes, little-endian), the header and the body",
+        )
+
+
+# --- values of the other topics, in every frame -----------------------------------------------------------
+
+
+def wrong_values(payload: Payload) -> str:
+    """What is wrong with the numbers of a product that is no scene; empty: nothing."""
+    judge = _JUDGES.get(type(payload))
+    return "" if judge is None else judge(payload)
+
+
+def _wrong_channel(channel: Channel) -> str:
+    found = _not_finite(channel)
+    if not found and channel.tau.size and not channel.tau.min() >= 0:
+        index = int(np.argmin(channel.tau))
+        found = f"tau[{index}] is {channel.tau[index]:g} s: a delay is at least 0"
+    return found or next((f"h[{i}]: {f}" for i, m in enumerate(channel.h) if (f := _not_finite(m))), "")
+
+
+def _wrong_link(link: Link) -> str:
+    return _not_finite(link) or _negative(link.abs_y, "abs_y", "1") or _negative(link.snr, "snr", "1")
+
+
+def _wrong_lidar(lidar: Lidar) -> str:
+    for scan in lidar.scans:
+        found = _wrong_pose(scan) or _not_finite(scan) or _negative(scan.range, "range", "m")
+        if found:
+            return f"scan of {scan.sensor!r}: {found}"
+    return ""
+
+
+def _wrong_images(payload: Camera | Depth | Segmentation) -> str:
+    for image in payload.images:
+        found = _wrong_pose(image) or _not_finite(image)
+        if found := found or _negative(getattr(image, "depth", None), "depth", "m"):
+            return f"image of {image.sensor!r}: {found}"
+    return ""
+
+
+def _wrong_action(action: Action) -> str:
+    for index, command in enumerate(action.commands):
+        try:
+            require_finite(command)
+        except PayloadError as error:
+            return f"commands[{index}]: {error}"
+    return ""
+
+
+def _wrong_pose(owner: Any) -> str:
+    norm = math.hypot(*owner.orientation)
+    if not abs(norm - 1) <= scenes.UNIT_TOLERANCE:
+        return f"its orientation has norm {norm:.6g}: a unit quaternion (w, x, y, z) is needed"
+    if not all(map(math.isfinite, owner.position)):
+        return f"its position {owner.position} is not finite"
+    return ""
+
+
+def _negative(values: Any, field: str, unit: str) -> str:
+    if values is None or not values.size or values.min() >= 0:
+        return ""
+    return f"{field} is {values.min():g} {unit} at worst: it is at least 0"
+
+
+def _not_finite(payload: Payload) -> str:
+    """The first array element that is not finite; the sum of squares of the others is."""
+    for field in _float_arrays(type(payload)):
+        values = getattr(payload, field)
+        if values is not None and not np.vdot(values, values).real < math.inf:
+            try:
+                require_finite(payload)
+            except PayloadError as error:
+                return str(error)
+    return ""
+
+
+@cache
+def _float_arrays(cls: type[Payload]) -> tuple[str, ...]:
+    return tuple(name for name, field in array_fields(cls).items() if field.dtype in ("<f4", "<f8", "<c16"))
+
+
+_JUDGES = cast(
+    dict[type, Callable[[msgspec.Struct], str]],
+    {
+        Channel: _wrong_channel,
+        Link: _wrong_link,
+        Lidar: _wrong_lidar,
+        Camera: _wrong_images,
+        Depth: _wrong_images,
+        Segmentation: _wrong_images,
+        Action: _wrong_action,
+    },
+)

@@ -1,0 +1,250 @@
+"""What a `Scene` may say: names, prefixes, meshes, devices, and the numbers of its objects.
+
+Each function looks at one aspect and returns what is wrong there, as a phrase for people, or an empty
+string. `caviar_protocol.content` applies them to every scene that a service consumes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import pairwise
+
+import msgspec
+import numpy as np
+
+from caviar_protocol.arrays import BoolArray, Float64Array
+from caviar_protocol.coordinates import SPEED_OF_LIGHT
+from caviar_protocol.devices import carries, fixed_device, mounted_device
+from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.topics.scene import Device, Scene
+
+UNIT_TOLERANCE = 1e-3
+"""By how much the norm of a unit quaternion may differ from 1: room for single precision, and no more than
+0.02 dB in a gain."""
+MAX_COORDINATE_M = 1e9
+"""[m] from the origin, along an axis."""
+MAX_SPEED = SPEED_OF_LIGHT
+"""[m/s] along an axis."""
+MAX_DIMENSION_M = 1e5
+"""[m] of a side of a bounding box."""
+MOUNT_TOLERANCE = {"rel_tol": 1e-5, "abs_tol": 1e-3}
+"""Of numbers of a device against those of the scenario: [m], [rad], [dBm], [wavelengths]."""
+SAME_ROTATION = 1e-6
+"""1 − |⟨p, q⟩| of two unit quaternions that count as one rotation: 0.16°."""
+
+
+class SceneRules(msgspec.Struct, frozen=True, kw_only=True):
+    """What the run says about the scenes of its worlds; what is not known is not checked."""
+
+    prefixes: Mapping[str, tuple[str, ...]] = {}
+    """By world: what the names of its objects and fixed devices begin with."""
+    devices: Mapping[str, tuple[DeviceSpec, ...]] = {}
+    """By world: the devices of the scenario that it publishes."""
+    assets: frozenset[str] | None = None
+    """Names of the files of scenery of the run."""
+
+
+# --- numbers, in every frame ------------------------------------------------------------------------
+
+
+def numbers_are_right(scene: Scene) -> bool:
+    """Whether `wrong_number` would find nothing, for a few microseconds; True is certain, False is not.
+
+    A sum of squares bounds every term of it, and is no number where one of them is none.
+    """
+    count = len(scene.names)
+    if not count:
+        return True
+    orientation = scene.orientation
+    if not abs(np.vdot(orientation, orientation) - count) <= UNIT_TOLERANCE:
+        return False
+    excess = np.vecdot(orientation, orientation) - 1.0
+    return bool(
+        # |n − 1| ≤ |n² − 1| for any norm n
+        excess.dot(excess) <= UNIT_TOLERANCE**2
+        and np.vdot(scene.position, scene.position) <= MAX_COORDINATE_M**2
+        and np.vdot(scene.velocity, scene.velocity) <= MAX_SPEED**2
+        and np.vdot(scene.dimensions, scene.dimensions) <= MAX_DIMENSION_M**2
+        and scene.dimensions.min() > 0
+    )
+
+
+def wrong_number(scene: Scene) -> str:
+    """The first object with an orientation, position, velocity or dimension that cannot be."""
+    return wrong_orientation(scene) or wrong_place(scene) or wrong_dimensions(scene)
+
+
+def wrong_orientation(scene: Scene) -> str:
+    """The first object whose orientation is no unit quaternion."""
+    with np.errstate(all="ignore"):
+        norms = np.linalg.norm(scene.orientation, axis=1)
+        wrong = ~(abs(norms - 1) <= UNIT_TOLERANCE)
+    return _first(scene, wrong, "orientation", scene.orientation, lambda i: _not_unit(norms[i]))
+
+
+def wrong_place(scene: Scene) -> str:
+    """The first object whose position or velocity is not finite, or absurd."""
+    far, fast = _beyond(scene.position, MAX_COORDINATE_M), _beyond(scene.velocity, MAX_SPEED)
+    bounds = f"finite numbers, at most {MAX_COORDINATE_M:g} m from the origin, are needed"
+    return _first(scene, far, "position", scene.position, lambda _: f"m: {bounds}") or _first(
+        scene, fast, "velocity", scene.velocity, lambda _: "m/s: finite numbers below light's are needed"
+    )
+
+
+def wrong_dimensions(scene: Scene) -> str:
+    """The first object with a side that is not above 0, or absurd."""
+    wrong = _beyond(scene.dimensions, MAX_DIMENSION_M) | np.any(scene.dimensions <= 0, axis=1)
+    bounds = f"m: each has to be above 0 and at most {MAX_DIMENSION_M:g}"
+    return _first(scene, wrong, "dimensions", scene.dimensions, lambda _: bounds)
+
+
+def _beyond(values: Float64Array, limit: float) -> BoolArray:
+    """Rows with a value that is none, or beyond the limit."""
+    within: BoolArray = np.all(abs(values) <= limit, axis=1)
+    return ~within
+
+
+def _first(
+    scene: Scene, wrong: BoolArray, field: str, values: Float64Array, why: Callable[[int], str]
+) -> str:
+    found = np.flatnonzero(wrong)
+    if not len(found):
+        return ""
+    index = int(found[0])
+    return f"object {scene.names[index]!r}: {field} {_numbers(values[index].tolist())} {why(index)}"
+
+
+def _not_unit(norm: float) -> str:
+    return f"has norm {norm:.6g}: a unit quaternion (w, x, y, z) is needed"
+
+
+def _numbers(values: Iterable[float]) -> str:
+    return f"({', '.join(f'{value:.6g}' for value in values)})"
+
+
+# --- names, meshes and devices, where they changed -----------------------------------------------------
+
+
+def wrong_order(scene: Scene) -> str:
+    """The first name of an object or device that is there twice, or not in its place."""
+    devices = [device.name for device in scene.devices]
+    return (
+        _unsorted("object", scene.names)
+        or _unsorted("device", devices)
+        or next((f"{name!r} names an object and a device" for name in set(scene.names) & {*devices}), "")
+    )
+
+
+def _unsorted(kind: str, names: Sequence[str]) -> str:
+    for name, following in pairwise(names):
+        if name == following:
+            return f"two {kind}s are named {name!r}"
+        if name > following:
+            return f"{kind} {name!r} stands before {following!r}: sort them by the UTF-8 bytes of their names"
+    return ""
+
+
+def wrong_prefix(scene: Scene, world: str, rules: SceneRules) -> str:
+    """The first object or fixed device without a prefix that its world declared."""
+    prefixes = rules.prefixes.get(world)
+    if prefixes is None:
+        return ""
+    fixed = [device.name for device in scene.devices if not device.parent]
+    for name in (*scene.names, *fixed):
+        if not name.startswith(prefixes):
+            stated = ", ".join(map(repr, prefixes)) or "none"
+            return f"{name!r} has none of the prefixes that READY declared: {stated}"
+    return ""
+
+
+def wrong_asset(scene: Scene, rules: SceneRules) -> str:
+    """The first object with a mesh that no world offered."""
+    if rules.assets is None:
+        return ""
+    for name, asset in zip(scene.names, scene.assets, strict=True):
+        if asset and asset not in rules.assets:
+            return f"object {name!r}: mesh {asset!r} was never offered; an empty name stands for a box"
+    return ""
+
+
+def wrong_device(scene: Scene) -> str:
+    """The first device whose parent, name, pose or range cannot be."""
+    names = set(scene.names)
+    return next((found for device in scene.devices if (found := _wrong_device(device, names))), "")
+
+
+def _wrong_device(device: Device, objects: set[str]) -> str:
+    what = f"device {device.name!r}:"
+    if device.parent and device.parent not in objects:
+        return f"{what} parent {device.parent!r} is no object of the scene"
+    if device.parent and not device.name.startswith(f"{device.parent}/"):
+        return f"{what} on {device.parent!r}, its name has to be {device.parent}/NAME"
+    for field in device.__struct_fields__:
+        value = getattr(device, field)
+        numbers = value if isinstance(value, tuple) else (value,)
+        if any(isinstance(number, float) and not math.isfinite(number) for number in numbers):
+            return f"{what} {field} {_numbers(numbers)} is not finite"
+    norm = math.hypot(*device.orientation)
+    if not abs(norm - 1) <= UNIT_TOLERANCE:
+        return f"{what} orientation {_numbers(device.orientation)} {_not_unit(norm)}"
+    return ""
+
+
+def wrong_mount(scene: Scene, world: str, rules: SceneRules) -> str:
+    """The first device of the scenario that is missing, superfluous, or not as the scenario says."""
+    specs = rules.devices.get(world, ())
+    published = {device.name: device for device in scene.devices}
+    return next((found for spec in specs if (found := _wrong_mount(spec, scene, published))), "")
+
+
+def _wrong_mount(spec: DeviceSpec, scene: Scene, published: Mapping[str, Device]) -> str:
+    if not spec.on:
+        device = published.get(spec.name)
+        missing = f"device {spec.name!r} of the scenario is missing"
+        return missing if device is None else _difference(fixed_device(spec), device)
+    able = [index for index, name in enumerate(scene.names) if carries(spec, name)]
+    carriers = [index for index in able if f"{scene.names[index]}/{spec.name}" in published]
+    due = min(spec.count, len(able))
+    if len(carriers) != due:
+        return (
+            f"device {spec.name!r} of the scenario is on {len(carriers)} objects: {due} of the {len(able)} "
+            f"that match on = {spec.on!r} carry it ({scene.names[able[0]]!r}, …; count = {spec.count})"
+        )
+    for index in carriers:
+        name = scene.names[index]
+        x, y, z = scene.dimensions[index].tolist()
+        found = _difference(mounted_device(spec, name, (x, y, z)), published[f"{name}/{spec.name}"])
+        if found:
+            return found
+    return ""
+
+
+def _difference(right: Device, device: Device) -> str:
+    """The first field of a device that is not as the scenario says."""
+    if type(device) is not type(right):
+        return f"device {device.name!r} is of another kind than the scenario's"
+    cosine = sum(a * b for a, b in zip(right.orientation, device.orientation, strict=True))
+    if abs(cosine) < 1 - SAME_ROTATION:
+        return _not_as(device, "orientation", device.orientation, right.orientation)
+    for field in right.__struct_fields__:
+        expected, got = getattr(right, field), getattr(device, field)
+        if field != "orientation" and not _close(expected, got):
+            return _not_as(device, field, got, expected)
+    return ""
+
+
+def _close(expected: object, got: object) -> bool:
+    """Equal, but for how a client rounds numbers."""
+    if isinstance(expected, float) and isinstance(got, float):
+        return math.isclose(expected, got, **MOUNT_TOLERANCE)
+    if isinstance(expected, tuple) and isinstance(got, tuple):
+        return all(_close(a, b) for a, b in zip(expected, got, strict=True))
+    if isinstance(expected, msgspec.Struct) and isinstance(got, msgspec.Struct):
+        return _close(msgspec.structs.astuple(expected), msgspec.structs.astuple(got))
+    return expected == got
+
+
+def _not_as(device: Device, field: str, got: object, expected: object) -> str:
+    shown = [_numbers(v) if isinstance(v, tuple) else repr(v) for v in (got, expected)]
+    return f"device {device.name!r}: {field} {shown[0]}, by the scenario it is {shown[1]}"
