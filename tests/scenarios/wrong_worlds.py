@@ -1,4 +1,4 @@
-"""Worlds whose scenes are wrong in one way each; scenarios name them as ``wrong_worlds:World``."""
+"""Producers that are wrong in one way each; scenarios name them as ``wrong_worlds:World`` or ``:Liar``."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ import numpy as np
 from msgspec.structs import replace
 
 from caviar_protocol.codec import encode_payload
-from caviar_protocol.topics import Scene
+from caviar_protocol.messages import Input, Role
+from caviar_protocol.topics import Lidar, LidarScan, Scene
+from caviar_services import exchange
 from caviar_services.encoded import Encoded
-from caviar_services.service import Frame, StepResult
+from caviar_services.service import Frame, RunInfo, Service, StepResult
 from caviar_services.world.trajectory import TrajectorySettings, TrajectoryWorld
 
 
@@ -72,6 +74,11 @@ class World(TrajectoryWorld):
 
     Settings: ClassVar[type[msgspec.Struct]] = WrongSettings
 
+    def __init__(self, settings: WrongSettings, run: RunInfo) -> None:
+        super().__init__(settings, run)
+        if settings.wrong == "a false digest":
+            _lie()
+
     def step(self, frame: Frame) -> StepResult:
         result = super().step(frame)
         settings = self.settings
@@ -83,6 +90,40 @@ class World(TrajectoryWorld):
             return StepResult(products={"scene": _with_nan(scene)})
         change = WRONG.get(settings.wrong)
         return result if change is None else StepResult(products={"scene": change(scene)})
+
+
+class LiarSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Has none."""
+
+
+class Liar(Service[LiarSettings]):
+    """A sensor whose large products, which no service but the recorder gets, have false digests."""
+
+    role: ClassVar[Role] = "sensors"
+    inputs: ClassVar[tuple[Input, ...]] = (Input(topic="scene"),)
+    outputs: ClassVar[tuple[str, ...]] = ("lidar",)
+    Settings: ClassVar[type[msgspec.Struct]] = LiarSettings
+
+    def step(self, frame: Frame) -> StepResult:
+        """A scan of five thousand points."""
+        _lie()
+        points = np.ones((5000, 3), "<f4")
+        scan = LidarScan(
+            sensor="uav/lidar",
+            position=(0.0, 0.0, 0.0),
+            orientation=(1.0, 0.0, 0.0, 0.0),
+            ray=np.arange(5000, dtype="<i4"),
+            points=points,
+            points_world=points,
+            range=np.ones(5000, "<f4"),
+            object=np.zeros(5000, "<i4"),
+        )
+        return StepResult(products={"lidar": Lidar(object_names=("car",), scans=(scan,))})
+
+
+def _lie() -> None:
+    """From now on this process, which is the service's own, states a digest of its own choice."""
+    exchange.payload_digest = lambda header, body: "0" * 64
 
 
 def _with_nan(scene: Scene) -> Encoded:
