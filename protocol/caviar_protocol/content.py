@@ -91,6 +91,7 @@ def wrong_description(scene: Scene, world: str, rules: SceneRules) -> str:
         or scenes.wrong_prefix(scene, world, rules)
         or scenes.wrong_asset(scene, rules)
         or scenes.wrong_device(scene)
+        or scenes.missing_device(scene, world, rules)
         or scenes.wrong_mount(scene, world, rules)
     )
 

@@ -7,7 +7,7 @@ string. `caviar_protocol.content` applies them to every scene that a service con
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 
 import msgspec
@@ -191,33 +191,43 @@ def _wrong_device(device: Device, objects: set[str]) -> str:
     return ""
 
 
-def wrong_mount(scene: Scene, world: str, rules: SceneRules) -> str:
-    """The first device of the scenario that is missing, superfluous, or not as the scenario says."""
-    specs = rules.devices.get(world, ())
-    published = {device.name: device for device in scene.devices}
-    return next((found for spec in specs if (found := _wrong_mount(spec, scene, published))), "")
-
-
-def _wrong_mount(spec: DeviceSpec, scene: Scene, published: Mapping[str, Device]) -> str:
-    if not spec.on:
-        device = published.get(spec.name)
-        missing = f"device {spec.name!r} of the scenario is missing"
-        return missing if device is None else _difference(fixed_device(spec), device)
-    able = [index for index, name in enumerate(scene.names) if carries(spec, name)]
-    carriers = [index for index in able if f"{scene.names[index]}/{spec.name}" in published]
-    due = min(spec.count, len(able))
-    if len(carriers) != due:
-        return (
-            f"device {spec.name!r} of the scenario is on {len(carriers)} objects: {due} of the {len(able)} "
-            f"that match on = {spec.on!r} carry it ({scene.names[able[0]]!r}, …; count = {spec.count})"
-        )
-    for index in carriers:
-        name = scene.names[index]
-        x, y, z = scene.dimensions[index].tolist()
-        found = _difference(mounted_device(spec, name, (x, y, z)), published[f"{name}/{spec.name}"])
-        if found:
-            return found
+def missing_device(scene: Scene, world: str, rules: SceneRules) -> str:
+    """The first device of the scenario that is not there, or on too few or too many objects."""
+    published = {device.name for device in scene.devices}
+    for spec in rules.devices.get(world, ()):
+        if not spec.on:
+            if spec.name not in published:
+                return f"device {spec.name!r} of the scenario is missing"
+            continue
+        able = [name for name in scene.names if carries(spec, name)]
+        carriers = sum(f"{name}/{spec.name}" in published for name in able)
+        due = min(spec.count, len(able))
+        if carriers != due:
+            return (
+                f"device {spec.name!r} of the scenario is on {carriers} objects: {due} of the {len(able)} that "
+                f"match on = {spec.on!r} carry it ({able[0]!r}, …; count = {spec.count})"
+            )
     return ""
+
+
+def wrong_mount(scene: Scene, world: str, rules: SceneRules) -> str:
+    """The first device that is not mounted, or not made, as the scenario says."""
+    published = {device.name: device for device in scene.devices}
+    pairs = (pair for spec in rules.devices.get(world, ()) for pair in _as_published(spec, scene, published))
+    return next((found for right, device in pairs if (found := _difference(right, device))), "")
+
+
+def _as_published(
+    spec: DeviceSpec, scene: Scene, published: Mapping[str, Device]
+) -> Iterator[tuple[Device, Device]]:
+    """The device by the scenario, and as it is published, on each object that carries it."""
+    if not spec.on and spec.name in published:
+        yield fixed_device(spec), published[spec.name]
+    for index, name in enumerate(scene.names):
+        device = published.get(f"{name}/{spec.name}")
+        if device is not None and carries(spec, name):
+            x, y, z = scene.dimensions[index].tolist()
+            yield mounted_device(spec, name, (x, y, z)), device
 
 
 def _difference(right: Device, device: Device) -> str:
