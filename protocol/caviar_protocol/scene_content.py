@@ -204,7 +204,7 @@ def missing_device(scene: Scene, world: str, rules: SceneRules) -> str:
         due = min(spec.count, len(able))
         if carriers != due:
             return (
-                f"device {spec.name!r} of the scenario is on {carriers} objects: {due} of the {len(able)} that "
+                f"device {spec.name!r} of the scenario is on {carriers} objects: {due} of {len(able)} that "
                 f"match on = {spec.on!r} carry it ({able[0]!r}, …; count = {spec.count})"
             )
     return ""

@@ -140,7 +140,7 @@ WRONG: dict[str, tuple[Callable[[], Scene], str]] = {
     "device norm": (with_devices(replace(BS, orientation=(0.0, 0.0, 0.0, 2.0)), EYE, A, B), "norm 2"),
     "device nan": (with_devices(replace(BS, power_dbm=np.nan), EYE, A, B), "'bs': power_dbm .* not finite"),
     "no devices": (with_devices(), "device 'bs' of the scenario is missing"),
-    "too few": (with_devices(BS, EYE, A), r"'rx' of the scenario is on 1 objects: 2 of the 20 .* count = 2"),
+    "too few": (with_devices(BS, EYE, A), r"'rx' of the scenario is on 1 objects: 2 of 20 .* count = 2"),
     "too many": (with_devices(BS, receiver("car.02"), EYE, A, B), "'rx' of the scenario is on 3"),
     "mount ignored": (with_devices(BS, EYE, replace(A, position=(0.0, 0.0, 0.0)), B),
                       r"'car.04/rx': position \(0, 0, 0\), by the scenario it is \(0, 0, 0.75\)"),
