@@ -15,6 +15,7 @@ from typing import Any
 
 import msgpack
 import zmq
+from broken_world import scene
 
 ENDPOINT, NAME, FAULT = sys.argv[1:4]
 ROLE = sys.argv[4] if len(sys.argv) > 4 else "agent"
@@ -98,6 +99,7 @@ class Client:
         self.broker.linger = 1000
         self.broker.connect(ENDPOINT)
         self.who: dict[str, int] = {}
+        self.devices: list[dict[str, Any]] = []
         self.episode, self.last, self.lived = -1, -1, 0
         self.counted = 0
         """Frames answered in this episode, on which products depend: its state."""
@@ -200,6 +202,7 @@ class Client:
             return 1
         if "epoch" in fields:
             self.who = {"epoch": fields["epoch"], "attempt": fields["attempt"]}
+            self.devices = fields["scenario"]["devices"]
             self.heart = Beat(self.context, fields, self.who)
             self.heart.start()
         return None
@@ -229,7 +232,8 @@ class Client:
             self.say("ASSET_GET", digest=fields["assets"][1]["digest"])
             return
         if ROLE == "world":
-            ready["prefixes"] = [NAME + "."]
+            fixed = [device["name"] for device in self.devices if not device.get("on")]
+            ready["prefixes"] = [NAME + ".", *fixed]
         self.say("READY", **who, **ready)
 
     def on_asset_get(self, fields: dict[str, Any], parts: list[bytes]) -> None:
@@ -335,6 +339,7 @@ class Client:
         header, body = self.product(frame)
         digest = hashlib.sha256(len(header).to_bytes(8, "little") + header + body).hexdigest()
         digest = digest.upper() if bad("writes digests in capitals") else digest
+        digest = "0" * 64 if bad("states a false digest") else digest
         topic = "link" if bad("makes what it did not declare") else OUTPUTS[ROLE][0]
         entry = {"topic": topic, "digest": digest}
         done["products"] = [entry, entry] if bad("makes a topic twice") else [entry]
@@ -342,7 +347,7 @@ class Client:
 
     def product(self, frame: int) -> tuple[bytes, bytes]:
         if ROLE == "world":
-            return self.scene()
+            return scene(NAME, self.devices, frame, FAULT)
         beam = self.lived if bad("remembers the episode before") else self.counted % 4
         command: dict[str, Any] = {"type": "beam", "tx": "bs", "rx": "car.1/rx", "tx_beam": beam}
         if bad("writes out a default in a payload"):
@@ -350,14 +355,6 @@ class Client:
         if bad("makes what is no payload"):
             del command["rx"]
         return msgpack.packb({"commands": [command]}), b"\0" * 8 if bad("pads the body") else b""
-
-    def scene(self) -> tuple[bytes, bytes]:
-        def empty(columns: int) -> dict[str, Any]:
-            return {"dtype": "<f8", "shape": [0, columns], "offset": 0}
-
-        fields = {"names": [], "classes": [], "assets": []}
-        arrays = {"position": 3, "orientation": 4, "velocity": 3, "dimensions": 3}
-        return msgpack.packb({**fields, **{name: empty(n) for name, n in arrays.items()}}), b""
 
 
 if not bad("dies of SIGTERM"):

@@ -240,6 +240,7 @@ FAULTS: dict[str, tuple[str, ...]] = {
         "answers another episode",
         "answers in another epoch",
         "writes digests in capitals",
+        "states a false digest",
         "makes what it did not declare",
         "makes a topic twice",
         "makes no product",
@@ -293,6 +294,26 @@ FAULTS: dict[str, tuple[str, ...]] = {
     "final-grant": ("acts in the final grant",),
     "several-sources": ("wants one source of each topic",),
     "canonical": ("writes out a default",),
+    "scene-orientations": (
+        "publishes quaternions of length 2/world",
+        "publishes quaternions of zeros/world",
+    ),
+    "scene-places": ("publishes NaN/world", "publishes cars that are faster than light/world"),
+    "scene-dimensions": ("publishes negative dimensions/world", "publishes flat boxes/world"),
+    "scene-names": (
+        "does not sort names/world",
+        "publishes a name twice/world",
+        "does not sort devices/world",
+    ),
+    "scene-prefixes": ("forgets its prefixes/world",),
+    "scene-meshes": ("names meshes that it did not offer/world",),
+    "scene-devices": ("publishes no devices/world", "passes over count/world"),
+    "scene-device-poses": (
+        "mounts devices on absent objects/world",
+        "publishes devices with quaternions of length 2/world",
+    ),
+    "scene-mounts": ("ignores mounts/world", "takes the array of another device/world"),
+    "scene-carriers": ("hands devices around/world",),
 }
 
 

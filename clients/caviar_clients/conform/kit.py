@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from caviar_clients.conform import checkpoints, joining, leaving, stepping, wrong
+from caviar_clients.conform import checkpoints, content, joining, leaving, stepping, wrong
 from caviar_clients.conform.case import Case, Failed, NotApplicable, Outcome, Verdict
 from caviar_clients.conform.client import ByHand, Client, Started
 from caviar_clients.conform.session import CONNECTING, JOINED, PATIENCE, READY, Rules, Seen, Session
@@ -31,6 +31,7 @@ def cases() -> tuple[Case, ...]:
     return (
         *joining.CASES,
         *stepping.CASES,
+        *content.CASES,
         *wrong.CASES,
         *checkpoints.CASES,
         *leaving.CASES,

@@ -35,6 +35,8 @@ def order(session: Session, topics: list[str], inputs: Inputs) -> Fields:
         ]
         order["assets"] = session.assets
     order["producers"] = {topic: list(names) for topic, names in sorted(inputs.sources.items())}
+    if session.hello["role"] != "world":
+        order["prefixes"] = {world: street.PREFIXES[world] for world in inputs.sources["scene"]}
     return order
 
 

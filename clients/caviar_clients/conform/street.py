@@ -108,6 +108,8 @@ SOURCES = {
     "link": ["radio"],
 }
 """Who produces each topic."""
+PREFIXES = {"air": ["uav."], "traffic": ["bs", "car."]}
+"""What the worlds of the kit declare of their names."""
 DOUBLED = {**SOURCES, "scene": ["air", "traffic"], "action": ["copilot", "pilot"]}
 """The same with two worlds and two agents."""
 

@@ -1,0 +1,118 @@
+"""What the world of `broken_client` publishes: two cars that drive, with the devices of WELCOME.
+
+Nothing but msgpack; the arithmetic of SPEC.md, written a second time.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import Any
+
+import msgpack
+
+SIZE = (4.6, 1.9, 1.5)
+MOUNT = {"centre": 0.0, "roof": 0.5, "floor": -0.5}
+
+
+def scene(name: str, specs: list[dict[str, Any]], frame: int, fault: str) -> tuple[bytes, bytes]:
+    """Header and body of the scene of a frame; ``fault`` is what is wrong with it, if anything here is."""
+    names = [f"{name}.car.1", f"{name}.car.2"]
+    arrays = {
+        "position": [[-12.0 + 0.9 * frame, 4.0, 0.75], [30.0, -4.0 - 0.7 * frame, 0.75]],
+        "orientation": [[math.cos(0.1 * frame), 0.0, 0.0, math.sin(0.1 * frame)], [1.0, 0.0, 0.0, 0.0]],
+        "velocity": [[9.0, 0.0, 0.0], [0.0, -7.0, 0.0]],
+        "dimensions": [list(SIZE), list(SIZE)],
+    }
+    assets = ["", ""]
+    devices = [found for spec in specs for found in _devices(spec, names, frame, fault)]
+    match fault:
+        case "publishes quaternions of length 2":
+            arrays["orientation"][1][0] = 2.0
+        case "publishes quaternions of zeros":
+            arrays["orientation"][1][0] = 0.0
+        case "publishes NaN":
+            arrays["position"][0][2] = math.nan
+        case "publishes cars that are faster than light":
+            arrays["velocity"][0][0] = 3e8
+        case "publishes negative dimensions":
+            arrays["dimensions"][1][1] = -1.9
+        case "publishes flat boxes":
+            arrays["dimensions"][1][2] = 0.0
+        case "does not sort names":
+            names.reverse()
+        case "publishes a name twice":
+            names[1] = names[0]
+        case "forgets its prefixes":
+            names = [f"anothers.{tail}" for tail in ("car.1", "car.2")]
+            devices = [d for d in devices if not d.get("parent")]
+        case "names meshes that it did not offer":
+            assets[0] = "objects/car.ply"
+        case "publishes no devices":
+            devices = []
+        case "mounts devices on absent objects":
+            absent = f"{name}.car.9"
+            devices.append({"type": "antenna", "name": f"{absent}/rx", "parent": absent, "role": "rx"})
+    if fault != "does not sort devices":
+        devices.sort(key=lambda device: str(device["name"]).encode())
+    header: dict[str, Any] = {"names": names, "classes": ["car", "car"], "assets": assets}
+    body = b""
+    for field, rows in arrays.items():
+        header[field] = {"dtype": "<f8", "shape": [2, len(rows[0])], "offset": len(body)}
+        body += struct.pack(f"<{2 * len(rows[0])}d", *rows[0], *rows[1])
+    if devices:
+        header["devices"] = devices
+    return msgpack.packb(header), body
+
+
+def _devices(spec: dict[str, Any], names: list[str], frame: int, fault: str) -> list[dict[str, Any]]:
+    """The devices that come of one entry of WELCOME's list, whose ``on`` is empty or ``*`` here."""
+    if not spec.get("on"):
+        return [_device(spec, "", 0.0, fault)]
+    count = spec.get("count", 1)
+    carriers = names[:count]
+    if fault == "hands devices around" and frame % 2:
+        carriers = names[-count:]
+    if fault == "passes over count":
+        carriers = names
+    return [_device(spec, name, SIZE[2], fault) for name in carriers]
+
+
+def _device(spec: dict[str, Any], parent: str, height: float, fault: str) -> dict[str, Any]:
+    """One device, its fields in the order of SPEC.md and without those that equal their default."""
+    x, y, z = spec.get("position_m", (0.0, 0.0, 0.0))
+    position = [x, y, z + MOUNT[spec.get("mount", "centre")] * height]
+    if fault == "ignores mounts":
+        position = [x, y, z]
+    if fault == "takes the array of another device":
+        spec = spec | {"array": {"columns": 3}}
+    device: dict[str, Any] = {
+        "type": spec["kind"],
+        "name": f"{parent}/{spec['name']}" if parent else spec["name"],
+    }
+    if parent:
+        device["parent"] = parent
+    if any(position):
+        device["position"] = position
+    if fault == "publishes devices with quaternions of length 2":
+        device["orientation"] = [2.0, 0.0, 0.0, 0.0]
+    match spec["kind"]:
+        case "antenna":
+            device["role"] = spec["role"]
+            array = {
+                key: n
+                for key, n in (spec.get("array") or {}).items()
+                if key in ("rows", "columns") and n != 1
+            }
+            if array:
+                device["array"] = array
+        case "lidar":
+            device |= {"beams": spec["beams"], "azimuth_steps": spec["azimuth_steps"]}
+            low, high = (math.radians(angle) for angle in spec.get("elevation_deg", (-25.0, 3.0)))
+            if low != math.radians(-25.0):
+                device["elevation_min"] = low
+            if high != math.radians(3.0):
+                device["elevation_max"] = high
+        case "camera":
+            device["width"], device["height"] = spec["size_px"]
+    return device
