@@ -148,13 +148,12 @@ def _unsorted(kind: str, names: Sequence[str]) -> str:
 def wrong_prefix(scene: Scene, world: str, rules: SceneRules) -> str:
     """The first object or fixed device without a prefix that its world declared."""
     prefixes = rules.prefixes.get(world)
-    if prefixes is None:
+    if not prefixes:  # a recorded world declares none: it does not know the names of all its frames
         return ""
     fixed = [device.name for device in scene.devices if not device.parent]
     for name in (*scene.names, *fixed):
         if not name.startswith(prefixes):
-            stated = ", ".join(map(repr, prefixes)) or "none"
-            return f"{name!r} has none of the prefixes that READY declared: {stated}"
+            return f"{name!r} has none of the prefixes that READY declared: {', '.join(map(repr, prefixes))}"
     return ""
 
 
