@@ -72,3 +72,17 @@ def test_a_full_disk_costs_the_summary_and_not_the_figures_on_the_screen(
     assert "digest" in capsys.readouterr().out
     assert json.loads(figures.read_text())["frames"] == 3
     assert Recording(directory).complete
+
+
+def test_a_disk_that_fills_during_the_run_is_named_and_what_was_recorded_is_readable(
+    capsys: pytest.CaptureFixture[str], small_disk: Path
+) -> None:
+    with pytest.raises(RunError, match="No space left on device") as told:
+        run_scenario(Path("smoke"), small_disk, Console(width=500), embedded=True)
+    said = f"{capsys.readouterr().out} {told.value}"
+    assert "recorder" in said or "journal" in said
+    assert "free space" in said
+    (directory,) = small_disk.iterdir()
+    recording = Recording(directory)
+    assert not recording.complete
+    assert len(recording) == len(recording["link"].abs_y) > 10
