@@ -1,7 +1,9 @@
 # make demo: a co-simulation of a street with traffic, with pictures. make test: every check.
+# What make demo needs is a part of what make setup installs: ray tracer, SUMO and Matplotlib.
 BIN      := .venv/bin
 STAMP    := .venv/.setup-done
-SCENARIO ?= deploy/caviar_scenarios/street-canyon.toml
+DEMO     := .venv/.setup-demo
+SCENARIO ?= demo
 FRAMES   ?= 120
 TESTS    ?= tests
 WORKERS  ?= 2
@@ -10,15 +12,18 @@ WORKERS  ?= 2
 .PHONY: help setup demo test test-all lint doctor clean
 
 help: ## List these targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 setup: $(STAMP) ## Make .venv and see to the system libraries (again only when pyproject.toml changes)
 	@:
 
 $(STAMP): pyproject.toml deploy/setup.sh
-	@deploy/setup.sh
+	@deploy/setup.sh dev
 
-demo: setup ## Run SCENARIO for FRAMES frames, draw its pictures, say where they are
+$(DEMO): pyproject.toml deploy/setup.sh
+	@deploy/setup.sh demo
+
+demo: $(if $(wildcard $(STAMP)),$(STAMP),$(DEMO)) ## Run SCENARIO for FRAMES frames, draw its pictures, say where they are
 	@FRAMES=$(FRAMES) deploy/demo.sh $(SCENARIO)
 
 lint: setup ## Style, types and the imports that the architecture allows
@@ -39,5 +44,5 @@ doctor: setup ## What this machine has, and what mends what it lacks
 	@$(BIN)/caviar doctor
 
 clean: ## Remove .venv, caches and builds; recorded runs stay
-	@rm -rf .venv build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	@rm -rf .venv .venvs build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
 	@find . -name __pycache__ -not -path './.git/*' -prune -exec rm -rf {} +

@@ -1,9 +1,15 @@
 #!/usr/bin/env bash
-# Make .venv with everything that `make demo` and `make test` need, and see to the system
-# libraries that pip does not bring. Installs Debian packages where it may (as root, or with
+# Make .venv with what `make demo` needs (deploy/setup.sh demo), or `make test` too (deploy/setup.sh dev),
+# and see to the system libraries that pip does not bring. Installs Debian packages where it may (as root, or with
 # passwordless sudo); otherwise it names the command and fails.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+
+case ${1:-dev} in
+  demo) extras=all what="ray tracer, SUMO and Matplotlib" size=1500 stamp=.venv/.setup-demo ;;
+  dev) extras=all,dev what="ray tracer, SUMO, Matplotlib, PyTorch and the tools of the tests" size=2500 stamp=.venv/.setup-done ;;
+  *) echo "usage: deploy/setup.sh [demo|dev]" >&2 && exit 2 ;;
+esac
 
 say() { printf '\033[1m==>\033[0m %s\n' "$*"; }
 die() {
@@ -130,9 +136,9 @@ see_to_llvm() {
 if ! { [ -x .venv/bin/python ] && .venv/bin/python -m pip --version && new_enough .venv/bin/python; } >/dev/null 2>&1; then
   make_venv
 fi
-say "installing the Python packages into .venv (1.6 GB; a few minutes the first time)"
-.venv/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[all,dev]'
+say "installing into .venv: $what ($size MB; a few minutes the first time)"
+.venv/bin/python -m pip install --quiet --disable-pip-version-check --editable ".[$extras]"
 see_to_shared_libraries
 see_to_llvm
-touch .venv/.setup-done
+touch "$stamp"
 say "ready: .venv/bin/caviar doctor shows what this machine has"

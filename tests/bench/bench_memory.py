@@ -1,6 +1,6 @@
 """Whether a long run leaks: memory of broker and services over the frames of the real command.
 
-    python tests/bench/bench_memory.py [--scenario deploy/caviar_scenarios/smoke.toml] [--frames 10000]
+    python tests/bench/bench_memory.py [--scenario smoke] [--frames 10000]
                                        [--service NAME ...] [--limit KB]
 
 Runs ``caviar run`` and samples the resident memory (``VmRSS`` of /proc/PID/status) of the broker and
@@ -25,7 +25,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-ROOT = Path(__file__).parents[2]
 SAMPLE_S = 0.1
 TAIL = 0.8
 """Share of the frames that the line is fitted to."""
@@ -135,7 +134,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--scenario", type=Path, default=ROOT / "deploy" / "caviar_scenarios" / "smoke.toml")
+    parser.add_argument("--scenario", type=Path, default=Path("smoke"))
     parser.add_argument("--frames", type=int, default=10_000)
     parser.add_argument("--service", nargs="*", default=["channel"], help="services to watch")
     parser.add_argument("--limit", type=float, help="greatest slope [KB a frame]")

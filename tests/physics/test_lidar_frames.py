@@ -227,6 +227,24 @@ def test_the_grid_comes_beside_the_points_and_only_where_it_is_asked_for(yard: d
     assert np.array_equal(asked.points, plain.points)
 
 
+def test_between_the_scans_with_points_the_grid_says_the_same(yard: dict[str, Path]) -> None:
+    grid = GridSettings(minimum_m=(-30, -30, 0), maximum_m=(30, 30, 6), cells=(30, 30, 6))
+    whole = prepared(yard, LidarSettings(bodies_per_asset=4, grid=grid), frozenset({"grid"}))
+    thin = prepared(yard, LidarSettings(bodies_per_asset=4, grid=grid, points_every=3), frozenset({"grid"}))
+    for number in range(5):
+        scene = scene_of({"a": a_car(9, 2 + number)}, LEVEL)
+        lidar = observed(thin, scene, number)
+        (scan,), (wanted,) = lidar.scans, observed(whole, scene, number).scans
+        assert scan.grid == wanted.grid
+        assert len(scan.ray) == len(scan.points) == len(scan.points_world) == len(scan.range)
+        if number % 3 == 0:
+            assert scan == wanted
+            assert len(scan.object) == len(scan.ray) > 0
+        else:
+            assert len(scan.ray) == 0
+            assert lidar.object_names == ()
+
+
 def traffic(frame: int) -> dict[str, Body]:
     """Cars that drive, turn, come and leave."""
     return {

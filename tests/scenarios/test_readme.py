@@ -1,7 +1,8 @@
-"""The script of the README does what the README says."""
+"""The README does what it says: its commands and scripts run as they are printed, in their order."""
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -10,21 +11,65 @@ from pathlib import Path
 import pytest
 from scenarios_support import ROOT
 
+README = (ROOT / "README.md").read_text()
+
+
+def blocks(language: str) -> list[str]:
+    """Blocks of a language, in their order."""
+    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+
+
+def run(command: list[str | Path], folder: Path) -> str:
+    """Run a command in a folder as with an activated environment; what it printed."""
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    done = subprocess.run(
+        command, cwd=folder, env=os.environ | {"PATH": path}, capture_output=True, text=True, timeout=240
+    )
+    assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+def script(text: str, folder: Path) -> list[str | Path]:
+    """A command that runs a block of Python."""
+    file = folder / "script.py"
+    file.write_text(text)
+    assert len(text.splitlines()) <= 30
+    return [sys.executable, file]
+
+
+def test_the_first_half_is_followed_from_top_to_bottom_in_an_empty_folder(tmp_path: Path) -> None:
+    shell = blocks("sh")
+    assert len(shell) == 2
+    for block in shell:
+        run(["bash", "-e", "-c", block], tmp_path)
+    assert (tmp_path / "crossing.toml").is_file()
+    assert len(list(tmp_path.glob("runs/crossing-*/summary.json"))) == 1
+    read, _ = blocks("python")
+    printed = run(script(read, tmp_path), tmp_path)
+    assert "(100, 2, 4, 32)" in printed
+    assert re.search(r"\|y\| of the agent: (100\.0|99\.\d)%", printed), printed
+
+
+def test_a_mistake_is_told_as_the_readme_shows(tmp_path: Path) -> None:
+    shown = re.search(r"^caviar: (crossing\.toml:\d+: .*)$", README, re.MULTILINE)
+    assert shown is not None
+    run(["caviar", "new", "crossing"], tmp_path)
+    file = tmp_path / "crossing.toml"
+    file.write_text(file.read_text().replace("normalization", "normalisation"))
+    refused = subprocess.run(
+        [sys.executable, "-m", "caviar_clients", "run", "crossing.toml"],
+        cwd=tmp_path, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert refused.returncode == 1
+    assert shown[1] in refused.stderr
+
 
 def test_the_learning_script_trains_and_compares(tmp_path: Path) -> None:
     pytest.importorskip("stable_baselines3", reason="needs the extra `learning`")
-    text = (ROOT / "README.md").read_text()
-    found = re.search(r"```python\n(.*?)```", text, re.DOTALL)
-    assert found is not None
-    script = tmp_path / "train.py"
-    script.write_text(found[1])
-    assert len(found[1].splitlines()) <= 30
-    done = subprocess.run(
-        [sys.executable, script], cwd=ROOT, capture_output=True, text=True, timeout=240, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    printed = re.search(r"DQN ([\d.]+), los-beam ([\d.]+), oracle ([\d.]+)", done.stdout)
-    assert printed is not None, done.stdout
+    _, train = blocks("python")
+    out = run(script(train, tmp_path), tmp_path)
+    printed = re.search(r"DQN ([\d.]+), los-beam ([\d.]+), oracle ([\d.]+)", out)
+    assert printed is not None, out
     dqn, straight, best = map(float, printed.groups())
     assert 0.3 * best < dqn < best, "better than chance, which has about a tenth of the best"
     assert straight < best

@@ -95,3 +95,20 @@ def test_users_are_asked_for_nothing_heavy_and_for_no_copyleft(repository: Path)
     for extra, requirements in project["optional-dependencies"].items():
         if extra != "dev":  # GPL packages may at most be compared with in tests
             assert "deepmimo" not in _names(requirements), extra
+
+
+def test_images_are_built_from_all_that_the_wheel_holds(repository: Path) -> None:
+    """Else the broker of a container would not know the scenarios by their names."""
+    project = tomllib.loads((repository / "pyproject.toml").read_text())
+    let_in = (repository / ".dockerignore").read_text().splitlines()
+    for package in project["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]:
+        assert {f"!{package}", f"!{package.partition('/')[0]}"} & {*let_in}, package
+
+
+def test_the_demo_installs_neither_learning_nor_tools_of_the_tests(repository: Path) -> None:
+    extras = tomllib.loads((repository / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert "extras=all " in (repository / "deploy" / "setup.sh").read_text()
+    (parts,) = [Requirement(line).extras for line in extras["all"]]
+    installed = set().union(*(_names(extras[part]) for part in parts))
+    assert "sionna-rt" in installed
+    assert not installed & {"torch", *_names(extras["learning"]), *_names(extras["dev"])}

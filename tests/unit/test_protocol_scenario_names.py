@@ -44,3 +44,14 @@ def test_what_is_neither_a_file_nor_a_name_is_refused_with_what_was_meant(
     Path("mine.toml").write_text("")
     with pytest.raises(ScenarioError, match=said):
         load_scenario(given)
+
+
+def test_the_demo_is_the_street_canyon_with_less_recorded() -> None:
+    demo, street = load_scenario("demo"), load_scenario("street-canyon")
+    assert demo.devices == street.devices
+    assert demo.carriers == street.carriers
+    assert demo.timeouts == street.timeouts
+    assert {name for name in street.services if demo.services[name] != street.services[name]} == {
+        "lidar",
+        "recorder",
+    }

@@ -74,7 +74,8 @@ def plot_run(
         draw_over_angle(data, agent, files[-1])
     if "lidar" in topics:
         files.append(folder / "lidar.png")
-        _scan(_frame(recording, frame, "lidar", chosen), files[-1])
+        at = _frame(recording, frame, "lidar", chosen)
+        _scan(at if frame is not None else _frame_with_points(recording, at), files[-1])
     seen = [topic for topic in ("camera", "depth", "segmentation") if topic in topics]
     if seen:
         shown = _frame(recording, frame, seen[0], chosen)
@@ -197,6 +198,21 @@ def _frame(
 
 def _has(frame: RecordedFrame, topic: str) -> bool:
     return any(entry.topic == topic and entry.status in ("fresh", "held") for entry in frame.inputs)
+
+
+def _frame_with_points(recording: Recording, frame: RecordedFrame) -> RecordedFrame:
+    """The frame, or the last one before it whose LIDAR scan has points (`points_every` of the LIDAR)."""
+    until = [
+        other
+        for other in recording.frames()
+        if (other.episode, other.number) <= (frame.episode, frame.number)
+    ]
+    scanned = (
+        other
+        for other in reversed(until)
+        if any(len(scan.ray) for lidar in other.of("lidar", Lidar).values() for scan in lidar.scans)
+    )
+    return next(scanned, frame)
 
 
 def _worth(frame: RecordedFrame, user: tuple[str, str, str] | None) -> int:

@@ -3,7 +3,7 @@
 import gymnasium
 import caviar_clients.envs
 
-env = gymnasium.make("caviar/BeamSelection-v0", scenario="deploy/caviar_scenarios/geometric.toml")
+env = gymnasium.make("caviar/BeamSelection-v0", scenario="geometric")
 """
 
 import gymnasium
