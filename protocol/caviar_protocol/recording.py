@@ -338,8 +338,13 @@ class Recording:
 
     def entry(self, index: int) -> FrameEntry:
         """The frame record of the ``index``-th frame of the recording."""
+        segment, place = self.segment_of(index)
+        return segment.entries[place]
+
+    def segment_of(self, index: int) -> tuple[Segment, int]:
+        """The segment of the ``index``-th frame of the recording, and the frame's place in it."""
         number = bisect_right(self._starts, index) - 1
-        return self._segments[number].entries[index - self._starts[number]]
+        return self._segments[number], index - self._starts[number]
 
     def products_of(self, index: int) -> tuple[RecordedProduct, ...]:
         """The products of the ``index``-th frame, held ones fetched from where they stand."""
@@ -395,9 +400,8 @@ class Recording:
         return {(m.channel, m.frame): m.data for m in segment.messages(chunk)}
 
     def _place(self, index: int) -> tuple[Segment, Chunk]:
-        number = bisect_right(self._starts, index) - 1
-        segment = self._segments[number]
-        return segment, segment.chunks[index - self._starts[number]]
+        segment, place = self.segment_of(index)
+        return segment, segment.chunks[place]
 
     @cached_property
     def _late(self) -> dict[tuple[int, Channel, int], int]:

@@ -214,8 +214,14 @@ def why(
 
 
 @app.command(rich_help_panel=OPERATE)
-def doctor() -> None:
-    """Check what this machine has; for what is missing, say the command that mends it."""
+def doctor(
+    run: Annotated[Path | None, typer.Argument(help="directory of a damaged run", show_default=False)] = None,
+) -> None:
+    """Check what this machine has, or say what of a damaged RUN can be read, and save that beside it."""
+    if run is not None:
+        from caviar_clients.cli.rescue import rescue_run
+
+        raise typer.Exit(rescue_run(run, _console))
     from caviar_clients.cli import doctor as checks
 
     found = checks.doctor()

@@ -141,7 +141,7 @@ class Continuation:
             for item in entry.inputs:
                 self.stored.is_new(item)
             if writer is not None:
-                writer.write(entry, list(_products(segment, index)), base_ns)
+                writer.write(entry, list(stored_products(segment, index)), base_ns)
         if writer is None:
             return known or segment.record()
         record = writer.finish()
@@ -183,7 +183,7 @@ def _frames_to_keep(
     return frames, last
 
 
-def _products(segment: Segment, index: int) -> Iterator[FrameInput]:
+def stored_products(segment: Segment, index: int) -> Iterator[FrameInput]:
     """The stored products of a frame, under the provenance that they were stored with."""
     entry, chunk = segment.entries[index], segment.chunks[index]
     told = {

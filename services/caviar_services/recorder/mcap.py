@@ -23,6 +23,8 @@ scenery in ``assets/``. In a segment:
 
 from __future__ import annotations
 
+import errno
+import os
 import time
 from collections.abc import Mapping
 from datetime import UTC, datetime
@@ -152,6 +154,8 @@ class McapRecorder(Recorder[McapSettings]):
         try:
             segment.write(entry, new, base_ns)
             self._kept.written(segment)
+            if segment.removed:
+                raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(segment.path))
             if (
                 segment.size >= self.settings.segment_mib * 2**20
                 or segment.frames >= self.settings.segment_frames

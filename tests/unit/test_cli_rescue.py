@@ -1,0 +1,102 @@
+"""``caviar doctor RUN``: what it says of a damaged run, what it saves, and its status."""
+
+from __future__ import annotations
+
+import shutil
+from io import StringIO
+from pathlib import Path
+
+import pytest
+from recording_samples import frame, record, recorder
+from rich.console import Console
+
+from caviar_clients.cli.rescue import rescue_run
+from caviar_protocol.errors import RunError
+from caviar_protocol.recording import Recording
+from caviar_protocol.segment import Segment
+
+
+def rescue(run: Path) -> tuple[int, str]:
+    console = Console(width=300, file=StringIO(), record=True)
+    return rescue_run(run, console), console.export_text()
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_a_whole_run_is_said_to_be_whole_and_not_copied(tmp_path):
+    run = record(tmp_path / "run")
+    status, text = rescue(run)
+    assert status == 0
+    assert "5 frames can be read, up to frame 4 of episode 0" in text
+    assert list(tmp_path.iterdir()) == [run]
+
+
+def test_a_run_that_was_killed_is_whole_up_to_there(tmp_path):
+    made = recorder(tmp_path / "run")
+    made.step(frame(0))
+    status, text = rescue(tmp_path / "run")
+    made.close()
+    assert status == 0
+    assert "1 frames can be read, up to frame 0 of episode 0; it breaks off there" in text
+
+
+def test_what_can_be_read_of_a_damaged_recording_is_saved_beside_it(tmp_path):
+    run = record(tmp_path / "run", frames=6, segment_frames=3)
+    file = run / "recording-0001.mcap"
+    chunk = Segment(file).chunks[1]
+    data = bytearray(file.read_bytes())
+    data[chunk.stop - 20] ^= 1
+    file.write_bytes(data)
+    before = content(run)
+    status, text = rescue(run)
+    assert status == 1
+    assert content(run) == before
+    assert "5 frames can be read" in text
+    assert "frame 4 (recording-0001.mcap" in text
+    saved = tmp_path / "run-rescued"
+    assert f"what can be read of it is in {saved}" in text
+    assert [f.number for f in Recording(saved).frames()] == [0, 1, 2, 3, 5]
+    for stored in Recording(saved).frames():
+        assert [p.digest for p in stored.products] == [e.digest for e in stored.inputs]
+    assert rescue(run)[0] == 1
+    assert (tmp_path / "run-rescued-2").is_dir()
+
+
+def test_a_recording_without_its_last_segment_is_saved_without_damage(tmp_path):
+    run = record(tmp_path / "run", frames=6, segment_frames=3)
+    (run / "recording-0001.mcap").unlink()
+    status, text = rescue(run)
+    assert status == 1
+    assert "recording-0001.mcap is missing: lost are all frames behind frame 2" in text
+    assert Recording(tmp_path / "run-rescued").complete
+    assert Recording(tmp_path / "run-rescued").run_digest().damage == ()
+
+
+def test_a_part_of_which_nothing_can_be_read_is_lost(tmp_path):
+    run = record(tmp_path / "run")
+    (run / "recording-0000.mcap").write_bytes(bytes(5000))
+    (run / "run.json").write_bytes(b"")
+    status, text = rescue(run)
+    assert status == 2
+    assert "does not begin as an MCAP file" in text
+    assert "run.json is damaged: it is empty" in text
+
+
+def test_no_run_is_named(tmp_path):
+    with pytest.raises(RunError, match="is no directory; give the directory of a run"):
+        rescue(tmp_path / "nothing")
+
+
+def test_a_journal_is_saved_up_to_its_damage(tmp_path):
+    from caviar_broker.journal_format import MAGIC
+
+    run = record(tmp_path / "run")
+    (run / "journal.msgpack").write_bytes(MAGIC + bytes(200))
+    status, text = rescue(run)
+    assert status == 2  # without run.json, whose scenario this recording does not have either
+    assert "0 entries can be read" in text
+    assert "200 B are lost" in text
+    assert (tmp_path / "run-rescued" / "journal.msgpack").read_bytes() == MAGIC
+    shutil.rmtree(tmp_path / "run-rescued")
