@@ -17,6 +17,7 @@ from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario_checks import check_scenario, settings_place
 from caviar_protocol.tables import Place, Source, convert_table
 from caviar_protocol.toml_lines import dotted, key_lines
+from caviar_protocol.toml_text import MAX_SIZE, parse_toml
 
 _FILE = "file:"
 
@@ -48,7 +49,8 @@ def load_scenario(path: Path | str) -> Scenario:
     """
     path = find_scenario(path)
     try:
-        text = path.read_bytes().decode()
+        with path.open("rb") as stream:  # no more than that shows that it is too large
+            text = stream.read(4 * MAX_SIZE + 1).decode(errors="strict")
     except OSError as error:
         raise ScenarioError(f"cannot be read: {error.strerror}{_beside(path)}", str(path)) from error
     except UnicodeDecodeError as error:
@@ -60,7 +62,7 @@ def load_scenario(path: Path | str) -> Scenario:
 def parse_scenario(text: str, file: str = "", folder: Path | None = None) -> Scenario:
     """Check a scenario given as text; ``folder`` is what its ``file:`` paths are relative to."""
     try:
-        table = tomllib.loads(text)
+        table = parse_toml(text)
     except tomllib.TOMLDecodeError as error:
         raise _syntax_error(error, text, file) from error
     lines = {dotted(path): line for path, line in key_lines(text.replace("\r\n", "\n")).items()}

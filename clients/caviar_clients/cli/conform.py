@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -18,6 +17,7 @@ from caviar_clients.conform.report import as_json, as_markdown, summary
 from caviar_clients.conform.session import Rules
 from caviar_clients.files import write_file
 from caviar_protocol.errors import SetupError
+from caviar_protocol.toml_text import MAX_SIZE, parse_toml
 
 STYLES = {"pass": "green", "fail": "bold red", "not applicable": "dim"}
 
@@ -92,9 +92,10 @@ def settings_of(file: Path | None) -> dict[str, Any]:
     if file is None:
         return {}
     try:
-        text = file.read_text("utf-8")
-        found = json.loads(text) if file.suffix == ".json" else tomllib.loads(text)
-    except (OSError, ValueError) as error:
+        with file.open(encoding="utf-8") as stream:
+            text = stream.read(MAX_SIZE + 1)
+        found = json.loads(text) if file.suffix == ".json" else parse_toml(text)
+    except (OSError, ValueError, RecursionError) as error:
         raise SetupError(f"cannot read settings from {file}: {error}; give a TOML or JSON file") from error
     if not isinstance(found, dict):
         raise SetupError(f"{file} holds {type(found).__name__}, expected a table of settings")

@@ -12,6 +12,7 @@ import msgspec
 from caviar_protocol.errors import RunError
 from caviar_protocol.scenario import ServiceSpec
 from caviar_protocol.tables import suggestion
+from caviar_protocol.toml_text import parse_toml
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,7 +107,7 @@ def _settings(services: Mapping[str, ServiceSpec], texts: Sequence[str]) -> dict
 def _value(text: str) -> Any:
     """A value as TOML writes it; what is none is text."""
     try:
-        return tomllib.loads(f"value = {text}")["value"]
+        return parse_toml(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         return text
 
