@@ -181,7 +181,8 @@ class Segment:
         while position + _RECORD.size <= len(data) and not self.finished:
             opcode, length = _RECORD.unpack_from(data, position)
             start = position + _RECORD.size
-            fault = "does not fit" if start + length > len(data) else ""
+            is_cut = start + length > len(data)
+            fault = "does not fit" if is_cut else ""
             try:
                 fault = fault or self._take(opcode, start, start + length)
             except RecordingError as error:
@@ -194,7 +195,7 @@ class Segment:
                 continue
             following = _find(data, _SEAL_HEAD, position + 1)
             if following < 0:
-                if self._end_is_in_place() or data[position] not in _KNOWN_OPCODES:
+                if not is_cut or self._end_is_in_place() or data[position] not in _KNOWN_OPCODES:
                     self.damage.append(f"the record at byte {position} {fault}")
                 break
             self.damage.append(f"bytes {position} to {following}: the record {fault}")
