@@ -7,8 +7,10 @@ import time
 from pathlib import Path
 
 import pytest
-from broker_harness import MS, Client, eventually, plan, play_to_the_end, serving
+import zmq
+from broker_harness import MS, PATIENCE_S, Client, eventually, plan, play_to_the_end, serving
 from security_harness import Ring, pair, ring
+from zmq.utils.monitor import recv_monitor_message
 
 from caviar_broker.port import Port
 from caviar_broker.security.access import Access, answer
@@ -254,3 +256,46 @@ def test_a_service_connects_over_ipv6(tmp_path: Path) -> None:
         Client(broker.endpoint, "world") as client,
     ):
         client.join()
+
+
+FAILURES = zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL, zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
+
+
+@pytest.mark.parametrize(
+    ("key", "expected"),
+    [
+        ("authorized", (zmq.EVENT_HANDSHAKE_SUCCEEDED,)),
+        ("unknown", (zmq.EVENT_HANDSHAKE_FAILED_AUTH,)),
+        ("none", FAILURES),
+        ("of another broker", FAILURES),
+    ],
+)
+def test_a_socket_monitor_shows_what_the_specification_says(
+    tmp_path: Path, keys: Ring, key: str, expected: tuple[int, ...]
+) -> None:
+    """SPEC.md, section Transport: the event that ends the handshake."""
+    right = keys.authorize("world", "world")
+    shown = {
+        "authorized": right,
+        "unknown": keys.of(pair()),
+        "none": None,
+        "of another broker": k.Credentials(right.pair, pair().public),
+    }[key]
+    with (
+        serving(plan("world", "sensors"), tmp_path, access=keys.access()) as broker,
+        zmq.Context() as context,
+        context.socket(zmq.DEALER) as socket,
+        socket.get_monitor_socket() as monitor,
+    ):
+        socket.linger = 0
+        if shown is not None:
+            shown.give(socket)
+        socket.connect(broker.endpoint)
+        events = []
+        last = expected[0] if key == "authorized" else zmq.EVENT_DISCONNECTED
+        while not events or events[-1] != last:
+            assert monitor.poll(PATIENCE_S * 1000), events
+            events.append(recv_monitor_message(monitor)["event"])
+        handshake = [event for event in events if event in (*FAILURES, *expected)]
+        assert handshake[0] in expected
+        socket.disable_monitor()
