@@ -26,7 +26,7 @@ class Canonical extends Encoder {
   }
 }
 const encode = (value) => Buffer.from(new Canonical({ ignoreUndefined: true }).encode(value));
-const floats = (values) => values.map((value) => new Float(value));
+const floats = (values) => values.map((value) => new Float(value + 0));
 const sha256 = (...pieces) => pieces.reduce((hash, piece) => hash.update(piece), createHash("sha256")).digest("hex");
 const byBytes = (a, b) => Buffer.compare(Buffer.from(a), Buffer.from(b));
 const unlessEqual = (value, standard) => (JSON.stringify(value) === JSON.stringify(standard) ? undefined : value);
@@ -37,7 +37,7 @@ function product(topic, fields, arrays) { // arrays: name to [columns, rows]; al
   for (const [key, value] of Object.entries(fields)) {
     order[key] = value;
     if (value !== null) continue;
-    const [columns, rows] = arrays[key], numbers = Float64Array.from(rows.flat());
+    const [columns, rows] = arrays[key], numbers = Float64Array.from(rows.flat(), (value) => value + 0); // + 0: no −0
     order[key] = { dtype: "<f8", shape: [rows.length, columns], offset };
     bodies.push(Buffer.from(numbers.buffer));
     offset += numbers.byteLength;
