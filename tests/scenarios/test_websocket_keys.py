@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from api_harness import Peer
-from scenarios_support import caviar, running, scenario_file
+from scenarios_support import SCENARIOS, caviar, running, scenario_file
 from test_websocket_agent import FRAMES, WITHIN_S, WebRun, over_zeromq, python_agent
 from websockets.exceptions import ConnectionClosed
 
@@ -87,8 +87,14 @@ def test_other_tokens_are_refused_and_named_and_a_revoked_one_ends_the_part_that
         assert token not in events
 
 
-def test_without_tokens_the_gateway_of_a_broker_with_keys_lets_nobody_in(tmp_path: Path, keys: Path) -> None:
-    with locked_run(tmp_path, keys) as run:
-        why = refused(run.url)
-        assert "this broker has keys, and no tokens" in why
-        assert f"caviar keys token NAME --role ROLE --directory {keys}" in why
+@pytest.mark.parametrize("command", ["run", "broker"])
+def test_http_with_keys_and_without_tokens_is_refused_before_the_run(
+    tmp_path: Path, keys: Path, command: str
+) -> None:
+    out = tmp_path / "runs"
+    asked = ("--http", "127.0.0.1:0", "--keys", keys, "--out", out)
+    refused = caviar(command, SCENARIOS / "remote.toml", *asked)
+    assert refused.status == 1
+    assert f"{keys} holds no tokens" in refused.output.replace("\n", "")
+    assert f"caviar keys token NAME --role operator --directory {keys}" in refused.output.replace("\n", "")
+    assert "Traceback" not in refused.output

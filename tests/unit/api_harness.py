@@ -84,7 +84,7 @@ def site(
     if tokens is not None:
         (tmp_path / "tokens.toml").write_text(tokens)
         command += ["--keys", str(tmp_path)]
-    planned = plan(*(services or PAIR), **run)
+    planned = plan(*(services or PAIR), limits=limits, **run)
     with serving(planned, tmp_path, desk=tmp_path) as broker:
         process = subprocess.Popen(command, stderr=subprocess.PIPE)
         try:

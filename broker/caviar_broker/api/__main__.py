@@ -20,7 +20,7 @@ from caviar_protocol.keys import Credentials, Pair
 async def serve(run: Path, address: str, keys: Path | None) -> None:
     """Serve until the broker ends. Raises `RunError` where none runs there, or the address is taken."""
     from caviar_broker.api.app import make_app
-    from caviar_broker.api.gateway import REMEDY, Gateway
+    from caviar_broker.api.gateway import NOTE, REMEDY, Gateway
     from caviar_broker.api.http_server import http_server, listening_socket
 
     desk = DeskLink(run)
@@ -37,7 +37,14 @@ async def serve(run: Path, address: str, keys: Path | None) -> None:
     remedy = f"{REMEDY} --directory {keys}" if keys is not None else REMEDY
     gateway = Gateway(_reachable(status["endpoint"]), tokens, tell, credentials, remedy)
     listening = listening_socket(host, port)
-    server = http_server(make_app(desk, tokens, gateway))
+    told: set[asyncio.Task[None]] = set()
+
+    def tell_soon(text: str) -> None:
+        task = asyncio.create_task(tell("", text, NOTE))
+        told.add(task)
+        task.add_done_callback(told.discard)
+
+    server = http_server(make_app(desk, tokens, gateway), tell_soon, own_process=True)
 
     async def end_with_the_broker() -> None:
         async for _ in desk.events():

@@ -42,7 +42,7 @@ def gateway_in_front(endpoint: str, address: str, tell: Callable[[str], None]) -
             tell(text)
 
         gateway = Gateway(endpoint, Tokens(None), note)
-        servers.append(http_server(Starlette(routes=[WebSocketRoute("/ws", gateway.serve)])))
+        servers.append(http_server(Starlette(routes=[WebSocketRoute("/ws", gateway.serve)]), tell))
         try:
             await servers[0].serve(sockets=[listening])
         finally:

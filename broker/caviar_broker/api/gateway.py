@@ -17,6 +17,7 @@ import zmq.asyncio
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from caviar_broker.api.door import foreign, subprotocol, token_of, token_shown
+from caviar_broker.api.strangers import ADMIT
 from caviar_broker.api.tokens import Tokens
 from caviar_broker.grumbles import Grumbles
 from caviar_protocol import messages as m
@@ -35,7 +36,9 @@ QUEUE = 16
 """Messages that wait in either direction."""
 LOOK_S = 1.0
 """[s] between looks at whether a token still holds."""
-MAX_CONNECTIONS = 256
+MESSAGES_BEFORE_HELLO = 8
+"""Messages of a WebSocket until the broker has accepted its HELLO or ATTACH. Beyond twice as many, the broker
+would cut off the gateway's connection, and bar its key."""
 TOO_LARGE = 1009
 REMEDY = "make one with  caviar keys token NAME --role ROLE"
 ABNORMAL = 1006
@@ -90,14 +93,11 @@ class Gateway:
         if why := self._refusal(socket, token, token_shown(socket.headers, offered)):
             await self._refuse(socket, why)
             return
-        if self.connections >= MAX_CONNECTIONS:
-            await socket.accept(subprotocol(offered))
-            await _close(socket, 1013, f"there are {MAX_CONNECTIONS} connections already")
-            return
         self.connections += 1
         try:
             await socket.accept(subprotocol(offered))
-            await _Bridge(socket, self._dealer(), self._tokens, token, self._tell, self._refused).run()
+            bridge = _Bridge(socket, self._dealer, self._tokens, token, self._tell, self._refused)
+            await bridge.run()
         finally:
             self.connections -= 1
 
@@ -109,7 +109,7 @@ class Gateway:
             what = f"the token of {token.name!r} is for {token.role}, and a service takes part here"
             return "" if token.of_service else f"{what}; {self._remedy}"
         if not self._tokens.exist:
-            return "" if self._credentials is None else f"this broker has keys, and no tokens; {self._remedy}"
+            return ""
         what = "this token is not, or no longer, known" if shown else "there is no token in the request"
         return f"{what}; {self._remedy}"
 
@@ -155,14 +155,19 @@ class _Bridge:
     def __init__(
         self,
         socket: WebSocket,
-        dealer: zmq.asyncio.Socket,
+        connect: Callable[[], zmq.asyncio.Socket],
         tokens: Tokens,
         token: Token | None,
         tell: Tell,
         refused: Callable[[str, str], Awaitable[None]],
     ) -> None:
-        self._socket, self._dealer, self._tell, self._refused = socket, dealer, tell, refused
+        self._socket, self._tell, self._refused = socket, tell, refused
         self._tokens, self._token = tokens, token
+        self._connect = connect
+        self._dealer: asyncio.Future[zmq.asyncio.Socket] = asyncio.get_running_loop().create_future()
+        """Made for a peer that says who it is: one that is silent costs the broker nothing."""
+        self._admitted, self._messages = False, 0
+        """Whether the broker has accepted the peer, and how many messages of it came before that."""
         self._welcome: m.Welcome | None = None
         """What the peer is told on its ordered connection; None before, and once it has said BYE."""
         self._awaits_welcome = False
@@ -180,7 +185,8 @@ class _Bridge:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
-            self._dealer.close()
+            if self._dealer.done():
+                self._dealer.result().close()
         for task in done:
             error = task.exception()
             if isinstance(error, _CutOff):
@@ -206,6 +212,9 @@ class _Bridge:
                 await self._note_end(event.get("code", ABNORMAL))
                 return
             frame = event.get("bytes")
+            self._messages += not self._admitted
+            if self._messages > MESSAGES_BEFORE_HELLO:
+                raise _CutOff(1008, f"more than {MESSAGES_BEFORE_HELLO} messages, and no HELLO was accepted")
             if frame is None:
                 raise _CutOff(1003, "it sent text; a message is one binary frame")
             try:
@@ -214,7 +223,12 @@ class _Bridge:
                 await self._answer(m.Error(code=error.code, message=str(error)))
                 raise _CutOff(1007, f"it sent a frame that is no message: {error}") from error
             parts[0] = await self._header(parts[0])
-            await self._dealer.send_multipart(parts)
+            await self._forward(parts)
+
+    async def _forward(self, parts: list[Any]) -> None:
+        if not self._dealer.done():
+            self._dealer.set_result(self._connect())
+        await self._dealer.result().send_multipart(parts)
 
     async def _note_end(self, code: int) -> None:
         """The peer is gone: a closing handshake counts as BYE; without one the broker sees that, not why."""
@@ -222,7 +236,7 @@ class _Bridge:
             if self._welcome is not None:
                 who = {"epoch": self._welcome.epoch, "attempt": self._welcome.attempt}
                 bye = m.Bye(**who, reason=f"it closed its WebSocket (code {code})")
-                await self._dealer.send_multipart([encode_message(bye)])
+                await self._forward([encode_message(bye)])
             return
         reason = {
             ABNORMAL: "its process ended, its machine is unreachable, or it has not read for long",
@@ -281,10 +295,11 @@ class _Bridge:
     # --- to the peer --------------------------------------------------------------------------------
 
     async def _down(self) -> None:
+        dealer = await asyncio.shield(self._dealer)  # the one who waits may be cancelled, and not the future
         while True:
-            parts = await self._dealer.recv_multipart(copy=False)
-            if self._awaits_welcome:
-                self._read_welcome(parts[0].buffer)
+            parts = await dealer.recv_multipart(copy=False)
+            if self._awaits_welcome or not self._admitted:
+                self._read_answer(parts[0].buffer)
             frame = join_parts([part.buffer for part in parts])
             patience = SLOW_S + self._sent / SLOW_RATE
             try:
@@ -294,12 +309,16 @@ class _Bridge:
                 raise _CutOff(1008, f"it has not read for {patience:.3g} s") from error
             self._sent = len(frame)
 
-    def _read_welcome(self, header: memoryview) -> None:
-        """Learn epoch and attempt from WELCOME; what cannot be read here is the peer's to judge."""
+    def _read_answer(self, header: memoryview) -> None:
+        """Learn from WELCOME, or the answer to ATTACH, that the peer is accepted, and as what; what cannot be
+        read here is the peer's to judge."""
         with contextlib.suppress(ProtocolError):
             message = decode_message(header)
             if isinstance(message, m.Welcome):
                 self._welcome, self._awaits_welcome = message, False
+            if isinstance(message, m.Welcome | m.HeartbeatAck):
+                self._admitted = True
+                self._socket.scope.get("state", {}).get(ADMIT, _no_limits)()
 
     async def _watch_token(self) -> None:
         """A token that is revoked ends what came in with it."""
@@ -307,6 +326,10 @@ class _Bridge:
             await asyncio.sleep(LOOK_S)
             if self._token is not None and not self._tokens.holds(self._token):
                 raise _CutOff(1008, "its token was revoked")
+
+
+def _no_limits() -> None:
+    """What admits a peer where the server has no limits for strangers."""
 
 
 async def _send(socket: WebSocket, message: m.Message) -> None:

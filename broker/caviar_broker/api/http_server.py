@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import gc
 import socket
+from collections.abc import Callable
 from typing import Any
 
 import uvicorn
 
+from caviar_broker.api.strangers import Strangers
 from caviar_protocol.errors import RunError
+from caviar_protocol.host import steady_memory
 from caviar_protocol.websocket import MAX_FRAME
 
 UNREACHABLE_MS = 8000
@@ -15,16 +19,31 @@ UNREACHABLE_MS = 8000
 SEND_BUFFER = 1 << 18
 """[B] that the system keeps for a peer at most, so that one that does not read is noticed soon."""
 BACKLOG = 128
-MAX_CONNECTIONS = 512
+"""Connections that are accepted at once, before any of them is looked at."""
 
 
-def http_server(app: Any) -> uvicorn.Server:
-    """A server of an ASGI application, WebSockets included, that has not begun to serve."""
+def http_server(app: Any, tell: Callable[[str], None], *, own_process: bool = False) -> uvicorn.Server:
+    """A server of an ASGI application, WebSockets included, that has not begun to serve.
+
+    Parameters
+    ----------
+    app
+        The application; ``scope["state"]["admit"]`` of a WebSocket is to be called once its peer is accepted.
+    tell
+        Is told of connections that were ended because there were too many.
+    own_process
+        Whether the process is this server's own, so that its memory may be tuned for it.
+    """
+    if own_process:
+        steady_memory()
+        gc.collect()
+        gc.freeze()  # what is loaded stays, and need not be looked at whenever a connection has ended
+    http, websockets = Strangers(tell, own_process).protocols()
     config = uvicorn.Config(
         app,
         loop="asyncio",
-        http="h11",
-        ws="websockets-sansio",
+        http=http,
+        ws=websockets,
         ws_max_size=MAX_FRAME,
         ws_ping_interval=None,  # a busy peer answers no pings, and is not gone
         ws_per_message_deflate=False,
@@ -32,7 +51,7 @@ def http_server(app: Any) -> uvicorn.Server:
         log_level="warning",
         access_log=False,
         server_header=False,
-        limit_concurrency=MAX_CONNECTIONS,
+        backlog=BACKLOG,
         timeout_graceful_shutdown=1,
     )
     return uvicorn.Server(config)

@@ -69,13 +69,20 @@ class Tokens:
 def http_address(text: str, keys: Path | None) -> tuple[str, int]:
     """Host and port of ``HOST:PORT``.
 
-    Raises `SetupError` where it is none, or where other machines could reach it without a token.
+    Raises `SetupError` where it is none, where other machines could reach it without a token, and where a
+    broker with keys has no tokens: a process of this machine without a key could then stop the run.
     """
     host, _, port = text.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")
     if not host or not port.isascii() or not port.isdigit() or int(port) > 65535:
         raise SetupError(f"{text!r} is no address for HTTP; write HOST:PORT, such as 127.0.0.1:8080")
-    if not is_loopback(host) and not Tokens(keys).exist:
+    if keys is not None and not Tokens(keys).exist:
+        raise SetupError(
+            f"HTTP at {text} would let every process of this machine in, though the broker asks for keys: "
+            f"{keys} holds no tokens; make one with  caviar keys token NAME --role operator --directory "
+            f"{keys},  or leave out --http"
+        )
+    if not is_loopback(host) and keys is None:
         raise SetupError(
             f"HTTP at {text} could be reached by others, and there are no tokens; make one with  "
             "caviar keys token NAME --role operator  and give --keys, or choose 127.0.0.1"
