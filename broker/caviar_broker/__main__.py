@@ -32,7 +32,7 @@ from caviar_broker.deskplace import refuse_second
 from caviar_broker.journal import JournalFile
 from caviar_broker.processes import reserve_descriptors
 from caviar_broker.record import RunRecord, read_record
-from caviar_broker.recorded import sync_recording
+from caviar_broker.recorded import has_recording, recorded_frames, sync_recording
 from caviar_broker.replaying import with_replay
 from caviar_broker.resume import Left, read_resumption
 from caviar_broker.scheduling import prefer
@@ -43,6 +43,7 @@ from caviar_broker.server import BrokerServer
 from caviar_broker.versions import changes, versions_of
 from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.host import steady_memory
+from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario_checks import with_overrides
 from caviar_protocol.scenario_loader import load_scenario
 
@@ -74,8 +75,12 @@ def serve(arguments: argparse.Namespace) -> int:
     durability = record.scenario.run.durability
     checkpoints = CheckpointFiles(directory, durable=durability != "none")
     # A launcher that starts its broker again has not summed the run up yet.
-    last, episodes = "summary.json" if arguments.control else LATENCIES, record.scenario.run.episodes
-    left = _left(directory, checkpoints, episodes, last) if arguments.resume else _NOTHING
+    last = "summary.json" if arguments.control else LATENCIES
+    left = _left(directory, record.scenario, checkpoints, last) if arguments.resume else _NOTHING
+    if left.is_cut and not has_recording(directory) and not arguments.force:
+        raise RunError(
+            f"cannot go on with {directory}: its recording is gone; put it back, or begin again with --force"
+        )
     resumption = left.resumption
     scheduling = prefer()  # before the threads of the port are started, which inherit it
     reporter = Reporter(sys.stdout.fileno(), directory / "events.jsonl", arguments.control)
@@ -177,21 +182,24 @@ def _resumed(arguments: argparse.Namespace) -> tuple[RunRecord, Path, tuple[str,
 _NOTHING = Left(None, None, ())
 
 
-def _left(directory: Path, checkpoints: CheckpointFiles, episodes: int, last: str) -> Left:
-    """What the journal says.
+def _left(directory: Path, scenario: Scenario, checkpoints: CheckpointFiles, last: str) -> Left:
+    """What journal and recording say.
 
     Raises `RunError` where every frame is finished and there is the file that is written ``last``.
     """
     journal = directory / JOURNAL
-    left = read_resumption(journal, checkpoints) if journal.exists() else _NOTHING
+    if not journal.exists():
+        return _NOTHING
+    recorded, damage = recorded_frames(directory, scenario)
+    left = read_resumption(journal, checkpoints, recorded)
     found = left.resumption
-    over = found is not None and found.finished >= found.frames and found.episode + 1 >= episodes
-    if over and (directory / last).exists():
+    over = found is not None and found.finished >= found.frames and found.episode + 1 >= scenario.run.episodes
+    if over and (directory / last).exists() and (directory / last).stat().st_size:
         raise RunError(
             f"cannot go on with {directory}: all its frames are finished, and so is it; "
             "to run its scenario again leave out --resume"
         )
-    return left
+    return replace(left, losses=(*damage, *left.losses)) if left.is_cut else left
 
 
 def _made(directory: Path) -> Path:

@@ -35,6 +35,8 @@ class Left:
     """Where the journal goes on [B]; None: where its log ends."""
     losses: tuple[str, ...]
     """What is lost, a line each."""
+    is_cut: bool = False
+    """Whether the recording lacks frames that were finished."""
 
 
 def read_resumption(
@@ -54,9 +56,8 @@ def read_resumption(
     reader, found = JournalReader(journal), _Reader(checkpoints, recorded)
     end = reader.end
     for entry in reader:
-        if recorded is not None and entry.outcome == "episode" and entry.episode > recorded[0]:
-            found.is_cut = True  # what the recording lacks will be decided anew
-            break
+        if found.is_cut and entry.outcome == "episode":
+            break  # frames before it are run again
         found.take(entry)
         end = reader.end
     resumption = found.resumption()
@@ -65,8 +66,8 @@ def read_resumption(
     if reader.problem:
         losses.append(f"{reader.problem}; {reader.lost} B behind it are lost, and the run goes on with {at}")
     if found.is_cut:
-        losses.append(f"the recording ends before {at}, later frames of the journal are run again")
-    return Left(resumption, end, tuple(losses))
+        losses.append(f"the recording ends before {at}: what the journal has from there on is run again")
+    return Left(resumption, end, tuple(losses), found.is_cut)
 
 
 class _Reader:

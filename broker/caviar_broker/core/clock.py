@@ -167,9 +167,9 @@ class FrameClock:
         return 0 if schedule is None else schedule.finished_frames
 
     def snapshot(self) -> Snapshot | None:
-        """The run up to its last finished frame; None between episodes. Actions that wait come later."""
+        """The run up to its last finished frame; None where the episode has none."""
         run, schedule = self._run, self._episodes.schedule
-        if schedule is None:
+        if schedule is None or not schedule.finished_frames:
             return None
         return Snapshot(
             episode=run.episode,
