@@ -112,8 +112,10 @@ def serve(arguments: argparse.Namespace) -> int:
                 Control(server)
             stopped = stop_on_signals(server)
             reporter.listening(server.endpoint)
-            for line in (*forced, *left.losses):
+            for line in forced:
                 server.note("", line)
+            for line in left.losses:
+                server.note("", line, "damage")
             beside.start(server)
             tune_collector()
             outcome = server.run()

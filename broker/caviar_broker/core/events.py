@@ -201,7 +201,7 @@ class Notice(msgspec.Struct, frozen=True):
 
     kind: str
     """``miss``, ``late``, ``skipped``, ``fault``, ``lost``, ``away``, ``back``, ``refused``, ``idle``,
-    ``lag``, ``stale``, ``discarded``, ``differs`` or ``note``."""
+    ``lag``, ``stale``, ``discarded``, ``differs``, ``disk``, ``damage`` or ``note``."""
     service: str
     text: str
     episode: int = 0

@@ -21,9 +21,14 @@ from caviar_broker.record import read_record
 from caviar_broker.security.local import check_bind
 from caviar_clients.cli.inside import EmbeddedLauncher
 from caviar_clients.cli.launch import Launcher
+from caviar_clients.cli.recording_check import with_recording_checked
 from caviar_clients.cli.remote import key_text, reachable, start_command, waiting_text
 from caviar_clients.cli.scenarios import require_extras
-from caviar_clients.cli.summary import recorded_figures, summary_of, summary_table
+from caviar_clients.cli.summary import (
+    recorded_figures,
+    summary_of,
+    summary_table,
+)
 from caviar_clients.files import reason, write_file
 from caviar_clients.sessions.checking import checked_scenario
 from caviar_clients.sessions.plausibility import implausible_values
@@ -135,6 +140,7 @@ def _follow(
             watcher.take(event)
             if event["event"] == "finished":
                 outcome = event
+    outcome = with_recording_checked(directory, scenario, outcome)
     recorded = recorded_figures(directory) if outcome["frames"] else None
     summary = summary_of(outcome, recorded, scenario.run.name, directory, scenario.run.seed, warnings)
     if outcome["frames"]:
