@@ -114,8 +114,8 @@ def serve(arguments: argparse.Namespace) -> int:
             reporter.listening(server.endpoint)
             for line in forced:
                 server.note("", line)
-            for line in left.losses:
-                server.note("", line, "damage")
+            if left.losses:
+                server.note("", "; ".join(left.losses), "damage")
             beside.start(server)
             tune_collector()
             outcome = server.run()
