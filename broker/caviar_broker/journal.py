@@ -31,7 +31,7 @@ from caviar_broker.retention import Located, needed
 from caviar_protocol.durability import sync_file
 from caviar_protocol.errors import RunError
 
-COMPACT_BYTES = 16 << 20
+COMPACT_BYTES = 8 << 20
 """[B] that a journal grows by before it is compacted."""
 CUT_SUFFIX = ".cut"
 """Of the file that keeps what was cut off a damaged journal."""

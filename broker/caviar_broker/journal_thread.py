@@ -74,6 +74,8 @@ class JournalThread:
         self.error: RunError | None = None
         """Why no more entries are confirmed."""
         self._batches: queue.SimpleQueue[_Batch | None] = queue.SimpleQueue()
+        self._last = 0
+        """Number of the last entry that was submitted."""
         self._compacting = False
         self._since: float | None = None
         """When the batch that is under way was handed to the thread [s]."""
@@ -124,6 +126,7 @@ class JournalThread:
             Of the same instant, where one is wanted.
         """
         batch = _Batch(entries, finished, snapshot)
+        self._last = batch.entries[-1].number
         self._compacting |= snapshot is not None
         self._since = time.monotonic()
         self._batches.put(batch)
@@ -131,16 +134,16 @@ class JournalThread:
             self._since = None
             return
         batch.awaited = False
-        if self._is_through(batch):
-            self._since = None
-
-    def _is_through(self, batch: _Batch) -> bool:
-        return self.error is not None or self.confirmed >= batch.entries[-1].number
+        self._look_whether_through()
 
     def take_note(self) -> None:
         """The descriptor is readable: the batch that was under way is confirmed, or failed."""
         os.eventfd_read(self.fd)
-        self._since = None
+        self._look_whether_through()
+
+    def _look_whether_through(self) -> None:
+        if self.error is not None or self.confirmed >= self._last:
+            self._since = None
 
     def waiting_s(self) -> tuple[float, str]:
         """For how long the batch that is under way has waited [s], and for what."""
