@@ -10,8 +10,12 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from caviar_broker.aside import Aside
+
 MAX_PENDING = 1 << 18
 """[B] of lines kept in memory; what comes behind them is read back from the log."""
+LOG_S = 0.1
+"""[s] that is waited for the disk to take a line of the log."""
 CHUNK = select.PIPE_BUF
 """[B] a pipe that polls as writable takes without blocking."""
 
@@ -39,6 +43,9 @@ class Outbox:
         self._fd, self._render = fd, render
         self._log = log.open("a+b", buffering=0)
         self._size = self._log.seek(0, os.SEEK_END)
+        self._aside = Aside()
+        self._unlogged = bytearray()
+        """Lines that wait for a disk that does not answer."""
         self._behind: int | None = None
         """Where in the log the notices begin that did not fit into memory; None: all did."""
         self._pending = bytearray()
@@ -100,7 +107,8 @@ class Outbox:
 
     def close(self) -> None:
         """Close the log; the descriptor is its owner's."""
-        self._log.close()
+        if not self._aside.is_busy:
+            self._log.close()
 
     def _encode(self, line: Line) -> bytes:
         return self._render(line).encode(errors="backslashreplace") + b"\n"
@@ -117,12 +125,20 @@ class Outbox:
 
     def _write_log(self, line: Line) -> bool:
         data = json.dumps(line, ensure_ascii=False).encode(errors="backslashreplace") + b"\n"
+        if self._aside.is_busy:
+            if len(self._unlogged) < MAX_PENDING:
+                self._unlogged += data
+            else:
+                self.log_error = "the disk did not answer"
+            return False
+        data, self._unlogged = bytes(self._unlogged) + data, bytearray()
         try:
-            self._size += self._log.write(data) or 0
+            in_time = self._aside.call(lambda: self._log.write(data), LOG_S)
         except OSError as error:
             self.log_error = error.strerror or str(error)
             return False
-        return True
+        self._size += len(data)
+        return in_time
 
     def _read_back(self) -> None:
         """Take the next lines from the log into memory."""
