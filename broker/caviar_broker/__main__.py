@@ -22,6 +22,7 @@ from pathlib import Path
 
 import msgspec
 
+from caviar_broker.aside import Aside
 from caviar_broker.beside import HttpBeside
 from caviar_broker.briefing import briefings, with_ownership
 from caviar_broker.checkpoints import CheckpointFiles
@@ -41,6 +42,7 @@ from caviar_broker.security.guard import PeerLimits
 from caviar_broker.security.local import check_bind
 from caviar_broker.server import BrokerServer
 from caviar_broker.versions import changes, versions_of
+from caviar_protocol.durability import file_system_of
 from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.host import steady_memory
 from caviar_protocol.scenario import Scenario
@@ -49,6 +51,8 @@ from caviar_protocol.scenario_loader import load_scenario
 
 JOURNAL = "journal.msgpack"
 LATENCIES = "latency.npz"
+SAVE_S = 5.0
+"""[s] that is waited for the disk to take the latencies."""
 DEFAULT_BIND = "tcp://127.0.0.1:5570"
 
 
@@ -120,8 +124,9 @@ def serve(arguments: argparse.Namespace) -> int:
             tune_collector()
             outcome = server.run()
     statistics = server.statistics
-    statistics.save(directory / LATENCIES)
+    takes_files = server.disk_answers and Aside().call(lambda: statistics.save(directory / LATENCIES), SAVE_S)
     reporter.finished(
+        disk="" if takes_files else f"the disk does not answer: {file_system_of(directory)}",
         error=outcome.error,
         culprit=outcome.culprit,
         digest=outcome.digest,

@@ -13,10 +13,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from caviar_broker.aside import Aside
 from caviar_protocol.errors import RunError
 
 SOCKET, NOTE = "control.sock", "control.json"
 BACKLOG = 16
+REMOVE_S = 1.0
+"""[s] that is waited for the disk to remove them."""
 REACH_S = 2.0
 """[s] that a broker gets to accept a connection and to answer a request."""
 
@@ -59,8 +62,11 @@ class DeskPlace:
             raise RunError(f"cannot write {note}: {error.strerror}") from error
 
     def close(self) -> None:
-        """Remove socket and note."""
+        """Remove socket and note, unless the disk does not answer."""
         self.socket.close()
+        Aside().call(self._remove, REMOVE_S)
+
+    def _remove(self) -> None:
         for name in (SOCKET, NOTE):
             (self._directory / name).unlink(missing_ok=True)
         if self._elsewhere:

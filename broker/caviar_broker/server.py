@@ -349,6 +349,7 @@ class BrokerServer:
     def _journal_answered(self) -> None:
         """A batch that took its time is confirmed, or failed."""
         self._journal.take_note()
+        self._look_at_disk()
         self._take_confirmed()
         self.clock.settle(time.monotonic_ns())
         self._perform()

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import os
+import threading
+import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import pytest
 from broker_harness import PAIR, Client, eventually, finishes_well, plan, play_to_the_end, playing, serving
 
-from caviar_broker.core.events import Journal
+from caviar_broker import journal_thread, server
+from caviar_broker.core.events import Journal, StopRequested
 from caviar_broker.journal import JournalFile
 from caviar_broker.journal_format import read_journal
 from caviar_protocol import messages as m
@@ -117,3 +122,60 @@ def test_a_journal_that_cannot_be_written_ends_the_run_in_order(tmp_path: Path) 
         assert isinstance(last, m.Shutdown)
         sensors.send(m.Bye(**sensors.ids))
         assert "no space left" in broker.outcome().error
+
+
+class Frozen(JournalFile):
+    """A journal on a disk that takes nothing of a frame until it is told to."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, 1)
+        self.thawed = threading.Event()
+
+    def write(self, entries: Iterable[Journal]) -> None:
+        written = list(entries)
+        if any(entry.frame == 1 for entry in written):
+            self.thawed.wait(30)
+        super().write(written)
+
+
+@pytest.mark.parametrize("thaws", [True, False])
+def test_a_disk_that_does_not_answer_is_told_of_and_holds_up_only_what_relies_on_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, thaws: bool
+) -> None:
+    monkeypatch.setattr(server, "DISK_NOTE_S", 0.05)
+    monkeypatch.setattr(journal_thread, "END_S", 0.1)
+    made: list[Frozen] = []
+
+    def frozen(path: Path) -> Frozen:
+        made.append(Frozen(path))
+        return made[0]
+
+    with (
+        serving(plan(*PAIR), tmp_path, frozen) as broker,
+        playing(broker.endpoint, *PAIR) as (world, sensors),
+    ):
+        for _ in range(2):
+            world.answer()
+            sensors.answer()
+        told = "the disk does not answer: write of"
+        eventually(lambda: told in broker.witness.texts(), "the disk is told of")
+        assert "mounted at" in broker.witness.texts()
+        assert broker.server.clock.look(time.monotonic_ns()).frame == 1  # it can be asked
+        if thaws:
+            made[0].thawed.set()
+            play_to_the_end([world, sensors], 1)
+            assert finishes_well(broker)
+            assert "the disk answers again" in broker.witness.texts()
+            return
+        broker.server.loop.watch(stop := os.eventfd(1), lambda: _stop(broker.server, stop))
+        for client in (world, sensors):
+            assert "stopped by Ctrl-C" in client.bye().reason
+        assert broker.outcome().error == "stopped by Ctrl-C"
+        assert not broker.server.disk_answers
+        made[0].thawed.set()
+
+
+def _stop(broker: server.BrokerServer, fd: int) -> None:
+    broker.loop.unwatch(fd)
+    os.close(fd)
+    broker.feed(StopRequested("stopped by Ctrl-C"))

@@ -10,6 +10,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+KILLED_S = 2.0
+"""[s] within which a process ends that is killed, unless it waits for a disk."""
 TAIL = 1 << 16
 """[B] of a log that are looked at for its last line."""
 
@@ -46,8 +48,8 @@ class Child:
         return lines[-1] if lines else ""
 
 
-def end(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> None:
-    """End all: SIGTERM, and after so long [s] SIGKILL."""
+def end(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> list[int]:
+    """End all: SIGTERM, and after so long [s] SIGKILL; who waits for a disk and cannot be ended before."""
     for process in processes:
         if process.poll() is None:
             process.send_signal(signal.SIGTERM)
@@ -55,7 +57,8 @@ def end(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> None:
     for process in processes:
         if process.poll() is None:
             process.kill()
-        process.wait()
+    wait(processes, KILLED_S)
+    return [process.pid for process in processes if process.poll() is None]
 
 
 def wait(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> None:

@@ -77,6 +77,8 @@ class Launcher:
     """Whether the user wants the run to end."""
     _finished: bool = False
     """Whether the broker's output has ended."""
+    _disk: str = ""
+    """Why processes of the run may not end; "" where the disk answers."""
     _give_up_at: float | None = None
     """When a broker that all services have left must have ended [s]; None while one is left."""
 
@@ -211,7 +213,11 @@ class Launcher:
                 self._brokers = 0
             if event["event"] == "finished":
                 self._over, self._frames = True, event["frames"]
+                self._disk = event.get("disk", "")
             yield event
+            if self._disk:  # the broker ends once the disk answers
+                self._finished = True
+                yield {"event": "ended", "status": 1}
 
     def _look_after_broker(self) -> None:
         """End a broker that is stopped; that it has ended is then seen like any other end."""
@@ -330,8 +336,8 @@ class Launcher:
                 self._broker.stdin.close()
         # Before the first frame some services may not have connected, so that no SHUTDOWN reached them.
         grace = self.scenario.timeouts.shutdown_s if self._frames else 0.0
-        wait(processes, grace)
-        end(processes, self.scenario.timeouts.shutdown_s + KILL_AFTER_S)
+        wait(processes, 0.0 if self._disk else grace)
+        end(processes, KILL_AFTER_S + (0.0 if self._disk else self.scenario.timeouts.shutdown_s))
         for child in self._children.values():
             os.close(child.pidfd)
         if self._broker is not None and self._broker.stdout is not None:

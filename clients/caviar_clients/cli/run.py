@@ -140,6 +140,10 @@ def _follow(
             watcher.take(event)
             if event["event"] == "finished":
                 outcome = event
+    if outcome.get("disk"):
+        words = f"{outcome['error']}; there is no summary, since {outcome['disk']}"
+        console.print(Text.assemble(("the run ended early:", "red"), f" {words}"), soft_wrap=True)
+        return 130 if interrupted.came else 1
     outcome = with_recording_checked(directory, scenario, outcome)
     recorded = recorded_figures(directory) if outcome["frames"] else None
     summary = summary_of(outcome, recorded, scenario.run.name, directory, scenario.run.seed, warnings)
