@@ -129,12 +129,13 @@ class Frozen(JournalFile):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, 1)
-        self.thawed = threading.Event()
+        self.thawed, self.reached = threading.Event(), threading.Event()
 
     def write(self, entries: Iterable[Journal]) -> None:
         written = list(entries)
         if any(entry.frame == 1 for entry in written):
-            self.thawed.wait(30)
+            self.reached.set()
+            self.thawed.wait(60)
         super().write(written)
 
 
@@ -142,7 +143,7 @@ class Frozen(JournalFile):
 def test_a_disk_that_does_not_answer_is_told_of_and_holds_up_only_what_relies_on_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, thaws: bool
 ) -> None:
-    monkeypatch.setattr(server, "DISK_NOTE_S", 0.05)
+    monkeypatch.setattr(server, "DISK_NOTE_S", 0.5)
     monkeypatch.setattr(journal_thread, "END_S", 0.1)
     made: list[Frozen] = []
 
@@ -157,6 +158,7 @@ def test_a_disk_that_does_not_answer_is_told_of_and_holds_up_only_what_relies_on
         for _ in range(2):
             world.answer()
             sensors.answer()
+        assert made[0].reached.wait(30)
         told = "the disk does not answer: write of"
         eventually(lambda: told in broker.witness.texts(), "the disk is told of")
         assert "mounted at" in broker.witness.texts()
