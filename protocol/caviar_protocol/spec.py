@@ -35,6 +35,7 @@ SINCE: dict[str, str] = {
     "Welcome.rejoin_ns": "1.3",
     "Prepare.prefixes": "1.3",
     "Fault.culprit": "1.3",
+    "WaypointCommand.at_once": "1.3",
 }
 """Minor version that brought a field (``Grant.reports``) or a class (``Grant``); 1.0 unless said here."""
 

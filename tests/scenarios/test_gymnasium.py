@@ -19,11 +19,14 @@ from scenarios_support import SCENARIOS, caviar, pid_of, running, scenario_file
 
 from caviar_clients.envs.beam_selection import BeamSelectionEnv
 from caviar_clients.envs.uav_path import UavPathEnv
+from caviar_clients.envs.uav_path_v1 import UavPathV1Env
 from caviar_clients.sessions.connected import ConnectedSession
 from caviar_protocol.errors import PayloadError, RunError
 from caviar_protocol.messages import Input
 from caviar_protocol.recording import Recording
 from caviar_protocol.topics import Action, VelocityCommand
+from caviar_services.meshes import box
+from caviar_services.world.shapes import joined, ply
 
 PARTS = ("aoa", "aod", "position", "velocity", "last_abs_y")
 FRAMES, EPISODES, BEAMS = 60, 3, 64
@@ -368,3 +371,62 @@ def test_the_same_seed_and_the_same_flight_give_the_same_channel() -> None:
             found.append([env.step(np.array([0.2, 0.9, -0.1], np.float32))[1] for _ in range(8)])
     assert found[0] == found[1]
     assert len(set(found[0])) == 8
+
+
+# --- version 1, over open ground -----------------------------------------------------------------------
+
+
+def open_ground(folder: Path) -> Path:
+    """The shipped flight with the agent's place free, without a ray tracer, beside a house of its own."""
+    text = (SCENARIOS / "uav-path.toml").read_text()
+    for begin, end in (
+        ("[services.channel.settings]", "[services.link]"),
+        ("[services.agent.set", "[services.rec"),
+    ):
+        head, _, tail = text.partition(begin)
+        text = head + tail[tail.index(end) :]
+    house = box((-80.0, 40.0), (180.0, 280.0), (0.0, 60.0))
+    ground = box((-150.0, 250.0), (-50.0, 350.0), (-1.0, 0.0))
+    (folder / "town.ply").write_bytes(ply(joined([house, ground])))
+    (folder / "town.xml").write_text(
+        '<scene version="2.1.0"><shape type="ply" id="town">'
+        '<string name="filename" value="town.ply"/></shape></scene>'
+    )
+    for old, new in (
+        ('"sionna:munich"', '"file:town.xml"'),
+        ('use = "sionna-rt"', 'use = "free-space"'),
+        ('use = "waypoints"', 'use = "remote"'),
+        ("frames = 60", "frames = 12\nepisodes = 3"),
+    ):
+        assert old in text
+        text = text.replace(old, new, 1)
+    path = folder / "scenario.toml"
+    path.write_text(text + "\n[timeouts]\nrejoin_s = 0.5\n")
+    return path
+
+
+def two_flights(env: UavPathV1Env) -> list[Any]:
+    """What an episode of a seed gives, and one with a start of one's own that follows it."""
+    told: list[Any] = []
+    for seed, options in ((5, {}), (None, {"start": (0.0, 20.0, 30.0)})):
+        observation, info = env.reset(seed=seed, options=options)
+        told.append((plain(observation), plain(info)))
+        ended = False
+        while not ended:
+            observation, reward, terminated, truncated, info = env.step(observation["goal"])
+            told.append((plain(observation), reward, terminated, truncated, plain(info)))
+            ended = terminated or truncated
+    return told
+
+
+def test_flights_of_version_1_are_equal_in_this_process_and_at_a_broker(tmp_path: Path) -> None:
+    """The scenery, in which start and goal are looked for, comes from the broker."""
+    scenario = open_ground(tmp_path)
+    with running(scenario, tmp_path / "out", "--bind", "tcp://127.0.0.1:0") as (process, mark):
+        run = Waiting(process, mark, scenario, tmp_path / "out")
+        with closing(UavPathV1Env(scenario)) as embedded:
+            here = two_flights(embedded)
+        with closing(UavPathV1Env(scenario, broker=run.endpoint)) as connected:
+            there = two_flights(connected)
+    assert there == here
+    assert len(here) == 2 + 2 * 11

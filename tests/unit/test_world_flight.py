@@ -281,3 +281,24 @@ def test_contradicting_settings_are_refused(changes: dict[str, object], message:
 def test_two_objects_of_one_name_are_refused() -> None:
     with pytest.raises(ScenarioError, match="second object is named 'uav'"):
         world(flown(), flown())
+
+
+def test_an_object_that_is_put_somewhere_at_once_is_there_at_rest_and_flies_on_from_there() -> None:
+    made = world()
+    fly(made, VelocityCommand(object="uav", velocity=(6.0, 0.0, 0.0)), 5)
+    there = (50.0, -40.0, 12.0)
+    command = WaypointCommand(object="uav", position=there, speed=3.0, at_once=True)
+    position, velocity, _ = state(fly(made, command, 1, first=6)[0])
+    assert position.tolist() == list(there)
+    assert velocity.tolist() == [0.0, 0.0, 0.0]
+    north = VelocityCommand(object="uav", velocity=(0.0, 6.0, 0.0))
+    position, velocity, _ = state(fly(made, north, 10, first=7)[-1])
+    assert position == pytest.approx([50.0, -40.0 + ACCELERATION / 2, 12.0], abs=1e-3)
+    assert velocity == pytest.approx([0.0, ACCELERATION, 0.0])
+
+
+@pytest.mark.parametrize("point", [(0.0, 0.0, 81.0), (0.0, -3.0, 0.0)], ids=["too high", "in the ground"])
+def test_an_object_is_not_put_where_it_cannot_be(point: Vector) -> None:
+    made = world(flown(maximum_m=(100.0, 100.0, 80.0), minimum_m=(-100.0, -100.0, 1.0)))
+    with pytest.raises(PayloadError, match=r"'uav' cannot be at .* choose another point"):
+        fly(made, WaypointCommand(object="uav", position=point, speed=3.0, at_once=True), 1)

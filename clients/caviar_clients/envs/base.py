@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import warnings
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import gymnasium
 import numpy as np
@@ -64,6 +64,13 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012  # as gymnasium has it
 
+    reset_options: ClassVar[tuple[str, ...]] = ()
+    """Names of the ``options`` that `reset` takes."""
+    needs_parts: ClassVar[bool] = True
+    """Whether an empty ``observe`` leaves nothing to be observed."""
+    uses_scenery: ClassVar[bool] = False
+    """Whether the files of the run's scenery are fetched (`Session.scenery`)."""
+
     def __init__(
         self,
         scenario: str | Path,
@@ -85,7 +92,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
             raise ScenarioError(
                 f"observe is the text {observe!r}; write a tuple of names: observe=({observe!r},)"
             )
-        if not observe:
+        if not observe and self.needs_parts:
             raise ScenarioError("observe names no part; write observe=('aoa',)")
         self.scenario = checked_scenario(Path(scenario))
         for text in implausible_values(self.scenario):
@@ -114,13 +121,22 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
     ) -> tuple[Observation, dict[str, Any]]:
         """Begin an episode. The same ``seed`` leads to the same episode, here and at a broker."""
         super().reset(seed=seed)
-        if options:
-            raise ScenarioError(f"options are not used, got {sorted(options)}; set them in the scenario")
+        unknown = sorted(set(options or {}) - set(self.reset_options))
+        if unknown:
+            there = ", ".join(self.reset_options) or "none; set them in the scenario"
+            raise ScenarioError(f"there are no options {', '.join(unknown)}; there are: {there}")
         if self._session is None:
             self._session = open_session(
-                self.scenario, self.agent, self._inputs(), self._broker, self._directory, self._credentials
+                self.scenario,
+                self.agent,
+                self._inputs(),
+                self._broker,
+                self._directory,
+                self._credentials,
+                with_scenery=self.uses_scenery,
             )
         self._moment = self._at(self._session.reset(seed))
+        self._begin(options or {})
         return self._observation(self._moment), self._info(self._moment)
 
     def step(self, action: A) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -132,8 +148,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         self._moment = now = self._at(self._session.step({"action": Action(commands=commands)}))
         if now.link is None:
             raise RunError(f"agent {self.agent!r} got no link of frame {before.frame.number}; is there one?")
-        served = {(pair.tx.name, pair.rx.name) for _, pair in before.users}
-        reward = self._reward.of(now.link, served) + self._further_reward(before, now)
+        reward = self._rewarded(before, now, now.link)
         return self._observation(now), reward, self._terminated(now), now.frame.final, self._info(now)
 
     def close(self) -> None:
@@ -158,6 +173,14 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
     @abstractmethod
     def _commands(self, action: A, moment: Moment) -> Sequence[Command]:
         """What the agent's decision means."""
+
+    def _begin(self, options: Mapping[str, Any]) -> None:
+        """Make the first frame of an episode what the ``options`` of a reset say; see `reset_options`."""
+
+    def _rewarded(self, before: Moment, now: Moment, link: Link) -> float:
+        """The reward of the decision between two moments; ``link`` is what it led to."""
+        served = {(pair.tx.name, pair.rx.name) for _, pair in before.users}
+        return self._reward.of(link, served) + self._further_reward(before, now)
 
     def _further_reward(self, before: Moment, now: Moment) -> float:
         """What is rewarded beside the link."""

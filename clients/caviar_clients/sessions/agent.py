@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import ClassVar
 
 import msgspec
@@ -30,10 +31,12 @@ class OutsideAgent(Service[OutsideSettings]):
     outputs: ClassVar[tuple[str, ...]] = ("action",)
     Settings = OutsideSettings
     decide: ClassVar[Callable[[Frame], StepResult]]
+    scenery_here: ClassVar[Callable[[Mapping[str, Path]], None]]
     first_seed: ClassVar[Callable[[], int]]
 
     def prepare(self, preparation: Preparation) -> Prepared:
         """Declare the actuators, and the seed of the first episode once it is known."""
+        type(self).scenery_here(preparation.assets)
         self.run.progress("waiting for the first reset", PATIENCE_S)
         seed = type(self).first_seed()
         if self.settings.except_users:
@@ -48,11 +51,26 @@ class OutsideAgent(Service[OutsideSettings]):
 
 
 def declared(
-    inputs: tuple[Input, ...], first_seed: Callable[[], int], decide: Callable[[Frame], StepResult]
+    inputs: tuple[Input, ...],
+    first_seed: Callable[[], int],
+    decide: Callable[[Frame], StepResult],
+    scenery_here: Callable[[Mapping[str, Path]], None] | None = None,
 ) -> type[OutsideAgent]:
     """The class of an agent with these inputs.
 
-    ``first_seed`` gives the seed of the first episode, −1 for the run's; ``decide`` answers a frame.
+    ``first_seed`` gives the seed of the first episode, −1 for the run's; ``decide`` answers a frame;
+    ``scenery_here`` is given the files of the run's scenery before the first frame, which are not fetched
+    without it.
     """
-    fields = {"inputs": inputs, "first_seed": staticmethod(first_seed), "decide": staticmethod(decide)}
+    fields = {
+        "inputs": inputs,
+        "first_seed": staticmethod(first_seed),
+        "decide": staticmethod(decide),
+        "uses_scenery": scenery_here is not None,
+        "scenery_here": staticmethod(scenery_here or _unused),
+    }
     return type("OutsideAgent", (OutsideAgent,), fields)
+
+
+def _unused(_: Mapping[str, Path]) -> None:
+    """For a session that does not look at the scenery."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from pathlib import Path
 from types import TracebackType
 
 from caviar_protocol.arrays import Payload
@@ -24,6 +25,11 @@ class Session(ABC):
 
     def __init__(self) -> None:
         self._frame: Frame | None = None
+        self.scenery: Mapping[str, Path] = {}
+        """Files of the run's scenery by asset name, behind the first `reset`; empty unless asked for."""
+
+    def _take_scenery(self, assets: Mapping[str, Path]) -> None:
+        self.scenery = assets
 
     def reset(self, seed: int | None = None) -> Frame:
         """Begin an episode; its frame 0. The same ``seed`` leads to the same episode.

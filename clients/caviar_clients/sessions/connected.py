@@ -42,6 +42,8 @@ class ConnectedSession(Session):
         Until the broker has to answer [s].
     credentials
         For a broker with keys; None: what the environment says.
+    with_scenery
+        Whether `Session.scenery` is fetched.
     """
 
     def __init__(
@@ -51,6 +53,7 @@ class ConnectedSession(Session):
         inputs: tuple[Input, ...],
         connect_timeout_s: float = CONNECT_TIMEOUT_S,
         credentials: Credentials | None = None,
+        with_scenery: bool = False,
     ) -> None:
         super().__init__()
         self._grants: SimpleQueue[Frame | CaviarError] = SimpleQueue()
@@ -61,7 +64,8 @@ class ConnectedSession(Session):
         self._decisions: OrderedDict[tuple[int, int], StepResult] = OrderedDict()
         """The newest, by episode and frame: a broker that lost the connection may ask for them again."""
         self._termination = _Leaving(self)
-        cls = declared(inputs, self._first_seed, self._decided)
+        scenery_here = self._take_scenery if with_scenery else None
+        cls = declared(inputs, self._first_seed, self._decided, scenery_here)
         runner = Runner(
             agent,
             cls,

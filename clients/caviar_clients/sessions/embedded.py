@@ -35,10 +35,17 @@ class EmbeddedSession(Session):
         What it consumes.
     directory
         Where recorder and journal write; None: nothing is written, which is a lot faster.
+    with_scenery
+        Whether `Session.scenery` is looked up.
     """
 
     def __init__(
-        self, scenario: Scenario, agent: str, inputs: tuple[Input, ...], directory: Path | None = None
+        self,
+        scenario: Scenario,
+        agent: str,
+        inputs: tuple[Input, ...],
+        directory: Path | None = None,
+        with_scenery: bool = False,
     ) -> None:
         super().__init__()
         self.notices: deque[str] = deque(maxlen=TOLD)
@@ -47,7 +54,8 @@ class EmbeddedSession(Session):
             directory.mkdir(parents=True, exist_ok=True)
         endless = replace(scenario, run=replace(scenario.run, episodes=ENDLESS))
         self._seed = -1
-        cls = declared(inputs, lambda: self._seed, _decided_outside)
+        scenery_here = self._take_scenery if with_scenery else None
+        cls = declared(inputs, lambda: self._seed, _decided_outside, scenery_here)
         self._run = EmbeddedRun(endless, directory, self._notice, seats={agent: cls})
         self._seat = self._run.seats[agent]
         self._steps = self._run.steps()

@@ -40,10 +40,11 @@ def open_session(
     broker: str | None = None,
     directory: Path | None = None,
     credentials: Credentials | None = None,
+    with_scenery: bool = False,
 ) -> Session:
     """A session of ``agent``, at ``broker`` or, without one, in this process."""
     if broker is None:
-        return EmbeddedSession(scenario, agent, inputs, directory)
+        return EmbeddedSession(scenario, agent, inputs, directory, with_scenery)
     if directory is not None:
         raise ScenarioError("a connected run records where its broker says; leave directory=… out")
-    return ConnectedSession(broker, agent, inputs, credentials=credentials)
+    return ConnectedSession(broker, agent, inputs, credentials=credentials, with_scenery=with_scenery)

@@ -33,6 +33,8 @@ class WaypointCommand(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=T
     position: Vector3
     """Where to."""
     speed: Annotated[float, quantity("m/s", "at most", gt=0)]
+    at_once: bool = False
+    """Be there in the next frame, at rest, without the way between: to begin an episode elsewhere."""
 
 
 class VelocityCommand(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, tag="velocity"):

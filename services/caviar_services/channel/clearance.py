@@ -99,6 +99,18 @@ class Surfaces:
             near = self._within(np.minimum(position, end), np.maximum(position, end), _MARGIN)
             yield near[_met(self._triangles[near], position, direction)]
 
+    def encloses(self, position: Float64Array) -> bool:
+        """Whether a point [m], Shape ``[3]``, is inside of closed surfaces, which may lack a floor.
+
+        All rising rays but one cross them an odd number of times then.
+        """
+        even = 0
+        for met in self.above(position):
+            even += len(met) % 2 == 0
+            if even > 1:
+                return False
+        return True
+
     def _within(self, low: Float64Array, high: Float64Array, reach: float) -> Int64Array:
         """Triangles whose bounding box meets a box."""
         found = np.flatnonzero((self._low[0] <= high[0] + reach) & (self._high[0] >= low[0] - reach))

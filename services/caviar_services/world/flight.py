@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, ClassVar
 
 import msgspec
@@ -137,6 +137,7 @@ class FlightWorld(TrajectoryWorld):
             )
         self._begun = True
         motions = self._motions(frame)
+        self._place(motions)
         counts: Counter[str] = Counter()
         elapsed_ns = frame.t_ns - self._t0_ns
         length_ns = elapsed_ns - self._elapsed_ns
@@ -144,6 +145,23 @@ class FlightWorld(TrajectoryWorld):
             counts.update(flyer.fly(motions.get(name), length_ns))
         self._elapsed_ns = elapsed_ns
         return replace(super().step(frame), counts=dict(counts))
+
+    def _place(self, motions: Mapping[str, Motion]) -> None:
+        """Put the objects where they are to be at once; they hover there.
+
+        Raises `PayloadError` for a point beyond the bounds or near to the scenery.
+        """
+        for name, motion in motions.items():
+            if motion.at_once and motion.target is not None:
+                flyer = self._flyers[name]
+                limits, target = flyer.limits, motion.target
+                inside = all(a <= x <= b for a, x, b in zip(limits.low, target, limits.high, strict=True))
+                if not inside or flyer.obstacles.distance(target, limits.kept) < limits.kept:
+                    raise PayloadError(
+                        f"{name!r} cannot be at {list(target)}: it keeps within {list(limits.low)} and "
+                        f"{list(limits.high)}, and {limits.kept:.3f} m clear of scenery; choose another point"
+                    )
+                flyer.reset(target, flyer.yaw)
 
     def checkpoint(self) -> bytes:
         """Where the flown objects are, and what is under way."""
@@ -198,7 +216,7 @@ class FlightWorld(TrajectoryWorld):
 
 def _motion(command: VelocityCommand | WaypointCommand, agent: str) -> Motion:
     if isinstance(command, WaypointCommand):
-        motion = Motion(target=command.position, speed=command.speed)
+        motion = Motion(target=command.position, speed=command.speed, at_once=command.at_once)
         values: tuple[float, ...] = (*command.position, command.speed)
     else:
         motion = Motion(velocity=command.velocity)

@@ -83,6 +83,8 @@ class Motion(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     velocity: Vector = (0.0, 0.0, 0.0)
     target: Vector | None = None
     speed: float = 0.0
+    at_once: bool = False
+    """Whether it is put there before it moves."""
 
 
 _HOVER = Motion()

@@ -1,0 +1,323 @@
+"""``caviar/UavPath-v1``: fly an object to a goal, and stay in reach of the radio on the way."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from caviar_clients.envs.base import Observation
+from caviar_clients.envs.flight import FlightEnv, point
+from caviar_clients.envs.observations import Moment
+from caviar_clients.sessions.airspace import Airspace
+from caviar_protocol.arrays import Float64Array
+from caviar_protocol.coordinates import Vector
+from caviar_protocol.errors import RunError, ScenarioError
+from caviar_protocol.seeding import generator
+from caviar_protocol.topics import Action, Link, WaypointCommand
+
+OWN_PARTS = ("position", "velocity", "goal", "rate", "outage")
+"""What is always observed."""
+
+SHARE_OF_WAY = (0.1, 0.5)
+"""Distance of start and goal, unless it is given: of the way that the object can fly in an episode."""
+
+_MARGIN = 0.01
+"""[m] beyond the clearance that the world asks for."""
+
+
+class Weights(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What each part of the reward counts."""
+
+    progress: float = 1.0
+    radio: float = 1.0
+    outage: float = 1.0
+    arrival: float = 10.0
+
+
+class RewardParts(msgspec.Struct, frozen=True, kw_only=True):
+    """The parts of the reward of one step, each in a range of its own."""
+
+    progress: float
+    """−1…1: how much nearer the goal has come, over the way at greatest speed."""
+    radio: float
+    """−1…0: what the mean rate of the users lacks of the best one."""
+    outage: float
+    """−1…0: minus the share of users without a path, or with an SNR below ``outage_snr_db``."""
+    arrival: float
+    """1 in the step that reaches the goal, else 0."""
+
+    def weighted(self, weights: Weights) -> float:
+        """Their weighted sum."""
+        return (
+            weights.progress * self.progress
+            + weights.radio * self.radio
+            + weights.outage * self.outage
+            + weights.arrival * self.arrival
+        )
+
+
+class UavPathV1Env(FlightEnv):
+    """Fly to a goal, and stay in reach of the radio on the way. The action is that of `FlightEnv`.
+
+    **Episode.** Start and goal are drawn by the seed, free of scenery, within the object's bounds; the
+    ``options`` of `reset` set them: ``{"start": (x, y, z), "goal": (x, y, z)}`` [m], either or both. Frame 0
+    puts the object at the start, so that an episode of S frames has S − 1 steps. It terminates where the goal
+    is reached and is truncated behind the last frame.
+
+    **Observation**, float32:
+
+    * ``position``: in the box of the bounds, −1…1 on each axis, Shape ``[3]``;
+    * ``velocity``: over the greatest speed, −1…1, Shape ``[3]``;
+    * ``goal``: the way that is left, over the size of the box, −1…1 on each axis, Shape ``[3]``;
+    * ``rate``: spectral efficiency of the frame before over ``efficiency_bit_s_hz``, mean over users, 0…1,
+      Shape ``[1]``; 0 at the start;
+    * ``outage``: share of users in outage in the frame before, 0…1, Shape ``[1]``; 0 at the start;
+    * and the parts of ``observe``.
+
+    **Reward** of a step: ``Σ weight·part`` with the parts of `RewardParts`, which ``info["reward_parts"]``
+    has: progress −1…1, radio −1…0, outage −1…0, arrival 0 or 1. With the weights' defaults it lies within
+    −3…11. Radio and outage are never above 0, so that nothing is gained by staying on the way; progress sums
+    up to the same on every way to the goal.
+
+    Parameters as `SessionEnv` but for ``reward``, and:
+
+    Parameters
+    ----------
+    vehicle
+        Name of the flown object; None: the only one.
+    reach_m
+        Distance at which the goal is reached [m].
+    box_m
+        Two corners [m] within which start and goal are drawn; None: the object's bounds.
+    distance_m
+        Least and greatest distance [m] of a drawn goal from the start; None: `SHARE_OF_WAY` of the way that
+        the object can fly in an episode.
+    efficiency_bit_s_hz
+        Spectral efficiency that is a radio part of 0: the best one that counts.
+    outage_snr_db
+        A user with a lower SNR [dB] is in outage.
+    weights
+        Of the parts: `Weights`, by name.
+    observe
+        Further parts: `caviar_clients.envs.observations.PARTS`; their bounds are their own.
+
+    Raises
+    ------
+    ScenarioError
+        The object has no bounds (``minimum_m``, ``maximum_m``), the scenario fewer than two frames, or an
+        argument or an option is out of its range.
+    """
+
+    reset_options = ("start", "goal")
+    uses_scenery = True
+    needs_parts = False
+
+    def __init__(
+        self,
+        scenario: str | Path,
+        vehicle: str | None = None,
+        reach_m: float = 5.0,
+        box_m: tuple[Sequence[float], Sequence[float]] | None = None,
+        distance_m: tuple[float, float] | None = None,
+        efficiency_bit_s_hz: float = 10.0,
+        outage_snr_db: float = 0.0,
+        weights: Mapping[str, float] | None = None,
+        observe: Sequence[str] = (),
+        **options: Any,
+    ) -> None:
+        if "reward" in options:
+            raise ScenarioError("the reward has parts of its own; leave reward=… out, or write weights={…}")
+        own = sorted(set(observe) & set(OWN_PARTS))
+        if own:
+            raise ScenarioError(f"{', '.join(own)} of observe is always observed; leave it out")
+        super().__init__(scenario, vehicle, observe=observe, **options)
+        self._weights = _weights(weights or {})
+        self._reach = _positive("reach_m", reach_m)
+        self._efficiency = _positive("efficiency_bit_s_hz", efficiency_bit_s_hz)
+        self._outage_snr = 10 ** (outage_snr_db / 10)
+        self._low, self._high = self._bounds()
+        self._drawn_in = (self._low, self._high) if box_m is None else self._box(box_m)
+        self._step_way = self._max_speed * self.scenario.run.sampling_period_ns / 1e9
+        self._distance = self._distances(distance_m)
+        self._airspace: Airspace | None = None
+        self._goal: Vector = (0.0, 0.0, 0.0)
+        self._parts_now: RewardParts | None = None
+        self.observation_space = spaces.Dict(
+            {
+                **{name: spaces.Box(-1.0, 1.0, (3,), np.float32) for name in OWN_PARTS[:3]},
+                **{name: spaces.Box(0.0, 1.0, (1,), np.float32) for name in OWN_PARTS[3:]},
+                **self.observation_space.spaces,
+            }
+        )
+
+    # --- what is set -------------------------------------------------------------------------------
+
+    def _bounds(self) -> tuple[Vector, Vector]:
+        low, high = (point(self._flown.get(key)) for key in ("minimum_m", "maximum_m"))
+        if low is None or high is None or not all(a < b for a, b in zip(low, high, strict=True)):
+            raise ScenarioError(
+                f"{self.vehicle!r} flies without bounds, and positions are observed relative to them; write "
+                "minimum_m and maximum_m in [[services.<world>.settings.flown]]"
+            )
+        if self.scenario.run.frames < 2:
+            raise ScenarioError("run.frames is 1, and frame 0 goes to the start; write at least 2")
+        return low, high
+
+    def _box(self, box_m: tuple[Sequence[float], Sequence[float]]) -> tuple[Vector, Vector]:
+        corners = [point(corner) for corner in box_m] if len(box_m) == 2 else []
+        low, high = corners if len(corners) == 2 else (None, None)
+        if (
+            low is None
+            or high is None
+            or not all(a <= x <= y <= b for a, x, y, b in zip(self._low, low, high, self._high, strict=True))
+        ):
+            raise ScenarioError(
+                f"box_m={box_m!r} is no box within {list(self._low)} and {list(self._high)}; write its "
+                "lowest and its highest corner, x, y, z [m] each"
+            )
+        return low, high
+
+    def _distances(self, distance_m: tuple[float, float] | None) -> tuple[float, float]:
+        if distance_m is None:
+            way = self._step_way * (self.scenario.run.frames - 1)
+            low, high = SHARE_OF_WAY
+            return max(low * way, 2 * self._reach), max(high * way, 4 * self._reach)
+        low, high = distance_m
+        if not self._reach < low <= high < math.inf:
+            raise ScenarioError(
+                f"distance_m={distance_m!r}; write two ascending numbers above reach_m={self._reach:g}"
+            )
+        return low, high
+
+    # --- an episode --------------------------------------------------------------------------------
+
+    def _begin(self, options: Mapping[str, Any]) -> None:
+        moment, session = self._moment, self._session
+        if moment is None or session is None:
+            raise RunError("no episode has begun; call reset()")
+        self._moment = None  # there is no episode to step until the object is at its start
+        start, self._goal = self._start_and_goal(moment, options)
+        there = WaypointCommand(object=self.vehicle, position=start, speed=self._max_speed, at_once=True)
+        frame = session.step({"action": Action(commands=(*self._beams(moment), there))})
+        # The link that comes with it is that of the place before.
+        self._moment, self._parts_now = msgspec.structs.replace(self._at(frame), link=None), None
+
+    def _start_and_goal(self, moment: Moment, options: Mapping[str, Any]) -> tuple[Vector, Vector]:
+        frame = moment.frame
+        random = generator(frame.seed, frame.seed_episode, f"{self.agent}/start-and-goal")
+        bounds, box = self._space((self._low, self._high)), self._space(self._drawn_in)
+        given = {name: self._given(bounds, name, options.get(name)) for name in self.reset_options}
+        start, goal = given["start"], given["goal"]
+        if start is None:
+            start = box.draw(random) if goal is None else box.draw(random, goal, self._distance)
+        if goal is None and start is not None:
+            goal = box.draw(random, start, self._distance)
+        if start is None or goal is None:
+            low, high = self._distance
+            raise ScenarioError(
+                f"no start and goal {low:g} to {high:g} m apart were found between {list(box.low)} and "
+                f"{list(box.high)}; write another box_m or distance_m, or other options"
+            )
+        if math.dist(start, goal) <= self._reach:
+            raise ScenarioError(f"start {list(start)} is within reach_m={self._reach:g} of goal {list(goal)}")
+        return start, goal
+
+    def _space(self, box: tuple[Vector, Vector]) -> Airspace:
+        if self._airspace is None and self._session is not None:
+            clearance = float(self._flown.get("clearance_m", 1.0)) + _MARGIN
+            self._airspace = Airspace(self._low, self._high, clearance, self._session.scenery)
+        if self._airspace is None:
+            raise RunError("no episode has begun; call reset()")
+        return self._airspace.within(*box)
+
+    def _given(self, space: Airspace, name: str, value: Any) -> Vector | None:
+        if value is None:
+            return None
+        place = point(value)
+        if place is None or not space.is_free(place):
+            raise ScenarioError(
+                f"{name} {value!r} is no place for {self.vehicle!r}; write a point [m] between "
+                f"{list(space.low)} and {list(space.high)}, clear of the scenery and outside of buildings"
+            )
+        return place
+
+    # --- what a step gives ---------------------------------------------------------------------------
+
+    def _rewarded(self, before: Moment, now: Moment, link: Link) -> float:
+        efficiency, outage = self._radio(before, link)
+        nearer = self._left(before) - self._left(now)
+        self._parts_now = RewardParts(
+            progress=min(1.0, max(-1.0, nearer / self._step_way)),
+            radio=efficiency - 1.0,
+            outage=0.0 - outage,
+            arrival=float(self._terminated(now)),
+        )
+        return self._parts_now.weighted(self._weights)
+
+    def _radio(self, moment: Moment, link: Link | None) -> tuple[float, float]:
+        """Mean spectral efficiency of the users over the best one that counts, and the share in outage."""
+        served = {(pair.tx.name, pair.rx.name) for _, pair in moment.users}
+        if link is None:
+            return 0.0, 0.0
+        mine = np.array([pair in served for pair in zip(link.tx, link.rx, strict=True)], np.bool_)
+        if not mine.any():
+            return 0.0, 1.0
+        efficiency = np.minimum(link.spectral_efficiency[mine] / self._efficiency, 1.0)
+        in_outage = ~link.has_path[mine] | (link.snr[mine] < self._outage_snr)
+        return float(efficiency.mean()), float(in_outage.mean())
+
+    def _left(self, moment: Moment) -> float:
+        return float(np.linalg.norm(np.asarray(self._goal) - self._position(moment)))
+
+    def _terminated(self, moment: Moment) -> bool:
+        return self._left(moment) <= self._reach
+
+    def _observation(self, moment: Moment) -> Observation:
+        low, size = np.asarray(self._low), np.subtract(self._high, self._low)
+        position = self._position(moment)
+        index = moment.scene.names.index(self.vehicle)
+        efficiency, outage = self._radio(moment, moment.link)
+        own = {
+            "position": 2 * (position - low) / size - 1,
+            "velocity": moment.scene.velocity[index] / self._max_speed,
+            "goal": (np.asarray(self._goal) - position) / size,
+        }
+        found: Observation = {name: _clipped(values) for name, values in own.items()}
+        found["rate"], found["outage"] = (np.array([value], np.float32) for value in (efficiency, outage))
+        return {**found, **super()._observation(moment)}
+
+    def _info(self, moment: Moment) -> dict[str, Any]:
+        known = super()._info(moment)
+        known["goal_m"], known["distance_m"] = self._goal, self._left(moment)
+        if self._parts_now is not None:
+            known["reward_parts"] = msgspec.structs.asdict(self._parts_now)
+        return known
+
+
+def _clipped(values: Float64Array) -> NDArray[np.float32]:
+    """Within ±1: rounding puts what is at a bound beyond it."""
+    return np.clip(values, -1.0, 1.0).astype(np.float32)
+
+
+def _positive(name: str, value: float) -> float:
+    if not 0 < value < math.inf:
+        raise ScenarioError(f"{name}={value!r}; write a finite number above 0")
+    return float(value)
+
+
+def _weights(given: Mapping[str, float]) -> Weights:
+    names = Weights.__struct_fields__
+    unknown = sorted(set(given) - set(names))
+    if unknown:
+        raise ScenarioError(f"weights has no part {', '.join(unknown)}; there are: {', '.join(names)}")
+    wrong = {name: value for name, value in given.items() if not 0 <= value < math.inf}
+    if wrong:
+        raise ScenarioError(f"weights are {wrong}; write finite numbers from 0 on")
+    return Weights(**given)
