@@ -123,8 +123,8 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         super().reset(seed=seed)
         unknown = sorted(set(options or {}) - set(self.reset_options))
         if unknown:
-            there = ", ".join(self.reset_options) or "none; set them in the scenario"
-            raise ScenarioError(f"there are no options {', '.join(unknown)}; there are: {there}")
+            there = f"there are: {', '.join(self.reset_options)}" if self.reset_options else "there are none"
+            raise ScenarioError(f"no options of reset are called {unknown}; {there}, set it in the scenario")
         if self._session is None:
             self._session = open_session(
                 self.scenario,
