@@ -155,9 +155,14 @@ def test_a_disk_that_does_not_answer_is_told_of_and_holds_up_only_what_relies_on
         serving(plan(*PAIR), tmp_path, frozen) as broker,
         playing(broker.endpoint, *PAIR) as (world, sensors),
     ):
-        for _ in range(2):
-            world.answer()
-            sensors.answer()
+        world.answer()
+        sensors.answer()
+        path = tmp_path / "journal.msgpack"
+        eventually(
+            lambda: {"world", "sensors"} <= {e.service for e in read_journal(path)}, "frame 0 is in it"
+        )
+        world.answer()
+        sensors.answer()
         assert made[0].reached.wait(30)
         told = "the disk does not answer: write of"
         eventually(lambda: told in broker.witness.texts(), "the disk is told of")
