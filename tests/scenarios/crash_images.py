@@ -162,11 +162,11 @@ def crash(folder: Path, scenario: Path, frames: int, at: float, how: str, digest
             select.select([], [], [], 0.002)
         now = time.monotonic()
         lose_power(place, image, kept, how, mark)
-    if how == "copy":
-        kept.replace(image)
+    if how == "shutdown":
+        shutil.copyfile(image, kept)  # another mount namespace may still hold the one that was stopped
     durability = scenario.stem.rpartition("-")[2]
     promised = {"frame": now, "periodic": now - SYNC_PERIOD_S, "none": 0.0}[durability]
-    with mounted(image, place):
+    with mounted(kept, place):
         directory = next(place.glob(f"{OUT}/*/"), place / "nothing")
         recorded = _recorded(directory)
         if (directory / "run.json").exists():
