@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from broker_harness import PAIR, PATIENCE_S, Serving, plan, serving
+from broker_harness import MS, PAIR, PATIENCE_S, Serving, plan, serving
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
@@ -26,6 +26,8 @@ from caviar_protocol.websocket import join_parts, split_frame
 
 M = TypeVar("M", bound=m.Message)
 CAVIAR = Subprotocol("caviar.v1")
+START_S = 60.0
+"""[s] that the HTTP process may take to start: on a busy machine its libraries take long to load."""
 
 
 @dataclass
@@ -84,7 +86,9 @@ def site(
     if tokens is not None:
         (tmp_path / "tokens.toml").write_text(tokens)
         command += ["--keys", str(tmp_path)]
-    planned = plan(*(services or PAIR), limits=limits, **run)
+    # The HTTP process may take many seconds to start on a busy machine, and the run has to wait for it.
+    waits = {"connect": int(START_S * 1000) * MS} | (limits or {})
+    planned = plan(*(services or PAIR), limits=waits, **run)
     with serving(planned, tmp_path, desk=tmp_path) as broker:
         process = subprocess.Popen(command, stderr=subprocess.PIPE)
         try:
@@ -95,7 +99,7 @@ def site(
 
 
 def port_of(directory: Path, process: subprocess.Popen[bytes]) -> int:
-    until = time.monotonic() + PATIENCE_S
+    until = time.monotonic() + START_S
     while True:
         served = ask(directory, do="status")["status"].get("http", "")
         if found := re.search(r":(\d+)$", served):
