@@ -192,7 +192,7 @@ def test_a_run_that_failed_is_blamed_at_every_further_call() -> None:
         env.reset(seed=1)
         env._sizes = [BEAMS + 1]  # so that a beam that does not exist gets as far as the link
         for call in (lambda: env.step(np.int64(BEAMS)), lambda: env.step(np.int64(0)), lambda: env.reset()):
-            with pytest.raises(RunError, match=r"link 'link' failed in frame 0.*TX beam 64"):
+            with pytest.raises(RunError, match=r"agent 'agent' made a wrong product.*TX beam 64"):
                 call()
 
 
