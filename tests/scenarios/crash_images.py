@@ -39,7 +39,7 @@ from caviar_protocol.recording_segments import recorded_until
 
 EXT4_IOC_SHUTDOWN, NOLOGFLUSH = 0x8004587D, struct.pack("I", 2)
 """Stop a file system without writing its journal, as a loss of power does."""
-IMAGE_BYTES = 192 << 20
+IMAGE_BYTES = 512 << 20
 OUT = "runs"
 """Folder of the runs in a file system."""
 START_S = 120.0
