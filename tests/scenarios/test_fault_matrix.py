@@ -161,7 +161,7 @@ def test_a_broker_that_is_wronged_goes_on_or_is_followed_by_another(
         assert sorted(n["service"] for n in result.notices if n["kind"] == "back") == sorted(SERVICES)
     else:
         words = {"garbage": "not in the protocol", "flood": "a connection from 127.0.0.1 was cut off"}
-        assert any(words[fault] in text for text in told(result, "note"))
+        assert any(words[fault] in text for text in told(result, "refused"))
     assert in_time(result)
 
 
