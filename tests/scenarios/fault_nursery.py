@@ -218,7 +218,8 @@ def follow(case: Case) -> Result:
                 if case.remote and (away or event["event"] == "listening"):
                     for before in remotes:
                         before.send_signal(signal.SIGCONT)
-                    remotes.append(_remote(case, launcher))
+                    if not remotes or case.fault == "kill":  # what lives comes back by itself
+                        remotes.append(_remote(case, launcher))
                 elif event["event"] == "finished":
                     outcome = event
     except CaviarError as raised:
