@@ -91,10 +91,10 @@ def film_run(
     recording = Recording(run)
     file = out or recording.directory / ("video.mp4" if find_ffmpeg() else "video.gif")
     suffix = file.suffix.lower()
-    make_folder_of(file)
     rate, pixels = _format(file, suffix, fps, width, recording.metadata.sampling_period_ns)
     chosen = choose_user(recording, user or "") if "link" in recording.topics else None
     survey = _survey(recording, _indices(recording, frames), chosen, camera)
+    make_folder_of(file)
     moving = MovingMap(survey.plan, pixels)
     count = len(survey.indices)
     spread = sorted({round(i) for i in np.linspace(0, count - 1, min(_SAMPLES, count))})
