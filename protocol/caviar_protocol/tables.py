@@ -37,6 +37,10 @@ class Source(msgspec.Struct, frozen=True, kw_only=True):
             key = re.sub(r"(^|\.)([^.\"\[]+|\"[^\"]*\")$|\[\d+\]$", "", key)
         return None
 
+    def holds(self, key: str) -> bool:
+        """Whether the file has this very key, or one below it."""
+        return any(line == key or line.startswith((f"{key}.", f"{key}[")) for line in self.lines)
+
 
 class Place(msgspec.Struct, frozen=True):
     """Where a value stands: a dotted key in a file that may be unknown."""
@@ -59,14 +63,17 @@ class Place(msgspec.Struct, frozen=True):
 def located(text: str, service: str, source: Source) -> str:
     """What a service says about the scenario, ``KEY: message``, with the file and the line before it.
 
-    A key that begins with ``settings`` is one of the service's own. A text that begins with no key of the
-    file comes back as it is.
+    A key that begins with ``settings``, or that the file has only among the service's settings, is one of the
+    service's own. A text that begins with no key of the file comes back as it is.
     """
     key, separator, message = text.partition(": ")
     if not separator or _KEY.fullmatch(key) is None:
         return text
+    own = Place("services").at(service).key
     if re.match(r"settings(?![A-Za-z0-9_-])", key):
-        key = f"{Place('services').at(service).key}.{key}"
+        key = f"{own}.{key}"
+    elif source.line(key) is None and source.holds(f"{own}.settings.{key}"):
+        key = f"{own}.settings.{key}"
     place = Place(key, source)
     return str(place.error(message)) if source.file and source.line(key) is not None else text
 

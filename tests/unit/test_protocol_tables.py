@@ -48,6 +48,8 @@ def source() -> Source:
         ("settings: needs a net", "left wing", "settings = {", 'services."left wing".'),
         ("run.sampling_period_ns: is bad: 3 of 4", "world", "[run]", ""),
         ("devices[0].kind: is bad", "world", 'kind = "lidar"', ""),
+        ("objects[0].kind: is bad", "world", 'kind = "car"', "services.world.settings."),
+        ("objects: is unknown", "world", "[[services.world", "services.world.settings."),
     ],
 )
 def test_a_key_is_told_with_its_line_or_that_of_the_table_around_it(

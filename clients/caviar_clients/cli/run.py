@@ -39,7 +39,7 @@ from caviar_protocol.scenario_loader import find_scenario
 
 QUIET = frozenset({"stale", "note", "idle", "lag"})
 """Kinds of notices that are logged, and only counted on the screen."""
-REPEATED = frozenset({"away", "back", "restarted", "refused"})
+REPEATED = frozenset({"lost", "away", "back", "restarted", "refused"})
 """Kinds of notices that are shown every time, since what they ask of the user is always new."""
 
 
@@ -260,7 +260,8 @@ class _Watcher:
         spec = self._scenario.services.get(event["service"])
         if event["kind"] != "away" or spec is None or not spec.remote:
             return ""
-        return f"; start it again with  {start_command(event['service'], spec, self._endpoint)}"
+        command = start_command(event["service"], spec, self._endpoint)
+        return f"; unless it comes back by itself, start it again with  {command}"
 
     def _tell(self, text: str, style: str) -> None:
         self._console.print(text, highlight=False, soft_wrap=True, style=style, markup=False)
