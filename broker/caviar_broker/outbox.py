@@ -4,22 +4,95 @@ from __future__ import annotations
 
 import json
 import os
+import queue
 import select
+import threading
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from caviar_broker.aside import Aside
-
 MAX_PENDING = 1 << 18
 """[B] of lines kept in memory; what comes behind them is read back from the log."""
 LOG_S = 0.1
-"""[s] that is waited for the disk to take a line of the log."""
+"""[s] that is waited for the disk to take lines of the log."""
 CHUNK = select.PIPE_BUF
 """[B] a pipe that polls as writable takes without blocking."""
 
 Line = Mapping[str, Any]
+
+
+class LogFile:
+    """A file that a thread appends to, so that a disk that does not answer holds up no caller.
+
+    Once lines could not be written, it takes no more: offsets of later ones would be wrong.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("a+b", buffering=0)
+        self.size = self._file.seek(0, os.SEEK_END)
+        """[B] of the file, with what is on its way."""
+        self._written = self.size
+        self._error = ""
+        self._queue: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self._progress = threading.Condition()
+        self._thread = threading.Thread(target=self._write_all, name="log", daemon=True)
+        self._thread.start()
+
+    @property
+    def failed(self) -> bool:
+        """Whether it takes no more lines."""
+        return bool(self._error)
+
+    @property
+    def error(self) -> str:
+        """Why lines are missing; empty where none is. Waits `LOG_S` for those on their way."""
+        self._wait_for(0)
+        return self._error
+
+    def put(self, data: bytes) -> bool:
+        """Append lines; whether the file takes them. Waits `LOG_S` where too much is on its way."""
+        if self.size - self._written > MAX_PENDING and not self._wait_for(MAX_PENDING):
+            self._error = self._error or "the disk did not answer"
+        if self._error:
+            return False
+        self.size += len(data)
+        self._queue.put(data)
+        return True
+
+    def read(self, start: int) -> bytes:
+        """Whole lines from an offset on, as far as they are written."""
+        data = os.pread(self._file.fileno(), min(MAX_PENDING, self._written - start), start)
+        return data[: data.rfind(b"\n") + 1]
+
+    def wait(self, seconds: float) -> None:
+        """Until more is written, but not longer than that [s]."""
+        with self._progress:
+            self._progress.wait(seconds)
+
+    def close(self) -> None:
+        """Close the file, once all is written or the disk has had `LOG_S` for it."""
+        self._wait_for(0)
+        self._queue.put(b"")
+        self._thread.join(LOG_S)
+        if not self._thread.is_alive():
+            self._file.close()
+
+    def _wait_for(self, backlog: int) -> bool:
+        with self._progress:
+            return self._progress.wait_for(lambda: self.failed or self.size - self._written <= backlog, LOG_S)
+
+    def _write_all(self) -> None:
+        while data := self._queue.get():
+            left = memoryview(data)
+            try:
+                while left:
+                    left = left[os.write(self._file.fileno(), left) :]
+            except OSError as error:
+                self._error = error.strerror or str(error)
+            with self._progress:
+                self._written += len(data) - len(left)
+                self._progress.notify_all()
 
 
 class Outbox:
@@ -41,11 +114,7 @@ class Outbox:
 
     def __init__(self, fd: int, log: Path, render: Callable[[Line], str]) -> None:
         self._fd, self._render = fd, render
-        self._log = log.open("a+b", buffering=0)
-        self._size = self._log.seek(0, os.SEEK_END)
-        self._aside = Aside()
-        self._unlogged = bytearray()
-        """Lines that wait for a disk that does not answer."""
+        self._log = LogFile(log)
         self._behind: int | None = None
         """Where in the log the notices begin that did not fit into memory; None: all did."""
         self._pending = bytearray()
@@ -53,8 +122,11 @@ class Outbox:
         self._poll.register(fd, select.POLLOUT)
         self.gone = False
         """Whether nobody reads any more."""
-        self.log_error = ""
-        """Why the log cannot be written; empty while it can."""
+
+    @property
+    def log_error(self) -> str:
+        """Why the log is incomplete; empty where it is not."""
+        return self._log.error
 
     @property
     def waiting(self) -> bool:
@@ -63,7 +135,8 @@ class Outbox:
 
     def notice(self, line: Line) -> None:
         """Log a line, and pass it on."""
-        start, logged = self._size, self._write_log(line)
+        start = self._log.size
+        logged = self._log.put(json.dumps(line, ensure_ascii=False).encode(errors="backslashreplace") + b"\n")
         if self.gone:
             return
         if logged and (self._behind is not None or len(self._pending) > MAX_PENDING):
@@ -85,9 +158,9 @@ class Outbox:
     def flush(self) -> None:
         """Write what the descriptor takes now."""
         while self.waiting and not self.gone:
-            if not self._pending:
-                self._read_back()
-            elif self._poll.poll(0):
+            if not self._pending and not self._read_back():
+                return
+            if self._poll.poll(0):
                 self._write()
             else:
                 return
@@ -96,7 +169,10 @@ class Outbox:
         """Write all that waits and then ``last``, but wait no longer than ``within_s``."""
         until = time.monotonic() + within_s
         while self.waiting and not self.gone and (left := until - time.monotonic()) > 0:
-            self._poll.poll(left * 1000)
+            if self._pending:
+                self._poll.poll(left * 1000)
+            else:
+                self._log.wait(min(left, LOG_S))
             self.flush()
         self._behind = None
         self._pending += self._encode(last)
@@ -107,8 +183,7 @@ class Outbox:
 
     def close(self) -> None:
         """Close the log; the descriptor is its owner's."""
-        if not self._aside.is_busy:
-            self._log.close()
+        self._log.close()
 
     def _encode(self, line: Line) -> bytes:
         return self._render(line).encode(errors="backslashreplace") + b"\n"
@@ -123,29 +198,12 @@ class Outbox:
         else:
             del self._pending[:taken]
 
-    def _write_log(self, line: Line) -> bool:
-        data = json.dumps(line, ensure_ascii=False).encode(errors="backslashreplace") + b"\n"
-        if self._aside.is_busy:
-            if len(self._unlogged) < MAX_PENDING:
-                self._unlogged += data
-            else:
-                self.log_error = "the disk did not answer"
-            return False
-        data, self._unlogged = bytes(self._unlogged) + data, bytearray()
-        try:
-            in_time = self._aside.call(lambda: self._log.write(data), LOG_S)
-        except OSError as error:
-            self.log_error = error.strerror or str(error)
-            return False
-        self._size += len(data)
-        return in_time
-
-    def _read_back(self) -> None:
-        """Take the next lines from the log into memory."""
+    def _read_back(self) -> bool:
+        """Take the next lines from the log into memory; False where the log does not have them yet."""
         start = self._behind or 0
-        data = os.pread(self._log.fileno(), MAX_PENDING, start)
-        data = data[: data.rfind(b"\n") + 1]
+        data = self._log.read(start)
         for line in data.splitlines():
             self._pending += self._encode(json.loads(line))
         start += len(data)
-        self._behind = start if data and start < self._size else None
+        self._behind = start if start < self._log.size and not self._log.failed else None
+        return bool(self._pending)
