@@ -84,6 +84,8 @@ def _device(spec: dict[str, Any], parent: str, height: float, fault: str) -> dic
     position = [x, y, z + MOUNT[spec.get("mount", "centre")] * height]
     if fault == "ignores mounts":
         position = [x, y, z]
+    if fault == "mounts on the roof what is on the floor":
+        position = [x, y, z + abs(MOUNT[spec.get("mount", "centre")]) * height]
     if fault == "takes the array of another device":
         spec = spec | {"array": {"columns": 3}}
     device: dict[str, Any] = {
@@ -94,6 +96,9 @@ def _device(spec: dict[str, Any], parent: str, height: float, fault: str) -> dic
         device["parent"] = parent
     if any(position):
         device["position"] = position
+    orientation = _orientation(spec, fault)
+    if orientation != [1.0, 0.0, 0.0, 0.0]:
+        device["orientation"] = orientation
     if fault == "publishes devices with quaternions of length 2":
         device["orientation"] = [2.0, 0.0, 0.0, 0.0]
     match spec["kind"]:
@@ -116,3 +121,25 @@ def _device(spec: dict[str, Any], parent: str, height: float, fault: str) -> dic
         case "camera":
             device["width"], device["height"] = spec["size_px"]
     return device
+
+
+def _orientation(spec: dict[str, Any], fault: str) -> list[float]:
+    """The quaternion of intrinsic z–y′–x″ rotations, by the formulas of SPEC.md."""
+    yaw, pitch, roll = (math.radians(spec.get(f"{angle}_deg", 0.0)) for angle in ("yaw", "pitch", "roll"))
+    match fault:
+        case "doubles yaw":
+            yaw *= 2
+        case "lifts the nose where it is to be lowered":
+            pitch = -pitch
+        case "ignores roll":
+            roll = 0.0
+        case "forgets to convert degrees":
+            yaw, pitch, roll = (math.degrees(angle) for angle in (yaw, pitch, roll))
+    cy, cp, cr = (math.cos(angle / 2) for angle in (yaw, pitch, roll))
+    sy, sp, sr = (math.sin(angle / 2) for angle in (yaw, pitch, roll))
+    return [
+        cy * cp * cr + sy * sp * sr,
+        cy * cp * sr - sy * sp * cr,
+        cy * sp * cr + sy * cp * sr,
+        sy * cp * cr - cy * sp * sr,
+    ]

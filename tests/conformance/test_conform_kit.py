@@ -312,7 +312,15 @@ FAULTS: dict[str, tuple[str, ...]] = {
         "mounts devices on absent objects/world",
         "publishes devices with quaternions of length 2/world",
     ),
-    "scene-mounts": ("ignores mounts/world", "takes the array of another device/world"),
+    "scene-mounts": (
+        "ignores mounts/world",
+        "mounts on the roof what is on the floor/world",
+        "takes the array of another device/world",
+        "doubles yaw/world",
+        "lifts the nose where it is to be lowered/world",
+        "ignores roll/world",
+        "forgets to convert degrees/world",
+    ),
     "scene-carriers": ("hands devices around/world",),
 }
 

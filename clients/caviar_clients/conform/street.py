@@ -15,6 +15,7 @@ import numpy as np
 from caviar_clients.conform.wire import Fields
 from caviar_protocol.arrays import Payload
 from caviar_protocol.codec import encode_payload
+from caviar_protocol.coordinates import quaternion_from_euler
 from caviar_protocol.scenario_checks import resolved
 from caviar_protocol.scenario_loader import parse_scenario
 from caviar_protocol.topics import (
@@ -74,6 +75,7 @@ array = { columns = 2 }
 name = "lidar"
 kind = "lidar"
 on = "*"
+mount = "floor"
 position_m = [0.0, 0.2, 1.3]
 beams = 2
 azimuth_steps = 12
@@ -83,6 +85,9 @@ name = "camera"
 kind = "camera"
 on = "*"
 position_m = [2.0, 0.0, 0.5]
+yaw_deg = 70.0
+pitch_deg = 25.0
+roll_deg = -40.0
 size_px = [16, 8]
 
 [services]
@@ -93,7 +98,11 @@ pilot = { role = "agent", use = "remote", budget_ms = 1000 }
 radio = { role = "link", use = "remote", budget_ms = 1000 }
 archive = { role = "recorder", use = "remote", budget_ms = 1000 }
 """
-"""The scenario of which WELCOME tells each client its part, as a broker does that reads this file."""
+"""The scenario of which WELCOME tells each client its part, as a broker does that reads this file.
+
+The angles of the camera differ in size and sign, so that no wrong rotation equals the right one.
+"""
+CAMERA_ORIENTATION = quaternion_from_euler(math.radians(70.0), math.radians(25.0), math.radians(-40.0))
 WORLD = "traffic"
 """The world that publishes the devices."""
 
@@ -190,10 +199,15 @@ def _scene(source: str, frame: int) -> Scene:
     if car:
         fixed = AntennaDevice(name="bs", position=(0.0, -10.0, 9.0), role="tx", array=AntennaArray(columns=4))
         camera = CameraDevice(
-            name="car.1/camera", parent="car.1", position=(2.0, 0.0, 0.5), width=16, height=8
+            name="car.1/camera",
+            parent="car.1",
+            position=(2.0, 0.0, 0.5),
+            orientation=CAMERA_ORIENTATION,
+            width=16,
+            height=8,
         )
         lidar = LidarDevice(
-            name="car.1/lidar", parent="car.1", position=(0.0, 0.2, 1.3), beams=2, azimuth_steps=12
+            name="car.1/lidar", parent="car.1", position=(0.0, 0.2, 0.55), beams=2, azimuth_steps=12
         )
         devices = [fixed, camera, lidar, *devices]
     return Scene(
