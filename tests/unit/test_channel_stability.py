@@ -14,6 +14,7 @@ from caviar_clients.cli.main import app
 from caviar_protocol.errors import AssetError, PayloadError
 from caviar_services.channel.stability import case as cases_module
 from caviar_services.channel.stability import formulas
+from caviar_services.channel.stability import run as run_module
 from caviar_services.channel.stability.bench import Bench
 from caviar_services.channel.stability.case import Case, Outcome, Result, all_of, close, equal, refused, worst
 from caviar_services.channel.stability.run import cases, markdown, run, wrong
@@ -109,6 +110,24 @@ class TestCommand:
         status, output = self.ask("--group", "distance")
         assert status == 1
         assert "wrong" in output
+
+    def test_what_needs_the_ray_tracer_is_not_run_without_it(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """A missing extra is no wrong physics: the rest is judged, one line says what to install."""
+        monkeypatch.setattr(run_module, "has_extra", lambda _: False)
+        result = CliRunner(env={"COLUMNS": "200"}).invoke(app, ["stability", "--group", "speed"])
+        ran = sum(case.group == "speed" and not case.traced for case in cases())
+        every = sum(case.group == "speed" for case in cases())
+        assert result.exit_code == 0
+        assert f"{ran} of {ran} right" in result.output
+        assert f"{every - ran} of {every} cases did not run" in result.output
+        assert result.output.count("caviar-sim[channel]") == 1
+        assert "wrong" not in result.output
+
+    def test_status_1_where_no_case_ran(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(run_module, "has_extra", lambda _: False)
+        only = [case for case in cases() if case.traced][:1]
+        monkeypatch.setattr(cli_stability, "cases", lambda: only)
+        assert CliRunner().invoke(app, ["stability"]).exit_code == 1
 
     def test_an_unknown_group_is_named(self) -> None:
         with pytest.raises(Exception, match=r"no group 'speeed' .* speed"):

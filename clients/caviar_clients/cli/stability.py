@@ -13,8 +13,9 @@ from rich.text import Text
 
 from caviar_clients.files import write_file
 from caviar_protocol.errors import SetupError
+from caviar_protocol.extras import install_command
 from caviar_services.channel.stability.case import Case, Result
-from caviar_services.channel.stability.run import cases, markdown, run, wrong
+from caviar_services.channel.stability.run import EXTRA, cases, markdown, run, wrong
 
 
 def stability(
@@ -24,7 +25,7 @@ def stability(
     markdown_file: Path | None = None,
     traced: bool = True,
 ) -> int:
-    """Run the cases, print them, write them; status 1 where one is wrong.
+    """Run the cases, print them, write them; status 1 where one that ran is wrong, or none ran.
 
     Raises `SetupError` for a group that does not exist, `RunError` where a file cannot be written:
     both before the first case.
@@ -34,16 +35,23 @@ def stability(
         if file is not None:
             write_file(file)
     results = _results(console, chosen)
-    console.print(_table(results))
-    faulty = wrong(results)
-    seconds = sum(result.seconds for result in results)
-    summary = f"{len(results) - len(faulty)} of {len(results)} right, in {seconds:.0f} s"
-    console.print(summary, style="bold red" if faulty else "bold green", highlight=False)
+    ran = [result for result in results if result.verdict != "not run"]
+    faulty = wrong(ran)
+    console.print(_table(ran))
+    seconds = sum(result.seconds for result in ran)
+    summary = f"{len(ran) - len(faulty)} of {len(ran)} right, in {seconds:.0f} s"
+    console.print(summary, style="bold green" if ran and not faulty else "bold red", highlight=False)
+    if len(ran) < len(results):
+        console.print(
+            f"{len(results) - len(ran)} of {len(results)} cases did not run: they need the ray tracer "
+            f"(extra {EXTRA!r}); run: {install_command(EXTRA)}",
+            style="yellow", markup=False, highlight=False, soft_wrap=True,
+        )  # fmt: skip
     if json_file is not None:
         write_file(json_file, msgspec.json.format(msgspec.json.encode(results), indent=2).decode() + "\n")
     if markdown_file is not None:
         write_file(markdown_file, markdown(results))
-    return 1 if faulty else 0
+    return 0 if ran and not faulty else 1
 
 
 def _chosen(groups: Sequence[str], traced: bool) -> list[Case]:

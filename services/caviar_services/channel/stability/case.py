@@ -44,7 +44,7 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
     expected: str
     got: str
     verdict: str
-    """``right`` or ``wrong``."""
+    """``right``, ``wrong``, or ``not run`` where the ray tracer that the case needs is not installed."""
     seconds: float
 
 

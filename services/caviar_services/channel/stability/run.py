@@ -10,8 +10,12 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from caviar_protocol.extras import has_extra
 from caviar_services.channel.stability.bench import Bench
 from caviar_services.channel.stability.case import CASES, Case, Outcome, Result
+
+EXTRA = "channel"
+"""Extra of the distribution that brings the ray tracer."""
 
 GROUPS = ("waves", "places", "counts", "motion", "meshes", "inputs")
 """Modules with cases, in the order of the table."""
@@ -27,12 +31,17 @@ def cases() -> Sequence[Case]:
 def run(chosen: Sequence[Case], progress: Callable[[int, Case], None] | None = None) -> list[Result]:
     """Ask the chosen cases, one after the other; one that raises an error of its own is wrong.
 
-    ``progress`` is called with number and case before each.
+    Cases that trace are ``not run`` where the ray tracer is not installed: that says nothing about physics.
+    ``progress`` is called with number and case before each case that runs.
     """
+    has_tracer = has_extra(EXTRA)
     results: list[Result] = []
     with TemporaryDirectory(prefix="caviar-stability-") as folder:
         bench = Bench(Path(folder))
         for number, case in enumerate(chosen):
+            if case.traced and not has_tracer:
+                results.append(_not_run(case))
+                continue
             if progress is not None:
                 progress(number, case)
             begin = time.perf_counter()
@@ -50,6 +59,17 @@ def run(chosen: Sequence[Case], progress: Callable[[int, Case], None] | None = N
     return results
 
 
+def _not_run(case: Case) -> Result:
+    return Result(
+        group=case.group,
+        case=case.name,
+        expected="an answer of the ray tracer",
+        got=f"needs the extra {EXTRA!r}",
+        verdict="not run",
+        seconds=0.0,
+    )
+
+
 def _asked(case: Case, bench: Bench) -> Outcome:
     try:
         with np.errstate(all="ignore"):
@@ -60,7 +80,7 @@ def _asked(case: Case, bench: Bench) -> Outcome:
 
 def wrong(results: Sequence[Result]) -> list[Result]:
     """Those with another answer than expected."""
-    return [result for result in results if result.verdict != "right"]
+    return [result for result in results if result.verdict == "wrong"]
 
 
 def markdown(results: Sequence[Result]) -> str:
