@@ -70,9 +70,24 @@ def parse_scenario(text: str, file: str = "", folder: Path | None = None) -> Sce
     if isinstance(table.get("run"), dict):
         table["run"] = with_instants(table["run"], Place("run", source), folder or Path())
     scenario = convert_table(Scenario, table, Place("", source))
-    scenario = msgspec.structs.replace(scenario, source=source)
+    scenario = msgspec.structs.replace(scenario, source=_with_device_names(source, scenario))
     check_scenario(scenario)
     return _with_files(scenario, folder or Path())
+
+
+def _with_device_names(source: Source, scenario: Scenario) -> Source:
+    """The source with the lines of ``devices[2].on`` under ``devices.rx.on`` too.
+
+    A world is given its own devices only and does not know their places in the file: its errors name them.
+    """
+    root = Place("devices")
+    named: dict[str, int] = {}
+    for index, device in enumerate(scenario.devices):
+        place, by_name = root.at(index).key, root.at(device.name).key
+        for key, line in source.lines.items():
+            if key == place or key.startswith((f"{place}.", f"{place}[")):
+                named.setdefault(by_name + key.removeprefix(place), line)
+    return msgspec.structs.replace(source, lines=named | source.lines)
 
 
 def _syntax_error(error: tomllib.TOMLDecodeError, text: str, file: str) -> ScenarioError:

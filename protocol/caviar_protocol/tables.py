@@ -163,8 +163,8 @@ def _check_struct(value: object, expected: inspect.StructType, place: Place) -> 
             _check(item, fields[name].type, place.at(name))
     for name, field in fields.items():
         if field.required and name not in table:
-            what = place.key or "the file"
-            raise place.error(f"{what} lacks {name!r}, write {_example(field, place.at(name))}")
+            what = "" if place.key else "the file "
+            raise place.error(f"{what}lacks {name!r}, write {_example(field, place.at(name))}")
 
 
 def _check_union(value: object, choices: tuple[inspect.Type, ...], place: Place) -> None:

@@ -9,6 +9,7 @@ import pytest
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario_loader import load_scenario, parse_scenario
+from caviar_protocol.tables import located
 
 GOOD = """\
 [run]
@@ -239,7 +240,17 @@ def test_a_missing_key_is_named_with_its_table(folder: Path, line: str, key: str
     error = failure(GOOD.replace(line, "", 1), folder)
     assert error.key == key
     assert error.line is not None
-    assert says in str(error)
+    assert f"{key}: {says}" in str(error)
+
+
+def test_a_device_is_found_by_its_name_too(folder: Path) -> None:
+    """A world knows its own devices only, and so names them in its errors; the line is that of the key."""
+    scenario = parse_scenario(GOOD, "crossing.toml", folder)
+    for index, device in enumerate(scenario.devices):
+        for key in ("name", "kind", "role"):
+            wanted = scenario.source.line(f"devices[{index}].{key}")
+            said = located(f"devices.{device.name}.{key}: is bad", "world", scenario.source)
+            assert said == f"crossing.toml:{wanted}: devices.{device.name}.{key}: is bad"
 
 
 def test_a_file_without_a_run_table_says_what_it_lacks() -> None:

@@ -88,8 +88,11 @@ def test_a_device_on_what_can_never_come_is_refused(on: str) -> None:
     if not on.startswith("cra"):
         assert world.prepare(Preparation(demand={})).prefixes == ("car.",)
         return
-    with pytest.raises(ScenarioError, match=r"'rx' stands on 'cra\..*begin with car\."):
+    with pytest.raises(ScenarioError, match=r"'rx' stands on 'cra\..*begin with car\.") as refused:
         world.prepare(Preparation(demand={}))
+    assert refused.value.key == "devices.rx.on"
+    if on == "cra.1":
+        assert "did you mean 'car.'?" in str(refused.value)
 
 
 def test_first_come_keep_their_devices_and_the_next_takes_over() -> None:

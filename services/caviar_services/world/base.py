@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
+from difflib import get_close_matches
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, ClassVar, NamedTuple, TypeVar
@@ -19,6 +20,7 @@ from caviar_protocol.arrays import Float64Array, quantity
 from caviar_protocol.coordinates import UnitQuaternion, Vector
 from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.messages import Role
+from caviar_protocol.tables import Place
 from caviar_protocol.topics import Scene
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
 from caviar_services.world.assets import object_assets, scenery_assets
@@ -119,10 +121,12 @@ class World(Service[W]):
                 literal.startswith(prefix) or (is_pattern and prefix.startswith(literal))
                 for prefix in prefixes
             ):
+                near = get_close_matches(spec.on, prefixes, n=1)
+                meant = f"did you mean {near[0]!r}? " if near else ""
                 raise ScenarioError(
                     f"device {spec.name!r} stands on {spec.on!r}, which no object of world "
-                    f"{self.run.name!r} can be: their names begin with {', '.join(prefixes)}",
-                    key="devices",
+                    f"{self.run.name!r} can be: {meant}their names begin with {', '.join(prefixes)}",
+                    key=Place("devices").at(spec.name).at("on").key,
                 )
 
     def reset(self, episode: int, seed: int, t0_ns: int) -> None:
