@@ -7,8 +7,8 @@
 >>> recording.frame(episode=0, frame=7).scene().names
 ('car', 'uav')
 
-`Recording.__getitem__` gives a topic as arrays over all frames, `Recording.frames` the products frame by
-frame; docs/reading-recordings.md has more.
+`newest_run` gives the directory of the newest run, `Recording.__getitem__` a topic as arrays over all frames,
+`Recording.frames` the products frame by frame; docs/reading-recordings.md has more.
 
 A recording is a directory with ``recording-0000.mcap``, ``recording-0001.mcap``, … and the
 scenery in ``assets/``. After a crash it is readable up to the last frame whose record was
@@ -41,6 +41,7 @@ from caviar_protocol.recording_layout import (
     RecordingMetadata,
 )
 from caviar_protocol.recording_segments import RecordedSegments, metadata_of
+from caviar_protocol.recording_segments import newest_run as newest_run
 from caviar_protocol.recording_sensors import CameraArrays, DepthArrays, LidarArrays, SegmentationArrays
 from caviar_protocol.recording_topics import ActionArrays, ChannelArrays, LinkArrays, SceneArrays
 from caviar_protocol.scene import merge_scenes

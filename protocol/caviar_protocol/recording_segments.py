@@ -191,3 +191,25 @@ def _expected(folder: Path, files: list[Path], known: dict[str, SegmentRecord]) 
 
 def _first_there(files: list[Path]) -> str:
     return next((file.name for file in files if file.exists()), "another one")
+
+
+def newest_run(root: str | Path = "runs", name: str = "*") -> Path:
+    """The run directory below ``root`` whose recording was written last.
+
+    Parameters
+    ----------
+    root
+        Directory in which `caviar run` makes the directories of runs (its ``--out``).
+    name
+        Glob pattern of the run directory's name, such as ``"smoke-*"``.
+
+    A directory without a recording, as a run leaves that failed while starting, is passed over.
+    Raises `RecordingError` where there is no other.
+    """
+    written = {
+        file.parent: file.stat().st_mtime_ns for file in sorted(Path(root).glob(f"{name}/{SEGMENT_PATTERN}"))
+    }
+    if not written:
+        where = Path(root).resolve() / name
+        raise RecordingError(f"no run with a recording is at {where}; make one with: caviar run SCENARIO")
+    return max(written, key=lambda directory: (written[directory], directory.name))

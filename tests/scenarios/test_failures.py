@@ -120,6 +120,19 @@ def test_ctrl_c_ends_everything_cleanly(tmp_path: Path, number: signal.Signals) 
     assert frames_recorded(next(tmp_path.glob("smoke-*"))) > 0
 
 
+def test_a_run_that_ctrl_c_ends_before_its_first_frame_leaves_no_directory(tmp_path: Path) -> None:
+    file = scenario_file(tmp_path, base="remote")
+    with running(file, tmp_path / "out") as (process, mark):
+        log = "out/*/logs/broker.log"
+        eventually(lambda: list(tmp_path.glob(log)), 20, "the broker starts")
+        process.send_signal(signal.SIGINT)
+        output, _ = process.communicate(timeout=20)
+        assert process.returncode == 130
+        assert "no frame was simulated" in output
+        assert marked(mark) == []
+    assert list((tmp_path / "out").iterdir()) == []
+
+
 def test_a_launcher_that_is_killed_leaves_no_process_behind(tmp_path: Path) -> None:
     with running(scenario_file(tmp_path), tmp_path, "--frames", "100000") as (process, mark):
         eventually(lambda: recorded_below(tmp_path) > 3, 20, "a few frames are recorded")

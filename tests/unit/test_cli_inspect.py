@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import sys
 
 import pytest
 from recording_samples import absent, frame, link, product, record, recorder, scene
 
 from caviar_clients.cli.inspect import inspect_command, summarise
+from caviar_clients.cli.main import main
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import Recording
 from caviar_protocol.segment import Segment
@@ -104,3 +106,15 @@ def test_an_empty_run_is_summarised_without_means(tmp_path, capsys):
     record(tmp_path, frames=0)
     assert inspect_command(tmp_path) == 0
     assert "0 of 10 planned" in capsys.readouterr().out
+
+
+def test_without_a_run_the_newest_is_taken_and_named(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    record(tmp_path / "runs" / "smoke-1")
+    monkeypatch.setattr(sys, "argv", ["caviar", "inspect", "--digest"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 0
+    out, err = capsys.readouterr()
+    assert out == Recording("runs/smoke-1").run_digest().digest + "\n"
+    assert err == "run runs/smoke-1, the newest in ./runs\n"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import warnings
 from pathlib import Path
@@ -13,7 +14,7 @@ from recording_samples import absent, frame, link, product, record, recorder, sc
 from caviar_protocol.digest import RunDigest
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.messages import Status
-from caviar_protocol.recording import Recording, RecordingWarning
+from caviar_protocol.recording import Recording, RecordingWarning, newest_run
 from caviar_protocol.segment import Segment
 from caviar_protocol.topics import Link, Scene
 
@@ -271,3 +272,19 @@ def test_another_format_is_refused(tmp_path):
     file.write_bytes(data[:place] + b"2" + data[place + 1 :])
     with pytest.raises(RecordingError, match="has format 2, this version reads format 1"):
         Recording(tmp_path / "run")
+
+
+def test_the_newest_run_is_that_recorded_last_of_those_that_match(tmp_path: Path) -> None:
+    for age, name in enumerate(["smoke-3", "smoke-1", "city-2"]):
+        segment = record(tmp_path / name) / "recording-0000.mcap"
+        os.utime(segment, ns=(10**18 - age, 10**18 - age))
+    (tmp_path / "smoke-4" / "logs").mkdir(parents=True)
+    assert newest_run(tmp_path) == tmp_path / "smoke-3"
+    assert newest_run(str(tmp_path), "city-*") == tmp_path / "city-2"
+    for root, name in ((tmp_path, "smoke-4"), (tmp_path / "nothing", "*")):
+        with pytest.raises(RecordingError) as none:
+            newest_run(root, name)
+        assert (
+            str(none.value)
+            == f"no run with a recording is at {root / name}; make one with: caviar run SCENARIO"
+        )

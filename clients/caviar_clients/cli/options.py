@@ -9,7 +9,24 @@ import typer
 
 from caviar_clients.cli.scenarios import complete_scenario
 
-RunDirectory = Annotated[Path, typer.Argument(help="directory of a run, or one segment of its recording")]
+
+def _newest_run() -> Path:
+    """The newest run below ``./runs``; says on standard error which it is."""
+    from caviar_protocol.recording import newest_run
+
+    directory = newest_run("runs")
+    typer.echo(f"run {directory}, the newest in ./runs", err=True)
+    return directory
+
+
+RunDirectory = Annotated[
+    Path,
+    typer.Argument(
+        help="directory of a run, or one segment of its recording",
+        default_factory=_newest_run,
+        show_default="the newest in ./runs",
+    ),
+]
 Frames = Annotated[int | None, typer.Option(min=1, help="frames of an episode, instead of the scenario's")]
 Seed = Annotated[int | None, typer.Option(min=0, max=2**63 - 1, help="seed, instead of the scenario's")]
 Pace = Annotated[

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import time
 from collections.abc import Mapping, Sequence
@@ -98,7 +99,7 @@ def run_scenario(
         launcher = Launcher(
             scenario, find_scenario(path).resolve(), directory, frames, seed, bind, keys, http, pace=pace
         )
-    return _follow(launcher, scenario, directory, console, json_file, keys, warnings)
+    return _follow(launcher, scenario, directory, console, json_file, keys, warnings, new=True)
 
 
 def resume_run(
@@ -130,8 +131,13 @@ def _follow(
     json_file: Path | None,
     keys: Path | None,
     warnings: Sequence[str] = (),
+    *,
+    new: bool = False,
 ) -> int:
-    """Show a run to its end, and sum it up; ``warnings`` are those of its scenario."""
+    """Show a run to its end, and sum it up; ``warnings`` are those of its scenario.
+
+    The directory of a ``new`` run that the user stops before its first frame is removed.
+    """
     outcome: Mapping[str, Any] = {}
     interrupted = _Interruption(launcher)
     with launcher, interrupted, _progress_bar(console) as bar:
@@ -156,6 +162,9 @@ def _follow(
         if log is not None:
             console.print(Text(f"its log: {log}"), soft_wrap=True)
     _write_summary(summary, directory, json_file)  # last: a disk that is full leaves the screen
+    if new and interrupted.came and not outcome["frames"]:
+        shutil.rmtree(directory, ignore_errors=True)
+        console.print(Text(f"no frame was simulated; {directory} is removed"), soft_wrap=True)
     return 130 if interrupted.came else 1 if outcome["error"] else 0
 
 
