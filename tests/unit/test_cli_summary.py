@@ -11,6 +11,7 @@ from recording_samples import record
 from rich.console import Console
 
 from caviar_clients.cli.run import run_scenario
+from caviar_clients.cli.scenarios import new_scenario
 from caviar_clients.cli.summary import recorded_figures, summary_of, summary_table
 from caviar_protocol.errors import RunError
 from caviar_protocol.recording import Recording
@@ -54,6 +55,35 @@ def test_missed_deadlines_are_counted_in_words_that_fit(tmp_path: Path, decision
         summary_table(summary_of(outcome(4) | {"deadlines": late}, None, "smoke", tmp_path, 1)).caption
     )
     assert said in told
+
+
+def test_misses_that_were_answered_before_the_broker_looked_are_told_apart(tmp_path: Path) -> None:
+    """The first number is the sum of the table's column."""
+    figures = {"p50_ms": 1.0, "p99_ms": 2.0, "budget_ms": 1.0, "frames": 100}
+    services = {"channel": figures | {"misses": 50}, "link": figures | {"misses": 30}}
+    late = {"decisions": 76, "p99_ms": 1.0, "worst_ms": 2.0}
+    ended = outcome(4) | {"deadlines": late, "services": services}
+    told = str(summary_table(summary_of(ended, None, "smoke", tmp_path, 1)).caption)
+    assert "80 missed deadlines: 76 decided 1.00 ms (p99) behind, 2.00 ms at worst; 4 answered before" in told
+
+
+def test_a_service_that_is_not_run_stands_on_the_screen_and_in_the_summary(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """The LIDAR that the template of `caviar new` has commented out, without "lidar" in `record`."""
+    path = new_scenario(str(tmp_path / "idle"))
+    text = path.read_text()
+    for block in ("[services.lidar]", "[[devices]]"):
+        begin = text.index(f"# {block}")
+        end = text.index("\n\n", begin)
+        text = text[:begin] + text[begin:end].replace("# ", "") + text[end:]
+    path.write_text(text)
+    assert run_scenario(path, tmp_path / "runs", Console(width=300), frames=2, embedded=True) == 0
+    said = 'no service takes its lidar, so it is not run; add "lidar" to run.record'
+    assert f"idle: lidar: {said}" in capsys.readouterr().out
+    (directory,) = (tmp_path / "runs").iterdir()
+    assert f"lidar: {said}" in json.loads((directory / "summary.json").read_text())["warnings"]
+    assert 'add "lidar" to run.record' in (directory / "summary.txt").read_text().replace("\n", " ")
 
 
 def test_a_full_disk_costs_the_summary_and_not_the_figures_on_the_screen(

@@ -112,8 +112,10 @@ class Joining:
             return
         run.enter(RunEvent.ALL_JOINED, now)
         for name in run.graph.idle:
-            outputs = ", ".join(hellos[name].outputs)
-            run.notice("idle", name, f"nobody asks for its {outputs}, so it is not run (see run.record)")
+            outputs = hellos[name].outputs
+            add = " or ".join(f'"{topic}"' for topic in outputs)
+            text = f"no service takes its {', '.join(outputs)}, so it is not run; add {add} to run.record"
+            run.notice("idle", name, text)
         self._prepare_whoever_can(now)
 
     # --- PREPARE and READY ---------------------------------------------------------------------------

@@ -38,7 +38,7 @@ from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario_checks import refuse_remote
 from caviar_protocol.scenario_loader import find_scenario
 
-QUIET = frozenset({"stale", "note", "idle", "lag"})
+QUIET = frozenset({"stale", "note", "lag"})
 """Kinds of notices that are logged, and only counted on the screen."""
 REPEATED = frozenset({"lost", "away", "back", "restarted", "refused"})
 """Kinds of notices that are shown every time, since what they ask of the user is always new."""
@@ -152,12 +152,13 @@ def _follow(
         return 130 if interrupted.came else 1
     outcome = with_recording_checked(directory, scenario, outcome)
     recorded = recorded_figures(directory) if outcome["frames"] else None
-    summary = summary_of(outcome, recorded, scenario.run.name, directory, scenario.run.seed, warnings)
+    told = [*warnings, *watcher.idle.values()]
+    summary = summary_of(outcome, recorded, scenario.run.name, directory, scenario.run.seed, told)
     if outcome["frames"]:
         _show(console, summary)
     if outcome["error"]:
-        told = Text.assemble(("the run ended early:", "red"), f" {outcome['error']}")
-        console.print(told, soft_wrap=True)
+        words = Text.assemble(("the run ended early:", "red"), f" {outcome['error']}")
+        console.print(words, soft_wrap=True)
         log = launcher.log_of(outcome["culprit"])
         if log is not None:
             console.print(Text(f"its log: {log}"), soft_wrap=True)
@@ -218,6 +219,8 @@ class _Watcher:
         self._first: tuple[float, int] | None = None
         self._shown: dict[tuple[str, str], int] = {}
         self._scenario, self._endpoint, self._keys = scenario, "", keys
+        self.idle: dict[str, str] = {}
+        """Services that are not run, with the reason, for the summary."""
 
     def take(self, event: Mapping[str, Any]) -> None:
         """Show one event."""
@@ -257,6 +260,8 @@ class _Watcher:
     def _notice(self, event: Mapping[str, Any]) -> None:
         """Show the first of each kind and service; the rest is in events.jsonl."""
         key = (event["kind"], event["service"])
+        if event["kind"] == "idle":
+            self.idle[event["service"]] = f"{event['service']}: {event['text']}"
         self._shown[key] = self._shown.get(key, 0) + 1
         if self._shown[key] == 1 or event["kind"] in REPEATED:
             frame = f" in frame {event['frame']}" if event["frame"] >= 0 else ""

@@ -94,10 +94,7 @@ def _caption(summary: Mapping[str, Any]) -> str:
         )
     late, pace = summary["deadlines"], summary["pace"]
     if late["decisions"]:
-        parts.append(
-            f"{counted(late['decisions'], 'missed deadline')}, decided {late['p99_ms']:.2f} ms (p99) behind, "
-            f"{late['worst_ms']:.2f} ms at worst"
-        )
+        parts.append(_missed(sum(s["misses"] for s in summary["services"].values()), late))
     if pace["slips"]:
         parts.append(
             f"{counted(pace['slips'], 'frame')} slipped behind real time, "
@@ -118,3 +115,17 @@ def _caption(summary: Mapping[str, Any]) -> str:
     parts += decided_lines(msgspec.convert(summary["decided"], list[Decided]))
     parts += [f"warning: {warning}" for warning in summary["warnings"]]
     return "\n".join(parts)
+
+
+def _missed(misses: int, late: Mapping[str, Any]) -> str:
+    """Missed deadlines, and how promptly the broker saw those that passed before the answer came."""
+    seen, when = (
+        late["decisions"],
+        f"{late['p99_ms']:.2f} ms (p99) behind, {late['worst_ms']:.2f} ms at worst",
+    )
+    if misses <= seen:
+        return f"{counted(seen, 'missed deadline')}, decided {when}"
+    return (
+        f"{counted(misses, 'missed deadline')}: {seen} decided {when}; "
+        f"{misses - seen} answered before the broker looked at the clock"
+    )
