@@ -101,6 +101,7 @@ class Client:
         self.who: dict[str, int] = {}
         self.devices: list[dict[str, Any]] = []
         self.episode, self.last, self.lived = -1, -1, 0
+        self.active = False
         self.counted = 0
         """Frames answered in this episode, on which products depend: its state."""
         self.stored: dict[int, list[bytes]] = {}
@@ -244,6 +245,10 @@ class Client:
         self.say("ASSET_GET", digest=fields["digest"])
 
     def on_reset(self, fields: dict[str, Any], parts: list[bytes]) -> None:
+        if self.active:
+            self.say("ERROR", code="unexpected", message="RESET without EPISODE_END")
+            return
+        self.active = True
         self.episode, self.last, self.stored, self.counted = fields["episode"], -1, {}, 0
         episode = 9 if bad("resets another episode") else self.episode
         if bad("stops beating in frames") and self.heart:
@@ -271,7 +276,7 @@ class Client:
             self.say("READY", **self.who)
 
     def on_episode_end(self, fields: dict[str, Any], parts: list[bytes]) -> None:
-        pass
+        self.active = False
 
     def on_stale(self, fields: dict[str, Any], parts: list[bytes]) -> None:
         if bad("answers complaints"):

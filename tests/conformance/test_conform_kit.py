@@ -21,6 +21,7 @@ from caviar_clients.cli.main import app
 from caviar_clients.conform import Verdict, cases, conform, street
 from caviar_clients.conform.client import End, Started
 from caviar_clients.conform.packing import unpack
+from caviar_clients.conform.report import as_markdown, repeated
 from caviar_clients.conform.session import Rules, Seen, Session
 from caviar_clients.conform.wire import Wire
 from caviar_protocol.codec import decode_payload, encode_payload
@@ -341,6 +342,20 @@ def test_each_fault_is_found_by_its_case(case: str, fault: str) -> None:
     verdicts = broken(fault, *(["hello"] if case == "canonical" else []), case)
     assert list(failures(verdicts)) == [case]
     assert verdicts[-1].got
+
+
+def test_a_failed_case_is_not_blamed_on_the_next_one() -> None:
+    """The client is strict: it answers RESET in an episode that did not end with ERROR."""
+    verdicts = broken("ends at an unknown field", "unknown-fields", "episodes")
+    assert {v.case: v.outcome for v in verdicts} == {"unknown-fields": "fail", "episodes": "pass"}
+
+
+def test_what_fails_alike_is_told_once_at_the_end() -> None:
+    verdicts = broken("states a false digest", "frames", "repeated-grant", "hello")
+    (line,) = repeated(verdicts)
+    assert line.startswith("2 cases failed with the same words (frames, repeated-grant)")
+    assert "hash the length of the header (8 bytes, little-endian), the header and the body" in line
+    assert f"- {line}" in as_markdown(verdicts).splitlines()
 
 
 def test_there_is_a_fault_for_every_case() -> None:

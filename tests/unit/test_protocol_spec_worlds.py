@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
 import msgspec
+import pytest
 
+from caviar_protocol.coordinates import rotated, rotation_matrix
 from caviar_protocol.host import host_identity
 from caviar_protocol.keys import Pair, read_pair
 from caviar_protocol.ply import read_ply
@@ -33,6 +37,29 @@ def test_the_example_of_scenery_and_its_mesh_are_read(tmp_path: Path) -> None:
     vertices, faces = read_ply(shape.file)
     assert vertices.shape == (4, 3)
     assert faces.tolist() == [[0, 1, 2], [0, 2, 3]]
+
+
+def of_engine(row: str, name: str, values: dict[str, float]) -> list[float]:
+    """Numbers of a cell of the table of engines, by the axes and components that it names."""
+    cells = dict(zip(("engine", "position", "quaternion", "dimensions"), row.split(" | "), strict=True))
+    terms = re.findall(r"(−?)([wxyz])(?:/(100))?", cells[name])
+    return [(-1 if sign else 1) * values[key] / float(scale or 1) for sign, key, scale in terms]
+
+
+@pytest.mark.parametrize("engine", ["ROS", "Unreal", "Unity", "Godot"])
+def test_the_table_of_engines_turns_and_then_maps_as_it_maps_and_then_turns(engine: str) -> None:
+    (row,) = re.findall(rf"^\| (.*\({engine}\) \|.*) \|$", SPEC, re.MULTILINE)
+    parts = {"w": 0.3, "x": 0.5, "y": -0.2, "z": math.sqrt(0.62)}
+    turn = rotation_matrix([parts[key] for key in "wxyz"])
+    body = [1.0, 2.0, 3.0]
+
+    def mapped(vector: Iterable[float]) -> list[float]:
+        return of_engine(row, "position", dict(zip("xyz", vector, strict=True)))
+
+    expected = mapped(turn @ body)
+    assert rotated(of_engine(row, "quaternion", parts), mapped(body)) == pytest.approx(expected)
+    sides = of_engine(row, "dimensions", {"x": 1.0, "y": 2.0, "z": 3.0})
+    assert sides == pytest.approx([abs(side) for side in mapped(body)])
 
 
 def test_every_key_of_a_device_is_in_the_table() -> None:

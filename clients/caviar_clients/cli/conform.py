@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from caviar_clients.conform import Verdict, cases, conform
-from caviar_clients.conform.report import as_json, as_markdown, summary
+from caviar_clients.conform.report import as_json, as_markdown, repeated, summary
 from caviar_clients.conform.session import Rules
 from caviar_clients.files import write_file
 from caviar_protocol.errors import SetupError
@@ -58,6 +58,8 @@ def conform_client(
     verdicts = conform(listen, **options)
     console.print()
     console.print(_table(verdicts))
+    for cause in repeated(verdicts):
+        console.print(Text(cause), soft_wrap=True)
     failed = any(verdict.outcome == "fail" for verdict in verdicts)
     console.print(summary(verdicts), style="bold red" if failed else "bold green", highlight=False)
     for file, text in ((json_file, as_json(verdicts)), (markdown_file, as_markdown(verdicts))):

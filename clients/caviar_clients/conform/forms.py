@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from typing import Any
 
-import msgspec
-
+from caviar_clients.conform.canonical import first_difference
 from caviar_clients.conform.case import Failed
 from caviar_clients.conform.packing import BROKEN, pack, unpack
 from caviar_clients.conform.wire import Fields, Received
@@ -54,12 +52,11 @@ def not_canonical(received: Received) -> str:
     kind = message_type(message)
     if next(iter(fields)) != "type":
         return f"{kind}: the first key is {next(iter(fields))!r}, not 'type'"
-    if pack(fields) != header:
-        return f"{kind}: an integer, string, list or map is not in its shortest form, or a key occurs twice"
-    known = {key: value for key, value in fields.items() if key in ("type", *message.__struct_fields__)}
+    unknown = frozenset(fields).difference(("type", *message.__struct_fields__))
+    known = {key: value for key, value in fields.items() if key not in unknown}
     right = encode_message(message)
-    if pack(known) != right:
-        return f"{kind}: keys are {', '.join(known)}; {_difference(known, unpack(right))}"
+    if pack(fields) != header or pack(known) != right:
+        return f"{kind}: {_difference(header, right, unknown)}"
     return ""
 
 
@@ -75,7 +72,9 @@ def check_products(done: Fields, parts: list[bytes], outputs: list[str]) -> dict
         right = product_digest(header, body)
         if entry["digest"] != right:
             raise Failed(
-                f"digest {right} over length, header and body of {topic!r}", str(entry["digest"]) or "none"
+                f"digest {right} of {topic!r}: hash the length of the header (8 bytes, little-endian), "
+                "the header and the body",
+                str(entry["digest"]) or "none",
             )
         try:
             payload = decode_payload(topic, header, body)
@@ -88,21 +87,18 @@ def check_products(done: Fields, parts: list[bytes], outputs: list[str]) -> dict
     return found
 
 
-def _difference(got: Fields, right: Fields) -> str:
-    superfluous = [key for key in got if key not in right]
-    if superfluous:
-        return f"{', '.join(superfluous)} equals its default and is to be left out"
-    if list(got) != list(right):
-        return f"the order of the table is {', '.join(right)}"
-    wrong = [key for key in got if pack(got[key]) != pack(right[key])]
-    return f"{', '.join(wrong)} is not canonical inside"
+def _difference(header: bytes, right: bytes, unknown: frozenset[str] = frozenset()) -> str:
+    try:
+        found = first_difference(header, right, unknown)
+    except BROKEN:  # nested too deep to walk through
+        found = ""
+    return found or "other bytes in the header"
 
 
 def _payload_difference(header: bytes, body: bytes, again: tuple[bytes, bytes]) -> str:
-    if header == again[0]:
-        return f"a body of {len(body)} B where {len(again[1])} B are canonical, or other filling than zeros"
-    try:
-        got: Any = unpack(header)
-        return _difference(got, msgspec.msgpack.decode(again[0]))
-    except (*BROKEN, msgspec.MsgspecError):
-        return "other bytes in the header"
+    if header != again[0]:
+        return _difference(header, again[0])
+    if len(body) != len(again[1]):
+        return f"a body of {len(body)} B where {len(again[1])} B are canonical"
+    place = next(place for place, pair in enumerate(zip(body, again[1], strict=True)) if pair[0] != pair[1])
+    return f"byte {place} of the body is {body[place]:#04x}, needs {again[1][place]:#04x}"

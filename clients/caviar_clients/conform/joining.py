@@ -119,7 +119,8 @@ def ready(kit: Kit) -> str:
     )
     right = hashlib.sha256(chain.encode()).hexdigest() if session.assets else ""
     if geometry != right and (geometry or role == "world"):
-        raise Failed(f"geometry {right or '(empty)'}", geometry or "none")
+        recipe = "hash name NUL digest NUL of each asset, in ascending order of names"
+        raise Failed(f"geometry {right or '(empty)'}: {recipe}", geometry or "none")
     if role == "world" and not said.get("prefixes"):
         raise Failed("prefixes of the names of the world's objects", "none")
     if role != "agent" and (said.get("actuators") or "seed" in said):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Sequence
 
@@ -9,6 +10,7 @@ import msgspec
 
 from caviar_clients.conform.case import Outcome, Verdict
 
+_NUMBER = re.compile(r"\b[0-9a-f]{64}\b|\d+")
 OUTCOMES: tuple[Outcome, ...] = ("pass", "fail", "not applicable")
 
 
@@ -20,6 +22,20 @@ def summary(verdicts: Sequence[Verdict]) -> str:
     return f"{', '.join(words)}, in {seconds:.1f} s"
 
 
+def repeated(verdicts: Sequence[Verdict]) -> list[str]:
+    """A line for cases in which the same came, but for numbers and digests: they may have one cause."""
+    causes: dict[str, list[Verdict]] = {}
+    for verdict in verdicts:
+        if verdict.outcome == "fail":
+            causes.setdefault(_NUMBER.sub("…", verdict.got), []).append(verdict)
+    return [
+        f"{len(alike)} cases failed with the same words ({', '.join(verdict.case for verdict in alike)}), "
+        f"maybe for one cause: expected {alike[0].expected}; got {alike[0].got}"
+        for alike in sorted(causes.values(), key=len, reverse=True)
+        if len(alike) > 1
+    ]
+
+
 def as_json(verdicts: Sequence[Verdict]) -> str:
     """An object with ``verdicts`` and how many of each outcome there are."""
     counts = Counter(verdict.outcome for verdict in verdicts)
@@ -29,7 +45,7 @@ def as_json(verdicts: Sequence[Verdict]) -> str:
 
 
 def as_markdown(verdicts: Sequence[Verdict]) -> str:
-    """A table, with the summary below."""
+    """A table, with what failed alike and the summary below."""
     lines = ["| case | clauses | verdict | expected | got |", "| --- | --- | --- | --- | --- |"]
     for verdict in verdicts:
         cells = (
@@ -40,7 +56,8 @@ def as_markdown(verdicts: Sequence[Verdict]) -> str:
             verdict.got,
         )
         lines.append("| " + " | ".join(map(_cell, cells)) + " |")
-    return "\n".join([*lines, "", summary(verdicts), ""])
+    causes = [f"- {line}" for line in repeated(verdicts)]
+    return "\n".join([*lines, "", *causes, *([""] if causes else []), summary(verdicts), ""])
 
 
 def _cell(text: str) -> str:
