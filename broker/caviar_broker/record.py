@@ -37,8 +37,10 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     def save(self, directory: Path) -> None:
         """Write it, in one step and to the disk. `RunError` naming the file where that fails."""
         path = directory / NAME
-        source_left_out = msgspec.structs.replace(self.scenario, source=Source())
-        plain = msgspec.structs.replace(self, scenario=source_left_out, check=_UNSET)
+        file = self.scenario.source.file  # whose folder may have modules of services
+        source = Source(file=str(Path(file).resolve()) if file else "")
+        without_lines = msgspec.structs.replace(self.scenario, source=source)
+        plain = msgspec.structs.replace(self, scenario=without_lines, check=_UNSET)
         data = msgspec.json.format(msgspec.json.encode(plain), indent=1) + b"\n"
         check = hashlib.sha256(data).hexdigest()
         try:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from caviar_protocol.errors import CaviarError
 from caviar_protocol.keys import credentials
+from caviar_services.registry import find_modules_in
 from caviar_services.runner import CONNECT_TIMEOUT_S, run_service
 
 
@@ -21,13 +23,20 @@ def serve(
     broker_key: Path | None = None,
     *,
     restarted: bool = False,
+    modules: Sequence[Path] = (),
 ) -> int:
-    """Run the implementation ``use`` ("role:name") as the service ``name``; the exit status."""
+    """Run the implementation ``use`` ("role:name") as the service ``name``; the exit status.
+
+    The module of a ``role:module:Class`` is also looked for in the current folder and in ``modules``.
+    """
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(message)s")
     role, separator, implementation = use.partition(":")
     if not separator:
         sys.stderr.write(f"caviar service: --use {use!r} is not ROLE:NAME, for example world:sumo\n")
         return 2
+    if ":" in implementation:
+        for folder in (*modules, Path.cwd()):
+            find_modules_in(folder)
     try:
         found = credentials(key, broker_key)
         return run_service(name, role, implementation, broker, connect_timeout_s, found, restarted=restarted)
@@ -59,6 +68,9 @@ def main() -> int:
         help="this process is started again whenever its status is not 0: status 1 after a run that failed, "
         "0 after SIGTERM",
     )
+    parser.add_argument(
+        "--modules", type=Path, action="append", default=[], help="folder of the module of ROLE:module:Class"
+    )
     arguments = parser.parse_args()
     return serve(
         arguments.name,
@@ -68,6 +80,7 @@ def main() -> int:
         arguments.key,
         arguments.broker_key,
         restarted=arguments.restarted,
+        modules=arguments.modules,
     )
 
 

@@ -9,9 +9,12 @@ registered at all can be named by its place, ``module:Class``, as long as Python
 from __future__ import annotations
 
 import difflib
+import inspect
+import sys
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Any
 
 from caviar_protocol.errors import DeclarationError
@@ -69,13 +72,28 @@ def load(role: str, name: str) -> type[Service[Any]]:
     except Exception as error:  # whatever a module that is not ours does when it is imported
         known = isinstance(error, ImportError | AttributeError)
         text = str(error) if known else f"{type(error).__name__}: {error}"
+        if isinstance(error, ModuleNotFoundError) and error.name == module_name.partition(".")[0]:
+            text += (
+                "; modules are looked for beside the scenario, in the current folder, among what is "
+                "installed and in PYTHONPATH"
+            )
         raise DeclarationError(f"{role} {name!r} cannot be loaded from {target}: {text}") from error
     if not (isinstance(cls, type) and issubclass(cls, Service)):
         raise DeclarationError(f"{role} {name!r} is {target}, which is not a Service")
     declared = getattr(cls, "role", None)
     if declared != role:
         raise DeclarationError(f"{role} {name!r} is {target}, whose role is {declared!r}")
+    if inspect.isabstract(cls):
+        missing = ", ".join(sorted(cls.__abstractmethods__))
+        raise DeclarationError(f"{role} {name!r} is {target}, which does not define: {missing}")
     return cls
+
+
+def find_modules_in(folder: Path) -> None:
+    """Let Python find modules in a folder too, after all other places, so that they hide no other module."""
+    text = str(folder.resolve())
+    if text not in sys.path:
+        sys.path.append(text)
 
 
 def _registered_target(role: str, name: str) -> str:

@@ -241,6 +241,10 @@ class StepResult(msgspec.Struct, frozen=True, kw_only=True):
     """Agents, with ``end_episode`` or for the final grant: of the next episode; −1: none chosen."""
 
 
+class NoSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of a service that has none."""
+
+
 class Service(ABC, Generic[S]):
     """One service of a run.
 
@@ -257,7 +261,7 @@ class Service(ABC, Generic[S]):
     """Whether `checkpoint` and `restore` are implemented: the service has state that outlives a frame."""
     extra: ClassVar[str] = ""
     """Extra of the distribution that brings the libraries of this service; empty: the base install does."""
-    Settings: ClassVar[type[msgspec.Struct]]
+    Settings: ClassVar[type[msgspec.Struct]] = NoSettings
     """Settings from the scenario: a frozen struct, ``forbid_unknown_fields=True``, units in names."""
 
     @classmethod

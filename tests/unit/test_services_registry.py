@@ -12,6 +12,7 @@ import pytest
 
 from caviar_protocol.errors import DeclarationError
 from caviar_services import registry
+from caviar_services.agent.base import AgentSettings
 from caviar_services.channel.free_space import FreeSpaceChannel
 from caviar_services.registry import BUILT_IN, load, registered
 
@@ -91,3 +92,28 @@ def test_importing_the_registry_imports_no_implementation() -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=True
     )
     assert done.stdout.strip() == "[]"
+
+
+def test_an_agent_of_no_settings_of_its_own_has_those_of_its_base(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = "from caviar_services.agent.base import Agent\n\n\nclass Mine(Agent):\n"
+    module(tmp_path, monkeypatch, "mine_whole", text + "    def choose(self, *given): return []\n")
+    assert load("agent", "mine_whole:Mine").Settings is AgentSettings
+    module(tmp_path, monkeypatch, "mine_empty", text + "    pass\n")
+    with pytest.raises(DeclarationError, match=r"mine_empty:Mine, which does not define: choose$"):
+        load("agent", "mine_empty:Mine")
+
+
+def test_a_module_is_found_in_a_folder_that_was_added_and_hides_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    (tmp_path / "only_here.py").write_text((Path(registry.__file__).parent / "agent/random.py").read_text())
+    with pytest.raises(DeclarationError, match="No module named 'only_here'; modules are looked for beside"):
+        load("agent", "only_here:RandomAgent")
+    registry.find_modules_in(tmp_path)
+    registry.find_modules_in(tmp_path)
+    assert load("agent", "only_here:RandomAgent").role == "agent"
+    assert sys.path.count(str(tmp_path)) == 1
+    assert sys.path[-1] == str(tmp_path)

@@ -16,6 +16,7 @@ from typing import Any
 from caviar_broker.processes import describe_exit, describe_stop, is_stopped
 from caviar_clients.cli.borrowed import BorrowedKey
 from caviar_clients.cli.children import Child, end, wait
+from caviar_clients.sessions.checking import module_folders
 from caviar_protocol.errors import RunError
 from caviar_protocol.scenario import Scenario, ServiceSpec
 
@@ -171,6 +172,8 @@ class Launcher:
         spec, path = self._local[name], self.directory / "logs" / f"{name}.log"
         command = [sys.executable, "-m", "caviar_services", name]
         command += ["--use", f"{spec.role}:{spec.use}", "--broker", self.endpoint]
+        for folder in module_folders(self.scenario):
+            command += ["--modules", str(folder)]
         child = Child.start(name, command, path, self._key.environment())
         before, self._children[name] = self._children.get(name), child
         if before is not None:

@@ -157,8 +157,8 @@ def _follow(
     if outcome["frames"]:
         _show(console, summary)
     if outcome["error"]:
-        words = Text.assemble(("the run ended early:", "red"), f" {outcome['error']}")
-        console.print(words, soft_wrap=True)
+        ended = Text.assemble(("the run ended early:", "red"), f" {outcome['error']}")
+        console.print(ended, soft_wrap=True)
         log = launcher.log_of(outcome["culprit"])
         if log is not None:
             console.print(Text(f"its log: {log}"), soft_wrap=True)

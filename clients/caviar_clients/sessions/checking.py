@@ -10,7 +10,7 @@ from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario_checks import scenario_error, settings_place, with_overrides
 from caviar_protocol.scenario_loader import load_scenario
 from caviar_protocol.tables import convert_settings
-from caviar_services.registry import load
+from caviar_services.registry import find_modules_in, load
 
 TOPICS_OF: Mapping[str, tuple[str, ...]] = {
     "world": ("scene",),
@@ -34,8 +34,21 @@ def checked_scenario(
     return check_implementations(with_overrides(load_scenario(path), frames, seed, pace))
 
 
+def module_folders(scenario: Scenario) -> tuple[Path, ...]:
+    """Where modules of services that are named ``module:Class`` may lie: beside the scenario, and here.
+
+    Empty where no service is named so.
+    """
+    if not any(":" in spec.use for spec in scenario.services.values()):
+        return ()
+    beside = (Path(scenario.source.file).resolve().parent,) if scenario.source.file else ()
+    return (*beside, Path.cwd())
+
+
 def check_implementations(scenario: Scenario) -> Scenario:
     """The scenario, checked as `checked_scenario` does."""
+    for folder in module_folders(scenario):
+        find_modules_in(folder)
     produced: set[str] = set()
     for name, spec in scenario.services.items():
         if spec.remote:

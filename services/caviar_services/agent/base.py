@@ -54,6 +54,7 @@ class Agent(Service[S]):
         Input(topic="link", lag=1, required=False),
     )
     outputs: ClassVar[tuple[str, ...]] = ("action",)
+    Settings: ClassVar[type[msgspec.Struct]] = AgentSettings
 
     def __init__(self, settings: S, run: RunInfo) -> None:
         super().__init__(settings, run)

@@ -69,6 +69,7 @@ class ChannelModel(Service[S]):
     """
 
     role: ClassVar[Role] = "channel"
+    Settings: ClassVar[type[msgspec.Struct]] = ChannelSettings
     inputs: ClassVar[tuple[Input, ...]] = (Input(topic="scene"),)
     outputs: ClassVar[tuple[str, ...]] = ("channel",)
     rung: str

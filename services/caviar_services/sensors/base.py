@@ -51,6 +51,7 @@ class Sensors(Service[S]):
     """
 
     role: ClassVar[Role] = "sensors"
+    Settings: ClassVar[type[msgspec.Struct]] = SensorSettings
     extra: ClassVar[str] = "sensors"
     inputs: ClassVar[tuple[Input, ...]] = (Input(topic="scene"),)
 

@@ -63,6 +63,7 @@ class World(Service[W]):
     """
 
     role: ClassVar[Role] = "world"
+    Settings: ClassVar[type[msgspec.Struct]] = WorldSettings
     outputs: ClassVar[tuple[str, ...]] = ("scene",)
 
     def __init__(self, settings: W, run: RunInfo) -> None:
