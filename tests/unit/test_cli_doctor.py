@@ -139,3 +139,23 @@ def test_a_machine_without_loopback_is_reported(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(doctor.socket, "create_server", refused)
     check = doctor.check_loopback()
     assert (check.ok, check.remedy) == (False, "sudo ip link set lo up")
+
+
+def test_a_base_install_is_whole_and_one_command_adds_every_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    base = {requirement.name for requirement in doctor._requirements("")}
+    versions = {name: doctor._version(name) for name in base}
+    monkeypatch.setattr(doctor, "_version", versions.get)
+    monkeypatch.setattr(doctor.importlib.util, "find_spec", lambda name: None)
+
+    def none() -> llvm.LlvmLibrary:
+        raise SetupError("no libLLVM of version 16 or newer")
+
+    monkeypatch.setattr(llvm, "choose_llvm", none)
+    checks = [doctor.check_base(), *map(doctor.check_extra, doctor.EXTRAS), doctor.check_sumo()]
+    checks.append(doctor.check_llvm())
+    assert [check.extra for check in checks if not check.ok] == [*doctor.EXTRAS, "world"]
+    assert doctor.exit_status(checks) == 0
+    text = shown(checks, width=200)
+    assert text.count("pip install") == 1
+    assert "install 'caviar-sim[channel,sensors,world,plot,learning]'" in text
+    assert "Everything that the base install needs is here." in text

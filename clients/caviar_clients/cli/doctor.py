@@ -30,10 +30,10 @@ from caviar_clients.cli.summary import recorded_figures
 from caviar_clients.embedded.run import EmbeddedRun
 from caviar_clients.sessions.checking import checked_scenario
 from caviar_protocol.errors import CaviarError, SetupError
-from caviar_protocol.extras import DISTRIBUTION
+from caviar_protocol.extras import DISTRIBUTION, install_command
 from caviar_services import llvm
 
-EXTRAS = ("channel", "sensors", "world", "plot")
+EXTRAS = ("channel", "sensors", "world", "plot", "learning")
 MINIMUM_PYTHON = (3, 11)
 MINIMUM_FREE_GB = 2.0
 MINIMUM_FILES = 1024
@@ -72,6 +72,8 @@ class Check:
     """What there is, or what is wrong with it."""
     remedy: str = ""
     """The command that mends it; empty where it is ok."""
+    extra: str = ""
+    """The extra that brings it, where the base install does without."""
 
 
 @dataclass(frozen=True)
@@ -93,8 +95,8 @@ def doctor() -> list[Check]:
 
 
 def exit_status(checks: list[Check]) -> int:
-    """1 where something that a shipped scenario needs is missing, else 0."""
-    return 0 if all(check.ok for check in checks) else 1
+    """1 where something is wrong, else 0; an extra that is not installed is optional."""
+    return 0 if all(check.ok or check.extra for check in checks) else 1
 
 
 def render(checks: list[Check], console: Console) -> None:
@@ -104,16 +106,27 @@ def render(checks: list[Check], console: Console) -> None:
     table.add_column("what", no_wrap=True)
     table.add_column("found", overflow="fold")
     for check in checks:
-        mark = "[green]ok[/]" if check.ok else "[bold red]--[/]"
+        mark = "[green]ok[/]" if check.ok else "[yellow]optional[/]" if check.extra else "[bold red]--[/]"
         table.add_row(mark, check.name, check.found)
     console.print(table)
-    wrong = [check for check in checks if not check.ok]
+    wrong = [check for check in checks if not check.ok and not check.extra]
+    lacking = dict.fromkeys(check.extra for check in checks if not check.ok and check.extra)
     for check in wrong:
         console.print(f"\n[bold red]{check.name}[/]: mend it with")
-        # printed as it is, so that it can be copied even where it is longer than the terminal
-        console.print(f"  {check.remedy}", soft_wrap=True, markup=False, highlight=False)
+        _print_command(console, check.remedy)
+    if lacking:
+        console.print(
+            f"\noptional: {', '.join(lacking)}; `caviar scenarios` says what needs which. To add them:"
+        )
+        _print_command(console, install_command(*lacking))
     if not wrong:
-        console.print("\nEverything that the shipped scenarios need is here.")
+        needed = "the base install" if lacking else "the shipped scenarios"
+        console.print(f"\nEverything that {needed} needs is here.")
+
+
+def _print_command(console: Console, command: str) -> None:
+    """Print it as it is, so that it can be copied even where it is longer than the terminal."""
+    console.print(f"  {command}", soft_wrap=True, markup=False, highlight=False)
 
 
 def check_python() -> Check:
@@ -164,11 +177,14 @@ def check_extra(extra: str) -> Check:
 
 def check_llvm() -> Check:
     """The LLVM that the ray tracer would use, and that it compiles."""
+    tracer = importlib.util.find_spec("drjit") is not None
     try:
         library = llvm.choose_llvm()
     except SetupError as error:
+        if not tracer:
+            return Check("LLVM", True, f"none; extras channel and sensors need one: {llvm.INSTALL}")
         return Check("LLVM", False, str(error), llvm.INSTALL)
-    if importlib.util.find_spec("drjit") is None:
+    if not tracer:
         return Check("LLVM", True, f"{library}; not tried, Dr.Jit is not installed")
     outcome = _run([sys.executable, "-c", _KERNEL], {llvm.ENVIRONMENT: str(library.path)})
     if outcome.ok:
@@ -186,7 +202,7 @@ def check_sumo() -> Check:
     """The traffic simulator: its programs and its library load."""
     spec = importlib.util.find_spec("sumo")
     if spec is None or not spec.submodule_search_locations:
-        return Check("SUMO", False, "not installed", _pip_install(_requirements("world")))
+        return Check("SUMO", False, "not installed", install_command("world"), extra="world")
     home = Path(next(iter(spec.submodule_search_locations)))
     for command in ([str(home / "bin" / "netconvert"), "--version"], [sys.executable, "-c", _SUMO]):
         outcome = _run(command, {"SUMO_HOME": str(home)})
@@ -265,13 +281,17 @@ def _check_requirements(name: str, extra: str) -> Check:
     if not requirements and not extra:
         remedy = f"{sys.executable} -m pip install --editable '.[all]'"
         return Check(name, False, f"{DISTRIBUTION} is not installed as a package", remedy)
-    unmet, versions = [], []
+    unmet, versions, outdated = [], [], False
     for requirement in requirements:
         version = _version(requirement.name)
         if version is None or not requirement.specifier.contains(version, prereleases=True):
             unmet.append(requirement)
+            outdated = outdated or version is not None
         versions.append(f"{requirement.name} {version or 'missing'}")
-    return _check(name, not unmet, ", ".join(versions), _pip_install(unmet))
+    found = ", ".join(versions)
+    if unmet and extra and not outdated:
+        return Check(name, False, found, install_command(extra), extra)
+    return _check(name, not unmet, found, _pip_install(unmet))
 
 
 def _version(name: str) -> str | None:
