@@ -8,13 +8,20 @@ FRAMES   ?= 120
 TESTS    ?= tests
 WORKERS  ?= 2
 
+# A .venv of another Python than the one that is asked for with PYTHON=… is made again.
+ifeq ($(origin PYTHON),command line)
+ifneq ($(shell $(BIN)/python --version 2>/dev/null),$(shell $(PYTHON) --version 2>/dev/null))
+$(STAMP) $(DEMO): another-python
+endif
+endif
+
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all lint doctor clean
+.PHONY: help setup demo test test-all lint doctor clean another-python
 
 help: ## List these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-setup: $(STAMP) ## Make .venv and see to the system libraries (again only when pyproject.toml changes)
+setup: $(STAMP) ## Make .venv (PYTHON=python3.13 chooses of which) and see to the system libraries
 	@:
 
 $(STAMP): pyproject.toml deploy/setup.sh

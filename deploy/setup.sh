@@ -42,15 +42,31 @@ need_packages() {
 }
 
 new_enough() { "$1" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; }
+tested() { "$1" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))' 2>/dev/null; }
 
+# PYTHON, or the python3 that is first in PATH if this project is tested with its version, or one that is.
 find_python() {
   local candidate
-  for candidate in "${PYTHON:-}" python3.11 python3.12 python3.13 python3; do
-    if [ -n "$candidate" ] && command -v "$candidate" >/dev/null && new_enough "$candidate"; then
+  if [ -n "${PYTHON:-}" ]; then
+    command -v "$PYTHON"
+    return
+  fi
+  for candidate in python3 python3.13 python3.12 python3.11; do
+    if tested "$candidate"; then
       command -v "$candidate"
       return
     fi
   done
+  if new_enough python3; then command -v python3; fi
+}
+
+# Whether .venv is there, works, and is of the Python that PYTHON names, if it names one.
+venv_fits() {
+  { [ -x .venv/bin/python ] && .venv/bin/python -m pip --version && new_enough .venv/bin/python; } >/dev/null 2>&1 || return
+  local has wanted
+  [ -n "${PYTHON:-}" ] || return 0
+  has=$(.venv/bin/python --version) wanted=$("$PYTHON" --version)
+  [ "$has" = "$wanted" ] || { say ".venv has $has, PYTHON=$PYTHON is $wanted: making .venv again" && false; }
 }
 
 make_venv() {
@@ -133,9 +149,10 @@ see_to_llvm() {
   say "$(.venv/bin/python -c "$choose")"
 }
 
-if ! { [ -x .venv/bin/python ] && .venv/bin/python -m pip --version && new_enough .venv/bin/python; } >/dev/null 2>&1; then
-  make_venv
+if [ -n "${PYTHON:-}" ] && ! new_enough "$PYTHON"; then
+  die "PYTHON=$PYTHON is no Python of version 3.11 or newer"
 fi
+if ! venv_fits; then make_venv; fi
 say "installing into .venv: $what ($size MB; a few minutes the first time)"
 .venv/bin/python -m pip install --quiet --disable-pip-version-check --editable ".[$extras]"
 see_to_shared_libraries

@@ -419,6 +419,10 @@ def test_an_unknown_case_a_bad_address_and_a_missing_program_are_named() -> None
         conform("tcp://nowhere", command="true")
     with pytest.raises(RunError, match="'no-such-program'"):
         conform(ANY, command="no-such-program {endpoint}")
+    judged: list[Verdict] = []
+    with pytest.raises(RunError, match=r"did not connect: it ended with status 2 .*no-such-file\.py"):
+        conform(ANY, command=python("no-such-file.py", "{endpoint}"), each=judged.append)
+    assert judged == []
 
 
 def test_a_client_started_by_hand_is_told_when(tmp_path: Path) -> None:

@@ -198,6 +198,8 @@ def service(
     """Run one service and connect it to a broker."""
     from caviar_services.__main__ import serve
 
+    limit = f"for at most {connect_timeout:g} s (--connect-timeout)"
+    typer.echo(f"service {name}: waiting for the broker at {broker}, {limit}", err=True)
     raise typer.Exit(serve(name, use, broker, connect_timeout, key, broker_key, restarted=restarted))
 
 

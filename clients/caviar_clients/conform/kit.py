@@ -59,6 +59,7 @@ class Kit:
         self._wire, self._client = wire, client
         self._session: Session | None = None
         self._unborn: list[str] = []
+        self._heard = False
 
     # --- for the cases -----------------------------------------------------------------------------
 
@@ -89,9 +90,18 @@ class Kit:
         try:
             self._session.begin()
         except Failed as failed:
+            self._check_command(self._session)
             self._unborn += [str(failed)] * HOPELESS_AFTER
             raise
+        self._heard = True
         return self._session
+
+    def _check_command(self, session: Session) -> None:
+        """`RunError` where the command fails by itself: no life of the client has sent anything."""
+        self._heard = self._heard or session.heard
+        end = self._client.ended()
+        if not self._heard and end is not None and end.status:
+            raise RunError(f"the client did not connect: {end}; see --command")
 
     def discard(self) -> None:
         """End the present life."""
@@ -171,7 +181,7 @@ def conform(
         Gets each verdict as soon as there is one.
 
     Raises `SetupError` for an unknown case or role, `RunError` where the endpoint cannot be
-    listened at or the command cannot be started.
+    listened at, or the command cannot be started or fails before its client sends anything.
     """
     picked, given = chosen(names), rules or Rules()
     if given.role and given.role not in ROLES:

@@ -111,6 +111,11 @@ class Session:
         self.early: deque[Answer] = deque()
         """READY that came before the world's scenery was here, as it may."""
 
+    @property
+    def heard(self) -> bool:
+        """Whether the client has sent anything."""
+        return self._route is not None
+
     # --- receiving -----------------------------------------------------------------------------------
 
     def receive(self, expected: str, seconds: float | None = None) -> Answer:
