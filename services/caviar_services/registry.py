@@ -89,6 +89,11 @@ def load(role: str, name: str) -> type[Service[Any]]:
     return cls
 
 
+def registered_names(role: str) -> tuple[str, ...]:
+    """Names of the implementations of a role, sorted."""
+    return tuple(sorted(key.removeprefix(f"{role}:") for key in registered() if key.startswith(f"{role}:")))
+
+
 def find_modules_in(folder: Path) -> None:
     """Let Python find modules in a folder too, after all other places, so that they hide no other module."""
     text = str(folder.resolve())
@@ -103,7 +108,7 @@ def _registered_target(role: str, name: str) -> str:
         raise DeclarationError(f"no service has the role {role!r}; one of {', '.join(roles)}")
     target = known.get(f"{role}:{name}")
     if target is None:
-        names = sorted(key.split(":", 1)[1] for key in known if key.startswith(f"{role}:"))
+        names = registered_names(role)
         near = difflib.get_close_matches(name, names, n=1)
         hint = f"did you mean {near[0]!r}? " if near else ""
         raise DeclarationError(f"no {role} is named {name!r}; {hint}known: {', '.join(names)}")

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
+
+import msgspec
 
 from caviar_protocol.errors import DeclarationError
-from caviar_protocol.scenario import Scenario
+from caviar_protocol.scenario import Scenario, ServiceSpec
 from caviar_protocol.scenario_checks import scenario_error, settings_place, with_overrides
 from caviar_protocol.scenario_loader import load_scenario
-from caviar_protocol.tables import convert_settings
-from caviar_services.registry import find_modules_in, load
+from caviar_protocol.tables import Place, convert_settings, suggestion
+from caviar_services.registry import find_modules_in, load, registered_names
+from caviar_services.service import Service
 
 TOPICS_OF: Mapping[str, tuple[str, ...]] = {
     "world": ("scene",),
@@ -45,6 +49,34 @@ def module_folders(scenario: Scenario) -> tuple[Path, ...]:
     return (*beside, Path.cwd())
 
 
+def _check_keys(spec: ServiceSpec, implementation: type[Service[Any]], place: Place) -> None:
+    """Raise `ScenarioError` for a setting that the implementation does not have, naming those that have it."""
+    known = _settings_of(implementation)
+    for key in spec.settings:
+        if key in known:
+            continue
+        owners = [name for name in registered_names(spec.role) if key in _settings_named(spec.role, name)]
+        has = f"{spec.use!r} has: {', '.join(known)}" if known else f"{spec.use!r} has no settings"
+        if owners:
+            hint = f"it is a setting of {' and '.join(map(repr, owners))}; "
+        else:
+            near = suggestion(key, known)
+            hint = f"{near} " if near.startswith("did") else ""
+        raise place.at(key).error(f"unknown key {key!r}; {hint}{has}")
+
+
+def _settings_named(role: str, name: str) -> tuple[str, ...]:
+    """Settings of a registered implementation; none of one that cannot be loaded here."""
+    try:
+        return _settings_of(load(role, name))
+    except DeclarationError:
+        return ()
+
+
+def _settings_of(implementation: type[Service[Any]]) -> tuple[str, ...]:
+    return tuple(field.encode_name for field in msgspec.structs.fields(implementation.Settings))
+
+
 def check_implementations(scenario: Scenario) -> Scenario:
     """The scenario, checked as `checked_scenario` does."""
     for folder in module_folders(scenario):
@@ -59,6 +91,7 @@ def check_implementations(scenario: Scenario) -> Scenario:
         except DeclarationError as error:
             raise scenario_error(scenario, f"services.{name}.use", str(error)) from error
         place = settings_place(scenario, name)
+        _check_keys(spec, implementation, place)
         implementation.check_settings(convert_settings(implementation.Settings, spec.settings, place), place)
         produced.update(implementation.outputs)
     for index, entry in enumerate(scenario.run.record):
