@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from caviar_protocol.errors import RunError
@@ -52,11 +52,34 @@ def write_file(path: Path, text: str = "") -> None:
                 part.unlink(missing_ok=True)
 
 
-def reason(path: Path, error: OSError) -> str:
-    """Why a file or folder cannot be written, and what mends that."""
+@contextmanager
+def reserved(*paths: Path) -> Iterator[None]:
+    """Try files before the work in the block, and leave nothing behind where that fails.
+
+    What the block raises goes on; files that are still empty, and folders made for them, are removed first.
+    Raises `RunError` as `writing` does.
+    """
+    files = [path for path in paths if not path.exists()]
+    folders = {folder for path in paths for folder in path.parents if not folder.exists()}
+    try:
+        for path in paths:
+            write_file(path)
+        yield
+    except BaseException:
+        for file in files:
+            if file.is_file() and not file.stat().st_size:
+                file.unlink()
+        for folder in sorted(folders, reverse=True):  # the deepest first
+            with suppress(OSError):  # something else is in it, or it was not made
+                folder.rmdir()
+        raise
+
+
+def reason(path: Path, error: OSError, what: str = "file") -> str:
+    """Why a ``file`` or ``folder`` cannot be written, and what mends that."""
     if error.errno in _NO_SPACE:
         return f"{error.strerror}; free space there, or choose another folder"
     in_the_way = next((folder for folder in path.parents if folder.exists() and not folder.is_dir()), None)
     if in_the_way is not None:
         return f"{in_the_way} is a file, not a folder; choose another folder"
-    return f"{error.strerror or error}; choose another file"
+    return f"{error.strerror or error}; choose another {what}"

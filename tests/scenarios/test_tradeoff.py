@@ -11,11 +11,13 @@ import pytest
 from rich.console import Console
 from scenarios_support import SCENARIOS, caviar, run, scenario_file
 
+from caviar_clients.cli import scenarios, tradeoff
 from caviar_clients.cli.tradeoff import trade
 from caviar_clients.tradeoff import ladder
 from caviar_clients.tradeoff.ladder import Setting
 from caviar_clients.tradeoff.report import Options
 from caviar_clients.tradeoff.scenes import scenes_of
+from caviar_protocol.errors import RunError, SetupError
 
 KEYS = ("time_ms_median", "factor", "nmse_db", "beam_top1", "beam_top5", "capacity_error_bps_hz")
 STRANGE = Setting(label="strange", use="free-space", settings={"colour": 3})
@@ -146,6 +148,34 @@ def test_a_file_that_cannot_be_written_is_refused_at_once(tmp_path: Path) -> Non
     finished = caviar("tradeoff", SCENARIOS / "smoke.toml", "--json", tmp_path / "file" / "t.json")
     assert finished.status == 1
     assert "cannot write" in finished.output
+
+
+def test_all_extras_that_lack_are_named_at_once_and_nothing_is_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (scenarios, tradeoff):
+        monkeypatch.setattr(module, "has_extra", lambda _: False)
+    with pytest.raises(
+        SetupError, match=r"\(channel, plot, world\); run:.*'caviar-sim\[channel,plot,world\]'"
+    ):
+        trade(SCENARIOS / "street-canyon.toml", 3, Options(), None, tmp_path / "trade", Console(quiet=True))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_comparison_that_fails_leaves_no_empty_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> None:
+        raise RunError("the worlds fail")
+
+    monkeypatch.setattr(tradeoff, "scenes_of", fails)
+    monkeypatch.setattr(tradeoff, "has_extra", lambda _: True)
+    json_file, kept = tmp_path / "new" / "t.json", tmp_path / "trade" / "kept"
+    kept.parent.mkdir()
+    kept.touch()
+    with pytest.raises(RunError, match="the worlds fail"):
+        trade(SCENARIOS / "smoke.toml", 3, Options(), json_file, tmp_path / "trade", Console(quiet=True))
+    assert sorted(tmp_path.rglob("*")) == [kept.parent, kept]
 
 
 def test_scenes_are_spread_over_the_episode() -> None:

@@ -58,7 +58,7 @@ def run_directory(root: Path, name: str) -> Path:
             continue
         except OSError as error:
             raise RunError(
-                f"cannot make the run's directory {directory}: {reason(directory, error)}"
+                f"cannot make the run's directory {directory}: {reason(directory, error, 'folder')}"
             ) from error
         return directory
     raise RunError(f"{root} has a thousand runs named {stem}; choose another directory with --out")

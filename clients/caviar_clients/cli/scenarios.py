@@ -102,9 +102,13 @@ def complete_scenario(incomplete: str) -> list[tuple[str, str]]:
 def new_scenario(name: str) -> Path:
     """Write a commented scenario to edit: ``NAME.toml`` in this folder, or the path that ``name`` is.
 
-    Raises `RunError` where the file exists or cannot be written, or the name is none of a run.
+    Raises `RunError` where the file exists or cannot be written, or the name is none of a run or that of
+    another kind of file.
     """
     path = Path(name if name.endswith(".toml") else f"{name}.toml")
+    suffix = Path(name).suffix
+    if suffix != ".toml" and suffix[1:2].isalpha():  # not the ".2" of v1.2
+        raise RunError(f"a scenario is a TOML file, not {suffix}: write {Path(name).with_suffix('.toml')}")
     if _NAME.fullmatch(path.stem) is None:
         raise RunError(f"{path.stem!r} is no name of a scenario: use letters, digits, '_', '.' and '-'")
     text = (resources.files("caviar_scenarios") / TEMPLATE).read_text()

@@ -7,18 +7,24 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import msgspec
+from msgspec.structs import replace
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from caviar_clients.files import write_file
-from caviar_clients.tradeoff.campaign import Told
+from caviar_clients.cli.scenarios import extras_of
+from caviar_clients.files import reserved, write_file
+from caviar_clients.sessions.checking import checked_scenario
+from caviar_clients.tradeoff import ladder
+from caviar_clients.tradeoff.campaign import Told, candidates
 from caviar_clients.tradeoff.plot import draw_convergence, draw_pareto
 from caviar_clients.tradeoff.report import PARTS, Options, Report, compare
-from caviar_clients.tradeoff.scenes import scenes_of
+from caviar_clients.tradeoff.scenes import is_recording, scenes_of, services_kept
 from caviar_clients.tradeoff.tables import by_reason, markdown, screen_table
-from caviar_protocol.errors import RunError
+from caviar_protocol.errors import RunError, SetupError
+from caviar_protocol.extras import has_extra, install_command
 from caviar_protocol.tables import suggestion
 from caviar_services.recorder.base import machine
+from caviar_services.registry import load
 
 
 def options_of(
@@ -48,23 +54,13 @@ def trade(
 ) -> Report:
     """Compare, show a table, and write what was asked for.
 
-    Raises `RunError` before anything is measured where a file cannot be written.
+    Raises `SetupError` naming all extras that lack, and `RunError` where a file cannot be written, both
+    before anything is measured. An error leaves no empty files.
     """
-    if json is not None:
-        write_file(json)
-    if out is not None:
-        write_file(out / "tradeoff.md")
-    with _progress(console) as bar:
-        task = bar.add_task("scenes", total=1.0, left="")
-
-        def told(news: Told) -> None:
-            minutes, seconds = divmod(round(news.left_s), 60)
-            bar.update(
-                task, description=news.text, completed=news.done, left=f"at most {minutes}:{seconds:02d} left"
-            )
-
-        scenes = scenes_of(source, frames)
-        report = compare(scenes, options, machine(), told)
+    _require_extras(source, options, with_pictures=out is not None)
+    files = [file for file in (json, out and out / "tradeoff.md") if file is not None]
+    with reserved(*files):
+        report = _compared(source, frames, options, console)
     console.print(screen_table(report))
     for reason, labels in by_reason(report.skipped).items():
         console.print(f"not measured: {', '.join(labels)}: {reason}", markup=False, highlight=False)
@@ -79,6 +75,46 @@ def trade(
         for file in files:
             console.print(str(file), markup=False, highlight=False, soft_wrap=True)
     return report
+
+
+def _require_extras(source: Path, options: Options, with_pictures: bool) -> None:
+    """Raise `SetupError` with one command where the comparison cannot be made with what is installed.
+
+    Then the command installs what the rest of the ladder needs, too; alone, that is left out and reported.
+    """
+    needed = {"plot"} if with_pictures else set[str]()
+    if not is_recording(source):
+        scenario = checked_scenario(source)
+        needed.update(extras_of(replace(scenario, services=services_kept(scenario))))
+    known = (*ladder.LADDER, *ladder.spacing_settings())
+    choices = (
+        candidates(options.reference, ladder.REFERENCES, known, "--reference"),
+        candidates(options.baseline, ladder.BASELINES, known, "--baseline"),
+    )
+    for settings in choices:
+        extras = {load("channel", setting.use).extra for setting in settings}
+        needed |= extras if "" not in extras else set()
+    if all(has_extra(extra) for extra in needed):
+        return
+    needed |= {load("channel", setting.use).extra for setting in known} - {""}
+    missing = sorted(extra for extra in needed if not has_extra(extra))
+    raise SetupError(
+        f"the comparison needs what is not installed ({', '.join(missing)}); run: {install_command(*missing)}"
+    )
+
+
+def _compared(source: Path, frames: int, options: Options, console: Console) -> Report:
+    with _progress(console) as bar:
+        task = bar.add_task("scenes", total=1.0, left="")
+
+        def told(news: Told) -> None:
+            minutes, seconds = divmod(round(news.left_s), 60)
+            bar.update(
+                task, description=news.text, completed=news.done, left=f"at most {minutes}:{seconds:02d} left"
+            )
+
+        scenes = scenes_of(source, frames)
+        return compare(scenes, options, machine(), told)
 
 
 @contextmanager

@@ -77,8 +77,7 @@ def scenes_of(path: Path, frames: int) -> Scenes:
     Raises `ScenarioError` or `RecordingError` for what is wrong with it, `RunError` where the worlds fail
     or no scene has both a transmitter and a receiver.
     """
-    recorded = path.is_dir() or path.suffix == ".mcap"
-    found = _of_recording(path, frames) if recorded else _of_scenario(path, frames)
+    found = _of_recording(path, frames) if is_recording(path) else _of_scenario(path, frames)
     if not found.carriers:
         raise ScenarioError(
             "a channel needs at least one carrier; add [[carriers]] with name and frequency_hz",
@@ -91,6 +90,11 @@ def scenes_of(path: Path, frames: int) -> Scenes:
             "there is no channel to compare"
         )
     return dataclasses.replace(found, instants=served, consecutive=_run(found.consecutive))
+
+
+def is_recording(path: Path) -> bool:
+    """Whether it is a run directory or a segment, and not a scenario."""
+    return path.is_dir() or path.suffix == ".mcap"
 
 
 def _of_recording(path: Path, frames: int) -> Scenes:
@@ -160,10 +164,15 @@ def worlds_only(scenario: Scenario) -> Scenario:
 
     An agent that takes a channel or sensors cannot decide here; what it steers stays as it starts.
     """
-    kept = {name: spec for name, spec in scenario.services.items() if _is_kept(spec)}
+    kept = services_kept(scenario)
     budget_ms = 1e3  # never reached: nothing is late in an embedded run
     kept[KEEPER] = ServiceSpec(role="sensors", use=KEEPER, budget_ms=budget_ms)
     return replace(scenario, services=kept, run=replace(scenario.run, episodes=1, record=(), pace="free"))
+
+
+def services_kept(scenario: Scenario) -> dict[str, ServiceSpec]:
+    """The services that make the scenes: worlds, and agents that need no channel."""
+    return {name: spec for name, spec in scenario.services.items() if _is_kept(spec)}
 
 
 def _is_kept(spec: ServiceSpec) -> bool:
