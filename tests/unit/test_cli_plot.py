@@ -5,10 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import recording_samples
 from recording_samples import channel, frame, lidar, link, product, record, recorder, scene
 
-from caviar_clients.cli.plot import plot_run
+from caviar_clients.cli.plot import plot_run, scenery
 from caviar_protocol.errors import RecordingError
+from caviar_protocol.recording import Recording
 
 pytest.importorskip("matplotlib")
 
@@ -50,6 +52,19 @@ def test_by_default_the_map_shows_the_middle_of_the_frames_with_line_of_sight(tm
     run = record(tmp_path / "run", frames=6)  # the sample is NLOS in frames 0 and 5
     chosen = plot_run(run, tmp_path / "a")[0].read_bytes()
     assert plot_run(run, tmp_path / "b", frame=3)[0].read_bytes() == chosen
+
+
+def test_boxes_that_block_a_drawn_channel_are_on_the_map(tmp_path, monkeypatch):
+    """They are in no scene, but in the settings of the channel that is recorded with the run."""
+    assert scenery(Recording(record(tmp_path / "without"))) is None
+    box = {"minimum_m": [20.0, 20.0, 0.0], "maximum_m": [35.0, 30.0, 25.0]}
+    drawn_channel = {"role": "channel", "use": "geometric", "settings": {"obstacles": [box]}}
+    services = {"channel": drawn_channel, "link": {"role": "link", "use": "beams"}}
+    monkeypatch.setattr(recording_samples, "SCENARIO", recording_samples.SCENARIO | {"services": services})
+    drawn = scenery(Recording(record(tmp_path / "with")))
+    assert drawn is not None
+    assert drawn.faces.min(axis=(0, 1)).tolist() == [20.0, 20.0]
+    assert drawn.faces.max(axis=(0, 1)).tolist() == [35.0, 30.0]
 
 
 def test_a_frame_or_user_that_is_not_there_is_refused(tmp_path):

@@ -201,8 +201,8 @@ def test_ffmpeg_reads_every_frame_of_an_mp4(tmp_path):
         ({"frames": "3:1"}, "--frames is '3:1', in which there is no frame"),
         ({"frames": "3"}, "--frames is '3'; write A:B for frames A to B - 1; .* has frames 0 to 3"),
         ({"frames": "-2:3"}, "--frames is '-2:3'; write A:B"),
-        ({"camera": "pol"}, "no pictures of camera 'pol'; did you mean 'pole'[?] known: car.0/front, pole"),
-        ({"camera": "x"}, "no pictures of camera 'x'; known: car.0/front, pole"),
+        ({"camera": "pol"}, "no images of camera 'pol'; did you mean 'pole'[?] known: car.0/front, pole"),
+        ({"camera": "x"}, "no images of camera 'x'; known: car.0/front, pole"),
         ({"user": "bike"}, "no user is named 'bike'"),
         ({"out": "video.avi"}, "video.avi ends in '.avi', which is no format of a video; write .mp4 or .gif"),
         ({"out": "video"}, "video has no suffix; write .mp4 or .gif"),
@@ -223,7 +223,7 @@ def test_what_cannot_be_is_refused_with_the_remedy_and_leaves_no_file(tmp_path, 
 
 def test_a_camera_of_a_run_without_any_is_refused(tmp_path):
     run = record(tmp_path / "run", 2)
-    with pytest.raises(RecordingError, match="no pictures of camera 'pole', nor of any other; leave out"):
+    with pytest.raises(RecordingError, match="no images of camera 'pole', nor of any other; leave out"):
         film_run(run, tmp_path / "a.gif", camera="pole")
 
 

@@ -130,11 +130,16 @@ def test_plot_draws_the_fixed_camera_of_a_recording_or_the_one_asked_for(tmp_pat
     names = ["map", "camera", "camera-rgb", "camera-depth", "camera-segmentation"]
     assert [file.stem for file in plot_run(run, frame=1)] == names
     assert round(255 * float(imread(run / "camera-rgb.png")[0, 0, 0])) == 41
-    plot_run(run, tmp_path / "other", frame=0, camera="car.0/eye")
-    assert round(255 * float(imread(tmp_path / "other" / "camera-rgb.png")[0, 0, 0])) == 0
+    fixed = (run / "camera-rgb.png").read_bytes()
+    files = plot_run(run, frame=0, camera="car.0/eye")
+    assert [file.stem for file in files[1:3]] == ["camera-car.0-eye", "camera-car.0-eye-rgb"]
+    assert round(255 * float(imread(files[2])[0, 0, 0])) == 0
+    assert (run / "camera-rgb.png").read_bytes() == fixed
 
 
 def test_a_camera_that_is_not_there_is_refused_with_those_that_are(tmp_path: Path) -> None:
     run = recorded(tmp_path / "run")
-    with pytest.raises(RecordingError, match=r"no images of camera 'pol'; it has those of car\.0/eye, pole"):
+    with pytest.raises(RecordingError, match=r"no images of camera 'pol'; did you mean 'pole'\?"):
         plot_run(run, tmp_path, camera="pol")
+    with pytest.raises(RecordingError, match=r"frame 0 has no images of camera 'x'; known: car\.0/eye, pole"):
+        plot_run(run, tmp_path, frame=0, camera="x")

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from caviar_clients.plots.footprints import footprints
+from caviar_clients.plots.footprints import footprints, with_boxes
 from caviar_protocol.errors import AssetError
 from caviar_protocol.ply import read_ply
 
@@ -53,6 +53,16 @@ def test_every_kind_of_ply_gives_the_same_triangles(tmp_path, kind, polygons):
     vertices, faces = read_ply(ply(tmp_path / "a.ply", box, QUADS if polygons else triangles(QUADS), kind))
     np.testing.assert_allclose(vertices, box)
     assert [tuple(face) for face in faces.tolist()] == triangles(QUADS)
+
+
+def test_boxes_that_block_a_channel_are_footprints_too() -> None:
+    boxes = [((20.0, 20.0, 0.0), (35.0, 30.0, 25.0)), ((0.0, 0.0, 0.0), (1.0, 2.0, 3.0))]
+    drawn = with_boxes(None, boxes)
+    assert edges_of(drawn) >= {frozenset({(20.0, 20.0), (35.0, 20.0)}), frozenset({(0.0, 2.0), (1.0, 2.0)})}
+    (a, b), (c, d) = (drawn.faces[:, 1] - drawn.faces[:, 0]).T, (drawn.faces[:, 2] - drawn.faces[:, 0]).T
+    assert np.abs(a * d - b * c).sum() / 2 == 152.0  # 15 m · 10 m and 1 m · 2 m, covered once
+    assert (drawn.faces.shape, drawn.edges.shape) == ((4, 3, 2), (8, 2, 2))
+    assert len(with_boxes(drawn, boxes).faces) == 8
 
 
 def edges_of(shape) -> set[frozenset[tuple[float, float]]]:

@@ -12,12 +12,17 @@ from recording_samples import channel, lidar, link, scene
 from caviar_clients.cli.plot import beam_gain
 from caviar_clients.plots.lidar import draw_scan, range_image
 from caviar_clients.plots.map import (
+    RECEIVER,
+    WITHOUT_LOS,
+    WITHOUT_PATH,
     Labels,
     MapData,
     chosen_beam,
     common_prefix,
+    draw_antennas,
     draw_map,
     draw_objects,
+    receiver_mark,
     view_of,
 )
 from caviar_clients.plots.rays import rays
@@ -43,6 +48,26 @@ def a_map(**changes) -> MapData:
         "title": "sample",
     }
     return MapData(**(given | changes))
+
+
+def test_a_receiver_shows_whether_it_has_line_of_sight_or_no_path_at_all():
+    assert receiver_mark(None, "car.0/rx") is RECEIVER
+    assert receiver_mark(link(1), "stranger/rx") is RECEIVER
+    assert receiver_mark(link(1), "car.0/rx") is RECEIVER
+    assert receiver_mark(link(0), "car.0/rx") is WITHOUT_LOS  # the sample is NLOS in frames 0, 5, …
+    assert receiver_mark(link(1, without_path=(0,)), "car.0/rx") is WITHOUT_PATH
+
+
+@pytest.mark.parametrize(
+    ("n", "without", "labels"), [(1, (), []), (1, (0,), ["receiver, no path"]), (0, (), ["receiver, NLOS"])]
+)
+def test_the_legend_of_a_map_says_so(n, without, labels):
+    from matplotlib.figure import Figure
+
+    axes = Figure().subplots()
+    draw_antennas(axes, a_map(link=link(n, without_path=without)))
+    shown = axes.get_legend_handles_labels()[1]
+    assert [label for label in shown if "," in label] == labels
 
 
 def test_rays_run_from_transmitter_over_their_points_to_the_receiver():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,7 @@ import numpy as np
 from caviar_clients.files import make_folder_of
 from caviar_clients.plots.camera import CameraView, draw_view
 from caviar_clients.plots.fig8 import choose_user, draw_over_angle, draw_over_time, series
-from caviar_clients.plots.footprints import Footprints, footprints
+from caviar_clients.plots.footprints import Box, Footprints, footprints, with_boxes
 from caviar_clients.plots.lidar import draw_scan
 from caviar_clients.plots.map import MapData, draw_map
 from caviar_protocol.arrays import Float64Array
@@ -44,7 +46,8 @@ def plot_run(
     user
         Receiver, or its object, for |y| and the beam; by default the one that was there longest.
     camera
-        Camera whose images are drawn; by default the first, of those that are fixed if there are any.
+        Camera whose images are drawn, in files with its name; by default the first, of those that are fixed
+        if there are any.
 
     Returns
     -------
@@ -80,7 +83,9 @@ def plot_run(
     if seen:
         shown = _frame(recording, frame, seen[0], chosen)
         view = camera_view(shown, camera)
-        files += draw_view(view, f"Camera {view.sensor}: {moment(shown)}", folder)
+        # Pictures of a camera that was asked for stand beside those of the others.
+        stem = "camera" if camera is None else f"camera-{camera.replace('/', '-')}"
+        files += draw_view(view, f"camera {view.sensor}, {moment(shown)}", folder, stem)
     elif camera is not None:
         raise RecordingError(f"{run} holds no images of a camera; leave out --camera")
     if not files:
@@ -151,11 +156,9 @@ def camera_view(frame: RecordedFrame, camera: str | None) -> CameraView:
         for _, payload in sorted(frame.of(topic, cls).items()):
             for image in payload.images:
                 found.setdefault(image.sensor, {})[topic] = (payload, image)
-    if not found or (camera is not None and camera not in found):
-        asked = f"no images of camera {camera!r}" if camera else "no images"
-        known = f"it has those of {', '.join(sorted(found))}" if found else "choose another with --frame"
-        raise RecordingError(f"frame {frame.number} has {asked}; {known}")
-    sensor = camera or min(found, key=lambda name: ("/" in name, name))
+    sensor = choose_camera(found, camera, f"frame {frame.number} has")
+    if sensor is None:
+        raise RecordingError(f"frame {frame.number} has no images; choose another with --frame")
     seen, scene = found[sensor], frame.scene()
     _, picture = seen.get("camera", (None, None))
     _, depth = seen.get("depth", (None, None))
@@ -173,12 +176,44 @@ def camera_view(frame: RecordedFrame, camera: str | None) -> CameraView:
     )
 
 
+def choose_camera(known: Iterable[str], camera: str | None, where: str) -> str | None:
+    """The camera asked for; by default the first, of those that are fixed if there are any.
+
+    None where none is asked for and none is known. Raises `RecordingError`, which begins with ``where``, for
+    a camera that is not known, with the near name and the known ones.
+    """
+    names = sorted(known)
+    if camera is None:
+        return min(names, key=lambda name: ("/" in name, name), default=None)
+    if camera in names:
+        return camera
+    without = f"{where} no images of camera {camera!r}"
+    if not names:
+        raise RecordingError(f"{without}, nor of any other; leave out --camera")
+    near = difflib.get_close_matches(camera, names, n=1)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    raise RecordingError(f"{without}; {hint}known: {', '.join(names)}")
+
+
 def scenery(recording: Recording) -> Footprints | None:
-    """Footprints of the recorded scenery; None where there is none."""
-    description = find_scenery(recording.assets)
-    if description is None:
-        return None
-    return footprints((shape.file, shape.to_world) for shape in read_scenery(description).shapes)
+    """Footprints of the recorded scenery and of the boxes that block a drawn channel; None without either."""
+    description, boxes = find_scenery(recording.assets), _obstacles(recording)
+    drawn = None
+    if description is not None:
+        drawn = footprints((shape.file, shape.to_world) for shape in read_scenery(description).shapes)
+    return with_boxes(drawn, boxes) if boxes else drawn
+
+
+def _obstacles(recording: Recording) -> list[Box]:
+    """The setting ``obstacles`` of the channels of the recorded scenario."""
+    services = recording.metadata.scenario.get("services")
+    specs = [spec for spec in services.values() if isinstance(spec, dict)] if services else []
+    found = [
+        settings.get("obstacles", ())
+        for spec in specs
+        if spec.get("role") == "channel" and isinstance(settings := spec.get("settings"), dict)
+    ]
+    return [(box["minimum_m"], box["maximum_m"]) for boxes in found for box in boxes]
 
 
 def _frame(

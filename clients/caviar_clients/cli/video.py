@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -12,16 +11,17 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from caviar_clients.cli.plot import agent_names, map_data, scenery
+from caviar_clients.cli.plot import agent_names, choose_camera, map_data, scenery
 from caviar_clients.files import make_folder_of
 from caviar_clients.plots.fig8 import UserSeries, choose_user, series
 from caviar_clients.plots.film import GIF_FPS, WRITERS, Reel, find_ffmpeg, needed_ffmpeg
-from caviar_clients.plots.map import View, chosen_beam, common_prefix, view_of
+from caviar_clients.plots.map import Mark, View, chosen_beam, common_prefix, receiver_mark, view_of
 from caviar_clients.plots.moving import MovingMap, Plan, key_colours
 from caviar_clients.plots.rays import rays, scale
 from caviar_protocol.arrays import UInt8Array
 from caviar_protocol.errors import RecordingError, SetupError
 from caviar_protocol.recording import RecordedFrame, Recording
+from caviar_protocol.scene import antennas
 from caviar_protocol.topics import Camera
 
 SLOWEST, FASTEST = 5.0, 30.0
@@ -160,6 +160,7 @@ def _survey(recording: Recording, indices: Sequence[int], user: User | None, cam
     gains: list[tuple[float, float]] = []
     aspects: dict[str, float] = {}
     kinds: set[bool] = set()
+    marks: set[Mark] = set()
     names: set[str] = set()
     has_ticks = has_beam = False
     for index in indices:
@@ -177,17 +178,19 @@ def _survey(recording: Recording, indices: Sequence[int], user: User | None, cam
         has_ticks |= bool(len(found.tick_gains))
         has_beam |= beam is not None
         carriers = {device.parent for device in data.scene.devices}
+        marks |= {receiver_mark(data.link, device.name) for device in antennas(data.scene, "rx")}
         kinds |= {name in carriers for name in data.scene.names}
         names |= set(data.scene.names)
     if not kept:
         raise RecordingError(f"{recording.path} holds no scene in these frames, so there is no map to draw")
-    shown = _camera(recording, aspects, camera)
+    shown = choose_camera(aspects, camera, f"these frames of {recording.path} hold")
     plan = Plan(
         view=_union(views),
         gains_db=scale(np.array(gains).ravel()) if gains else None,
         has_ticks=has_ticks,
         has_beam=has_beam,
         kinds=frozenset(kinds),
+        receivers=frozenset(marks),
         prefix=common_prefix(sorted(names)),
         user="" if user is None else user[1].split("/")[0],
         footprints=ground,
@@ -197,19 +200,6 @@ def _survey(recording: Recording, indices: Sequence[int], user: User | None, cam
         aspect=aspects.get(shown or "", 0.75),
     )
     return _Survey(kept, plan)
-
-
-def _camera(recording: Recording, known: dict[str, float], camera: str | None) -> str | None:
-    if camera is None:
-        return min(known, key=lambda name: ("/" in name, name), default=None)
-    if camera in known:
-        return camera
-    without = f"these frames of {recording.path} hold no pictures of camera {camera!r}"
-    if not known:
-        raise RecordingError(f"{without}, nor of any other; leave out --camera")
-    near = difflib.get_close_matches(camera, known, n=1)
-    hint = f"did you mean {near[0]!r}? " if near else ""
-    raise RecordingError(f"{without}; {hint}known: {', '.join(sorted(known))}")
 
 
 def _seen(frame: RecordedFrame) -> dict[str, UInt8Array]:

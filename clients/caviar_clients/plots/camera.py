@@ -111,7 +111,7 @@ def _draw_all(panels: list[tuple[str, str, _Draw, float]], title: str, file: Pat
     rows = -(-len(chosen) // columns)
     height = max(panel[3] for panel in chosen)
     with figure(file, 8.0 * columns, (5.6 * height + 0.5) * rows + 0.5, layout="compressed") as drawn:
-        drawn.suptitle(title)
+        drawn.suptitle(title[:1].upper() + title[1:])
         cells = drawn.subplots(rows, columns, squeeze=False).ravel()
         for axes in cells[len(chosen) :]:
             axes.set_axis_off()

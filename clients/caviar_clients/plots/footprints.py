@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +10,9 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_protocol.ply import read_ply
+
+Box = tuple[Sequence[float], Sequence[float]]
+"""Lowest and highest corner [m]."""
 
 _STEEP = 0.1
 """A face is a wall where the vertical part of its unit normal is smaller."""
@@ -49,6 +52,16 @@ def footprints(meshes: Iterable[tuple[Path, Float64Array]]) -> Footprints:
         faces=np.concatenate([_level(shape) for shape in buildings] or [np.zeros((0, 3, 2))]),
         edges=np.concatenate([_outline(shape) for shape in buildings] or [np.zeros((0, 2, 2))]),
     )
+
+
+def with_boxes(drawn: Footprints | None, boxes: Sequence[Box]) -> Footprints:
+    """Footprints, and those of boxes along the world's axes, each its lowest and its highest corner [m]."""
+    corners = np.array([[[x0, y0], [x1, y0], [x1, y1], [x0, y1]] for (x0, y0, *_), (x1, y1, *_) in boxes])
+    faces = corners[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3, 2)
+    edges = np.stack([corners, np.roll(corners, -1, axis=1)], axis=2).reshape(-1, 2, 2)
+    if drawn is not None:
+        faces, edges = np.concatenate([drawn.faces, faces]), np.concatenate([drawn.edges, edges])
+    return Footprints(faces=faces, edges=edges)
 
 
 def _shape(file: Path, to_world: Float64Array) -> _Shape:

@@ -300,26 +300,51 @@ def _overlap(a: Rectangle, b: Rectangle) -> bool:
     return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
+@dataclass(frozen=True)
+class Mark:
+    """How a device stands in a map."""
+
+    label: str
+    marker: str
+    size: float
+    """[points²]"""
+    color: str = BLACK
+    edge: str = "white"
+    width: float = 0.8
+
+
+TRANSMITTER = Mark("transmitter", "^", 110)
+RECEIVER = Mark("receiver", "o", 18)
+WITHOUT_LOS = Mark("receiver, NLOS", "o", 30, color="white", edge=BLACK, width=1.6)
+WITHOUT_PATH = Mark("receiver, no path", "X", 70)
+RECEIVERS = (RECEIVER, WITHOUT_LOS, WITHOUT_PATH)
+
+
+def receiver_mark(link: Link | None, receiver: str) -> Mark:
+    """Whether any transmitter reaches a receiver along the line of sight, or at all; plain where unknown."""
+    users = [i for i, rx in enumerate(link.rx) if rx == receiver] if link is not None else []
+    if link is None or not users or link.los[users].any():
+        return RECEIVER
+    return WITHOUT_LOS if link.has_path[users].any() else WITHOUT_PATH
+
+
 def draw_antennas(axes: Any, data: MapData) -> None:
     """Transmitters as triangles with their names, receivers as dots."""
     from matplotlib.patheffects import withStroke
 
     halo = [withStroke(linewidth=2.5, foreground="white")]
-    for role, marker, size, label in (("tx", "^", 110, "transmitter"), ("rx", "o", 18, "receiver")):
-        devices = antennas(data.scene, role)
+    by_mark: dict[Mark, list[AntennaDevice]] = {TRANSMITTER: list(antennas(data.scene, "tx"))}
+    for device in antennas(data.scene, "rx"):
+        by_mark.setdefault(receiver_mark(data.link, device.name), []).append(device)
+    for mark in (TRANSMITTER, *RECEIVERS):
+        devices = by_mark.get(mark, [])
         if not devices:
             continue
         places = np.array([device_pose(data.scene, device).position[:2] for device in devices])
         axes.scatter(
-            *places.T,
-            marker=marker,
-            s=size,
-            color=BLACK,
-            edgecolors="white",
-            linewidths=0.8,
-            zorder=5,
-            label=label,
-        )
+            *places.T, marker=mark.marker, s=mark.size, color=mark.color, edgecolors=mark.edge,
+            linewidths=mark.width, zorder=5, label=mark.label,
+        )  # fmt: skip
         for device, place in zip(devices, places, strict=True):
             if not device.parent:
                 axes.annotate(

@@ -14,11 +14,14 @@ from caviar_clients.plots.fig8 import UserSeries, curves, shade
 from caviar_clients.plots.footprints import Footprints
 from caviar_clients.plots.map import (
     BEAM_ALPHA,
+    RECEIVERS,
     TICK_COLOR,
     TICK_LABEL,
+    TRANSMITTER,
     Beam,
     Labels,
     MapData,
+    Mark,
     View,
     chosen_beam,
     draw_antennas,
@@ -55,6 +58,8 @@ class Plan:
     has_beam: bool
     kinds: frozenset[bool]
     """Whether objects with a device (True) and others (False) occur."""
+    receivers: frozenset[Mark]
+    """Marks of receivers that occur."""
     prefix: str
     """What names of objects leave out."""
     user: str
@@ -166,9 +171,10 @@ class MovingMap:
             colors = ScalarMappable(Normalize(*plan.gains_db), "viridis")
             self._figure.colorbar(colors, cax=bar, label="Path gain [dB]")
         handles = _legend(plan)
-        # Beside the axis label, so that a legend of one row fits below the map.
+        # Below the axis label there is room for two rows, in each for six of these texts.
+        columns = math.ceil(len(handles) / math.ceil(len(handles) / 6))
         self._figure.legend(
-            handles=handles, loc="lower left", ncols=len(handles), frameon=False, fontsize=9,
+            handles=handles, loc="lower left", ncols=columns, frameon=False, fontsize=9,
             bbox_to_anchor=((places.map[0] - 0.1) / _WIDTH, 0.02 / places.height), borderaxespad=0,
             columnspacing=1.4, handletextpad=0.5,
         )  # fmt: skip
@@ -315,7 +321,8 @@ def _legend(plan: Plan) -> list[Any]:
         handles.append(mark("s", 8, ORANGE, BLACK, "object with a device"))
     if False in plan.kinds:
         handles.append(mark("s", 8, SKY, BLACK, "other object"))
-    handles += [mark("^", 10, BLACK, "white", "transmitter"), mark("o", 4.5, BLACK, "white", "receiver")]
+    for shown in (TRANSMITTER, *(known for known in RECEIVERS if known in plan.receivers)):
+        handles.append(mark(shown.marker, math.sqrt(shown.size), shown.color, shown.edge, shown.label))
     if plan.has_beam:
         handles.append(Line2D([], [], color=VERMILION, linewidth=1.3, label="chosen beam"))
     if plan.has_ticks:
