@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 from scenarios_support import ROOT
 
+from caviar_protocol.recording import Recording, newest_run
+
 README = (ROOT / "README.md").read_text()
 
 
@@ -44,10 +46,25 @@ def test_the_first_half_is_followed_from_top_to_bottom_in_an_empty_folder(tmp_pa
         run(["bash", "-e", "-c", block], tmp_path)
     assert (tmp_path / "crossing.toml").is_file()
     assert len(list(tmp_path.glob("runs/crossing-*/summary.json"))) == 1
-    read, _ = blocks("python")
+    _, read, _ = blocks("python")
     printed = run(script(read, tmp_path), tmp_path)
     assert "(100, 2, 4, 32)" in printed
     assert re.search(r"\|y\| of the agent: (100\.0|99\.\d)%", printed), printed
+
+
+def test_a_class_beside_the_scenario_takes_part(tmp_path: Path) -> None:
+    agent, _, _ = blocks("python")
+    (tmp_path / "my_agent.py").write_text(agent)
+    run(["caviar", "new", "crossing"], tmp_path)
+    file = tmp_path / "crossing.toml"
+    use = re.search(r"`(use = \"my_agent:\w+\")`", README)
+    assert use is not None
+    text = file.read_text()
+    assert text.count('use = "los-beam"') == 1
+    file.write_text(text.replace('use = "los-beam"', use[1]))
+    run(["caviar", "run", "crossing.toml", "--frames", "9", "--embedded"], tmp_path)
+    link = Recording(newest_run(tmp_path / "runs"))["link"]
+    assert link.tx_beam.tolist() == [[frame, frame] for frame in range(9)]
 
 
 def test_a_mistake_is_told_as_the_readme_shows(tmp_path: Path) -> None:
@@ -66,7 +83,7 @@ def test_a_mistake_is_told_as_the_readme_shows(tmp_path: Path) -> None:
 
 def test_the_learning_script_trains_and_compares(tmp_path: Path) -> None:
     pytest.importorskip("stable_baselines3", reason="needs the extra `learning`")
-    _, train = blocks("python")
+    _, _, train = blocks("python")
     out = run(script(train, tmp_path), tmp_path)
     printed = re.search(r"DQN ([\d.]+), los-beam ([\d.]+), oracle ([\d.]+)", out)
     assert printed is not None, out
