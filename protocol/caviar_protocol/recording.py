@@ -213,6 +213,13 @@ class Recording:
     def __len__(self) -> int:
         return self._starts[-1]
 
+    def __repr__(self) -> str:
+        episodes = len({episode for episode, _ in self._index})
+        of = f"{len(self)} frames in {episodes} episode{'s' * (episodes != 1)}"
+        lines = [f"Recording of {self.path}: {of}{'' if self.complete else ', breaks off'}"]
+        lines += [f"  {topic} of {', '.join(map(repr, sources))}" for topic, sources in self.topics.items()]
+        return "\n".join(lines)
+
     @property
     def directory(self) -> Path:
         """The run directory."""

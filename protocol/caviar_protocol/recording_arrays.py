@@ -46,6 +46,11 @@ _MISSING: dict[str, Any] = {"f": np.nan, "c": complex(np.nan, np.nan), "i": -1, 
 _FRESHNESS = (Status.ABSENT, Status.HELD, Status.FRESH)
 
 
+MEASURED_B = 16 * 2**20
+"""Size of a recording up to which the text of a topic has the sizes of its arrays, for which all of the topic
+is read."""
+
+
 class Column(Generic[S]):
     """An array attribute of a `TopicArrays`, read from the recording each time it is asked for.
 
@@ -269,7 +274,7 @@ class TopicArrays(Generic[P, K]):
 
     def stack(self, column: Column[S]) -> NDArray[S]:
         """The array of a column, Shape ``[F, rows, …]``."""
-        shape = len(self), len(self.keys), *self._sizes(column)
+        shape = self._shape(column)
         out: NDArray[S] = np.full(shape, _MISSING[column.dtype.kind], dtype=column.dtype)
         for at, payload in enumerate(self):
             if payload is None:
@@ -285,8 +290,17 @@ class TopicArrays(Generic[P, K]):
 
     def __repr__(self) -> str:
         lines = [f"{self.topic} of {', '.join(map(repr, self.sources))}, F = {len(self)} frames"]
-        lines += [f"  {name}: {column.__doc__}" for name, column in self.columns.items()]
+        try:
+            is_small = sum(file.stat().st_size for file in self._recording.files) <= MEASURED_B
+            shapes = {name: self._shape(c) for name, c in self.columns.items()} if is_small else {}
+        except (OSError, RecordingError):  # damaged: reading an array says where
+            shapes = {}
+        for name, column in self.columns.items():
+            lines.append(f"  {name}: {column.__doc__}" + (f" Here {shapes[name]}." if shapes else ""))
         return "\n".join(lines)
+
+    def _shape(self, column: Column[Any]) -> tuple[int, ...]:
+        return len(self), len(self.keys), *self._sizes(column)
 
     # --- what a topic defines -------------------------------------------------------------------
 

@@ -10,9 +10,13 @@ import pytest
 from recording_samples import frame, record, recorder
 from rich.console import Console
 
+from caviar_broker.journal_format import MAGIC
+from caviar_broker.record import RunRecord
+from caviar_clients.cli.inspect import inspect_command
 from caviar_clients.cli.rescue import rescue_run
 from caviar_protocol.errors import RunError
 from caviar_protocol.recording import Recording
+from caviar_protocol.scenario_loader import load_scenario
 from caviar_protocol.segment import Segment
 
 
@@ -37,6 +41,11 @@ def test_a_run_that_was_killed_is_whole_up_to_there(tmp_path):
     made = recorder(tmp_path / "run")
     made.step(frame(0))
     status, text = rescue(tmp_path / "run")
+    assert "--resume" not in text  # it has no record, as an embedded run
+    kept = RunRecord(run="sample-1", epoch=1, endpoint="tcp://127.0.0.1:1", scenario=load_scenario("smoke"))
+    kept.save(tmp_path / "run")
+    (tmp_path / "run" / "journal.msgpack").write_bytes(MAGIC)
+    assert f"caviar run --resume {tmp_path / 'run'}\n" in rescue(tmp_path / "run")[1]
     made.close()
     assert status == 0
     assert "1 frames can be read, up to frame 0 of episode 0; it breaks off there" in text
@@ -90,8 +99,6 @@ def test_no_run_is_named(tmp_path):
 
 
 def test_a_journal_is_saved_up_to_its_damage(tmp_path):
-    from caviar_broker.journal_format import MAGIC
-
     run = record(tmp_path / "run")
     (run / "journal.msgpack").write_bytes(MAGIC + bytes(200))
     status, text = rescue(run)
@@ -100,3 +107,15 @@ def test_a_journal_is_saved_up_to_its_damage(tmp_path):
     assert "200 B are lost" in text
     assert (tmp_path / "run-rescued" / "journal.msgpack").read_bytes() == MAGIC
     shutil.rmtree(tmp_path / "run-rescued")
+
+
+@pytest.mark.parametrize("ended", [True, False])
+def test_a_closed_recording_of_a_run_without_a_summary_goes_on_too(tmp_path, capsys, ended):
+    """Where `caviar run` alone is killed, its recording is closed; a run that ended has a summary."""
+    run = record(tmp_path / "run", frames=5)
+    scenario = load_scenario("smoke")
+    RunRecord(run="sample-1", epoch=1, endpoint="tcp://127.0.0.1:1", scenario=scenario).save(run)
+    if ended:
+        (run / "summary.json").write_text("{}")
+    assert inspect_command(run) == 0
+    assert (f"caviar run --resume {run}\n" in capsys.readouterr().out) is not ended

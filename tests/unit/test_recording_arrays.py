@@ -365,3 +365,17 @@ def test_the_page_lists_every_array(repository: Path, section: str) -> None:
     wanted = "\n".join(lines) + "\n"
     page = (repository / "docs" / "reading-recordings.md").read_text()
     assert wanted in page, f"docs/reading-recordings.md lacks\n{wanted}"
+
+
+def test_a_recording_and_its_topics_say_what_they_hold(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The sizes of arrays are there as long as the recording is not large."""
+    recording = Recording(record(tmp_path, frames=4))
+    lines = repr(recording).splitlines()
+    assert lines[0] == f"Recording of {tmp_path}: 4 frames in 1 episode"
+    assert "  link of 'link'" in lines
+    links = recording["link"]
+    assert f"  abs_y: {type(links).columns['abs_y'].__doc__} Here {links.abs_y.shape}." in repr(links)
+    monkeypatch.setattr("caviar_protocol.recording_arrays.MEASURED_B", 0)
+    assert "Here" not in repr(links)

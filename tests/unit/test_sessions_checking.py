@@ -17,7 +17,7 @@ from caviar_protocol.errors import ScenarioError
         (
             'use = "geometric"',
             'use = "sionna-rt"',
-            r"normalization: unknown key 'normalization'; it is a setting of 'geometric'; 'sionna-rt' has: .*max_",
+            r"normalization: unknown key 'normalization'; it is a setting of 'geometric'; 'sionna-rt' has",
         ),
         ("nlos =", "nloss =", r"nloss: unknown key 'nloss'; did you mean 'nlos'\? 'geometric' has: .*nlos"),
         ("nlos =", "colour =", r"colour: unknown key 'colour'; 'geometric' has: .*nlos"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -14,7 +15,9 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
+from caviar_broker.record import NAME as RECORD
 from caviar_clients.cli.decided import Decided, Decisions, decided_lines
 from caviar_clients.cli.outages import Outages, OutageSummary, outage_lines
 from caviar_clients.cli.unserved import Unserved
@@ -85,6 +88,21 @@ class RunSummary(msgspec.Struct, kw_only=True):
     damage: list[str]
 
 
+def resume_hint(recording: Recording) -> str:
+    """How to go on with a run that was killed; empty for one that ended, or is embedded and cannot go on.
+
+    A recorder closes its recording where `caviar run` alone was killed: such a run has no summary.
+    """
+    directory, metadata = recording.directory, recording.metadata
+    planned = metadata.frames * _episodes_planned(metadata.scenario)
+    ended = (directory / "summary.json").is_file() or len(recording) >= planned
+    if not (directory / RECORD).is_file() or (recording.complete and ended):
+        return ""
+    return (
+        f"unless the run still goes on, continue it with: caviar run --resume {shlex.quote(str(directory))}"
+    )
+
+
 def inspect_command(run: Path, digest: bool = False, as_json: bool = False) -> int:
     """Print a summary of a recording, or only its digest; the exit status, 1 where it is damaged.
 
@@ -93,7 +111,9 @@ def inspect_command(run: Path, digest: bool = False, as_json: bool = False) -> i
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RecordingWarning)  # its lines are printed as damage
         recording = Recording(run)
-    return _print_digest(recording) if digest else _print_summary(summarise(recording), as_json)
+    if digest:
+        return _print_digest(recording)
+    return _print_summary(summarise(recording), as_json, resume_hint(recording))
 
 
 def summarise(recording: Recording) -> RunSummary:
@@ -214,13 +234,15 @@ def _print_damage(damage: Sequence[str]) -> int:
     return 1 if damage else 0
 
 
-def _print_summary(summary: RunSummary, as_json: bool) -> int:
+def _print_summary(summary: RunSummary, as_json: bool, hint: str) -> int:
     if as_json:
         typer.echo(msgspec.json.format(msgspec.json.encode(summary), indent=2))
     else:
         console = Console()
         console.print(_facts(summary))
         console.print(_topics(summary.sources))
+        if hint:
+            console.print(Text(hint), soft_wrap=True)
     return _print_damage(summary.damage)
 
 

@@ -22,6 +22,7 @@ from caviar_broker.checkpoints import FOLDER as CHECKPOINTS
 from caviar_broker.journal_format import JournalReader
 from caviar_broker.record import NAME as RECORD
 from caviar_broker.record import RunRecord, read_record
+from caviar_clients.cli.inspect import resume_hint
 from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import Recording, RecordingWarning
@@ -72,6 +73,8 @@ def rescue_run(run: Path, console: Console) -> int:
     console.print(_table(parts))
     states = {part.state for part in parts}
     if not states & {"damaged", "lost"}:
+        if recording is not None and (hint := resume_hint(recording)):
+            console.print(Text(hint), soft_wrap=True)
         return 0
     target = _free_name(run)
     try:

@@ -50,7 +50,7 @@ def module_folders(scenario: Scenario) -> tuple[Path, ...]:
 
 
 def _check_keys(spec: ServiceSpec, implementation: type[Service[Any]], place: Place) -> None:
-    """Raise `ScenarioError` for a setting that the implementation does not have, naming those that have it."""
+    """Raise `ScenarioError` for a setting that the implementation lacks, naming those that have it."""
     known = _settings_of(implementation)
     for key in spec.settings:
         if key in known:
