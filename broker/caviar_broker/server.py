@@ -271,7 +271,7 @@ class BrokerServer:
             if finished != self._finished_frames:
                 self._finished_frames = finished
                 self._perform()
-                self._hand_over_entries()  # the next frame relies on them
+                self._hand_over_entries(wait=True)  # the next frame relies on them
             self.clock.settle(time.monotonic_ns())
             self._perform()
 
@@ -341,8 +341,12 @@ class BrokerServer:
         Written once somebody waits for it, while services are at work, and whenever deadlines are looked
         at; so services that answer one after the other cost one write.
         """
-        while self._entries and not self._journal.busy:
-            self._hand_over_entries()
+        while self._entries:
+            if self._journal.busy:
+                if not self.clock.waits_for_journal or not self._journal.wait():
+                    return
+                self._take_confirmed()
+            self._hand_over_entries(wait=self.clock.waits_for_journal)
             self.clock.settle(time.monotonic_ns())
             self._perform()
 
@@ -355,12 +359,12 @@ class BrokerServer:
         self._perform()
         self._write_journal()
 
-    def _hand_over_entries(self) -> None:
+    def _hand_over_entries(self, *, wait: bool) -> None:
         if self._entries and not self._journal.busy:
             entries, self._entries = self._entries, []
             finished = self.clock.episode, self.clock.finished_frames - 1
             snapshot = self.clock.snapshot() if self._journal.wants_snapshot else None
-            self._journal.submit(entries, finished, snapshot)
+            self._journal.submit(entries, finished, snapshot, wait=wait)
             self._take_confirmed()
 
     def _take_confirmed(self) -> None:
