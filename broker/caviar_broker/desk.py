@@ -149,7 +149,7 @@ class Desk:
         """The answer to one request, and whether events are wanted from now on."""
         try:
             request = json.loads(line)
-        except ValueError:
+        except (ValueError, RecursionError):  # what is nested too deep is no request
             request = None
         if not isinstance(request, dict):
             return _refusal('a request is one JSON object a line, such as {"do": "status"}'), False

@@ -132,8 +132,8 @@ class JournalThread:
         snapshot
             Of the same instant, where one is wanted.
         wait
-            Whether a grant waits for them: then this waits, too, for `BRIEFLY_S`. To hand over to a thread and
-            back costs 0.1 ms and more, which is better spent on messages where nothing waits.
+            Whether a grant waits for them: then this waits, too, for `BRIEFLY_S`. To hand over to a thread
+            and back costs 0.1 ms and more, which is better spent on messages where nothing waits.
         """
         batch = self._batch = _Batch(entries, finished, snapshot)
         self._last = batch.entries[-1].number

@@ -29,20 +29,31 @@ class _Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Base of all tables of a scenario: unknown keys are refused."""
 
 
+LONGEST_S = 1e8
+"""[s] Longest wait and budget that a scenario may ask for, three years: nanoseconds are 64-bit numbers."""
+
+
 class Timeouts(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How long the broker waits for what."""
 
-    connect_s: Annotated[float, quantity("s", "for HELLO of every service", gt=0)] = 30.0
-    ready_s: Annotated[float, quantity("s", "for READY, beyond a declared grace", gt=0)] = 120.0
-    reset_s: Annotated[float, quantity("s", "for RESET_DONE", gt=0)] = 60.0
-    stall_s: Annotated[float, quantity("s", "without progress, under wait", gt=0)] = 30.0
+    connect_s: Annotated[float, quantity("s", "for HELLO of every service", gt=0, le=LONGEST_S)] = 30.0
+    ready_s: Annotated[float, quantity("s", "for READY, beyond a declared grace", gt=0, le=LONGEST_S)] = 120.0
+    reset_s: Annotated[float, quantity("s", "for RESET_DONE", gt=0, le=LONGEST_S)] = 60.0
+    stall_s: Annotated[float, quantity("s", "without progress, under wait", gt=0, le=LONGEST_S)] = 30.0
     rejoin_s: (
-        Annotated[float, quantity("s", "for a service that died to come back; 0: the run ends", ge=0)] | None
+        Annotated[
+            float, quantity("s", "for a service that died to come back; 0: the run ends", ge=0, le=LONGEST_S)
+        ]
+        | None
     ) = None
     """Absent: `REMOTE_REJOIN_S` for remote services, 0 for those that `caviar run` starts."""
-    shutdown_s: Annotated[float, quantity("s", "for BYE; then the process is killed", gt=0)] = 2.0
-    heartbeat_s: Annotated[float, quantity("s", "between heartbeats", gt=0)] = 0.25
-    liveness_s: Annotated[float, quantity("s", "silence after which a remote peer is gone", gt=0)] = 1.5
+    shutdown_s: Annotated[float, quantity("s", "for BYE; then the process is killed", gt=0, le=LONGEST_S)] = (
+        2.0
+    )
+    heartbeat_s: Annotated[float, quantity("s", "between heartbeats", gt=0, le=LONGEST_S)] = 0.25
+    liveness_s: Annotated[
+        float, quantity("s", "silence after which a remote peer is gone", gt=0, le=LONGEST_S)
+    ] = 1.5
 
 
 class Limits(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -134,7 +145,9 @@ class ServiceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     role: Role
     use: str
     """Registered implementation of that role; `REMOTE`: whatever the user starts and connects."""
-    budget_ms: Annotated[float, quantity("ms", "wall time for a frame; misses are counted", gt=0)]
+    budget_ms: Annotated[
+        float, quantity("ms", "wall time for a frame; misses are counted", gt=0, le=1e3 * LONGEST_S)
+    ]
     policy: Policy = "wait"
     max_in_flight: Annotated[
         int, quantity("1", "grants queued; more than 1 only under wait", ge=1, le=64)

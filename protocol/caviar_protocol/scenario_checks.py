@@ -15,6 +15,8 @@ from caviar_protocol.tables import Place, convert_table, suggestion
 from caviar_protocol.topics import PARTS, PAYLOADS
 
 _STRICT_ROLES = ("world", "recorder")
+LONGEST_NS = 2**62
+"""[ns] Longest episode: an instant is a 64-bit integer."""
 BEAM = "beam:"
 """Prefix of the actuators that steer beams; the receiver's name follows. Users may be written without."""
 
@@ -41,6 +43,7 @@ def settings_place(scenario: Scenario, service: str) -> Place:
 def check_scenario(scenario: Scenario) -> None:
     """Raise `ScenarioError` for the first rule that the scenario breaks."""
     root = Place("", scenario.source)
+    _check_duration(scenario, root.at("run"))
     _check_record(scenario, root.at("run").at("record"))
     _check_timeouts(scenario, root.at("timeouts"))
     _check_limits(scenario, root.at("limits"))
@@ -52,6 +55,16 @@ def check_scenario(scenario: Scenario) -> None:
         world_of(scenario, index)
     _check_antennas(scenario, root.at("devices"))
     _check_users(scenario, root.at("services"))
+
+
+def _check_duration(scenario: Scenario, place: Place) -> None:
+    """Every instant is a 64-bit number of nanoseconds, also where it is doubled."""
+    run = scenario.run
+    if not run.instants_s and run.frames * run.sampling_period_ns > LONGEST_NS:
+        raise place.at("sampling_period_ns").error(
+            f"{run.frames} frames of {run.sampling_period_ns} ns are longer than {LONGEST_NS / 1e9:.3g} s; "
+            "write a shorter period or fewer frames"
+        )
 
 
 def refuse_remote(scenario: Scenario) -> None:

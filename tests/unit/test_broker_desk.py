@@ -182,6 +182,17 @@ def test_a_wrong_order_is_refused_and_changes_nothing(
         assert broker.outcome().error == ""
 
 
+@pytest.mark.parametrize("line", [b"[" * 2000, b'{"a":' * 700, b"{", b"7", b"\xff"])
+def test_a_line_that_is_no_request_is_refused_and_the_broker_goes_on(tmp_path: Path, line: bytes) -> None:
+    with desk_of(tmp_path) as broker, playing(broker.endpoint, *PAIR) as clients:
+        with connect(tmp_path) as connection, connection.makefile("rwb") as lines:
+            lines.write(line + b"\n")
+            lines.flush()
+            assert "one JSON object a line" in json.loads(lines.readline())["error"]
+        play_to_the_end(clients, 3)
+        assert broker.outcome().error == ""
+
+
 def test_a_subscriber_hears_notices_frames_and_the_end(tmp_path: Path) -> None:
     with desk_of(tmp_path) as broker, playing(broker.endpoint, *PAIR) as clients:
         with connect(tmp_path) as connection, connection.makefile("rwb") as lines:

@@ -297,3 +297,20 @@ def test_an_agent_without_any_receiver_is_told_so() -> None:
     text = text[: text.index("[[devices]]")].replace('role = "channel"', 'role = "sensors"') + antenna
     with pytest.raises(ScenarioError, match="no receiver is named 'car/rx'; no antenna has role = \"rx\""):
         parse_scenario(text)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("sampling_period_ns = 100_000_000", "sampling_period_ns = 9223372036854775807", "longer than"),
+        ("[run]\n", "[timeouts]\nrejoin_s = 1e300\n\n[run]\n", "timeouts.rejoin_s"),
+        ("[run]\n", "[timeouts]\nheartbeat_s = 1e9\n\n[run]\n", "timeouts.heartbeat_s"),
+        ("budget_ms = 20", "budget_ms = 1e15", "budget_ms"),
+    ],
+)
+def test_times_that_no_64_bit_number_of_nanoseconds_holds_are_refused(old: str, new: str, said: str) -> None:
+    text = SMOKE.read_text()
+    assert old in text
+    with pytest.raises(ScenarioError, match=said) as refused:
+        parse_scenario(text.replace(old, new, 1), "town.toml", SMOKE.parent)
+    assert "town.toml:" in str(refused.value)

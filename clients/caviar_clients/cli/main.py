@@ -77,7 +77,9 @@ def run(
     seed: Seed = None,
     json: Annotated[Path | None, typer.Option(help="write the summary to this file too")] = None,
     out: Annotated[Path, typer.Option(help="directory in which the run's own is made")] = Path("runs"),
-    bind: Annotated[str, typer.Option(help="address of the broker; port 0: any")] = ANY_PORT,
+    bind: Annotated[
+        str, typer.Option(help="address of the broker; port 0: any, and the default but for --resume")
+    ] = "",
     embedded: Annotated[
         bool, typer.Option("--embedded", help="all in this process, without sockets")
     ] = False,
@@ -92,14 +94,15 @@ def run(
 
     if resume is not None:
         _nothing_else(scenario, frames, seed, embedded or None, pace)
-        bind = "" if bind == ANY_PORT else bind
         raise typer.Exit(resume_run(resume, _console, json, bind, keys, http, force=force))
     if scenario is None:
         raise RunError(
             "give a scenario, by name (caviar scenarios) or file, or --resume with the directory of a run"
         )
     raise typer.Exit(
-        run_scenario(scenario, out, _console, frames, seed, json, bind, embedded, keys, http, pace)
+        run_scenario(
+            scenario, out, _console, frames, seed, json, bind or ANY_PORT, embedded, keys, http, pace
+        )
     )
 
 
