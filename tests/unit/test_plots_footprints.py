@@ -55,6 +55,17 @@ def test_every_kind_of_ply_gives_the_same_triangles(tmp_path, kind, polygons):
     assert [tuple(face) for face in faces.tolist()] == triangles(QUADS)
 
 
+def test_a_roof_that_reaches_the_ground_is_no_ground(tmp_path) -> None:
+    """A mesh apart from its walls, with a level piece at the height of the ground."""
+    box, yard = corners((0, 0, 0), (10, 10, 20)), corners((4, 4, 0), (6, 6, 0))[:4]
+    walls = ply(tmp_path / "walls.ply", box, QUADS[2:])
+    roof = ply(tmp_path / "roof.ply", np.concatenate([box[4:], yard]), [(0, 1, 2, 3), (4, 5, 6, 7)])
+    ground = ply(tmp_path / "ground.ply", corners((-50, -50, 0), (50, 50, 0))[:4], [(0, 1, 2, 3)])
+    drawn = footprints((file, np.eye(4)) for file in (walls, roof, ground))
+    assert drawn.faces.shape == (4, 3, 2)
+    assert (drawn.faces.min(), drawn.faces.max()) == (0.0, 10.0)
+
+
 def test_boxes_that_block_a_channel_are_footprints_too() -> None:
     boxes = [((20.0, 20.0, 0.0), (35.0, 30.0, 25.0)), ((0.0, 0.0, 0.0), (1.0, 2.0, 3.0))]
     drawn = with_boxes(None, boxes)

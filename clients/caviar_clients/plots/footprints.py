@@ -47,7 +47,8 @@ def footprints(meshes: Iterable[tuple[Path, Float64Array]]) -> Footprints:
     shapes = [_shape(file, to_world) for file, to_world in meshes]
     shapes = [shape for shape in shapes if len(shape.faces)]
     lowest = min((shape.corners[..., 2].min() for shape in shapes), default=0.0)
-    buildings = [shape for shape in shapes if not _is_ground(shape, lowest)]
+    walls = [_extent(shape) for shape in shapes if not _is_level(shape)]
+    buildings = [shape for shape in shapes if not _is_ground(shape, lowest, walls)]
     return Footprints(
         faces=np.concatenate([_level(shape) for shape in buildings] or [np.zeros((0, 3, 2))]),
         edges=np.concatenate([_outline(shape) for shape in buildings] or [np.zeros((0, 2, 2))]),
@@ -81,9 +82,25 @@ def _shape(file: Path, to_world: Float64Array) -> _Shape:
     )
 
 
-def _is_ground(shape: _Shape, lowest: float) -> bool:
+def _is_ground(shape: _Shape, lowest: float, walls: Sequence[Float64Array]) -> bool:
+    """Whether a mesh is ground, given the extents of the meshes with walls.
+
+    A roof may reach the ground too, as a mesh apart from its walls; it has their extent.
+    """
+    if not _is_level(shape) or shape.corners[..., 2].min() >= lowest + 1.0:
+        return False
+    return not any(np.allclose(_extent(shape), other, rtol=0, atol=0.05) for other in walls)
+
+
+def _is_level(shape: _Shape) -> bool:
     walls = shape.area[shape.steepness < _STEEP].sum() / shape.area.sum()
-    return bool(walls < _GROUND_WALLS and shape.corners[..., 2].min() < lowest + 1.0)
+    return bool(walls < _GROUND_WALLS)
+
+
+def _extent(shape: _Shape) -> Float64Array:
+    """Lowest and highest x and y [m], Shape ``[2, 2]``."""
+    places = shape.corners[..., :2].reshape(-1, 2)
+    return np.array([places.min(axis=0), places.max(axis=0)])
 
 
 def _level(shape: _Shape) -> Float64Array:

@@ -263,9 +263,8 @@ def _name_objects(axes: Any, scene: Scene, boxes: Float64Array, carriers: set[st
                 taken.append(places[side])
                 labels.sides[name] = side
                 standing = {"color": VERMILION, "fontweight": "bold"} if name == labels.marked else {}
-                axes.text(
-                    *places[side][:2], text, fontsize=8, path_effects=halo, zorder=6, clip_on=True, **standing
-                )
+                # Not clipped: the width is an estimate, and a name that is cut is another name.
+                axes.text(*places[side][:2], text, fontsize=8, path_effects=halo, zorder=6, **standing)
                 break
 
 
