@@ -6,7 +6,7 @@ DEMO     := .venv/.setup-demo
 SCENARIO ?= demo
 FRAMES   ?= 120
 TESTS    ?= tests
-WORKERS  ?= 2
+WORKERS  ?= 3
 
 # A .venv of another Python than the one that is asked for with PYTHON=… is made again.
 ifeq ($(origin PYTHON),command line)

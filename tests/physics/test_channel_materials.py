@@ -199,7 +199,13 @@ def test_these_are_all_bundled_scenes() -> None:
     assert str(caught.value).endswith(f"known: {', '.join(BUNDLED)}")
 
 
-@pytest.mark.parametrize("name", BUNDLED)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.exhaustive] if name in ("munich", "san_francisco") else [])
+        for name in BUNDLED
+    ],
+)
 def test_bundled_scenes_run_on_four_carriers(name: str) -> None:
     """2.8, 28, 60 and 100 GHz in one product: a free line of sight, and a reflection from below on all four,
     under either policy; what was used where is in the product. A wedge of two walls has nothing below."""

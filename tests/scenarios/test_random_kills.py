@@ -8,7 +8,6 @@ import pytest
 import random_kills
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kills", "seed"),
     [

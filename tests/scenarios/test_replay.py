@@ -130,6 +130,7 @@ def test_what_is_wrong_is_told_before_anything_starts(smoke: Path, tmp_path: Pat
     assert caviar("replay", tmp_path, "--out", tmp_path / "none").status == 1
 
 
+@pytest.mark.exhaustive
 @pytest.mark.sumo
 @pytest.mark.channel
 def test_an_adaptive_channel_is_served_and_repeated(tmp_path: Path) -> None:

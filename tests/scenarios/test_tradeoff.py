@@ -98,6 +98,7 @@ def test_keyframes_have_a_table_of_their_own(tmp_path: Path, monkeypatch: pytest
     assert "## Between keyframes" in (tmp_path / "pictures" / "tradeoff.md").read_text()
 
 
+@pytest.mark.exhaustive
 @pytest.mark.usefixtures("small_ladder")
 def test_receivers_can_be_few(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
@@ -106,6 +107,7 @@ def test_receivers_can_be_few(tmp_path: Path) -> None:
     assert [row["users"] for row in report["rows"]] == [3, 3]
 
 
+@pytest.mark.exhaustive
 @pytest.mark.channel
 @pytest.mark.sumo
 def test_deeper_tracing_comes_nearer_and_takes_longer(
