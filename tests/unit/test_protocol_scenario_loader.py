@@ -151,8 +151,8 @@ WRONG_VALUES = [
         "write a whole number ≥ 0 and ≤ 9223372036854775807",
     ),
     ('name = "crossing"', 'name = "a b"', "run.name", "a string that matches"),
-    ("stall_s = 5", "stall_s = inf", "timeouts.stall_s", "is inf, write a number > 0 [s]"),
-    ("stall_s = 5", "stall_s = 2024-01-01", "timeouts.stall_s", "write a number > 0 [s]"),
+    ("stall_s = 5", "stall_s = inf", "timeouts.stall_s", "is inf, write a number > 0 and ≤ 100000000.0 [s]"),
+    ("stall_s = 5", "stall_s = 2024-01-01", "timeouts.stall_s", "write a number > 0 and ≤ 100000000.0 [s]"),
     ("28e9", "-28e9", "carriers[0].frequency_hz", "write a number > 0 [Hz]"),
     ("[0, 0.5, 10]", "[0, 0.5]", "devices[0].position_m", "has 2 elements, write 3 [m]"),
     ("[0, 0.5, 10]", '[0, 0.5, "x"]', "devices[0].position_m[2]", "is 'x', write a number"),
@@ -163,7 +163,7 @@ WRONG_VALUES = [
     ('kind = "lidar"', 'kind = "lider"', "devices[1].kind", "did you mean 'lidar'? One of"),
     ('policy = "hold"', 'policy = "skip"', "services.channel.policy", "known: abort, drop, hold, wait"),
     ('role = "channel"', 'role = "chanel"', "services.channel.role", "did you mean 'channel'?"),
-    ("budget_ms = 150", "budget_ms = 0", "services.channel.budget_ms", "is 0, write a number > 0 [ms]"),
+    ("budget_ms = 150", "budget_ms = 0", "services.channel.budget_ms", "is 0, write a number > 0 and ≤ 100000000000.0 [ms]"),
 ]
 
 SECOND_RECORDER = """[services.tape]
