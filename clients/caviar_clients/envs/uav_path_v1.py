@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import numbers
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,8 @@ OWN_PARTS = ("position", "velocity", "goal", "rate", "outage")
 SHARE_OF_WAY = (0.1, 0.5)
 """Distance of start and goal, unless it is given: of the way that the object can fly in an episode."""
 
+GREATEST_DB = 300.0
+"""[dB] Greatest ratio that an argument may be."""
 _MARGIN = 0.01
 """[m] beyond the clearance that the world asks for."""
 
@@ -141,7 +144,7 @@ class UavPathV1Env(FlightEnv):
         self._weights = _weights(weights or {})
         self._reach = _positive("reach_m", reach_m)
         self._efficiency = _positive("efficiency_bit_s_hz", efficiency_bit_s_hz)
-        self._outage_snr = 10 ** (outage_snr_db / 10)
+        self._outage_snr = _decibels("outage_snr_db", outage_snr_db)
         self._low, self._high = self._bounds()
         self._drawn_in = (self._low, self._high) if box_m is None else self._box(box_m)
         self._step_way = self._max_speed * self.scenario.run.sampling_period_ns / 1e9
@@ -171,7 +174,7 @@ class UavPathV1Env(FlightEnv):
         return low, high
 
     def _box(self, box_m: tuple[Sequence[float], Sequence[float]]) -> tuple[Vector, Vector]:
-        corners = [point(corner) for corner in box_m] if len(box_m) == 2 else []
+        corners = [point(corner) for corner in box_m] if isinstance(box_m, Sequence) else []
         low, high = corners if len(corners) == 2 else (None, None)
         if (
             low is None
@@ -189,12 +192,12 @@ class UavPathV1Env(FlightEnv):
             way = self._step_way * (self.scenario.run.frames - 1)
             low, high = SHARE_OF_WAY
             return max(low * way, 2 * self._reach), max(high * way, 4 * self._reach)
-        low, high = distance_m
-        if not self._reach < low <= high < math.inf:
+        found = tuple(distance_m) if isinstance(distance_m, Sequence) else ()
+        if not (len(found) == 2 and all(map(_is_number, found)) and self._reach < found[0] <= found[1]):
             raise ScenarioError(
                 f"distance_m={distance_m!r}; write two ascending numbers above reach_m={self._reach:g}"
             )
-        return low, high
+        return found[0], found[1]
 
     # --- an episode --------------------------------------------------------------------------------
 
@@ -306,18 +309,32 @@ def _clipped(values: Float64Array) -> NDArray[np.float32]:
     return np.clip(values, -1.0, 1.0).astype(np.float32)
 
 
+def _is_number(value: object) -> bool:
+    """Whether it is a finite number; NaN compares false with everything, so a range alone does not tell."""
+    return isinstance(value, numbers.Real) and math.isfinite(value)
+
+
 def _positive(name: str, value: float) -> float:
-    if not 0 < value < math.inf:
+    if not (_is_number(value) and value > 0):
         raise ScenarioError(f"{name}={value!r}; write a finite number above 0")
     return float(value)
 
 
+def _decibels(name: str, value: float) -> float:
+    """A ratio that is given in dB, as a number."""
+    if not (_is_number(value) and abs(value) <= GREATEST_DB):
+        raise ScenarioError(f"{name}={value!r}; write a number from -{GREATEST_DB:g} to {GREATEST_DB:g} [dB]")
+    return float(10 ** (value / 10))
+
+
 def _weights(given: Mapping[str, float]) -> Weights:
     names = Weights.__struct_fields__
+    if not isinstance(given, Mapping):
+        raise ScenarioError(f"weights={given!r}; write numbers by name, of {', '.join(names)}")
     unknown = sorted(set(given) - set(names))
     if unknown:
         raise ScenarioError(f"weights has no part {', '.join(unknown)}; there are: {', '.join(names)}")
-    wrong = {name: value for name, value in given.items() if not 0 <= value < math.inf}
+    wrong = {name: value for name, value in given.items() if not (_is_number(value) and value >= 0)}
     if wrong:
         raise ScenarioError(f"weights are {wrong}; write finite numbers from 0 on")
     return Weights(**given)
