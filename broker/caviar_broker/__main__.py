@@ -15,7 +15,7 @@ import argparse
 import gc
 import signal
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -29,7 +29,7 @@ from caviar_broker.checkpoints import CheckpointFiles
 from caviar_broker.control import Control, Reporter, stop_on_signals
 from caviar_broker.core.plan import plan_run
 from caviar_broker.desk import Desk
-from caviar_broker.deskplace import refuse_second
+from caviar_broker.deskplace import held, refuse_second
 from caviar_broker.journal import JournalFile
 from caviar_broker.processes import reserve_descriptors
 from caviar_broker.record import RunRecord, read_record
@@ -68,6 +68,11 @@ def serve(arguments: argparse.Namespace) -> int:
     """Run the broker; the exit status: 0 exactly if the run came to its end."""
     steady_memory()
     record, directory, forced = _resumed(arguments) if arguments.resume else _begun(arguments)
+    with held(directory):  # before its journal is read, which is cut where it is damaged
+        return _serve(arguments, record, directory, forced)
+
+
+def _serve(arguments: argparse.Namespace, record: RunRecord, directory: Path, forced: Sequence[str]) -> int:
     told = with_ownership(record.scenario)
     reserve_descriptors(len(told.services))
     local = {name: spec.role for name, spec in told.services.items() if not spec.remote}

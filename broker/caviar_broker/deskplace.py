@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import shutil
@@ -77,6 +78,30 @@ def refuse_second(directory: Path) -> None:
     """Raises `RunError` where a broker runs in a directory."""
     if _answers(directory):
         raise RunError(f"another broker runs in {directory} already; stop it, or choose another directory")
+
+
+@contextmanager
+def held(directory: Path) -> Iterator[None]:
+    """Have a run's directory to oneself within the block, or until this process ends.
+
+    Two brokers that go on with a run at the same instant both find that no other answers, and the second
+    would cut the journal of the first. A file system without locks (some network ones) holds nothing.
+
+    Raises `RunError` where another broker has the directory.
+    """
+    fd = os.open(directory, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise RunError(
+                f"another broker runs in {directory} already; stop it, or choose another directory"
+            ) from None
+        except OSError:
+            pass
+        yield
+    finally:
+        os.close(fd)
 
 
 def connect(directory: Path) -> socket.socket:

@@ -30,7 +30,7 @@ from broker_harness import (
 from rich.console import Console
 
 from caviar_broker.desk import MAX_CONNECTIONS, MAX_REQUEST, MAX_WAITING
-from caviar_broker.deskplace import NOTE, SOCKET, ask, connect
+from caviar_broker.deskplace import NOTE, SOCKET, ask, connect, held
 from caviar_clients.cli.why import newest_run, why_command
 from caviar_protocol import messages as m
 from caviar_protocol.errors import RunError
@@ -339,3 +339,10 @@ def test_a_broker_that_is_stopped_is_told_from_one_that_is_gone(
         with pytest.raises(RunError, match=r"did not answer within 0\.2 s"):
             ask(tmp_path, do="why")
         assert select.select([mute], [], [], 0)[0]
+
+
+def test_a_directory_is_held_by_one_broker_at_a_time(tmp_path: Path) -> None:
+    with held(tmp_path), pytest.raises(RunError, match="another broker runs in"), held(tmp_path):
+        pass
+    with held(tmp_path):
+        pass

@@ -163,7 +163,7 @@ WRONG_VALUES = [
     ('kind = "lidar"', 'kind = "lider"', "devices[1].kind", "did you mean 'lidar'? One of"),
     ('policy = "hold"', 'policy = "skip"', "services.channel.policy", "known: abort, drop, hold, wait"),
     ('role = "channel"', 'role = "chanel"', "services.channel.role", "did you mean 'channel'?"),
-    ("budget_ms = 150", "budget_ms = 0", "services.channel.budget_ms", "is 0, write a number > 0 and ≤ 100000000000.0 [ms]"),
+    ("budget_ms = 150", "budget_ms = 0", "services.channel.budget_ms", "is 0, write a number > 0 and ≤ 1"),
 ]
 
 SECOND_RECORDER = """[services.tape]
