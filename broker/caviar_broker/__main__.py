@@ -22,7 +22,7 @@ from pathlib import Path
 
 import msgspec
 
-from caviar_broker.aside import Aside
+from caviar_broker.aside import call_aside
 from caviar_broker.beside import HttpBeside
 from caviar_broker.briefing import briefings, with_ownership
 from caviar_broker.checkpoints import CheckpointFiles
@@ -129,7 +129,7 @@ def _serve(arguments: argparse.Namespace, record: RunRecord, directory: Path, fo
             tune_collector()
             outcome = server.run()
     statistics = server.statistics
-    takes_files = server.disk_answers and Aside().call(lambda: statistics.save(directory / LATENCIES), SAVE_S)
+    takes_files = server.disk_answers and call_aside(lambda: statistics.save(directory / LATENCIES), SAVE_S)
     reporter.finished(
         disk="" if takes_files else f"the disk does not answer: {file_system_of(directory)}",
         error=outcome.error,

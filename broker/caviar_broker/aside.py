@@ -1,4 +1,4 @@
-"""Calls that may wait for a disk, made by a thread, so that whoever asked for them need not."""
+"""Calls that may wait for a disk, made in a thread, so that the caller waits for a bounded time only."""
 
 from __future__ import annotations
 
@@ -6,39 +6,25 @@ import threading
 from collections.abc import Callable
 
 
-class Aside:
-    """Makes one call at a time. A thread that waits for a disk cannot be ended, and holds up nothing."""
+def call_aside(action: Callable[[], object], seconds: float) -> bool:
+    """Make a call in a thread of its own; whether it came to its end within so long [s].
 
-    def __init__(self) -> None:
-        self._free = threading.Event()
-        self._free.set()
+    A thread that waits for a disk cannot be ended: it goes on, and holds up no caller and no exit.
+    Raises the `OSError` that the call raised in that time.
+    """
+    errors: list[OSError] = []
 
-    @property
-    def is_busy(self) -> bool:
-        """Whether a call is under way."""
-        return not self._free.is_set()
+    def body() -> None:
+        try:
+            action()
+        except OSError as error:
+            errors.append(error)
 
-    def call(self, action: Callable[[], object], seconds: float) -> bool:
-        """Make a call; whether it came to its end within so long [s]. False while another is under way.
-
-        Raises the `OSError` that it raised in that time.
-        """
-        if self.is_busy:
-            return False
-        errors: list[OSError] = []
-        self._free.clear()
-
-        def body() -> None:
-            try:
-                action()
-            except OSError as error:
-                errors.append(error)
-            finally:
-                self._free.set()
-
-        threading.Thread(target=body, name="aside", daemon=True).start()
-        if not self._free.wait(seconds):
-            return False
-        if errors:
-            raise errors[0]
-        return True
+    thread = threading.Thread(target=body, name="aside", daemon=True)
+    thread.start()
+    thread.join(seconds)
+    if thread.is_alive():
+        return False
+    if errors:
+        raise errors[0]
+    return True

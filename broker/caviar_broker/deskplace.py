@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from caviar_broker.aside import Aside
+from caviar_broker.aside import call_aside
 from caviar_protocol.errors import RunError
 
 SOCKET, NOTE = "control.sock", "control.json"
@@ -65,7 +65,7 @@ class DeskPlace:
     def close(self) -> None:
         """Remove socket and note, unless the disk does not answer."""
         self.socket.close()
-        Aside().call(self._remove, REMOVE_S)
+        call_aside(self._remove, REMOVE_S)
 
     def _remove(self) -> None:
         for name in (SOCKET, NOTE):
