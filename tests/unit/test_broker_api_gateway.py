@@ -16,6 +16,7 @@ import zmq.asyncio
 from api_harness import Peer, Site, site
 from broker_harness import MS, PAIR, PATIENCE_S, eventually, plan, playing, serving
 from starlette.datastructures import Headers
+from starlette.websockets import WebSocketDisconnect
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
@@ -257,6 +258,29 @@ def test_one_who_does_not_read_is_cut_off_and_named(monkeypatch: pytest.MonkeyPa
     assert told == [("sensors", "the WebSocket of 'sensors' was cut off: it has not read for 0.1 s")]
 
 
+def test_what_a_peer_sent_before_it_closed_is_delivered_where_it_takes_nothing_any_more() -> None:
+    """A message to it fails before its BYE, which is there, is read."""
+
+    async def tell(*_: str) -> None:
+        return
+
+    async def serve() -> m.Message:
+        with zmq.asyncio.Context() as context, context.socket(zmq.ROUTER) as router:
+            router.linger = 0
+            port = router.bind_to_random_port("tcp://127.0.0.1")
+            gateway = Gateway(f"tcp://127.0.0.1:{port}", Tokens(None), tell)
+            serving_it = asyncio.create_task(gateway.serve(LeavingSocket()))  # type: ignore[arg-type]
+            async with asyncio.timeout(PATIENCE_S):
+                route, _ = await router.recv_multipart()
+                await router.send_multipart([route, encode_message(m.HeartbeatAck(sequence=0))])
+                _, last = await router.recv_multipart()
+                await serving_it
+            gateway.close()
+            return decode_message(last)
+
+    assert asyncio.run(serve()) == m.Bye(epoch=1, attempt=1)
+
+
 class MuteSocket:
     """A WebSocket that says HELLO and reads nothing."""
 
@@ -280,6 +304,28 @@ class MuteSocket:
 
     async def close(self, code: int, reason: str) -> None:
         self.closed = code, reason
+
+
+class LeavingSocket(MuteSocket):
+    """A WebSocket whose BYE is read only after something could not be sent to it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._frames.insert(0, join_parts([encode_message(m.Bye(epoch=1, attempt=1))]))
+        self._failed = asyncio.Event()
+
+    async def receive(self) -> dict[str, object]:
+        if len(self._frames) < 2:
+            await self._failed.wait()
+            for _ in range(10):  # turns of the loop, in which the failure is seen first
+                await asyncio.sleep(0)
+        if not self._frames:
+            return {"type": "websocket.disconnect", "code": 1000}
+        return await super().receive()
+
+    async def send_bytes(self, _: bytes) -> None:
+        self._failed.set()
+        raise WebSocketDisconnect(1006)
 
 
 # --- who comes in -----------------------------------------------------------------------------------------

@@ -179,8 +179,13 @@ class _Bridge:
     async def run(self) -> None:
         """Carry messages both ways until one side ends."""
         tasks = [asyncio.create_task(way) for way in (self._up(), self._down(), self._watch_token())]
+        up, down, _ = tasks
         try:
-            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            if down.done() and isinstance(down.exception(), WebSocketDisconnect):
+                # It takes nothing any more; what it sent before, BYE among it, may not have been read yet.
+                await asyncio.wait([up], timeout=LOOK_S)
+            done = [task for task in tasks if task.done()]
         finally:
             for task in tasks:
                 task.cancel()
