@@ -9,17 +9,16 @@ def dealer(context):  # a broker with keys wants the files that two environment 
         own, broker = (tomllib.loads(pathlib.Path(os.environ[file]).read_text()) for file in variables)
         socket.curve_publickey, socket.curve_secretkey = own["public"].encode(), own["secret"].encode()
         socket.curve_serverkey = broker["public"].encode()
+    socket.connect(ENDPOINT)
     return socket
 
 def beat(welcome):
-    pulse, beating = dealer(zmq.Context()), {"type": "ATTACH", **who, "name": NAME}
-    pulse.connect(ENDPOINT)
-    for sequence in itertools.count():
-        pulse.send(msgpack.packb(beating))
+    pulse, attach = dealer(zmq.Context()), {"type": "ATTACH", **who, "name": NAME}
+    for sequence in itertools.count(-1):
+        pulse.send(msgpack.packb(attach if sequence < 0 else {"type": "HEARTBEAT", "sequence": sequence}))
         answer = msgpack.unpackb(pulse.recv()) if pulse.poll(welcome["liveness_ns"] / 1e6) else {}
         if answer.get("type") != "HEARTBEAT_ACK":
             raise RuntimeError(f"from the broker came {answer or 'no answer to a heartbeat'}")
-        beating = {"type": "HEARTBEAT", "sequence": sequence}
         time.sleep(welcome["heartbeat_ns"] / 1e9)
 
 def done(grant, parts):
@@ -42,18 +41,20 @@ def done(grant, parts):
     return [msgpack.packb(report)] if grant.get("final") else [msgpack.packb(report | product), payload, b""]
 
 threading.excepthook = lambda end: os._exit(os.write(2, f"{NAME}: {end.exc_value!r}\n".encode()) and 1)
-signal.signal(signal.SIGTERM, lambda *_: sys.exit(broker.send(msgpack.packb({"type": "BYE", **who})) or 143))
+leaving = set()  # by SIGTERM, which may come amid the parts of a message: BYE goes behind them, from the loop
 with zmq.Context() as context, dealer(context) as broker:
     broker.linger = 1000  # [ms] at the end, so that a broker that is gone holds nobody up
-    broker.connect(ENDPOINT)
     broker.send(msgpack.packb({"type": "HELLO", **message}))
-    while message.get("type") != "SHUTDOWN":
+    while message.get("type") != "SHUTDOWN" and not leaving:
+        if not broker.poll(100):  # [ms], as a signal need not end the wait
+            continue
         header, *parts = broker.recv_multipart()
         match (message := msgpack.unpackb(header[: 1 << 20]))["type"]:
             case kind if kind in ("REFUSE", "STALE", "ERROR") or message.get("version", [1])[0] != 1:
                 sys.exit(f"{NAME}: {kind}: {message.get('message', message)}")
             case "WELCOME":
                 turn = {"episode": -1, **(who := {key: message[key] for key in ("epoch", "attempt")})}
+                signal.signal(signal.SIGTERM, lambda *_: leaving.add(143))
                 threading.Thread(target=beat, args=[message], daemon=True).start()
             case "PREPARE":
                 broker.send(msgpack.packb({"type": "READY", **who, "actuators": ["beam:*"]}))
@@ -65,4 +66,4 @@ with zmq.Context() as context, dealer(context) as broker:
                 broker.send_multipart(stored[message["frame"]])
             case kind if kind not in ("CANCEL", "EPISODE_END", "SHUTDOWN"):
                 broker.send(msgpack.packb({"type": "ERROR", "code": "unexpected", "message": str(kind)}))
-    broker.send(msgpack.packb({"type": "BYE", **who}))
+    sys.exit(broker.send(msgpack.packb({"type": "BYE", **who})) or max(leaving, default=0))

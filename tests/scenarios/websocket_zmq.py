@@ -45,8 +45,10 @@ class Dealer:
     def poll(self, milliseconds: float) -> bool:
         try:
             self._next = self._socket.recv(timeout=milliseconds / 1000)  # type: ignore[assignment]
-        except (TimeoutError, ConnectionClosed):
+        except TimeoutError:
             return False
+        except ConnectionClosed:
+            return True  # `recv` says so
         return True
 
     def recv_multipart(self) -> list[bytes]:
