@@ -36,6 +36,7 @@ from caviar_broker.record import RunRecord, read_record
 from caviar_broker.recorded import has_recording, recorded_frames, sync_recording
 from caviar_broker.replaying import with_replay
 from caviar_broker.resume import Left, read_resumption
+from caviar_broker.run_files import check_run_files
 from caviar_broker.scheduling import prefer
 from caviar_broker.security.access import Access
 from caviar_broker.security.guard import PeerLimits
@@ -45,7 +46,6 @@ from caviar_broker.versions import changes, versions_of
 from caviar_protocol.durability import file_system_of
 from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.host import steady_memory
-from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario_checks import with_overrides
 from caviar_protocol.scenario_loader import load_scenario
 
@@ -85,7 +85,7 @@ def _serve(arguments: argparse.Namespace, record: RunRecord, directory: Path, fo
     checkpoints = CheckpointFiles(directory, durable=durability != "none")
     # A launcher that starts its broker again has not summed the run up yet.
     last = "summary.json" if arguments.control else LATENCIES
-    left = _left(directory, record.scenario, checkpoints, last) if arguments.resume else _NOTHING
+    left = _left(directory, record, checkpoints, last) if arguments.resume else _NOTHING
     if left.is_cut and not has_recording(directory) and not arguments.force:
         raise RunError(
             f"cannot go on with {directory}: its recording is gone; put it back, or begin again with --force"
@@ -94,7 +94,7 @@ def _serve(arguments: argparse.Namespace, record: RunRecord, directory: Path, fo
     scheduling = prefer()  # before the threads of the port are started, which inherit it
     reporter = Reporter(sys.stdout.fileno(), directory / "events.jsonl", arguments.control)
     journal_file = JournalFile(
-        directory / JOURNAL, plan.epoch, checkpoints, left.end, durable=durability != "none"
+        directory / JOURNAL, plan.epoch, checkpoints, left.end, run=plan.run, durable=durability != "none"
     )
     with closing(journal_file) as journal:
         supervised = arguments.supervised if arguments.control else ()
@@ -194,14 +194,17 @@ def _resumed(arguments: argparse.Namespace) -> tuple[RunRecord, Path, tuple[str,
 _NOTHING = Left(None, None, ())
 
 
-def _left(directory: Path, scenario: Scenario, checkpoints: CheckpointFiles, last: str) -> Left:
+def _left(directory: Path, record: RunRecord, checkpoints: CheckpointFiles, last: str) -> Left:
     """What journal and recording say.
 
-    Raises `RunError` where every frame is finished and there is the file that is written ``last``.
+    Raises `RunError` where they are no files, or those of another run, or where every frame is finished and
+    there is the file that is written ``last``.
     """
     journal = directory / JOURNAL
     if not journal.exists():
         return _NOTHING
+    scenario = record.scenario
+    check_run_files(directory, journal, record.run)
     recorded, damage = recorded_frames(directory, scenario)
     left = read_resumption(journal, checkpoints, recorded)
     found = left.resumption

@@ -10,6 +10,7 @@ from typing import Any
 
 from caviar_protocol.durability import replace_file, sync_file
 from caviar_protocol.errors import RunError
+from caviar_protocol.regular_file import read_regular
 
 FOLDER = "checkpoints"
 
@@ -86,7 +87,7 @@ class CheckpointFiles:
         """A state that was saved before a restart of the broker; None where it is gone, or is another."""
         path = self._folder / file
         try:
-            state = path.read_bytes()
+            state = read_regular(path)
         except OSError:
             return None
         if hashlib.sha256(state).hexdigest() != digest:

@@ -10,12 +10,13 @@ import socket
 import struct
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from caviar_broker.aside import call_aside
 from caviar_protocol.errors import RunError
+from caviar_protocol.regular_file import read_regular, refuse_other_kinds
 
 SOCKET, NOTE = "control.sock", "control.json"
 BACKLOG = 16
@@ -57,6 +58,7 @@ class DeskPlace:
         note = self._directory / NOTE
         draft = note.with_suffix(".new")
         try:
+            refuse_other_kinds(note)
             draft.write_text(json.dumps(self._told, indent=2) + "\n")
             draft.replace(note)
         except OSError as error:
@@ -69,7 +71,8 @@ class DeskPlace:
 
     def _remove(self) -> None:
         for name in (SOCKET, NOTE):
-            (self._directory / name).unlink(missing_ok=True)
+            with suppress(OSError):  # what was there before and is no file stays
+                (self._directory / name).unlink(missing_ok=True)
         if self._elsewhere:
             shutil.rmtree(self._elsewhere, ignore_errors=True)
 
@@ -111,7 +114,7 @@ def connect(directory: Path) -> socket.socket:
     """
     note = directory / NOTE
     try:
-        path = Path(json.loads(note.read_text())["socket"])
+        path = Path(json.loads(read_regular(note))["socket"])
     except (OSError, ValueError, KeyError, TypeError):
         path = directory / SOCKET
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)

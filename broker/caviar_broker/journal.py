@@ -60,6 +60,8 @@ class JournalFile:
         Where the states of services go; by default beside the journal.
     end
         Where to go on [B]; what is behind it is kept in a file of its own. By default the end of the log.
+    run
+        Id of the run, by which a journal in the directory of another run is noticed.
     durable
         Whether what is compacted has to be on the disk before it takes the place of what was there.
 
@@ -73,8 +75,10 @@ class JournalFile:
         checkpoints: CheckpointFiles | None = None,
         end: int | None = None,
         *,
+        run: str = "",
         durable: bool = False,
     ) -> None:
+        self._run = run
         self.path, self._epoch, self._durable = path, epoch, durable
         self.checkpoints = checkpoints or CheckpointFiles(path.parent, durable=durable)
         self._encoder = msgspec.msgpack.Encoder()
@@ -158,6 +162,7 @@ class JournalFile:
             service=entry.service,
             outcome=entry.outcome,
             decisions=entry.decisions,
+            run=self._run if entry.outcome == "episode" else "",
             products=products,
         )
 
@@ -237,6 +242,7 @@ class JournalFile:
             },
             members=snapshot.members,
             digest=snapshot.digest,
+            run=self._run,
         )
 
     def _copy(

@@ -18,6 +18,7 @@ import msgspec
 
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.messages import GrantInput
+from caviar_protocol.regular_file import open_regular
 
 MAGIC = b"CAVIAR journal 2\n"
 HEAD = struct.Struct("<QI")
@@ -48,6 +49,8 @@ class JournalEntry(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
     """Of the service's state, in ``checkpoints/``."""
     digest: str = ""
     """SHA-256 of that state; of a snapshot, the digest of the run."""
+    run: str = ""
+    """Id of the run, in the first entry of an episode and in a snapshot: a journal opens with either."""
     products: tuple[tuple[str, bytes, bytes], ...] = ()
     """(topic, payload header, body) of products that a later frame may consume, or a service that
     comes back (clause 18). Last, so that the body of the last one ends the entry: it is written from where
@@ -117,6 +120,14 @@ class JournalReader:
             yield payload
 
 
+def run_of_journal(path: Path) -> str:
+    """Id of the run that a journal is of; empty where it does not say, as those of earlier versions.
+
+    Raises `RecordingError` like `JournalReader`.
+    """
+    return next((entry.run for entry in JournalReader(path)), "")
+
+
 def checksum(before: int, length: int, payload: bytes | memoryview) -> int:
     """CRC-32 of an entry behind the one with the CRC ``before``."""
     return zlib.crc32(payload, zlib.crc32(length.to_bytes(8, "little"), before))
@@ -138,7 +149,7 @@ def read_journal(path: Path) -> Iterator[JournalEntry]:
 
 def _mapped(path: Path) -> memoryview:
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             if not file.seek(0, 2):
                 return memoryview(b"")
             return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))

@@ -12,6 +12,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from caviar_protocol.errors import RunError
+from caviar_protocol.regular_file import refuse_other_kinds
+
 MAX_PENDING = 1 << 18
 """[B] of lines kept in memory; what comes behind them is read back from the log."""
 LOG_S = 0.1
@@ -26,10 +29,15 @@ class LogFile:
     """A file that a thread appends to, so that a disk that does not answer holds up no caller.
 
     Once lines could not be written, it takes no more: offsets of later ones would be wrong.
+    Raises `RunError` naming the file where it cannot be opened.
     """
 
     def __init__(self, path: Path) -> None:
-        self._file = path.open("a+b", buffering=0)
+        try:
+            refuse_other_kinds(path)
+            self._file = path.open("a+b", buffering=0)
+        except OSError as error:
+            raise RunError(f"cannot write {path}: {error.strerror}") from error
         self.size = self._file.seek(0, os.SEEK_END)
         """[B] of the file, with what is on its way."""
         self._written = self.size

@@ -10,6 +10,7 @@ import msgspec
 
 from caviar_protocol.durability import replace_file
 from caviar_protocol.errors import RecordingError, RunError
+from caviar_protocol.regular_file import read_regular
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.tables import Source
 
@@ -53,16 +54,15 @@ def read_record(directory: Path) -> RunRecord:
     """The record of a run. `RecordingError` naming the file where it is none, or not as it was written."""
     path = directory / NAME
     try:
-        data = path.read_bytes()
+        data = read_regular(path)
     except OSError as error:
-        if (directory / "journal.msgpack").exists():
+        if isinstance(error, FileNotFoundError) and (directory / "journal.msgpack").exists():
             raise RecordingError(
                 f"cannot go on with {directory}: it has no {NAME}, and an embedded run cannot be "
                 "gone on with; run its scenario again"
             ) from error
-        raise RecordingError(
-            f"cannot go on with {directory}: {path}: {error.strerror}; give the directory of a run"
-        ) from error
+        remedy = "; give the directory of a run" if isinstance(error, FileNotFoundError) else ""
+        raise RecordingError(f"cannot go on with {directory}: {path}: {error.strerror}{remedy}") from error
     found = _CHECK.search(data)
     if found is None or hashlib.sha256(_blanked(data, found)).hexdigest() != found[1].decode():
         why = "it is empty" if not data.strip(b"\0") else "its content is not that of its SHA-256"

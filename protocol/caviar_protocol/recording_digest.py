@@ -12,6 +12,7 @@ from caviar_protocol.errors import RecordingError
 from caviar_protocol.messages import Status
 from caviar_protocol.recording_layout import ASSET_FOLDER, FrameEntry
 from caviar_protocol.recording_segments import RecordedSegments, metadata_of
+from caviar_protocol.regular_file import open_regular
 from caviar_protocol.segment import Channel, Chunk, Segment
 
 
@@ -67,7 +68,7 @@ def damaged_assets(recorded: RecordedSegments) -> list[str]:
     for asset in metadata_of(recorded.segments[0]).assets:
         file = recorded.path / ASSET_FOLDER / asset.name
         try:
-            with file.open("rb") as stream:
+            with open_regular(file) as stream:
                 digest = hashlib.file_digest(stream, "sha256").hexdigest()
         except OSError as error:
             found.append(f"{file} cannot be read: {error.strerror}")

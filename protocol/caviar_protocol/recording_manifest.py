@@ -16,6 +16,7 @@ import msgspec
 
 from caviar_protocol.durability import replace_file
 from caviar_protocol.errors import RecordingError
+from caviar_protocol.regular_file import read_regular
 
 MANIFEST_NAME = "recording.json"
 
@@ -74,7 +75,7 @@ def read_manifest(folder: Path) -> Manifest | None:
     """
     path = folder / MANIFEST_NAME
     try:
-        data = path.read_bytes()
+        data = read_regular(path)
     except FileNotFoundError:
         return None
     except OSError as error:

@@ -30,6 +30,7 @@ from caviar_protocol.errors import RecordingError
 from caviar_protocol.expansion import expand, may_expand
 from caviar_protocol.recording_layout import FRAME_TOPIC, METADATA_NAME, PROFILE, FrameEntry
 from caviar_protocol.recording_manifest import SegmentRecord
+from caviar_protocol.regular_file import open_regular
 
 MAGIC = b"\x89MCAP0\r\n"
 SEAL_OPCODE = 0xCA
@@ -355,7 +356,7 @@ def _find(data: memoryview, pattern: bytes, start: int) -> int:
 
 def _mapped(path: Path) -> memoryview:
     try:
-        with path.open("rb") as stream:
+        with open_regular(path) as stream:
             stream.seek(0, 2)
             if stream.tell() == 0:
                 return memoryview(b"")

@@ -130,6 +130,30 @@ def test_a_broker_that_hangs_is_given_up_once_its_services_have_left_it(
     assert alive(started) == []
 
 
+def test_a_broker_that_never_listens_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(launch, "LISTEN_S", 0.0)
+    with (
+        launcher(tmp_path) as started,
+        pytest.raises(RunError, match=rf"has not begun to listen within 0 s.* {tmp_path}.*broker\.log"),
+    ):
+        list(started.events())
+    assert alive(started) == []
+
+
+@pytest.mark.parametrize("name", ["logs", "logs/broker.log"])
+def test_a_log_that_cannot_be_written_is_named(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "run" / name
+    if name == "logs":
+        path.parent.mkdir()
+        path.write_text("in the way")
+    else:
+        path.parent.mkdir(parents=True)
+        os.mkfifo(path)
+    words = "logs is a file, not a folder" if name == "logs" else "it is a named pipe, not a file; move it"
+    with launcher(tmp_path) as started, pytest.raises(RunError, match=f"cannot write the log .*{words}"):
+        list(started.events())
+
+
 def test_services_that_die_with_their_broker_are_each_started_again_once(tmp_path: Path) -> None:
     """Their deaths are seen together with the broker's, when others have taken their places already."""
     extra = "[timeouts]\nrejoin_s = 5.0\n"

@@ -15,6 +15,7 @@ from caviar_clients.replay.recorded import RecordedRun
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.recording_layout import FrameEntry
+from caviar_protocol.regular_file import open_regular
 
 LATENCIES = "latency.npz"
 At: TypeAlias = tuple[int, int]
@@ -123,7 +124,7 @@ def _latencies(run: RecordedRun) -> dict[str, npt.NDArray[np.int64]]:
 def _archive(run: RecordedRun) -> dict[str, npt.NDArray[np.int64]]:
     path: Path = run.recording.directory / LATENCIES
     try:
-        with path.open("rb") as file, np.load(file) as archive:
+        with open_regular(path) as file, np.load(file) as archive:
             return {key: archive[key] for key in archive.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise RecordingError(

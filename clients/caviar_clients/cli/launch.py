@@ -15,8 +15,9 @@ from typing import Any
 
 from caviar_broker.processes import describe_exit, describe_stop, is_stopped
 from caviar_clients.cli.borrowed import BorrowedKey
-from caviar_clients.cli.children import Child, end, wait
+from caviar_clients.cli.children import Child, end, open_log, wait
 from caviar_clients.sessions.checking import module_folders
+from caviar_protocol.durability import file_system_of
 from caviar_protocol.errors import RunError
 from caviar_protocol.scenario import Scenario, ServiceSpec
 
@@ -26,6 +27,8 @@ BROKER_S = 10.0
 """[s] that the broker gets to end after its last service, beyond the run's ``shutdown_s``."""
 MAX_RESTARTS = 5
 """Processes that are started for a service that died, before it comes back."""
+LISTEN_S = 120.0
+"""[s] from its start until the broker listens: one that goes on with a run reads its journal before."""
 LOOK_S = 0.05
 """[s] between looks at whether the broker's process is stopped; its death shows at once."""
 
@@ -83,11 +86,13 @@ class Launcher:
     _give_up_at: float | None = None
     """When a broker that all services have left must have ended [s]; None while one is left."""
 
+    _listen_until: float | None = None
+    """When a broker that was started must listen [s]; None once it does."""
+
     def __post_init__(self) -> None:
         self._key = BorrowedKey(self.keys)
 
     def __enter__(self) -> Launcher:
-        (self.directory / "logs").mkdir(parents=True, exist_ok=True)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -115,6 +120,11 @@ class Launcher:
             self._look_after_broker()
             if self._give_up_at is not None and time.monotonic() > self._give_up_at:
                 raise RunError("the broker does not answer: all services have ended, and it does not")
+            if self._listen_until is not None and time.monotonic() > self._listen_until:
+                raise RunError(
+                    f"the broker has not begun to listen within {LISTEN_S:g} s, and is ended; it waits for "
+                    f"a file in {self.directory} ({file_system_of(self.directory)}); its log: {self._log}"
+                )
 
     def stop(self, reason: str) -> None:
         """Ask for an orderly end."""
@@ -133,6 +143,11 @@ class Launcher:
 
     # --- starting ----------------------------------------------------------------------------------
 
+    @property
+    def _log(self) -> Path:
+        """Where the broker prints."""
+        return self.directory / "logs" / "broker.log"
+
     def _broker_arguments(self) -> list[str]:
         if self.resume:
             bind = ["--bind", self.bind] if self.bind else []
@@ -150,7 +165,7 @@ class Launcher:
         command = [sys.executable, "-m", "caviar_broker", *self._broker_arguments()]
         command += ["--http", self.http] if self.http else []
         command += [*self._key.options(), "--control", "--supervised", *self._local]
-        with (self.directory / "logs" / "broker.log").open("ab") as log:
+        with open_log(self._log) as log:
             self._broker = subprocess.Popen(  # noqa: S603  # our own module with checked arguments
                 command,
                 stdin=subprocess.PIPE,
@@ -163,6 +178,7 @@ class Launcher:
             raise RunError("the broker has no standard input or output")
         os.set_blocking(self._broker.stdin.fileno(), False)
         self._selector.register(self._broker.stdout, selectors.EVENT_READ)
+        self._listen_until = time.monotonic() + LISTEN_S
 
     def _start_services(self) -> None:
         for name in self._local:
@@ -207,7 +223,7 @@ class Launcher:
         for line in lines:
             event = json.loads(line)
             if event["event"] == "listening":
-                self.endpoint = event["endpoint"]
+                self.endpoint, self._listen_until = event["endpoint"], None
                 if not self._children:  # else they were started beside a broker that goes on
                     self._start_services()
             if event["event"] == "notice" and event.get("service") in self._children:
@@ -281,7 +297,7 @@ class Launcher:
         if status is None:
             raise RunError("the broker closed its output and does not end")
         if not self._over:
-            log = (self.directory / "logs" / "broker.log").read_text(errors="replace").strip()
+            log = self._log.read_text(errors="replace").strip()
             last = self._verdict or (log.splitlines()[-1] if log else describe_exit(status))
             told = last.startswith("caviar broker: ")
             raise RunError(last.removeprefix("caviar broker: ") if told else f"the broker died: {last}")

@@ -81,7 +81,9 @@ class EmbeddedRun:
         self.statistics = Statistics({s.name: s.budget_ns for s in plan.services})
         self._now = 0
         self._clock = FrameClock(plan, self._now)
-        self._journal = JournalFile(folder / "journal.msgpack", plan.epoch) if directory else None
+        self._journal = (
+            JournalFile(folder / "journal.msgpack", plan.epoch, run=plan.run) if directory else None
+        )
         self._on_notice, self._on_frame = on_notice, on_frame
         self.outcome: ev.Finished | None = None
         """How it ended; None until then."""
