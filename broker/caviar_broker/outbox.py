@@ -12,8 +12,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from caviar_protocol.errors import RunError
-from caviar_protocol.regular_file import refuse_other_kinds
+from caviar_protocol.regular_file import open_to_append
 
 MAX_PENDING = 1 << 18
 """[B] of lines kept in memory; what comes behind them is read back from the log."""
@@ -33,11 +32,7 @@ class LogFile:
     """
 
     def __init__(self, path: Path) -> None:
-        try:
-            refuse_other_kinds(path)
-            self._file = path.open("a+b", buffering=0)
-        except OSError as error:
-            raise RunError(f"cannot write {path}: {error.strerror}") from error
+        self._file = open_to_append(path)
         self.size = self._file.seek(0, os.SEEK_END)
         """[B] of the file, with what is on its way."""
         self._written = self.size

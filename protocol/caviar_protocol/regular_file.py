@@ -5,8 +5,10 @@ from __future__ import annotations
 import errno
 import os
 import stat
-from io import BufferedReader
+from io import BufferedReader, FileIO
 from pathlib import Path
+
+from caviar_protocol.errors import RunError
 
 PUT_BACK = "move it away, and put the file of the run back"
 _KINDS = {
@@ -40,6 +42,26 @@ def read_regular(path: Path) -> bytes:
     """The content of a regular file. Raises `OSError` as `open_regular` does."""
     with open_regular(path) as file:
         return file.read()
+
+
+def open_to_append(path: Path) -> FileIO:
+    """Open a file of a run behind its end, to be written and read; it and its folder are made where missing.
+
+    Raises `RunError` naming the file, why it cannot be written, and what mends that.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not path.is_char_device():  # /dev/null takes a log
+            refuse_other_kinds(path)
+        return path.open("a+b", buffering=0)
+    except OSError as error:
+        if path.parent.exists() and not path.parent.is_dir():
+            words = f"{path.parent} is a file, not a folder; move it away"
+        elif path.exists() and not path.is_file():
+            words = str(error.strerror)
+        else:
+            words = f"{error.strerror}; copy the run to a folder that can be written, or choose another"
+        raise RunError(f"cannot write {path}: {words}") from error
 
 
 def refuse_other_kinds(path: Path, remedy: str = "move it away") -> None:

@@ -10,11 +10,13 @@ from pathlib import Path
 import pytest
 
 from caviar_broker.__main__ import parser, serve
+from caviar_broker.deskplace import DeskPlace
 from caviar_broker.journal_format import read_journal, run_of_journal
+from caviar_broker.outbox import LogFile
 from caviar_broker.record import RunRecord
 from caviar_broker.versions import versions_of
 from caviar_clients.embedded.run import EmbeddedRun
-from caviar_protocol.errors import CaviarError
+from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.recording_manifest import read_manifest
 from caviar_protocol.scenario_checks import with_overrides
 from caviar_protocol.scenario_loader import load_scenario
@@ -82,3 +84,17 @@ def test_journal_and_recording_say_of_which_run_they_are(runs: Path) -> None:
     assert manifest is not None
     assert (run_of_journal(runs / "b" / "journal.msgpack"), manifest.run) == ("b", "b")
     assert [e.run for e in read_journal(runs / "b" / "journal.msgpack")][1:3] == ["", ""]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_where_a_run_writes_what_is_no_file_is_named_with_the_remedy(tmp_path: Path, kind: str) -> None:
+    KINDS[kind](tmp_path / "events.jsonl")
+    KINDS[kind](tmp_path / "control.json")
+    words = f"it is a {kind}, not a file; move it away"
+    with pytest.raises(RunError, match=f"cannot write {tmp_path}/events.jsonl: {words}"):
+        LogFile(tmp_path / "events.jsonl")
+    place = DeskPlace(tmp_path)
+    with pytest.raises(RunError, match=f"cannot write {tmp_path}/control.json: {words}"):
+        place.announce(run="a")
+    place.close()
+    assert (tmp_path / "control.json").exists() is (kind == "directory")

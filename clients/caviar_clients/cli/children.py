@@ -9,11 +9,8 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
 
-from caviar_clients.files import reason
-from caviar_protocol.errors import RunError
-from caviar_protocol.regular_file import refuse_other_kinds
+from caviar_protocol.regular_file import open_to_append
 
 KILLED_S = 2.0
 """[s] within which a process ends that is killed, unless it waits for a disk."""
@@ -34,7 +31,7 @@ class Child:
     @classmethod
     def start(cls, name: str, command: Sequence[str], log: Path, environment: Mapping[str, str]) -> Child:
         """Start it; its log goes on where one before it ended."""
-        with open_log(log) as file:
+        with open_to_append(log) as file:
             process = subprocess.Popen(  # noqa: S603  # our own module with checked arguments
                 command,
                 stdin=subprocess.DEVNULL,
@@ -51,16 +48,6 @@ class Child:
             file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL))
             lines = file.read().decode(errors="replace").strip().splitlines()
         return lines[-1] if lines else ""
-
-
-def open_log(path: Path) -> BinaryIO:
-    """Open what a process prints to, behind what is there. Raises `RunError` naming the file."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        refuse_other_kinds(path)
-        return path.open("ab")
-    except OSError as error:
-        raise RunError(f"cannot write the log {path}: {reason(path, error)}") from error
 
 
 def end(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> list[int]:

@@ -15,10 +15,11 @@ from typing import Any
 
 from caviar_broker.processes import describe_exit, describe_stop, is_stopped
 from caviar_clients.cli.borrowed import BorrowedKey
-from caviar_clients.cli.children import Child, end, open_log, wait
+from caviar_clients.cli.children import Child, end, wait
 from caviar_clients.sessions.checking import module_folders
 from caviar_protocol.durability import file_system_of
 from caviar_protocol.errors import RunError
+from caviar_protocol.regular_file import open_to_append
 from caviar_protocol.scenario import Scenario, ServiceSpec
 
 KILL_AFTER_S = 1.0
@@ -165,7 +166,7 @@ class Launcher:
         command = [sys.executable, "-m", "caviar_broker", *self._broker_arguments()]
         command += ["--http", self.http] if self.http else []
         command += [*self._key.options(), "--control", "--supervised", *self._local]
-        with open_log(self._log) as log:
+        with open_to_append(self._log) as log:
             self._broker = subprocess.Popen(  # noqa: S603  # our own module with checked arguments
                 command,
                 stdin=subprocess.PIPE,
