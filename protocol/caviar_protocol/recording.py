@@ -180,6 +180,8 @@ class Recording:
     ----------
     path
         The run directory, or one ``.mcap`` file of it.
+    past_gaps
+        Whether what is behind a segment that is missing or broken is read too.
 
     Raises
     ------
@@ -193,9 +195,9 @@ class Recording:
         A last segment that breaks off, as a killed recorder leaves it, is no damage.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, *, past_gaps: bool = False) -> None:
         self.path = Path(path)
-        self._found = RecordedSegments(self.path)
+        self._found = RecordedSegments(self.path, past_gaps=past_gaps)
         self._segments = self._found.segments
         self.complete = self._found.closed
         """Whether the recorder closed it, and nothing of it is missing."""

@@ -11,7 +11,13 @@ import msgspec
 
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.recording_layout import FORMAT, SEGMENT_PATTERN, RecordingMetadata, segment_name
-from caviar_protocol.recording_manifest import Manifest, SegmentRecord, frame_name, read_manifest
+from caviar_protocol.recording_manifest import (
+    MANIFEST_NAME,
+    Manifest,
+    SegmentRecord,
+    frame_name,
+    read_manifest,
+)
 from caviar_protocol.segment import Segment
 
 
@@ -27,6 +33,8 @@ class RecordedSegments:
     trusted_before: tuple[int, int] | None = None
     """Finished segments all of whose frames are before this (episode, frame), and whose size is that of the
     manifest, are not opened, the last one excepted; None: all are opened."""
+    past_gaps: bool = False
+    """Whether segments behind one that is missing, broken or of another run are read too."""
     trusted: list[SegmentRecord] = field(default_factory=list)
     """Those before `segments`."""
     manifest: Manifest | None = None
@@ -36,6 +44,8 @@ class RecordedSegments:
     """What is missing or cannot be read, as far as can be told without reading products: a line each."""
     closed: bool = False
     """Whether the recorder closed the recording, and all of it is there."""
+    _listed: dict[str, SegmentRecord] = field(default_factory=dict, init=False)
+    """What the manifest says, by file name."""
 
     def __post_init__(self) -> None:
         alone = self.path.is_file()
@@ -45,15 +55,18 @@ class RecordedSegments:
             self.manifest = read_manifest(folder)
         except RecordingError as error:
             self.damage.append(str(error))
-        known = {record.name: record for record in self.manifest.segments} if self.manifest else {}
-        expected = files if alone else _expected(folder, files, known)
+        self._listed = {record.name: record for record in self.manifest.segments} if self.manifest else {}
+        expected = files if alone else _expected(folder, files, self._listed)
         if self.trusted_before is not None:
-            self._trust(expected, known, self.trusted_before)
+            self._trust(expected, self._listed, self.trusted_before)
         for number, file in enumerate(expected):
             if number < len(self.trusted):
                 continue
-            if not self._open(file, known.get(file.name), expected[number + 1 :]):
+            record = self._listed.get(file.name)
+            if not self._open(file, record, expected[number + 1 :]) and not self.past_gaps:
                 break
+        if not self.segments and not self.trusted:
+            raise RecordingError(self.damage[0])
         there = len(self.trusted) + len(self.segments)
         self.closed = there == len(expected) and self.segments[-1].finished and not self.damage
         if self.manifest is not None and not alone:
@@ -82,18 +95,24 @@ class RecordedSegments:
     def _open(self, file: Path, record: SegmentRecord | None, later: list[Path]) -> bool:
         """Add a segment; whether the next one may follow it."""
         if not file.exists():
-            if not self.segments and not self.trusted:
+            if record is None and not any(path.exists() for path in later):
+                return False  # only the manifest of another run has it
+            if self._has_nothing and not self.past_gaps:
                 raise RecordingError(f"{file} is missing, although {_first_there(later)} is there")
             self._lost(f"{file} is missing", record, later)
             return False
         try:
             segment = _opened(file)
+            if strange := self._strange(segment):
+                self._lost(strange, record, later)
+                return False
         except RecordingError as error:
-            if not self.segments and not self.trusted:
+            if self._has_nothing and not self.past_gaps:
                 raise
             if record is not None or later:  # else it was killed while it opened this segment
                 self._lost(str(error), record, later)
             return False
+        record = self._listed.get(file.name)
         self.segments.append(segment)
         self.damage += [f"{file}: {line}" for line in segment.damage]
         if record is not None and record.finished and len(segment) != record.size:
@@ -115,8 +134,34 @@ class RecordedSegments:
             self._lost(f"{file} is readable up to byte {segment.readable} of {len(segment)}", record, later)
         return True
 
+    @property
+    def _has_nothing(self) -> bool:
+        return not self.segments and not self.trusted
+
+    def _strange(self, segment: Segment) -> str:
+        """What is said of a segment of another run than those before it; empty where it is of the same.
+
+        The first one tells of which run the recording is. A manifest of another run is left aside.
+        """
+        if self.segments and not self.past_gaps:
+            return ""  # where several runs are mixed, `Recording` refuses them all
+        run = metadata_of(segment).run
+        listed = self.manifest.run if self.manifest else ""
+        own = metadata_of(self.segments[0]).run if self.segments else listed if self.trusted else run
+        if own != run:
+            return f"{segment.path} is of run {run!r}, and what is before it of run {own!r}"
+        if listed not in ("", own):
+            other = f"{segment.path.parent / MANIFEST_NAME} is of run {listed!r}"
+            self.damage.append(f"{other}, and {segment.path.name} of run {own!r}: it is left aside")
+            self.manifest, self._listed = None, {}
+        return ""
+
     def _lost(self, what: str, record: SegmentRecord | None, later: list[Path]) -> None:
         """Say what is lost, and from which frame."""
+        if self.past_gaps and any(path.exists() for path in later):
+            extent = f", {record.extent}" if record is not None else ""
+            self.damage.insert(0, f"{what}: its frames are lost{extent}")
+            return
         instants = self.instants or [record.last for record in self.trusted[-1:] if record.last]
         since = f"all frames behind {frame_name(instants[-1])}" if instants else "every frame"
         until = f" up to {frame_name(record.last)}" if record is not None and record.last else ""

@@ -16,6 +16,7 @@ from caviar_clients.cli.inspect import inspect_command
 from caviar_clients.cli.rescue import rescue_run
 from caviar_protocol.errors import RunError
 from caviar_protocol.recording import Recording
+from caviar_protocol.recording_manifest import Manifest, SegmentRecord
 from caviar_protocol.scenario_loader import load_scenario
 from caviar_protocol.segment import Segment
 
@@ -119,3 +120,49 @@ def test_a_closed_recording_of_a_run_without_a_summary_goes_on_too(tmp_path, cap
         (run / "summary.json").write_text("{}")
     assert inspect_command(run) == 0
     assert (f"caviar run --resume {run}\n" in capsys.readouterr().out) is not ended
+
+
+@pytest.mark.parametrize("lost", ["recording-0000.mcap", "recording-0001.mcap"])
+def test_what_is_behind_a_segment_that_is_missing_is_saved(tmp_path, lost):
+    run = record(tmp_path / "run", frames=9, segment_frames=3)
+    (run / lost).unlink()
+    status, text = rescue(run)
+    assert status == 1
+    assert "6 frames can be read, up to frame 8 of episode 0" in text
+    first = 3 * int(lost[13])
+    extent = f"frame {first} of episode 0 to frame {first + 2} of episode 0"
+    assert f"{lost} is missing: its frames are lost, {extent}" in text
+    expected = [number for number in range(9) if number // 3 != first // 3]
+    assert [f.number for f in Recording(tmp_path / "run-rescued").frames()] == expected
+
+
+def test_where_nothing_can_be_read_no_directory_is_left(tmp_path):
+    run = record(tmp_path / "run")
+    (run / "recording-0000.mcap").unlink()
+    status, text = rescue(run)
+    assert status == 2
+    assert "nothing is saved, since nothing can be read" in text
+    assert list(tmp_path.iterdir()) == [run]
+
+
+def test_a_manifest_of_another_run_is_said_to_be_that_and_left_aside(tmp_path):
+    run = record(tmp_path / "run", frames=3)
+    Manifest(run="sample-2", segments=(SegmentRecord(name="recording-0001.mcap"),), closed=True).save(
+        run, sync=False
+    )
+    status, text = rescue(run)
+    assert status == 1
+    assert "recording.json is of run 'sample-2', and recording-0000.mcap of run 'sample-1'" in text
+    assert Recording(tmp_path / "run-rescued").complete
+
+
+def test_parts_of_several_runs_are_told_apart_and_not_saved_as_one(tmp_path):
+    run = record(tmp_path / "run", frames=3)
+    scenario = load_scenario("smoke")
+    RunRecord(run="sample-2", epoch=1, endpoint="tcp://127.0.0.1:1", scenario=scenario).save(run)
+    status, text = rescue(run)
+    assert status == 2
+    assert "of run 'sample-1'" in text
+    assert "of run 'sample-2'" in text
+    assert "put the files of one run together" in text
+    assert list(tmp_path.iterdir()) == [run]

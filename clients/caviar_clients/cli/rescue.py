@@ -19,7 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from caviar_broker.checkpoints import FOLDER as CHECKPOINTS
-from caviar_broker.journal_format import JournalReader
+from caviar_broker.journal_format import JournalReader, run_of_journal
 from caviar_broker.record import NAME as RECORD
 from caviar_broker.record import RunRecord, read_record
 from caviar_clients.cli.inspect import resume_hint
@@ -39,7 +39,7 @@ JOURNAL = "journal.msgpack"
 SHOWN = 10
 """Lines about a part that are printed; how many there are more is said."""
 
-State: TypeAlias = Literal["whole", "damaged", "lost", "none"]
+State: TypeAlias = Literal["whole", "damaged", "lost", "none", "foreign"]
 
 
 class Part(msgspec.Struct, kw_only=True):
@@ -47,8 +47,11 @@ class Part(msgspec.Struct, kw_only=True):
 
     name: str
     state: State
-    """Of a damaged part something can be read, of a lost one nothing; none: the run has no such part."""
+    """Of a damaged part something can be read, of a lost one nothing; none: the run has no such part;
+    foreign: the parts are of several runs."""
     lines: list[str]
+    run: str = ""
+    """Id of the run that it says it is of; empty where it does not."""
 
 
 def rescue_run(run: Path, console: Console) -> int:
@@ -70,20 +73,38 @@ def rescue_run(run: Path, console: Console) -> int:
     journal, of_journal = _examine_journal(run)
     record, of_record = _examine_record(run, recording, journal)
     parts = [of_recording, of_record, of_journal]
+    _tell_runs_apart(parts)
     console.print(_table(parts))
     states = {part.state for part in parts}
-    if not states & {"damaged", "lost"}:
+    if not states & {"damaged", "lost", "foreign"}:
         if recording is not None and (hint := resume_hint(recording)):
             console.print(Text(hint), soft_wrap=True)
         return 0
+    if "foreign" in states:
+        text = "nothing is saved: each part is of a run of its own; put the files of one run together"
+        console.print(Text(text), soft_wrap=True)
+        return 2
     target = _free_name(run)
     try:
         _save(run, target, recording, record, journal)
     except OSError as error:
         raise failure(Path(error.filename or target), error) from error
+    if not any(target.iterdir()):
+        target.rmdir()
+        console.print(Text("nothing is saved, since nothing can be read"), soft_wrap=True)
+        return 2
     text = f"{run} is as it was; what can be read of it is in {target}"
     console.print(Text(text), soft_wrap=True)
     return 2 if "lost" in states else 1
+
+
+def _tell_runs_apart(parts: list[Part]) -> None:
+    """Say of each part of which run it is, where they are not all of one."""
+    told = [part for part in parts if part.run]
+    if len({part.run for part in told}) > 1:
+        for part in told:
+            part.state = "foreign"
+            part.lines.insert(0, f"of run {part.run!r}")
 
 
 def _examine_recording(run: Path) -> tuple[Recording | None, Part]:
@@ -94,7 +115,7 @@ def _examine_recording(run: Path) -> tuple[Recording | None, Part]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RecordingWarning)
-            recording = Recording(run)
+            recording = Recording(run, past_gaps=True)
         damage = list(recording.run_digest().damage)
     except RecordingError as error:
         part.state, part.lines = "lost", [str(error)]
@@ -103,6 +124,7 @@ def _examine_recording(run: Path) -> tuple[Recording | None, Part]:
     last = recording.entry(len(recording) - 1) if len(recording) else None
     up_to = f", up to {frame_name((last.episode, last.frame))}" if last else ""
     ends = "" if recording.complete or damage else "; it breaks off there, as a killed recorder leaves it"
+    part.run = recording.metadata.run
     part.lines = [f"{readable} frames can be read{up_to}{ends}", *damage]
     if damage:
         part.state = "damaged"
@@ -115,6 +137,7 @@ def _examine_journal(run: Path) -> tuple[JournalReader | None, Part]:
         part.state, part.lines = "none", ["there is none: an embedded run has no journal"]
         return None, part
     try:
+        part.run = run_of_journal(run / JOURNAL)
         reader = JournalReader(run / JOURNAL)
         entries = sum(1 for _ in reader)
     except RecordingError as error:
@@ -143,6 +166,7 @@ def _examine_record(
         if rebuilt is not None:
             part.lines.append("made anew from the recording's metadata and the journal")
         return rebuilt, part
+    part.run = record.run
     part.lines = [f"run {record.run}, epoch {record.epoch}"]
     return record, part
 
@@ -229,7 +253,7 @@ def _table(parts: list[Part]) -> Table:
     table.add_column(no_wrap=True)
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
-    styles = {"whole": "green", "none": "", "damaged": "yellow", "lost": "bold red"}
+    styles = {"whole": "green", "none": "", "damaged": "yellow", "lost": "bold red", "foreign": "bold red"}
     for part in parts:
         more = [f"and {len(part.lines) - SHOWN} more lines"] if len(part.lines) > SHOWN else []
         text = "\n".join([*part.lines[:SHOWN], *more])
