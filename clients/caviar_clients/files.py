@@ -75,6 +75,11 @@ def reserved(*paths: Path) -> Iterator[None]:
         raise
 
 
+def printable(text: str) -> str:
+    """A text without what would steer a terminal: control characters are written as Python escapes them."""
+    return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
+
+
 def reason(path: Path, error: OSError, what: str = "file") -> str:
     """Why a ``file`` or ``folder`` cannot be written, and what mends that."""
     if error.errno in _NO_SPACE:

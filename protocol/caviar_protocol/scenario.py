@@ -80,7 +80,8 @@ class Limits(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class Run(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The run as a whole."""
 
-    name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
+    # The name of the run's directory has a date and a time behind it, and 255 B at most.
+    name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,199}$")]
     frames: Annotated[int, quantity("frame", "of an episode", ge=1)]
     sampling_period_ns: Annotated[int, quantity("ns", "T_sam", gt=0)] = 100_000_000
     instants_s: tuple[Annotated[float, quantity("s", "instant of a frame", ge=0)], ...] = ()

@@ -134,7 +134,9 @@ def with_overrides(
             .error(f"is {frames}, and the scenario has {instants} instants; write at most {instants}")
         )
     values = msgspec.structs.asdict(scenario.run) | changes
-    return msgspec.structs.replace(scenario, run=convert_table(run, values, Place("run")))
+    changed = msgspec.structs.replace(scenario, run=convert_table(run, values, Place("run")))
+    _check_duration(changed, Place("", scenario.source).at("run"))
+    return changed
 
 
 def resolved(scenario: Scenario, settings: Mapping[str, msgspec.Struct] | None = None) -> dict[str, Any]:

@@ -50,7 +50,7 @@ def load_scenario(path: Path | str) -> Scenario:
     path = find_scenario(path)
     try:
         with path.open("rb") as stream:  # no more than that shows that it is too large
-            text = stream.read(4 * MAX_SIZE + 1).decode(errors="strict")
+            text = stream.read(4 * MAX_SIZE + 1).decode("utf-8-sig")  # some editors put a mark first
     except OSError as error:
         raise ScenarioError(f"cannot be read: {error.strerror}{_beside(path)}", str(path)) from error
     except UnicodeDecodeError as error:

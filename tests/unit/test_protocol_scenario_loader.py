@@ -8,7 +8,8 @@ import pytest
 
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.scenario import Scenario
-from caviar_protocol.scenario_loader import load_scenario, parse_scenario
+from caviar_protocol.scenario_checks import with_overrides
+from caviar_protocol.scenario_loader import find_scenario, load_scenario, parse_scenario
 from caviar_protocol.tables import located
 
 GOOD = """\
@@ -297,3 +298,21 @@ def test_a_channel_with_antennas_of_one_role_alone_is_refused(folder: Path, role
 def test_windows_line_ends_count_as_one(folder: Path) -> None:
     text = GOOD.replace("seed = 7", "sede = 7")
     assert failure(text.replace("\n", "\r\n"), folder).line == failure(text, folder).line
+
+
+def test_a_mark_in_front_of_a_file_is_passed_over(tmp_path: Path) -> None:
+    text = find_scenario("smoke").read_bytes()
+    (tmp_path / "marked.toml").write_bytes(b"\xef\xbb\xbf" + text)
+    assert load_scenario(tmp_path / "marked.toml").services == load_scenario("smoke").services
+
+
+def test_a_name_that_is_too_long_for_a_directory_is_refused_with_the_limit(tmp_path: Path) -> None:
+    text = find_scenario("smoke").read_text().replace('name = "smoke"', f'name = "{"n" * 300}"')
+    (tmp_path / "long.toml").write_text(text)
+    with pytest.raises(ScenarioError, match=r"long\.toml:\d+: run\.name.*matches .*\{0,199\}"):
+        load_scenario(tmp_path / "long.toml")
+
+
+def test_frames_of_the_command_line_are_within_the_longest_duration() -> None:
+    with pytest.raises(ScenarioError, match=r"9000000000000 frames of \d+ ns are longer than"):
+        with_overrides(load_scenario("smoke"), frames=9_000_000_000_000)

@@ -81,7 +81,7 @@ def rescue_run(run: Path, console: Console) -> int:
             console.print(Text(hint), soft_wrap=True)
         return 0
     if "foreign" in states:
-        text = "nothing is saved: each part is of a run of its own; put the files of one run together"
+        text = "nothing is saved: the parts are of several runs; put the files of one run together"
         console.print(Text(text), soft_wrap=True)
         return 2
     target = _free_name(run)

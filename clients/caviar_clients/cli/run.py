@@ -30,7 +30,7 @@ from caviar_clients.cli.summary import (
     summary_of,
     summary_table,
 )
-from caviar_clients.files import reason, write_file
+from caviar_clients.files import printable, reason, write_file
 from caviar_clients.sessions.checking import checked_scenario
 from caviar_clients.sessions.plausibility import implausible_values
 from caviar_protocol.errors import RunError, SetupError
@@ -157,7 +157,7 @@ def _follow(
     if outcome["frames"]:
         _show(console, summary)
     if outcome["error"]:
-        ended = Text.assemble(("the run ended early:", "red"), f" {outcome['error']}")
+        ended = Text.assemble(("the run ended early:", "red"), f" {printable(outcome['error'])}")
         console.print(ended, soft_wrap=True)
         log = launcher.log_of(outcome["culprit"])
         if log is not None:
@@ -278,7 +278,7 @@ class _Watcher:
         return f"; unless it comes back by itself, start it again with  {command}"
 
     def _tell(self, text: str, style: str) -> None:
-        self._console.print(text, highlight=False, soft_wrap=True, style=style, markup=False)
+        self._console.print(printable(text), highlight=False, soft_wrap=True, style=style, markup=False)
 
 
 def _progress_bar(console: Console) -> Progress:
