@@ -66,7 +66,9 @@ class RecordedSegments:
             if not self._open(file, record, expected[number + 1 :]) and not self.past_gaps:
                 break
         if not self.segments and not self.trusted:
-            raise RecordingError(self.damage[0])
+            raise RecordingError(
+                self.damage[0] if self.damage else f"{self.path} holds no recording any more"
+            )
         there = len(self.trusted) + len(self.segments)
         self.closed = there == len(expected) and self.segments[-1].finished and not self.damage
         if self.manifest is not None and not alone:
@@ -95,10 +97,10 @@ class RecordedSegments:
     def _open(self, file: Path, record: SegmentRecord | None, later: list[Path]) -> bool:
         """Add a segment; whether the next one may follow it."""
         if not file.exists():
-            if record is None and not any(path.exists() for path in later):
-                return False  # only the manifest of another run has it
             if self._has_nothing and not self.past_gaps:
                 raise RecordingError(f"{file} is missing, although {_first_there(later)} is there")
+            if record is None and not any(path.exists() for path in later):
+                return False  # only the manifest of another run has it, or its recorder removed it just now
             self._lost(f"{file} is missing", record, later)
             return False
         try:

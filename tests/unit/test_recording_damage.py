@@ -14,6 +14,7 @@ import pytest
 from mcap.writer import CompressionType, Writer
 from recording_samples import SCENARIO, frame, link, product, record, recorder
 
+from caviar_protocol import recording_segments
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.expansion import expand, may_expand
 from caviar_protocol.recording import Recording, RecordingWarning
@@ -255,3 +256,11 @@ def test_a_warning_says_it_once(tmp_path):
     with pytest.warns(RecordingWarning, match="the recording is damaged") as told:
         Recording(run)
     assert len(told) == 1
+
+
+@pytest.mark.parametrize("past_gaps", [False, True])
+def test_a_segment_that_its_recorder_removes_meanwhile_is_no_recording(tmp_path, monkeypatch, past_gaps):
+    gone = tmp_path / "recording-0000.mcap"
+    monkeypatch.setattr(recording_segments, "_files", lambda _: [gone])
+    with pytest.raises(RecordingError, match=r"is missing|no recording any more"):
+        recording_segments.RecordedSegments(tmp_path, past_gaps=past_gaps)
