@@ -127,7 +127,7 @@ def _serve(arguments: argparse.Namespace, record: RunRecord, directory: Path, fo
                 server.note("", "; ".join(left.losses), "damage")
             beside.start(server)
             tune_collector()
-            outcome = server.run()
+            outcome = server.run(prefer)
     statistics = server.statistics
     takes_files = server.disk_answers and call_aside(lambda: statistics.save(directory / LATENCIES), SAVE_S)
     reporter.finished(

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import errno
 import os
-import zlib
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -35,7 +34,8 @@ COMPACT_BYTES = 8 << 20
 """[B] that a journal grows by before it is compacted."""
 CUT_SUFFIX = ".cut"
 """Of the file that keeps what was cut off a damaged journal."""
-_NO_HEAD = bytes(HEAD.size)
+_MOST_PIECES = 1024
+"""That one call of ``writev`` takes."""
 _NO_BYTES = b"\xc4\x00"
 """An empty body, as msgpack writes it."""
 _UNSYNCABLE = frozenset({errno.EINVAL, errno.EROFS, errno.ENOTSUP})
@@ -82,7 +82,6 @@ class JournalFile:
         self.path, self._epoch, self._durable = path, epoch, durable
         self.checkpoints = checkpoints or CheckpointFiles(path.parent, durable=durable)
         self._encoder = msgspec.msgpack.Encoder()
-        self._buffer = bytearray()
         self._lock = Lock()
         """Held while the file is replaced, or its descriptor taken."""
         self._entries: list[Located] = []
@@ -102,44 +101,32 @@ class JournalFile:
 
     def write(self, entries: Iterable[Journal]) -> None:
         """Append entries. `RunError` naming the file where the system refuses them; then none is in it."""
-        data, crc, located = self._buffer, self._crc, list[Located]()
-        data.clear()
         pieces: list[bytes | memoryview] = []
-        size, saved = self.size, False
+        crc, size, located, saved = self._crc, self.size, list[Located](), False
         for entry in entries:
             record = self._record(entry)
             saved |= bool(record.file)
-            body = record.products[-1][2] if record.products else b""
-            large = len(body) >= _UNCOPIED
-            if large:
-                topic, header, _ = record.products[-1]
-                products = (*record.products[:-1], (topic, header, b""))
-                record = msgspec.structs.replace(record, products=products)
-            start = len(data)
-            data += _NO_HEAD
-            self._encoder.encode_into(record, data, -1)
-            if large:
-                del data[-len(_NO_BYTES) :]
-                data += b"\xc6" + len(body).to_bytes(4, "big")
-            length = len(data) - start - HEAD.size
-            crc = zlib.crc32((length + len(body) * large).to_bytes(8, "little"), crc)
-            with memoryview(data) as view:
-                crc = zlib.crc32(view[start + HEAD.size :], crc)
-            if large:
-                length += len(body)
-                crc = zlib.crc32(body, crc)
-            HEAD.pack_into(data, start, length, crc)
+            payload = self._encoded(record)
+            head, crc = framed(crc, *payload)
+            pieces += (head, *payload)
+            length = sum(map(len, payload))
             located.append(Located.of(record, size + HEAD.size, length))
             size += HEAD.size + length
-            if large:
-                pieces += [bytes(data), body]
-                data.clear()
-        pieces.append(bytes(data))
         self._put(pieces)
         self._crc, self.size = crc, size
         self._entries += located
         if saved:
             self.checkpoints.entered()
+
+    def _encoded(self, record: JournalEntry) -> tuple[bytes | memoryview, ...]:
+        """A record in one piece, or two where its last product is large."""
+        body = record.products[-1][2] if record.products else b""
+        if len(body) < _UNCOPIED:
+            return (self._encoder.encode(record),)
+        topic, header, _ = record.products[-1]
+        short = msgspec.structs.replace(record, products=(*record.products[:-1], (topic, header, b"")))
+        data = self._encoder.encode(short).removesuffix(_NO_BYTES)
+        return data + b"\xc6" + len(body).to_bytes(4, "big"), body
 
     def _record(self, entry: Journal) -> JournalEntry:
         products: tuple[tuple[str, Any, Any], ...] = tuple(
@@ -170,7 +157,7 @@ class JournalFile:
         """Hand over all of it, or nothing; Linux takes 2 GiB at once at most."""
         try:
             while pieces:
-                pieces = _behind(pieces, os.writev(self._fd, pieces))
+                pieces = _behind(pieces, os.writev(self._fd, pieces[:_MOST_PIECES]))
         except OSError as error:
             with suppress(OSError):
                 os.ftruncate(self._fd, self.size)  # half an entry would end the log for what may follow

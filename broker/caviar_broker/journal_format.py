@@ -113,7 +113,7 @@ class JournalReader:
                 self.problem = f"{self.path}: the entry at byte {self.end} is cut off or damaged"
                 return
             payload = self._data[start : start + length]
-            if checksum(self.crc, length, payload) != crc:
+            if framed(self.crc, payload)[1] != crc:
                 self.problem = f"{self.path}: the entry at byte {self.end} is damaged, its CRC-32 differs"
                 return
             self.end, self.crc = start + length, crc
@@ -128,15 +128,13 @@ def run_of_journal(path: Path) -> str:
     return next((entry.run for entry in JournalReader(path)), "")
 
 
-def checksum(before: int, length: int, payload: bytes | memoryview) -> int:
-    """CRC-32 of an entry behind the one with the CRC ``before``."""
-    return zlib.crc32(payload, zlib.crc32(length.to_bytes(8, "little"), before))
-
-
-def framed(before: int, payload: bytes | memoryview) -> tuple[bytes, int]:
-    """The head of an entry, and its CRC."""
-    crc = checksum(before, len(payload), payload)
-    return HEAD.pack(len(payload), crc), crc
+def framed(before: int, *pieces: bytes | memoryview) -> tuple[bytes, int]:
+    """The head of an entry behind the one with the CRC ``before``, and its CRC; its bytes are ``pieces``."""
+    length = sum(map(len, pieces))
+    crc = zlib.crc32(length.to_bytes(8, "little"), before)
+    for piece in pieces:
+        crc = zlib.crc32(piece, crc)
+    return HEAD.pack(length, crc), crc
 
 
 def read_journal(path: Path) -> Iterator[JournalEntry]:

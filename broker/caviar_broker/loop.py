@@ -33,6 +33,7 @@ class Loop:
         self._sockets: dict[int, zmq.Socket[Any]] = {}
         self._callbacks: dict[Source, Callable[[], None]] = {}
         self._prompt: set[int] = set()
+        self._polls = 0
 
     def watch(
         self,
@@ -64,6 +65,7 @@ class Loop:
 
     def poll(self, wait_ns: int = 0) -> list[Source]:
         """What is ready, after at most that long [ns]."""
+        self._polls += 1
         until = time.monotonic_ns() + wait_ns
         ready = [source for source, _ in self._poller.poll(max(0, wait_ns // COARSE_NS - 1))]
         return ready if ready or wait_ns <= 0 else self.poll_sockets(until)
@@ -81,8 +83,14 @@ class Loop:
                 return [*found]
 
     def call(self, ready: list[Source]) -> None:
-        """Call back for what `poll` returned, unless it is not watched any more."""
+        """Call back for what `poll` returned, unless it is not watched any more.
+
+        Where another thread polls while one of the callbacks waits, the others are its to call.
+        """
+        polls = self._polls
         for source in ready:
+            if self._polls != polls:
+                return
             callback = self._callbacks.get(source)
             if callback is not None:
                 callback()

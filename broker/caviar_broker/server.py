@@ -7,6 +7,7 @@ frames they came in, neither copied nor decoded.
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
@@ -20,12 +21,13 @@ from caviar_broker.core.plan import RunPlan
 from caviar_broker.core.resumption import Resumption
 from caviar_broker.core.transitions import RunState
 from caviar_broker.journal import JournalFile
-from caviar_broker.journal_thread import JournalThread
+from caviar_broker.journal_writer import JournalWriter
 from caviar_broker.loop import Loop
 from caviar_broker.port import Port
 from caviar_broker.scenery import SceneryDesk, SceneryExchange
 from caviar_broker.security.access import Access
 from caviar_broker.security.guard import PeerLimits
+from caviar_broker.standby import Standby
 from caviar_broker.statistics import Statistics
 from caviar_broker.watchdog import CHECK_NS, Watchdog
 from caviar_protocol import messages as m
@@ -142,8 +144,9 @@ class BrokerServer:
         self.loop = Loop()
         """Others may have descriptors watched by it."""
         self.loop.watch(self._port.socket, self._receive_all)
-        self._journal = JournalThread(journal, durability, sync_recording)
-        self.loop.watch(self._journal.fd, self._journal_answered, prompt=True)
+        self._journal = JournalWriter(journal, durability, sync_recording)
+        self._standby = Standby(self._turn, lambda: self.outcome is not None)
+        self.loop.watch(self._standby.fd, self._disk_answers_again, prompt=True)
         self._watchdog = Watchdog(
             clock=self.clock,
             heartbeat_ns=plan.limits.heartbeat,
@@ -196,16 +199,23 @@ class BrokerServer:
         self.clock.receive(event, time.monotonic_ns())
         self._perform()
 
-    def run(self) -> ev.Finished:
-        """Serve until the run is over."""
+    def run(self, begin: Callable[[], object] = lambda: None) -> ev.Finished:
+        """Serve until the run is over, in threads that call ``begin`` first."""
         try:
-            while self.outcome is None:
-                self._turn()
+            self._standby.run(begin)
         finally:
             self._watchdog.close()
             self._port.close()
-            self.disk_answers = self._journal.close()
+            self.disk_answers = not self._standby.calling and self._journal.close()
+            self._standby.close()
+        if self.outcome is None:
+            raise AssertionError("the loop ended before the run")
         return self.outcome
+
+    @property
+    def cpu_s(self) -> float:
+        """CPU time that serving took, without what ZeroMQ's threads do, once it is over [s]."""
+        return self._standby.cpu_s
 
     def _turn(self) -> None:
         """Serve whoever is there; with nobody there, or after `LOOK_NS` at the latest, see to deadlines.
@@ -219,8 +229,8 @@ class BrokerServer:
             self._catch_up()
             self._unhurried = self._budgets_are_long and wake - now > SOON_NS
             self._look_at = min(now + (UNHURRIED_LOOK_NS if self._unhurried else LOOK_NS), wake)
-            self.loop.call(self.loop.poll(0 if self._port.readable else wake - now))
-        elif self._unhurried and not self._journal.busy:
+            self.loop.call(self.loop.poll(0 if self._port.readable else wake - time.monotonic_ns()))
+        elif self._unhurried and not self._standby.calling:
             self._receive_all(wait=True)
         elif self._port.readable:
             self._receive_all()
@@ -247,6 +257,7 @@ class BrokerServer:
             self._guard.check(now)
             self._look_at_disk()
         self._write_journal()
+        now = time.monotonic_ns()  # the disk may have taken its time
         deadline = self.clock.next_deadline()
         if deadline is None:
             return self._next_check
@@ -271,7 +282,7 @@ class BrokerServer:
             if finished != self._finished_frames:
                 self._finished_frames = finished
                 self._perform()
-                self._hand_over_entries(wait=True)  # the next frame relies on them
+                self._hand_over_entries()  # the next frame relies on them
             self.clock.settle(time.monotonic_ns())
             self._perform()
 
@@ -341,33 +352,22 @@ class BrokerServer:
         Written once somebody waits for it, while services are at work, and whenever deadlines are looked
         at; so services that answer one after the other cost one write.
         """
-        while self._entries:
-            if self._journal.busy:
-                if not self.clock.waits_for_journal or not self._journal.wait():
-                    return
-                self._take_confirmed()
-            self._hand_over_entries(wait=self.clock.waits_for_journal)
+        while self._entries and not self._standby.calling:
+            self._hand_over_entries()
             self.clock.settle(time.monotonic_ns())
             self._perform()
 
-    def _journal_answered(self) -> None:
-        """A batch that took its time is confirmed, or failed."""
-        self._journal.take_note()
+    def _disk_answers_again(self) -> None:
+        os.eventfd_read(self._standby.fd)
         self._look_at_disk()
-        self._take_confirmed()
-        self.clock.settle(time.monotonic_ns())
-        self._perform()
-        self._write_journal()
 
-    def _hand_over_entries(self, *, wait: bool) -> None:
-        if self._entries and not self._journal.busy:
-            entries, self._entries = self._entries, []
-            finished = self.clock.episode, self.clock.finished_frames - 1
-            snapshot = self.clock.snapshot() if self._journal.wants_snapshot else None
-            self._journal.submit(entries, finished, snapshot, wait=wait)
-            self._take_confirmed()
-
-    def _take_confirmed(self) -> None:
+    def _hand_over_entries(self) -> None:
+        if not self._entries or self._standby.calling:
+            return
+        entries, self._entries = self._entries, []
+        finished = self.clock.episode, self.clock.finished_frames - 1
+        snapshot = self.clock.snapshot() if self._journal.wants_snapshot else None
+        self._standby.call(lambda: self._journal.write(entries, finished, snapshot))
         confirmed, error = self._journal.confirmed, self._journal.error
         if error is not None:
             self.clock.take(ev.StopRequested(str(error)), time.monotonic_ns())
@@ -377,7 +377,8 @@ class BrokerServer:
 
     def _look_at_disk(self) -> None:
         """Tell of a disk that takes nothing, and that it does again."""
-        waited, doing = self._journal.waiting_s()
+        since, doing = self._standby.calling_since, self._journal.doing
+        waited = 0.0 if since is None else time.monotonic() - since
         if waited >= DISK_NOTE_S and not self._disk_told:
             place = f"{self._journal.path} ({file_system_of(self._journal.path)})"
             limit = f"at most {self._plan.limits.stall / 1e9:g} s (timeouts.stall_s)"

@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
-import select
 import statistics
 import subprocess
 import sys
@@ -27,7 +26,7 @@ from caviar_broker.checkpoints import CheckpointFiles
 from caviar_broker.core.events import Journal, Product
 from caviar_broker.core.resumption import Snapshot
 from caviar_broker.journal import JournalFile
-from caviar_broker.journal_thread import JournalThread
+from caviar_broker.journal_writer import JournalWriter
 from caviar_broker.resume import read_resumption
 from caviar_protocol.digest import RunDigest, payload_digest
 from caviar_protocol.durability import Durability
@@ -77,14 +76,14 @@ def grow(folder: Path, frames: int, durability: Durability) -> dict[str, float]:
     path, digest, most, written, last = folder / "journal.msgpack", RunDigest(), 0, 0, 0
     began = time.perf_counter()
     with closing(JournalFile(path, 1, files, durable=durability != "none")) as file:
-        thread = JournalThread(file, durability)
+        journal = JournalWriter(file, durability)
         for frame in range(frames):
             entries = list(entries_of(frame, last, frames))
             last = entries[-1].number
             told = [(d.topic, e.service, d.digest) for e in entries for d in e.decisions]
             digest.add_frame(0, frame, told)
             snapshot = None
-            if thread.wants_snapshot:
+            if journal.wants_snapshot:
                 snapshot = Snapshot(
                     episode=0,
                     finished=frame + 1,
@@ -96,12 +95,10 @@ def grow(folder: Path, frames: int, durability: Durability) -> dict[str, float]:
                     members=tuple(SERVICES),
                 )
             before = file.size
-            thread.submit(entries, (0, frame), snapshot)
-            while thread.busy and select.select([thread.fd], [], [])[0]:
-                thread.take_note()
+            journal.write(entries, (0, frame), snapshot)
             written += max(0, file.size - before)
             most = max(most, file.size)
-        thread.close()
+        journal.close()
     wrote = time.perf_counter() - began
     began = time.perf_counter()
     left = read_resumption(path, CheckpointFiles(folder))

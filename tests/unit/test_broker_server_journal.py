@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from broker_harness import PAIR, Client, eventually, finishes_well, plan, play_to_the_end, playing, serving
 
-from caviar_broker import journal_thread, server
+from caviar_broker import journal_writer, server
 from caviar_broker.core.events import Journal, StopRequested
 from caviar_broker.journal import JournalFile
 from caviar_broker.journal_format import read_journal
@@ -144,7 +144,7 @@ def test_a_disk_that_does_not_answer_is_told_of_and_holds_up_only_what_relies_on
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, thaws: bool
 ) -> None:
     monkeypatch.setattr(server, "DISK_NOTE_S", 0.5)
-    monkeypatch.setattr(journal_thread, "END_S", 0.1)
+    monkeypatch.setattr(journal_writer, "END_S", 0.1)
     made: list[Frozen] = []
 
     def frozen(path: Path) -> Frozen:
