@@ -9,7 +9,7 @@ frame, and the error names the service that made it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache
 from typing import Any, cast
 
@@ -20,13 +20,13 @@ from caviar_protocol import scene_content as scenes
 from caviar_protocol.arrays import Payload, array_fields, require_finite
 from caviar_protocol.digest import payload_digest
 from caviar_protocol.errors import PayloadError, ProductError
-from caviar_protocol.messages import GrantInput
+from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.scene_content import SceneRules
 from caviar_protocol.topics import Action, Camera, Channel, Depth, Lidar, Link, Scene, Segmentation
 
-SMALL_PRODUCT = 16 << 10
-"""[B] of a product of which a consumer checks the digest: SHA-256 takes 10 µs for that. The recorder checks
-all that it writes."""
+_MADE_OF_SCENES = frozenset({"channel", "link", "lidar", "camera", "depth", "segmentation"})
+FIRST_LOOKS = 16
+"""Products of each source that every consumer looks at, and of which it compares the digest."""
 
 
 class ContentCheck:
@@ -43,10 +43,36 @@ class ContentCheck:
 
     def __init__(self, rules: SceneRules | None = None) -> None:
         self.rules = rules or SceneRules()
+        self._derived: frozenset[int] = frozenset()
+        """Frames of whose scenes a product was made that is an input beside them."""
+        self._looks: dict[tuple[str, str], int] = {}
+        """Products that were looked at, by (topic, source)."""
         self._passed: dict[tuple[str, str], Payload] = {}
         """By (topic, source), the last product without bytes: in one process all consumers get one object."""
         self._described: dict[str, bytes | Scene] = {}
         """By world, the last header, or scene, of which names and devices are right."""
+
+    def begin(self, inputs: Iterable[GrantInput]) -> None:
+        """These are the inputs of the next grant: one that was made of a frame's scenes vouches for them.
+
+        A channel looks at every scene before it computes with it. Behind the `FIRST_LOOKS` of a source those
+        who get the channel too do not look again: it would cost as much as a small service's own work.
+        """
+        self._derived = frozenset(
+            [i.frame for i in inputs if i.topic in _MADE_OF_SCENES and i.status is Status.FRESH]
+        )
+
+    def is_due(self, entry: GrantInput) -> bool:
+        """Whether this consumer has to look at a product."""
+        return not (entry.frame in self._derived and entry.topic == "scene" and self._is_familiar(entry))
+
+    def digest(self, entry: GrantInput, header: bytes | memoryview, body: bytes | memoryview) -> None:
+        """Raise `ProductError` where one of the first products of a source has not the digest that it stated.
+
+        Who computes digests wrongly does so from the first frame on; the recorder compares all of them.
+        """
+        if not self._is_familiar(entry):
+            check_digest(entry, header, body)
 
     def __call__(self, entry: GrantInput, payload: Payload, header: bytes = b"") -> None:
         """Raise `ProductError` where the payload cannot be.
@@ -54,7 +80,7 @@ class ContentCheck:
         ``header`` are the payload's encoded fields, where there are any.
         """
         key = entry.topic, entry.source
-        if not header and self._passed.get(key) is payload:
+        if (not header and self._passed.get(key) is payload) or not self.is_due(entry):
             return
         if isinstance(payload, Scene):
             found = self._wrong_scene(payload, entry.source, header)
@@ -62,8 +88,12 @@ class ContentCheck:
             found = wrong_values(payload)
         if found:
             raise ProductError(entry.topic, entry.source, entry.frame, found)
+        self._looks[key] = self._looks.get(key, 0) + 1
         if not header:
             self._passed[key] = payload
+
+    def _is_familiar(self, entry: GrantInput) -> bool:
+        return self._looks.get((entry.topic, entry.source), 0) >= FIRST_LOOKS
 
     def _wrong_scene(self, scene: Scene, world: str, header: bytes) -> str:
         if not scenes.numbers_are_right(scene) and (found := scenes.wrong_number(scene)):

@@ -337,6 +337,7 @@ class Runner:
             answer.append(encode_message(fault))
 
         with Guard(self._identity, failed, "step", grant.episode, grant.frame) as guard:
+            self._check.begin(grant.inputs)
             inputs = inputs_of(grant, [part.buffer for part in parts], self._check)
             frame = frame_of(self._running, reset, grant, inputs)
             started = time.monotonic_ns()

@@ -24,7 +24,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Payload
 from caviar_protocol.codec import decode_payload
-from caviar_protocol.content import SMALL_PRODUCT, ContentCheck, check_digest
+from caviar_protocol.content import ContentCheck
 from caviar_protocol.errors import PayloadError, ProductError, ProtocolError
 from caviar_protocol.messages import GrantInput, Input, Report, Role, Status
 from caviar_protocol.scenario import DeviceSpec
@@ -152,10 +152,14 @@ class FrameInput:
         self._payload, self._check = payload, None
         return payload
 
+    def look(self) -> None:
+        """Have the payload checked where that is due, for a service that does not use it; raises as it does."""
+        if self._check is not None and self._check.is_due(self.provenance):
+            self.payload  # noqa: B018 - decoded and checked on first use
+
     def _decoded(self, entry: GrantInput) -> Payload:
-        # A product that is small is also compared with its digest. The recorder does so with all of them.
-        if self._check is not None and len(self.header) + len(self.body) <= SMALL_PRODUCT:
-            check_digest(entry, self.header, self.body)
+        if self._check is not None:
+            self._check.digest(entry, self.header, self.body)
         try:
             return decode_payload(entry.topic, self.header, self.body)
         except ProtocolError as error:

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from caviar_clients.conform.street import product
 from caviar_protocol.arrays import Payload
 from caviar_protocol.codec import decode_payload, encode_payload
-from caviar_protocol.content import ContentCheck, check_digest, wrong_values
+from caviar_protocol.content import FIRST_LOOKS, ContentCheck, check_digest, wrong_values
 from caviar_protocol.errors import ProductError
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.scenario import DeviceSpec
@@ -278,6 +278,39 @@ def test_a_false_digest_is_refused() -> None:
         check_digest(entry(digest="0" * 64), header, body)
 
 
+# --- who looks --------------------------------------------------------------------------------------
+
+
+def test_a_scene_of_which_a_channel_was_made_is_looked_at_by_the_channel_alone_behind_the_first() -> None:
+    vouched = GrantInput(topic="channel", source="channel", status=Status.FRESH, frame=3)
+    wrong = scene(orientation=2 * scene().orientation)
+    header, _ = encode_payload(scene())
+    check = ContentCheck(RULES)
+    check.begin([entry(), vouched])
+    for _ in range(FIRST_LOOKS):
+        assert check.is_due(entry())
+        check(entry(), scene(), header)
+    assert not check.is_due(entry())
+    check(entry(), wrong, header)
+    for others in ([], [replace(vouched, frame=2)], [replace(vouched, status=Status.HELD)]):
+        check.begin([entry(), *others])
+        assert check.is_due(entry())
+        with pytest.raises(ProductError, match="has norm 2"):
+            check(entry(), wrong, header)
+
+
+def test_a_false_digest_is_refused_in_the_first_products_of_a_source() -> None:
+    header, body = encode_payload(scene())
+    check, false = ContentCheck(RULES), entry(digest="0" * 64)
+    with pytest.raises(ProductError, match="its digest is"):
+        check.digest(false, header, body)
+    for _ in range(FIRST_LOOKS):
+        check(entry(), scene(), header)
+    check.digest(false, header, body)
+    with pytest.raises(ProductError, match="its digest is"):
+        check.digest(GrantInput(topic="scene", source="air", status=Status.FRESH, frame=3), header, body)
+
+
 # --- what it costs ----------------------------------------------------------------------------------
 
 
@@ -293,7 +326,7 @@ def cost_us(call: Callable[[], object]) -> float:
 
 
 def test_a_scene_of_twenty_objects_is_checked_within_20_us() -> None:
-    """6 µs on the machine that it was written on; tests/bench/bench_content.py has more."""
+    """6 µs on the machine that it was written on."""
     check, right = ContentCheck(RULES), scene()
     header, _ = encode_payload(right)
     check(entry(), right, header)

@@ -254,7 +254,7 @@ def _check(item: FrameInput) -> None:
     if item.provenance.digest:
         check_digest(item.provenance, item.header, item.body)
     if item.provenance.topic in _LOOKED_INTO:
-        item.payload  # noqa: B018 - decoded and checked on first use
+        item.look()
 
 
 def _with_digest(item: FrameInput) -> GrantInput:
