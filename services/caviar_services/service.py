@@ -153,7 +153,7 @@ class FrameInput:
         return payload
 
     def look(self) -> None:
-        """Have the payload checked where that is due, for a service that does not use it; raises as it does."""
+        """Have the payload checked where that is due, for a service that does not use it."""
         if self._check is not None and self._check.is_due(self.provenance):
             self.payload  # noqa: B018 - decoded and checked on first use
 
