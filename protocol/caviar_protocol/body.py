@@ -6,7 +6,6 @@ the next multiple of 8 bytes; what lies between is zero.
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,9 @@ ALIGNMENT = 8
 """[B] Offsets are multiples of this."""
 
 
+_CODES = {dtype: code for code, dtype in WIRE_DTYPES.items()}
+
+
 class BodyWriter:
     """Lays arrays behind each other."""
 
@@ -29,19 +31,22 @@ class BodyWriter:
 
     def place(self, value: NDArray[Any]) -> dict[str, Any]:
         """Append an array; returns the reference that stands for it in the header."""
-        dtype = value.dtype.newbyteorder("<")
-        if dtype.str not in WIRE_DTYPES:
-            raise PayloadError(f"dtype {dtype.str} cannot travel; one of {', '.join(WIRE_DTYPES)}")
+        code = _CODES.get(value.dtype)
+        if code is None:
+            dtype = value.dtype.newbyteorder("<")
+            if dtype not in _CODES:
+                raise PayloadError(f"dtype {dtype.str} cannot travel; one of {', '.join(WIRE_DTYPES)}")
+            code, value = _CODES[dtype], value.astype(dtype)
         if value.ndim > MAX_DIMENSIONS:
             raise PayloadError(f"{value.ndim} dimensions cannot travel, at most {MAX_DIMENSIONS}")
-        data = value.astype(dtype, order="C", copy=False).tobytes()
+        data = value.tobytes()
         padding = -self.length % ALIGNMENT
         if padding:
             self._chunks.append(bytes(padding))
         offset = self.length + padding
         self._chunks.append(data)
         self.length = offset + len(data)
-        return {"dtype": dtype.str, "shape": value.shape, "offset": offset}
+        return {"dtype": code, "shape": value.shape, "offset": offset}
 
     def body(self) -> bytes:
         """All arrays so far."""
@@ -62,9 +67,11 @@ class BodyReader:
         the arrays taken before.
         """
         code, shape, offset = _reference(reference)
-        dtype = WIRE_DTYPES[code]
-        count = math.prod(shape)
-        if math.prod(max(size, 1) for size in shape) > limits.MAX_BODY:
+        dtype, count, room = WIRE_DTYPES[code], 1, 1
+        for size in shape:
+            count *= size
+            room *= size or 1
+        if room > limits.MAX_BODY:
             raise DecodeError(f"array shape {shape} is larger than any body")
         end = offset + count * dtype.itemsize
         if end > len(self._body):
@@ -76,7 +83,7 @@ class BodyReader:
             raise DecodeError(f"array at offset {offset} overlaps the one before, which ends at {self._end}")
         self._end = end
         array: NDArray[Any] = np.ndarray(shape, dtype, self._body, offset)
-        if code == "|b1" and count and array.view(np.uint8).max() > 1:
+        if code == "|b1" and bytes(self._body[offset:end]).strip(b"\0\1"):
             raise DecodeError("a |b1 array holds a byte other than 0 and 1")
         return array
 
@@ -89,8 +96,11 @@ def _reference(reference: Any) -> tuple[str, list[int], int]:
         raise DecodeError("an array is a map with dtype, shape and offset") from None
     if type(code) is not str or code not in WIRE_DTYPES:
         raise DecodeError(f"array dtype {code!r:.40} is not one of {', '.join(WIRE_DTYPES)}")
-    if type(shape) is not list or not all(type(n) is int and 0 <= n <= limits.MAX_BODY for n in shape):
+    if type(shape) is not list:
         raise DecodeError(f"array shape {shape!r:.80} is not a list of sizes")
+    for size in shape:
+        if type(size) is not int or not 0 <= size <= limits.MAX_BODY:
+            raise DecodeError(f"array shape {shape!r:.80} is not a list of sizes")
     if len(shape) > MAX_DIMENSIONS:
         raise LimitError(f"array has {len(shape)} dimensions, at most {MAX_DIMENSIONS} are accepted")
     if type(offset) is not int or offset < 0 or offset % ALIGNMENT:

@@ -81,7 +81,7 @@ def _few_numbers_are_right(scene: Scene) -> bool:
             abs(w * w + x * x + y * y + z * z - 1.0) <= UNIT_TOLERANCE
             and e * e + n * n + u * u <= MAX_COORDINATE_M**2
             and ve * ve + vn * vn + vu * vu <= MAX_SPEED**2
-            and 0.0 < min(a, b, c)
+            and min(a, b, c) > 0.0
             and a + b + c <= MAX_DIMENSION_M
         ):
             return False
