@@ -106,7 +106,8 @@ def describe_exit(code: int) -> str:
 def _stat(pid: int) -> list[str] | None:
     """Fields of /proc/PID/stat behind the command name, state first; None where it is gone."""
     try:
-        text = Path(f"/proc/{pid}/stat").read_text()
+        with open(f"/proc/{pid}/stat", "rb", buffering=0) as file:  # noqa: PTH123 - read 100 times a second
+            text = file.read()
     except OSError:
         return None
-    return text.rpartition(")")[2].split()
+    return text.rpartition(b")")[2].decode().split()
