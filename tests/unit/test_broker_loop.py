@@ -113,3 +113,19 @@ def test_the_broker_takes_the_best_place_that_it_is_permitted(
     monkeypatch.setattr(os, "getpriority", lambda *_: 3)
     assert prefer() == told
     assert asked[0] == "sched_setscheduler"
+
+
+def test_what_another_thread_polls_meanwhile_is_not_called_for_again() -> None:
+    """A callback may wait for a disk: then a standby serves, and empties what was ready before."""
+    loop, called, fds = Loop(), list[str](), [os.eventfd(1, os.EFD_NONBLOCK) for _ in range(2)]
+
+    def first() -> None:
+        called.append("first")
+        loop.poll()
+
+    loop.watch(fds[0], first)
+    loop.watch(fds[1], lambda: called.append("second"))
+    loop.call(sorted(loop.poll(), key=fds.index))
+    assert called == ["first"]
+    for fd in fds:
+        os.close(fd)
