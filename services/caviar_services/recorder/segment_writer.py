@@ -125,6 +125,7 @@ class SegmentWriter:
         """Write index and summary, for `close` to follow; what the manifest says about the segment."""
         self._writer.finish()
         self._stream.hand_over()
+        del self._writer  # and its index: until the segment is closed it may wait for the disk
         return SegmentRecord(
             name=self.path.name,
             first=self.first,
