@@ -21,8 +21,8 @@ from caviar_broker.journal import JournalFile
 from caviar_protocol.durability import SYNC_PERIOD_S, Durability
 from caviar_protocol.errors import RunError
 
-END_S = 2.0
-"""[s] that closing waits for the disk."""
+END_S = 10.0
+"""[s] that closing waits for the disk: a busy one takes seconds for the last entries."""
 
 
 class JournalWriter:

@@ -24,7 +24,7 @@ from caviar_protocol.scenario import Scenario, ServiceSpec
 
 KILL_AFTER_S = 1.0
 """[s] that a process gets after SIGTERM before SIGKILL, beyond the run's ``shutdown_s``."""
-BROKER_S = 10.0
+BROKER_S = 30.0
 """[s] that the broker gets to end after its last service, beyond the run's ``shutdown_s``."""
 MAX_RESTARTS = 5
 """Processes that are started for a service that died, before it comes back."""
