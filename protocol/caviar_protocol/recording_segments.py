@@ -223,7 +223,12 @@ def follows(earlier: tuple[int, int], later: tuple[int, int]) -> bool:
 def _files(folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise RecordingError(f"{folder} does not exist: give a run directory or a {SEGMENT_PATTERN} file")
-    files = sorted(folder.glob(SEGMENT_PATTERN), key=lambda file: (len(file.name), file.name))
+    try:
+        files = sorted(folder.glob(SEGMENT_PATTERN), key=lambda file: (len(file.name), file.name))
+    except OSError as error:
+        raise RecordingError(
+            f"cannot read the folder {folder}: {error.strerror}; check its file system (fsck)"
+        ) from error
     if not files:
         raise RecordingError(f"{folder} holds no recording: there is no {SEGMENT_PATTERN} in it")
     return files

@@ -40,6 +40,8 @@ from caviar_protocol.recording_segments import recorded_until
 EXT4_IOC_SHUTDOWN, NOLOGFLUSH = 0x8004587D, struct.pack("I", 2)
 """Stop a file system without writing its journal, as a loss of power does."""
 IMAGE_BYTES = 512 << 20
+FSCK_FAILED = 4
+"""Exit status of ``e2fsck`` from which errors are left."""
 OUT = "runs"
 """Folder of the runs in a file system."""
 START_S = 120.0
@@ -75,7 +77,7 @@ def missing() -> str:
     """Why no file system can be mounted here; empty where one can."""
     if os.geteuid() != 0:
         return "mounting a file system needs root"
-    tools = [tool for tool in ("mkfs.ext4", "mount", "umount") if shutil.which(tool) is None]
+    tools = [tool for tool in ("mkfs.ext4", "e2fsck", "mount", "umount") if shutil.which(tool) is None]
     if tools:
         return f"{', '.join(tools)} not installed"
     with tempfile.TemporaryDirectory() as folder:
@@ -145,12 +147,22 @@ def lose_power(mount: Path, image: Path, kept: Path, how: str, mark: str) -> Non
         fcntl.ioctl(fd, EXT4_IOC_SHUTDOWN, NOLOGFLUSH)
         os.close(fd)
     else:
+        _signal_all(mark, signal.SIGSTOP)
         shutil.copyfile(image, kept)
-    while entries := marked(mark):
-        for entry in entries:
-            with suppress(ProcessLookupError):
-                os.kill(int(entry.split()[0]), signal.SIGKILL)
+        # Blocks may have been written while they were copied: what a system does at its next start mends that.
+        checked = subprocess.run(["e2fsck", "-f", "-y", kept], capture_output=True, check=False)
+        assert checked.returncode < FSCK_FAILED, checked.stdout.decode()
+    while _signal_all(mark, signal.SIGKILL):
         select.select([], [], [], 0.05)
+
+
+def _signal_all(mark: str, number: signal.Signals) -> bool:
+    """Send a signal to every process of a run; whether there is one."""
+    entries = marked(mark)
+    for entry in entries:
+        with suppress(ProcessLookupError):
+            os.kill(int(entry.split()[0]), number)
+    return bool(entries)
 
 
 def crash(folder: Path, scenario: Path, frames: int, at: float, how: str, digest: str) -> Outcome:
