@@ -149,7 +149,7 @@ def lose_power(mount: Path, image: Path, kept: Path, how: str, mark: str) -> Non
     else:
         _signal_all(mark, signal.SIGSTOP)
         shutil.copyfile(image, kept)
-        # Blocks may have been written while they were copied: what a system does at its next start mends that.
+        # Blocks may have been written while they were copied: a system mends that at its next start.
         checked = subprocess.run(["e2fsck", "-f", "-y", kept], capture_output=True, check=False)
         assert checked.returncode < FSCK_FAILED, checked.stdout.decode()
     while _signal_all(mark, signal.SIGKILL):
