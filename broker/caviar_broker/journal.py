@@ -26,7 +26,7 @@ from caviar_broker.journal_format import (
     JournalReader,
     framed,
 )
-from caviar_broker.retention import Located, needed
+from caviar_broker.retention import EntryIndex, Located, needed
 from caviar_protocol.durability import sync_file
 from caviar_protocol.errors import RunError
 
@@ -84,7 +84,7 @@ class JournalFile:
         self._encoder = msgspec.msgpack.Encoder()
         self._lock = Lock()
         """Held while the file is replaced, or its descriptor taken."""
-        self._entries: list[Located] = []
+        self._entries = EntryIndex()
         self._number, self._crc, self.size = 0, MAGIC_CRC, 0
         self._compacted_size = 0
         if path.is_file() and path.stat().st_size:
@@ -114,7 +114,7 @@ class JournalFile:
             size += HEAD.size + length
         self._put(pieces)
         self._crc, self.size = crc, size
-        self._entries += located
+        self._entries.extend(located)
         if saved:
             self.checkpoints.entered()
 
@@ -209,7 +209,8 @@ class JournalFile:
                 sync_file(self.path.parent)
         except OSError as error:
             raise self._failed(error) from error
-        self._crc, self.size, self._entries = crc, size, moved
+        self._crc, self.size, self._entries = crc, size, EntryIndex()
+        self._entries.extend(moved)
         self._compacted_size = size
 
     def _opening(self, snapshot: Snapshot, base: int) -> JournalEntry:
@@ -260,7 +261,7 @@ class JournalFile:
             if end is not None and reader.end > end:
                 break
             offset = self.size + HEAD.size
-            self._entries.append(Located.of(entry, offset, reader.end - offset))
+            self._entries.extend([Located.of(entry, offset, reader.end - offset)])
             self._crc, self._number, self.size = reader.crc, max(self._number, entry.number), reader.end
         if reader.size > self.size:
             cut = self.path.with_name(self.path.name + CUT_SUFFIX)

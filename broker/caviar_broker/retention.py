@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from array import array
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 from caviar_broker.core.resumption import Snapshot
@@ -27,6 +28,31 @@ class Located(NamedTuple):
         """The place of an entry."""
         topics = tuple([product[0] for product in entry.products])
         return cls(entry.episode, entry.frame, entry.service, entry.outcome, topics, offset, length)
+
+
+class EntryIndex:
+    """The places of the entries of a journal, in 40 B each: some hundred thousand are kept until the next
+    compaction."""
+
+    def __init__(self) -> None:
+        self._numbers = array("q")
+        """Episode, frame, offset and length of each."""
+        self._kinds: list[tuple[str, str, tuple[str, ...]]] = []
+        """Service, outcome and topics of each."""
+        self._known: dict[tuple[str, str, tuple[str, ...]], tuple[str, str, tuple[str, ...]]] = {}
+
+    def extend(self, entries: Iterable[Located]) -> None:
+        """Note entries behind those that are known."""
+        for entry in entries:
+            kind = entry.service, entry.outcome, entry.topics
+            self._kinds.append(self._known.setdefault(kind, kind))
+            self._numbers.extend((entry.episode, entry.frame, entry.offset, entry.length))
+
+    def __iter__(self) -> Iterator[Located]:
+        numbers = iter(self._numbers)
+        columns = zip(numbers, numbers, numbers, numbers, strict=True)
+        for (episode, frame, offset, length), kind in zip(columns, self._kinds, strict=True):
+            yield Located(episode, frame, *kind, offset, length)
 
 
 def needed(entries: Iterable[Located], snapshot: Snapshot) -> tuple[int, list[Located]]:

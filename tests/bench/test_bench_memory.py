@@ -6,7 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bench_memory import ROOT, Growth, measure
+from bench_memory import Growth, measure
+
+from caviar_protocol.scenario_loader import find_scenario
 
 
 def test_the_slope_is_that_of_the_last_frames() -> None:
@@ -20,7 +22,7 @@ def test_the_slope_is_that_of_the_last_frames() -> None:
 
 
 def test_smoke_grows_by_less_than_a_kilobyte_a_frame(tmp_path: Path) -> None:
-    measured = measure(ROOT / "deploy" / "caviar_scenarios" / "smoke.toml", 3000, ["channel"], tmp_path)
+    measured = measure(find_scenario("smoke"), 3000, ["channel"], tmp_path)
     assert len(measured.finished_ns) == 3000
     slopes = measured.slopes()
     assert slopes["broker"] < 1.0
