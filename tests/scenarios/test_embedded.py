@@ -78,6 +78,7 @@ def test_street_canyon_has_the_digest_of_the_distributed_run(tmp_path: Path) -> 
     assert digest_of(run(arguments[0], tmp_path / "many", "--frames", "12", timeout=120)) == embedded
 
 
+@pytest.mark.exhaustive
 @pytest.mark.channel
 def test_cameras_have_the_same_digest_in_every_run(tmp_path: Path) -> None:
     """Pictures too: in one process with a channel beside them, whose variant is another, and distributed."""

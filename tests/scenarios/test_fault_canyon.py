@@ -43,8 +43,8 @@ def digest(scenario: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
     [
         ("caviar_services traffic", signal.SIGKILL),
         ("caviar_services channel", signal.SIGKILL),
-        ("caviar_services agent", signal.SIGKILL),
-        ("caviar_services recorder", signal.SIGKILL),
+        pytest.param("caviar_services agent", signal.SIGKILL, marks=pytest.mark.exhaustive),
+        pytest.param("caviar_services recorder", signal.SIGKILL, marks=pytest.mark.exhaustive),
         ("caviar_broker", signal.SIGKILL),
         ("caviar_services channel", signal.SIGSTOP),
     ],

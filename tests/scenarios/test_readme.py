@@ -81,12 +81,15 @@ def test_a_mistake_is_told_as_the_readme_shows(tmp_path: Path) -> None:
     assert shown[1] in refused.stderr
 
 
-def test_the_learning_script_trains_and_compares(tmp_path: Path) -> None:
+@pytest.mark.parametrize("steps", [300, pytest.param(2000, marks=pytest.mark.exhaustive)])
+def test_the_learning_script_trains_and_compares(steps: int, tmp_path: Path) -> None:
     pytest.importorskip("stable_baselines3", reason="needs the extra `learning`")
     _, _, train = blocks("python")
-    out = run(script(train, tmp_path), tmp_path)
+    assert "agent.learn(2000)" in train
+    out = run(script(train.replace("agent.learn(2000)", f"agent.learn({steps})"), tmp_path), tmp_path)
     printed = re.search(r"DQN ([\d.]+), los-beam ([\d.]+), oracle ([\d.]+)", out)
     assert printed is not None, out
     dqn, straight, best = map(float, printed.groups())
-    assert 0.3 * best < dqn < best, "better than chance, which has about a tenth of the best"
     assert straight < best
+    if steps == 2000:
+        assert 0.3 * best < dqn < best, "better than chance, which has about a tenth of the best"

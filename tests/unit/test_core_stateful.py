@@ -326,8 +326,9 @@ def play(examples: int) -> None:
     )
 
 
-def test_any_order_and_lateness_of_events_keeps_the_invariants() -> None:
-    play(400)
+@pytest.mark.parametrize("examples", [200, pytest.param(2000, marks=pytest.mark.exhaustive)])
+def test_any_order_and_lateness_of_events_keeps_the_invariants(examples: int) -> None:
+    play(examples)
 
 
 @given(
