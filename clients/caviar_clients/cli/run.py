@@ -40,7 +40,7 @@ from caviar_protocol.scenario_loader import find_scenario
 
 QUIET = frozenset({"stale", "note", "lag"})
 """Kinds of notices that are logged, and only counted on the screen."""
-REPEATED = frozenset({"lost", "away", "back", "restarted", "refused"})
+REPEATED = frozenset({"lost", "away", "back", "restarted", "refused", "disk"})
 """Kinds of notices that are shown every time, since what they ask of the user is always new."""
 
 
