@@ -163,7 +163,7 @@ def edge_fields(
             going = types[:, d] != 0
             out = np.where(going[:, None], _unit(steps[:, d + 1]), k)
             constants = media.permittivity[carrier, :, d], media.conductivity[carrier, :, d]
-            wall = _Wall(*constants, media.thickness[:, d], media.scattering[:, d], wavelength)
+            wall = Wall(*constants, media.thickness[:, d], media.scattering[:, d], wavelength)
             flat = wall.dyad(k, _unit(normals[:, d]), types[:, d] == Interaction.TRANSMISSION)
             there = bent[:, d]
             if there.any():
@@ -183,7 +183,7 @@ def edge_fields(
 
 
 @dataclass(frozen=True, eq=False)
-class _Wall:
+class Wall:
     """Slabs that P rays meet, at one wavelength [m]."""
 
     permittivity: Float64Array
@@ -192,9 +192,9 @@ class _Wall:
     scattering: Float64Array
     wavelength: float
 
-    def take(self, rows: Int64Array) -> _Wall:
+    def take(self, rows: Int64Array) -> Wall:
         """Those of these rays."""
-        return _Wall(
+        return Wall(
             self.permittivity[rows],
             self.conductivity[rows],
             self.thickness[rows],
@@ -214,7 +214,7 @@ class _Wall:
 
 
 def _diffracted(
-    k: Float64Array, out: Float64Array, faces: Faces, wall: _Wall, legs: tuple[Float64Array, Float64Array]
+    k: Float64Array, out: Float64Array, faces: Faces, wall: Wall, legs: tuple[Float64Array, Float64Array]
 ) -> Complex128Array:
     """Dyads of diffraction, without spreading, from ``k`` to ``out``; ``legs`` [m] are s' and s."""
     edge, (face_0, face_n) = faces.edge, np.moveaxis(faces.normals, 1, 0)

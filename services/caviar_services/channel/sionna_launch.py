@@ -67,9 +67,19 @@ class Launch:
 
 
 class Launcher:
-    """Launches the rays; one kernel serves every depth."""
+    """Launches the rays; one kernel serves every depth.
 
-    def __init__(self, mi_scene: Any, options: LaunchOptions) -> None:
+    Parameters
+    ----------
+    mi_scene
+        Where they go, a `mitsuba.Scene`.
+    options
+        What is traced.
+    part
+        Numbers of the first ray and of the one behind the last; absent: all rays.
+    """
+
+    def __init__(self, mi_scene: Any, options: LaunchOptions, part: tuple[int, int] | None = None) -> None:
         from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
         from sionna.rt.utils import fibonacci_lattice
 
@@ -77,7 +87,12 @@ class Launcher:
         self._options = options
         self._generator = SBCandidateGenerator()
         self._sampler = self._generator._sampler
-        self._directions = _along_curve(fibonacci_lattice(options.samples))
+        first, end = part or (0, options.samples)
+        self._count = end - first
+        whole = self._count == options.samples
+        self._first = first
+        lattice = fibonacci_lattice(options.samples) if whole else _lattice(options.samples, first, end)
+        self._directions = _along_curve(lattice)
         self._enabled = (
             REFLECTED * options.reflection
             | SCATTERED * options.scattering
@@ -96,8 +111,8 @@ class Launcher:
 
         if not self._enabled:
             return Launch((), None)
-        samples = self._options.samples if rays is None else len(rays)
-        self._sampler.seed(self._options.seed + number, samples)
+        samples = self._count if rays is None else len(rays)
+        self._sampler.seed(self._options.seed + number + self._first, samples)
         origin = dr.repeat(source, samples)
         direction = mi.Vector3f(self._directions)
         if rays is not None:
@@ -155,6 +170,16 @@ class Launcher:
         dr.eval(found, onward.o, onward.d, active, enabled, wedges)
         bounce = Bounce(kind, shape, hit.prim_index, hit.p, normal, sample.pdf)
         return bounce, onward.o, onward.d, active, enabled, wedges
+
+
+def _lattice(count: int, first: int, end: int) -> Any:
+    """Points ``first`` to ``end`` of `sionna.rt.utils.fibonacci_lattice`."""
+    import drjit as dr
+    import mitsuba as mi
+
+    number = dr.opaque(mi.Float64, first) + dr.arange(mi.Float64, end - first)
+    x = number / ((1.0 + math.sqrt(5.0)) / 2.0)
+    return mi.Point2f(x - dr.floor(x), number / dr.opaque(mi.Float64, count - 1))
 
 
 def _along_curve(lattice: Any) -> Any:

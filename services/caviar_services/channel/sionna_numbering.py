@@ -7,6 +7,7 @@ in a plane of it.
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
@@ -85,6 +86,40 @@ class NumberedTriangles:
         self.plane_table.update(self._corners - self.centre, self._moving_plane)
         self.surfaces.move(self._first_moving, self._corners[self._faces[self._first_moving :]])
         return True
+
+    @property
+    def first_moving_plane(self) -> int:
+        """Number of the first plane of a body; those of scenery come before."""
+        return int(self._moving_plane)
+
+    @property
+    def first_body_piece(self) -> int:
+        """Number of the piece that is the first body; those of scenery come before."""
+        return len(self.names) - len(self._bodies)
+
+    @property
+    def scenery_digest(self) -> bytes:
+        """Of all triangles at rest and of their planes."""
+        digest = hashlib.blake2b(digest_size=20)
+        faces = self._faces[: self._first_moving]
+        still = self._corners[: len(self._corners) - len(self._vertices)]
+        for part in (still - self.centre, faces, self.plane_of[: self._first_moving]):
+            digest.update(np.ascontiguousarray(part).tobytes())
+        return digest.digest()
+
+    def bodies_of(self, asset: str) -> Int64Array:
+        """Numbers of the bodies of an asset, counted through all bodies."""
+        return np.flatnonzero([of == asset for of, _ in self._bodies])
+
+    def face_numbers(self, asset: str) -> Int32Array:
+        """Number of the plane of each triangle of a body of an asset, within it; it has one body at least."""
+        piece = self.first_body_piece + int(self.bodies_of(asset)[0])
+        ends = np.append(self._first_triangles, len(self._faces))
+        return self._face_of[ends[piece] : ends[piece + 1]]
+
+    def piece_of(self, triangles: Int64Array) -> Int64Array:
+        """Number of the piece that each of these triangles is of."""
+        return np.searchsorted(self._first_triangles, triangles, side="right") - 1
 
     def enclosing(self, position: Float64Array) -> int:
         """Piece that a point [m], Shape ``[3]``, is inside; −1: none.

@@ -125,6 +125,12 @@ class PlaneTable:
         self.low[first:] = np.minimum.reduceat(triangles.min(1), begin)
         self.high[first:] = np.maximum.reduceat(triangles.max(1), begin)
 
+    def triangles_of(self, planes: Int64Array) -> tuple[Int64Array, Int64Array]:
+        """Numbers of the triangles of these planes, plane after plane, and how many each has."""
+        sizes = np.append(self._begin[1:], len(self._order))[planes] - self._begin[planes]
+        place = np.arange(int(sizes.sum())) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+        return self._order[place + np.repeat(self._begin[planes], sizes)], sizes
+
     def first_holding(self, triangles: Int64Array, points: Float64Array) -> Int64Array:
         """For each point [m], Shape ``[N, 3]``, in one of these triangles, the first triangle of the same
         plane that holds it too.

@@ -16,18 +16,22 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array
+from caviar_protocol.assets import default_folder
 from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.errors import PayloadError, SetupError
 from caviar_protocol.extras import install_command
 from caviar_protocol.seeding import derive_seed
 from caviar_protocol.topics import AntennaDevice, ChannelOptions, Scene
 from caviar_services.channel.base import Found, PathModel
+from caviar_services.channel.chain_cache import ChainCache
 from caviar_services.channel.clearance import with_near_pairs
 from caviar_services.channel.contributing import contributing
 from caviar_services.channel.edge_range import EdgeRange
+from caviar_services.channel.enumerated_tracer import EnumeratedTracer, unknown_paths
 from caviar_services.channel.matrices import Matrices
 from caviar_services.channel.mimo_rt import ElementTracer
 from caviar_services.channel.paths import Antenna, PathTable
+from caviar_services.channel.scenery_chains import SceneryChains, SceneryLaunch
 from caviar_services.channel.sionna_following import Following, FollowingState
 from caviar_services.channel.sionna_launch import LaunchOptions
 from caviar_services.channel.sionna_materials import MaterialPolicy, OutsideUse
@@ -67,7 +71,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
     def __init__(self, settings: SionnaSettings, run: RunInfo) -> None:
         super().__init__(settings, run)
         self.rung = settings.rung
-        self._samples = settings.launched_samples(run.name)
+        settings.launched_samples(run.name)  # says what is wrong with them
         self._variant = ""
         self._scene: SionnaScene
         self._tracer: Tracer
@@ -78,6 +82,12 @@ class SionnaChannel(PathModel[SionnaSettings]):
         """Traces where no edge is in range."""
         self._without_edge = 0
         """Transmitters of this frame that no edge is in range of."""
+        self._enumerated: EnumeratedTracer | None = None
+        """Finds reflected paths where they are enumerated."""
+        self._scenery: SceneryChains
+        """What it knows of the scenery."""
+        self._launches = True
+        """Whether rays are launched in each frame for the paths of all kinds."""
         self._following: Following | None = None
         self._outside: tuple[OutsideUse, ...] = ()
         self._detail = ""
@@ -86,7 +96,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         seed = settings.launch_seed
         self._asked = LaunchOptions(
             max_depth=settings.max_depth,
-            samples=self._samples,
+            samples=settings.launched_samples(run.name),
             max_paths=settings.max_paths,
             seed=derive_seed(run.seed, 0, f"{run.name}/launch") if seed is None else seed,
             reflection=settings.reflection,
@@ -106,7 +116,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
             diffraction=launched.diffraction,
             scattering=launched.scattering,
             max_depth=launched.max_depth,
-            samples=launched.samples,
+            samples=self._samples,
             materials_outside=tuple(use.brief(self.run.carriers[use.carrier].name) for use in self._outside),
             detail=self._detail,
         )
@@ -148,6 +158,10 @@ class SionnaChannel(PathModel[SionnaSettings]):
             self._detail = self._scene.detail_effect.brief
         self._launched, switched = contributing(self._asked, self._scene.used_surfaces(), frequencies)
         self._wavelengths = SPEED_OF_LIGHT / np.array(frequencies)
+        enumerated = s.enumerates(self._moving(preparation)) and self._launched.reflection
+        self._samples = s.launched_samples(self.run.name, enumerated)
+        if enumerated:
+            self._launched = replace(self._launched, samples=s.samples_per_frame)
         launched, samples = self._launched, self.settings.scattering_samples
         if samples is not None and launched.scattering:
             own = replace(
@@ -160,6 +174,8 @@ class SionnaChannel(PathModel[SionnaSettings]):
             self._diffuse = Tracer(self._scene, self._wavelengths.tolist(), own)
             launched = replace(launched, scattering=False)
         self._tracer = Tracer(self._scene, self._wavelengths.tolist(), launched)
+        if enumerated:
+            notes += self._enumerate(launched)
         if s.edges_within_m is not None and launched.diffraction:
             self._edge_range = EdgeRange(self._scene, s.edges_within_m)
             self._unbent = Tracer(
@@ -261,7 +277,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
             return SphericalWaves(surfaces, self._tracer.look, traced_from, memory)
         if self.rung == "mimo-rt":
             # The rays of a launch are kept whole; the rest is for the candidates of some receivers at a time.
-            lanes = memory // LANE_BYTES - self._samples * self._launched.max_depth
+            lanes = memory // LANE_BYTES - self._launched.samples * self._launched.max_depth
             return ElementTracer(
                 self._tracer, self._scene, self._wavelengths, max(1, lanes), self.settings.los
             )
@@ -291,9 +307,15 @@ class SionnaChannel(PathModel[SionnaSettings]):
         ):
             tracer = self._unbent
             self._without_edge += 1
-        found = [
-            tracer.trace(transmitter.position, targets, s.receivers_at_once, followed, names, corners=corners)
-        ]
+        found = []
+        if self._enumerated is not None:
+            scenery = self._scenery.of(transmitter.position)
+            found.append(self._enumerated.trace(transmitter.position, targets, scenery))
+        if self._launches:
+            launched = tracer.trace(
+                transmitter.position, targets, s.receivers_at_once, followed, names, corners=corners
+            )
+            found.append(launched if not found else unknown_paths(launched, found[0], self._scene))
         if self._diffuse is not None:
             element = Element(transmitter.array.pattern, transmitter.rotation)
             found.append(
@@ -301,6 +323,36 @@ class SionnaChannel(PathModel[SionnaSettings]):
             )
         first, index = t * len(receivers), np.array(others, np.int64)
         return [(first + index[traced.receiver], traced) for traced in found]
+
+    def _moving(self, preparation: Preparation) -> bool:
+        """Whether objects move in the run, for all that is known before its first frame."""
+        meshes = any(name.startswith("objects/") for name in preparation.assets)
+        return meshes or any(device.on for device in self.run.devices)
+
+    def _enumerate(self, launched: LaunchOptions) -> tuple[str, ...]:
+        """Know the scenery from where transmitters stand; what was found, and what could not be kept."""
+        s = self.settings
+        depth = min(launched.max_depth, s.enumerated_depth)
+        self._launches = (
+            launched.refraction or launched.diffraction or launched.scattering or launched.max_depth > depth
+        )
+        cache = ChainCache(default_folder() / "chains") if s.cache_chains else None
+        launch = SceneryLaunch(samples=self._samples, launches=s.scenery_launches)
+        self._enumerated = EnumeratedTracer(self._scene, launched.max_depth)
+        options = replace(launched, max_depth=depth)
+        self._scenery = SceneryChains(self._scene, options, launch, s.samples_per_frame, cache)
+        notes = []
+        for device in self.run.devices:
+            if device.kind == "antenna" and device.role in ("tx", "both") and not device.on:
+                name = device.name
+
+                def progress(part: int, parts: int, name: str = name) -> None:
+                    phase = f"launching scenery rays from {name!r}, part {part + 1} of {parts}"
+                    self.run.progress(phase, _COMPILE_GRACE_S)
+
+                place = self._scene.surfaces.cleared(np.array(device.position_m))
+                notes.append(f"transmitter {name!r}: {self._scenery.prepare(place, progress)}")
+        return (*notes, *(cache.notes if cache else ()))
 
     def _start(self) -> tuple[str, ...]:
         """Import the ray tracer with its library and variant; notes that say which."""

@@ -207,6 +207,21 @@ class SionnaScene(NumberedTriangles):
         return np.concatenate(found)
 
     @property
+    def unit_meshes(self) -> Mapping[str, Mesh]:
+        """Of the assets that have bodies."""
+        return {asset: mesh for asset, mesh in self._meshes.items() if self._pool[asset]}
+
+    @property
+    def standing_bodies(self) -> tuple[int, ...]:
+        """Numbers of the bodies that stand for an object, in ascending order."""
+        return tuple(number for number, body in enumerate(self._bodies) if body in self._standing)
+
+    def is_parking_piece(self, pieces: Int64Array) -> BoolArray:
+        """Which pieces are the box around parked receivers, which is not in the world."""
+        parking: BoolArray = pieces == self.names.index(_PARKING)
+        return parking
+
+    @property
     def parking(self) -> Float64Array:
         """Where unused receivers stand [m], Shape ``[3]``."""
         middle = (self.low + self.high) / 2

@@ -16,6 +16,10 @@ from caviar_services.channel.mesh_detail import DetailSettings
 from caviar_services.channel.sionna_materials import MaterialSettings, OutsideRange
 
 _SAMPLES = 100_000
+"""Of a launch in each frame."""
+
+_SCENERY_SAMPLES = 10_000_000
+"""Of a launch before the first one."""
 
 
 class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
@@ -24,10 +28,26 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     max_depth: Annotated[int, quantity("1", "interactions of a path at most", ge=0, le=16)] = 3
     rung: Literal["siso-rt", "spherical", "mimo-rt"] = "siso-rt"
     """How arrays are treated: plane waves, spherical waves, or every antenna pair traced."""
+    candidates: Literal["enumerated", "launched"] | None = None
+    """How reflected paths are looked for: ``enumerated``, chains of scenery by launches from where
+    transmitters stand, before the first frame, and chains by way of moving objects face by face in each
+    frame; ``launched``, all of them by rays in each frame. Absent: enumerated where objects move in the run,
+    which is where devices are mounted on them or a world has meshes of them."""
     samples: (
-        Annotated[int, quantity("1", "rays launched per transmitter; absent: 100,000", ge=1, le=100_000_000)]
-        | None
+        Annotated[int, quantity("1", "rays of a launch from each transmitter", ge=1, le=100_000_000)] | None
     ) = None
+    """Of the scenery's launches where candidates are enumerated, of those in each frame elsewhere. Absent:
+    10,000,000 and 100,000."""
+    scenery_launches: Annotated[int, quantity("1", "launches of scenery that are united", ge=1, le=100)] = 4
+    """Each has its rays turned against the others: what one passes by, another meets."""
+    samples_per_frame: Annotated[
+        int, quantity("1", "rays launched in each frame where some are needed", ge=1, le=100_000_000)
+    ] = 100_000
+    """Where candidates are enumerated: from transmitters that move, and for refraction, diffraction,
+    scattering and paths longer than ``enumerated_depth``."""
+    enumerated_depth: Annotated[int, quantity("1", "reflections of enumerated paths at most", ge=1, le=5)] = 3
+    cache_chains: bool = True
+    """Keep the scenery's chains in the user's cache, ``$XDG_CACHE_HOME/caviar/chains``, for the next run."""
     ray_spacing_deg: (
         Annotated[float, quantity("°", "mean angle between rays, in place of samples", ge=0.03, le=90)] | None
     ) = None
@@ -104,6 +124,11 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
             raise ValueError(
                 'edges_within_m needs diffraction = true and a rung other than "mimo-rt"; leave it out'
             )
+        if self.candidates == "enumerated" and (self.follow is not None or self.rung == "mimo-rt"):
+            raise ValueError(
+                'candidates = "enumerated" goes with neither follow nor rung = "mimo-rt", which launch their '
+                "own; leave one out"
+            )
         mixed = self.scattering and self.scattering_samples is None
         if self.follow is not None and (self.diffraction or mixed):
             raise ValueError(
@@ -111,10 +136,17 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
                 "false and give diffuse paths a launch of their own with scattering_samples"
             )
 
-    def launched_samples(self, service: str) -> int:
+    def enumerates(self, moving: bool) -> bool:
+        """Whether reflected paths are enumerated, in a run in which objects move or none do."""
+        if self.candidates is not None:
+            return self.candidates == "enumerated"
+        return moving and self.reflection and self.rung == "siso-rt" and self.follow is None
+
+    def launched_samples(self, service: str, enumerated: bool = False) -> int:
         """Rays of a launch, however they were given. Raises `ScenarioError` where they were given twice."""
         if self.ray_spacing_deg is None:
-            return _SAMPLES if self.samples is None else self.samples
+            absent = _SCENERY_SAMPLES if enumerated else _SAMPLES
+            return absent if self.samples is None else self.samples
         if self.samples is not None:
             raise ScenarioError(
                 f"samples = {self.samples} and ray_spacing_deg = {self.ray_spacing_deg} both say "

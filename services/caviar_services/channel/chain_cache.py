@@ -1,0 +1,93 @@
+"""Chains of scenery kept in files, so that the next run with the same scenery does not launch them again.
+
+A file's name is a digest of all that its chains follow from, so a file is never out of date: the scenery's
+triangles, the transmitter's position, how rays are launched, and the versions of this format and of the ray
+tracer. Files are put in place in one step, and one that is damaged is launched again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+import numpy as np
+
+from caviar_protocol.arrays import Int32Array
+from caviar_protocol.durability import replace_file
+from caviar_services.state import Packed
+
+_FORMAT: Literal["caviar-chains-1"] = "caviar-chains-1"
+
+
+class _ChainFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The content of a file."""
+
+    format: Literal["caviar-chains-1"]
+    key: str
+    planes: Packed
+    digest: bytes
+    """Of the planes' bytes."""
+
+
+class ChainCache:
+    """Files of chains below a folder, which is made when the first one is written.
+
+    Parameters
+    ----------
+    folder
+        Any; several processes may use it at once.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self.notes: list[str] = []
+        """What could not be read or written, and why."""
+
+    def load(self, key: str, depth: int) -> Int32Array | None:
+        """The chains of a key, Shape ``[K, depth]``; None where there is no file, or a damaged one."""
+        path = self._folder / key
+        try:
+            data = path.read_bytes()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            self.notes.append(f"{path} cannot be read ({error.strerror}); its chains are launched again")
+            return None
+        try:
+            file = msgspec.msgpack.decode(data, type=_ChainFile)
+            chains: Int32Array = file.planes.array(np.int32)
+            intact = file.key == key and file.digest == _digest(file.planes.data)
+        except (msgspec.MsgspecError, UnicodeDecodeError, ValueError):
+            intact = False
+        if intact and chains.ndim == 2 and chains.shape[1] == depth:
+            return chains
+        self.notes.append(f"{path} is damaged; its chains are launched again")
+        return None
+
+    def save(self, key: str, chains: Int32Array) -> None:
+        """Keep the chains of a key; where that cannot be done, a note says so."""
+        packed = Packed.of(chains, "<i4")
+        file = _ChainFile(format=_FORMAT, key=key, planes=packed, digest=_digest(packed.data))
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            replace_file(self._folder / key, msgspec.msgpack.encode(file), durable=False)
+        except OSError as error:
+            self.notes.append(
+                f"chains cannot be kept in {self._folder} ({error.strerror}); the next run launches them "
+                "again, unless XDG_CACHE_HOME names a folder that can be written"
+            )
+
+
+def cache_key(*parts: bytes) -> str:
+    """Digest of all that chains follow from."""
+    digest = hashlib.blake2b(digest_size=20)
+    for part in (_FORMAT.encode(), *parts):
+        digest.update(len(part).to_bytes(8, "little"))
+        digest.update(part)
+    return digest.hexdigest()
+
+
+def _digest(data: bytes) -> bytes:
+    return hashlib.blake2b(data, digest_size=16).digest()

@@ -1,0 +1,140 @@
+"""Reflected paths among bodies that move, found without a launch in each frame.
+
+Chains of scenery are known of the place that a transmitter stands at, and chains by way of bodies are
+enumerated in each frame (`scenery_chains`, `body_chains`).
+
+In the street canyon this finds what 3e7 rays find, in about half the time that 1e5 rays take.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from caviar_protocol.arrays import Float64Array, Int32Array, Int64Array
+from caviar_protocol.topics import Interaction
+from caviar_services.channel.body_chains import ChainPairs, body_chains
+from caviar_services.channel.face_rectangles import FaceRectangles
+from caviar_services.channel.image_paths import ImagePaths, image_paths, unhidden
+from caviar_services.channel.reflection_fields import reflection_fields
+from caviar_services.channel.scene_faces import SceneFaces
+from caviar_services.channel.sionna_reach import Faces
+from caviar_services.channel.sionna_scene import SionnaScene
+from caviar_services.channel.sionna_traced import Traced, nothing
+from caviar_services.channel.sionna_wedges import Wedges
+
+_NO_SHAPE = 0xFFFFFFFF
+
+_NEAREST = 0.01
+"""[m]; pairs nearer than this have no path between them that could be traced, as in Sionna RT."""
+
+
+class EnumeratedTracer:
+    """Paths of reflections, and lines of sight, of a scene as it stands.
+
+    Parameters
+    ----------
+    scene
+        The scene; its bodies are where they were placed last.
+    depth
+        Reflections of a path at most.
+    """
+
+    def __init__(self, scene: SionnaScene, depth: int) -> None:
+        self._scene = scene
+        self._depth = depth
+        self._faces = SceneFaces(scene)
+        self._look = Faces(scene)
+        self._bodies: tuple[int, FaceRectangles, Int64Array] | None = None
+
+    def trace(self, transmitter: Float64Array, receivers: Float64Array, scenery: Int32Array) -> Traced:
+        """Paths from one transmitter [3] to all receivers [R, 3], positions in metres in the world.
+
+        ``scenery`` are the chains of scenery alone that waves from there go along (`scenery_chains`).
+        """
+        scene = self._scene
+        if not len(receivers):
+            return nothing(len(scene.wavelengths), self._depth, 0)
+        start, ends = transmitter - scene.centre, receivers - scene.centre
+        of_bodies, sizes = self._standing()
+        planes = scenery.astype(np.int64)
+        of_scenery = self._faces.scenery(planes[planes >= 0])
+        faces = of_scenery.and_those(of_bodies)
+        chains = np.searchsorted(of_scenery.plane, planes)
+        chains = np.where(planes >= 0, chains, -1)
+        pairs = body_chains(faces, sizes, chains, start, ends)
+        pairs = _with_every_receiver(pairs, chains, len(receivers))
+        paths = image_paths(faces, pairs, start, ends)
+        paths = paths.take(unhidden(self._look, faces, paths, start, ends))
+        near = ((ends - start) ** 2).sum(1) <= _NEAREST**2
+        return self._traced(faces, paths.take(~near[paths.receiver]), start, ends)
+
+    def _standing(self) -> tuple[FaceRectangles, Int64Array]:
+        """Faces of bodies, which are the same for all transmitters of a frame."""
+        version = self._scene.version
+        if self._bodies is None or self._bodies[0] != version:
+            self._bodies = (version, *self._faces.bodies())
+        return self._bodies[1:]
+
+    def _traced(
+        self, faces: FaceRectangles, paths: ImagePaths, start: Float64Array, ends: Float64Array
+    ) -> Traced:
+        scene = self._scene
+        used = paths.chain >= 0
+        count, end = used.sum(1), ends[paths.receiver]
+        shapes = np.full(used.shape, _NO_SHAPE, np.int64)
+        primitives = np.full(used.shape, _NO_SHAPE, np.int64)
+        normals = np.zeros((*used.shape, 3))
+        if used.any():
+            plane = faces.plane[paths.chain[used]]
+            triangles = scene.plane_table.first_holding(scene.plane_table.triangle[plane], paths.points[used])
+            shapes[used], primitives[used] = scene.shapes_of(triangles)
+            normals[used] = faces.normal[paths.chain[used]]
+        corners = np.concatenate(
+            [np.broadcast_to(start, (len(count), 1, 3)), paths.points, end[:, None]], axis=1
+        )
+        media = scene.media(shapes)
+        rest = ((0, 0), (0, self._depth - used.shape[1]))
+        shapes, primitives = (
+            np.pad(column, rest, constant_values=_NO_SHAPE) for column in (shapes, primitives)
+        )
+        types = np.pad(np.where(used, Interaction.REFLECTION, 0).astype(np.uint8), rest)
+        points = np.pad(np.where(used[..., None], paths.points + scene.centre, 0.0), (*rest, (0, 0)))
+        return Traced(
+            receiver=paths.receiver,
+            transfer=reflection_fields(corners, count, normals, media, scene.wavelengths),
+            types=types,
+            shapes=shapes,
+            primitives=primitives,
+            points=points,
+            wedge=Wedges.none(len(count)),
+            hidden=np.zeros(len(count), np.bool_),
+            settled=np.zeros(len(count), np.bool_),
+            lost=0,
+        )
+
+
+def _with_every_receiver(pairs: ChainPairs, chains: Int64Array, receivers: int) -> ChainPairs:
+    """Pairs, and every receiver with the line of sight and each of some chains."""
+    sight = np.full((1, chains.shape[1]), -1)
+    every = np.concatenate([sight, chains])
+    return ChainPairs(
+        np.concatenate([pairs.chain, np.tile(every, (receivers, 1))]),
+        np.concatenate([pairs.receiver, np.repeat(np.arange(receivers), len(every))]),
+    )
+
+
+def unknown_paths(launched: Traced, enumerated: Traced, scene: SionnaScene) -> Traced:
+    """Of launched paths, those that are none of the enumerated ones: of another kind, or by other planes."""
+    keys = np.concatenate([_keys(enumerated, scene), _keys(launched, scene)])
+    _, first = np.unique(keys, axis=0, return_index=True)
+    new = np.zeros(len(keys), np.bool_)
+    new[first] = True
+    other = ((launched.types != 0) & (launched.types != Interaction.REFLECTION)).any(1)
+    return launched.take(new[len(enumerated.types) :] | other)
+
+
+def _keys(traced: Traced, scene: SionnaScene) -> Int64Array:
+    """Receiver, and plane of each reflection, of paths."""
+    planes = scene.plane_of[scene.triangle_numbers(traced.shapes, traced.primitives)]
+    used = traced.types != 0
+    return np.column_stack([traced.receiver, np.where(used, planes, -1)])

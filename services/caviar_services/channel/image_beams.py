@@ -1,0 +1,416 @@
+"""Beams of images: where waves can go that were reflected at given faces, culled in the ray tracer's arrays.
+
+Mirrored in a face, a transmitter is an image, and what it lights by way of that face is the pyramid from the
+image through the face's rectangle. The next face mirrors the image and the last rectangle with it: a beam is
+an image, the pyramids through its last two rectangles, and the side of the last plane that it lights (M. F.
+Catedra et al., "Efficient ray-tracing techniques for three-dimensional analyses of propagation in mobile
+communications", IEEE Antennas Propag. Mag. 40(2), 1998, cull by such beams). Nothing that a beam lights is
+left out, and some that it does not light is kept: the image method decides, in float64, which is a path.
+
+Everything here counts in float32, with a slack that is more than its rounding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
+from caviar_services.channel.face_rectangles import FaceRectangles
+from caviar_services.channel.sionna_candidates import positions
+from caviar_services.columns import aligned_columns, aligned_indices, several
+
+_SLACK = 5e-3
+"""[m] around everything that is looked for."""
+
+_RELATIVE_SLACK = 2e-6
+"""The same as a part of the largest coordinate."""
+
+_LANES = 1 << 23
+"""Pairs that are looked at together at most."""
+
+
+class Targets:
+    """What beams are held against in a frame: faces, the spheres around bodies, and points.
+
+    Parameters
+    ----------
+    faces
+        Of scenery, and behind them of bodies, body after body.
+    sizes
+        How many of the last ones each body has, Shape ``[V]``.
+    """
+
+    def __init__(self, faces: FaceRectangles, sizes: Int64Array) -> None:
+        import drjit as dr
+        import mitsuba as mi
+
+        self.faces = faces
+        self.first_body = len(faces) - int(sizes.sum())
+        """Number of the first face of a body."""
+        self.most = int(sizes.max(initial=0))
+        """Faces of a body, at most."""
+        self.bodies = len(sizes)
+        centre, reach = _spheres(faces, self.first_body, sizes)
+        rows = np.concatenate(
+            [
+                faces.normal,
+                faces.centre,
+                faces.axes[:, 0] * faces.half[:, :1],
+                faces.axes[:, 1] * faces.half[:, 1:],
+                faces.offset[:, None],
+                faces.radius[:, None],
+            ],
+            axis=1,
+        ).T
+        columns = [mi.Float(column) for column in aligned_columns(rows[:, several(len(faces))])]
+        self.normal, self.centre, self.u, self.v = (mi.Vector3f(*columns[i : i + 3]) for i in (0, 3, 6, 9))
+        self.offset, self.radius = columns[12:]
+        self.two_sided = mi.UInt(aligned_indices(faces.two_sided[several(len(faces))])) != 0
+        some = several(self.bodies)
+        self.body_centre = positions(centre[some])
+        self.body_radius = mi.Float(aligned_columns(reach[None, some])[0])
+        begin = self.first_body + np.cumsum(sizes) - sizes
+        self.body_begin, self.body_size = (mi.UInt(aligned_indices(part[some])) for part in (begin, sizes))
+        slack = _SLACK + _RELATIVE_SLACK * float(np.abs(faces.centre).max(initial=0.0))
+        self.slack = dr.opaque(mi.Float, slack)
+        """Around everything that is looked for [m]; a number in a kernel would be another kernel."""
+
+    def body_of(self, faces: Int64Array) -> Int64Array:
+        """Number of the body of these faces of bodies."""
+        begin = self.body_begin.numpy()[: self.bodies].astype(np.int64)
+        return np.searchsorted(begin, faces, side="right") - 1
+
+    def corners(self, face: Any) -> list[Any]:
+        """Those of rectangles, in turn."""
+        centre, u, v = (_gathered(column, face) for column in (self.centre, self.u, self.v))
+        return [centre - u - v, centre + u - v, centre + u + v, centre - u + v]
+
+    def height(self, point: Any, face: Any) -> Any:
+        """How far points are in front of planes."""
+        import drjit as dr
+
+        return dr.dot(point, _gathered(self.normal, face)) - _gathered(self.offset, face)
+
+
+def _spheres(faces: FaceRectangles, first: int, sizes: Int64Array) -> tuple[Float64Array, Float64Array]:
+    """Centre [m], Shape ``[V, 3]``, and radius [m] of a sphere around all rectangles of each body."""
+    if not len(sizes):
+        return np.zeros((0, 3)), np.zeros(0)
+    u, v = (faces.axes[first:, i] * faces.half[first:, i, None] for i in (0, 1))
+    corners = faces.centre[first:, None] + np.stack([u + v, u - v, v - u, -u - v], axis=1)
+    begin = np.cumsum(sizes) - sizes
+    low = np.minimum.reduceat(corners.min(1), begin)
+    high = np.maximum.reduceat(corners.max(1), begin)
+    centre = (low + high) / 2
+    away = np.sqrt(((corners - np.repeat(centre, sizes, axis=0)[:, None]) ** 2).sum(-1)).max(1)
+    return centre, np.maximum.reduceat(away, begin)
+
+
+@dataclass(frozen=True, eq=False)
+class Beams:
+    """B beams behind the same number of reflections, in the ray tracer's arrays and in NumPy's."""
+
+    chain: Int64Array
+    """Faces that they were reflected at, Shape ``[B, n]``."""
+    by_body: BoolArray
+    """Whether one of these is of a body, Shape ``[B]``."""
+    image: Any
+    sides: Sequence[Any]
+    """Unit normals, inwards, of the pyramids' sides: four for each rectangle."""
+    axis: Any
+    cosine: Any
+    """Of the half angle of the narrowest cone around a pyramid."""
+    last: Any
+    """The last face."""
+    lit: Any
+    """Unit normal of its plane towards the side that is lit."""
+    lit_from: Any
+    """Offset of that plane along it."""
+
+    def __len__(self) -> int:
+        return len(self.chain)
+
+    def light_cone(self, beam: Any, centre: Any, radius: Any, slack: Any) -> Any:
+        """Whether spheres reach into the cones of beams, and before their last planes."""
+        import drjit as dr
+
+        axis, cosine = _gathered(self.axis, beam), _gathered(self.cosine, beam)
+        towards = centre - _gathered(self.image, beam)
+        along = dr.dot(axis, towards)
+        across = dr.sqrt(dr.maximum(dr.squared_norm(towards) - along * along, 0.0))
+        sine = dr.sqrt(dr.maximum(1.0 - cosine * cosine, 0.0))
+        before = dr.dot(_gathered(self.lit, beam), centre) - _gathered(self.lit_from, beam)
+        reach = radius + 2.0 * slack
+        return (across * cosine - along * sine <= reach) & (before > -reach)
+
+    def light(self, beam: Any, centre: Any, reach: Any) -> Any:
+        """Whether spheres reach into the pyramids of beams."""
+        import drjit as dr
+        import mitsuba as mi
+
+        towards = centre - _gathered(self.image, beam)
+        lit = mi.Bool(True)
+        for side in self.sides:
+            lit &= dr.dot(_gathered(side, beam), towards) > -reach
+        return lit
+
+
+def first_beams(targets: Targets, source: Float64Array, scenery: Int64Array) -> Beams:
+    """Beams of a transmitter [m], Shape ``[3]``, by these faces of scenery, then by all that bodies show it."""
+    faces = targets.faces
+    bodies = np.arange(targets.first_body, len(faces))
+    shown = faces.height(np.broadcast_to(source, (len(bodies), 3)), bodies) > 0
+    first = np.concatenate([scenery, bodies[shown | faces.two_sided[bodies]]])
+    image = positions(np.broadcast_to(source, (len(several(len(first))), 3)))
+    return _reflected(targets, first[:, None], image, None)
+
+
+def next_beams(targets: Targets, beams: Beams, scenery: Int64Array, known: Int64Array) -> Beams:
+    """Beams behind one more reflection.
+
+    Parameters
+    ----------
+    scenery
+        Faces of scenery that reflect what bodies reflected.
+    known
+        Chains of scenery alone that are one longer than those of ``beams``, Shape ``[K, n + 1]``, each
+        beginning with one of these: of scenery alone these are gone on with.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    next_face = np.concatenate([scenery, np.arange(targets.first_body, len(targets.faces))])
+    faces = mi.UInt(aligned_indices(next_face[several(len(next_face))]))
+    by_body = mi.UInt(aligned_indices(beams.by_body[several(len(beams))])) != 0
+    of_body = dr.opaque(mi.UInt, targets.first_body)
+
+    def lights(beam: Any, place: Any) -> Any:
+        face = _gathered(faces, place)
+        lit = (face != _gathered(beams.last, beam)) & ((face >= of_body) | _gathered(by_body, beam))
+        image = _gathered(beams.image, beam)
+        lit &= _gathered(targets.two_sided, face) | (targets.height(image, face) > -targets.slack)
+        corners = targets.corners(face)
+        lit &= _some(corners, _gathered(beams.lit, beam), _gathered(beams.lit_from, beam) + targets.slack)
+        for side in beams.sides:
+            normal = _gathered(side, beam)
+            lit &= _some(corners, normal, dr.dot(normal, image) - targets.slack)
+        return lit
+
+    beam, place = (_numbers(part) for part in pairs(len(beams), len(next_face), lights))
+    before = _rows_of(beams.chain, known[:, :-1])
+    chain = np.concatenate([known, np.concatenate([beams.chain[beam], next_face[place][:, None]], axis=1)])
+    parent = np.concatenate([before, beam])
+    lanes = several(len(chain))
+    index = mi.UInt(aligned_indices(parent[lanes]))
+    return _reflected(targets, chain, _gathered(beams.image, index), _gathered(beams.last, index))
+
+
+def _reflected(targets: Targets, chain: Int64Array, image: Any, before: Any | None) -> Beams:
+    """Beams by way of the last faces of chains, from images before these and by way of faces ``before``."""
+    import drjit as dr
+    import mitsuba as mi
+
+    last = mi.UInt(aligned_indices(chain[several(len(chain)), -1]))
+    normal, offset = _gathered(targets.normal, last), _gathered(targets.offset, last)
+
+    def mirrored(point: Any) -> Any:
+        return point - 2.0 * (dr.dot(point, normal) - offset) * normal
+
+    image = mirrored(image)
+    corners = targets.corners(last)
+    axis, cosine = _cone(image, corners)
+    sides = _sides(image, corners)
+    if before is not None:
+        mirrored_corners = [mirrored(corner) for corner in targets.corners(before)]
+        other_axis, other_cosine = _cone(image, mirrored_corners)
+        narrower = other_cosine > cosine
+        axis, cosine = dr.select(narrower, other_axis, axis), dr.maximum(cosine, other_cosine)
+        sides += _sides(image, mirrored_corners)
+    away = dr.select(dr.dot(image, normal) > offset, -1.0, 1.0)
+    lit, lit_from = normal * away, offset * away
+    dr.eval(image, axis, cosine, sides, lit, lit_from, last)
+    by_body: BoolArray = (chain >= targets.first_body).any(1)
+    return Beams(chain, by_body, image, sides, axis, cosine, last, lit, lit_from)
+
+
+def ends_at(
+    targets: Targets, beams: Beams, points: Float64Array, of_face: Int64Array
+) -> tuple[Int64Array, Int64Array]:
+    """Beam by way of a body and point of each pair where the one lights the other.
+
+    Parameters
+    ----------
+    points
+        Receivers, or their images [m], Shape ``[P, 3]``.
+    of_face
+        Face that mirrored each, which is not a beam's last one; −1 for receivers, Shape ``[P]``.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    # Chains of scenery alone stand first.
+    first = int(np.argmax(beams.by_body)) if beams.by_body.any() else len(beams)
+    behind = dr.opaque(mi.UInt, first)
+    lanes = several(len(points))
+    place = positions(points[lanes])
+    mirror = mi.UInt(aligned_indices(of_face[lanes] + 1))
+
+    def near(beam: Any, point: Any) -> Any:
+        lit = _gathered(mirror, point) != _gathered(beams.last, beam + behind) + 1
+        return lit & beams.light_cone(beam + behind, _gathered(place, point), 0.0, targets.slack)
+
+    def lit(beam: Any, point: Any) -> Any:
+        return beams.light(beam + behind, _gathered(place, point), targets.slack)
+
+    beam, point = filtered(lit, pairs(len(beams) - first, len(points), near))
+    return _numbers(beam) + first, _numbers(point)
+
+
+def through_bodies(
+    targets: Targets, beams: Beams, receivers: Float64Array
+) -> tuple[Int64Array, Int64Array, Int64Array]:
+    """Beam, face of a body and receiver, where the beam may light the receiver by way of the face; receivers
+    [m] are of Shape ``[R, 3]``."""
+    import drjit as dr
+
+    none = np.zeros(0, np.int64)
+    if not targets.bodies * len(beams) * len(receivers):
+        return none, none, none
+    slack = targets.slack
+
+    def near(beam: Any, body: Any) -> Any:
+        centre, radius = _gathered(targets.body_centre, body), _gathered(targets.body_radius, body)
+        return beams.light_cone(beam, centre, radius, slack)
+
+    def lit(beam: Any, body: Any) -> Any:
+        centre, radius = _gathered(targets.body_centre, body), _gathered(targets.body_radius, body)
+        return beams.light(beam, centre, radius + slack)
+
+    beam, body = filtered(lit, pairs(len(beams), targets.bodies, near))
+
+    def face_of(pair: Any, number: Any) -> Any:
+        return _gathered(targets.body_begin, _gathered(body, pair)) + number
+
+    def shows(pair: Any, number: Any) -> Any:
+        there = number < _gathered(targets.body_size, _gathered(body, pair))
+        of, face = _gathered(beam, pair), dr.select(there, face_of(pair, number), 0)
+        height = targets.height(_gathered(beams.image, of), face)
+        there &= (height > -slack) | _gathered(targets.two_sided, face)
+        there &= face != _gathered(beams.last, of)
+        centre, radius = _gathered(targets.centre, face), _gathered(targets.radius, face)
+        return there & beams.light_cone(of, centre, radius, slack)
+
+    def shows_within(pair: Any, number: Any) -> Any:
+        face = face_of(pair, number)
+        reach = _gathered(targets.radius, face) + slack
+        return beams.light(_gathered(beam, pair), _gathered(targets.centre, face), reach)
+
+    pair, number = filtered(shows_within, pairs(dr.width(beam), targets.most, shows))
+    beam, face = _gathered(beam, pair), face_of(pair, number)
+    dr.eval(beam, face)
+    place = positions(receivers[several(len(receivers))])
+
+    def reaches(way: Any, receiver: Any) -> Any:
+        of, last, point = _gathered(beam, way), _gathered(face, way), _gathered(place, receiver)
+        image = _gathered(beams.image, of)
+        normal, offset = _gathered(targets.normal, last), _gathered(targets.offset, last)
+        there, here = dr.dot(image, normal) - offset, dr.dot(point, normal) - offset
+        both = (there * here > 0.0) & ((here > 0.0) | _gathered(targets.two_sided, last))
+        sum_ = there + here
+        met = (there * point + here * image) / sum_
+        beside = met - _gathered(targets.centre, last)
+        for side in (_gathered(targets.u, last), _gathered(targets.v, last)):
+            square = dr.squared_norm(side)
+            both &= dr.abs(dr.dot(beside, side)) <= square + slack * dr.sqrt(square)
+        met -= (2.0 * here * there / sum_) * normal
+        return both & beams.light(of, met, slack)
+
+    way, receiver = pairs(dr.width(beam), len(receivers), reaches)
+    beam, face = _gathered(beam, way), _gathered(face, way)
+    return _numbers(beam), _numbers(face), _numbers(receiver)
+
+
+def pairs(first: int, second: int, test: Callable[[Any, Any], Any]) -> tuple[Any, Any]:
+    """Which pairs of numbers below ``first`` and below ``second`` pass a test, as `mitsuba.UInt`."""
+    import drjit as dr
+    import mitsuba as mi
+
+    parts = []
+    at_once = max(1, _LANES // max(second, 1))
+    many = dr.opaque(mi.UInt, second)
+    for begin in range(0, first if second else 0, at_once):
+        count = min(at_once, first - begin)
+        lane = dr.arange(mi.UInt, count * second)
+        start = dr.opaque(mi.UInt, begin)
+        kept: Any = dr.compress(test(start + lane // many, lane % many))
+        parts.append((start + kept // many, kept % many))
+    if not parts:
+        return mi.UInt(), mi.UInt()
+    if len(parts) == 1:
+        return parts[0]
+    return dr.concat([one for one, _ in parts]), dr.concat([other for _, other in parts])
+
+
+def filtered(test: Callable[[Any, Any], Any], numbers: tuple[Any, Any]) -> tuple[Any, Any]:
+    """Those of pairs of numbers that pass a test."""
+    import drjit as dr
+
+    if not dr.width(numbers[0]):
+        return numbers
+    kept = dr.compress(test(*numbers))
+    found = _gathered(numbers[0], kept), _gathered(numbers[1], kept)
+    dr.eval(found)
+    return found
+
+
+def _some(corners: list[Any], normal: Any, offset: Any) -> Any:
+    """Whether one of the corners at least is beyond a plane."""
+    import drjit as dr
+
+    a, b, c, d = (dr.dot(normal, corner) for corner in corners)
+    return dr.maximum(dr.maximum(a, b), dr.maximum(c, d)) > offset
+
+
+def _sides(image: Any, corners: list[Any]) -> list[Any]:
+    """Unit normals, inwards, of the sides of the pyramid from a point around corners in turn."""
+    import drjit as dr
+
+    edges = [corner - image for corner in corners]
+    middle = edges[0] + edges[2]
+    sides = []
+    for one, other in zip(edges, [*edges[1:], edges[0]], strict=True):
+        normal = dr.cross(one, other)
+        normal *= dr.rsqrt(dr.maximum(dr.squared_norm(normal), 1e-20))
+        sides.append(dr.select(dr.dot(normal, middle) < 0.0, -normal, normal))
+    return sides
+
+
+def _cone(image: Any, corners: list[Any]) -> tuple[Any, Any]:
+    """Axis of a cone from a point around corners, and the cosine of its half angle."""
+    import drjit as dr
+
+    edges = [dr.normalize(corner - image) for corner in corners]
+    axis = dr.normalize(edges[0] + edges[1] + edges[2] + edges[3])
+    a, b, c, d = (dr.dot(edge, axis) for edge in edges)
+    return axis, dr.minimum(dr.minimum(a, b), dr.minimum(c, d))
+
+
+def _gathered(column: Any, index: Any) -> Any:
+    import drjit as dr
+
+    return dr.gather(type(column), column, index)
+
+
+def _numbers(indices: Any) -> Int64Array:
+    found: Int64Array = indices.numpy().astype(np.int64)
+    return found
+
+
+def _rows_of(rows: Int64Array, wanted: Int64Array) -> Int64Array:
+    """Number of the row that each of the wanted ones is."""
+    known = {tuple(row): number for number, row in enumerate(rows.tolist())}
+    return np.array([known[tuple(row)] for row in wanted.tolist()], np.int64)

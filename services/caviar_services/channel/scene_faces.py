@@ -1,0 +1,126 @@
+"""The plane faces of a scene: those of scenery, made once, and of moving bodies, as they stand in a frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
+from caviar_services.channel.face_rectangles import FaceRectangles, ranges
+from caviar_services.channel.sionna_scene import SionnaScene
+from caviar_services.meshes import Mesh
+
+_SAME_CORNER = 1e-6
+"""Corners this near, as a part of a mesh's extent, are one."""
+
+
+class SceneFaces:
+    """Faces of a scene in the coordinates of its ray tracer.
+
+    Parameters
+    ----------
+    scene
+        Whose faces; its bodies are where `SionnaScene.place` put them last.
+    """
+
+    def __init__(self, scene: SionnaScene) -> None:
+        self._scene = scene
+        table = scene.plane_table
+        first = scene.first_moving_plane
+        triangles, sizes = table.triangles_of(np.arange(len(table.triangle)))
+        piece = scene.piece_of(triangles)
+        self._scenery = _faces_of(scene, np.arange(first), ~scene.is_parking_piece(piece))
+        self._row = np.full(first, -1)
+        self._row[self._scenery.plane] = np.arange(len(self._scenery))
+        body_of = piece[np.cumsum(sizes) - sizes] - scene.first_body_piece
+        self._body_of = body_of[first:]
+        """Number of the body that each moving plane is of."""
+        self._two_sided = np.ones(len(self._body_of), np.bool_)
+        for asset, mesh in scene.unit_meshes.items():
+            of_mesh = two_sided_planes(mesh, scene.face_numbers(asset))
+            for body in scene.bodies_of(asset):
+                self._two_sided[self._body_of == body] = of_mesh
+        self._standing: tuple[int, ...] | None = None
+        self._rows: tuple[Int64Array, Int64Array, Int64Array]
+
+    def scenery(self, planes: Int64Array) -> FaceRectangles:
+        """Faces of these planes of scenery, in ascending order; planes of no area are left out."""
+        rows = self._row[np.unique(planes)]
+        return self._scenery.take(rows[rows >= 0])
+
+    def bodies(self) -> tuple[FaceRectangles, Int64Array]:
+        """Faces of all standing bodies, body after body, and how many each of these has."""
+        scene, standing = self._scene, self._scene.standing_bodies
+        if standing != self._standing:
+            planes = np.flatnonzero(np.isin(self._body_of, np.array(standing, np.int64)))
+            self._rows = (planes, *scene.plane_table.triangles_of(planes + scene.first_moving_plane))
+            self._standing = standing
+        planes, triangles, sizes = self._rows
+        normal = scene.plane_table.normal[planes + scene.first_moving_plane]
+        flat = np.einsum("fc,fc->f", normal, normal) > 0
+        if not flat.all():
+            kept = np.flatnonzero(flat)
+            triangles = triangles[ranges(np.cumsum(sizes)[kept] - sizes[kept], sizes[kept])[1]]
+            planes, sizes, normal = planes[kept], sizes[kept], normal[kept]
+        faces = FaceRectangles.of(
+            planes + scene.first_moving_plane,
+            normal,
+            scene.corners(triangles) - scene.centre,
+            sizes,
+            self._two_sided[planes],
+        )
+        _, counts = np.unique(self._body_of[planes], return_counts=True)
+        return faces, counts
+
+
+def _faces_of(scene: SionnaScene, planes: Int64Array, used: BoolArray) -> FaceRectangles:
+    """Faces of planes of scenery; ``used`` says which of all triangles, in the order of planes, count."""
+    table = scene.plane_table
+    triangles, sizes = table.triangles_of(planes)
+    own = np.repeat(np.arange(len(planes)), sizes)
+    used = used[: len(triangles)] & (table.normal[planes] != 0).any(1)[own]
+    corners = scene.corners(triangles[used]) - scene.centre
+    sizes = np.bincount(own[used], minlength=len(planes))
+    kept = np.flatnonzero(sizes)
+    # Scenery has faces of either sense, so their order of corners says nothing.
+    both = np.ones(len(kept), np.bool_)
+    return FaceRectangles.of(planes[kept], table.normal[planes[kept]], corners, sizes[kept], both)
+
+
+def two_sided_planes(mesh: Mesh, numbers: Int32Array) -> BoolArray:
+    """Whether the planes of a mesh can be met from both sides, by number, Shape ``[N]``.
+
+    From outside of a closed surface whose normals lead outwards, only front faces are met. Every side of a
+    triangle then belongs to as many triangles that go along it one way as the other.
+    """
+    count = int(numbers.max(initial=-1)) + 1
+    corners = mesh.vertices[mesh.faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    if float(np.einsum("fc,fc->", corners[:, 0] - corners.mean((0, 1)), normal)) <= 0 or not _is_closed(mesh):
+        return np.ones(count, np.bool_)
+    # Two parts of one plane may face each other's back.
+    order = np.argsort(-np.einsum("fc,fc->f", normal, normal), kind="stable")
+    largest = np.zeros((count, 3))
+    largest[numbers[order[::-1]]] = normal[order[::-1]]
+    against: Float64Array = np.einsum("fc,fc->f", normal, largest[numbers])
+    two_sided = np.zeros(count, np.bool_)
+    two_sided[numbers[against < 0]] = True
+    return two_sided
+
+
+def _is_closed(mesh: Mesh) -> bool:
+    extent = float(np.ptp(mesh.vertices, axis=0).max()) if len(mesh.vertices) else 0.0
+    if extent == 0:
+        return False
+    cells = np.round(mesh.vertices / (_SAME_CORNER * extent)).astype(np.int64)
+    corner = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)[mesh.faces]
+    some = (corner != np.roll(corner, -1, axis=1)).all(1)
+    sides = np.stack([corner[some], np.roll(corner[some], -1, axis=1)], axis=-1).reshape(-1, 2)
+    return _counted(sides) == _counted(sides[:, ::-1])
+
+
+def _counted(sides: Int64Array) -> Sequence[list[int]]:
+    found, counts = np.unique(sides, axis=0, return_counts=True)
+    rows: list[list[int]] = np.column_stack([found, counts]).tolist()
+    return rows

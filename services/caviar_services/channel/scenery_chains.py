@@ -1,0 +1,159 @@
+"""Chains of planes of scenery that waves from a place go along, found by launching many rays.
+
+One launch misses what its rays pass by: of 84 chains of the street canyon it finds 77, whether with 1e5
+rays or with 1e7, and the others only where the rays point elsewhere. So several launches, each turned a
+little, are united, and a launch is traced in parts, whose memory is bounded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import astuple, dataclass, replace
+
+import numpy as np
+
+from caviar_protocol.arrays import Float64Array, Int32Array, Int64Array
+from caviar_services.channel.chain_cache import ChainCache, cache_key
+from caviar_services.channel.sionna_candidates import positions
+from caviar_services.channel.sionna_chains import chains_of
+from caviar_services.channel.sionna_launch import Launch, Launcher, LaunchOptions
+from caviar_services.channel.sionna_scene import SionnaScene
+
+_SAME_PLACE = 0.05
+"""[m]; a transmitter this near has the same chains: what stands off a surface may be moved by less."""
+
+PART = 1_000_000
+"""Rays that are traced together: 1.25 GB."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneryLaunch:
+    """How chains of scenery are looked for."""
+
+    samples: int
+    """Rays of a launch."""
+    launches: int
+    """Each turned a little against the others."""
+
+
+class SceneryChains:
+    """Chains of scenery of all transmitters: of those that stand, launched once with many rays; of others,
+    launched in each frame.
+
+    Parameters
+    ----------
+    scene, options
+        What is traced in, and the depth and the seed of what is wanted.
+    launch
+        From where a transmitter stands.
+    per_frame
+        Rays from one that moves.
+    cache
+        Where chains are kept between runs; None: nowhere.
+    """
+
+    def __init__(
+        self,
+        scene: SionnaScene,
+        options: LaunchOptions,
+        launch: SceneryLaunch,
+        per_frame: int,
+        cache: ChainCache | None,
+    ) -> None:
+        self._scene, self._options, self._launch, self._cache = scene, options, launch, cache
+        self._launcher = Launcher(scene.mi_scene, only_reflected(options, per_frame))
+        self._known: list[tuple[Float64Array, Int32Array]] = []
+        self._last: tuple[bytes, int, Int32Array] | None = None
+
+    def prepare(self, transmitter: Float64Array, progress: Callable[[int, int], None]) -> str:
+        """Launch from where a transmitter stands [m], Shape ``[3]``, while nothing else is in the scene.
+
+        ``progress`` is called before each part with its number and how many there are. Returns what was
+        found.
+        """
+        place = transmitter - self._scene.centre
+        key = self._key(place)
+        chains = self._cache.load(key, self._options.max_depth) if self._cache else None
+        source = "of the cache"
+        if chains is None:
+            chains = launched_chains(self._scene, self._options, self._launch, place, progress)
+            source = f"of {self._launch.launches} launches of {self._launch.samples} rays"
+            if self._cache:
+                self._cache.save(key, chains)
+        self._known.append((place, chains))
+        return f"{len(chains)} chains of scenery {source}"
+
+    def of(self, transmitter: Float64Array) -> Int32Array:
+        """Those from a position in the world [m], Shape ``[3]``, in the scene as it stands."""
+        place = transmitter - self._scene.centre
+        for known, chains in self._known:
+            if np.abs(known - place).max() <= _SAME_PLACE:
+                return chains
+        last = self._last
+        if last is None or last[:2] != (place.tobytes(), self._scene.version):
+            launch = self._launcher(positions(place[None]))
+            chains = scenery_of(launch, self._scene, self._options.max_depth)
+            last = self._last = place.tobytes(), self._scene.version, chains
+        return last[2]
+
+    def _key(self, place: Float64Array) -> str:
+        import sionna.rt
+
+        options = (self._options.max_depth, self._options.seed, *astuple(self._launch), sionna.rt.__version__)
+        return cache_key(self._scene.scenery_digest, place.tobytes(), repr(options).encode())
+
+
+def launched_chains(
+    scene: SionnaScene,
+    options: LaunchOptions,
+    launch: SceneryLaunch,
+    transmitter: Float64Array,
+    progress: Callable[[int, int], None],
+) -> Int32Array:
+    """Planes of all chains of scenery that rays from a place go along, −1 behind the last, Shape ``[K, D]``.
+
+    Chains are sorted, those of fewer planes first, and with each chain its beginnings are there.
+
+    Parameters
+    ----------
+    options
+        Of the paths that are wanted: the depth and the seed; only reflections are looked for.
+    transmitter
+        In the ray tracer's coordinates [m], Shape ``[3]``.
+    progress
+        Called before each part with its number and how many there are.
+    """
+    reflected = only_reflected(options, launch.samples)
+    source = positions(transmitter[None])
+    parts = -(-launch.samples // PART)
+    found = np.full((0, options.max_depth), -1, np.int32)
+    for part in range(parts):
+        rays = (part * PART, min((part + 1) * PART, launch.samples))
+        launcher = Launcher(scene.mi_scene, reflected, rays)
+        for number in range(launch.launches):
+            progress(part * launch.launches + number, parts * launch.launches)
+            chains = scenery_of(launcher(source, number=number), scene, options.max_depth)
+            found = united(found, chains)
+    return found
+
+
+def only_reflected(options: LaunchOptions, samples: int) -> LaunchOptions:
+    """What a launch is made with that looks for chains of reflections."""
+    return replace(
+        options, samples=samples, reflection=True, refraction=False, diffraction=False, scattering=False
+    )
+
+
+def scenery_of(launch: Launch, scene: SionnaScene, depth: int) -> Int32Array:
+    """Chains of a launch that planes of scenery alone reflect, as in `launched_chains`."""
+    chains = chains_of(launch, scene, depth)
+    some = chains.straight & ((chains.planes >= 0).sum(1) == chains.depth)
+    some &= (chains.planes < scene.first_moving_plane).all(1)
+    return united(np.full((0, depth), -1, np.int32), chains.planes[some])
+
+
+def united(one: Int32Array, other: Int32Array) -> Int32Array:
+    """The chains of both, each once, sorted by their number of planes and by these."""
+    chains = np.unique(np.concatenate([one, other]), axis=0)
+    order: Int64Array = np.lexsort((*chains.T[::-1], (chains >= 0).sum(1)))
+    return chains[order]
