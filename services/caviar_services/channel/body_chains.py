@@ -16,10 +16,12 @@ from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_services.channel.face_rectangles import FaceRectangles
 from caviar_services.channel.image_beams import (
     Targets,
+    by_scenery,
     ends_at,
     first_beams,
+    lit_bodies,
     next_beams,
-    through_bodies,
+    through_faces,
 )
 
 
@@ -72,33 +74,17 @@ def body_chains(
     targets = Targets(faces, sizes)
     used = np.unique(scenery[scenery >= 0])
     length = (scenery >= 0).sum(1)
-    none = np.full(len(receivers), -1)
     beams = first_beams(targets, transmitter, scenery[length == 1, 0])
-    found: list[tuple[Int64Array, Int64Array]] = []
-    # A chain of one face begins with none: only it needs no beam before the face of the body.
-    beam, receiver = ends_at(targets, beams, receivers, none)
-    found.append((beams.chain[beam], receiver))
-    for n in range(1, depth):
-        if n > 1:
-            beams = next_beams(targets, beams, used, scenery[length == n, :n])
-            beam, receiver = ends_at(targets, beams, receivers, none)
-            found.append((beams.chain[beam], receiver))
+    beam, receiver = ends_at(targets, beams, receivers)
+    found = [(beams.chain[beam], receiver)]
+    for n in range(2, depth):
+        beams = next_beams(targets, beams, used, scenery[length == n, :n])
+        beam, receiver = ends_at(targets, beams, receivers)
+        found.append((beams.chain[beam], receiver))
     if depth > 1:
-        images, mirrors = _images(faces, receivers, used)
-        beam, point = ends_at(targets, beams, images, mirrors)
-        found.append((_longer(beams.chain[beam], mirrors[point]), point // max(len(used), 1)))
-        beam, face, receiver = through_bodies(targets, beams, receivers)
-        found.append((_longer(beams.chain[beam], face), receiver))
+        # The last reflection needs no beams of its own: its faces are held against the receivers at once.
+        last = (by_scenery(targets, beams, used), True), (lit_bodies(targets, beams), False)
+        for ways, large in last:
+            beam, face, receiver = through_faces(targets, beams, ways, receivers, large=large)
+            found.append((np.concatenate([beams.chain[beam], face[:, None]], axis=1), receiver))
     return ChainPairs.joined(found, depth)
-
-
-def _images(
-    faces: FaceRectangles, points: Float64Array, mirrors: Int64Array
-) -> tuple[Float64Array, Int64Array]:
-    """Images of all points in all of some faces, point after point, and the face of each."""
-    which = np.tile(mirrors, len(points))
-    return faces.mirrored(np.repeat(points, len(mirrors), axis=0), which), which
-
-
-def _longer(chain: Int64Array, face: Int64Array) -> Int64Array:
-    return np.concatenate([chain, face[:, None]], axis=1)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -134,6 +135,11 @@ class Beams:
     def __len__(self) -> int:
         return len(self.chain)
 
+    @property
+    def first_by_body(self) -> int:
+        """Number of the first beam by way of a body: those of scenery alone stand before."""
+        return int(np.argmax(self.by_body)) if self.by_body.any() else len(self)
+
     def light_cone(self, beam: Any, centre: Any, radius: Any, slack: Any) -> Any:
         """Whether spheres reach into the cones of beams, and before their last planes."""
         import drjit as dr
@@ -160,7 +166,7 @@ class Beams:
 
 
 def first_beams(targets: Targets, source: Float64Array, scenery: Int64Array) -> Beams:
-    """Beams of a transmitter [m], Shape ``[3]``, by these faces of scenery, then by all that bodies show it."""
+    """Beams of a transmitter [m], Shape ``[3]``, by faces of scenery, then by all that bodies show it."""
     faces = targets.faces
     bodies = np.arange(targets.first_body, len(faces))
     shown = faces.height(np.broadcast_to(source, (len(bodies), 3)), bodies) > 0
@@ -180,106 +186,46 @@ def next_beams(targets: Targets, beams: Beams, scenery: Int64Array, known: Int64
         Chains of scenery alone that are one longer than those of ``beams``, Shape ``[K, n + 1]``, each
         beginning with one of these: of scenery alone these are gone on with.
     """
-    import drjit as dr
     import mitsuba as mi
 
-    next_face = np.concatenate([scenery, np.arange(targets.first_body, len(targets.faces))])
-    faces = mi.UInt(aligned_indices(next_face[several(len(next_face))]))
-    by_body = mi.UInt(aligned_indices(beams.by_body[several(len(beams))])) != 0
-    of_body = dr.opaque(mi.UInt, targets.first_body)
-
-    def lights(beam: Any, place: Any) -> Any:
-        face = _gathered(faces, place)
-        lit = (face != _gathered(beams.last, beam)) & ((face >= of_body) | _gathered(by_body, beam))
-        image = _gathered(beams.image, beam)
-        lit &= _gathered(targets.two_sided, face) | (targets.height(image, face) > -targets.slack)
-        corners = targets.corners(face)
-        lit &= _some(corners, _gathered(beams.lit, beam), _gathered(beams.lit_from, beam) + targets.slack)
-        for side in beams.sides:
-            normal = _gathered(side, beam)
-            lit &= _some(corners, normal, dr.dot(normal, image) - targets.slack)
-        return lit
-
-    beam, place = (_numbers(part) for part in pairs(len(beams), len(next_face), lights))
+    beam, face = by_scenery(targets, beams, scenery)
+    of_body = filtered(partial(_lights_corner, targets, beams), lit_bodies(targets, beams))
+    chain = np.concatenate(
+        [
+            known,
+            np.concatenate([beams.chain[_numbers(beam)], _numbers(face)[:, None]], axis=1),
+            np.concatenate([beams.chain[_numbers(of_body[0])], _numbers(of_body[1])[:, None]], axis=1),
+        ]
+    )
     before = _rows_of(beams.chain, known[:, :-1])
-    chain = np.concatenate([known, np.concatenate([beams.chain[beam], next_face[place][:, None]], axis=1)])
-    parent = np.concatenate([before, beam])
+    parent = np.concatenate([before, _numbers(beam), _numbers(of_body[0])])
     lanes = several(len(chain))
     index = mi.UInt(aligned_indices(parent[lanes]))
     return _reflected(targets, chain, _gathered(beams.image, index), _gathered(beams.last, index))
 
 
-def _reflected(targets: Targets, chain: Int64Array, image: Any, before: Any | None) -> Beams:
-    """Beams by way of the last faces of chains, from images before these and by way of faces ``before``."""
+def by_scenery(targets: Targets, beams: Beams, scenery: Int64Array) -> tuple[Any, Any]:
+    """Beams by way of bodies and faces of scenery that they light, as `mitsuba.UInt`."""
     import drjit as dr
     import mitsuba as mi
 
-    last = mi.UInt(aligned_indices(chain[several(len(chain)), -1]))
-    normal, offset = _gathered(targets.normal, last), _gathered(targets.offset, last)
+    faces = mi.UInt(aligned_indices(scenery[several(len(scenery))]))
+    first = dr.opaque(mi.UInt, beams.first_by_body)
 
-    def mirrored(point: Any) -> Any:
-        return point - 2.0 * (dr.dot(point, normal) - offset) * normal
+    def lights(beam: Any, place: Any) -> Any:
+        beam, face = beam + first, _gathered(faces, place)
+        return (face != _gathered(beams.last, beam)) & _lights_corner(targets, beams, beam, face)
 
-    image = mirrored(image)
-    corners = targets.corners(last)
-    axis, cosine = _cone(image, corners)
-    sides = _sides(image, corners)
-    if before is not None:
-        mirrored_corners = [mirrored(corner) for corner in targets.corners(before)]
-        other_axis, other_cosine = _cone(image, mirrored_corners)
-        narrower = other_cosine > cosine
-        axis, cosine = dr.select(narrower, other_axis, axis), dr.maximum(cosine, other_cosine)
-        sides += _sides(image, mirrored_corners)
-    away = dr.select(dr.dot(image, normal) > offset, -1.0, 1.0)
-    lit, lit_from = normal * away, offset * away
-    dr.eval(image, axis, cosine, sides, lit, lit_from, last)
-    by_body: BoolArray = (chain >= targets.first_body).any(1)
-    return Beams(chain, by_body, image, sides, axis, cosine, last, lit, lit_from)
+    beam, place = pairs(len(beams) - beams.first_by_body, len(scenery), lights)
+    beam, face = beam + first, _gathered(faces, place)
+    dr.eval(beam, face)
+    return beam, face
 
 
-def ends_at(
-    targets: Targets, beams: Beams, points: Float64Array, of_face: Int64Array
-) -> tuple[Int64Array, Int64Array]:
-    """Beam by way of a body and point of each pair where the one lights the other.
-
-    Parameters
-    ----------
-    points
-        Receivers, or their images [m], Shape ``[P, 3]``.
-    of_face
-        Face that mirrored each, which is not a beam's last one; −1 for receivers, Shape ``[P]``.
-    """
-    import drjit as dr
-    import mitsuba as mi
-
-    # Chains of scenery alone stand first.
-    first = int(np.argmax(beams.by_body)) if beams.by_body.any() else len(beams)
-    behind = dr.opaque(mi.UInt, first)
-    lanes = several(len(points))
-    place = positions(points[lanes])
-    mirror = mi.UInt(aligned_indices(of_face[lanes] + 1))
-
-    def near(beam: Any, point: Any) -> Any:
-        lit = _gathered(mirror, point) != _gathered(beams.last, beam + behind) + 1
-        return lit & beams.light_cone(beam + behind, _gathered(place, point), 0.0, targets.slack)
-
-    def lit(beam: Any, point: Any) -> Any:
-        return beams.light(beam + behind, _gathered(place, point), targets.slack)
-
-    beam, point = filtered(lit, pairs(len(beams) - first, len(points), near))
-    return _numbers(beam) + first, _numbers(point)
-
-
-def through_bodies(
-    targets: Targets, beams: Beams, receivers: Float64Array
-) -> tuple[Int64Array, Int64Array, Int64Array]:
-    """Beam, face of a body and receiver, where the beam may light the receiver by way of the face; receivers
-    [m] are of Shape ``[R, 3]``."""
+def lit_bodies(targets: Targets, beams: Beams) -> tuple[Any, Any]:
+    """Beams and faces of bodies whose spheres they light, as `mitsuba.UInt`."""
     import drjit as dr
 
-    none = np.zeros(0, np.int64)
-    if not targets.bodies * len(beams) * len(receivers):
-        return none, none, none
     slack = targets.slack
 
     def near(beam: Any, body: Any) -> Any:
@@ -312,26 +258,113 @@ def through_bodies(
     pair, number = filtered(shows_within, pairs(dr.width(beam), targets.most, shows))
     beam, face = _gathered(beam, pair), face_of(pair, number)
     dr.eval(beam, face)
+    return beam, face
+
+
+def _reflected(targets: Targets, chain: Int64Array, image: Any, before: Any | None) -> Beams:
+    """Beams by way of the last faces of chains, from images before these and by way of faces ``before``."""
+    import drjit as dr
+    import mitsuba as mi
+
+    last = mi.UInt(aligned_indices(chain[several(len(chain)), -1]))
+    normal, offset = _gathered(targets.normal, last), _gathered(targets.offset, last)
+
+    def mirrored(point: Any) -> Any:
+        return point - 2.0 * (dr.dot(point, normal) - offset) * normal
+
+    image = mirrored(image)
+    corners = targets.corners(last)
+    axis, cosine = _cone(image, corners)
+    sides = _sides(image, corners)
+    if before is not None:
+        mirrored_corners = [mirrored(corner) for corner in targets.corners(before)]
+        other_axis, other_cosine = _cone(image, mirrored_corners)
+        narrower = other_cosine > cosine
+        axis, cosine = dr.select(narrower, other_axis, axis), dr.maximum(cosine, other_cosine)
+        sides += _sides(image, mirrored_corners)
+    away = dr.select(dr.dot(image, normal) > offset, -1.0, 1.0)
+    lit, lit_from = normal * away, offset * away
+    dr.eval(image, axis, cosine, sides, lit, lit_from, last)
+    by_body = chain >= targets.first_body
+    return Beams(
+        chain, np.logical_or.reduce(by_body, axis=1), image, sides, axis, cosine, last, lit, lit_from
+    )
+
+
+def ends_at(targets: Targets, beams: Beams, receivers: Float64Array) -> tuple[Int64Array, Int64Array]:
+    """Beam by way of a body and receiver of each pair where the one lights the other; receivers [m] are of
+    Shape ``[R, 3]``."""
+    import drjit as dr
+    import mitsuba as mi
+
+    first = dr.opaque(mi.UInt, beams.first_by_body)
     place = positions(receivers[several(len(receivers))])
 
-    def reaches(way: Any, receiver: Any) -> Any:
-        of, last, point = _gathered(beam, way), _gathered(face, way), _gathered(place, receiver)
-        image = _gathered(beams.image, of)
-        normal, offset = _gathered(targets.normal, last), _gathered(targets.offset, last)
-        there, here = dr.dot(image, normal) - offset, dr.dot(point, normal) - offset
-        both = (there * here > 0.0) & ((here > 0.0) | _gathered(targets.two_sided, last))
-        sum_ = there + here
-        met = (there * point + here * image) / sum_
-        beside = met - _gathered(targets.centre, last)
-        for side in (_gathered(targets.u, last), _gathered(targets.v, last)):
-            square = dr.squared_norm(side)
-            both &= dr.abs(dr.dot(beside, side)) <= square + slack * dr.sqrt(square)
-        met -= (2.0 * here * there / sum_) * normal
-        return both & beams.light(of, met, slack)
+    def near(beam: Any, receiver: Any) -> Any:
+        return beams.light_cone(beam + first, _gathered(place, receiver), 0.0, targets.slack)
 
-    way, receiver = pairs(dr.width(beam), len(receivers), reaches)
-    beam, face = _gathered(beam, way), _gathered(face, way)
-    return _numbers(beam), _numbers(face), _numbers(receiver)
+    def lit(beam: Any, receiver: Any) -> Any:
+        return beams.light(beam + first, _gathered(place, receiver), targets.slack)
+
+    beam, receiver = filtered(lit, pairs(len(beams) - beams.first_by_body, len(receivers), near))
+    return _numbers(beam) + beams.first_by_body, _numbers(receiver)
+
+
+def through_faces(
+    targets: Targets, beams: Beams, ways: tuple[Any, Any], receivers: Float64Array, *, large: bool
+) -> tuple[Int64Array, Int64Array, Int64Array]:
+    """Beam, face and receiver, where the beam may light the receiver by way of the face.
+
+    Parameters
+    ----------
+    ways
+        Beams and faces, as `mitsuba.UInt`.
+    receivers
+        [m], Shape ``[R, 3]``.
+    large
+        Whether faces are rather larger than beams are wide, or smaller: what rules out most comes first.
+    """
+    import drjit as dr
+
+    beam, face = ways
+    place = positions(receivers[several(len(receivers))])
+
+    def within_face(way: Any, receiver: Any) -> Any:
+        return _crosses(targets, _gathered(beams.image, _gathered(beam, way)), face_and_point(way, receiver))
+
+    def within_cone(way: Any, receiver: Any) -> Any:
+        last, point = face_and_point(way, receiver)
+        image = point - 2.0 * targets.height(point, last) * _gathered(targets.normal, last)
+        return beams.light_cone(_gathered(beam, way), image, 0.0, targets.slack)
+
+    def within_beam(way: Any, receiver: Any) -> Any:
+        last, point = face_and_point(way, receiver)
+        image = point - 2.0 * targets.height(point, last) * _gathered(targets.normal, last)
+        return beams.light(_gathered(beam, way), image, targets.slack)
+
+    def face_and_point(way: Any, receiver: Any) -> tuple[Any, Any]:
+        return _gathered(face, way), _gathered(place, receiver)
+
+    first, second = (within_cone, within_face) if large else (within_face, within_beam)
+    found = filtered(second, pairs(dr.width(beam), len(receivers), first))
+    if large:
+        found = filtered(within_beam, found)
+    way, receiver = found
+    return _numbers(_gathered(beam, way)), _numbers(_gathered(face, way)), _numbers(receiver)
+
+
+def _crosses(targets: Targets, image: Any, at: tuple[Any, Any]) -> Any:
+    """Whether points see images in faces: on the side that reflects, and within the rectangle."""
+    import drjit as dr
+
+    face, point = at
+    there, here = targets.height(image, face), targets.height(point, face)
+    crosses = (there * here > 0.0) & ((here > 0.0) | _gathered(targets.two_sided, face))
+    beside = dr.fma(image - point, here / (there + here), point) - _gathered(targets.centre, face)
+    for side in (_gathered(targets.u, face), _gathered(targets.v, face)):
+        square = dr.squared_norm(side)
+        crosses &= dr.abs(dr.dot(beside, side)) <= square + targets.slack * dr.sqrt(square)
+    return crosses
 
 
 def pairs(first: int, second: int, test: Callable[[Any, Any], Any]) -> tuple[Any, Any]:
@@ -347,7 +380,8 @@ def pairs(first: int, second: int, test: Callable[[Any, Any], Any]) -> tuple[Any
         lane = dr.arange(mi.UInt, count * second)
         start = dr.opaque(mi.UInt, begin)
         kept: Any = dr.compress(test(start + lane // many, lane % many))
-        parts.append((start + kept // many, kept % many))
+        if dr.width(kept):
+            parts.append((start + kept // many, kept % many))
     if not parts:
         return mi.UInt(), mi.UInt()
     if len(parts) == 1:
@@ -365,6 +399,18 @@ def filtered(test: Callable[[Any, Any], Any], numbers: tuple[Any, Any]) -> tuple
     found = _gathered(numbers[0], kept), _gathered(numbers[1], kept)
     dr.eval(found)
     return found
+
+
+def _lights_corner(targets: Targets, beams: Beams, beam: Any, face: Any) -> Any:
+    """Whether no side of beams has all corners of rectangles beyond it."""
+    import drjit as dr
+
+    corners, image = targets.corners(face), _gathered(beams.image, beam)
+    lit = _some(corners, _gathered(beams.lit, beam), _gathered(beams.lit_from, beam) + targets.slack)
+    for side in beams.sides:
+        normal = _gathered(side, beam)
+        lit &= _some(corners, normal, dr.dot(normal, image) - targets.slack)
+    return lit
 
 
 def _some(corners: list[Any], normal: Any, offset: Any) -> Any:

@@ -375,13 +375,15 @@ class SionnaChannel(PathModel[SionnaSettings]):
         """Compile every kernel that frames need; how long that took."""
         self.run.progress("compiling kernels", _COMPILE_GRACE_S)
         begin = time.monotonic()
+        tracers = [self._tracer] if self._edge_range is None else [self._tracer, self._unbent]
         compile_kernels(
             self._scene,
             self._launched,
-            [self._tracer] if self._edge_range is None else [self._tracer, self._unbent],
+            tracers if self._launches else [],
             self._diffuse,
             rung=self.rung,
             followed_parts=self.settings.follow,
+            enumerated=self._enumerated,
         )
         self.run.progress("kernels compiled", 0.0)
         return (f"kernels compiled in {time.monotonic() - begin:.1f} s",)
