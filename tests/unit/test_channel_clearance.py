@@ -58,7 +58,7 @@ def test_in_a_corner_it_is_clear_of_both_faces() -> None:
 
 def test_triangles_that_moved_are_where_they_are() -> None:
     moved = surfaces()
-    moved.move(0, TRIANGLES + np.array([0.0, 0.0, 5.0]))
+    moved.move(np.arange(len(TRIANGLES)), TRIANGLES + np.array([0.0, 0.0, 5.0]))
     assert moved.cleared(np.array([0.7, 1.9, 1.0])).tolist() == [0.7, 1.9, 1.0]
     assert moved.cleared(np.array([0.7, 1.9, 6.0]))[2] == pytest.approx(6 + CLEARANCE)
 

@@ -104,7 +104,7 @@ def test_what_moves_is_taken_anew_and_the_rest_stays() -> None:
     table.update(corners)
     still = table.low[: counts[0]].copy()
     corners[8:] += [100.0, 0.0, 0.0]
-    table.update(corners, counts[0])
+    table.update(corners, np.arange(counts[0], counts[0] + counts[1]))
     assert np.array_equal(table.low[: counts[0]], still)
     assert table.low[counts[0] :, 0].min() == pytest.approx(99.5)
 

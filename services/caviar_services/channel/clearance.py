@@ -51,9 +51,8 @@ class Surfaces:
         self._outside = outside
         self._low, self._high = np.moveaxis(_boxes(self._triangles), -1, 0)
 
-    def move(self, first: int, triangles: Float64Array) -> None:
-        """Put triangles in the place of those from number ``first`` on."""
-        rows = slice(first, first + len(triangles))
+    def move(self, rows: Int64Array, triangles: Float64Array) -> None:
+        """Put triangles in the place of those of these numbers."""
         self._triangles[rows] = triangles
         boxes = _boxes(triangles)
         self._low[:, rows], self._high[:, rows] = boxes[..., 0], boxes[..., 1]

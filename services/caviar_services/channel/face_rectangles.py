@@ -11,6 +11,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
+from caviar_services.channel.sionna_planes import cross
 
 RIM = 1e-3
 """[m]; a point this far outside of a triangle is in it, so that none falls between two."""
@@ -75,21 +76,23 @@ class FaceRectangles:
         if not count:
             return cls.none()
         begin = np.cumsum(sizes) - sizes
-        sides = np.roll(triangles, -1, axis=1) - triangles
+        sides = triangles[:, [1, 2, 0]] - triangles
         square = np.einsum("tkc,tkc->tk", sides, sides)
         # Along the longest side of all, a face of two triangles or of a strip has its smallest rectangle.
-        longest = np.maximum.reduceat(square.max(1), begin)
-        hits = np.flatnonzero(square.max(1) == np.repeat(longest, sizes))
+        most = np.maximum(np.maximum(square[:, 0], square[:, 1]), square[:, 2])
+        longest = np.maximum.reduceat(most, begin)
+        hits = np.flatnonzero(most == np.repeat(longest, sizes))
         chosen = hits[np.searchsorted(hits, begin)]
         along = sides[chosen, square[chosen].argmax(1)]
         along = along - np.einsum("fc,fc->f", along, normal)[:, None] * normal
         along /= np.sqrt(np.einsum("fc,fc->f", along, along))[:, None]
-        axes = np.stack([along, np.cross(normal, along)], axis=1)
+        axes = np.stack([along, cross(normal, along)], axis=1)
         origin = triangles[chosen, 0]
         own = np.repeat(np.arange(count), sizes)
-        flat = np.einsum("tkc,tac->tka", triangles - origin[own][:, None], axes[own])
-        low = np.minimum.reduceat(flat.min(1), begin)
-        high = np.maximum.reduceat(flat.max(1), begin)
+        flat = (triangles - origin[own][:, None]) @ axes[own].transpose(0, 2, 1)
+        a, b, c = flat[:, 0], flat[:, 1], flat[:, 2]
+        low = np.minimum.reduceat(np.minimum(np.minimum(a, b), c), begin)
+        high = np.maximum.reduceat(np.maximum(np.maximum(a, b), c), begin)
         middle = (low + high) / 2
         centre = origin + np.einsum("fa,fac->fc", middle, axes)
         return cls(

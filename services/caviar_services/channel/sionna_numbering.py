@@ -65,6 +65,7 @@ class NumberedTriangles:
         self._faces = np.concatenate([mesh.faces + b for mesh, b in zip(meshes, before, strict=True)])
         self.names = tuple(name for shape in shapes for name in shape.names)
         """What the indices of `object_index` stand for while no body stands for an object."""
+        self._relative = self._corners - centre
         self._number_planes(meshes, unit_meshes)
         last = shapes[-1].meshes
         self._vertices = self._corners[len(self._corners) - sum(len(mesh.vertices) for mesh in last) :]
@@ -79,12 +80,18 @@ class NumberedTriangles:
 
     def move(self, vertices: Float64Array) -> bool:
         """Put the vertices of the last shape there [m], Shape ``[V, 3]``. Returns whether any has moved."""
-        if np.array_equal(vertices, self._vertices):
+        changed = (vertices != self._vertices).any(1)
+        if not changed.any():
             return False
         self._vertices[:] = vertices
         self.version += 1
-        self.plane_table.update(self._corners - self.centre, self._moving_plane)
-        self.surfaces.move(self._first_moving, self._corners[self._faces[self._first_moving :]])
+        first = len(self._corners) - len(vertices)
+        self._relative[first:][changed] = vertices[changed] - self.centre
+        # Most bodies of the pool stand for nothing: only what has moved is looked at.
+        moved = changed[self._faces[self._first_moving :] - first].any(1)
+        triangles = self._first_moving + np.flatnonzero(moved)
+        self.plane_table.update(self._relative, np.unique(self.plane_of[triangles]))
+        self.surfaces.move(triangles, self._corners[self._faces[triangles]])
         return True
 
     @property
@@ -241,13 +248,13 @@ class NumberedTriangles:
         parts = np.concatenate([number + first for number, first in zip(numbers, before, strict=True)])
         faces = self._faces.astype(np.int64)
         apart = PlaneTable(parts.astype(np.int64), faces)
-        apart.update(self._corners - self.centre)
+        apart.update(self._relative)
         shared = shared_planes(apart, int(counts[:still].sum()))
         self.plane_of = shared[parts]
         """Infinite plane of each triangle, numbered through all objects."""
         self._moving_plane = len(apart.normal) and int(shared.max()) + 1 - int(counts[still:].sum())
         self.plane_table = PlaneTable(self.plane_of, faces)
-        self.plane_table.update(self._corners - self.centre)
+        self.plane_table.update(self._relative)
 
     def _points_outside(self, triangle: int, normal: Float64Array) -> bool:
         """Whether a triangle's normal points away from its piece, or up from one that lies.
