@@ -71,7 +71,8 @@ class SionnaChannel(PathModel[SionnaSettings]):
     def __init__(self, settings: SionnaSettings, run: RunInfo) -> None:
         super().__init__(settings, run)
         self.rung = settings.rung
-        settings.launched_samples(run.name)  # says what is wrong with them
+        self._samples = settings.launched_samples(run.name)
+        """Rays of each launch; where candidates are enumerated, of the scenery's."""
         self._variant = ""
         self._scene: SionnaScene
         self._tracer: Tracer
@@ -96,7 +97,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         seed = settings.launch_seed
         self._asked = LaunchOptions(
             max_depth=settings.max_depth,
-            samples=settings.launched_samples(run.name),
+            samples=self._samples,
             max_paths=settings.max_paths,
             seed=derive_seed(run.seed, 0, f"{run.name}/launch") if seed is None else seed,
             reflection=settings.reflection,
@@ -338,7 +339,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         )
         cache = ChainCache(default_folder() / "chains") if s.cache_chains else None
         launch = SceneryLaunch(samples=self._samples, launches=s.scenery_launches)
-        self._enumerated = EnumeratedTracer(self._scene, launched.max_depth)
+        self._enumerated = EnumeratedTracer(self._scene, launched.max_depth, launched.max_paths)
         options = replace(launched, max_depth=depth)
         self._scenery = SceneryChains(self._scene, options, launch, s.samples_per_frame, cache)
         notes = []

@@ -90,7 +90,7 @@ def _enumerate(scene: SionnaScene, tracer: EnumeratedTracer, depth: int) -> None
     chains = chains[(chains < scene.first_moving_plane).all(1)]
     for parked in (0, len(assets) // 2, len(assets)):
         scene.place(_without(objects, parked), frozenset())
-        tracer.trace(above + [0.0, 3.0, 4.0], place + [0.3, 0.2, 1.0], chains[1:])
+        tracer.trace(above + np.array([0.0, 3.0, 4.0]), place + np.array([0.3, 0.2, 1.0]), chains[1:])
 
 
 def _without(scene: Scene, count: int) -> Scene:
