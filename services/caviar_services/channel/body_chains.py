@@ -15,13 +15,14 @@ import numpy as np
 from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_services.channel.face_rectangles import FaceRectangles
 from caviar_services.channel.image_beams import (
+    Beams,
     Targets,
-    by_scenery,
     ends_at,
+    ends_by_bodies,
+    ends_by_scenery,
     first_beams,
-    lit_bodies,
     next_beams,
-    through_faces,
+    scenery_beams,
 )
 
 
@@ -45,14 +46,16 @@ class ChainPairs:
         return cls(np.concatenate(chains), np.concatenate(receivers))
 
 
-def body_chains(
+def chain_pairs(
     faces: FaceRectangles,
     sizes: Int64Array,
     scenery: Int64Array,
+    sights: Int64Array,
     transmitter: Float64Array,
     receivers: Float64Array,
 ) -> ChainPairs:
-    """All pairs of a chain with a face of a body and a receiver that it may be a path to.
+    """All pairs of a chain and a receiver that it may be a path to: no reflection, chains of scenery alone,
+    and chains with a face of a body.
 
     Parameters
     ----------
@@ -63,28 +66,38 @@ def body_chains(
     scenery
         Chains of scenery alone that waves from the transmitter go along, with the beginnings of each, as
         faces, −1 behind the last, Shape ``[K, D]``.
+    sights
+        Pairs of faces of scenery that see one another, in both orders, Shape ``[M, 2]``.
     transmitter
         [m], Shape ``[3]``.
     receivers
         [m], Shape ``[R, 3]``.
     """
     depth = scenery.shape[1]
-    if not (depth and len(sizes) and len(receivers)):
-        return ChainPairs.joined([], depth)
+    every = np.arange(len(receivers))
+    found = [(np.zeros((len(receivers), 0), np.int64), every)]
+    if not (depth and len(faces) and len(receivers)):
+        return ChainPairs.joined(found, depth)
     targets = Targets(faces, sizes)
     used = np.unique(scenery[scenery >= 0])
     length = (scenery >= 0).sum(1)
-    beams = first_beams(targets, transmitter, scenery[length == 1, 0])
-    beam, receiver = ends_at(targets, beams, receivers)
-    found = [(beams.chain[beam], receiver)]
-    for n in range(2, depth):
-        beams = next_beams(targets, beams, used, scenery[length == n, :n])
+    sights = np.searchsorted(used, sights[np.isin(sights, used).all(1)])
+
+    def add(beams: Beams) -> None:
         beam, receiver = ends_at(targets, beams, receivers)
         found.append((beams.chain[beam], receiver))
+
+    beams = first_beams(targets, transmitter, scenery[length == 1, 0])
+    add(beams)
+    for n in range(2, depth):
+        beams = next_beams(targets, beams, used, scenery[length == n, :n])
+        add(beams)
     if depth > 1:
         # The last reflection needs no beams of its own: its faces are held against the receivers at once.
-        last = (by_scenery(targets, beams, used), True), (lit_bodies(targets, beams), False)
-        for ways, large in last:
-            beam, face, receiver = through_faces(targets, beams, ways, receivers, large=large)
+        add(scenery_beams(targets, beams, scenery[length == depth]))
+        for beam, face, receiver in (
+            ends_by_scenery(targets, beams, receivers, used, sights),
+            ends_by_bodies(targets, beams, receivers),
+        ):
             found.append((np.concatenate([beams.chain[beam], face[:, None]], axis=1), receiver))
     return ChainPairs.joined(found, depth)

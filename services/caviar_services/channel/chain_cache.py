@@ -26,9 +26,10 @@ class _ChainFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     format: Literal["caviar-chains-1"]
     key: str
-    planes: Packed
+    tables: tuple[Packed, ...]
+    """Of planes by number."""
     digest: bytes
-    """Of the planes' bytes."""
+    """Of the tables' bytes."""
 
 
 class ChainCache:
@@ -45,8 +46,9 @@ class ChainCache:
         self.notes: list[str] = []
         """What could not be read or written, and why."""
 
-    def load(self, key: str, depth: int) -> Int32Array | None:
-        """The chains of a key, Shape ``[K, depth]``; None where there is no file, or a damaged one."""
+    def load(self, key: str, widths: tuple[int, ...]) -> tuple[Int32Array, ...] | None:
+        """The tables of a key, which have rows of these widths; None where there is no file, or a damaged
+        one."""
         path = self._folder / key
         try:
             data = path.read_bytes()
@@ -57,19 +59,19 @@ class ChainCache:
             return None
         try:
             file = msgspec.msgpack.decode(data, type=_ChainFile)
-            chains: Int32Array = file.planes.array(np.int32)
-            intact = file.key == key and file.digest == _digest(file.planes.data)
+            tables: tuple[Int32Array, ...] = tuple([table.array(np.int32) for table in file.tables])
+            intact = file.key == key and file.digest == _digest(file.tables)
         except (msgspec.MsgspecError, UnicodeDecodeError, ValueError):
             intact = False
-        if intact and chains.ndim == 2 and chains.shape[1] == depth:
-            return chains
+        if intact and [table.shape[1:] for table in tables] == [(width,) for width in widths]:
+            return tables
         self.notes.append(f"{path} is damaged; its chains are launched again")
         return None
 
-    def save(self, key: str, chains: Int32Array) -> None:
-        """Keep the chains of a key; where that cannot be done, a note says so."""
-        packed = Packed.of(chains, "<i4")
-        file = _ChainFile(format=_FORMAT, key=key, planes=packed, digest=_digest(packed.data))
+    def save(self, key: str, tables: tuple[Int32Array, ...]) -> None:
+        """Keep the tables of a key; where that cannot be done, a note says so."""
+        packed = tuple([Packed.of(table, "<i4") for table in tables])
+        file = _ChainFile(format=_FORMAT, key=key, tables=packed, digest=_digest(packed))
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             replace_file(self._folder / key, msgspec.msgpack.encode(file), durable=False)
@@ -89,5 +91,5 @@ def cache_key(*parts: bytes) -> str:
     return digest.hexdigest()
 
 
-def _digest(data: bytes) -> bytes:
-    return hashlib.blake2b(data, digest_size=16).digest()
+def _digest(tables: tuple[Packed, ...]) -> bytes:
+    return hashlib.blake2b(b"".join([table.data for table in tables]), digest_size=16).digest()

@@ -12,13 +12,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from caviar_protocol.arrays import Float64Array, Int32Array, Int64Array
+from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_protocol.topics import Interaction
-from caviar_services.channel.body_chains import ChainPairs, body_chains
+from caviar_services.channel.body_chains import chain_pairs
 from caviar_services.channel.face_rectangles import FaceRectangles
 from caviar_services.channel.image_paths import ImagePaths, image_paths, unhidden
 from caviar_services.channel.reflection_fields import reflection_fields
 from caviar_services.channel.scene_faces import SceneFaces
+from caviar_services.channel.scenery_chains import KnownScenery
 from caviar_services.channel.sionna_candidates import first_of_each
 from caviar_services.channel.sionna_reach import Faces
 from caviar_services.channel.sionna_scene import SionnaScene
@@ -51,23 +52,23 @@ class EnumeratedTracer:
         self._look = Faces(scene)
         self._bodies: tuple[int, FaceRectangles, Int64Array] | None = None
 
-    def trace(self, transmitter: Float64Array, receivers: Float64Array, scenery: Int32Array) -> Traced:
+    def trace(self, transmitter: Float64Array, receivers: Float64Array, scenery: KnownScenery) -> Traced:
         """Paths from one transmitter [3] to all receivers [R, 3], positions in metres in the world.
 
-        ``scenery`` are the chains of scenery alone that waves from there go along (`scenery_chains`).
+        ``scenery`` is what is known of it from there.
         """
         scene = self._scene
         if not len(receivers):
             return nothing(len(scene.wavelengths), self._depth, 0)
         start, ends = transmitter - scene.centre, receivers - scene.centre
         of_bodies, sizes = self._standing()
-        planes = scenery.astype(np.int64)
+        planes, sights = scenery.chains.astype(np.int64), scenery.sights.astype(np.int64)
         of_scenery = self._faces.scenery(planes[planes >= 0])
         faces = of_scenery.and_those(of_bodies)
         planes = planes[(np.isin(planes, of_scenery.plane) | (planes < 0)).all(1)]
         chains = np.where(planes >= 0, np.searchsorted(of_scenery.plane, planes), -1)
-        pairs = body_chains(faces, sizes, chains, start, ends)
-        pairs = _with_every_receiver(pairs, chains, len(receivers))
+        sights = np.searchsorted(of_scenery.plane, sights[np.isin(sights, of_scenery.plane).all(1)])
+        pairs = chain_pairs(faces, sizes, chains, sights, start, ends)
         paths = image_paths(faces, pairs, start, ends)
         paths = paths.take(unhidden(self._look, faces, paths, start, ends))
         near = ((ends - start) ** 2).sum(1) <= _NEAREST**2
@@ -119,16 +120,6 @@ class EnumeratedTracer:
             settled=np.zeros(len(count), np.bool_),
             lost=0,
         )
-
-
-def _with_every_receiver(pairs: ChainPairs, chains: Int64Array, receivers: int) -> ChainPairs:
-    """Pairs, and every receiver with the line of sight and each of some chains."""
-    sight = np.full((1, chains.shape[1]), -1)
-    every = np.concatenate([sight, chains])
-    return ChainPairs(
-        np.concatenate([pairs.chain, np.tile(every, (receivers, 1))]),
-        np.concatenate([pairs.receiver, np.repeat(np.arange(receivers), len(every))]),
-    )
 
 
 def unknown_paths(launched: Traced, enumerated: Traced, scene: SionnaScene) -> Traced:

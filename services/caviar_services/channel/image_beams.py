@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
-from caviar_services.channel.face_rectangles import FaceRectangles
+from caviar_services.channel.face_rectangles import FaceRectangles, ranges
 from caviar_services.channel.sionna_candidates import positions
 from caviar_services.columns import aligned_columns, aligned_indices, several
 
@@ -29,6 +29,12 @@ _SLACK = 5e-3
 
 _RELATIVE_SLACK = 2e-6
 """The same as a part of the largest coordinate."""
+
+_WIDE = 0.01
+"""Cosine of the half angle of the widest cone that is held against anything."""
+
+_BLOCK = 16
+"""Beams of one group that are looked at together: groups are filled up to a multiple of it."""
 
 _LANES = 1 << 23
 """Pairs that are looked at together at most."""
@@ -175,6 +181,13 @@ def first_beams(targets: Targets, source: Float64Array, scenery: Int64Array) -> 
     return _reflected(targets, first[:, None], image, None)
 
 
+def receiver_beams(targets: Targets, receivers: Float64Array, scenery: Int64Array) -> Beams:
+    """What receivers [m], Shape ``[R, 3]``, see in each of some faces of scenery, receiver after receiver."""
+    chain = np.tile(scenery, len(receivers))[:, None]
+    image = positions(np.repeat(receivers, len(scenery), axis=0)[several(len(chain))])
+    return _reflected(targets, chain, image, None)
+
+
 def next_beams(targets: Targets, beams: Beams, scenery: Int64Array, known: Int64Array) -> Beams:
     """Beams behind one more reflection.
 
@@ -186,7 +199,6 @@ def next_beams(targets: Targets, beams: Beams, scenery: Int64Array, known: Int64
         Chains of scenery alone that are one longer than those of ``beams``, Shape ``[K, n + 1]``, each
         beginning with one of these: of scenery alone these are gone on with.
     """
-    import mitsuba as mi
 
     beam, face = by_scenery(targets, beams, scenery)
     of_body = filtered(partial(_lights_corner, targets, beams), lit_bodies(targets, beams))
@@ -199,8 +211,19 @@ def next_beams(targets: Targets, beams: Beams, scenery: Int64Array, known: Int64
     )
     before = _rows_of(beams.chain, known[:, :-1])
     parent = np.concatenate([before, _numbers(beam), _numbers(of_body[0])])
-    lanes = several(len(chain))
-    index = mi.UInt(aligned_indices(parent[lanes]))
+    return _longer(targets, beams, parent, chain)
+
+
+def scenery_beams(targets: Targets, beams: Beams, known: Int64Array) -> Beams:
+    """Of `next_beams`, those of chains of scenery alone."""
+    return _longer(targets, beams, _rows_of(beams.chain, known[:, :-1]), known)
+
+
+def _longer(targets: Targets, beams: Beams, parent: Int64Array, chain: Int64Array) -> Beams:
+    """Beams of chains, each of which is longer by one than that of its parent."""
+    import mitsuba as mi
+
+    index = mi.UInt(aligned_indices(parent[several(len(parent))]))
     return _reflected(targets, chain, _gathered(beams.image, index), _gathered(beams.last, index))
 
 
@@ -210,13 +233,21 @@ def by_scenery(targets: Targets, beams: Beams, scenery: Int64Array) -> tuple[Any
     import mitsuba as mi
 
     faces = mi.UInt(aligned_indices(scenery[several(len(scenery))]))
-    first = dr.opaque(mi.UInt, beams.first_by_body)
+    begin = beams.first_by_body
+    first = _opaque(begin)
+
+    def near(beam: Any, place: Any) -> Any:
+        beam, face = beam + first, _gathered(faces, place)
+        centre, radius = _gathered(targets.centre, face), _gathered(targets.radius, face)
+        lit = beams.light_cone(beam, centre, radius, targets.slack)
+        return lit & (face != _gathered(beams.last, beam))
 
     def lights(beam: Any, place: Any) -> Any:
-        beam, face = beam + first, _gathered(faces, place)
-        return (face != _gathered(beams.last, beam)) & _lights_corner(targets, beams, beam, face)
+        return _lights_corner(targets, beams, beam + first, _gathered(faces, place))
 
-    beam, place = pairs(len(beams) - beams.first_by_body, len(scenery), lights)
+    beam, place = filtered(lights, pairs(len(beams) - begin, len(scenery), near))
+    if not dr.width(beam):
+        return beam, place
     beam, face = beam + first, _gathered(faces, place)
     dr.eval(beam, face)
     return beam, face
@@ -227,16 +258,7 @@ def lit_bodies(targets: Targets, beams: Beams) -> tuple[Any, Any]:
     import drjit as dr
 
     slack = targets.slack
-
-    def near(beam: Any, body: Any) -> Any:
-        centre, radius = _gathered(targets.body_centre, body), _gathered(targets.body_radius, body)
-        return beams.light_cone(beam, centre, radius, slack)
-
-    def lit(beam: Any, body: Any) -> Any:
-        centre, radius = _gathered(targets.body_centre, body), _gathered(targets.body_radius, body)
-        return beams.light(beam, centre, radius + slack)
-
-    beam, body = filtered(lit, pairs(len(beams), targets.bodies, near))
+    beam, body = near_bodies(targets, beams)
 
     def face_of(pair: Any, number: Any) -> Any:
         return _gathered(targets.body_begin, _gathered(body, pair)) + number
@@ -291,73 +313,155 @@ def _reflected(targets: Targets, chain: Int64Array, image: Any, before: Any | No
     )
 
 
-def ends_at(targets: Targets, beams: Beams, receivers: Float64Array) -> tuple[Int64Array, Int64Array]:
-    """Beam by way of a body and receiver of each pair where the one lights the other; receivers [m] are of
-    Shape ``[R, 3]``."""
-    import drjit as dr
-    import mitsuba as mi
+def near_bodies(targets: Targets, beams: Beams) -> tuple[Any, Any]:
+    """Beams and bodies whose spheres they light, as `mitsuba.UInt`."""
 
-    first = dr.opaque(mi.UInt, beams.first_by_body)
+    def near(beam: Any, body: Any) -> Any:
+        centre, radius = _gathered(targets.body_centre, body), _gathered(targets.body_radius, body)
+        return beams.light_cone(beam, centre, radius, targets.slack)
+
+    def lit(beam: Any, body: Any) -> Any:
+        centre, radius = _gathered(targets.body_centre, body), _gathered(targets.body_radius, body)
+        return beams.light(beam, centre, radius + targets.slack)
+
+    return filtered(lit, pairs(len(beams), targets.bodies, near))
+
+
+def ends_at(targets: Targets, beams: Beams, receivers: Float64Array) -> tuple[Int64Array, Int64Array]:
+    """Beam and receiver of each pair where the one lights the other; receivers [m] are of Shape
+    ``[R, 3]``."""
     place = positions(receivers[several(len(receivers))])
 
     def near(beam: Any, receiver: Any) -> Any:
-        return beams.light_cone(beam + first, _gathered(place, receiver), 0.0, targets.slack)
+        return beams.light_cone(beam, _gathered(place, receiver), 0.0, targets.slack)
 
     def lit(beam: Any, receiver: Any) -> Any:
-        return beams.light(beam + first, _gathered(place, receiver), targets.slack)
+        return beams.light(beam, _gathered(place, receiver), targets.slack)
 
-    beam, receiver = filtered(lit, pairs(len(beams) - beams.first_by_body, len(receivers), near))
-    return _numbers(beam) + beams.first_by_body, _numbers(receiver)
+    beam, receiver = filtered(lit, pairs(len(beams), len(receivers), near))
+    return _numbers(beam), _numbers(receiver)
 
 
-def through_faces(
-    targets: Targets, beams: Beams, ways: tuple[Any, Any], receivers: Float64Array, *, large: bool
+def ends_by_bodies(
+    targets: Targets, beams: Beams, receivers: Float64Array
 ) -> tuple[Int64Array, Int64Array, Int64Array]:
-    """Beam, face and receiver, where the beam may light the receiver by way of the face.
-
-    Parameters
-    ----------
-    ways
-        Beams and faces, as `mitsuba.UInt`.
-    receivers
-        [m], Shape ``[R, 3]``.
-    large
-        Whether faces are rather larger than beams are wide, or smaller: what rules out most comes first.
-    """
+    """Beam, face of a body and receiver, where the beam may light the receiver by way of the face; receivers
+    [m] are of Shape ``[R, 3]``."""
     import drjit as dr
 
-    beam, face = ways
+    beam, face = lit_bodies(targets, beams)
     place = positions(receivers[several(len(receivers))])
 
-    def within_face(way: Any, receiver: Any) -> Any:
-        return _crosses(targets, _gathered(beams.image, _gathered(beam, way)), face_and_point(way, receiver))
+    def crosses(way: Any, receiver: Any) -> Any:
+        image = _gathered(beams.image, _gathered(beam, way))
+        return _crosses(targets, image, _gathered(face, way), _gathered(place, receiver))
 
-    def within_cone(way: Any, receiver: Any) -> Any:
-        last, point = face_and_point(way, receiver)
-        image = point - 2.0 * targets.height(point, last) * _gathered(targets.normal, last)
-        return beams.light_cone(_gathered(beam, way), image, 0.0, targets.slack)
-
-    def within_beam(way: Any, receiver: Any) -> Any:
-        last, point = face_and_point(way, receiver)
+    def lit(way: Any, receiver: Any) -> Any:
+        last, point = _gathered(face, way), _gathered(place, receiver)
         image = point - 2.0 * targets.height(point, last) * _gathered(targets.normal, last)
         return beams.light(_gathered(beam, way), image, targets.slack)
 
-    def face_and_point(way: Any, receiver: Any) -> tuple[Any, Any]:
-        return _gathered(face, way), _gathered(place, receiver)
-
-    first, second = (within_cone, within_face) if large else (within_face, within_beam)
-    found = filtered(second, pairs(dr.width(beam), len(receivers), first))
-    if large:
-        found = filtered(within_beam, found)
-    way, receiver = found
+    way, receiver = filtered(lit, pairs(dr.width(beam), len(receivers), crosses))
     return _numbers(_gathered(beam, way)), _numbers(_gathered(face, way)), _numbers(receiver)
 
 
-def _crosses(targets: Targets, image: Any, at: tuple[Any, Any]) -> Any:
+def ends_by_scenery(
+    targets: Targets, beams: Beams, receivers: Float64Array, scenery: Int64Array, sights: Int64Array
+) -> tuple[Int64Array, Int64Array, Int64Array]:
+    """Beam by way of a body, face of scenery and receiver, where the beam may light the receiver by way of
+    the face.
+
+    What a receiver sees in a face is a beam too: only bodies and faces that it meets can come before.
+
+    Parameters
+    ----------
+    receivers
+        [m], Shape ``[R, 3]``.
+    scenery, sights
+        Faces, and which of these see one another, as places among them, Shape ``[M, 2]``.
+    """
+    import mitsuba as mi
+
+    none = np.zeros(0, np.int64)
+    first = beams.first_by_body
+    if first == len(beams) or not len(scenery):
+        return none, none, none
+    views = receiver_beams(targets, receivers, scenery)
+    view, body = (_numbers(part) for part in near_bodies(targets, views))
+    seen, other = _views_of(targets, views, scenery, sights, len(receivers))
+    view = np.concatenate([view, seen])
+    group = np.concatenate([body, targets.bodies + other])
+    last = beams.chain[first:, -1]
+    of_body = last >= targets.first_body
+    group_of = np.where(of_body, targets.body_of(last), targets.bodies + np.searchsorted(scenery, last))
+    order = np.argsort(group_of, kind="stable")
+    sizes = np.bincount(group_of, minlength=targets.bodies + len(scenery))
+    begin = np.cumsum(sizes) - sizes
+    own, block = ranges(np.zeros(len(group), np.int64), -(-sizes[group] // _BLOCK))
+    start = begin[group[own]] + block * _BLOCK
+    columns = [
+        mi.UInt(aligned_indices(column[several(len(own))]))
+        for column in (view[own], start, (begin + sizes)[group[own]])
+    ]
+    by_group = mi.UInt(aligned_indices(first + order[several(len(order))]))
+    place = positions(receivers[several(len(receivers))])
+    per_receiver = _opaque(len(scenery))
+
+    def beam_of(block: Any, number: Any) -> tuple[Any, Any]:
+        there = _gathered(columns[1], block) + number
+        within = there < _gathered(columns[2], block)
+        return _gathered(by_group, _either(within, there)), within
+
+    def near(block: Any, number: Any) -> Any:
+        beam, within = beam_of(block, number)
+        seen = _gathered(columns[0], block)
+        within &= _gathered(views.last, seen) != _gathered(beams.last, beam)
+        return within & beams.light_cone(beam, _gathered(views.image, seen), 0.0, targets.slack)
+
+    def lit(block: Any, number: Any) -> Any:
+        beam, _ = beam_of(block, number)
+        seen = _gathered(columns[0], block)
+        image, point = _gathered(beams.image, beam), _gathered(place, seen // per_receiver)
+        crosses = _crosses(targets, image, _gathered(views.last, seen), point)
+        return crosses & beams.light(beam, _gathered(views.image, seen), targets.slack)
+
+    found = filtered(lit, pairs(len(own), _BLOCK, near))
+    block, number = (_numbers(part) for part in found)
+    seen = view[own[block]]
+    beam = first + order[start[block] + number]
+    return beam, scenery[seen % len(scenery)], seen // len(scenery)
+
+
+def _views_of(
+    targets: Targets, views: Beams, scenery: Int64Array, sights: Int64Array, receivers: int
+) -> tuple[Int64Array, Int64Array]:
+    """What receivers see in one face of scenery, and the places of the faces that they see there."""
+    import mitsuba as mi
+
+    lanes = several(len(sights))
+    mirror, face = (
+        mi.UInt(aligned_indices(column)) for column in (sights[lanes, 0], scenery[sights[lanes, 1]])
+    )
+    many = _opaque(len(scenery))
+
+    def near(pair: Any, receiver: Any) -> Any:
+        shown = _gathered(face, pair)
+        centre, radius = _gathered(targets.centre, shown), _gathered(targets.radius, shown)
+        return views.light_cone(receiver * many + _gathered(mirror, pair), centre, radius, targets.slack)
+
+    def lights(pair: Any, receiver: Any) -> Any:
+        return _lights_corner(
+            targets, views, receiver * many + _gathered(mirror, pair), _gathered(face, pair)
+        )
+
+    pair, receiver = (_numbers(part) for part in filtered(lights, pairs(len(sights), receivers, near)))
+    return receiver * len(scenery) + sights[pair, 0], sights[pair, 1]
+
+
+def _crosses(targets: Targets, image: Any, face: Any, point: Any) -> Any:
     """Whether points see images in faces: on the side that reflects, and within the rectangle."""
     import drjit as dr
 
-    face, point = at
     there, here = targets.height(image, face), targets.height(point, face)
     crosses = (there * here > 0.0) & ((here > 0.0) | _gathered(targets.two_sided, face))
     beside = dr.fma(image - point, here / (there + here), point) - _gathered(targets.centre, face)
@@ -442,13 +546,30 @@ def _cone(image: Any, corners: list[Any]) -> tuple[Any, Any]:
     edges = [dr.normalize(corner - image) for corner in corners]
     axis = dr.normalize(edges[0] + edges[1] + edges[2] + edges[3])
     a, b, c, d = (dr.dot(edge, axis) for edge in edges)
-    return axis, dr.minimum(dr.minimum(a, b), dr.minimum(c, d))
+    cosine = dr.minimum(dr.minimum(a, b), dr.minimum(c, d))
+    # A cone that is wider than a half-space does not hold all that its directions span.
+    return axis, dr.select(cosine > _WIDE, cosine, -1.0)
 
 
 def _gathered(column: Any, index: Any) -> Any:
     import drjit as dr
 
     return dr.gather(type(column), column, index)
+
+
+def _opaque(number: int) -> Any:
+    """A number that a kernel reads: as a constant of the kernel, each would be another kernel."""
+    import drjit as dr
+    import mitsuba as mi
+
+    return dr.opaque(mi.UInt, number)
+
+
+def _either(used: Any, index: Any) -> Any:
+    """An index where it is used, else 0."""
+    import drjit as dr
+
+    return dr.select(used, index, 0)
 
 
 def _numbers(indices: Any) -> Int64Array:

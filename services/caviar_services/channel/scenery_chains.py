@@ -14,10 +14,16 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int32Array, Int64Array
 from caviar_services.channel.chain_cache import ChainCache, cache_key
+from caviar_services.channel.plane_visibility import visible_pairs
+from caviar_services.channel.scene_faces import SceneFaces
 from caviar_services.channel.sionna_candidates import positions
 from caviar_services.channel.sionna_chains import chains_of
 from caviar_services.channel.sionna_launch import Launch, Launcher, LaunchOptions
+from caviar_services.channel.sionna_reach import Faces
 from caviar_services.channel.sionna_scene import SionnaScene
+
+_SIGHT_RAYS, _SIGHT_RAYS_PER_FRAME = 4096, 64
+"""From each plane, to find which others it sees: before the first frame, and in each."""
 
 _SAME_PLACE = 0.05
 """[m]; a transmitter this near has the same chains: what stands off a surface may be moved by less."""
@@ -34,6 +40,16 @@ class SceneryLaunch:
     """Rays of a launch."""
     launches: int
     """Each turned a little against the others."""
+
+
+@dataclass(frozen=True, eq=False)
+class KnownScenery:
+    """What is known of the scenery from the place of a transmitter."""
+
+    chains: Int32Array
+    """Planes that waves from there are reflected at in turn, −1 behind the last, Shape ``[K, D]``."""
+    sights: Int32Array
+    """Pairs of these planes that see one another, in both orders, Shape ``[M, 2]``."""
 
 
 class SceneryChains:
@@ -62,8 +78,10 @@ class SceneryChains:
     ) -> None:
         self._scene, self._options, self._launch, self._cache = scene, options, launch, cache
         self._launcher = Launcher(scene.mi_scene, only_reflected(options, per_frame))
-        self._known: list[tuple[Float64Array, Int32Array]] = []
-        self._last: tuple[bytes, int, Int32Array] | None = None
+        self._look = Faces(scene)
+        self._faces = SceneFaces(scene)
+        self._known: list[tuple[Float64Array, KnownScenery]] = []
+        self._last: tuple[bytes, int, KnownScenery] | None = None
 
     def prepare(self, transmitter: Float64Array, progress: Callable[[int, int], None]) -> str:
         """Launch from where a transmitter stands [m], Shape ``[3]``, while nothing else is in the scene.
@@ -73,28 +91,36 @@ class SceneryChains:
         """
         place = transmitter - self._scene.centre
         key = self._key(place)
-        chains = self._cache.load(key, self._options.max_depth) if self._cache else None
+        known = self._cache.load(key, (self._options.max_depth, 2)) if self._cache else None
         source = "of the cache"
-        if chains is None:
+        if known is None:
             chains = launched_chains(self._scene, self._options, self._launch, place, progress)
+            known = chains, self._sights(chains, _SIGHT_RAYS)
             source = f"of {self._launch.launches} launches of {self._launch.samples} rays"
             if self._cache:
-                self._cache.save(key, chains)
-        self._known.append((place, chains))
+                self._cache.save(key, known)
+        chains, sights = known
+        self._known.append((place, KnownScenery(chains, sights)))
         return f"{len(chains)} chains of scenery {source}"
 
-    def of(self, transmitter: Float64Array) -> Int32Array:
+    def of(self, transmitter: Float64Array) -> KnownScenery:
         """Those from a position in the world [m], Shape ``[3]``, in the scene as it stands."""
         place = transmitter - self._scene.centre
-        for known, chains in self._known:
+        for known, scenery in self._known:
             if np.abs(known - place).max() <= _SAME_PLACE:
-                return chains
+                return scenery
         last = self._last
         if last is None or last[:2] != (place.tobytes(), self._scene.version):
             launch = self._launcher(positions(place[None]))
             chains = scenery_of(launch, self._scene, self._options.max_depth)
-            last = self._last = place.tobytes(), self._scene.version, chains
+            scenery = KnownScenery(chains, self._sights(chains, _SIGHT_RAYS_PER_FRAME))
+            last = self._last = place.tobytes(), self._scene.version, scenery
         return last[2]
+
+    def _sights(self, chains: Int32Array, rays: int) -> Int32Array:
+        """Which planes of chains see one another."""
+        faces = self._faces.scenery(chains[chains >= 0].astype(np.int64))
+        return visible_pairs(self._look, faces, rays, self._options.seed).astype(np.int32)
 
     def _key(self, place: Float64Array) -> str:
         import sionna.rt

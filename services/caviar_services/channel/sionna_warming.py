@@ -10,6 +10,7 @@ import numpy as np
 
 from caviar_protocol.topics import Scene
 from caviar_services.channel.enumerated_tracer import EnumeratedTracer
+from caviar_services.channel.scenery_chains import KnownScenery
 from caviar_services.channel.sionna_follow import Followed
 from caviar_services.channel.sionna_launch import LaunchOptions
 from caviar_services.channel.sionna_reach import Corners
@@ -88,9 +89,12 @@ def _enumerate(scene: SionnaScene, tracer: EnumeratedTracer, depth: int) -> None
     for length in range(depth + 1):
         chains[length, :length] = np.arange(length)
     chains = chains[(chains < scene.first_moving_plane).all(1)]
+    some = np.arange(depth)
+    sights = np.stack(np.meshgrid(some, some), axis=-1).reshape(-1, 2).astype(np.int32)
+    scenery = KnownScenery(chains[1:], sights)
     for parked in (0, len(assets) // 2, len(assets)):
         scene.place(_without(objects, parked), frozenset())
-        tracer.trace(above + np.array([0.0, 3.0, 4.0]), place + np.array([0.3, 0.2, 1.0]), chains[1:])
+        tracer.trace(above + np.array([0.0, 3.0, 4.0]), place + np.array([0.3, 0.2, 1.0]), scenery)
 
 
 def _without(scene: Scene, count: int) -> Scene:
