@@ -16,6 +16,7 @@ from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_services.channel.face_rectangles import FaceRectangles
 from caviar_services.channel.image_beams import (
     Beams,
+    SceneryViews,
     Targets,
     ends_at,
     ends_by_bodies,
@@ -50,7 +51,7 @@ def chain_pairs(
     faces: FaceRectangles,
     sizes: Int64Array,
     scenery: Int64Array,
-    sights: Int64Array,
+    views: SceneryViews,
     transmitter: Float64Array,
     receivers: Float64Array,
 ) -> ChainPairs:
@@ -66,8 +67,8 @@ def chain_pairs(
     scenery
         Chains of scenery alone that waves from the transmitter go along, with the beginnings of each, as
         faces, −1 behind the last, Shape ``[K, D]``.
-    sights
-        Pairs of faces of scenery that see one another, in both orders, Shape ``[M, 2]``.
+    views
+        Of all faces of these chains.
     transmitter
         [m], Shape ``[3]``.
     receivers
@@ -79,9 +80,7 @@ def chain_pairs(
     if not (depth and len(faces) and len(receivers)):
         return ChainPairs.joined(found, depth)
     targets = Targets(faces, sizes)
-    used = np.unique(scenery[scenery >= 0])
     length = (scenery >= 0).sum(1)
-    sights = np.searchsorted(used, sights[np.isin(sights, used).all(1)])
 
     def add(beams: Beams) -> None:
         beam, receiver = ends_at(targets, beams, receivers)
@@ -90,13 +89,13 @@ def chain_pairs(
     beams = first_beams(targets, transmitter, scenery[length == 1, 0])
     add(beams)
     for n in range(2, depth):
-        beams = next_beams(targets, beams, used, scenery[length == n, :n])
+        beams = next_beams(targets, beams, views.faces, scenery[length == n, :n])
         add(beams)
     if depth > 1:
         # The last reflection needs no beams of its own: its faces are held against the receivers at once.
         add(scenery_beams(targets, beams, scenery[length == depth]))
         for beam, face, receiver in (
-            ends_by_scenery(targets, beams, receivers, used, sights),
+            ends_by_scenery(targets, beams, receivers, views),
             ends_by_bodies(targets, beams, receivers),
         ):
             found.append((np.concatenate([beams.chain[beam], face[:, None]], axis=1), receiver))

@@ -16,7 +16,9 @@ from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.body_chains import chain_pairs
 from caviar_services.channel.face_rectangles import FaceRectangles
+from caviar_services.channel.image_beams import SceneryViews
 from caviar_services.channel.image_paths import ImagePaths, image_paths, unhidden
+from caviar_services.channel.plane_visibility import seen_planes
 from caviar_services.channel.reflection_fields import reflection_fields
 from caviar_services.channel.scene_faces import SceneFaces
 from caviar_services.channel.scenery_chains import KnownScenery
@@ -27,6 +29,12 @@ from caviar_services.channel.sionna_traced import Traced, nothing
 from caviar_services.channel.sionna_wedges import Wedges
 
 _NO_SHAPE = 0xFFFFFFFF
+
+_FEW = 64
+"""Faces of scenery that each receiver is taken to see; of more, it sees those that its rays meet."""
+
+_RAYS = 8192
+"""Of a receiver, to find out: 2.2° apart."""
 
 _NEAREST = 0.01
 """[m]; pairs nearer than this have no path between them that could be traced, as in Sionna RT."""
@@ -67,8 +75,8 @@ class EnumeratedTracer:
         faces = of_scenery.and_those(of_bodies)
         planes = planes[(np.isin(planes, of_scenery.plane) | (planes < 0)).all(1)]
         chains = np.where(planes >= 0, np.searchsorted(of_scenery.plane, planes), -1)
-        sights = np.searchsorted(of_scenery.plane, sights[np.isin(sights, of_scenery.plane).all(1)])
-        pairs = chain_pairs(faces, sizes, chains, sights, start, ends)
+        views = self._views(of_scenery, sights, ends)
+        pairs = chain_pairs(faces, sizes, chains, views, start, ends)
         paths = image_paths(faces, pairs, start, ends)
         paths = paths.take(unhidden(self._look, faces, paths, start, ends))
         near = ((ends - start) ** 2).sum(1) <= _NEAREST**2
@@ -76,6 +84,16 @@ class EnumeratedTracer:
         kept = first_of_each(paths.receiver, self._most)
         traced = self._traced(faces, paths.take(kept), start, ends)
         return replace(traced, lost=len(kept) - int(kept.sum()))
+
+    def _views(self, scenery: FaceRectangles, sights: Int64Array, receivers: Float64Array) -> SceneryViews:
+        """Which faces of scenery may come last: all of a few, those that receivers see of many."""
+        pairs = np.searchsorted(scenery.plane, sights[np.isin(sights, scenery.plane).all(1)])
+        if len(scenery) <= _FEW:
+            seen = np.ones((len(receivers), len(scenery)), np.bool_)
+        else:
+            seen = seen_planes(self._look, receivers, scenery.plane, _RAYS)
+        receiver, place = np.nonzero(seen)
+        return SceneryViews(np.arange(len(scenery)), pairs, receiver, place)
 
     def _standing(self) -> tuple[FaceRectangles, Int64Array]:
         """Faces of bodies, which are the same for all transmitters of a frame."""

@@ -118,6 +118,20 @@ def _spheres(faces: FaceRectangles, first: int, sizes: Int64Array) -> tuple[Floa
 
 
 @dataclass(frozen=True, eq=False)
+class SceneryViews:
+    """Faces of scenery that may be the last ones before receivers."""
+
+    faces: Int64Array
+    """In ascending order, Shape ``[U]``."""
+    sights: Int64Array
+    """Which of these see one another, as places among them, in both orders and sorted, Shape ``[M, 2]``."""
+    receiver: Int64Array
+    """Of W pairs of a receiver and a face that it may see, Shape ``[W]``."""
+    place: Int64Array
+    """Places of these faces, Shape ``[W]``."""
+
+
+@dataclass(frozen=True, eq=False)
 class Beams:
     """B beams behind the same number of reflections, in the ray tracer's arrays and in NumPy's."""
 
@@ -181,11 +195,9 @@ def first_beams(targets: Targets, source: Float64Array, scenery: Int64Array) -> 
     return _reflected(targets, first[:, None], image, None)
 
 
-def receiver_beams(targets: Targets, receivers: Float64Array, scenery: Int64Array) -> Beams:
-    """What receivers [m], Shape ``[R, 3]``, see in each of some faces of scenery, receiver after receiver."""
-    chain = np.tile(scenery, len(receivers))[:, None]
-    image = positions(np.repeat(receivers, len(scenery), axis=0)[several(len(chain))])
-    return _reflected(targets, chain, image, None)
+def receiver_beams(targets: Targets, receivers: Float64Array, faces: Int64Array) -> Beams:
+    """What each of some receivers [m], Shape ``[W, 3]``, sees in a face of scenery, Shape ``[W]``."""
+    return _reflected(targets, faces[:, None], positions(receivers[several(len(faces))]), None)
 
 
 def next_beams(targets: Targets, beams: Beams, scenery: Int64Array, known: Int64Array) -> Beams:
@@ -209,14 +221,14 @@ def next_beams(targets: Targets, beams: Beams, scenery: Int64Array, known: Int64
             np.concatenate([beams.chain[_numbers(of_body[0])], _numbers(of_body[1])[:, None]], axis=1),
         ]
     )
-    before = _rows_of(beams.chain, known[:, :-1])
+    before = _rows_of(beams.chain[: beams.first_by_body], known[:, :-1])
     parent = np.concatenate([before, _numbers(beam), _numbers(of_body[0])])
     return _longer(targets, beams, parent, chain)
 
 
 def scenery_beams(targets: Targets, beams: Beams, known: Int64Array) -> Beams:
     """Of `next_beams`, those of chains of scenery alone."""
-    return _longer(targets, beams, _rows_of(beams.chain, known[:, :-1]), known)
+    return _longer(targets, beams, _rows_of(beams.chain[: beams.first_by_body], known[:, :-1]), known)
 
 
 def _longer(targets: Targets, beams: Beams, parent: Int64Array, chain: Int64Array) -> Beams:
@@ -366,36 +378,30 @@ def ends_by_bodies(
 
 
 def ends_by_scenery(
-    targets: Targets, beams: Beams, receivers: Float64Array, scenery: Int64Array, sights: Int64Array
+    targets: Targets, beams: Beams, receivers: Float64Array, scenery: SceneryViews
 ) -> tuple[Int64Array, Int64Array, Int64Array]:
     """Beam by way of a body, face of scenery and receiver, where the beam may light the receiver by way of
-    the face.
+    the face; receivers [m] are of Shape ``[R, 3]``.
 
     What a receiver sees in a face is a beam too: only bodies and faces that it meets can come before.
-
-    Parameters
-    ----------
-    receivers
-        [m], Shape ``[R, 3]``.
-    scenery, sights
-        Faces, and which of these see one another, as places among them, Shape ``[M, 2]``.
     """
     import mitsuba as mi
 
     none = np.zeros(0, np.int64)
     first = beams.first_by_body
-    if first == len(beams) or not len(scenery):
+    if first == len(beams) or not len(scenery.receiver):
         return none, none, none
-    views = receiver_beams(targets, receivers, scenery)
+    views = receiver_beams(targets, receivers[scenery.receiver], scenery.faces[scenery.place])
     view, body = (_numbers(part) for part in near_bodies(targets, views))
-    seen, other = _views_of(targets, views, scenery, sights, len(receivers))
+    seen, other = _shown(targets, views, scenery)
     view = np.concatenate([view, seen])
     group = np.concatenate([body, targets.bodies + other])
     last = beams.chain[first:, -1]
     of_body = last >= targets.first_body
-    group_of = np.where(of_body, targets.body_of(last), targets.bodies + np.searchsorted(scenery, last))
+    place_of = np.searchsorted(scenery.faces, last)
+    group_of = np.where(of_body, targets.body_of(last), targets.bodies + place_of)
     order = np.argsort(group_of, kind="stable")
-    sizes = np.bincount(group_of, minlength=targets.bodies + len(scenery))
+    sizes = np.bincount(group_of, minlength=targets.bodies + len(scenery.faces))
     begin = np.cumsum(sizes) - sizes
     own, block = ranges(np.zeros(len(group), np.int64), -(-sizes[group] // _BLOCK))
     start = begin[group[own]] + block * _BLOCK
@@ -404,8 +410,7 @@ def ends_by_scenery(
         for column in (view[own], start, (begin + sizes)[group[own]])
     ]
     by_group = mi.UInt(aligned_indices(first + order[several(len(order))]))
-    place = positions(receivers[several(len(receivers))])
-    per_receiver = _opaque(len(scenery))
+    place = positions(receivers[scenery.receiver[several(len(views))]])
 
     def beam_of(block: Any, number: Any) -> tuple[Any, Any]:
         there = _gathered(columns[1], block) + number
@@ -421,7 +426,7 @@ def ends_by_scenery(
     def lit(block: Any, number: Any) -> Any:
         beam, _ = beam_of(block, number)
         seen = _gathered(columns[0], block)
-        image, point = _gathered(beams.image, beam), _gathered(place, seen // per_receiver)
+        image, point = _gathered(beams.image, beam), _gathered(place, seen)
         crosses = _crosses(targets, image, _gathered(views.last, seen), point)
         return crosses & beams.light(beam, _gathered(views.image, seen), targets.slack)
 
@@ -429,33 +434,36 @@ def ends_by_scenery(
     block, number = (_numbers(part) for part in found)
     seen = view[own[block]]
     beam = first + order[start[block] + number]
-    return beam, scenery[seen % len(scenery)], seen // len(scenery)
+    return beam, scenery.faces[scenery.place[seen]], scenery.receiver[seen]
 
 
-def _views_of(
-    targets: Targets, views: Beams, scenery: Int64Array, sights: Int64Array, receivers: int
-) -> tuple[Int64Array, Int64Array]:
-    """What receivers see in one face of scenery, and the places of the faces that they see there."""
+def _shown(targets: Targets, views: Beams, scenery: SceneryViews) -> tuple[Int64Array, Int64Array]:
+    """Views, and places of the other faces of scenery that they show."""
+    import drjit as dr
     import mitsuba as mi
 
-    lanes = several(len(sights))
-    mirror, face = (
-        mi.UInt(aligned_indices(column)) for column in (sights[lanes, 0], scenery[sights[lanes, 1]])
-    )
-    many = _opaque(len(scenery))
+    sizes = np.bincount(scenery.sights[:, 0], minlength=len(scenery.faces))
+    own, rows = ranges((np.cumsum(sizes) - sizes)[scenery.place], sizes[scenery.place])
+    other = scenery.sights[rows, 1]
+    lanes = several(len(own))
+    if not len(lanes):
+        return own, other
+    view, face = (mi.UInt(aligned_indices(column[lanes])) for column in (own, scenery.faces[other]))
 
-    def near(pair: Any, receiver: Any) -> Any:
+    def near(pair: Any) -> Any:
         shown = _gathered(face, pair)
         centre, radius = _gathered(targets.centre, shown), _gathered(targets.radius, shown)
-        return views.light_cone(receiver * many + _gathered(mirror, pair), centre, radius, targets.slack)
+        return views.light_cone(_gathered(view, pair), centre, radius, targets.slack)
 
-    def lights(pair: Any, receiver: Any) -> Any:
-        return _lights_corner(
-            targets, views, receiver * many + _gathered(mirror, pair), _gathered(face, pair)
-        )
+    def lights(pair: Any) -> Any:
+        return _lights_corner(targets, views, _gathered(view, pair), _gathered(face, pair))
 
-    pair, receiver = (_numbers(part) for part in filtered(lights, pairs(len(sights), receivers, near)))
-    return receiver * len(scenery) + sights[pair, 0], sights[pair, 1]
+    kept = dr.compress(near(dr.arange(mi.UInt, len(lanes))))
+    if dr.width(kept):
+        kept = _gathered(kept, dr.compress(lights(kept)))
+    pair = _numbers(kept)
+    pair = pair[pair < len(own)]
+    return own[pair], other[pair]
 
 
 def _crosses(targets: Targets, image: Any, face: Any, point: Any) -> Any:

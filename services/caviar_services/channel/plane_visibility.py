@@ -6,9 +6,11 @@ which; planes that are hidden but for less than one ray meets count as hidden.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from caviar_protocol.arrays import Float64Array, Int64Array
+from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_services.channel.face_rectangles import FaceRectangles
 from caviar_services.channel.sionna_reach import Faces
 
@@ -49,6 +51,22 @@ def visible_pairs(look: Faces, faces: FaceRectangles, rays: int, seed: int) -> I
     pairs = np.concatenate(found)
     pairs = pairs[np.isin(pairs[:, 1], faces.plane) & (pairs[:, 0] != pairs[:, 1])]
     return np.unique(np.concatenate([pairs, pairs[:, ::-1]]), axis=0)
+
+
+def seen_planes(look: Faces, points: Float64Array, planes: Int64Array, rays: int) -> BoolArray:
+    """Which of some planes, in ascending order, each of some points [m], Shape ``[R, 3]``, sees, Shape
+    ``[R, U]``: those that rays in all directions meet first."""
+    number = np.arange(rays) + 0.5
+    z, turn = 1 - 2 * number / rays, np.pi * (1 + math.sqrt(5.0)) * number
+    flat = np.sqrt(1 - z**2)
+    directions = np.column_stack([flat * np.cos(turn), flat * np.sin(turn), z])
+    seen = np.zeros((len(points), len(planes) + 1), np.bool_)
+    start = np.repeat(points, rays, axis=0)
+    behind, plane = look.nearest(start, start + np.tile(directions, (len(points), 1)))
+    place = np.searchsorted(planes, plane)
+    known = np.isfinite(behind) & (np.append(planes, -1)[place] == plane)
+    seen[np.repeat(np.arange(len(points)), rays), np.where(known, place, len(planes))] = True
+    return seen[:, :-1]
 
 
 def _points(faces: FaceRectangles, count: int, rng: np.random.Generator) -> Float64Array:
