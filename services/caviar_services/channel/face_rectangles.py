@@ -13,7 +13,7 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_services.channel.sionna_planes import cross
 
-RIM = 1e-3
+RIM = 1e-4
 """[m]; a point this far outside of a triangle is in it, so that none falls between two."""
 
 _SLACK = 2e-3
@@ -56,9 +56,10 @@ class FaceRectangles:
     def of(
         cls,
         plane: Int64Array,
-        normal: Float64Array,
         triangles: Float64Array,
         sizes: Int64Array,
+        along: Int64Array,
+        normal: Float64Array,
         two_sided: BoolArray,
     ) -> FaceRectangles:
         """Rectangles around triangles of planes.
@@ -71,28 +72,20 @@ class FaceRectangles:
             Corners [m], face after face, Shape ``[T, 3, 3]``.
         sizes
             How many of them each face has, at least one, Shape ``[F]``.
+        along
+            Of each face, a side that its rectangle lies along (`narrowest_sides`), Shape ``[F]``.
         """
         count = len(plane)
         if not count:
             return cls.none()
-        begin = np.cumsum(sizes) - sizes
-        sides = triangles[:, [1, 2, 0]] - triangles
-        square = np.einsum("tkc,tkc->tk", sides, sides)
-        # Along the longest side of all, a face of two triangles or of a strip has its smallest rectangle.
-        most = np.maximum(np.maximum(square[:, 0], square[:, 1]), square[:, 2])
-        longest = np.maximum.reduceat(most, begin)
-        hits = np.flatnonzero(most == np.repeat(longest, sizes))
-        chosen = hits[np.searchsorted(hits, begin)]
-        along = sides[chosen, square[chosen].argmax(1)]
-        along = along - np.einsum("fc,fc->f", along, normal)[:, None] * normal
-        along /= np.sqrt(np.einsum("fc,fc->f", along, along))[:, None]
-        axes = np.stack([along, cross(normal, along)], axis=1)
-        origin = triangles[chosen, 0]
+        origin = triangles[along // 3, along % 3]
+        side = triangles[along // 3, (along + 1) % 3] - origin
+        side = side - np.einsum("fc,fc->f", side, normal)[:, None] * normal
+        side /= np.sqrt(np.einsum("fc,fc->f", side, side))[:, None]
+        axes = np.stack([side, cross(normal, side)], axis=1)
         own = np.repeat(np.arange(count), sizes)
         flat = (triangles - origin[own][:, None]) @ axes[own].transpose(0, 2, 1)
-        a, b, c = flat[:, 0], flat[:, 1], flat[:, 2]
-        low = np.minimum.reduceat(np.minimum(np.minimum(a, b), c), begin)
-        high = np.maximum.reduceat(np.maximum(np.maximum(a, b), c), begin)
+        low, high = _extents(flat, np.cumsum(sizes) - sizes)
         middle = (low + high) / 2
         centre = origin + np.einsum("fa,fac->fc", middle, axes)
         return cls(
@@ -170,6 +163,40 @@ class FaceRectangles:
         held = np.zeros(len(faces), np.bool_)
         held[own[within]] = True
         return held
+
+
+def narrowest_sides(triangles: Float64Array, sizes: Int64Array) -> Int64Array:
+    """Of each face, the side of its largest triangle that the smallest rectangle around it lies along.
+
+    It is three times the triangle's number plus that of the side. Of two triangles that are a rectangle it is
+    never the diagonal, whose rectangle would be twice as large. The parameters are those of `FaceRectangles.of`.
+    """
+    begin = np.cumsum(sizes) - sizes
+    own = np.repeat(np.arange(len(sizes)), sizes)
+    normal = cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    square = np.einsum("fc,fc->f", normal, normal)
+    hits = np.flatnonzero(square == np.maximum.reduceat(square, begin)[own]) if len(own) else own
+    largest = hits[np.searchsorted(hits, begin)]
+    best, least = 3 * largest, np.full(len(sizes), np.inf)
+    for side in range(3):
+        origin = triangles[largest, side]
+        one = triangles[largest, (side + 1) % 3] - origin
+        axes = np.stack([one, cross(normal[largest], one)], axis=1)
+        length = np.sqrt(np.einsum("fac,fac->fa", axes, axes))[..., None]
+        axes /= np.where(length > 0, length, 1.0)
+        flat = (triangles - origin[own][:, None]) @ axes[own].transpose(0, 2, 1)
+        low, high = _extents(flat, begin)
+        area = np.where(length.all((1, 2)), np.prod(high - low, axis=1), np.inf)
+        best, least = np.where(area < least, 3 * largest + side, best), np.minimum(area, least)
+    return best
+
+
+def _extents(flat: Float64Array, begin: Int64Array) -> tuple[Float64Array, Float64Array]:
+    """Lowest and highest coordinates of triangles ``[T, 3, 2]``, of each run of them."""
+    a, b, c = flat[:, 0], flat[:, 1], flat[:, 2]
+    low: Float64Array = np.minimum.reduceat(np.minimum(np.minimum(a, b), c), begin)
+    high: Float64Array = np.maximum.reduceat(np.maximum(np.maximum(a, b), c), begin)
+    return low, high
 
 
 def ranges(begin: Int64Array, sizes: Int64Array) -> tuple[Int64Array, Int64Array]:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
-from caviar_services.channel.face_rectangles import FaceRectangles, ranges
+from caviar_services.channel.face_rectangles import FaceRectangles, narrowest_sides, ranges
 from caviar_services.channel.sionna_scene import SionnaScene
 from caviar_services.meshes import Mesh
 
@@ -37,10 +37,14 @@ class SceneFaces:
         self._body_of = body_of[first:]
         """Number of the body that each moving plane is of."""
         self._two_sided = np.ones(len(self._body_of), np.bool_)
+        self._along = np.zeros(len(self._body_of), np.int64)
+        """Side of each moving plane's rectangle, the first of its triangles having the sides 0 to 2."""
         for asset, mesh in scene.unit_meshes.items():
-            of_mesh = two_sided_planes(mesh, scene.face_numbers(asset))
+            numbers = scene.face_numbers(asset)
+            both, along = two_sided_planes(mesh, numbers), _sides_of(mesh, numbers)
             for body in scene.bodies_of(asset):
-                self._two_sided[self._body_of == body] = of_mesh
+                self._two_sided[self._body_of == body] = both
+                self._along[self._body_of == body] = along
         self._standing: tuple[int, ...] | None = None
         self._rows: tuple[Int64Array, Int64Array, Int64Array]
 
@@ -65,9 +69,10 @@ class SceneFaces:
             planes, sizes, normal = planes[kept], sizes[kept], normal[kept]
         faces = FaceRectangles.of(
             planes + scene.first_moving_plane,
-            normal,
             scene.corners(triangles) - scene.centre,
             sizes,
+            3 * (np.cumsum(sizes) - sizes) + self._along[planes],
+            normal,
             self._two_sided[planes],
         )
         _, counts = np.unique(self._body_of[planes], return_counts=True)
@@ -85,7 +90,16 @@ def _faces_of(scene: SionnaScene, planes: Int64Array, used: BoolArray) -> FaceRe
     kept = np.flatnonzero(sizes)
     # Scenery has faces of either sense, so their order of corners says nothing.
     both = np.ones(len(kept), np.bool_)
-    return FaceRectangles.of(planes[kept], table.normal[planes[kept]], corners, sizes[kept], both)
+    sizes = sizes[kept]
+    along = narrowest_sides(corners, sizes)
+    return FaceRectangles.of(planes[kept], corners, sizes, along, table.normal[planes[kept]], both)
+
+
+def _sides_of(mesh: Mesh, numbers: Int32Array) -> Int64Array:
+    """`narrowest_sides` of the planes of a mesh, by number, counted from the first triangle of each."""
+    order = np.argsort(numbers, kind="stable")
+    sizes = np.bincount(numbers)
+    return narrowest_sides(mesh.vertices[mesh.faces[order]], sizes) - 3 * (np.cumsum(sizes) - sizes)
 
 
 def two_sided_planes(mesh: Mesh, numbers: Int32Array) -> BoolArray:

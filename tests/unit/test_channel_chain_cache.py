@@ -1,0 +1,70 @@
+"""Chains of scenery in files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from caviar_services.channel.chain_cache import ChainCache, cache_key
+
+TABLES = (np.array([[1, -1, -1], [1, 5, 2]], np.int32), np.array([[1, 2], [2, 1], [2, 5]], np.int32))
+KEY = cache_key(b"geometry", b"place")
+
+
+def test_what_was_saved_is_loaded(tmp_path: Path) -> None:
+    cache = ChainCache(tmp_path / "chains")
+    assert cache.load(KEY, (3, 2)) is None
+    cache.save(KEY, TABLES)
+    loaded = ChainCache(tmp_path / "chains").load(KEY, (3, 2))
+    assert loaded is not None
+    assert all(np.array_equal(one, other) for one, other in zip(loaded, TABLES, strict=True))
+    assert [path.name for path in (tmp_path / "chains").iterdir()] == [KEY]
+    assert cache.notes == []
+
+
+def test_empty_tables_too(tmp_path: Path) -> None:
+    cache = ChainCache(tmp_path)
+    cache.save(KEY, (np.zeros((0, 3), np.int32), np.zeros((0, 2), np.int32)))
+    loaded = cache.load(KEY, (3, 2))
+    assert loaded is not None
+    assert [table.shape for table in loaded] == [(0, 3), (0, 2)]
+
+
+def test_damage_of_any_kind_is_noted_and_nothing_is_loaded(tmp_path: Path) -> None:
+    cache = ChainCache(tmp_path)
+    cache.save(KEY, TABLES)
+    path = tmp_path / KEY
+    whole = path.read_bytes()
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 1
+    for data in (b"", whole[:-1], bytes(flipped), b"\xc1" * 50):
+        path.write_bytes(data)
+        assert cache.load(KEY, (3, 2)) is None
+        assert "is damaged" in cache.notes.pop()
+    path.write_bytes(whole)
+    assert cache.load(KEY, (4, 2)) is None
+    assert "is damaged" in cache.notes.pop()
+    assert cache.load(KEY, (3, 2)) is not None
+
+
+def test_a_file_under_another_name_is_not_believed(tmp_path: Path) -> None:
+    cache = ChainCache(tmp_path)
+    cache.save(KEY, TABLES)
+    other = cache_key(b"geometry", b"another place")
+    (tmp_path / KEY).rename(tmp_path / other)
+    assert cache.load(other, (3, 2)) is None
+    assert "is damaged" in cache.notes.pop()
+
+
+def test_a_folder_that_cannot_be_written_is_noted_with_the_remedy(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    cache = ChainCache(tmp_path / "file" / "chains")
+    cache.save(KEY, TABLES)
+    assert "XDG_CACHE_HOME" in cache.notes.pop()
+    assert cache.load(KEY, (3, 2)) is None
+
+
+def test_keys_tell_parts_apart() -> None:
+    keys = {cache_key(*parts) for parts in ((b"ab", b"c"), (b"a", b"bc"), (b"abc",), (b"ab", b"c", b""))}
+    assert len(keys) == 4
