@@ -168,8 +168,9 @@ class FaceRectangles:
 def narrowest_sides(triangles: Float64Array, sizes: Int64Array) -> Int64Array:
     """Of each face, the side of its largest triangle that the smallest rectangle around it lies along.
 
-    It is three times the triangle's number plus that of the side. Of two triangles that are a rectangle it is
-    never the diagonal, whose rectangle would be twice as large. The parameters are those of `FaceRectangles.of`.
+    It is three times the number of the triangle plus that of the side. Of two triangles that are a
+    rectangle it is never the diagonal, whose rectangle would be twice as large. The parameters are those of
+    `FaceRectangles.of`.
     """
     begin = np.cumsum(sizes) - sizes
     own = np.repeat(np.arange(len(sizes)), sizes)
