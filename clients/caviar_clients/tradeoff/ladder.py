@@ -67,7 +67,7 @@ _ALL = {"refraction": True, "diffraction": True}
 def _traced(samples: int, depth: int, **more: Any) -> dict[str, Any]:
     """Settings of a ray-traced rung; what is not named is off."""
     off = {"refraction": False, "diffraction": False, "scattering": False}
-    return {**off, "samples": samples, "max_depth": depth, **more}
+    return {**off, "candidates": "launched", "samples": samples, "max_depth": depth, **more}
 
 
 def chosen_diffuse(samples: int) -> dict[str, Any]:

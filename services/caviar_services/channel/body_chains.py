@@ -13,18 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array
+from caviar_services.channel.beam_ends import SceneryViews, ends_at, ends_by_bodies, ends_by_scenery
 from caviar_services.channel.face_rectangles import FaceRectangles
-from caviar_services.channel.image_beams import (
-    Beams,
-    SceneryViews,
-    Targets,
-    ends_at,
-    ends_by_bodies,
-    ends_by_scenery,
-    first_beams,
-    next_beams,
-    scenery_beams,
-)
+from caviar_services.channel.image_beams import Beams, Targets, first_beams, next_beams, scenery_beams
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,9 +14,9 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_protocol.topics import Interaction
+from caviar_services.channel.beam_ends import SceneryViews
 from caviar_services.channel.body_chains import chain_pairs
 from caviar_services.channel.face_rectangles import FaceRectangles
-from caviar_services.channel.image_beams import SceneryViews
 from caviar_services.channel.image_paths import ImagePaths, image_paths, unhidden
 from caviar_services.channel.plane_visibility import seen_planes
 from caviar_services.channel.reflection_fields import reflection_fields

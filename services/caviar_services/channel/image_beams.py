@@ -12,7 +12,7 @@ Everything here counts in float32, with a slack that is more than its rounding.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
-from caviar_services.channel.face_rectangles import FaceRectangles, ranges
+from caviar_services.channel.face_rectangles import FaceRectangles
+from caviar_services.channel.lane_pairs import filtered, gathered, numbers, opaque, pairs
 from caviar_services.channel.sionna_candidates import positions
 from caviar_services.columns import aligned_columns, aligned_indices, several
 
@@ -32,12 +33,6 @@ _RELATIVE_SLACK = 2e-6
 
 _WIDE = 0.01
 """Cosine of the half angle of the widest cone that is held against anything."""
-
-_BLOCK = 16
-"""Beams of one group that are looked at together: groups are filled up to a multiple of it."""
-
-_LANES = 1 << 23
-"""Pairs that are looked at together at most."""
 
 
 class Targets:
@@ -93,14 +88,14 @@ class Targets:
 
     def corners(self, face: Any) -> list[Any]:
         """Those of rectangles, in turn."""
-        centre, u, v = (_gathered(column, face) for column in (self.centre, self.u, self.v))
+        centre, u, v = (gathered(column, face) for column in (self.centre, self.u, self.v))
         return [centre - u - v, centre + u - v, centre + u + v, centre - u + v]
 
     def height(self, point: Any, face: Any) -> Any:
         """How far points are in front of planes."""
         import drjit as dr
 
-        return dr.dot(point, _gathered(self.normal, face)) - _gathered(self.offset, face)
+        return dr.dot(point, gathered(self.normal, face)) - gathered(self.offset, face)
 
 
 def _spheres(faces: FaceRectangles, first: int, sizes: Int64Array) -> tuple[Float64Array, Float64Array]:
@@ -115,20 +110,6 @@ def _spheres(faces: FaceRectangles, first: int, sizes: Int64Array) -> tuple[Floa
     centre = (low + high) / 2
     away = np.sqrt(((corners - np.repeat(centre, sizes, axis=0)[:, None]) ** 2).sum(-1)).max(1)
     return centre, np.maximum.reduceat(away, begin)
-
-
-@dataclass(frozen=True, eq=False)
-class SceneryViews:
-    """Faces of scenery that may be the last ones before receivers."""
-
-    faces: Int64Array
-    """In ascending order, Shape ``[U]``."""
-    sights: Int64Array
-    """Which of these see one another, as places among them, in both orders and sorted, Shape ``[M, 2]``."""
-    receiver: Int64Array
-    """Of W pairs of a receiver and a face that it may see, Shape ``[W]``."""
-    place: Int64Array
-    """Places of these faces, Shape ``[W]``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,12 +145,12 @@ class Beams:
         """Whether spheres reach into the cones of beams, and before their last planes."""
         import drjit as dr
 
-        axis, cosine = _gathered(self.axis, beam), _gathered(self.cosine, beam)
-        towards = centre - _gathered(self.image, beam)
+        axis, cosine = gathered(self.axis, beam), gathered(self.cosine, beam)
+        towards = centre - gathered(self.image, beam)
         along = dr.dot(axis, towards)
         across = dr.sqrt(dr.maximum(dr.squared_norm(towards) - along * along, 0.0))
         sine = dr.sqrt(dr.maximum(1.0 - cosine * cosine, 0.0))
-        before = dr.dot(_gathered(self.lit, beam), centre) - _gathered(self.lit_from, beam)
+        before = dr.dot(gathered(self.lit, beam), centre) - gathered(self.lit_from, beam)
         reach = radius + 2.0 * slack
         return (across * cosine - along * sine <= reach) & (before > -reach)
 
@@ -178,10 +159,10 @@ class Beams:
         import drjit as dr
         import mitsuba as mi
 
-        towards = centre - _gathered(self.image, beam)
+        towards = centre - gathered(self.image, beam)
         lit = mi.Bool(True)
         for side in self.sides:
-            lit &= dr.dot(_gathered(side, beam), towards) > -reach
+            lit &= dr.dot(gathered(side, beam), towards) > -reach
         return lit
 
 
@@ -192,12 +173,7 @@ def first_beams(targets: Targets, source: Float64Array, scenery: Int64Array) -> 
     shown = faces.height(np.broadcast_to(source, (len(bodies), 3)), bodies) > 0
     first = np.concatenate([scenery, bodies[shown | faces.two_sided[bodies]]])
     image = positions(np.broadcast_to(source, (len(several(len(first))), 3)))
-    return _reflected(targets, first[:, None], image, None)
-
-
-def receiver_beams(targets: Targets, receivers: Float64Array, faces: Int64Array) -> Beams:
-    """What each of some receivers [m], Shape ``[W, 3]``, sees in a face of scenery, Shape ``[W]``."""
-    return _reflected(targets, faces[:, None], positions(receivers[several(len(faces))]), None)
+    return reflected_beams(targets, first[:, None], image, None)
 
 
 def next_beams(targets: Targets, beams: Beams, scenery: Int64Array, known: Int64Array) -> Beams:
@@ -213,16 +189,16 @@ def next_beams(targets: Targets, beams: Beams, scenery: Int64Array, known: Int64
     """
 
     beam, face = by_scenery(targets, beams, scenery)
-    of_body = filtered(partial(_lights_corner, targets, beams), lit_bodies(targets, beams))
+    of_body = filtered(partial(lights_corner, targets, beams), lit_bodies(targets, beams))
     chain = np.concatenate(
         [
             known,
-            np.concatenate([beams.chain[_numbers(beam)], _numbers(face)[:, None]], axis=1),
-            np.concatenate([beams.chain[_numbers(of_body[0])], _numbers(of_body[1])[:, None]], axis=1),
+            np.concatenate([beams.chain[numbers(beam)], numbers(face)[:, None]], axis=1),
+            np.concatenate([beams.chain[numbers(of_body[0])], numbers(of_body[1])[:, None]], axis=1),
         ]
     )
     before = _rows_of(beams.chain[: beams.first_by_body], known[:, :-1])
-    parent = np.concatenate([before, _numbers(beam), _numbers(of_body[0])])
+    parent = np.concatenate([before, numbers(beam), numbers(of_body[0])])
     return _longer(targets, beams, parent, chain)
 
 
@@ -236,7 +212,7 @@ def _longer(targets: Targets, beams: Beams, parent: Int64Array, chain: Int64Arra
     import mitsuba as mi
 
     index = mi.UInt(aligned_indices(parent[several(len(parent))]))
-    return _reflected(targets, chain, _gathered(beams.image, index), _gathered(beams.last, index))
+    return reflected_beams(targets, chain, gathered(beams.image, index), gathered(beams.last, index))
 
 
 def by_scenery(targets: Targets, beams: Beams, scenery: Int64Array) -> tuple[Any, Any]:
@@ -246,21 +222,21 @@ def by_scenery(targets: Targets, beams: Beams, scenery: Int64Array) -> tuple[Any
 
     faces = mi.UInt(aligned_indices(scenery[several(len(scenery))]))
     begin = beams.first_by_body
-    first = _opaque(begin)
+    first = opaque(begin)
 
     def near(beam: Any, place: Any) -> Any:
-        beam, face = beam + first, _gathered(faces, place)
-        centre, radius = _gathered(targets.centre, face), _gathered(targets.radius, face)
+        beam, face = beam + first, gathered(faces, place)
+        centre, radius = gathered(targets.centre, face), gathered(targets.radius, face)
         lit = beams.light_cone(beam, centre, radius, targets.slack)
-        return lit & (face != _gathered(beams.last, beam))
+        return lit & (face != gathered(beams.last, beam))
 
     def lights(beam: Any, place: Any) -> Any:
-        return _lights_corner(targets, beams, beam + first, _gathered(faces, place))
+        return lights_corner(targets, beams, beam + first, gathered(faces, place))
 
     beam, place = filtered(lights, pairs(len(beams) - begin, len(scenery), near))
     if not dr.width(beam):
         return beam, place
-    beam, face = beam + first, _gathered(faces, place)
+    beam, face = beam + first, gathered(faces, place)
     dr.eval(beam, face)
     return beam, face
 
@@ -273,35 +249,35 @@ def lit_bodies(targets: Targets, beams: Beams) -> tuple[Any, Any]:
     beam, body = near_bodies(targets, beams)
 
     def face_of(pair: Any, number: Any) -> Any:
-        return _gathered(targets.body_begin, _gathered(body, pair)) + number
+        return gathered(targets.body_begin, gathered(body, pair)) + number
 
     def shows(pair: Any, number: Any) -> Any:
-        there = number < _gathered(targets.body_size, _gathered(body, pair))
-        of, face = _gathered(beam, pair), dr.select(there, face_of(pair, number), 0)
-        height = targets.height(_gathered(beams.image, of), face)
-        there &= (height > -slack) | _gathered(targets.two_sided, face)
-        there &= face != _gathered(beams.last, of)
-        centre, radius = _gathered(targets.centre, face), _gathered(targets.radius, face)
+        there = number < gathered(targets.body_size, gathered(body, pair))
+        of, face = gathered(beam, pair), dr.select(there, face_of(pair, number), 0)
+        height = targets.height(gathered(beams.image, of), face)
+        there &= (height > -slack) | gathered(targets.two_sided, face)
+        there &= face != gathered(beams.last, of)
+        centre, radius = gathered(targets.centre, face), gathered(targets.radius, face)
         return there & beams.light_cone(of, centre, radius, slack)
 
     def shows_within(pair: Any, number: Any) -> Any:
         face = face_of(pair, number)
-        reach = _gathered(targets.radius, face) + slack
-        return beams.light(_gathered(beam, pair), _gathered(targets.centre, face), reach)
+        reach = gathered(targets.radius, face) + slack
+        return beams.light(gathered(beam, pair), gathered(targets.centre, face), reach)
 
     pair, number = filtered(shows_within, pairs(dr.width(beam), targets.most, shows))
-    beam, face = _gathered(beam, pair), face_of(pair, number)
+    beam, face = gathered(beam, pair), face_of(pair, number)
     dr.eval(beam, face)
     return beam, face
 
 
-def _reflected(targets: Targets, chain: Int64Array, image: Any, before: Any | None) -> Beams:
+def reflected_beams(targets: Targets, chain: Int64Array, image: Any, before: Any | None) -> Beams:
     """Beams by way of the last faces of chains, from images before these and by way of faces ``before``."""
     import drjit as dr
     import mitsuba as mi
 
     last = mi.UInt(aligned_indices(chain[several(len(chain)), -1]))
-    normal, offset = _gathered(targets.normal, last), _gathered(targets.offset, last)
+    normal, offset = gathered(targets.normal, last), gathered(targets.offset, last)
 
     def mirrored(point: Any) -> Any:
         return point - 2.0 * (dr.dot(point, normal) - offset) * normal
@@ -329,198 +305,24 @@ def near_bodies(targets: Targets, beams: Beams) -> tuple[Any, Any]:
     """Beams and bodies whose spheres they light, as `mitsuba.UInt`."""
 
     def near(beam: Any, body: Any) -> Any:
-        centre, radius = _gathered(targets.body_centre, body), _gathered(targets.body_radius, body)
+        centre, radius = gathered(targets.body_centre, body), gathered(targets.body_radius, body)
         return beams.light_cone(beam, centre, radius, targets.slack)
 
     def lit(beam: Any, body: Any) -> Any:
-        centre, radius = _gathered(targets.body_centre, body), _gathered(targets.body_radius, body)
+        centre, radius = gathered(targets.body_centre, body), gathered(targets.body_radius, body)
         return beams.light(beam, centre, radius + targets.slack)
 
     return filtered(lit, pairs(len(beams), targets.bodies, near))
 
 
-def ends_at(targets: Targets, beams: Beams, receivers: Float64Array) -> tuple[Int64Array, Int64Array]:
-    """Beam and receiver of each pair where the one lights the other; receivers [m] are of Shape
-    ``[R, 3]``."""
-    place = positions(receivers[several(len(receivers))])
-
-    def near(beam: Any, receiver: Any) -> Any:
-        return beams.light_cone(beam, _gathered(place, receiver), 0.0, targets.slack)
-
-    def lit(beam: Any, receiver: Any) -> Any:
-        return beams.light(beam, _gathered(place, receiver), targets.slack)
-
-    beam, receiver = filtered(lit, pairs(len(beams), len(receivers), near))
-    return _numbers(beam), _numbers(receiver)
-
-
-def ends_by_bodies(
-    targets: Targets, beams: Beams, receivers: Float64Array
-) -> tuple[Int64Array, Int64Array, Int64Array]:
-    """Beam, face of a body and receiver, where the beam may light the receiver by way of the face; receivers
-    [m] are of Shape ``[R, 3]``."""
-    import drjit as dr
-
-    beam, face = lit_bodies(targets, beams)
-    place = positions(receivers[several(len(receivers))])
-
-    def crosses(way: Any, receiver: Any) -> Any:
-        image = _gathered(beams.image, _gathered(beam, way))
-        return _crosses(targets, image, _gathered(face, way), _gathered(place, receiver))
-
-    def lit(way: Any, receiver: Any) -> Any:
-        last, point = _gathered(face, way), _gathered(place, receiver)
-        image = point - 2.0 * targets.height(point, last) * _gathered(targets.normal, last)
-        return beams.light(_gathered(beam, way), image, targets.slack)
-
-    way, receiver = filtered(lit, pairs(dr.width(beam), len(receivers), crosses))
-    return _numbers(_gathered(beam, way)), _numbers(_gathered(face, way)), _numbers(receiver)
-
-
-def ends_by_scenery(
-    targets: Targets, beams: Beams, receivers: Float64Array, scenery: SceneryViews
-) -> tuple[Int64Array, Int64Array, Int64Array]:
-    """Beam by way of a body, face of scenery and receiver, where the beam may light the receiver by way of
-    the face; receivers [m] are of Shape ``[R, 3]``.
-
-    What a receiver sees in a face is a beam too: only bodies and faces that it meets can come before.
-    """
-    import mitsuba as mi
-
-    none = np.zeros(0, np.int64)
-    first = beams.first_by_body
-    if first == len(beams) or not len(scenery.receiver):
-        return none, none, none
-    views = receiver_beams(targets, receivers[scenery.receiver], scenery.faces[scenery.place])
-    view, body = (_numbers(part) for part in near_bodies(targets, views))
-    seen, other = _shown(targets, views, scenery)
-    view = np.concatenate([view, seen])
-    group = np.concatenate([body, targets.bodies + other])
-    last = beams.chain[first:, -1]
-    of_body = last >= targets.first_body
-    place_of = np.searchsorted(scenery.faces, last)
-    group_of = np.where(of_body, targets.body_of(last), targets.bodies + place_of)
-    order = np.argsort(group_of, kind="stable")
-    sizes = np.bincount(group_of, minlength=targets.bodies + len(scenery.faces))
-    begin = np.cumsum(sizes) - sizes
-    own, block = ranges(np.zeros(len(group), np.int64), -(-sizes[group] // _BLOCK))
-    start = begin[group[own]] + block * _BLOCK
-    columns = [
-        mi.UInt(aligned_indices(column[several(len(own))]))
-        for column in (view[own], start, (begin + sizes)[group[own]])
-    ]
-    by_group = mi.UInt(aligned_indices(first + order[several(len(order))]))
-    place = positions(receivers[scenery.receiver[several(len(views))]])
-
-    def beam_of(block: Any, number: Any) -> tuple[Any, Any]:
-        there = _gathered(columns[1], block) + number
-        within = there < _gathered(columns[2], block)
-        return _gathered(by_group, _either(within, there)), within
-
-    def near(block: Any, number: Any) -> Any:
-        beam, within = beam_of(block, number)
-        seen = _gathered(columns[0], block)
-        within &= _gathered(views.last, seen) != _gathered(beams.last, beam)
-        return within & beams.light_cone(beam, _gathered(views.image, seen), 0.0, targets.slack)
-
-    def lit(block: Any, number: Any) -> Any:
-        beam, _ = beam_of(block, number)
-        seen = _gathered(columns[0], block)
-        image, point = _gathered(beams.image, beam), _gathered(place, seen)
-        crosses = _crosses(targets, image, _gathered(views.last, seen), point)
-        return crosses & beams.light(beam, _gathered(views.image, seen), targets.slack)
-
-    found = filtered(lit, pairs(len(own), _BLOCK, near))
-    block, number = (_numbers(part) for part in found)
-    seen = view[own[block]]
-    beam = first + order[start[block] + number]
-    return beam, scenery.faces[scenery.place[seen]], scenery.receiver[seen]
-
-
-def _shown(targets: Targets, views: Beams, scenery: SceneryViews) -> tuple[Int64Array, Int64Array]:
-    """Views, and places of the other faces of scenery that they show."""
-    import drjit as dr
-    import mitsuba as mi
-
-    sizes = np.bincount(scenery.sights[:, 0], minlength=len(scenery.faces))
-    own, rows = ranges((np.cumsum(sizes) - sizes)[scenery.place], sizes[scenery.place])
-    other = scenery.sights[rows, 1]
-    lanes = several(len(own))
-    if not len(lanes):
-        return own, other
-    view, face = (mi.UInt(aligned_indices(column[lanes])) for column in (own, scenery.faces[other]))
-
-    def near(pair: Any) -> Any:
-        shown = _gathered(face, pair)
-        centre, radius = _gathered(targets.centre, shown), _gathered(targets.radius, shown)
-        return views.light_cone(_gathered(view, pair), centre, radius, targets.slack)
-
-    def lights(pair: Any) -> Any:
-        return _lights_corner(targets, views, _gathered(view, pair), _gathered(face, pair))
-
-    kept = dr.compress(near(dr.arange(mi.UInt, len(lanes))))
-    if dr.width(kept):
-        kept = _gathered(kept, dr.compress(lights(kept)))
-    pair = _numbers(kept)
-    pair = pair[pair < len(own)]
-    return own[pair], other[pair]
-
-
-def _crosses(targets: Targets, image: Any, face: Any, point: Any) -> Any:
-    """Whether points see images in faces: on the side that reflects, and within the rectangle."""
-    import drjit as dr
-
-    there, here = targets.height(image, face), targets.height(point, face)
-    crosses = (there * here > 0.0) & ((here > 0.0) | _gathered(targets.two_sided, face))
-    beside = dr.fma(image - point, here / (there + here), point) - _gathered(targets.centre, face)
-    for side in (_gathered(targets.u, face), _gathered(targets.v, face)):
-        square = dr.squared_norm(side)
-        crosses &= dr.abs(dr.dot(beside, side)) <= square + targets.slack * dr.sqrt(square)
-    return crosses
-
-
-def pairs(first: int, second: int, test: Callable[[Any, Any], Any]) -> tuple[Any, Any]:
-    """Which pairs of numbers below ``first`` and below ``second`` pass a test, as `mitsuba.UInt`."""
-    import drjit as dr
-    import mitsuba as mi
-
-    parts = []
-    at_once = max(1, _LANES // max(second, 1))
-    many = dr.opaque(mi.UInt, second)
-    for begin in range(0, first if second else 0, at_once):
-        count = min(at_once, first - begin)
-        lane = dr.arange(mi.UInt, count * second)
-        start = dr.opaque(mi.UInt, begin)
-        kept: Any = dr.compress(test(start + lane // many, lane % many))
-        if dr.width(kept):
-            parts.append((start + kept // many, kept % many))
-    if not parts:
-        return mi.UInt(), mi.UInt()
-    if len(parts) == 1:
-        return parts[0]
-    return dr.concat([one for one, _ in parts]), dr.concat([other for _, other in parts])
-
-
-def filtered(test: Callable[[Any, Any], Any], numbers: tuple[Any, Any]) -> tuple[Any, Any]:
-    """Those of pairs of numbers that pass a test."""
-    import drjit as dr
-
-    if not dr.width(numbers[0]):
-        return numbers
-    kept = dr.compress(test(*numbers))
-    found = _gathered(numbers[0], kept), _gathered(numbers[1], kept)
-    dr.eval(found)
-    return found
-
-
-def _lights_corner(targets: Targets, beams: Beams, beam: Any, face: Any) -> Any:
+def lights_corner(targets: Targets, beams: Beams, beam: Any, face: Any) -> Any:
     """Whether no side of beams has all corners of rectangles beyond it."""
     import drjit as dr
 
-    corners, image = targets.corners(face), _gathered(beams.image, beam)
-    lit = _some(corners, _gathered(beams.lit, beam), _gathered(beams.lit_from, beam) + targets.slack)
+    corners, image = targets.corners(face), gathered(beams.image, beam)
+    lit = _some(corners, gathered(beams.lit, beam), gathered(beams.lit_from, beam) + targets.slack)
     for side in beams.sides:
-        normal = _gathered(side, beam)
+        normal = gathered(side, beam)
         lit &= _some(corners, normal, dr.dot(normal, image) - targets.slack)
     return lit
 
@@ -557,32 +359,6 @@ def _cone(image: Any, corners: list[Any]) -> tuple[Any, Any]:
     cosine = dr.minimum(dr.minimum(a, b), dr.minimum(c, d))
     # A cone that is wider than a half-space does not hold all that its directions span.
     return axis, dr.select(cosine > _WIDE, cosine, -1.0)
-
-
-def _gathered(column: Any, index: Any) -> Any:
-    import drjit as dr
-
-    return dr.gather(type(column), column, index)
-
-
-def _opaque(number: int) -> Any:
-    """A number that a kernel reads: as a constant of the kernel, each would be another kernel."""
-    import drjit as dr
-    import mitsuba as mi
-
-    return dr.opaque(mi.UInt, number)
-
-
-def _either(used: Any, index: Any) -> Any:
-    """An index where it is used, else 0."""
-    import drjit as dr
-
-    return dr.select(used, index, 0)
-
-
-def _numbers(indices: Any) -> Int64Array:
-    found: Int64Array = indices.numpy().astype(np.int64)
-    return found
 
 
 def _rows_of(rows: Int64Array, wanted: Int64Array) -> Int64Array:
