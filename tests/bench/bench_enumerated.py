@@ -9,9 +9,9 @@ seed, so each launch has some more than the one before. Lengths are those of ima
 own delays are off by 10⁻⁵ m. The two ways take turns frame by frame; with rays a frame takes a minute.
 
 Sionna RT takes planes for one whose rounded normals and offsets agree, and so lacks paths by way of one of
-two panels of a roof that hardly differ. ``missing_db`` is the strongest path that the reference has and a channel
-has not, relative to all paths of its receiver; ``extra`` counts paths that the reference has not, and the
-figures that begin with ``same`` are of receivers without one.
+two panels of a roof that hardly differ. ``missing_db`` is the strongest path that the reference has and a
+channel has not, relative to all paths of its receiver; ``extra`` counts paths that the reference has not,
+and the figures that begin with ``same`` are of receivers without one.
 """
 
 # ruff: noqa: T201 - a command that prints what it measured
