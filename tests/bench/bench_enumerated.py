@@ -6,7 +6,8 @@
 The reference is Sionna RT's own path solver with ``--rays`` rays from the transmitter, ``--launches`` times,
 and the paths that any of these finds: one launch misses some. Its rays point the same way whatever its
 seed, so each launch has some more than the one before. Lengths are those of images in float64, since Sionna's
-own delays are off by 10⁻⁵ m. The two ways take turns frame by frame; with rays a frame takes a minute.
+own delays are off by 10⁻⁵ m. The two ways take turns frame by frame, and of each frame the shortest time
+counts; with rays a frame takes a minute.
 
 Sionna RT takes planes for one whose rounded normals and offsets agree, and so lacks paths by way of one of
 two panels of a roof that hardly differ. ``missing_db`` is the strongest path that the reference has and a
@@ -58,7 +59,6 @@ class Case:
     preparation: Preparation
     settings: dict[str, Any]
     scenes: tuple[Scene, ...]
-    first_timed: int = 2
 
 
 def street_canyon(frames: int) -> Case:
@@ -313,11 +313,12 @@ def main() -> None:
             for model in models.values():
                 model(number, scene)
     for name, model in models.items():
-        timed = model.ms[case.first_timed :]
+        least = np.array(model.ms).reshape(args.repeat, -1).min(0)
         figures[name] = {
             "prepared_s": model.prepared_s,
-            "p50_ms": float(np.median(timed)),
-            "p95_ms": float(np.quantile(timed, 0.95)),
+            "least_ms": float(np.median(least)),
+            "p50_ms": float(np.median(model.ms)),
+            "p95_ms": float(np.quantile(model.ms, 0.95)),
         }
     if args.rays:
         sionna = Sionna(models["enumerated"], args.rays, args.launches)
@@ -333,7 +334,7 @@ def main() -> None:
             figures[name] |= described(rows[name])
     for name, of in figures.items():
         print(f"{name}: " + ", ".join(f"{key} {value:.4g}" for key, value in of.items()))
-    ratio = figures["enumerated"]["p50_ms"] / figures["launched"]["p50_ms"]
+    ratio = figures["enumerated"]["least_ms"] / figures["launched"]["least_ms"]
     print(f"time of enumerated candidates to that of {LAUNCHED} launched rays: {ratio:.2f}")
     if args.json:
         args.json.write_text(json.dumps(figures, indent=1))
