@@ -230,3 +230,11 @@ def test_deeper_paths_than_are_enumerated_are_launched(tmp_path: Path) -> None:
 def test_what_launches_its_own_cannot_enumerate(more: dict[str, Any]) -> None:
     with pytest.raises(msgspec.ValidationError, match='candidates = "enumerated" goes with neither'):
         msgspec.convert({"candidates": "enumerated", **more}, SionnaSettings)
+
+
+def test_spherical_waves_keep_what_only_a_part_of_the_elements_has(tmp_path: Path) -> None:
+    """Launched paths of the arrays' corners stand beside the enumerated ones of their centres."""
+    launched, _ = street(tmp_path / "one", rung="spherical", candidates="launched", samples=100_000)
+    enumerated, _ = street(tmp_path / "two", rung="spherical", samples_per_frame=100_000)
+    at = traffic(1)
+    assert set(keys(measure(launched, at))) <= set(keys(measure(enumerated, at)))

@@ -334,8 +334,13 @@ class SionnaChannel(PathModel[SionnaSettings]):
         """Know the scenery from where transmitters stand; what was found, and what could not be kept."""
         s = self.settings
         depth = min(launched.max_depth, s.enumerated_depth)
+        # Paths that only other elements than the arrays' centres have are launched too.
         self._launches = (
-            launched.refraction or launched.diffraction or launched.scattering or launched.max_depth > depth
+            launched.refraction
+            or launched.diffraction
+            or launched.scattering
+            or launched.max_depth > depth
+            or self.rung == "spherical"
         )
         cache = ChainCache(default_folder() / "chains") if s.cache_chains else None
         launch = SceneryLaunch(samples=self._samples, launches=s.scenery_launches)
