@@ -16,7 +16,7 @@ FRAMES = 12
 FAULT_FRAME = 4
 CHANGES = [
     ("frames = 100\n", f"frames = {FRAMES}\ncheckpoint_frames = 3\n"),
-    ("samples = 100_000", "samples = 4_000"),
+    ("max_depth = 3", "samples = 4_000\nmax_depth = 3"),
     ("budget_ms = 300", "budget_ms = 3000"),
 ]
 

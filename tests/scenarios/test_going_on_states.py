@@ -17,7 +17,7 @@ FRAMES = 40
 CHANGES = [
     ("frames = 100\n", f"frames = {FRAMES}\ncheckpoint_frames = 7\n"),
     ('"lidar", "action"', '"action"'),
-    ("samples = 100_000", "samples = 4_000\nfollow = 4"),
+    ("max_depth = 3", "samples = 4_000\nfollow = 4\nmax_depth = 3"),
     ("bus = 8 }", "bus = 8, uav = 2 }"),
     ("budget_ms = 300", "budget_ms = 3000"),
     ('use = "los-beam"\n', 'use = "los-beam"\nusers = ["vehicle.*"]\n'),
