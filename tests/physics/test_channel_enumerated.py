@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,14 +38,16 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monk
     return folder / "caviar" / "chains"
 
 
-def street(folder: Path, standing: bool = True, **settings: Any) -> tuple[ChannelModel[Any], tuple[str, ...]]:
+def street(
+    folder: Path, standing: bool = True, plates: Sequence[Plate] = PLATES, **settings: Any
+) -> tuple[ChannelModel[Any], tuple[str, ...]]:
     """A channel between two walls, and what it said when it was prepared."""
     own = {"samples": 20_000, "bodies": 4, "candidates": "enumerated", "max_depth": DEPTH, **settings}
     station = DeviceSpec(name="bs", kind="antenna", role="tx", position_m=STATION)
     run = RunInfo(name="channel", seed=1, carriers=carriers(28e9), devices=(station,) if standing else ())
     model = SionnaChannel(msgspec.convert(own, SionnaSettings), run)
     folder.mkdir(exist_ok=True)
-    prepared = model.prepare(Preparation(demand={}, assets=write_scenery(folder, PLATES)))
+    prepared = model.prepare(Preparation(demand={}, assets=write_scenery(folder, plates)))
     return model, prepared.notes
 
 
@@ -63,10 +66,10 @@ def traffic(seed: int) -> Scene:
     return scene(devices, things)
 
 
-def rectangles(at: Scene) -> list[Array]:
+def rectangles(at: Scene, plates: Sequence[Plate] = PLATES) -> list[Array]:
     """Corner and both sides of every face, Shape ``[3, 3]``: of the plates, then of the boxes."""
     found = []
-    for plate in PLATES:
+    for plate in plates:
         a, b, _, d = np.array(plate.corners, float)
         found.append(np.array([a, b - a, d - a]))
     for position, (w, _, _, z), size in zip(at.position, at.orientation, at.dimensions, strict=True):
@@ -154,6 +157,26 @@ def test_there_are_the_paths_of_all_sequences_of_faces(tmp_path: Path) -> None:
             assert lengths(channel, rx) == pytest.approx(wanted, abs=1e-7)
         deepest += int((channel.interactions != 0).all(1).sum())
     assert deepest > 10
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_there_are_as_many_where_no_chain_of_scenery_is_as_long_as_others(tmp_path: Path, count: int) -> None:
+    plates = PLATES[:count]
+    model, _ = street(tmp_path, plates=plates)
+    at = traffic(0)
+    channel, faces = measure(model, at), rectangles(at, plates)
+    for rx, device in enumerate(at.devices[1:]):
+        wanted = paths_by_images(np.array(STATION), np.array(device.position), faces)
+        assert len(wanted) >= 2
+        assert lengths(channel, rx) == pytest.approx(wanted, abs=1e-7)
+
+
+def test_a_plate_that_nobody_sees_leaves_the_line_of_sight(tmp_path: Path) -> None:
+    """No face of scenery reflects, and no body is there: no chain at all."""
+    far = Plate("far", [(900, 900, -90), (901, 900, -90), (901, 901, -90), (900, 901, -90)])
+    model, _ = street(tmp_path, plates=[far])
+    channel = measure(model, scene([antenna("bs", "tx", STATION), antenna("rx", "rx", (0.0, 0.0, 2.0))], []))
+    assert len(channel.tau) == 1
 
 
 def test_fields_are_those_of_launched_paths(tmp_path: Path) -> None:

@@ -74,15 +74,17 @@ def chain_pairs(
     length = (scenery >= 0).sum(1)
 
     def add(beams: Beams) -> None:
-        beam, receiver = ends_at(targets, beams, receivers)
-        found.append((beams.chain[beam], receiver))
+        if len(beams):
+            beam, receiver = ends_at(targets, beams, receivers)
+            found.append((beams.chain[beam], receiver))
 
     beams = first_beams(targets, transmitter, scenery[length == 1, 0])
     add(beams)
     for n in range(2, depth):
-        beams = next_beams(targets, beams, views.faces, scenery[length == n, :n])
-        add(beams)
-    if depth > 1:
+        if len(beams):
+            beams = next_beams(targets, beams, views.faces, scenery[length == n, :n])
+            add(beams)
+    if depth > 1 and len(beams):
         # The last reflection needs no beams of its own: its faces are held against the receivers at once.
         add(scenery_beams(targets, beams, scenery[length == depth]))
         for beam, face, receiver in (

@@ -276,6 +276,8 @@ def reflected_beams(targets: Targets, chain: Int64Array, image: Any, before: Any
     import drjit as dr
     import mitsuba as mi
 
+    if not len(chain):  # kernels of no lanes do not exist
+        return Beams(chain, np.zeros(0, np.bool_), None, (), None, None, None, None, None)
     last = mi.UInt(aligned_indices(chain[several(len(chain)), -1]))
     normal, offset = gathered(targets.normal, last), gathered(targets.offset, last)
 
