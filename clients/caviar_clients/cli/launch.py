@@ -78,8 +78,8 @@ class Launcher:
     """Whether the broker told how the run ended."""
     _frames: int = 0
     """Frames that the run had, once it is over."""
-    _stopping: bool = False
-    """Whether the user wants the run to end."""
+    _stopping: str = ""
+    """Why the run is to end by the user's wish; "" where it is not."""
     _finished: bool = False
     """Whether the broker's output has ended."""
     _disk: str = ""
@@ -129,7 +129,7 @@ class Launcher:
 
     def stop(self, reason: str) -> None:
         """Ask for an orderly end."""
-        self._stopping = True
+        self._stopping = reason
         self._order({"stop": reason})
 
     def log_of(self, service: str) -> Path | None:
@@ -178,6 +178,8 @@ class Launcher:
         if self._broker.stdin is None or self._broker.stdout is None:
             raise RunError("the broker has no standard input or output")
         os.set_blocking(self._broker.stdin.fileno(), False)
+        if self._stopping:  # the order came before there was a broker to take it
+            self._order({"stop": self._stopping})
         self._selector.register(self._broker.stdout, selectors.EVENT_READ)
         self._listen_until = time.monotonic() + LISTEN_S
 
