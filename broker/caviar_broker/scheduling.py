@@ -11,13 +11,13 @@ NICE = -10
 
 
 def prefer() -> str:
-    """Have this process run before the services where the system permits it; how it is scheduled now.
+    """Have this thread run before the services where the system permits it; how it is scheduled now.
 
     A deadline is decided on time only by a process that gets a core then. The real-time class needs
     ``CAP_SYS_NICE`` or ``ulimit -r`` of 1, a better niceness ``CAP_SYS_NICE`` or ``ulimit -e`` of 30. Without
     the right to either the broker keeps its place, and a busy machine shows in the lateness that a run
-    reports. Threads that are started later share it, processes do not. The kernel leaves a twentieth
-    of each second to others, whatever a real-time task does.
+    reports. It is the thread that calls which gets it: those that it starts later share its niceness, but not
+    the real-time class. The kernel leaves a twentieth of each second to others, whatever such a task does.
     """
     try:
         policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
