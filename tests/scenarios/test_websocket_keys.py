@@ -83,7 +83,9 @@ def test_other_tokens_are_refused_and_named_and_a_revoked_one_ends_the_part_that
         events = next(run.out.glob("*/events.jsonl")).read_text()
         assert "a WebSocket from 127.0.0.1 was refused: there is no token in the request" in events
         assert "the token is of agent 'stranger', not of agent 'agent'" in events
-        assert "not authorized any more: there is no token of a service 'agent'" in events
+        # Broker and gateway both look: where the gateway closes the socket first, the agent is away.
+        ends = ("not authorized any more: there is no token of a service 'agent'", "'agent' is away")
+        assert any(words in events for words in ends)
         assert token not in events
 
 
