@@ -67,6 +67,7 @@ def test_frames_stand_at_the_instants_of_the_scenario(smoke: Finished, tmp_path:
     assert all(bytes(places[t]) == bytes(own[t]) for t in common)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.channel
 @pytest.mark.sumo
 def test_street_canyon_has_the_digest_of_the_distributed_run(tmp_path: Path) -> None:

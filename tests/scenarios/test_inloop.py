@@ -55,6 +55,7 @@ def positions(finished: Finished) -> np.ndarray:
     return np.array([s.position[0] for s in recorded(finished, "scene") if isinstance(s, Scene)])
 
 
+@pytest.mark.exhaustive
 def test_where_the_agent_flies_decides_about_the_line_of_sight(tmp_path: Path) -> None:
     """Equal at frame 0, before any command acts; then each goes where its agent sends it."""
     near = flight(tmp_path / "near", IN_SIGHT, "--frames", "24")
