@@ -105,7 +105,7 @@ class JournalWriter:
                 self._compact(snapshot)
         except RunError as error:
             self.error = error
-        else:
+        if self.error is None:
             self.confirmed = entries[-1].number
 
     def close(self) -> bool:
@@ -139,7 +139,8 @@ class JournalWriter:
                 if self._dirty_since is None:
                     self._dirty_since = now
                 self.doing = "fsync"
-                self._clean.wait_for(lambda: self._over or not self._is_overdue())
+                # Behind an error of the thread that synchronises, no sync will come.
+                self._clean.wait_for(lambda: self._over or self.error is not None or not self._is_overdue())
 
     def _is_overdue(self) -> bool:
         oldest = self._dirty_since if self._syncing_since is None else self._syncing_since

@@ -31,8 +31,7 @@ class Located(NamedTuple):
 
 
 class EntryIndex:
-    """The places of the entries of a journal, in 40 B each: some hundred thousand are kept until the next
-    compaction."""
+    """The places of the entries of a journal, in 40 B each: they are kept until the next compaction."""
 
     def __init__(self) -> None:
         self._numbers = array("q")

@@ -186,3 +186,33 @@ def _stop(broker: server.BrokerServer, fd: int) -> None:
     broker.loop.unwatch(fd)
     os.close(fd)
     broker.feed(StopRequested("stopped by Ctrl-C"))
+
+
+def test_a_write_that_waits_for_a_sync_that_fails_ends_with_its_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No other sync comes behind it; the entry is in the file, and does not count as handed over."""
+    monkeypatch.setattr(journal_writer, "SYNC_PERIOD_S", 0.02)
+    asked, fails = threading.Event(), threading.Event()
+
+    def sync_recording() -> None:
+        asked.set()
+        fails.wait(30)
+        raise RunError("cannot write the recording: input/output error")
+
+    file = JournalFile(tmp_path / "journal.msgpack", 1)
+    writer = journal_writer.JournalWriter(file, "periodic", sync_recording)
+    writer.write([Journal(1, 0, 0, "world", "done")], (0, 0))
+    assert asked.wait(30)
+    eventually(writer._is_overdue, "the sync takes longer than a period")
+    waiting = threading.Thread(
+        target=writer.write, args=([Journal(2, 0, 1, "world", "done")], (0, 1)), daemon=True
+    )
+    waiting.start()
+    eventually(lambda: writer.doing == "fsync", "the write waits")
+    fails.set()
+    waiting.join(30)
+    assert not waiting.is_alive()
+    assert "input/output error" in str(writer.error)
+    assert writer.confirmed == 1
+    file.close()

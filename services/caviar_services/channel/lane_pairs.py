@@ -48,6 +48,7 @@ def filtered(test: Callable[[Any, Any], Any], numbers: tuple[Any, Any]) -> tuple
 
 
 def gathered(column: Any, index: Any) -> Any:
+    """Elements of a column of the ray tracer, by index."""
     import drjit as dr
 
     return dr.gather(type(column), column, index)
@@ -62,5 +63,6 @@ def opaque(number: int) -> Any:
 
 
 def numbers(indices: Any) -> Int64Array:
+    """Indices of the ray tracer for NumPy, Shape ``[N]``."""
     found: Int64Array = indices.numpy().astype(np.int64)
     return found
