@@ -20,10 +20,16 @@ from caviar_protocol.recording_manifest import (
 )
 from caviar_protocol.segment import Segment
 
+_READINGS = 8
+"""A recorder replaces the manifest a few times while it goes on with a recording, then once a segment."""
+
 
 @dataclass
 class RecordedSegments:
     """A recording up to the first segment that is missing or broken.
+
+    A recorder that goes on with it meanwhile replaces manifest and segments: where they contradict each other
+    and the manifest is another one by then, everything is read again.
 
     Raises `RecordingError` where there is no recording, or nothing of it can be read.
     """
@@ -46,17 +52,31 @@ class RecordedSegments:
     """Whether the recorder closed the recording, and all of it is there."""
     _listed: dict[str, SegmentRecord] = field(default_factory=dict, init=False)
     """What the manifest says, by file name."""
+    _on_disk: Manifest | None = field(default=None, init=False)
+    """The manifest as it was read, also where it is of another run."""
 
     def __post_init__(self) -> None:
+        for _ in range(_READINGS - 1):
+            try:
+                self._read()
+            except RecordingError:
+                if not self._has_changed():
+                    raise
+            else:
+                if not self.damage or not self._has_changed():
+                    return
+        self._read()
+
+    def _read(self) -> None:
+        self.trusted, self.segments, self.damage, self.manifest = [], [], [], None
         alone = self.path.is_file()
-        folder = self.path.parent if alone else self.path
         files = [self.path] if alone else _files(self.path)
         try:
-            self.manifest = read_manifest(folder)
+            self.manifest = self._on_disk = read_manifest(self._folder)
         except RecordingError as error:
             self.damage.append(str(error))
         self._listed = {record.name: record for record in self.manifest.segments} if self.manifest else {}
-        expected = files if alone else _expected(folder, files, self._listed)
+        expected = files if alone else _expected(self._folder, files, self._listed)
         if self.trusted_before is not None:
             self._trust(expected, self._listed, self.trusted_before)
         for number, file in enumerate(expected):
@@ -73,6 +93,17 @@ class RecordedSegments:
         self.closed = there == len(expected) and self.segments[-1].finished and not self.damage
         if self.manifest is not None and not alone:
             self.closed &= self.manifest.closed
+
+    @property
+    def _folder(self) -> Path:
+        return self.path.parent if self.path.is_file() else self.path
+
+    def _has_changed(self) -> bool:
+        """Whether the manifest is another one than when it was read."""
+        try:
+            return read_manifest(self._folder) != self._on_disk
+        except RecordingError:
+            return False
 
     @property
     def instants(self) -> list[tuple[int, int]]:

@@ -8,21 +8,23 @@ import pytest
 from mcap.reader import make_reader
 from recording_samples import PERIOD_NS, SCENARIO, absent, frame, link, product
 
+from caviar_protocol import recording_segments
 from caviar_protocol.errors import RunError
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import Recording
+from caviar_protocol.recording_manifest import Manifest, read_manifest
 from caviar_services.recorder.mcap import McapRecorder, McapSettings
 from caviar_services.service import Frame, Preparation, RunInfo
 
 
-def started(folder: Path, *, again: bool, **settings: object) -> McapRecorder:
+def started(folder: Path, *, again: bool, durability: str = "periodic", **settings: object) -> McapRecorder:
     run = RunInfo(
         name="recorder",
         run="sample-1",
         seed=7,
         sampling_period_ns=PERIOD_NS,
         frames=10,
-        scenario=SCENARIO,
+        scenario=SCENARIO | {"run": {"durability": durability}},
         directory=folder,
         again=again,
     )
@@ -144,3 +146,57 @@ def test_a_recording_that_is_there_when_a_run_begins_is_not_touched(tmp_path: Pa
     with pytest.raises(RunError, match="is there already"):
         started(tmp_path / "whole", again=False)
     assert (tmp_path / "whole" / "recording-0000.mcap").read_bytes() == before
+
+
+def killed_in_the_second_segment(folder: Path) -> None:
+    made = started(folder, again=False, segment_frames=3, durability="none")
+    for one in FRAMES[:5]:
+        made.step(one)
+    killed(made)
+
+
+def go_back_to_frame_2(folder: Path) -> None:
+    made = started(folder, again=True, segment_frames=3, durability="none")
+    made.step(FRAMES[2])
+    killed(made)
+
+
+def test_a_reader_meets_no_damage_while_it_goes_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    killed_in_the_second_segment(tmp_path)
+    replace, unlink, met = Path.replace, Path.unlink, list[int]()
+
+    def read(path: Path) -> None:
+        if path.suffix == ".mcap":
+            met.append(len(Recording(tmp_path)))
+
+    def read_and_replace(path: Path, target: Path) -> Path:
+        read(target)
+        replaced = replace(path, target)
+        read(target)
+        return replaced
+
+    def unlink_and_read(path: Path, *, missing_ok: bool = False) -> None:
+        unlink(path, missing_ok=missing_ok)
+        read(path)
+
+    monkeypatch.setattr(Path, "replace", read_and_replace)
+    monkeypatch.setattr(Path, "unlink", unlink_and_read)
+    go_back_to_frame_2(tmp_path)
+    assert met == [3, 3, 2]
+
+
+def test_a_reader_that_began_before_it_went_back_reads_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    killed_in_the_second_segment(tmp_path)
+    times_read = list[Path]()
+
+    def read_and_go_back(folder: Path) -> Manifest | None:
+        manifest = read_manifest(folder)
+        times_read.append(folder)
+        if len(times_read) == 1:
+            go_back_to_frame_2(tmp_path)
+        return manifest
+
+    monkeypatch.setattr(recording_segments, "read_manifest", read_and_go_back)
+    assert len(Recording(tmp_path)) == 3

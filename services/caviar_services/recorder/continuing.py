@@ -14,7 +14,7 @@ from caviar_protocol.durability import sync_file
 from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.recording_layout import SEGMENT_PATTERN
-from caviar_protocol.recording_manifest import SegmentRecord, frame_name
+from caviar_protocol.recording_manifest import Manifest, SegmentRecord, frame_name
 from caviar_protocol.recording_segments import RecordedSegments, follows
 from caviar_protocol.segment import Channel, Segment
 from caviar_services.recorder.segment_writer import SegmentWriter
@@ -91,8 +91,9 @@ class Continuation:
         """Keep the frames before ``until`` (episode, frame), or all of them.
 
         A segment that breaks off, or has later frames, is written anew from its whole records and takes
-        its place in one step; one with nothing to keep is removed. Of finished segments, which the manifest
-        knows, only the last one is opened.
+        its place in one step; one with nothing to keep is removed. The manifest says so first, so that a
+        reader who comes in between, or after a loss of power, finds nothing that contradicts it.
+        Of finished segments, which the manifest knows, only the last one is opened.
 
         Raises `RunError` where frames before ``until`` are missing; then nothing is changed.
         """
@@ -112,13 +113,21 @@ class Continuation:
             raise self._gap(last, None, damage)
         if until is not None and until != (0, 0) and (last is None or not follows(last, until)):
             raise self._gap(last, until, damage)
+        if found is not None and found.manifest is not None:
+            self._announce(found.manifest, [*records, *_announced(keep, found)], sync=sync)
+        kept = {record.name for record in records} | {segment.path.name for segment, _ in keep}
+        for file in sorted(files, reverse=True):
+            if file.name not in kept:
+                file.unlink(missing_ok=True)
         self.records = [*records]
         for segment, frames in keep:
             self.records.append(self._take(segment, frames, rewrite, found, sync=sync))
-        kept = {record.name for record in self.records}
-        for file in files:
-            if file.name not in kept:
-                file.unlink(missing_ok=True)
+
+    def _announce(self, manifest: Manifest, records: list[SegmentRecord], *, sync: bool) -> None:
+        """Replace the manifest before the segments, where it says more than they will hold."""
+        announced = msgspec.structs.replace(manifest, segments=tuple(records), closed=False)
+        if announced != manifest:
+            announced.save(self.folder, sync=sync)
 
     def _take(
         self,
@@ -131,7 +140,7 @@ class Continuation:
     ) -> SegmentRecord:
         """Take over these frames of a segment; its part of the manifest."""
         known = found.record(segment) if found is not None else None
-        whole = segment.finished and not segment.damage and len(frames) == len(segment.chunks)
+        whole = _is_whole(segment, frames)
         mended = segment.path.with_suffix(".mending")
         writer = None if whole else rewrite(mended, segment)
         for index in frames:
@@ -167,6 +176,19 @@ class Continuation:
 
 
 _END = (sys.maxsize, 0)
+
+
+def _is_whole(segment: Segment, frames: list[int]) -> bool:
+    """Whether a segment can stay as it is, with these of its frames."""
+    return segment.finished and not segment.damage and len(frames) == len(segment.chunks)
+
+
+def _announced(keep: list[tuple[Segment, list[int]]], found: RecordedSegments) -> Iterator[SegmentRecord]:
+    """What the manifest says of segments that are taken over; those to be written anew are open."""
+    for segment, frames in keep:
+        known = found.record(segment) if _is_whole(segment, frames) else None
+        entry = segment.entries[frames[0]]
+        yield known or SegmentRecord(name=segment.path.name, first=(entry.episode, entry.frame))
 
 
 def _frames_to_keep(
