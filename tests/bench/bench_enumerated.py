@@ -1,18 +1,19 @@
-"""Enumerated candidates beside launched ones: how near both come to Sionna RT, and the time that they take.
+"""Enumerated candidates beside launched ones: how near both come to all paths there are, and their times.
 
-    python tests/bench/bench_enumerated.py [--scene street-canyon|munich|crowd] [--frames N] [--rays N]
-        [--launches N] [--json FILE]
+    python tests/bench/bench_enumerated.py [--scene street-canyon|uav|munich|crowd] [--frames N] [--rays N]
+        [--launches N] [--own-rays N] [--own-launches N] [--json FILE]
 
-The reference is Sionna RT's own path solver with ``--rays`` rays from the transmitter, ``--launches`` times,
-and the paths that any of these finds: one launch misses some. Its rays point the same way whatever its
-seed, so each launch has some more than the one before. Lengths are those of images in float64, since Sionna's
-own delays are off by 10⁻⁵ m. The two ways take turns frame by frame, and of each frame the shortest time
-counts; with rays a frame takes a minute.
+The reference is the union of ``--launches`` launches of ``--rays`` rays by Sionna RT's own solver and of
+``--own-launches`` of ``--own-rays`` by this project (`path_reference`). Each path that the reference lacks,
+and each that a channel lacks, is held against every triangle of the scene in float64 (`path_check`): it is
+``real``, ``wrong``, or at a ``border``, none by less than 1 mm. ``missing_real_db`` is the strongest real
+path that the reference has and a channel has not, relative to all paths of its receiver; ``extra_real``
+counts real paths that the reference has not. The figures that begin with ``all`` are against real paths
+alone: those of the reference, and those that it lacks. A real path of more than 1 % of a receiver's power
+that one of two neighbouring frames lacks ``blinks``.
 
-Sionna RT takes planes for one whose rounded normals and offsets agree, and so lacks paths by way of one of
-two panels of a roof that hardly differ. ``missing_db`` is the strongest path that the reference has and a
-channel has not, relative to all paths of its receiver; ``extra`` counts paths that the reference has not,
-and the figures that begin with ``same`` are of receivers without one.
+The two ways take turns frame by frame, and of each frame the shortest time counts. With rays a frame takes a
+minute, and this project's own launches 1.25 GB for each million of rays.
 """
 
 # ruff: noqa: T201 - a command that prints what it measured
@@ -21,9 +22,9 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,21 +32,22 @@ import bench_follow
 import msgspec
 import numpy as np
 from bench_ladder import world
+from path_check import PathCheck
+from path_reference import OwnLaunches, Sionna, absent, paths_of, united
+from path_reference import Path as Ray
 
-from caviar_protocol.arrays import Complex128Array, Float64Array
-from caviar_protocol.coordinates import SPEED_OF_LIGHT, Pose, rotation_matrix
+from caviar_protocol.arrays import Complex128Array
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.scenario import DeviceSpec
-from caviar_protocol.scene import antennas, device_pose
+from caviar_protocol.scene import antennas
 from caviar_protocol.topics import Carrier, Channel, Scene
 from caviar_services.channel.sionna_rt import SionnaChannel
+from caviar_services.channel.sionna_scene import SionnaScene
 from caviar_services.channel.sionna_settings import SionnaSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 from caviar_services.world.assets import object_assets, scenery_assets
 
 FREQUENCY_HZ = 28e9
-SAME_LENGTH = 1e-4
-"""[m]; paths of one receiver whose lengths are nearer are one."""
 
 LAUNCHED = 100_000
 """Rays of the launches that enumeration stands beside."""
@@ -73,6 +75,25 @@ def crowd(frames: int) -> Case:
     made = world(5, 1, 10)
     scenes = tuple(_crowded(made.scenes[0], frame) for frame in range(frames))
     return Case(made.run, made.preparation, {"max_depth": 3, "bodies": 40}, scenes)
+
+
+def uav(frames: int) -> Case:
+    """The street canyon, its base station on a UAV that flies along above the street."""
+    made = world(5, frames, 10)
+    kept = {"max_depth": 3, "pool": made.settings["pool"]}
+    scenes = tuple(_flown(scene, number) for number, scene in enumerate(made.scenes))
+    return Case(replace(made.run, devices=()), made.preparation, kept, scenes)
+
+
+def _flown(scene: Scene, frame: int) -> Scene:
+    place = (-40.0 + 1.0 * frame, 3.0 * math.sin(0.1 * frame), 18.0 + 0.05 * frame)
+    devices = tuple(
+        msgspec.structs.replace(device, position=place, parent="")
+        if device in antennas(scene, "tx")
+        else device
+        for device in scene.devices
+    )
+    return msgspec.structs.replace(scene, devices=devices)
 
 
 def _crowded(scene: Scene, frame: int) -> Scene:
@@ -122,11 +143,7 @@ def munich(frames: int) -> Case:
     return Case(run, Preparation(demand={}, assets=assets), {"max_depth": 3, "bodies": 36}, scenes)
 
 
-CASES = {"street-canyon": street_canyon, "munich": munich, "crowd": crowd}
-
-
-Reference = tuple[Complex128Array, Float64Array]
-"""H of a receiver, and length [m] and power of each of its paths, Shape ``[P, 2]``."""
+CASES = {"street-canyon": street_canyon, "uav": uav, "munich": munich, "crowd": crowd}
 
 
 class Model:
@@ -152,144 +169,144 @@ class Model:
         return product
 
 
-class Sionna:
-    """Sionna RT's own path solver in the scene of a model."""
+class Reference:
+    """What is there, for all that launches find."""
 
-    def __init__(self, model: Model, rays: int, launches: int) -> None:
-        import sionna.rt as rt
+    def __init__(self, case: Case, model: Model, args: argparse.Namespace) -> None:
+        self._model, self._depth = model, case.settings["max_depth"]
+        self._sionna = Sionna(model.channel, args.rays, args.launches, self._depth)
+        self._own: Model | None = None
+        if args.own_launches:
+            self._own = Model(case, candidates="launched", samples=args.own_rays)
+            self._launches = OwnLaunches(self._own.channel, args.own_launches)
 
-        self._scene = model.channel._scene
-        self._traced = self._scene._scene
-        self._rays, self._launches = rays, launches
-        self._solver = rt.PathSolver()
-
-    def __call__(self, scene: Scene) -> list[Reference]:
-        """H of each receiver, and length [m] and power of each of its paths."""
-        import sionna.rt as rt
-
-        (transmitter,), receivers = antennas(scene, "tx"), antennas(scene, "rx")
-        traced = self._traced
-        for name in (*traced.transmitters, *traced.receivers):
-            traced.remove(name)
-        traced.tx_array, traced.rx_array = (
-            rt.PlanarArray(
-                num_rows=device.array.rows,
-                num_cols=device.array.columns,
-                vertical_spacing=0.5,
-                horizontal_spacing=0.5,
-                pattern=device.array.pattern,
-                polarization="V",
-            )
-            for device in (transmitter, receivers[0])
-        )
-        ends = [self._end(scene, device) for device in (transmitter, *receivers)]
-        traced.add(rt.Transmitter("tx", position=ends[0][0].tolist(), orientation=ends[0][1]))
-        for number, (position, orientation) in enumerate(ends[1:]):
-            traced.add(rt.Receiver(f"rx{number:02d}", position=position.tolist(), orientation=orientation))
-        found: list[dict[bytes, tuple[float, Complex128Array]]] = [{} for _ in receivers]
-        for launch in range(self._launches):
-            rays = self._rays + launch * self._rays // 50
-            paths = self._solver(
-                traced,
-                max_depth=3,
-                samples_per_src=rays,
-                max_num_paths_per_src=2_000_000,
-                synthetic_array=True,
-                refraction=False,
-            )
-            self._collect(paths, [end[0] for end in ends], found)
-        empty = np.zeros((receivers[0].array.size, transmitter.array.size), np.complex128)
-        return [
-            (
-                sum((h for _, h in of.values()), empty),
-                np.array([(length, (np.abs(h) ** 2).sum()) for length, h in of.values()]).reshape(-1, 2),
-            )
-            for of in found
-        ]
-
-    def _end(self, scene: Scene, device: Any) -> tuple[Float64Array, list[float]]:
-        """Position [m], relative to the scene's centre, and orientation [rad] of an antenna."""
-        pose: Pose = device_pose(scene, device)
-        turn = rotation_matrix(pose.orientation)
-        yaw, pitch = np.arctan2(turn[1, 0], turn[0, 0]), -np.arcsin(turn[2, 0])
-        roll = np.arctan2(turn[2, 1], turn[2, 2])
-        return np.array(pose.position) - self._scene.centre, [float(yaw), float(pitch), float(roll)]
-
-    def _collect(
-        self,
-        paths: Any,
-        ends: Sequence[Float64Array],
-        found: list[dict[bytes, tuple[float, Complex128Array]]],
-    ) -> None:
-        a = paths.a[0].numpy() + 1j * paths.a[1].numpy()  # [rx, rx_ant, tx, tx_ant, path]
-        kinds = paths.interactions.numpy()[:, :, 0]
-        shapes, primitives = (
-            column.numpy()[:, :, 0].astype(np.int64) for column in (paths.objects, paths.primitives)
-        )
-        valid = paths.valid.numpy()[:, 0]
-        scene = self._scene
-        for receiver, known in enumerate(found):
-            rows = np.flatnonzero(valid[receiver])
-            used = kinds[:, receiver, rows].T != 0
-            triangles = scene.triangle_numbers(shapes[:, receiver, rows].T, primitives[:, receiver, rows].T)
-            planes = np.where(used, scene.plane_of[triangles], -1)
-            image = np.broadcast_to(ends[0], (len(rows), 3))
-            for d in range(used.shape[1]):
-                normal, origin = (column[planes[:, d]] for column in (self._normals, self._origins))
-                height = ((image - origin) * normal).sum(1, keepdims=True)
-                image = np.where(used[:, d, None], image - 2 * height * normal, image)
-            length = np.sqrt(((ends[1 + receiver] - image) ** 2).sum(1))
-            phase = np.exp(-2j * np.pi * (length * FREQUENCY_HZ / SPEED_OF_LIGHT % 1.0))
-            for row, key, long, turn in zip(rows, planes, length.tolist(), phase, strict=True):
-                known.setdefault(key.tobytes(), (long, a[receiver, :, 0, :, row] * turn))
-
-    @property
-    def _normals(self) -> Float64Array:
-        return self._scene.plane_table.normal
-
-    @property
-    def _origins(self) -> Float64Array:
-        return self._scene.plane_table.origin
+    def __call__(self, number: int, scene: Scene) -> tuple[list[list[Ray]], PathCheck]:
+        """Paths of each receiver, and what judges others in this scene, which the model has just seen."""
+        check = PathCheck(self._model.channel._scene)
+        found = self._sionna(scene)
+        if self._own is not None:
+            more = self._launches(lambda at: self._own(number, at), scene)
+            found = [united(known, new) for known, new in zip(found, more, strict=True)]
+        return found, check
 
 
-def compared(found: Channel, reference: list[Reference]) -> list[list[float]]:
-    """Of each receiver that the reference reaches: ‖H − H_ref‖²/‖H_ref‖², error of the gain [dB], whether the
-    best beam pair of DFT codebooks is that of the reference, part of the strongest missing path in all power,
-    and how many paths the reference has not."""
+def compared(
+    found: list[list[Ray]], reference: list[list[Ray]], check: PathCheck, notes: list[str]
+) -> list[dict[str, float]]:
+    """Figures of each receiver that the reference reaches; what is lacking or more is noted."""
     rows = []
-    for rx, (matrix, (wanted, paths)) in enumerate(zip(found.h, reference, strict=True)):
-        power = float((np.abs(wanted) ** 2).sum())
-        if not power:
+    for number, (paths, known) in enumerate(zip(found, reference, strict=True)):
+        if not known:
             continue
-        error = float((np.abs(matrix.h - wanted) ** 2).sum()) / power
-        gain = 10 * np.log10(max(float((np.abs(matrix.h) ** 2).sum()), 1e-300) / power)
-        best = [int(np.abs(np.fft.fft2(h)).argmax()) for h in (matrix.h, wanted)]
-        lengths = found.tau[found.offsets[rx] : found.offsets[rx + 1]] * SPEED_OF_LIGHT
-        same = np.abs(lengths[:, None] - paths[:, 0]) < SAME_LENGTH
-        missing = max(paths[~same.any(0), 1].max(initial=0.0) / power, 1e-12)
-        extra = int((~same.any(1)).sum())
-        rows.append([error, abs(gain), float(best[0] == best[1]), missing, extra])
+        power = float((np.abs(h_of(known, paths)) ** 2).sum())
+        extra, missing = absent(paths, known), absent(known, paths)
+        row = against(paths, known)
+        if row["error"] > 1e-5:
+            notes.append(f"rx {number}: NMSE {_db(row['error']):.1f} dB")
+            for path in paths:
+                notes += [
+                    f"  {10 * np.log10(path.power / power):.1f} dB, {len(path.points)} points, apart by "
+                    f"{_db((np.abs(path.h - other.h) ** 2).sum() / path.power):.1f} dB"
+                    for other in known
+                    if path.is_same(other) and (np.abs(path.h - other.h) ** 2).sum() > 1e-5 * power
+                ]
+        judged = [(path, check(path.start, path.points, path.end)) for path in extra]
+        for path, verdict in judged:
+            row[f"extra_{verdict.word}"] += 1
+            level = 10 * np.log10(path.power / power)
+            notes.append(f"rx {number}: extra {level:.1f} dB, {len(path.points)} points: {verdict}")
+        lost = [(path, check(path.start, path.points, path.end)) for path in missing]
+        for path, verdict in lost:
+            part = path.power / power
+            row[f"missing_{verdict.word}"] = max(row[f"missing_{verdict.word}"], part)
+            level = 10 * np.log10(part)
+            notes.append(f"rx {number}: missing {level:.1f} dB, {len(path.points)} points: {verdict}")
+        real = [path for path, verdict in judged if verdict.word == "real"]
+        unreal = [path for path, verdict in lost if verdict.word != "real"]
+        whole = against(paths, [*absent(known, unreal), *real])
+        rows.append(row | {f"all_{name}": whole[name] for name in ("error", "gain", "beam")})
     return rows
 
 
-def described(rows: list[list[float]]) -> dict[str, float]:
-    """Figures of many receivers."""
-    error, gain, beam, missing, extra = np.array(rows).T
-    same = error[extra == 0]
+def h_of(paths: list[Ray], like: list[Ray]) -> Complex128Array:
+    """Sum of what paths add to H."""
+    return sum((path.h for path in paths), np.zeros((paths or like)[0].h.shape, np.complex128))
+
+
+def against(paths: list[Ray], known: list[Ray]) -> dict[str, float]:
+    """‖H − H_ref‖²/‖H_ref‖², error of the gain [dB], whether the best pair of DFT beams is one."""
+    got, wanted = h_of(paths, known), h_of(known, paths)
+    power = float((np.abs(wanted) ** 2).sum())
+    best = [int(np.abs(np.fft.fft2(h)).argmax()) for h in (got, wanted)]
+    words = ("real", "border", "wrong")
     return {
-        "nmse_db": float(10 * np.log10(error.mean())),
-        "median_db": float(10 * np.log10(np.median(error))),
-        "worst_db": float(10 * np.log10(error.max())),
-        "within_20_db": float((error < 0.01).mean()),
-        "gain_error_db": float(np.median(gain)),
-        "best_beams": float(beam.mean()),
-        "missing_db": float(10 * np.log10(missing.max())),
-        "extra": float(extra.sum()),
-        "receivers": len(error),
-        "same": len(same),
-        "same_nmse_db": float(10 * np.log10(same.mean())) if len(same) else 0.0,
-        "same_worst_db": float(10 * np.log10(same.max())) if len(same) else 0.0,
+        "error": float((np.abs(got - wanted) ** 2).sum()) / power,
+        "gain": abs(float(10 * np.log10(max(float((np.abs(got) ** 2).sum()), 1e-300) / power))),
+        "beam": float(best[0] == best[1]),
+        **{f"extra_{word}": 0.0 for word in words},
+        **{f"missing_{word}": 0.0 for word in words},
     }
+
+
+def described(rows: list[dict[str, float]]) -> dict[str, float]:
+    """Figures of many receivers."""
+    columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    told: dict[str, float] = {"receivers": len(rows)}
+    for kind in ("", "all_"):
+        error = columns[f"{kind}error"]
+        told |= {
+            f"{kind}nmse_db": _db(error.mean()),
+            f"{kind}median_db": _db(np.median(error)),
+            f"{kind}worst_db": _db(error.max()),
+            f"{kind}within_20_db": float((error < 0.01).mean()),
+            f"{kind}gain_error_db": float(np.median(columns[f"{kind}gain"])),
+            f"{kind}best_beams": float(columns[f"{kind}beam"].mean()),
+        }
+    for word in ("real", "border", "wrong"):
+        told[f"extra_{word}"] = float(columns[f"extra_{word}"].sum())
+        told[f"missing_{word}_db"] = _db(columns[f"missing_{word}"].max())
+    return told
+
+
+def _db(power: float) -> float:
+    return float(10 * np.log10(max(power, 1e-20)))
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a channel made of a frame."""
+
+    scene: Scene
+    paths: list[list[Ray]]
+    check: PathCheck
+    names: tuple[str, ...]
+    """Of the pieces of its scene."""
+
+
+def blinking(scene: SionnaScene, one: Seen, other: Seen, notes: list[str]) -> int:
+    """Paths of more than 1 % of a receiver's power in a frame that another lacks, though real there, too."""
+    there = {
+        (device.name, device.parent): number for number, device in enumerate(antennas(other.scene, "rx"))
+    }
+    count = 0
+    for number, device in enumerate(antennas(one.scene, "rx")):
+        also, paths = there.get((device.name, device.parent)), one.paths[number]
+        if also is None or not other.paths[also]:
+            continue
+        power = float((np.abs(h_of(paths, paths)) ** 2).sum()) if paths else 0.0
+        start, end = other.paths[also][0].start, other.paths[also][0].end
+        for path in (path for path in paths if path.power > 0.01 * power):
+            triangles = scene.moved_triangles(one.check.triangles(path.points), one.names, other.names)
+            if (triangles < 0).any():
+                continue
+            points = other.check.mirrored_at(triangles, start, end)
+            moved = Ray(start, points, end, path.h)
+            if any(moved.is_same(known) for known in other.paths[also]):
+                continue
+            if np.isfinite(points).all() and other.check(start, points, end).word == "real":
+                count += 1
+                notes.append(f"rx {number}: {10 * np.log10(path.power / power):.1f} dB blinks")
+    return count
 
 
 def main() -> None:
@@ -297,9 +314,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--scene", choices=sorted(CASES), default="street-canyon")
     parser.add_argument("--frames", type=int, default=20)
-    parser.add_argument("--rays", type=int, default=10_000_000, help="of the reference; 0: times alone")
-    parser.add_argument("--launches", type=int, default=4)
-    parser.add_argument("--repeat", type=int, default=3, help="times that the frames are timed")
+    parser.add_argument(
+        "--rays", type=int, default=10_000_000, help="of Sionna RT's launches; 0: times alone"
+    )
+    parser.add_argument("--launches", type=int, default=4, help="of Sionna RT's")
+    parser.add_argument("--own-rays", type=int, default=2_000_000, help="of this project's launches")
+    parser.add_argument("--own-launches", type=int, default=4, help="of this project's; 0: Sionna RT alone")
+    parser.add_argument(
+        "--repeat", type=int, default=3, help="times that the frames are timed; 0: not at all"
+    )
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     case = CASES[args.scene](args.frames)
@@ -313,31 +336,54 @@ def main() -> None:
             for model in models.values():
                 model(number, scene)
     for name, model in models.items():
-        least = np.array(model.ms).reshape(args.repeat, -1).min(0)
-        figures[name] = {
-            "prepared_s": model.prepared_s,
-            "least_ms": float(np.median(least)),
-            "p50_ms": float(np.median(model.ms)),
-            "p95_ms": float(np.quantile(model.ms, 0.95)),
-        }
+        figures[name] = timed(model, args.repeat)
     if args.rays:
-        sionna = Sionna(models["enumerated"], args.rays, args.launches)
-        rows: dict[str, list[list[float]]] = {name: [] for name in models}
-        for number, scene in enumerate(case.scenes):
-            products = {name: model(number, scene) for name, model in models.items()}
-            models["enumerated"].channel._activate()
-            reference = sionna(scene)
-            for name, product in products.items():
-                rows[name] += compared(product, reference)
-            print(f"frame {number}: {described(rows['enumerated'])}", flush=True)
-        for name in models:
-            figures[name] |= described(rows[name])
+        for name, found in accuracy(case, models, args).items():
+            figures[name] |= found
     for name, of in figures.items():
         print(f"{name}: " + ", ".join(f"{key} {value:.4g}" for key, value in of.items()))
-    ratio = figures["enumerated"]["least_ms"] / figures["launched"]["least_ms"]
-    print(f"time of enumerated candidates to that of {LAUNCHED} launched rays: {ratio:.2f}")
+    if args.repeat:
+        ratio = figures["enumerated"]["least_ms"] / figures["launched"]["least_ms"]
+        print(f"time of enumerated candidates to that of {LAUNCHED} launched rays: {ratio:.2f}")
     if args.json:
         args.json.write_text(json.dumps(figures, indent=1))
+
+
+def timed(model: Model, repeat: int) -> dict[str, float]:
+    """Times of a model whose frames were played so many times."""
+    if not repeat:
+        return {"prepared_s": model.prepared_s}
+    least = np.array(model.ms).reshape(repeat, -1).min(0)
+    return {
+        "prepared_s": model.prepared_s,
+        "least_ms": float(np.median(least)),
+        "p50_ms": float(np.median(model.ms)),
+        "p95_ms": float(np.quantile(model.ms, 0.95)),
+    }
+
+
+def accuracy(case: Case, models: dict[str, Model], args: argparse.Namespace) -> dict[str, dict[str, float]]:
+    """Figures of models against the reference, over all frames."""
+    reference = Reference(case, models["enumerated"], args)
+    rows: dict[str, list[dict[str, float]]] = {name: [] for name in models}
+    before: dict[str, Seen] = {}
+    blinks = dict.fromkeys(models, 0)
+    for number, scene in enumerate(case.scenes):
+        products = {name: model(number, scene) for name, model in models.items()}
+        known, check = reference(number, scene)
+        for name, product in products.items():
+            notes: list[str] = []
+            paths = paths_of(product, scene)
+            rows[name] += compared(paths, known, check, notes)
+            seen = Seen(scene, paths, check, models[name].channel._names)
+            if name in before:
+                pieces = models[name].channel._scene
+                blinks[name] += blinking(pieces, before[name], seen, notes)
+                blinks[name] += blinking(pieces, seen, before[name], notes)
+            before[name] = seen
+            if name == "enumerated":
+                print(f"frame {number}: {described(rows[name])}", *notes, sep="\n  ", flush=True)
+    return {name: described(rows[name]) | {"blinks": float(blinks[name])} for name in models}
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from caviar_protocol.codec import encode_payload
 from caviar_protocol.digest import payload_digest
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.topics import Channel, Scene
+from caviar_services.channel import scenery_chains
 from caviar_services.channel.base import ChannelModel
 from caviar_services.channel.sionna_rt import SionnaChannel
 from caviar_services.channel.sionna_settings import SionnaSettings
@@ -219,10 +220,14 @@ def test_another_scenery_is_another_file_and_none_is_kept_that_need_not(
     assert len(list(own_cache.iterdir())) == 3
 
 
-def test_from_a_transmitter_that_moves_the_same_is_found(tmp_path: Path) -> None:
-    """Its scenery is launched in each frame: nobody said where it stands."""
+@pytest.mark.parametrize(("few", "rays"), [(64, 1), (0, 100_000)])
+def test_from_a_transmitter_that_moves_the_same_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, few: int, rays: int
+) -> None:
+    """By all sequences of its scenery's few faces; of many, a launch in each frame finds the chains."""
     stands, _ = street(tmp_path / "one")
-    moves, said = street(tmp_path / "two", standing=False)
+    monkeypatch.setattr(scenery_chains, "_FEW", few)
+    moves, said = street(tmp_path / "two", standing=False, samples_per_frame=rays)
     assert not any("chains of scenery" in note for note in said)
     at = traffic(2)
     assert same(measure(stands, at), measure(moves, at))

@@ -6,8 +6,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array
 from caviar_services.channel.face_rectangles import RIM, FaceRectangles, narrowest_sides, ranges
-from caviar_services.channel.scene_faces import two_sided_planes
-from caviar_services.channel.sionna_planes import plane_numbers
+from caviar_services.channel.sionna_planes import plane_numbers, two_sided_planes
 from caviar_services.meshes import Mesh, unit_box
 
 L_SHAPE = np.array(

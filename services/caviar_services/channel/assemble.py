@@ -138,6 +138,7 @@ def _canonical_names(table: PathTable) -> PathTable:
         object_names=tuple(table.object_names[i] for i in order),
         object_velocity=table.object_velocity[order],
         faces=None if table.faces is None else np.where(used, table.faces, 0).astype(np.int32),
+        joined_faces=table.joined_faces,
         hidden=table.hidden,
     )
 

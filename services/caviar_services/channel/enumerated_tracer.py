@@ -77,13 +77,23 @@ class EnumeratedTracer:
         chains = np.where(planes >= 0, np.searchsorted(of_scenery.plane, planes), -1)
         views = self._views(of_scenery, sights, ends)
         pairs = chain_pairs(faces, sizes, chains, views, start, ends)
-        paths = image_paths(faces, pairs, start, ends)
-        paths = paths.take(unhidden(self._look, faces, paths, start, ends))
+        paths = self._once(faces, image_paths(faces, pairs, start, ends))
+        paths = paths.take(unhidden(scene, self._look, faces, paths, start, ends))
         near = ((ends - start) ** 2).sum(1) <= _NEAREST**2
         paths = paths.take(~near[paths.receiver])
         kept = first_of_each(paths.receiver, self._most)
         traced = self._traced(faces, paths.take(kept), start, ends)
         return replace(traced, lost=len(kept) - int(kept.sum()))
+
+    def _once(self, faces: FaceRectangles, paths: ImagePaths) -> ImagePaths:
+        """Paths by way of faces that are one surface, each by way of the first of these."""
+        joined = self._scene.joined
+        if not joined.groups:
+            return paths
+        used = paths.chain >= 0
+        surfaces = np.where(used, joined.label[faces.plane[paths.chain]], -1)
+        keys = np.column_stack([paths.receiver, surfaces])
+        return paths.take(np.sort(np.unique(keys, axis=0, return_index=True)[1]))
 
     def _views(self, scenery: FaceRectangles, sights: Int64Array, receivers: Float64Array) -> SceneryViews:
         """Which faces of scenery may come last: all of a few, those that receivers see of many."""
@@ -151,7 +161,7 @@ def unknown_paths(launched: Traced, enumerated: Traced, scene: SionnaScene) -> T
 
 
 def _keys(traced: Traced, scene: SionnaScene) -> Int64Array:
-    """Receiver, and plane of each reflection, of paths."""
-    planes = scene.plane_of[scene.triangle_numbers(traced.shapes, traced.primitives)]
+    """Receiver, and surface of each reflection, of paths."""
+    planes = scene.surface_of[scene.triangle_numbers(traced.shapes, traced.primitives)]
     used = traced.types != 0
     return np.column_stack([traced.receiver, np.where(used, planes, -1)])

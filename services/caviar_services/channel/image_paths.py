@@ -8,11 +8,17 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_services.channel.body_chains import ChainPairs
+from caviar_services.channel.coplanar_faces import COPLANAR, COPLANAR_RELATIVE
 from caviar_services.channel.face_rectangles import FaceRectangles
+from caviar_services.channel.sionna_planes import PlaneTable
 from caviar_services.channel.sionna_reach import Faces
+from caviar_services.channel.sionna_scene import SionnaScene
 
 _OFF_SURFACE = 2e-4
 """[m]; rays from face to face start this far from the first."""
+
+_PARALLEL = 1 - 1e-6
+"""Cosine between the normals of planes that are parallel."""
 
 _AT_END = 1e-3
 """[m]; what stands this near the end of a segment is what it ends at: two faces meet there, or are one."""
@@ -73,6 +79,7 @@ def image_paths(
 
 
 def unhidden(
+    scene: SionnaScene,
     look: Faces,
     faces: FaceRectangles,
     paths: ImagePaths,
@@ -81,8 +88,8 @@ def unhidden(
 ) -> BoolArray:
     """Which paths nothing stands in the way of, Shape ``[P]``; positions in metres.
 
-    A ray along each segment meets the plane of its end first, or something within `_AT_END` of it: shorter
-    rays would lose what grazes.
+    A ray along each segment meets the surface of its end first, or something within `_AT_END` of it that
+    does not stand in front of it: shorter rays would lose what grazes.
     """
     count = (paths.chain >= 0).sum(1)
     end = receivers[paths.receiver]
@@ -115,6 +122,21 @@ def unhidden(
     owners, planes = np.concatenate(owner), np.concatenate(wanted)
     free = np.ones(len(count), np.bool_)
     if len(owners):
-        behind, met = look.nearest(np.concatenate(first), np.concatenate(last))
-        free[owners[(behind < -_AT_END) & (met != planes)]] = False
+        ends = np.concatenate(last)
+        behind, met = look.nearest(np.concatenate(first), ends)
+        other = (behind < 0) & (met != np.where(planes >= 0, scene.joined.label[planes], -1))
+        hidden = other & (behind < -_AT_END)
+        near = np.flatnonzero(other & ~hidden & (planes >= 0))
+        hidden[near] = _in_front(scene.plane_table, met[near], planes[near], ends[near])
+        free[owners[hidden]] = False
     return free
+
+
+def _in_front(table: PlaneTable, met: Int64Array, wanted: Int64Array, points: Float64Array) -> BoolArray:
+    """Whether planes that rays met before points [m] of others hide these: they are parallel, and farther
+    apart than rounding."""
+    normal = table.normal[met]
+    parallel = np.abs(np.einsum("nc,nc->n", normal, table.normal[wanted])) > _PARALLEL
+    height = np.abs(np.einsum("nc,nc->n", points - table.origin[met], normal))
+    hidden: BoolArray = parallel & (height > COPLANAR + COPLANAR_RELATIVE * np.abs(points).max(1))
+    return hidden

@@ -34,11 +34,12 @@ def _kinds(table: PathTable) -> tuple[UInt64Array, Int64Array]:
     if not depth:
         return np.array([_name_hash(())], np.uint64), np.zeros(len(table.pair), np.int64)
     faces = np.zeros_like(table.objects) if table.faces is None else table.faces
-    discrete = np.concatenate([table.types.astype(np.int32), table.objects, faces], axis=1)
+    objects = np.where(faces < 0, -1, table.objects)
+    discrete = np.concatenate([table.types.astype(np.int32), objects, faces], axis=1)
     kinds, kind = np.unique(discrete, axis=0, return_inverse=True)
     named = (
         tuple(
-            (t, table.object_names[o], f)
+            (t, *(table.joined_faces[-1 - f] if f < 0 else (table.object_names[o], f)))
             for t, o, f in zip(row[:depth], row[depth : 2 * depth], row[2 * depth :], strict=True)
             if t
         )

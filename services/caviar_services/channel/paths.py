@@ -74,7 +74,9 @@ class PathTable:
     unknown."""
     faces: Int32Array | None = None
     """Number of the plane of each point within its object, the same in every frame, Shape ``[P, D]``;
-    absent: unknown."""
+    absent: unknown. Below 0: −1 minus the place of a surface in ``joined_faces``."""
+    joined_faces: tuple[tuple[str, int], ...] = ()
+    """Object and number of the plane that surfaces of several objects are known by."""
 
     def take(self, which: Int64Array | BoolArray) -> PathTable:
         """These paths, in this order."""
@@ -87,6 +89,7 @@ class PathTable:
             object_names=self.object_names,
             object_velocity=self.object_velocity,
             faces=None if self.faces is None else self.faces[which],
+            joined_faces=self.joined_faces,
             hidden=None if self.hidden is None else self.hidden[which],
             traced=None if self.traced is None else self.traced[which],
         )

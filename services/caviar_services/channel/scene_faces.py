@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
+from caviar_protocol.arrays import BoolArray, Int32Array, Int64Array
 from caviar_services.channel.face_rectangles import FaceRectangles, narrowest_sides, ranges
+from caviar_services.channel.sionna_planes import two_sided_planes
 from caviar_services.channel.sionna_scene import SionnaScene
 from caviar_services.meshes import Mesh
-
-_SAME_CORNER = 1e-6
-"""Corners this near, as a part of a mesh's extent, are one."""
 
 
 class SceneFaces:
@@ -100,41 +96,3 @@ def _sides_of(mesh: Mesh, numbers: Int32Array) -> Int64Array:
     order = np.argsort(numbers, kind="stable")
     sizes = np.bincount(numbers)
     return narrowest_sides(mesh.vertices[mesh.faces[order]], sizes) - 3 * (np.cumsum(sizes) - sizes)
-
-
-def two_sided_planes(mesh: Mesh, numbers: Int32Array) -> BoolArray:
-    """Whether the planes of a mesh can be met from both sides, by number, Shape ``[N]``.
-
-    From outside of a closed surface whose normals lead outwards, only front faces are met. Every side of a
-    triangle then belongs to as many triangles that go along it one way as the other.
-    """
-    count = int(numbers.max(initial=-1)) + 1
-    corners = mesh.vertices[mesh.faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    if float(np.einsum("fc,fc->", corners[:, 0] - corners.mean((0, 1)), normal)) <= 0 or not _is_closed(mesh):
-        return np.ones(count, np.bool_)
-    # Two parts of one plane may face each other's back.
-    order = np.argsort(-np.einsum("fc,fc->f", normal, normal), kind="stable")
-    largest = np.zeros((count, 3))
-    largest[numbers[order[::-1]]] = normal[order[::-1]]
-    against: Float64Array = np.einsum("fc,fc->f", normal, largest[numbers])
-    two_sided = np.zeros(count, np.bool_)
-    two_sided[numbers[against < 0]] = True
-    return two_sided
-
-
-def _is_closed(mesh: Mesh) -> bool:
-    extent = float(np.ptp(mesh.vertices, axis=0).max()) if len(mesh.vertices) else 0.0
-    if extent == 0:
-        return False
-    cells = np.round(mesh.vertices / (_SAME_CORNER * extent)).astype(np.int64)
-    corner = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)[mesh.faces]
-    some = (corner != np.roll(corner, -1, axis=1)).all(1)
-    sides = np.stack([corner[some], np.roll(corner[some], -1, axis=1)], axis=-1).reshape(-1, 2)
-    return _counted(sides) == _counted(sides[:, ::-1])
-
-
-def _counted(sides: Int64Array) -> Sequence[list[int]]:
-    found, counts = np.unique(sides, axis=0, return_counts=True)
-    rows: list[list[int]] = np.column_stack([found, counts]).tolist()
-    return rows

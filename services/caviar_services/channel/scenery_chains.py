@@ -3,6 +3,9 @@
 One launch misses what its rays pass by: of 84 chains of the street canyon it finds 77, whether with 1e5
 rays or with 1e7, and the others only where the rays point elsewhere. So several launches, each turned a
 little, are united, and a launch is traced in parts, whose memory is bounded.
+
+Where scenery has few faces, a transmitter that moves needs no launch: every sequence of faces that see one
+another is a chain, from wherever it is.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int32Array, Int64Array
 from caviar_services.channel.chain_cache import ChainCache, cache_key
+from caviar_services.channel.face_rectangles import ranges
 from caviar_services.channel.plane_visibility import visible_pairs
 from caviar_services.channel.scene_faces import SceneFaces
 from caviar_services.channel.sionna_candidates import positions
@@ -27,6 +31,9 @@ _SIGHT_RAYS, _SIGHT_RAYS_PER_FRAME = 4096, 64
 
 _SAME_PLACE = 0.05
 """[m]; a transmitter this near has the same chains: what stands off a surface may be moved by less."""
+
+_FEW, _MOST_CHAINS = 64, 20_000
+"""Faces of scenery, and sequences of them, of which all are taken."""
 
 PART = 1_000_000
 """Rays that are traced together: 1.25 GB."""
@@ -54,7 +61,9 @@ class KnownScenery:
 
 class SceneryChains:
     """Chains of scenery of all transmitters: of those that stand, launched once with many rays; of others,
-    launched in each frame.
+    all that there can be, or where these are too many, launched in each frame.
+
+    Made while no body is in the scene.
 
     Parameters
     ----------
@@ -81,6 +90,7 @@ class SceneryChains:
         self._look = Faces(scene)
         self._faces = SceneFaces(scene)
         self._known: list[tuple[Float64Array, KnownScenery]] = []
+        self._every = self._every_chain()
         self._last: tuple[bytes, int, KnownScenery] | None = None
 
     def prepare(self, transmitter: Float64Array, progress: Callable[[int, int], None]) -> str:
@@ -109,6 +119,8 @@ class SceneryChains:
         for known, scenery in self._known:
             if np.abs(known - place).max() <= _SAME_PLACE:
                 return scenery
+        if self._every is not None:
+            return self._every
         last = self._last
         if last is None or last[:2] != (place.tobytes(), self._scene.version):
             launch = self._launcher(positions(place[None]))
@@ -116,6 +128,15 @@ class SceneryChains:
             scenery = KnownScenery(chains, self._sights(chains, _SIGHT_RAYS_PER_FRAME))
             last = self._last = place.tobytes(), self._scene.version, scenery
         return last[2]
+
+    def _every_chain(self) -> KnownScenery | None:
+        """Chains that serve from everywhere; None: too many."""
+        faces = self._faces.scenery(np.arange(self._scene.first_moving_plane))
+        if not 0 < len(faces) <= _FEW:
+            return None
+        sights = visible_pairs(self._look, faces, _SIGHT_RAYS, self._options.seed)
+        chains = sequences(faces.plane, sights, self._options.max_depth)
+        return None if chains is None else KnownScenery(chains, sights.astype(np.int32))
 
     def _sights(self, chains: Int32Array, rays: int) -> Int32Array:
         """Which planes of chains see one another."""
@@ -160,6 +181,24 @@ def launched_chains(
             progress(part * launch.launches + number, parts * launch.launches)
             chains = scenery_of(launcher(source, number=number), scene, options.max_depth)
             found = united(found, chains)
+    return found
+
+
+def sequences(planes: Int64Array, sights: Int64Array, depth: int) -> Int32Array | None:
+    """All sequences of planes, Shape ``[U]``, each of which sees the next one, as in `launched_chains`; None
+    where there are more than 20,000.
+
+    ``sights`` are pairs of planes that see one another, in both orders and sorted, Shape ``[M, 2]``.
+    """
+    longer = np.unique(planes)[:, None].astype(np.int32)
+    found = np.full((0, depth), -1, np.int32)
+    for length in range(1, depth + 1):
+        if len(found) + len(longer) > _MOST_CHAINS:
+            return None
+        found = np.concatenate([found, np.pad(longer, ((0, 0), (0, depth - length)), constant_values=-1)])
+        begin, end = (np.searchsorted(sights[:, 0], longer[:, -1], side) for side in ("left", "right"))
+        before, behind = ranges(begin, end - begin)
+        longer = np.column_stack([longer[before], sights[behind, 1]]).astype(np.int32)
     return found
 
 

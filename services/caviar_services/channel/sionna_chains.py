@@ -97,7 +97,7 @@ def _tokens(
     bounce = launch.bounces[d]
     kind = bounce.kind.numpy()[ray].astype(np.int64)
     shape = bounce.shape.numpy()[ray].astype(np.int64)
-    plane = scene.plane_of[scene.triangle_numbers(shape, bounce.primitive.numpy()[ray].astype(np.int64))]
+    plane = scene.surface_of[scene.triangle_numbers(shape, bounce.primitive.numpy()[ray].astype(np.int64))]
     planes = len(scene.plane_table.triangle)
     token = np.where(kind == REFLECTED, plane, planes + kind)
     edges = 0

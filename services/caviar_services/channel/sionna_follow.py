@@ -273,7 +273,7 @@ def _met(launch: Launch, chains: Chains, scene: SionnaScene, number: int) -> _Ta
 
 def _planes(table: _Table, scene: SionnaScene) -> Int64Array:
     """Plane of each interaction that is a reflection, −1 elsewhere, Shape ``[K, D]``."""
-    return np.where(table.kind == REFLECTED, scene.plane_of[table.triangle], -1)
+    return np.where(table.kind == REFLECTED, scene.surface_of[table.triangle], -1)
 
 
 def _keys(table: _Table, scene: SionnaScene) -> UInt64Array:

@@ -16,12 +16,21 @@ from numpy.typing import NDArray
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
 from caviar_services.channel.clearance import Surfaces
+from caviar_services.channel.coplanar_faces import CoplanarFaces, JoinedFaces
 from caviar_services.channel.sionna_meshes import Shape
-from caviar_services.channel.sionna_planes import PlaneTable, plane_numbers, shared_planes
+from caviar_services.channel.sionna_planes import (
+    PlaneTable,
+    plane_numbers,
+    shared_planes,
+    two_sided_planes,
+)
 from caviar_services.meshes import Mesh
 
 Body = tuple[str, int]
 """Asset and slot of a body in the pool."""
+
+SurfaceNames = tuple[tuple[str, int], ...]
+"""Objects, and planes of each, that surfaces of several objects are known by."""
 
 _LYING = 0.5
 """Vertical part of the normal of grounds and roofs, at least."""
@@ -66,6 +75,8 @@ class NumberedTriangles:
         self.names = tuple(name for shape in shapes for name in shape.names)
         """What the indices of `object_index` stand for while no body stands for an object."""
         self._relative = self._corners - centre
+        self.joined: JoinedFaces
+        """Which faces are one surface."""
         self._number_planes(meshes, unit_meshes)
         last = shapes[-1].meshes
         self._vertices = self._corners[len(self._corners) - sum(len(mesh.vertices) for mesh in last) :]
@@ -90,9 +101,41 @@ class NumberedTriangles:
         # Most bodies of the pool stand for nothing: only what has moved is looked at.
         moved = changed[self._faces[self._first_moving :] - first].any(1)
         triangles = self._first_moving + np.flatnonzero(moved)
-        self.plane_table.update(self._relative, np.unique(self.plane_of[triangles]))
+        joined = np.array([group[0] for group in self.joined.groups], np.int64)
+        self.plane_table.update(self._relative, np.union1d(self.plane_of[triangles], joined))
+        self._join()
         self.surfaces.move(triangles, self._corners[self._faces[triangles]])
         return True
+
+    def _join(self) -> None:
+        """Find the faces that are one surface now."""
+        before, now = self.joined, self._coplanar.find()
+        self.joined = now
+        self.plane_table.join(now.groups)
+        if before.groups or now.groups:
+            self.surface_of = self.joined.label[self.plane_of]
+
+    def surface_names(self, triangles: Int64Array, names: Sequence[str]) -> tuple[Int32Array, SurfaceNames]:
+        """By what name paths by way of triangles are known: the number of the plane within its object, or
+        where a body's face is one surface with others, −1 minus the place of that surface's object and plane.
+
+        A surface has the name of the first scenery that its bodies touch, else the least of its names.
+        ``names`` are those of all pieces, as `SionnaScene.place` returned them.
+        """
+        numbers = self._face_of[triangles].astype(np.int32)
+        of, known = self.plane_of[triangles], []
+        for group in self.joined.groups:
+            its = np.isin(of, group[group >= self.first_moving_plane])
+            if not its.any():
+                continue
+            touched = self.joined.scenery.get(int(group[0]))
+            members = self.plane_table.triangle[group] if touched is None else np.array([touched])
+            pieces = self.piece_of(members).tolist()
+            known.append(
+                min((names[piece], int(self._face_of[t])) for piece, t in zip(pieces, members, strict=True))
+            )
+            numbers[its] = -len(known)
+        return numbers, tuple(known)
 
     @property
     def first_moving_plane(self) -> int:
@@ -255,6 +298,15 @@ class NumberedTriangles:
         self._moving_plane = len(apart.normal) and int(shared.max()) + 1 - int(counts[still:].sum())
         self.plane_table = PlaneTable(self.plane_of, faces)
         self.plane_table.update(self._relative)
+        two_sided = {asset: two_sided_planes(mesh, of_asset[asset]) for asset, mesh in unit_meshes.items()}
+        sides = [np.zeros(0, np.bool_), *(two_sided[asset] for asset, _ in self._bodies)]
+        self._coplanar = CoplanarFaces(
+            self.plane_table, int(self._moving_plane), counts[still:], np.concatenate(sides)
+        )
+        self.joined = self._coplanar.none
+        self.surface_of = self.plane_of
+        """Number of the surface that each triangle is of: that of its plane, or of the first of the planes
+        that are one surface with it."""
 
     def _points_outside(self, triangle: int, normal: Float64Array) -> bool:
         """Whether a triangle's normal points away from its piece, or up from one that lies.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
@@ -12,6 +14,9 @@ _OFF_PLANE = 2e-5
 
 _ANGLE = 2e-4
 """[rad] Largest angle between the normals of a plane's triangles."""
+
+_SAME_CORNER = 1e-6
+"""Corners this near, as a part of a mesh's extent, are one."""
 
 _RIM = 1e-3
 """[m]; a point this near a triangle is one of it."""
@@ -111,6 +116,7 @@ class PlaneTable:
         self.low = np.zeros((count, 3))
         """Box around the triangles of each plane [m]."""
         self.high = np.zeros((count, 3))
+        self._joined: Sequence[Int64Array] = ()
 
     def update(self, corners: Float64Array, planes: Int64Array | None = None) -> None:
         """Take planes, all of them where none are named, from these corners of all meshes [m], Shape
@@ -136,6 +142,19 @@ class PlaneTable:
         self.low[planes] = np.minimum.reduceat(np.minimum(np.minimum(a, b), c), begin)
         self.high[planes] = np.maximum.reduceat(np.maximum(np.maximum(a, b), c), begin)
 
+    def join(self, groups: Sequence[Int64Array]) -> None:
+        """Take planes, group by group in ascending order, for one surface, until `update` is called for the
+        first of each: the box of the first is around all of them."""
+        self._joined = groups
+        for group in groups:
+            self.low[group[0]] = self.low[group].min(0)
+            self.high[group[0]] = self.high[group].max(0)
+
+    def corners_of(self, triangles: Int64Array) -> Float64Array:
+        """Corners of triangles by number [m], Shape ``[N, 3, 3]``."""
+        corners: Float64Array = self._corners[self._faces[triangles]]
+        return corners
+
     def triangles_of(self, planes: Int64Array) -> tuple[Int64Array, Int64Array]:
         """Numbers of the triangles of these planes, plane after plane, and how many each has."""
         sizes = np.append(self._begin[1:], len(self._order))[planes] - self._begin[planes]
@@ -144,7 +163,7 @@ class PlaneTable:
 
     def first_holding(self, triangles: Int64Array, points: Float64Array) -> Int64Array:
         """For each point [m], Shape ``[N, 3]``, in one of these triangles, the first triangle of the same
-        plane that holds it too.
+        surface that holds it too.
 
         Where faces coincide, the floor of a house and the ground below it, or two houses' common wall, a ray
         hits whichever was looked at first, which depends on the rays beside it.
@@ -162,6 +181,12 @@ class PlaneTable:
         # Within a plane triangles are in ascending order.
         hits, where = np.unique(hit[held], return_index=True)
         first[hits] = candidate[held][where]
+        for group in self._joined:
+            for row in np.flatnonzero(np.isin(plane, group[1:])).tolist():
+                others = np.sort(self.triangles_of(group)[0])
+                others = others[others < first[row]]
+                holding = others[_holds(self.corners_of(others), points[np.full(len(others), row)])]
+                first[row] = holding[0] if len(holding) else first[row]
         return first
 
 
@@ -176,3 +201,41 @@ def _holds(triangles: Float64Array, points: Float64Array) -> BoolArray:
         across = (np.cross(edge, points - triangles[:, corner]) * normal).sum(1)
         inside &= across >= -_RIM * np.linalg.norm(edge, axis=1)
     return inside
+
+
+def two_sided_planes(mesh: Mesh, numbers: Int32Array) -> BoolArray:
+    """Whether the planes of a mesh can be met from both sides, by number, Shape ``[N]``.
+
+    From outside of a closed surface whose normals lead outwards, only front faces are met. Every side of a
+    triangle then belongs to as many triangles that go along it one way as the other.
+    """
+    count = int(numbers.max(initial=-1)) + 1
+    corners = mesh.vertices[mesh.faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    if float(np.einsum("fc,fc->", corners[:, 0] - corners.mean((0, 1)), normal)) <= 0 or not _is_closed(mesh):
+        return np.ones(count, np.bool_)
+    # Two parts of one plane may face each other's back.
+    order = np.argsort(-np.einsum("fc,fc->f", normal, normal), kind="stable")
+    largest = np.zeros((count, 3))
+    largest[numbers[order[::-1]]] = normal[order[::-1]]
+    against: Float64Array = np.einsum("fc,fc->f", normal, largest[numbers])
+    two_sided = np.zeros(count, np.bool_)
+    two_sided[numbers[against < 0]] = True
+    return two_sided
+
+
+def _is_closed(mesh: Mesh) -> bool:
+    extent = float(np.ptp(mesh.vertices, axis=0).max()) if len(mesh.vertices) else 0.0
+    if extent == 0:
+        return False
+    cells = np.round(mesh.vertices / (_SAME_CORNER * extent)).astype(np.int64)
+    corner = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)[mesh.faces]
+    some = (corner != np.roll(corner, -1, axis=1)).all(1)
+    sides = np.stack([corner[some], np.roll(corner[some], -1, axis=1)], axis=-1).reshape(-1, 2)
+    return _counted(sides) == _counted(sides[:, ::-1])
+
+
+def _counted(sides: Int64Array) -> Sequence[list[int]]:
+    found, counts = np.unique(sides, axis=0, return_counts=True)
+    rows: list[list[int]] = np.column_stack([found, counts]).tolist()
+    return rows

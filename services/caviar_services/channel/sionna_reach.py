@@ -26,19 +26,30 @@ _AT_END = 1e-2
 
 
 class Faces:
-    """What rays meet first in a scene: how far away, and which of the planes of its objects' faces."""
+    """What rays meet first in a scene: how far away, and which of the surfaces of its objects' faces."""
 
     def __init__(self, scene: SionnaScene) -> None:
         import mitsuba as mi
 
         self._scene = scene
         self._offset = mi.UInt(aligned_indices(scene.offset_by_shape))
-        self._plane = mi.UInt(aligned_indices(scene.plane_of))
+        self._surface_of = scene.surface_of
+        self._surface = mi.UInt(aligned_indices(scene.surface_of))
+
+    def _follow_scene(self) -> None:
+        """Know which faces are one surface now."""
+        import mitsuba as mi
+
+        if self._surface_of is not self._scene.surface_of:
+            self._surface_of = self._scene.surface_of
+            self._surface = mi.UInt(aligned_indices(self._surface_of))
 
     def along(self, start: Any, end: Any, active: Any) -> tuple[Any, Any]:
-        """How much farther than a segment's end [m] the first surface along it is, and its plane."""
+        """How much farther than a segment's end [m] the first surface along it is, and its number."""
         import drjit as dr
         import mitsuba as mi
+
+        self._follow_scene()
 
         line = end - start
         length = dr.norm(line)
@@ -47,10 +58,10 @@ class Faces:
         met = self._scene.mi_scene.ray_intersect_preliminary(ray, coherent=False, active=active)
         hit = active & met.is_valid()
         offset = dr.gather(mi.UInt, self._offset, mi.UInt(dr.reinterpret_array(mi.UInt, met.shape)), hit)
-        return met.t - length, dr.gather(mi.UInt, self._plane, offset + met.prim_index, hit)
+        return met.t - length, dr.gather(mi.UInt, self._surface, offset + met.prim_index, hit)
 
     def nearest(self, start: Float64Array, end: Float64Array) -> tuple[Float64Array, Int64Array]:
-        """The same of segments ``[Q, 3]`` → ``[Q, 3]``; infinite where there is none, its plane anything."""
+        """The same of segments ``[Q, 3]`` → ``[Q, 3]``; infinite where there is none, its number anything."""
         import drjit as dr
         import mitsuba as mi
 

@@ -53,6 +53,7 @@ def path_table(
     _diffract_anew(scene, [part for _, part in parts], (types, shapes, primitives), traced, ends, transfer)
     specular = ((types != Interaction.DIFFRACTION) & (types != Interaction.SCATTERING)).all(1)
     objects = scene.object_index(shapes, primitives)
+    faces, joined = scene.surface_names(scene.triangle_numbers(shapes, primitives), names)
     table = PathTable(
         pair=pair,
         transfer=spread_anew(
@@ -68,7 +69,8 @@ def path_table(
         traced=np.arange(len(pair)),
         object_names=names,
         object_velocity=velocity,
-        faces=scene.face_number(shapes, primitives),
+        faces=faces,
+        joined_faces=joined,
     )
     # What only other elements have may have its points where the centres' path has them, on another face.
     kept = hidden.copy()

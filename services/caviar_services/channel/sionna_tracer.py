@@ -310,7 +310,7 @@ class Tracer:
         types, shapes, primitives, points = geometry(buffer)
         wanted = candidates.planes
         triangles = self._scene.triangle_numbers(shapes, primitives)
-        own = ((wanted < 0) | (wanted == self._scene.plane_of[triangles])).all(1)
+        own = ((wanted < 0) | (wanted == self._scene.surface_of[triangles])).all(1)
         start = np.broadcast_to(transmitter, (len(types), 3))
         end = receivers[candidates.receiver]
         if hidden.any():  # no ray of the centre's has been at their points

@@ -46,7 +46,7 @@ def traced_surfaces(
         types=types,
         points=points,
         origin=origin,
-        plane=scene.plane_of[triangles],
+        plane=scene.surface_of[triangles],
         normal=normal,
         edge=edge,
         outward=outward,

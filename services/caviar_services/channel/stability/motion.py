@@ -9,7 +9,9 @@ import numpy as np
 
 from caviar_services.channel.stability import formulas
 from caviar_services.channel.stability.bench import (
+    CONDUCTOR,
     Bench,
+    Plate,
     Thing,
     answer,
     antenna,
@@ -117,3 +119,46 @@ def _(bench: Bench) -> Outcome:
         len(link(model, (-40.0, 0.0, 2.0), (40.0, 1.0, 1.5), *some).tau) for some in ((), (bus,), (), (bus,))
     ]
     return equal([1, 0, 1, 0], seen, "paths")
+
+
+def _flush(candidates: str, bench: Bench) -> Outcome:
+    """Two lorries side by side pass the point of reflection: their walls are one mirror, whose wave stays."""
+    model = bench.traced(F, bodies=2, candidates=candidates)
+    tx, rx = np.array([-7.0, -9.0, 2.0]), np.array([6.0, -7.0, 1.5])
+    image = formulas.mirrored(tx, np.array([0.0, 1.0, 0.0]), np.array([0.0, 1.0, 0.0]))
+    expected = formulas.friis(float(np.linalg.norm(image - rx)), F)
+    errors, counts, ids = [], set(), set()
+    for seam in (*np.arange(-0.1, 0.5, 0.01), *np.arange(0.215, 0.225, 0.001)):
+        lorries = [
+            Thing(name, (seam + side * 3.0, 2.25, 1.5), (6.0, 2.5, 3.0))
+            for name, side in (("east", 1), ("west", -1))
+        ]
+        channel = link(model, tx.tolist(), rx.tolist(), *lorries)
+        bounced = (channel.interactions == 1).any(1)
+        counts.add(int(bounced.sum()))
+        ids |= set(channel.id[bounced].tolist())
+        errors += [abs(20 * math.log10(abs(a) / expected)) for a in channel.a[0, bounced]]
+    return all_of(
+        equal([1], sorted(counts), "paths"),
+        equal(1, len(ids), "id"),
+        worst(errors, 0.02, "dB", "level"),
+    )
+
+
+for _how in ("enumerated", "launched"):
+    case("flush", f"two lorries side by side go by in steps of 1 cm and 1 mm, {_how}")(partial(_flush, _how))
+
+
+@case("flush", "a box whose front is that of the wall beside it: one wall")
+def _(bench: Bench) -> Outcome:
+    """The receiver goes along; the point of reflection goes from the wall to the box."""
+    wall = Plate("wall", [(-30, 1, 0), (-5, 1, 0), (-5, 1, 6), (-30, 1, 6)], "steel")
+    model = bench.traced(F, [wall], {"steel": CONDUCTOR}, bodies=1, candidates="enumerated")
+    box = Thing("box", (-3.5, 2.25, 1.5), (3.0, 2.5, 3.0))
+    tx, counts, ids = (-7.0, -9.0, 2.0), set(), set()
+    for x in np.arange(-4.0, 3.0, 0.1):
+        channel = link(model, tx, (float(x), -9.0, 1.5), box)
+        bounced = (channel.interactions == 1).any(1)
+        counts.add(int(bounced.sum()))
+        ids |= set(channel.id[bounced].tolist())
+    return all_of(equal([1], sorted(counts), "paths"), equal(1, len(ids), "id"))
