@@ -30,10 +30,12 @@ Int64Array: TypeAlias = NDArray[np.int64]
 UInt64Array: TypeAlias = NDArray[np.uint64]
 Float32Array: TypeAlias = NDArray[np.float32]
 Float64Array: TypeAlias = NDArray[np.float64]
+Complex64Array: TypeAlias = NDArray[np.complex64]
 Complex128Array: TypeAlias = NDArray[np.complex128]
 
 WIRE_DTYPES: dict[str, np.dtype[Any]] = {
-    code: np.dtype(code) for code in ("|b1", "|u1", "|i1", "<u2", "<i4", "<i8", "<u8", "<f4", "<f8", "<c16")
+    code: np.dtype(code)
+    for code in ("|b1", "|u1", "|i1", "<u2", "<i4", "<i8", "<u8", "<f4", "<f8", "<c8", "<c16")
 }
 """Element types that may travel, by the code that stands in a header."""
 

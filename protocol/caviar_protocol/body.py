@@ -18,6 +18,9 @@ from caviar_protocol.errors import DecodeError, LimitError, PayloadError
 ALIGNMENT = 8
 """[B] Offsets are multiples of this."""
 
+_VIEWED = 1 << 16
+"""[B] Arrays from this size on are copied once, into the body; of smaller ones a view costs more."""
+
 
 _CODES = {dtype: code for code, dtype in WIRE_DTYPES.items()}
 
@@ -26,7 +29,7 @@ class BodyWriter:
     """Lays arrays behind each other."""
 
     def __init__(self) -> None:
-        self._chunks: list[bytes] = []
+        self._chunks: list[bytes | memoryview] = []
         self.length = 0
 
     def place(self, value: NDArray[Any]) -> dict[str, Any]:
@@ -39,7 +42,8 @@ class BodyWriter:
             code, value = _CODES[dtype], value.astype(dtype)
         if value.ndim > MAX_DIMENSIONS:
             raise PayloadError(f"{value.ndim} dimensions cannot travel, at most {MAX_DIMENSIONS}")
-        data = value.tobytes()
+        is_viewed = value.nbytes >= _VIEWED and value.flags.c_contiguous
+        data = value.reshape(-1).view(np.uint8).data if is_viewed else value.tobytes()
         padding = -self.length % ALIGNMENT
         if padding:
             self._chunks.append(bytes(padding))

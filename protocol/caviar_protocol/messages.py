@@ -46,7 +46,7 @@ from caviar_protocol.items import Report as Report
 from caviar_protocol.items import Role as Role
 from caviar_protocol.items import Status as Status
 
-PROTOCOL_VERSION = (1, 3)
+PROTOCOL_VERSION = (1, 4)
 """Major and minor version of the protocol that this package speaks."""
 
 CAPABILITIES: tuple[str, ...] = ("assets", "checkpoint", "episodes", "parts")

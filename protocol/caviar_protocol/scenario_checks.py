@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 
 from caviar_protocol.errors import ScenarioError
+from caviar_protocol.ofdm import undefined_part
 from caviar_protocol.scenario import DeviceSpec, Scenario, ServiceSpec
 from caviar_protocol.tables import Place, convert_table, suggestion
 from caviar_protocol.topics import PARTS, PAYLOADS
@@ -223,6 +224,8 @@ def _check_record(scenario: Scenario, place: Place) -> None:
         if dot and part not in PARTS.get(topic, ()):
             known = suggestion(part, PARTS.get(topic, ())) if topic in PARTS else f'write "{topic}"'
             raise place.at(index).error(f"topic {topic!r} has no part {part!r}; {known}")
+        if topic == "channel" and (problem := undefined_part(part, scenario.carriers)):
+            raise place.at(index).error(problem)
     if scenario.run.record and not any(s.role == "recorder" for s in scenario.services.values()):
         raise place.error('topics to record need a recorder; add [services.recorder] with role = "recorder"')
 

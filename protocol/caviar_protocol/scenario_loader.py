@@ -13,6 +13,7 @@ import msgspec
 
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.instants import with_instants
+from caviar_protocol.ofdm import with_numerology
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario_checks import check_scenario, settings_place
 from caviar_protocol.tables import Place, Source, convert_table
@@ -72,6 +73,7 @@ def parse_scenario(text: str, file: str = "", folder: Path | None = None) -> Sce
     scenario = convert_table(Scenario, table, Place("", source))
     scenario = msgspec.structs.replace(scenario, source=_with_device_names(source, scenario))
     check_scenario(scenario)
+    scenario = _with_numerologies(scenario)
     return _with_files(scenario, folder or Path())
 
 
@@ -118,6 +120,16 @@ def _beside(path: Path) -> str:
         path /= "SCENARIO.toml"
     names = sorted(other.name for other in path.parent.glob("*.toml"))
     return f"; {path.parent.resolve()} has {', '.join(names)}" if names and not path.is_file() else ""
+
+
+def _with_numerologies(scenario: Scenario) -> Scenario:
+    """The scenario with all that follows from the keys of its carriers written out."""
+    run, place = scenario.run, Place("carriers", scenario.source)
+    period = None if run.instants_s else run.sampling_period_ns
+    carriers = tuple(
+        with_numerology(carrier, period, place.at(index)) for index, carrier in enumerate(scenario.carriers)
+    )
+    return msgspec.structs.replace(scenario, carriers=carriers)
 
 
 def _with_files(scenario: Scenario, folder: Path) -> Scenario:

@@ -36,6 +36,15 @@ SINCE: dict[str, str] = {
     "Prepare.prefixes": "1.3",
     "Fault.culprit": "1.3",
     "WaypointCommand.at_once": "1.3",
+    "Carrier.subcarriers": "1.4",
+    "Carrier.subcarrier_spacing_hz": "1.4",
+    "Carrier.taps": "1.4",
+    "Carrier.slots": "1.4",
+    "Carrier.slot_duration_s": "1.4",
+    "ChannelResponse": "1.4",
+    "ChannelTaps": "1.4",
+    "Channel.hf": "1.4",
+    "Channel.taps": "1.4",
 }
 """Minor version that brought a field (``Grant.reports``) or a class (``Grant``); 1.0 unless said here."""
 

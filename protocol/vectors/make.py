@@ -32,7 +32,7 @@ import msgpack
 
 FORMATS = {
     "|b1": "?", "|u1": "B", "|i1": "b", "<u2": "<H", "<i4": "<i", "<i8": "<q", "<u8": "<Q",
-    "<f4": "<f", "<f8": "<d", "<c16": "<dd",
+    "<f4": "<f", "<f8": "<d", "<c8": "<ff", "<c16": "<dd",
 }  # fmt: skip
 
 
@@ -53,7 +53,7 @@ def header_of(value: Any, body: bytearray) -> Any:
         return {key: header_of(item, body) for key, item in value.items()}
     layout, offset = FORMATS[value["dtype"]], value["offset"]
     data = b"".join(
-        struct.pack(layout, *(item if layout == "<dd" else [item]))
+        struct.pack(layout, *(item if isinstance(item, list) else [item]))
         for item in elements(value["values"], len(value["shape"]))
     )
     body.extend(bytes(max(0, offset + len(data) - len(body))))

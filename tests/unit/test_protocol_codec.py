@@ -333,7 +333,8 @@ def test_any_minor_version_is_accepted_and_another_major_names_both(major: int, 
     if major == PROTOCOL_VERSION[0]:
         check_version((major, minor))
     else:
-        with pytest.raises(VersionError, match=rf"{major}\.{minor}, this side speaks 1\.3"):
+        own = r"\.".join(map(str, PROTOCOL_VERSION))
+        with pytest.raises(VersionError, match=rf"{major}\.{minor}, this side speaks {own}"):
             check_version((major, minor))
 
 

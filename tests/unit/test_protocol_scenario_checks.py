@@ -144,7 +144,18 @@ table.samples = 3
 def test_the_resolved_form_shows_defaults_and_reads_back() -> None:
     loaded = parse_scenario(TEXT, "x.toml")
     plain = resolved(loaded)
-    assert plain["carriers"] == [{"name": "c", "frequency_hz": 1e9, "bandwidth_hz": 100e6}]
+    assert plain["carriers"] == [
+        {
+            "name": "c",
+            "frequency_hz": 1e9,
+            "bandwidth_hz": 100e6,
+            "subcarriers": 0,
+            "subcarrier_spacing_hz": 0.0,
+            "taps": 0,
+            "slots": 1,
+            "slot_duration_s": 0.0,
+        }
+    ]
     assert plain["timeouts"]["stall_s"] == 30.0
     assert plain["services"]["streets"]["settings"] == {"lanes": 2, "grid": [1, 2], "table": {"samples": 3}}
     assert "source" not in plain

@@ -182,8 +182,8 @@ def test_every_optional_field_is_present_in_one_vector_and_absent_in_another() -
 
 
 def test_every_element_type_has_a_vector() -> None:
-    seen = {str(array.dtype.str) for array in read(load("arrays_every_type"))}
-    assert seen == set(WIRE_DTYPES)
+    arrays = [load("arrays_every_type"), load("arrays_complex64")]
+    assert {str(array.dtype.str) for vector in arrays for array in read(vector)} == set(WIRE_DTYPES)
     assert array_of({"dtype": "<c16", "shape": [1], "values": [[1.0, -2.0]]})[0] == 1 - 2j
 
 

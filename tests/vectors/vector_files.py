@@ -82,7 +82,8 @@ def array_of(value: dict[str, Any]) -> np.ndarray[Any, Any]:
     """The NumPy array that JSON states."""
     dtype = WIRE_DTYPES[value["dtype"]]
     if dtype.kind == "c":
-        pairs = np.array(value["values"], dtype=np.float64).reshape(*value["shape"], 2)
+        part = np.dtype(f"<f{dtype.itemsize // 2}")
+        pairs = np.array(value["values"], dtype=part).reshape(*value["shape"], 2)
         return np.ascontiguousarray(pairs).view(dtype)[..., 0]
     return np.array(value["values"], dtype=dtype).reshape(value["shape"])
 

@@ -21,6 +21,8 @@ from caviar_protocol.topics.channel import (
     Channel,
     ChannelMatrix,
     ChannelOptions,
+    ChannelResponse,
+    ChannelTaps,
     Interaction,
 )
 from caviar_protocol.topics.link import Link
@@ -57,7 +59,7 @@ PAYLOADS: dict[str, type[Payload]] = {
 """Payload class of each topic."""
 
 PARTS: dict[str, tuple[str, ...]] = {
-    "channel": ("h",),
+    "channel": ("h", "hf", "taps"),
     "lidar": ("grid",),
     "depth": ("normals",),
     "segmentation": ("materials",),
@@ -78,6 +80,8 @@ __all__ = [
     "Channel",
     "ChannelMatrix",
     "ChannelOptions",
+    "ChannelResponse",
+    "ChannelTaps",
     "Depth",
     "DepthImage",
     "Interaction",

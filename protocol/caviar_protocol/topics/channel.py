@@ -9,6 +9,7 @@ import msgspec
 
 from caviar_protocol.arrays import (
     BoolArray,
+    Complex64Array,
     Complex128Array,
     Float64Array,
     Int32Array,
@@ -33,12 +34,31 @@ class Interaction(IntEnum):
 
 
 class Carrier(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """One radio carrier."""
+    """One radio carrier, with the OFDM numerology and the instants of its wideband channel.
+
+    Subcarrier k of K is at ``frequency_hz + (k − ⌊K/2⌋)·subcarrier_spacing_hz``, slot s of a frame begins
+    ``s·slot_duration_s`` after the frame's instant.
+    """
 
     name: str
     """Unique in the run."""
     frequency_hz: Annotated[float, quantity("Hz", "centre frequency", gt=0)]
     bandwidth_hz: Annotated[float, quantity("Hz", "noise and rate bandwidth", gt=0)] = 100e6
+    subcarriers: Annotated[
+        int, quantity("1", "subcarriers K of part `hf`; 0: the carrier has no part `hf`", ge=0, le=65536)
+    ] = 0
+    subcarrier_spacing_hz: Annotated[
+        float, quantity("Hz", "between neighbouring subcarriers; above 0 where there are any", ge=0)
+    ] = 0.0
+    taps: Annotated[
+        int, quantity("1", "taps L of part `taps`; 0: the carrier has no part `taps`", ge=0, le=65536)
+    ] = 0
+    slots: Annotated[
+        int, quantity("1", "slots S of a frame, for each of which `hf` and `taps` are given", ge=1, le=65536)
+    ] = 1
+    slot_duration_s: Annotated[
+        float, quantity("s", "from one slot to the next; above 0 where there are several", ge=0)
+    ] = 0.0
 
 
 class ChannelOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -75,6 +95,42 @@ class ChannelMatrix(Payload, frozen=True, kw_only=True, omit_defaults=True):
     h: Annotated[
         Complex128Array,
         array("<c16", "Nr", "Nt", unit="1", doc="amplitude gain from TX element n to RX element m"),
+    ]
+
+
+class ChannelResponse(Payload, frozen=True, kw_only=True, omit_defaults=True):
+    """Frequency response of one carrier and one TX/RX pair, at each subcarrier and slot of the carrier.
+
+    With amplitudes a, delays τ and Doppler shifts ν of the paths, Δf from the carrier and Δt from the frame:
+    H(Δf, Δt) = Σ a·exp(−j2π(Δf·(τ − Δt·ν/frequency_hz) − ν·Δt)), between elements as in ``h``, which it is
+    at Δf = 0 and Δt = 0.
+    """
+
+    carrier: Annotated[int, quantity("1", "index into `Channel.carriers`", ge=0)]
+    tx: Annotated[int, quantity("1", "index into `Channel.tx`", ge=0)]
+    rx: Annotated[int, quantity("1", "index into `Channel.rx`", ge=0)]
+    h: Annotated[
+        Complex64Array,
+        array("<c8", "S", "K", "Nr", "Nt", unit="1", doc="amplitude gain from TX element n to RX element m"),
+    ]
+
+
+class ChannelTaps(Payload, frozen=True, kw_only=True, omit_defaults=True):
+    """Sampled impulse response of one carrier and one TX/RX pair, in each slot of the carrier.
+
+    Tap l is at the absolute delay (first + l)/W with the sampling rate W = ``bandwidth_hz``, behind an ideal
+    low-pass filter: h = Σ a·sinc(first + l − W·(τ − Δt·ν/frequency_hz))·exp(j2πν·Δt), where
+    sinc(x) = sin(πx)/(πx). ``first`` is some samples before the earliest path; what arrives behind the last
+    tap is left out.
+    """
+
+    carrier: Annotated[int, quantity("1", "index into `Channel.carriers`", ge=0)]
+    tx: Annotated[int, quantity("1", "index into `Channel.tx`", ge=0)]
+    rx: Annotated[int, quantity("1", "index into `Channel.rx`", ge=0)]
+    first: Annotated[int, quantity("1", "sample of the first tap; 0 is the delay 0")]
+    h: Annotated[
+        Complex64Array,
+        array("<c8", "S", "L", "Nr", "Nt", unit="1", doc="amplitude gain from TX element n to RX element m"),
     ]
 
 
@@ -133,6 +189,12 @@ class Channel(Payload, frozen=True, kw_only=True, omit_defaults=True):
     h: tuple[ChannelMatrix, ...] = ()
     """One matrix per carrier and pair, carriers slowest; empty unless part ``h`` is in demand."""
     dropped: Annotated[int, quantity("1", "paths dropped for non-finite values", ge=0)] = 0
+    hf: tuple[ChannelResponse, ...] = ()
+    """One response per carrier with subcarriers and pair, carriers slowest; empty unless part ``hf`` is in
+    demand."""
+    taps: tuple[ChannelTaps, ...] = ()
+    """One impulse response per carrier with taps and pair, likewise; empty unless part ``taps`` is in
+    demand."""
 
     def check(self) -> None:
         """``offsets`` cuts the path axis into one run for each pair."""

@@ -22,10 +22,11 @@ from caviar_protocol.topics import (
 )
 from caviar_services.channel.atmosphere import amplitude_factor
 from caviar_services.channel.geometry import PathGeometry, path_geometry
-from caviar_services.channel.matrices import Located, Matrices, plane_waves
+from caviar_services.channel.matrices import Located, Matrices, PlaneWaves
 from caviar_services.channel.path_ids import stable_ids
 from caviar_services.channel.paths import Antenna, PathTable
 from caviar_services.channel.patterns import radiated_field
+from caviar_services.channel.wideband import Wideband, bins_of, wideband_parts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +37,8 @@ class Product:
     options: ChannelOptions
     carriers: tuple[Carrier, ...]
     with_h: bool
+    wideband: frozenset[str] = frozenset()
+    """Wideband parts in demand."""
     absorption_db_per_km: Float64Array | None = None
     """By the air, on each carrier, Shape ``[C]``; None: no atmosphere."""
 
@@ -50,7 +53,8 @@ def assemble(
 ) -> Channel:
     """The canonical product: antennas, phase and absorption applied, non-finite paths dropped, sorted.
 
-    ``matrices`` makes H where somebody asks for it: `plane_waves` unless the model has a way of its own.
+    ``matrices`` makes H, and its wideband parts, where they are in demand: `PlaneWaves` unless the model has
+    a way of its own.
     """
     table = _canonical_names(table)
     row = np.arange(len(table.pair))
@@ -72,9 +76,16 @@ def assemble(
     pairs = len(transmitters) * len(receivers)
     offsets = np.searchsorted(table.pair, np.arange(pairs + 1)).astype(np.int64)
     h: tuple[ChannelMatrix, ...] = ()
-    if product.with_h:
+    wideband = Wideband()
+    if product.with_h or product.wideband:
         located = _located(product, row, table, offsets, geometry, a)
-        h = (matrices or plane_waves)(product.carriers, transmitters, receivers, located)
+        matrices = matrices or PlaneWaves()
+        if product.with_h:
+            h = matrices(product.carriers, transmitters, receivers, located)
+        if product.wideband:
+            bins = bins_of(product.wideband, product.carriers, geometry.tau, offsets)
+            responses = matrices.responses(bins, transmitters, receivers, located)
+            wideband = wideband_parts(bins, responses, len(receivers))
     if table.hidden is not None and table.hidden.any():
         shown = ~table.hidden
         table, geometry, a = table.take(shown), _select(geometry, shown), a[:, shown]
@@ -102,6 +113,8 @@ def assemble(
         objects=table.objects[:, :depth],
         h=h,
         dropped=dropped,
+        hf=wideband.hf,
+        taps=wideband.taps,
     )
 
 

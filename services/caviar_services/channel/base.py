@@ -25,6 +25,7 @@ from caviar_services.channel.atmosphere import Atmosphere, specific_attenuation
 from caviar_services.channel.matrices import Matrices
 from caviar_services.channel.outage import outage_counts
 from caviar_services.channel.paths import Antenna, PathTable
+from caviar_services.channel.wideband import required_parts
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
 
 
@@ -94,6 +95,8 @@ class ChannelModel(Service[S]):
         """The devices of the last scene, which mostly are those of the next, and the sum of their numbers."""
         self.with_h = False
         """Whether somebody asks for the matrices."""
+        self.wideband: frozenset[str] = frozenset()
+        """Parts ``hf`` and ``taps`` that are in demand."""
 
     @property
     def options(self) -> ChannelOptions:
@@ -133,7 +136,9 @@ class ChannelModel(Service[S]):
         """The channels of all TX/RX pairs of a frame."""
 
     def prepare(self, preparation: Preparation) -> Prepared:
-        self.with_h = "h" in preparation.demand.get("channel", frozenset())
+        demand = preparation.demand.get("channel", frozenset())
+        self.with_h = "h" in demand
+        self.wideband = required_parts(demand, self.run.carriers)
         return Prepared(notes=(*self.load(preparation), *self._absorption_notes()))
 
     def step(self, frame: Frame) -> StepResult:
@@ -238,6 +243,7 @@ class PathModel(ChannelModel[S]):
             options=self.modelled,
             carriers=self.run.carriers,
             with_h=self.with_h,
+            wideband=self.wideband,
             absorption_db_per_km=self.absorption_db_per_km,
         )
         channel = assemble(product, tx, rx, found.table, found.los, found.matrices)

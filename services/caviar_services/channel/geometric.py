@@ -29,7 +29,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise, product
 from typing import NamedTuple
@@ -38,6 +38,7 @@ import numpy as np
 
 from caviar_protocol.arrays import (
     BoolArray,
+    Complex64Array,
     Complex128Array,
     Float64Array,
     Int32Array,
@@ -66,6 +67,7 @@ from caviar_services.channel.waves import (
     velocity,
     with_phase,
 )
+from caviar_services.channel.wideband import Bins, Wideband, bins_of, superposed, wideband_parts
 from caviar_services.service import Frame, RunInfo
 
 BLOCK = 256
@@ -230,6 +232,7 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         aod, aoa = np.array([x for wave in both for x in angles(wave)], np.float64).reshape(2, -1, 2)
         shape = (len(transmitters), len(receivers))
         constant = _constant(tuple(los), tuple(offsets), tuple(waves.id), shape)
+        wideband = self._wideband(a, waves, pairs, constant.offsets, len(receivers))
         return Channel(
             rung=self.rung,
             options=self.modelled,
@@ -248,6 +251,8 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
             points=constant.points,
             objects=constant.objects,
             h=self._matrices(a, waves, pairs, len(receivers)) if self.with_h else (),
+            hf=wideband.hf,
+            taps=wideband.taps,
         )
 
     def _path_gain(self, waves: Waves, pairs: Sequence[PairWaves]) -> Float64Array:
@@ -283,6 +288,32 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
                 h = mine.dot(transmit)[None] if receive is None else (receive * mine[:, None]).T @ transmit
                 found.append(ChannelMatrix(carrier=carrier, tx=tx, rx=rx, h=h))
         return tuple(found)
+
+    def _wideband(
+        self,
+        a: Complex128Array,
+        waves: Waves,
+        pairs: Sequence[PairWaves],
+        offsets: Int64Array,
+        receivers: int,
+    ) -> Wideband:
+        """The parts ``hf`` and ``taps`` in demand."""
+        if not self.wideband:
+            return Wideband()
+        tau, ratio = np.array(waves.tau), np.array(waves.doppler_ratio)
+
+        def responses(bins: Sequence[Bins]) -> Iterator[Complex64Array]:
+            for asked in bins:
+                doppler = ratio * asked.carrier.frequency_hz
+                for number, pair in enumerate(pairs):
+                    weights = asked.weights(number, tau[pair.mine], doppler[pair.mine])
+                    receive = steering_vector(pair.rx.array, pair.arrivals(waves))
+                    transmit = steering_vector(pair.tx.array, pair.departures(waves))
+                    elements = receive[:, :, None] * transmit[:, None, :]
+                    yield superposed(weights * a[asked.index, pair.mine], elements)
+
+        bins = bins_of(self.wideband, self.run.carriers, tau, offsets)
+        return wideband_parts(bins, responses(bins), receivers)
 
 
 class _Constant(NamedTuple):

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Protocol
 
-from caviar_protocol.arrays import Complex128Array, Float64Array, Int64Array
+from caviar_protocol.arrays import Complex64Array, Complex128Array, Float64Array, Int64Array
 from caviar_protocol.topics import Carrier, ChannelMatrix
 from caviar_services.antenna import steering_vector
 from caviar_services.channel.geometry import PathGeometry
 from caviar_services.channel.paths import Antenna
 from caviar_services.channel.stacked import summed
+from caviar_services.channel.wideband import Bins, superposed
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,10 +34,56 @@ class Located:
     """As in `Product`."""
 
 
-Matrices = Callable[
-    [Sequence[Carrier], Sequence[Antenna], Sequence[Antenna], Located], tuple[ChannelMatrix, ...]
-]
-"""Makes the matrices of a product from its paths."""
+class Matrices(Protocol):
+    """Makes the matrices of a product from its paths, at the carriers and over the band."""
+
+    def __call__(
+        self,
+        carriers: Sequence[Carrier],
+        transmitters: Sequence[Antenna],
+        receivers: Sequence[Antenna],
+        located: Located,
+    ) -> tuple[ChannelMatrix, ...]:
+        """H of every carrier and pair, carriers slowest."""
+
+    def responses(
+        self,
+        bins: Sequence[Bins],
+        transmitters: Sequence[Antenna],
+        receivers: Sequence[Antenna],
+        located: Located,
+    ) -> Iterator[Complex64Array]:
+        """What `Bins` ask for, of each of them and each pair, pairs fastest; Shape ``[J, Nr, Nt]`` each."""
+
+
+class PlaneWaves:
+    """H[m, n] = Σ_p a[p] · receive[p, m] · transmit[p, n]: delays and phases within an array are those at
+    the carrier, so that its beams point where they do there on every subcarrier (no beam squint)."""
+
+    def __call__(
+        self,
+        carriers: Sequence[Carrier],
+        transmitters: Sequence[Antenna],
+        receivers: Sequence[Antenna],
+        located: Located,
+    ) -> tuple[ChannelMatrix, ...]:
+        return plane_waves(carriers, transmitters, receivers, located)
+
+    def responses(
+        self,
+        bins: Sequence[Bins],
+        transmitters: Sequence[Antenna],
+        receivers: Sequence[Antenna],
+        located: Located,
+    ) -> Iterator[Complex64Array]:
+        geometry = located.geometry
+        steered = list(_steered(transmitters, receivers, located))
+        for asked in bins:
+            doppler = geometry.doppler_ratio * asked.carrier.frequency_hz
+            for pair, (mine, receive, transmit) in enumerate(steered):
+                weights = asked.weights(pair, geometry.tau[mine], doppler[mine])
+                waves = receive[:, :, None] * transmit[:, None, :]
+                yield superposed(weights * located.a[asked.index, mine], waves)
 
 
 def plane_waves(
@@ -45,19 +93,30 @@ def plane_waves(
     located: Located,
 ) -> tuple[ChannelMatrix, ...]:
     """H[m, n] = Σ_p a[p] · receive[p, m] · transmit[p, n] of every carrier and pair."""
-    steered = []
-    geometry, a = located.geometry, located.a
+    a = located.a
+    steered = list(_steered(transmitters, receivers, located))
+    return tuple(
+        ChannelMatrix(
+            carrier=carrier,
+            tx=pair // len(receivers),
+            rx=pair % len(receivers),
+            h=summed(receive * a[carrier, mine, None], transmit),
+        )
+        for carrier in range(len(carriers))
+        for pair, (mine, receive, transmit) in enumerate(steered)
+    )
+
+
+def _steered(
+    transmitters: Sequence[Antenna], receivers: Sequence[Antenna], located: Located
+) -> Iterator[tuple[slice, Complex128Array, Complex128Array]]:
+    """Of each pair: its paths, and the phases of receiving and transmitting elements, Shape ``[p, N]``."""
+    geometry = located.geometry
     for pair, (begin, end) in enumerate(pairwise(located.offsets.tolist())):
         tx, rx = divmod(pair, len(receivers))
         mine = slice(begin, end)
         transmit = _steering(transmitters[tx], geometry.departure[mine])
-        receive = _steering(receivers[rx], geometry.arrival[mine])
-        steered.append((tx, rx, mine, receive, transmit))
-    return tuple(
-        ChannelMatrix(carrier=carrier, tx=tx, rx=rx, h=summed(receive * a[carrier, mine, None], transmit))
-        for carrier in range(len(carriers))
-        for tx, rx, mine, receive, transmit in steered
-    )
+        yield mine, _steering(receivers[rx], geometry.arrival[mine]), transmit
 
 
 def _steering(antenna: Antenna, directions: Float64Array) -> Complex128Array:

@@ -271,16 +271,21 @@ class SionnaChannel(PathModel[SionnaSettings]):
             mi.set_variant(self._variant)
 
     def _matrices(self, launches: Sequence[Traced], table: PathTable, traced_from: Ends) -> Matrices | None:
-        """How the rung makes H; `plane_waves` where it has no way of its own."""
+        """How the rung makes H; `PlaneWaves` where it has no way of its own."""
         memory = int(self.settings.memory_gib * 2**30)
         if self.rung == "spherical" and table.traced is not None:
             surfaces = traced_surfaces(launches, table.traced, table.types, table.points, self._scene)
-            return SphericalWaves(surfaces, self._tracer.look, traced_from, memory)
+            return SphericalWaves(surfaces, self._tracer.look, traced_from, self.run.carriers, memory)
         if self.rung == "mimo-rt":
             # The rays of a launch are kept whole; the rest is for the candidates of some receivers at a time.
             lanes = memory // LANE_BYTES - self._launched.samples * self._launched.max_depth
             return ElementTracer(
-                self._tracer, self._scene, self._wavelengths, max(1, lanes), self.settings.los
+                self._tracer,
+                self._scene,
+                table.object_velocity,
+                self._wavelengths,
+                max(1, lanes),
+                self.settings.los,
             )
         return None
 
@@ -295,7 +300,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         others = [r for r, receiver in enumerate(receivers) if receiver.name != transmitter.name]
         targets = np.array([receivers[r].position for r in others]).reshape(-1, 3)
         corners = None
-        if self.rung == "spherical" and self.with_h:
+        if self.rung == "spherical" and (self.with_h or self.wideband):
             longest = SPEED_OF_LIGHT / min(carrier.frequency_hz for carrier in self.run.carriers)
             corners = Corners(
                 outermost([transmitter], longest)[0], outermost([receivers[r] for r in others], longest)

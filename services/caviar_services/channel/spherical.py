@@ -13,14 +13,18 @@ from itertools import pairwise
 
 import numpy as np
 
-from caviar_protocol.arrays import Complex128Array, Float64Array, Int64Array
+from caviar_protocol.arrays import Complex64Array, Complex128Array, Float64Array, Int64Array
 from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Carrier, ChannelMatrix
 from caviar_services.channel.element_gains import ElementGains
-from caviar_services.channel.element_paths import Bend, ElementPaths, Surfaces
+from caviar_services.channel.element_paths import Bend, ElementPaths, Lengths, Surfaces
 from caviar_services.channel.matrices import Located
 from caviar_services.channel.paths import Antenna
 from caviar_services.channel.visibility import Elements, Look, Visibility, elements, visibility
+from caviar_services.channel.wideband import Bins
+
+_BINS = 1 << 20
+"""Subcarriers or taps times element pairs that are computed at once."""
 
 _LANES = 1 << 15
 """Element pairs times paths computed at once: what stays in a processor's cache."""
@@ -41,6 +45,8 @@ class SphericalWaves:
         Asks this frame's scene.
     traced_from
         Transmitters and receivers off the surfaces that they are at: there their elements look.
+    carriers
+        Of the product.
     memory
         For looking at pairs of elements [bytes] at most; what is kept of each path comes on top.
     """
@@ -50,8 +56,11 @@ class SphericalWaves:
         surfaces: Surfaces,
         look: Look,
         traced_from: tuple[Sequence[Antenna], Sequence[Antenna]],
+        carriers: Sequence[Carrier],
         memory: int,
     ) -> None:
+        self._carriers = carriers
+        self._made: list[_Field] = []
         self._memory = memory
         self._surfaces = surfaces
         self._look = look
@@ -64,6 +73,35 @@ class SphericalWaves:
         receivers: Sequence[Antenna],
         located: Located,
     ) -> tuple[ChannelMatrix, ...]:
+        fields = self._fields(carriers, transmitters, receivers, located)
+        return tuple(
+            ChannelMatrix(carrier=carrier, tx=pair // len(receivers), rx=pair % len(receivers), h=h)
+            for carrier, field in enumerate(fields)
+            for pair, h in enumerate(field.matrices(located.offsets))
+        )
+
+    def responses(
+        self,
+        bins: Sequence[Bins],
+        transmitters: Sequence[Antenna],
+        receivers: Sequence[Antenna],
+        located: Located,
+    ) -> Iterator[Complex64Array]:
+        fields = self._fields(self._carriers, transmitters, receivers, located)
+        for asked in bins:
+            doppler = located.geometry.doppler_ratio * asked.carrier.frequency_hz
+            yield from fields[asked.index].responses(located.offsets, asked, doppler)
+
+    def _fields(
+        self,
+        carriers: Sequence[Carrier],
+        transmitters: Sequence[Antenna],
+        receivers: Sequence[Antenna],
+        located: Located,
+    ) -> Sequence[_Field]:
+        """The field of each carrier, made once: the parts of a product share it."""
+        if self._made:
+            return self._made
         paths = ElementPaths(self._surfaces.take(located.row))
         tx, rx = np.divmod(located.pair, max(len(receivers), 1))
         start, end = _positions(transmitters)[tx], _positions(receivers)[rx]
@@ -75,33 +113,30 @@ class SphericalWaves:
             bent, 1 / np.where(bent, of_bent, 1.0), SPEED_OF_LIGHT * located.geometry.tau
         )
         towards = paths.ends(start, end)
-        made: list[ChannelMatrix] = []
         for carrier, properties in enumerate(carriers):
             wavelength = SPEED_OF_LIGHT / properties.frequency_hz
             transmit, receive = elements(transmitters, wavelength), elements(receivers, wavelength)
             looking = elements(self._sources, wavelength), elements(self._targets, wavelength)
             seen = visibility(paths, tx, rx, *looking, self._look, self._memory)
-            field = _Field(
-                paths=paths,
-                seen=_far_enough(seen, paths, (tx, rx), (transmit, receive), wavelength),
-                transmit=transmit,
-                receive=receive,
-                transmitter=tx,
-                receiver=rx,
-                gains=ElementGains(
-                    (transmitters, receivers),
-                    (tx, rx),
-                    towards,
-                    located.transfer[carrier] * without_spreading[:, None, None],
-                    wavelength,
-                ),
-                wavelength=wavelength,
+            self._made.append(
+                _Field(
+                    paths=paths,
+                    seen=_far_enough(seen, paths, (tx, rx), (transmit, receive), wavelength),
+                    transmit=transmit,
+                    receive=receive,
+                    transmitter=tx,
+                    receiver=rx,
+                    gains=ElementGains(
+                        (transmitters, receivers),
+                        (tx, rx),
+                        towards,
+                        located.transfer[carrier] * without_spreading[:, None, None],
+                        wavelength,
+                    ),
+                    wavelength=wavelength,
+                )
             )
-            made += [
-                ChannelMatrix(carrier=carrier, tx=pair // len(receivers), rx=pair % len(receivers), h=h)
-                for pair, h in enumerate(field.matrices(located.offsets))
-            ]
-        return tuple(made)
+        return self._made
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,12 +168,33 @@ class _Field:
                 for first, last in pairwise((offsets[pairs.start : pairs.stop + 1] - begin).tolist()):
                     yield waves[first:last].sum(0)
 
-    def _waves(self, rows: slice, sizes: tuple[int, int]) -> Complex128Array:
-        """What each of some paths adds to H, Shape ``[p, M, N]``."""
+    def responses(self, offsets: Int64Array, asked: Bins, doppler: Float64Array) -> Iterator[Complex64Array]:
+        """What is asked, of each pair of antennas in order, Shape ``[J, M, N]``."""
+        arrays = [(rx.size, tx.size) for tx in self.transmit.arrays for rx in self.receive.arrays]
+        bins = asked.carrier.slots * (asked.carrier.subcarriers if asked.part == "hf" else asked.carrier.taps)
+        for pair, (sizes, (begin, end)) in enumerate(zip(arrays, pairwise(offsets.tolist()), strict=True)):
+            response = np.zeros((bins, *sizes), np.complex64)
+            at_once = max(1, _BINS // (bins * sizes[1]))
+            for row in range(begin, end):
+                wave = self._waves(slice(row, row + 1), sizes)[0]
+                tau = self._between(slice(row, row + 1), sizes).length[0] / SPEED_OF_LIGHT
+                for first in range(0, sizes[0], at_once):
+                    m = slice(first, first + at_once)
+                    weights = asked.weights(pair, tau[m], doppler[row])
+                    response[:, m] += weights * wave[m]
+            yield response
+
+    def _between(self, rows: slice, sizes: tuple[int, int]) -> Lengths:
+        """Lengths and spreading of some paths between all elements, Shape ``[p, M, N]``."""
         tx, rx = self.transmitter[rows], self.receiver[rows]
         transmit = self.transmit.first[tx, None] + np.arange(sizes[1])
         receive = self.receive.first[rx, None] + np.arange(sizes[0])
-        between = self.paths.lengths(rows, self.transmit.positions[transmit], self.receive.positions[receive])
+        return self.paths.lengths(rows, self.transmit.positions[transmit], self.receive.positions[receive])
+
+    def _waves(self, rows: slice, sizes: tuple[int, int]) -> Complex128Array:
+        """What each of some paths adds to H, Shape ``[p, M, N]``."""
+        tx, rx = self.transmitter[rows], self.receiver[rows]
+        between = self._between(rows, sizes)
         turns = between.length
         turns *= -1 / self.wavelength
         turns -= np.round(turns)

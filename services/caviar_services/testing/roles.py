@@ -156,7 +156,24 @@ class ChannelConformance(ServiceConformance):
         finally:
             service.close()
         assert isinstance(product, Channel)
-        assert product.h == ()
+        assert product.h == product.hf == product.taps == ()
+
+    def test_wideband_parts_agree_with_the_matrices(self, played: Played) -> None:
+        """An entry per pair and carrier that has them; at the carrier and the frame's instant they are H."""
+        for channel in _products(played, "channel", Channel):
+            matrices = {(m.carrier, m.tx, m.rx): m.h for m in channel.h}
+            for response in channel.hf:
+                carrier = channel.carriers[response.carrier]
+                assert response.h.shape[:2] == (carrier.slots, carrier.subcarriers)
+                h = matrices[response.carrier, response.tx, response.rx]
+                centre = response.h[0, carrier.subcarriers // 2]
+                assert np.abs(centre - h).max() <= 1e-5 * np.abs(h).max(initial=0.0)
+            for taps in channel.taps:
+                carrier = channel.carriers[taps.carrier]
+                assert taps.h.shape[:2] == (carrier.slots, carrier.taps)
+            pairs = len(channel.tx) * len(channel.rx)
+            assert len(channel.hf) == pairs * sum(c.subcarriers > 0 for c in channel.carriers)
+            assert len(channel.taps) == pairs * sum(c.taps > 0 for c in channel.carriers)
 
 
 class SensorConformance(ServiceConformance):

@@ -47,7 +47,18 @@ from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 from caviar_services.world.shapes import SHAPES, ply
 
 SAMPLING_PERIOD_NS = 100_000_000
-CARRIERS = (Carrier(name="mmwave", frequency_hz=28e9, bandwidth_hz=100e6),)
+CARRIERS = (
+    Carrier(
+        name="mmwave",
+        frequency_hz=28e9,
+        bandwidth_hz=100e6,
+        subcarriers=5,
+        subcarrier_spacing_hz=480e3,
+        taps=8,
+        slots=2,
+        slot_duration_s=5e-4,
+    ),
+)
 DEVICES = (
     DeviceSpec(name="bs", kind="antenna", role="tx"),
     DeviceSpec(name="rx", kind="antenna", role="rx", on="*", count=2),

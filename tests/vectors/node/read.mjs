@@ -24,6 +24,7 @@ const readers = {
   "<u8": [8, (view, at) => view.getBigUint64(at, true)],
   "<f4": [4, (view, at) => view.getFloat32(at, true)],
   "<f8": [8, (view, at) => view.getFloat64(at, true)],
+  "<c8": [8, (view, at) => [view.getFloat32(at, true), view.getFloat32(at + 4, true)]],
   "<c16": [16, (view, at) => [view.getFloat64(at, true), view.getFloat64(at + 8, true)]],
 };
 

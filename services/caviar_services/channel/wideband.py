@@ -1,0 +1,114 @@
+"""Wideband parts of a channel: responses over subcarriers, taps, and both over the slots of a frame.
+
+`caviar_protocol.ofdm` says what a path's delay and Doppler shift make of each subcarrier and tap, `matrices`
+and the rungs have the waves between antenna elements; here they become the parts ``hf`` and ``taps``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal
+
+import msgspec
+import numpy as np
+
+from caviar_protocol.arrays import Complex64Array, Complex128Array, Float64Array, Int64Array
+from caviar_protocol.errors import ScenarioError
+from caviar_protocol.ofdm import first_tap, subcarrier_weights, tap_weights, undefined_part
+from caviar_protocol.topics import Carrier, ChannelResponse, ChannelTaps
+
+Part = Literal["hf", "taps"]
+
+_PRODUCTS = 1 << 15
+"""Products of elements in one product of matrices: OpenBLAS shares larger ones out to threads (`stacked`)."""
+
+
+class Wideband(msgspec.Struct, frozen=True):
+    """The wideband parts of a `Channel`."""
+
+    hf: tuple[ChannelResponse, ...] = ()
+    taps: tuple[ChannelTaps, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Bins:
+    """What is asked of one carrier in one part: J = S·K subcarriers or S·L taps."""
+
+    part: Part
+    index: int
+    """Of the carrier."""
+    carrier: Carrier
+    first: Int64Array
+    """Sample of the first tap of each pair, Shape ``[pairs]``."""
+
+    def weights(self, pair: int, tau: Float64Array, doppler: Float64Array) -> Complex128Array:
+        """What the amplitudes of a pair's paths are multiplied with, Shape ``[J, ...]``.
+
+        Delays [s] have the Shape ``[...]``, Doppler shifts [Hz] one that broadcasts to it.
+        """
+        if self.part == "hf":
+            found = subcarrier_weights(self.carrier, tau, doppler)
+        else:
+            found = tap_weights(self.carrier, tau, doppler, int(self.first[pair]))
+        return found.reshape(-1, *tau.shape)
+
+
+def required_parts(demand: Collection[str], carriers: Sequence[Carrier]) -> frozenset[str]:
+    """The wideband parts in demand. Raises `ScenarioError` where no carrier says what they consist of."""
+    parts = frozenset({"hf", "taps"} & set(demand))
+    for part in sorted(parts):
+        if problem := undefined_part(part, carriers):
+            raise ScenarioError(problem, key="carriers")
+    return parts
+
+
+def bins_of(
+    parts: Collection[str], carriers: Sequence[Carrier], tau: Float64Array, offsets: Int64Array
+) -> tuple[Bins, ...]:
+    """The parts of all carriers that have them; delays [s] and ``offsets`` are those of `Channel`."""
+    pairs = len(offsets) - 1
+    found = []
+    for index, carrier in enumerate(carriers):
+        if "hf" in parts and carrier.subcarriers:
+            found.append(Bins("hf", index, carrier, np.zeros(pairs, np.int64)))
+        if "taps" in parts and carrier.taps:
+            ends = pairwise(offsets.tolist())
+            first = [first_tap(carrier, tau[begin:end]) for begin, end in ends]
+            found.append(Bins("taps", index, carrier, np.array(first, np.int64)))
+    return tuple(found)
+
+
+def wideband_parts(bins: Sequence[Bins], responses: Iterable[Complex64Array], receivers: int) -> Wideband:
+    """Both parts from the responses ``[J, Nr, Nt]`` of each of the bins and pairs, pairs fastest."""
+    made: dict[str, list[ChannelResponse | ChannelTaps]] = {"hf": [], "taps": []}
+    rest = iter(responses)
+    for asked in bins:
+        for pair, first in enumerate(asked.first.tolist()):
+            tx, rx = divmod(pair, receivers)
+            response = next(rest)
+            h = response.reshape(asked.carrier.slots, -1, *response.shape[1:])
+            if asked.part == "hf":
+                made["hf"].append(ChannelResponse(carrier=asked.index, tx=tx, rx=rx, h=h))
+            else:
+                made["taps"].append(ChannelTaps(carrier=asked.index, tx=tx, rx=rx, first=first, h=h))
+    return Wideband(tuple(made["hf"]), tuple(made["taps"]))  # type: ignore[arg-type]
+
+
+def superposed(weights: Complex128Array, waves: Complex128Array) -> Complex64Array:
+    """Σ_p weights[j, p] · waves[p, m, n] in single precision, Shape ``[J, Nr, Nt]``.
+
+    In blocks that one thread multiplies: see `stacked.summed`.
+    """
+    paths, *sizes = waves.shape
+    columns = waves.reshape(paths, -1).astype(np.complex64)
+    single = weights.astype(np.complex64)
+    total = np.zeros((len(weights), columns.shape[1]), np.complex64)
+    depth = 32
+    for begin in range(0, paths, depth):
+        block = slice(begin, begin + depth)
+        at_once = max(1, _PRODUCTS // max(1, columns.shape[1] * len(columns[block])))
+        for row in range(0, len(total), at_once):
+            total[row : row + at_once] += single[row : row + at_once, block] @ columns[block]
+    return total.reshape(-1, *sizes)
