@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from functools import cached_property
 from typing import (
     TYPE_CHECKING,
@@ -290,13 +291,14 @@ class TopicArrays(Generic[P, K]):
 
     def __repr__(self) -> str:
         lines = [f"{self.topic} of {', '.join(map(repr, self.sources))}, F = {len(self)} frames"]
-        try:
-            is_small = sum(file.stat().st_size for file in self._recording.files) <= MEASURED_B
-            shapes = {name: self._shape(c) for name, c in self.columns.items()} if is_small else {}
-        except (OSError, RecordingError):  # damaged: reading an array says where
-            shapes = {}
+        shapes: dict[str, tuple[int, ...]] = {}
+        with suppress(OSError):  # damaged: reading an array says where
+            if sum(file.stat().st_size for file in self._recording.files) <= MEASURED_B:
+                for name, column in self.columns.items():
+                    with suppress(RecordingError):  # damaged likewise, or a part that was not recorded
+                        shapes[name] = self._shape(column)
         for name, column in self.columns.items():
-            lines.append(f"  {name}: {column.__doc__}" + (f" Here {shapes[name]}." if shapes else ""))
+            lines.append(f"  {name}: {column.__doc__}" + (f" Here {shapes[name]}." if name in shapes else ""))
         return "\n".join(lines)
 
     def _shape(self, column: Column[Any]) -> tuple[int, ...]:

@@ -224,6 +224,30 @@ class ChannelArrays(UserArrays[Channel]):
         found = {(m.carrier, m.tx, m.rx): m.h for m in channel.h}
         return recorded_part(self, "channel.h", [found.get(pair) for pair in _pairs(channel)])
 
+    def _responses(self, channel: Channel) -> Rows:
+        return self._wideband("hf", channel)
+
+    def _impulses(self, channel: Channel) -> Rows:
+        return self._wideband("taps", channel)
+
+    def _first_taps(self, channel: Channel) -> Rows:
+        if not channel.taps:
+            return self._wideband("taps", channel)
+        first = {(t.carrier, t.tx, t.rx): t.first for t in channel.taps}
+        return [first.get(pair, 0) for pair in _pairs(channel)]
+
+    def _wideband(self, part: str, channel: Channel) -> Rows:
+        """Rows of a part that only carriers with a numerology have; empty ones for the others."""
+        found = {(r.carrier, r.tx, r.rx): r.h for r in getattr(channel, part)}
+        keys = {"hf": "subcarriers", "taps": "taps"}
+        rows = [
+            found.get(pair) if getattr(channel.carriers[pair[0]], keys[part]) else _NO_BINS
+            for pair in _pairs(channel)
+        ]
+        if not found and rows:
+            rows = [None]
+        return recorded_part(self, f"channel.{part}", rows)
+
     def _sights(self, channel: Channel) -> Rows:
         return [channel.los[t, r] for _, t, r in _pairs(channel)]
 
@@ -258,6 +282,25 @@ class ChannelArrays(UserArrays[Channel]):
     h = Column(
         np.complex128, "Nr", "Nt", doc="narrowband gain from TX element n to RX element m", rows=_matrices
     )
+    hf = Column(
+        np.complex64,
+        "S",
+        "K",
+        "Nr",
+        "Nt",
+        doc="gain on each subcarrier in each slot, from TX element n to RX element m",
+        rows=_responses,
+    )
+    taps = Column(
+        np.complex64,
+        "S",
+        "L",
+        "Nr",
+        "Nt",
+        doc="gain in each tap and slot, from TX element n to RX element m",
+        rows=_impulses,
+    )
+    first_tap = Column(np.int64, doc="sample of the first tap; 0 is the delay 0", rows=_first_taps)
     los = Column(np.bool_, doc="line of sight is free", rows=_sights)
     paths = Column(np.int64, doc="number of paths", rows=_counts)
     a = Column(np.complex128, "P", doc="amplitude gain of each path, incl. exp(−j2πfτ)", rows=_amplitudes)
@@ -294,6 +337,10 @@ class ChannelArrays(UserArrays[Channel]):
     def keys_of(self, payload: Channel) -> Sequence[User]:
         carriers, tx, rx = payload.carriers, payload.tx, payload.rx
         return [User(tx[t], rx[r], carriers[c].name) for c, t, r in _pairs(payload)]
+
+
+_NO_BINS = np.zeros((0, 0, 0, 0), np.complex64)
+"""Of a carrier without subcarriers or taps."""
 
 
 def _pairs(channel: Channel) -> Iterator[tuple[int, int, int]]:

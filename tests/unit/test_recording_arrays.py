@@ -21,6 +21,8 @@ from caviar_protocol.topics import (
     Carrier,
     Channel,
     ChannelMatrix,
+    ChannelResponse,
+    ChannelTaps,
     Depth,
     DepthImage,
     Intrinsics,
@@ -90,6 +92,40 @@ def test_paths_are_cut_by_user_and_padded_to_the_most(street: Path) -> None:
     assert rays.los[0].tolist() == [True, False, False]
     assert rays.rung == ("siso-rt",) * 6
     assert np.isnan(rays.expected_error_db).all()
+
+
+def test_wideband_parts_are_there_for_carriers_that_have_them(tmp_path: Path) -> None:
+    """hf and taps of the first carrier; the second has no subcarriers and no taps."""
+    rays = with_h(channel(0, 2), two_carriers=True)
+    wide = msgspec.structs.replace(
+        rays.carriers[0], subcarriers=3, subcarrier_spacing_hz=1e6, taps=2, slots=2, slot_duration_s=1e-3
+    )
+    h = np.arange(2 * 3 * 4).reshape(2, 3, 1, 4).astype(np.complex64)
+    rays = msgspec.structs.replace(
+        rays,
+        carriers=(wide, rays.carriers[1]),
+        hf=tuple(ChannelResponse(carrier=0, tx=0, rx=r, h=(r + 1) * h) for r in range(2)),
+        taps=tuple(ChannelTaps(carrier=0, tx=0, rx=r, first=7 - r, h=(r + 1j) * h[:, :2]) for r in range(2)),
+    )
+    made = recorder(tmp_path)
+    made.step(frame(0, product("channel", "rt", rays, 0)))
+    made.close()
+    read = Recording(tmp_path)["channel"]
+    assert (read.hf.shape, read.hf.dtype) == ((1, 4, 2, 3, 1, 4), np.complex64)
+    np.testing.assert_array_equal(read.select(carrier="wide").hf[0, 1], 2 * h)
+    assert np.isnan(read.select(carrier=("wide", "low")).hf[0, 2:]).all()
+    np.testing.assert_array_equal(read.taps[0, 1], (1 + 1j) * h[:, :2])
+    assert read.first_tap.tolist() == [[7, 6, 0, 0]]
+
+
+def test_a_wideband_part_that_was_not_recorded_is_asked_for_by_name(street: Path) -> None:
+    rays = Recording(street)["channel"]
+    with pytest.raises(RecordingError, match=r"without channel\.hf: write it into `record`"):
+        rays.hf  # noqa: B018
+    with pytest.raises(RecordingError, match=r"without channel\.taps: write it into `record`"):
+        rays.first_tap  # noqa: B018
+    assert "h: narrowband gain" in repr(rays)
+    assert f"Here {rays.h.shape}" in repr(rays)
 
 
 def test_several_carriers_are_users_of_their_own(tmp_path: Path) -> None:

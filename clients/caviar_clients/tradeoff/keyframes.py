@@ -22,8 +22,8 @@ from caviar_clients.tradeoff.users import Key, Noise, UserChannel, differences, 
 from caviar_clients.tradeoff.worker import Sample, Worker
 from caviar_protocol.errors import RunError
 from caviar_protocol.topics import Channel
+from caviar_protocol.topics.channel import PLANE_WAVES
 from caviar_services.channel.interpolation import Between, Interpolation, Keyframe
-from caviar_services.channel.interpolation.between import PLANE_WAVES
 
 SPACINGS = (2, 5, 10)
 """Frames from one keyframe to the next."""

@@ -22,6 +22,9 @@ from caviar_protocol.arrays import (
 )
 from caviar_protocol.errors import PayloadError
 
+PLANE_WAVES = ("free-space", "geometric", "siso-rt")
+"""Rungs on which arrays see plane waves: H follows from the paths between their reference points."""
+
 
 class Interaction(IntEnum):
     """What a path does at one of its points."""

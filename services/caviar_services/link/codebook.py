@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from functools import lru_cache
 
 import numpy as np
 
@@ -31,6 +32,14 @@ def dft_codebook(array: AntennaArray) -> Complex128Array:
     return codebook
 
 
+def dft_beam(array: AntennaArray, beam: int) -> Complex128Array:
+    """Row ``beam`` of `dft_codebook`, Shape ``[N]``, without the others."""
+    column, row = divmod(beam, array.rows)
+    vector: Complex128Array = np.multiply.outer(_dft(array.columns)[column], _dft(array.rows)[row]).ravel()
+    return vector
+
+
+@lru_cache(maxsize=64)
 def _dft(size: int) -> Complex128Array:
     """Unitary matrix with entry (k, n) = exp(+j2πkn/N)/sqrt(N)."""
     n = np.arange(size)

@@ -17,14 +17,13 @@ from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int
 from caviar_protocol.coordinates import SPEED_OF_LIGHT, angles
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.topics import Channel, ChannelMatrix, Scene
+from caviar_protocol.topics.channel import PLANE_WAVES
 from caviar_services.antenna import element_positions, steering_vector
 from caviar_services.channel.interpolation.course import Course, Courses
 from caviar_services.channel.interpolation.joined import Joined, carrier_phase, join
 from caviar_services.channel.interpolation.motion import Places, ends_of, places, velocities
 from caviar_services.channel.paths import Antenna
 
-PLANE_WAVES = ("free-space", "geometric", "siso-rt")
-"""Rungs whose H follows from paths between reference points."""
 CURVATURE = 4.0
 """|G''|/|G| over direction [1/rad²] that antennas, Fresnel's coefficients and polarisation are expected to
 stay below: 1 for a dipole, 2.1 for the element of 3GPP TR 38.901, and each at both ends."""

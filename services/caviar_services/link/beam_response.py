@@ -1,0 +1,106 @@
+"""What chosen beam pairs get over the band and the slots of a frame, without the matrices of the whole grid.
+
+With the beams of `codebook` the equivalent channel (paper, eq. 1) of a pair of beams w and f is
+
+    y(Δf, Δt) = w* H(Δf, Δt) f = Σ_p (w* r_p) · (t_pᵀ f) · a_p · exp(−j2π(Δf·(τ_p − Δt·ν_p/f_c) − ν_p·Δt))
+
+with the phases r_p and t_p of the elements on path p: two numbers a path instead of a matrix a subcarrier.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from caviar_protocol.arrays import Complex128Array, Float64Array
+from caviar_protocol.coordinates import rotation_matrix
+from caviar_protocol.errors import PayloadError
+from caviar_protocol.ofdm import subcarrier_weights
+from caviar_protocol.scene import device_pose
+from caviar_protocol.topics import AntennaDevice, Channel, Scene
+from caviar_protocol.topics.channel import PLANE_WAVES
+from caviar_services.antenna import steering_vector
+from caviar_services.link.codebook import dft_beam
+from caviar_services.link.users import Users
+
+
+def beam_responses(
+    channel: Channel, scene: Scene, users: Users, beams: Sequence[tuple[int, int]]
+) -> list[Complex128Array]:
+    """y of each user's beam pair on the subcarriers and in the slots of its carrier.
+
+    Parameters
+    ----------
+    channel
+        With its paths; on the rungs ``spherical`` and ``mimo-rt``, where an array does not see plane waves,
+        with part ``hf``.
+    scene
+        Of the same frame.
+    users
+        Of that scene.
+    beams
+        TX and RX beam of each user; a pair with −1 is not served.
+
+    Returns
+    -------
+    list of Complex128Array
+        Of each user, Shape ``[S, K]`` with S slots and K subcarriers; zeros for a user that is not served,
+        has no path, or is not in ``channel``.
+
+    Raises
+    ------
+    PayloadError
+        Naming the user, for a beam that its codebook does not have, or where part ``hf`` is missing.
+    """
+    matrices = {(response.carrier, response.tx, response.rx): response.h for response in channel.hf}
+    rotations: dict[str, Float64Array] = {}
+    found = []
+    for user, place, (tx_beam, rx_beam) in zip(users, users.places(channel), beams, strict=True):
+        if place is None or tx_beam < 0 or rx_beam < 0:
+            found.append(np.zeros((user.carrier.slots, user.carrier.subcarriers), np.complex128))
+            continue
+        for beam, device in ((tx_beam, user.tx), (rx_beam, user.rx)):
+            if beam >= device.array.size:
+                raise PayloadError(
+                    f"beam {beam} of user {user} does not exist; the codebook of {device.name!r} has beams "
+                    f"0 to {device.array.size - 1}"
+                )
+        ends = dft_beam(user.tx.array, tx_beam).conj(), dft_beam(user.rx.array, rx_beam).conj()
+        index, tx, rx = place
+        if channel.rung in PLANE_WAVES:
+            paths = channel.pair(user.tx.name, user.rx.name)
+            sent = _gains(scene, user.tx, channel.aod[paths], ends[0], rotations)
+            taken = _gains(scene, user.rx, channel.aoa[paths], ends[1], rotations)
+            carrier = channel.carriers[index]
+            weights = subcarrier_weights(carrier, channel.tau[paths], channel.doppler[index, paths])
+            found.append(weights @ (channel.a[index, paths] * sent * taken))
+        elif (index, tx, rx) in matrices:
+            found.append((matrices[index, tx, rx] @ ends[0]) @ ends[1])
+        else:
+            raise PayloadError(
+                f"the response of user {user} on rung {channel.rung!r} does not follow from paths; ask for "
+                "part 'hf' of the channel in the inputs of this service"
+            )
+    return found
+
+
+def _gains(
+    scene: Scene,
+    device: AntennaDevice,
+    angles: Float64Array,
+    beam: Complex128Array,
+    rotations: dict[str, Float64Array],
+) -> Complex128Array:
+    """Gain of a beam on paths with these angles in world axes, Shape ``[P, 2]`` to ``[P]``."""
+    if device.array.size == 1:
+        return np.ones(len(angles), np.complex128)
+    if device.name not in rotations:
+        rotations[device.name] = rotation_matrix(device_pose(scene, device).orientation)
+    sine = np.sin(angles[:, 0])
+    directions = np.empty((len(angles), 3))
+    directions[:, 0] = sine * np.cos(angles[:, 1])
+    directions[:, 1] = sine * np.sin(angles[:, 1])
+    directions[:, 2] = np.cos(angles[:, 0])
+    gains: Complex128Array = steering_vector(device.array, directions @ rotations[device.name]) @ beam
+    return gains
