@@ -171,10 +171,9 @@ class _Field:
     def responses(self, offsets: Int64Array, asked: Bins, doppler: Float64Array) -> Iterator[Complex64Array]:
         """What is asked, of each pair of antennas in order, Shape ``[J, M, N]``."""
         arrays = [(rx.size, tx.size) for tx in self.transmit.arrays for rx in self.receive.arrays]
-        bins = asked.carrier.slots * (asked.carrier.subcarriers if asked.part == "hf" else asked.carrier.taps)
         for pair, (sizes, (begin, end)) in enumerate(zip(arrays, pairwise(offsets.tolist()), strict=True)):
-            response = np.zeros((bins, *sizes), np.complex64)
-            at_once = max(1, _BINS // (bins * sizes[1]))
+            response = np.zeros((asked.count, *sizes), np.complex64)
+            at_once = max(1, _BINS // (asked.count * sizes[1]))
             for row in range(begin, end):
                 wave = self._waves(slice(row, row + 1), sizes)[0]
                 tau = self._between(slice(row, row + 1), sizes).length[0] / SPEED_OF_LIGHT

@@ -6,6 +6,7 @@ and the rungs have the waves between antenna elements; here they become the part
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -43,6 +44,12 @@ class Bins:
     first: Int64Array
     """Sample of the first tap of each pair, Shape ``[pairs]``."""
 
+    @property
+    def count(self) -> int:
+        """J."""
+        carrier = self.carrier
+        return carrier.slots * (carrier.subcarriers if self.part == "hf" else carrier.taps)
+
     def weights(self, pair: int, tau: Float64Array, doppler: Float64Array) -> Complex128Array:
         """What the amplitudes of a pair's paths are multiplied with, Shape ``[J, ...]``.
 
@@ -52,7 +59,7 @@ class Bins:
             found = subcarrier_weights(self.carrier, tau, doppler)
         else:
             found = tap_weights(self.carrier, tau, doppler, int(self.first[pair]))
-        return found.reshape(-1, *tau.shape)
+        return found.reshape(self.count, *tau.shape)
 
 
 def required_parts(demand: Collection[str], carriers: Sequence[Carrier]) -> frozenset[str]:
@@ -102,7 +109,7 @@ def superposed(weights: Complex128Array, waves: Complex128Array) -> Complex64Arr
     In blocks that one thread multiplies: see `stacked.summed`.
     """
     paths, *sizes = waves.shape
-    columns = waves.reshape(paths, -1).astype(np.complex64)
+    columns = waves.reshape(paths, math.prod(sizes)).astype(np.complex64)
     single = weights.astype(np.complex64)
     total = np.zeros((len(weights), columns.shape[1]), np.complex64)
     depth = 32
@@ -111,4 +118,4 @@ def superposed(weights: Complex128Array, waves: Complex128Array) -> Complex64Arr
         at_once = max(1, _PRODUCTS // max(1, columns.shape[1] * len(columns[block])))
         for row in range(0, len(total), at_once):
             total[row : row + at_once] += single[row : row + at_once, block] @ columns[block]
-    return total.reshape(-1, *sizes)
+    return total.reshape(len(weights), *sizes)

@@ -1,0 +1,129 @@
+"""Wideband parts of a product, from paths as a model found them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from caviar_protocol.codec import decode_payload, encode_payload
+from caviar_protocol.coordinates import SPEED_OF_LIGHT
+from caviar_protocol.errors import ScenarioError
+from caviar_protocol.ofdm import slot_offsets, subcarrier_offsets
+from caviar_protocol.topics import AntennaArray, Carrier, Channel, ChannelOptions
+from caviar_services.antenna import element_positions
+from caviar_services.channel.assemble import Product, assemble
+from caviar_services.channel.paths import Antenna, PathTable
+from caviar_services.channel.wideband import required_parts, superposed
+
+CARRIERS = (
+    Carrier(
+        name="wide",
+        frequency_hz=28e9,
+        bandwidth_hz=400e6,
+        subcarriers=31,
+        subcarrier_spacing_hz=12e6,
+        taps=40,
+        slots=2,
+        slot_duration_s=2e-4,
+    ),
+    Carrier(name="narrow", frequency_hz=3.5e9),
+)
+ARRAYS = AntennaArray(rows=2, columns=4), AntennaArray(columns=3)
+
+
+def antenna(name: str, array: AntennaArray, x: float, speed: float = 0.0) -> Antenna:
+    return Antenna(name, array, np.array([x, 2.0, 3.0]), np.eye(3), np.array([speed, 0.0, 0.0]))
+
+
+def product(parts: frozenset[str], reached: tuple[int, ...] = (0,)) -> Channel:
+    """A transmitter, a receiver with a direct and a reflected path, and one without a path."""
+    transmitters = [antenna("bs", ARRAYS[0], 0.0)]
+    receivers = [antenna("near", ARRAYS[1], 40.0, speed=-20.0), antenna("none", ARRAYS[1], 50.0)]
+    pair = np.repeat(np.array(reached, np.int64), 2)
+    loss = SPEED_OF_LIGHT / (4 * np.pi * np.array([28e9, 3.5e9]))
+    scale = np.tile([1 / 40.0, 0.4 / 60.0], len(reached))
+    table = PathTable(
+        pair=pair,
+        transfer=(loss[:, None] * scale)[..., None, None] * np.eye(3, dtype=np.complex128),
+        types=np.tile(np.array([[0], [1]], np.uint8), (len(reached), 1)),
+        objects=np.tile(np.array([[-1], [0]], np.int32), (len(reached), 1)),
+        points=np.tile(np.array([[[0.0, 0.0, 0.0]], [[20.0, 24.0, 3.0]]]), (len(reached), 1, 1)),
+        object_names=("wall",),
+        object_velocity=np.zeros((1, 3)),
+    )
+    asked = Product(rung="siso-rt", options=ChannelOptions(), carriers=CARRIERS, with_h=True, wideband=parts)
+    return assemble(asked, transmitters, receivers, table, np.array([[True, False]]))
+
+
+BOTH = frozenset({"hf", "taps"})
+
+
+def test_every_element_pair_has_the_response_of_its_paths() -> None:
+    """Σ_p a·exp(j2π k̂·r)·exp(−j2π(f·τ)) written out, with delays that shrink or grow from slot to slot."""
+    channel = product(BOTH)
+    carrier = CARRIERS[0]
+    f, t = subcarrier_offsets(carrier), slot_offsets(carrier)
+    expected = np.zeros((2, 31, 3, 8), np.complex128)
+    taps = np.zeros((2, 40, 3, 8), np.complex128)
+    for p in range(2):
+        away = [
+            np.array([np.sin(z) * np.cos(phi), np.sin(z) * np.sin(phi), np.cos(z)])
+            for z, phi in (channel.aoa[p], channel.aod[p])
+        ]
+        rx, tx = (
+            np.exp(2j * np.pi * element_positions(array) @ k)
+            for array, k in zip(ARRAYS[::-1], away, strict=True)
+        )
+        a, tau, shift = channel.a[0, p], channel.tau[p], channel.doppler[0, p]
+        for s in range(2):
+            delay = tau - shift / 28e9 * t[s]
+            turned = a * np.exp(2j * np.pi * shift * t[s]) * np.outer(rx, tx)
+            expected[s] += np.exp(-2j * np.pi * f * delay)[:, None, None] * turned
+            sample = channel.taps[0].first + np.arange(40) - 400e6 * delay
+            taps[s] += np.sinc(sample)[:, None, None] * turned
+    assert np.abs(channel.hf[0].h - expected).max() <= 1e-6 * np.abs(expected).max()
+    assert np.abs(channel.taps[0].h - taps).max() <= 1e-6 * np.abs(taps).max()
+    assert np.abs(channel.hf[0].h[0, 15] - channel.h[0].h).max() <= 1e-6 * np.abs(channel.h[0].h).max()
+    assert abs(channel.doppler[0, 0]) == pytest.approx(28e9 * 20 / SPEED_OF_LIGHT)
+
+
+def test_pairs_without_a_path_have_zeros_and_carriers_without_subcarriers_nothing() -> None:
+    channel = product(BOTH)
+    assert [(r.carrier, r.tx, r.rx) for r in channel.hf] == [(0, 0, 0), (0, 0, 1)]
+    assert channel.hf[1].h.shape == (2, 31, 3, 8)
+    assert channel.taps[1].h.shape == (2, 40, 3, 8)
+    assert not channel.hf[1].h.any()
+    assert not channel.taps[1].h.any()
+    empty = product(BOTH, reached=())
+    assert not any(r.h.any() for r in (*empty.hf, *empty.taps))
+
+
+def test_parts_are_made_where_asked_for_and_change_nothing_else() -> None:
+    plain = product(frozenset())
+    assert plain.hf == plain.taps == ()
+    assert product(frozenset({"taps"})).hf == ()
+    header, body = encode_payload(product(BOTH))
+    assert (header, body) == encode_payload(product(BOTH))
+    assert decode_payload("channel", header, body) == product(BOTH)
+    for matrix, other in zip(plain.h, product(BOTH).h, strict=True):
+        assert matrix.h.tobytes() == other.h.tobytes()
+
+
+def test_a_part_that_no_carrier_defines_is_refused_with_what_to_write() -> None:
+    assert required_parts({"h", "hf"}, CARRIERS) == {"hf"}
+    with pytest.raises(ScenarioError, match=r"channel\.hf needs a carrier .* subcarriers = 264"):
+        required_parts({"hf"}, CARRIERS[1:])
+    with pytest.raises(ScenarioError, match=r"channel\.taps needs a carrier .* taps = 64"):
+        required_parts({"taps"}, CARRIERS[1:])
+
+
+@pytest.mark.parametrize(("bins", "paths", "sizes"), [(7, 0, (2, 3)), (5, 130, (8, 64)), (3, 2, (64, 1024))])
+def test_sums_in_blocks_are_sums(bins: int, paths: int, sizes: tuple[int, int]) -> None:
+    random = np.random.default_rng(paths)
+    weights, waves = (
+        random.normal(size=shape) + 1j * random.normal(size=shape)
+        for shape in ((bins, paths), (paths, *sizes))
+    )
+    found, expected = superposed(weights, waves), np.einsum("jp,pmn->jmn", weights, waves)
+    assert found.shape == (bins, *sizes)
+    assert np.abs(found - expected).max(initial=0.0) <= 1e-5 * max(np.abs(expected).max(initial=0.0), 1.0)
