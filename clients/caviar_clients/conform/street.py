@@ -39,7 +39,6 @@ from caviar_protocol.topics import (
     Segmentation,
     SegmentationImage,
 )
-from caviar_protocol.topics.channel import Carrier
 
 PERIOD_NS = 100_000_000
 FREQUENCY_HZ = 28e9
@@ -53,6 +52,9 @@ frames = 1000
 [[carriers]]
 name = "mmwave"
 frequency_hz = 28e9
+subcarriers = 4
+subcarrier_spacing_hz = 480e3
+taps = 8
 
 [[devices]]
 name = "bs"
@@ -230,7 +232,7 @@ def _channel(frame: int) -> Channel:
     phases = np.exp(1j * math.pi * np.outer(np.arange(2), np.ones(4)) * math.sin(azimuth))
     return Channel(
         rung="free-space",
-        carriers=(Carrier(name="mmwave", frequency_hz=FREQUENCY_HZ, bandwidth_hz=100e6),),
+        carriers=parse_scenario(SCENARIO).carriers,
         tx=("bs",),
         rx=("car.1/rx",),
         los=np.array([[True]]),
