@@ -80,7 +80,7 @@ class LidarArrays(_NamesObjects[Lidar]):
         return [scan.points for scan in payload.scans]
 
     def _points_world(self, payload: Lidar) -> Rows:
-        return [scan.points_world for scan in payload.scans]
+        return [scan.in_world() for scan in payload.scans]
 
     def _ranges(self, payload: Lidar) -> Rows:
         return [scan.range for scan in payload.scans]

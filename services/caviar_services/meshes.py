@@ -1,8 +1,9 @@
-"""Meshes of moving objects, and the pool of bodies that stand for them in a ray tracer.
+"""Meshes of moving objects, and the pool of bodies that stand for them in a channel's ray tracer.
 
 An object's mesh is a *unit* mesh: its bounding box is −½…½ on every axis, x forward, z up. It is
 scaled by the object's dimensions, turned and moved. Ray tracers rebuild little when vertices
-change and much when bodies come or go, so each keeps a pool of bodies and parks the unused ones.
+change and much when bodies come or go, so the channel keeps a pool of bodies and parks the unused ones.
+Sensors need nothing of a body but its triangles, and hold those of the frame alone.
 """
 
 from __future__ import annotations

@@ -245,6 +245,34 @@ def test_between_the_scans_with_points_the_grid_says_the_same(yard: dict[str, Pa
             assert lidar.object_names == ()
 
 
+def test_points_in_world_axes_follow_from_those_of_the_sensor(yard: dict[str, Path]) -> None:
+    """Left out by a setting, they are computed; the grid, which is made of them, is the same."""
+    grid = GridSettings(minimum_m=(-30, -30, 0), maximum_m=(30, 30, 6), cells=(30, 30, 6))
+    settings = LidarSettings(bodies_per_asset=4, grid=grid)
+    device = LidarDevice(
+        name="lidar", position=(4, -3, 2), orientation=quaternion_from_euler(0.7, 0.2, -0.1), azimuth_steps=90
+    )
+    scene = scene_of({"a": a_car(9, 2)}, device)
+    (whole,) = observed(prepared(yard, settings, frozenset({"grid"})), scene).scans
+    alone = LidarSettings(bodies_per_asset=4, grid=grid, points_world=False)
+    (scan,) = observed(prepared(yard, alone, frozenset({"grid"})), scene).scans
+    assert scan.points_world is None
+    assert whole.points_world is not None
+    np.testing.assert_allclose(scan.in_world(), whole.points_world, atol=2e-5)
+    assert np.array_equal(scan.points, whole.points)
+    assert scan.grid == whole.grid
+
+
+def test_the_ray_tracer_holds_the_bodies_of_the_frame_alone(yard: dict[str, Path]) -> None:
+    """Embree rebuilds all triangles of the mesh in each frame, those of bodies that are not there too."""
+    service = prepared(yard, LidarSettings(bodies_per_asset=64))
+    for count in (3, 0, 5):
+        observed(service, scene_of({f"car{i}": a_car(6 * i, 5) for i in range(count)}, LEVEL))
+        assert service.traced is not None
+        moving = len(service.traced.face_owner) - service.traced.scenery_faces
+        assert moving == max(1, count * len(car().faces))
+
+
 def traffic(frame: int) -> dict[str, Body]:
     """Cars that drive, turn, come and leave."""
     return {

@@ -294,6 +294,17 @@ def test_lidar_scans_are_padded_and_objects_renumbered(tmp_path: Path) -> None:
         Recording(tmp_path)["lidar"]
 
 
+def test_points_in_world_axes_are_computed_where_they_were_left_out(tmp_path: Path) -> None:
+    made = recorder(tmp_path)
+    whole = lidar(1)
+    scan = msgspec.structs.replace(whole.scans[0], points_world=None)
+    made.step(frame(1, product("lidar", "lidar", msgspec.structs.replace(whole, scans=(scan,)), 1)))
+    made.close()
+    world = Recording(tmp_path)["lidar"].points_world[0, 0]
+    np.testing.assert_allclose(world, whole.scans[0].points_world, atol=1e-5)
+    assert np.abs(world - scan.points).max() > 1
+
+
 def test_images_are_stacked(tmp_path: Path) -> None:
     optics = {"sensor": "cam", "position": (1.0, 2.0, 3.0), "orientation": (1.0, 0.0, 0.0, 0.0)}
     optics["intrinsics"] = Intrinsics(fx=1.0, fy=1.0, cx=2.0, cy=1.0)

@@ -37,8 +37,8 @@ def draw_scan(scan: LidarScan, lidar: Lidar, scene: Scene | None, title: str, fi
 def _view(scan: LidarScan) -> tuple[tuple[float, float], tuple[float, float]]:
     """Limits of x and y [m]: the sensor and nearly all hits; at least 20 m."""
     around = np.array([scan.position[:2]])
-    if len(scan.points_world):
-        around = np.vstack([around, np.percentile(scan.points_world[:, :2], [0.2, 99.8], axis=0)])
+    if len(scan.range):
+        around = np.vstack([around, np.percentile(scan.in_world()[:, :2], [0.2, 99.8], axis=0)])
     low, high = around.min(axis=0), around.max(axis=0)
     half = np.maximum((high - low) / 2 + 3.0, 10.0)
     half = np.maximum(half, half.max() * 0.25)
@@ -47,7 +47,7 @@ def _view(scan: LidarScan) -> tuple[tuple[float, float], tuple[float, float]]:
 
 
 def _draw_above(drawn: Any, axes: Any, scan: LidarScan, moving: BoolArray, scene: Scene | None) -> None:
-    points = scan.points_world
+    points = scan.in_world()
     height = points[:, 2]
     limits = np.percentile(height, [1, 99]) if len(height) else (0.0, 1.0)
     cloud = axes.scatter(

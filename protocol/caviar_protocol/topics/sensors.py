@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated
 
 import msgspec
+import numpy as np
 
 from caviar_protocol.arrays import (
     Float32Array,
@@ -17,6 +18,7 @@ from caviar_protocol.arrays import (
     array,
     quantity,
 )
+from caviar_protocol.coordinates import rotation_matrix
 
 
 class OccupancyGrid(Payload, frozen=True, kw_only=True, omit_defaults=True):
@@ -36,7 +38,8 @@ class LidarScan(Payload, frozen=True, kw_only=True, omit_defaults=True):
     """One turn of one LIDAR: the rays that hit something, in ray order.
 
     Ray ``r`` belongs to beam ``r // azimuth_steps`` (lowest elevation first) and azimuth step
-    ``r % azimuth_steps`` (counter-clockwise from the device's +x axis).
+    ``r % azimuth_steps`` (counter-clockwise from the device's +x axis). A LIDAR may be set to leave
+    ``points_world`` out since 1.4; then they are the points turned by the orientation, at the position.
     """
 
     sensor: str
@@ -47,11 +50,25 @@ class LidarScan(Payload, frozen=True, kw_only=True, omit_defaults=True):
     """Rotates the sensor's axes into world axes."""
     ray: Annotated[Int32Array, array("<i4", "N", unit="1", doc="index of the ray")]
     points: Annotated[Float32Array, array("<f4", "N", 3, unit="m", doc="hit, sensor axes")]
-    points_world: Annotated[Float32Array, array("<f4", "N", 3, unit="m", doc="hit, world axes")]
+    points_world: (
+        Annotated[
+            Float32Array,
+            array("<f4", "N", 3, unit="m", doc="hit, world axes"),
+        ]
+        | None
+    ) = None
     range: Annotated[Float32Array, array("<f4", "N", unit="m", doc="distance to the hit")]
     object: Annotated[Int32Array, array("<i4", "N", unit="1", doc="index into object_names")]
     grid: OccupancyGrid | None = None
     """Where part ``grid`` is in demand."""
+
+    def in_world(self) -> Float32Array:
+        """Hits in world axes [m], Shape ``[N, 3]``: ``points_world``, or else of ``points`` and the pose."""
+        if self.points_world is not None:
+            return self.points_world
+        turned = self.points.astype(np.float64) @ rotation_matrix(self.orientation).T
+        world: Float32Array = (turned + np.array(self.position)).astype(np.float32)
+        return world
 
 
 class Lidar(Payload, frozen=True, kw_only=True, omit_defaults=True):

@@ -1,6 +1,6 @@
-"""What all sensor services share: the scene for rays, and the settings of its pool of bodies.
+"""What all sensor services share: the scene for rays, and how many bodies may be in it.
 
-A sensor implements `observe`; loading, moving and parking of meshes is done here, the same way
+A sensor implements `observe`; loading and moving of meshes is done here, the same way
 for every sensor.
 """
 
@@ -59,6 +59,8 @@ class Sensors(Service[S]):
     """The scene for rays; None where nothing is asked for."""
     shapes: tuple[SceneryShape, ...] = ()
     """Shapes of the scenery, in the order of their owners in `traced`."""
+    _capacity: Mapping[str, int]
+    """Objects that may be in the scene at once, by asset name."""
 
     def prepare(self, preparation: Preparation) -> Prepared:
         """Load the scenery and the objects' meshes, and compile what `observe` needs.
@@ -106,6 +108,13 @@ class Sensors(Service[S]):
             measured={"scene update": updated - started, "observation": done - updated},
         )
 
+    def release_memory(self) -> None:
+        """Dr.Jit keeps freed buffers, some of each size that it has seen; sizes vary with what rays hit."""
+        if self.traced is not None:
+            import drjit as dr
+
+            dr.flush_malloc_cache()
+
     def close(self) -> None:
         """Release the scene."""
         self.traced = None
@@ -136,21 +145,23 @@ class Sensors(Service[S]):
                 f"the run has no mesh {unknown[0]!r}; meshes of its objects: {', '.join(sorted(bodies)[1:])}",
                 key=f"services.{self.run.name}.settings.bodies",
             )
-        capacity = dict.fromkeys(bodies, self.settings.bodies_per_asset) | self.settings.bodies
-        return TracedScene(mi, tuple(shape.name for shape in self.shapes), meshes, bodies, capacity)
+        self._capacity = dict.fromkeys(bodies, self.settings.bodies_per_asset) | self.settings.bodies
+        return TracedScene(mi, tuple(shape.name for shape in self.shapes), meshes, bodies, self._capacity)
 
     def _warm_up(self, mi: Any) -> None:
-        """Compile the kernels of an update and an observation, on a scene without objects."""
+        """Compile the kernels of an update and an observation: of a box around example devices, so that
+        their rays come back."""
         if self.traced is None:
             return
+        count = min(1, self._capacity[""])
         scene = Scene(
-            names=(),
-            classes=(),
-            assets=(),
-            position=np.zeros((0, 3)),
-            orientation=np.zeros((0, 4)),
-            velocity=np.zeros((0, 3)),
-            dimensions=np.zeros((0, 3)),
+            names=("warm-up box",) * count,
+            classes=("box",) * count,
+            assets=("",) * count,
+            position=np.zeros((count, 3)),
+            orientation=np.array([[1.0, 0.0, 0.0, 0.0]] * count).reshape(count, 4),
+            velocity=np.zeros((count, 3)),
+            dimensions=np.full((count, 3), 10.0),
             devices=self.example_devices(),
         )
         self.traced.update(mi, scene)

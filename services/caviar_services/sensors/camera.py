@@ -104,13 +104,6 @@ class CameraSensors(Sensors[CameraSettings]):
         """One small camera at the origin."""
         return (CameraDevice(name="warm-up", width=8, height=6),)
 
-    def release_memory(self) -> None:
-        """Dr.Jit keeps freed buffers, some of each size that it has seen; sizes vary with the edges."""
-        if self.traced is not None:
-            import drjit as dr
-
-            dr.flush_malloc_cache()
-
     def observe(self, mi: Any, traced: TracedScene, scene: Scene) -> dict[str, Payload]:
         """One image of each camera on each topic that is in demand."""
         devices = sorted(

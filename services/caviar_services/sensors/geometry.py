@@ -19,7 +19,7 @@ from caviar_protocol.coordinates import Vector
 from caviar_protocol.errors import AssetError, PayloadError
 from caviar_protocol.scene import object_pose
 from caviar_protocol.topics import Scene
-from caviar_services.columns import aligned_columns
+from caviar_services.columns import aligned_columns, aligned_indices
 from caviar_services.meshes import BodyPool, Mesh, placed
 from caviar_services.scenery import Scenery
 
@@ -128,18 +128,23 @@ class _Part:
         parameters["faces"] = mi.UInt32(faces.ravel().astype(np.uint32))
         parameters.update()
         self.scene = mi.load_dict({"type": "scene", name: mesh})
-        self._key = f"{name}.vertex_positions"
+        self._keys = f"{name}.vertex_positions", f"{name}.faces"
         self._parameters = mi.traverse(self.scene)
-        self._parameters.keep(self._key)
+        self._parameters.keep(list(self._keys))
+        self._faces = faces
 
-    def move(self, mi: Any, vertices: Float64Array) -> None:
+    def replace(self, mi: Any, vertices: Float64Array, faces: Int32Array) -> None:
+        """Put another mesh in place of this one, of any size."""
         (column,) = aligned_columns(vertices.reshape(1, -1))
-        self._parameters[self._key] = mi.Float(column)
+        self._parameters[self._keys[0]] = mi.Float(column)
+        if not np.array_equal(faces, self._faces):
+            self._parameters[self._keys[1]] = mi.UInt32(aligned_indices(faces.ravel()))
+            self._faces = faces
         self._parameters.update()
 
 
 class TracedScene:
-    """Scenery and a pool of bodies, for rays. Build and use it under `active_variant`.
+    """Scenery and the bodies of moving objects, for rays. Build and use it under `active_variant`.
 
     Parameters
     ----------
@@ -163,33 +168,21 @@ class TracedScene:
         self._bodies = dict(bodies)
         self._capacity = dict(capacity)
         self._scenery: _Part | None = None
-        vertices, faces, scenery_owner = _merged(meshes)
+        vertices, faces, self._scenery_owner = merged(meshes)
         self.scenery_faces = len(faces)
         if faces.size:
             self._scenery = _Part(mi, "scenery", vertices, faces)
         self._scenery_normals = _normals(vertices, faces)
-        # Parked bodies are collapsed to a point within the scene, where no ray can hit them.
-        self._parked = vertices.mean(axis=0) if len(vertices) else np.zeros(3)
-        self._start: dict[str, int] = {}
-        pooled: list[Mesh] = []
-        for asset in sorted(self._bodies):
-            self._start[asset] = len(pooled)
-            pooled += [self._bodies[asset]] * capacity[asset]
-        _, self._body_faces, owner = _merged(pooled)
-        self.face_owner: Int32Array = np.concatenate([scenery_owner, owner + np.int32(len(names))])
-        """Owner of each face, Shape ``[F]``: the scenery's faces, then the bodies'."""
-        self._vertex_start = np.cumsum([0, *(len(mesh.vertices) for mesh in pooled)])
-        self._vertices = np.tile(self._parked, (self._vertex_start[-1], 1))
-        self._moving = _Part(mi, "bodies", self._vertices, self._body_faces)
-        self.owner_names: list[str] = [*names, *[""] * len(pooled)]
-        """By owner; empty for a body that no object has."""
-        self.object_owner: dict[str, int] = {}
-        """Owner of each object of the last update, by its name."""
+        # A triangle without area, within the scene, which no ray can hit: a mesh has one at least.
+        place = vertices.mean(axis=0) if len(vertices) else np.zeros(3)
+        self._nothing = Mesh(np.tile(place, (3, 1)), np.array([[0, 1, 2]], dtype=np.int32))
+        self._moving = _Part(mi, "bodies", self._nothing.vertices, self._nothing.faces)
+        self._set_bodies([], [])
 
     def update(self, mi: Any, scene: Scene) -> None:
-        """Move the bodies to where the scene's objects are.
+        """Bring the bodies to where the scene's objects are.
 
-        Raises `PayloadError` where there are more objects of an asset than bodies, and where an
+        Raises `PayloadError` where there are more objects of an asset than there may be, and where an
         object has the name of a scenery shape.
         """
         clash = set(self._scenery_names) & set(scene.names)
@@ -198,22 +191,24 @@ class TracedScene:
                 f"object {min(clash)!r} has the name of a shape of the scenery; give the world's objects "
                 "another prefix"
             )
-        vertices = np.tile(self._parked, (self._vertex_start[-1], 1))
-        scenery_size = len(self._scenery_names)
-        self.owner_names[scenery_size:] = [""] * (len(self._vertex_start) - 1)
-        self.object_owner = {}
-        # A new assignment each frame, so that a product depends on its scene alone, whatever came before.
-        places = BodyPool(self._capacity).assign(zip(scene.names, scene.assets, strict=True))
-        for index, name in enumerate(scene.names):
-            asset, slot = places[name]
-            body = self._start[asset] + slot
-            self.owner_names[scenery_size + body] = name
-            self.object_owner[name] = scenery_size + body
-            vertices[self._vertex_start[body] : self._vertex_start[body + 1]] = placed(
-                self._bodies[asset], scene.dimensions[index], object_pose(scene, index)
-            )
-        self._vertices = vertices
-        self._moving.move(mi, vertices)
+        BodyPool(self._capacity).assign(zip(scene.names, scene.assets, strict=True))
+        # Embree rebuilds all that is in the mesh, whether a ray can hit it or not: no body is parked there.
+        meshes = [
+            Mesh(placed(unit, scene.dimensions[index], object_pose(scene, index)), unit.faces)
+            for index, unit in enumerate(self._bodies[asset] for asset in scene.assets)
+        ]
+        self._set_bodies(scene.names, meshes)
+        self._moving.replace(mi, self._vertices, self._body_faces)
+
+    def _set_bodies(self, names: Sequence[str], meshes: list[Mesh]) -> None:
+        self._vertices, self._body_faces, owner = merged(meshes or [self._nothing])
+        first = len(self._scenery_names)
+        self.face_owner: Int32Array = np.concatenate([self._scenery_owner, owner + np.int32(first)])
+        """Owner of each face in the last update, Shape ``[F]``: the scenery's faces, then the bodies'."""
+        self.owner_names: list[str] = [*self._scenery_names, *(names or [""])]
+        """By owner; empty for that of the triangle that stands for no object."""
+        self.object_owner: dict[str, int] = {name: first + body for body, name in enumerate(names)}
+        """Owner of each object of the last update, by its name."""
 
     def trace(self, mi: Any, origin: Float64Array, direction: Float64Array, reach: Float64Array) -> Hits:
         """First hit of each ray.
@@ -284,7 +279,7 @@ class TracedScene:
         return self.owner_names[owner]
 
 
-def _merged(meshes: list[Mesh]) -> tuple[Float64Array, Int32Array, Int32Array]:
+def merged(meshes: list[Mesh]) -> tuple[Float64Array, Int32Array, Int32Array]:
     """One mesh of several: vertices, faces, and the index of the mesh that each face is of."""
     if not meshes:
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32), np.zeros(0, dtype=np.int32)

@@ -8,14 +8,16 @@ from typing import Annotated, Any, ClassVar
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
-from caviar_protocol.arrays import BoolArray, Float32Array, Float64Array, Int32Array, Payload, quantity
-from caviar_protocol.coordinates import Pose
+from caviar_protocol.arrays import Float32Array, Float64Array, Int32Array, Int64Array, Payload, quantity
+from caviar_protocol.coordinates import Pose, rotation_matrix
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.topics import Lidar, LidarDevice, LidarScan, Scene
 from caviar_protocol.topics.scene import Device
-from caviar_services.sensors.base import Sensors, SensorSettings, pose_outside, turned
-from caviar_services.sensors.geometry import NO_HIT, TracedScene, visible_names
+from caviar_services.columns import aligned_doubles, aligned_indices, several
+from caviar_services.sensors.base import Sensors, SensorSettings, pose_outside
+from caviar_services.sensors.geometry import TracedScene, visible_names
 from caviar_services.sensors.grid import GridSettings, antenna_positions, occupancy
 from caviar_services.service import Frame, Preparation, Prepared, StepResult
 
@@ -26,31 +28,40 @@ class LidarSettings(SensorSettings, frozen=True, kw_only=True, forbid_unknown_fi
     grid: GridSettings | None = None
     """The quantised grid that each scan carries where somebody asks for it (``lidar.grid``)."""
     points_every: Annotated[int, quantity("frame", "from one whose scans have points to the next", ge=1)] = 1
-    """The scans between have the grid alone: of 64 × 1,800 rays the points take 3.6 MB a frame."""
+    """The scans between have the grid alone: of 64 × 1,800 rays the points take 2.4 to 3.6 MB a frame."""
+    points_world: bool = True
+    """Whether scans have their points in world axes too. Without them a scan is a third smaller, and
+    `LidarScan.in_world` computes them."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Rays:
-    """The rays of one sensor at one instant, as rows x, y, z, Shape ``[3, N]``."""
+    """The rays of all sensors, sensor after sensor, in the ray tracer's arrays."""
 
-    device: LidarDevice
-    pose: Pose
-    local: Float64Array
-    """Unit vectors in the sensor's axes."""
-    world: Float64Array
-    """The same in world axes."""
+    patterns: tuple[tuple[int, int, float, float], ...]
+    """Beams, azimuth steps, lowest and highest elevation [rad] of each sensor."""
+    first: Int64Array
+    """Number of the first ray of each sensor, and behind them that of all rays."""
+    local: list[Any]
+    """Unit vectors in the sensors' axes, x, y and z as `mitsuba.Float64`."""
+    sensor: Any
+    """Of each ray, as `mitsuba.UInt32`."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Returns:
-    """The rays of one sensor that came back."""
+    """H rays of all sensors that came back, in their order."""
 
-    rays: _Rays
-    hit: BoolArray
+    ray: Int32Array
+    """Number among all rays, Shape ``[H]``."""
     distance: Float32Array
-    """[m], of those that hit."""
-    owner: Int32Array
-    """What they hit, for `TracedScene.name_of`."""
+    """[m], Shape ``[H]``."""
+    face: NDArray[np.uint32]
+    """The triangle that each hit, for `TracedScene.face_owner`, Shape ``[H]``."""
+    points: Float32Array
+    """In the sensors' axes [m], Shape ``[H, 3]``."""
+    world: Float32Array | None
+    """In world axes [m], Shape ``[H, 3]``; None: not asked for."""
 
 
 class LidarSensors(Sensors[LidarSettings]):
@@ -64,6 +75,8 @@ class LidarSensors(Sensors[LidarSettings]):
 
     _with_grid = False
     _with_points = True
+    _rays: _Rays | None = None
+    """Of the last frame; those of the next are mostly the same."""
     outputs: ClassVar[tuple[str, ...]] = ("lidar",)
     uses_scenery: ClassVar[bool] = True
     Settings: ClassVar[type[msgspec.Struct]] = LidarSettings
@@ -94,33 +107,56 @@ class LidarSensors(Sensors[LidarSettings]):
         devices = sorted(
             (d for d in scene.devices if isinstance(d, LidarDevice)), key=lambda device: device.name
         )
-        bundles = [_rays(traced, scene, device) for device in devices]
-        returns = _traced(mi, traced, bundles) if bundles else []
-        kept = returns if self._with_points else []
-        names, index = visible_names(traced.owner_names, [item.owner for item in kept])
-        scans = tuple(self._scan(scene, item, index) for item in returns)
+        if not devices:
+            return {"lidar": Lidar(object_names=(), scans=())}
+        poses = [pose_outside(traced, scene, device) for device in devices]
+        patterns = tuple(
+            (device.beams, device.azimuth_steps, device.elevation_min, device.elevation_max)
+            for device in devices
+        )
+        if self._rays is None or self._rays.patterns != patterns:
+            self._rays = _rays(mi, patterns)
+        with_world = self._with_grid or (self._with_points and self.settings.points_world)
+        returns = _traced(mi, traced, self._rays, devices, poses, with_world)
+        hit = np.zeros(len(traced.face_owner), dtype=np.bool_)
+        hit[returns.face if self._with_points else slice(0)] = True
+        names, index = visible_names(traced.owner_names, [traced.face_owner[hit]])
+        of_face = index[traced.face_owner]
+        first = self._rays.first
+        bounds = np.searchsorted(returns.ray, first)
+        scans = tuple(
+            self._scan(scene, device, pose, returns, slice(*bounds[i : i + 2]), first[i], of_face)
+            for i, (device, pose) in enumerate(zip(devices, poses, strict=True))
+        )
         return {"lidar": Lidar(object_names=names, scans=scans)}
 
-    def _scan(self, scene: Scene, returns: _Returns, index: Int32Array) -> LidarScan:
-        rays, hit = returns.rays, returns.hit
-        distance = returns.distance.astype(np.float64)
-        points = _scaled(rays.local, hit, distance)
-        # Relative to the sensor in float64, so that only the sum is rounded to float32.
-        world = (_scaled(rays.world, hit, distance) + np.array(rays.pose.position)).astype(np.float32)
+    def _scan(
+        self,
+        scene: Scene,
+        device: LidarDevice,
+        pose: Pose,
+        returns: _Returns,
+        own: slice,
+        first: np.int64,
+        object_of_face: Int32Array,
+    ) -> LidarScan:
+        """The scan of the sensor whose returns are ``own`` and whose rays begin at ``first``."""
         grid = None
-        if self._with_grid and self.settings.grid is not None:
-            tx, rx = antenna_positions(scene, rays.device, self.settings.grid)
-            grid = occupancy(world, returns.distance, tx, rx, self.settings.grid)
-        shown = slice(None if self._with_points else 0)
+        if self._with_grid and self.settings.grid is not None and returns.world is not None:
+            tx, rx = antenna_positions(scene, device, self.settings.grid)
+            grid = occupancy(returns.world[own], returns.distance[own], tx, rx, self.settings.grid)
+        if not self._with_points:
+            own = slice(0)
+        world = returns.world if self.settings.points_world else None
         return LidarScan(
-            sensor=rays.device.name,
-            position=rays.pose.position,
-            orientation=rays.pose.orientation,
-            ray=np.flatnonzero(hit)[shown].astype(np.int32),
-            points=points[shown].astype(np.float32),
-            points_world=world[shown],
-            range=returns.distance[shown],
-            object=index[returns.owner[shown]],
+            sensor=device.name,
+            position=pose.position,
+            orientation=pose.orientation,
+            ray=returns.ray[own] - np.int32(first),
+            points=returns.points[own],
+            points_world=None if world is None else world[own],
+            range=returns.distance[own],
+            object=object_of_face[returns.face[own]],
             grid=grid,
         )
 
@@ -144,39 +180,88 @@ def ray_directions(
     return directions
 
 
-def _rays(traced: TracedScene, scene: Scene, device: LidarDevice) -> _Rays:
-    pose = pose_outside(traced, scene, device)
-    local = ray_directions(device.beams, device.azimuth_steps, device.elevation_min, device.elevation_max)
-    return _Rays(device, pose, local, turned(pose, local))
-
-
-def _traced(mi: Any, traced: TracedScene, bundles: list[_Rays]) -> list[_Returns]:
-    sizes = [rays.local.shape[1] for rays in bundles]
-    origins = np.repeat(np.array([rays.pose.position for rays in bundles]).T, sizes, axis=1)
-    # A little more than the range, which is applied exactly below, in float64.
-    reach = np.repeat([rays.device.max_range * (1 + 1e-6) for rays in bundles], sizes)
-    hits = traced.trace(mi, origins, np.concatenate([rays.world for rays in bundles], axis=1), reach)
-    ends = np.cumsum(sizes)[:-1]
-    return [
-        _returns(rays, distance, owner)
-        for rays, distance, owner in zip(
-            bundles, np.split(hits.distance, ends), np.split(hits.owner, ends), strict=True
-        )
-    ]
-
-
-def _returns(rays: _Rays, distance: Float32Array, owner: Int32Array) -> _Returns:
-    hit = (
-        (owner != NO_HIT)
-        & (distance >= np.float64(rays.device.min_range))
-        & (distance <= np.float64(rays.device.max_range))
+def _rays(mi: Any, patterns: tuple[tuple[int, int, float, float], ...]) -> _Rays:
+    directions = [ray_directions(*pattern) for pattern in patterns]
+    sizes = [rows.shape[1] for rows in directions]
+    sensor = np.repeat(np.arange(len(sizes)), sizes)
+    return _Rays(
+        patterns=patterns,
+        first=np.cumsum([0, *sizes]),
+        local=[mi.Float64(row) for row in aligned_doubles(np.concatenate(directions, axis=1))],
+        sensor=mi.UInt32(aligned_indices(sensor)),
     )
-    return _Returns(rays, hit, distance[hit], owner[hit])
 
 
-def _scaled(directions: Float64Array, hit: BoolArray, distance: Float64Array) -> Float64Array:
-    """Rows x, y, z of unit vectors to points, Shape ``[3, N]`` to ``[H, 3]``."""
-    points = np.empty((len(distance), 3))
-    for axis in range(3):
-        np.multiply(directions[axis][hit], distance, out=points[:, axis])
-    return points
+def _traced(
+    mi: Any,
+    traced: TracedScene,
+    rays: _Rays,
+    devices: list[LidarDevice],
+    poses: list[Pose],
+    with_world: bool,
+) -> _Returns:
+    """What comes back of rays from sensors at these poses.
+
+    Positions and directions are float64 until they are those of a ray or a point.
+    """
+    import drjit as dr
+
+    def turned(local: list[Any], sensor: Any) -> list[Any]:
+        """Vectors in the sensors' axes in world axes."""
+        rows = [[dr.gather(mi.Float64, mounts[3 * i + j], sensor) for j in range(3)] for i in range(3)]
+        return [row[0] * local[0] + row[1] * local[1] + row[2] * local[2] for row in rows]
+
+    mounts = [mi.Float64(row) for row in aligned_doubles(_mounts(devices, poses)[:, several(len(devices))])]
+    of_ray = [dr.gather(mi.Float64, row, rays.sensor) for row in mounts[9:]]
+    direction = turned(rays.local, rays.sensor)
+    ray = mi.Ray3f(mi.Point3f(*map(mi.Float, of_ray[:3])), mi.Vector3f(*map(mi.Float, direction)))
+    nearest, farthest = of_ray[3:]
+    # A little more than the range, which is applied exactly to what is found.
+    ray.maxt = mi.Float(farthest * (1 + 1e-6))
+    distance, face = traced.intersect(mi, ray)
+    back = (mi.Float64(distance) >= nearest) & (mi.Float64(distance) <= farthest)
+    dr.eval(distance, face, back)
+    number: Any = dr.compress(back)
+    if not dr.width(number):
+        return _nothing(with_world)
+    distance, face = dr.gather(mi.Float, distance, number), dr.gather(mi.UInt32, face, number)
+    sensor: Any = dr.gather(mi.UInt32, rays.sensor, number)
+    local = [dr.gather(mi.Float64, row, number) for row in rays.local]
+    away = mi.Float64(distance)
+    points: Any = dr.ravel(mi.Point3f(*(mi.Float(row * away) for row in local)))
+    world: Any = None
+    if with_world:
+        # Relative to the sensor in float64, so that only the sum is rounded to float32.
+        at = [dr.gather(mi.Float64, row, sensor) for row in mounts[9:12]]
+        ends = (mi.Float(row * away + start) for row, start in zip(turned(local, sensor), at, strict=True))
+        world = dr.ravel(mi.Point3f(*ends))
+    dr.eval(distance, face, points, world)
+    return _Returns(
+        ray=number.numpy().view(np.int32),
+        distance=distance.numpy(),
+        face=face.numpy(),
+        points=points.numpy().reshape(-1, 3),
+        world=None if world is None else world.numpy().reshape(-1, 3),
+    )
+
+
+def _mounts(devices: list[LidarDevice], poses: list[Pose]) -> Float64Array:
+    """Of sensors, the rotation matrix, row by row, position [m], least and greatest range [m], Shape
+    ``[14, S]``."""
+    return np.array(
+        [
+            [*rotation_matrix(pose.orientation).ravel(), *pose.position, device.min_range, device.max_range]
+            for device, pose in zip(devices, poses, strict=True)
+        ]
+    ).T
+
+
+def _nothing(with_world: bool) -> _Returns:
+    points = np.zeros((0, 3), dtype=np.float32)
+    return _Returns(
+        ray=np.zeros(0, dtype=np.int32),
+        distance=np.zeros(0, dtype=np.float32),
+        face=np.zeros(0, dtype=np.uint32),
+        points=points,
+        world=points if with_world else None,
+    )
