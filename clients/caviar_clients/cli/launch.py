@@ -21,6 +21,7 @@ from caviar_protocol.durability import file_system_of
 from caviar_protocol.errors import RunError
 from caviar_protocol.regular_file import open_to_append
 from caviar_protocol.scenario import Scenario, ServiceSpec
+from caviar_services.ray_tracing_threads import ENVIRONMENT, share_of_each
 
 KILL_AFTER_S = 1.0
 """[s] that a process gets after SIGTERM before SIGKILL, beyond the run's ``shutdown_s``."""
@@ -30,6 +31,8 @@ MAX_RESTARTS = 5
 """Processes that are started for a service that died, before it comes back."""
 LISTEN_S = 120.0
 """[s] from its start until the broker listens: one that goes on with a run reads its journal before."""
+_TRACING_ROLES = ("channel", "sensors")
+"""Of services that trace rays, or may."""
 LOOK_S = 0.05
 """[s] between looks at whether the broker's process is stopped; its death shows at once."""
 
@@ -193,12 +196,18 @@ class Launcher:
         command += ["--use", f"{spec.role}:{spec.use}", "--broker", self.endpoint]
         for folder in module_folders(self.scenario):
             command += ["--modules", str(folder)]
-        child = Child.start(name, command, path, self._key.environment())
+        child = Child.start(name, command, path, {**self._threads, **self._key.environment()})
         before, self._children[name] = self._children.get(name), child
         if before is not None:
             os.close(before.pidfd)
         self._selector.register(child.pidfd, selectors.EVENT_READ, child)
         self._give_up_at = None
+
+    @property
+    def _threads(self) -> Mapping[str, str]:
+        """What tells services that trace rays how many threads they share."""
+        tracers = [spec for spec in self._local.values() if spec.role in _TRACING_ROLES]
+        return {ENVIRONMENT: str(share_of_each(len(tracers)))}
 
     def _start_again(self, name: str) -> None:
         """Start a service that died and is waited for, unless that was in vain too often."""

@@ -48,6 +48,7 @@ from caviar_services.channel.spherical import SphericalWaves
 from caviar_services.channel.traced_surfaces import traced_surfaces
 from caviar_services.channel.visibility import outermost
 from caviar_services.llvm import activate_llvm, choose_variant
+from caviar_services.ray_tracing_threads import all_threads, limit_threads
 from caviar_services.service import Frame, Preparation, RunInfo, StepResult
 from caviar_services.state import restored, saved
 
@@ -362,7 +363,9 @@ class SionnaChannel(PathModel[SionnaSettings]):
                     self.run.progress(phase, _COMPILE_GRACE_S)
 
                 place = self._scene.surfaces.cleared(np.array(device.position_m))
-                notes.append(f"transmitter {name!r}: {self._scenery.prepare(place, progress)}")
+                with all_threads():
+                    known = self._scenery.prepare(place, progress)
+                notes.append(f"transmitter {name!r}: {known}")
         return (*notes, *(cache.notes if cache else ()))
 
     def _start(self) -> tuple[str, ...]:
@@ -375,6 +378,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
             import mitsuba as mi
 
             mi.set_variant(self._variant)
+            limit_threads()
             import sionna.rt
         except ImportError as error:
             raise SetupError(

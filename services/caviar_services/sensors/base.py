@@ -26,6 +26,7 @@ from caviar_protocol.topics import Scene
 from caviar_protocol.topics.scene import Device
 from caviar_services.llvm import activate_llvm, choose_variant, cuda_devices
 from caviar_services.meshes import Mesh, unit_box
+from caviar_services.ray_tracing_threads import limit_threads
 from caviar_services.scenery import SceneryShape, find_scenery, read_scenery
 from caviar_services.sensors.geometry import TracedScene, active_variant, load_scenery, load_unit_mesh
 from caviar_services.service import Frame, Preparation, Prepared, Service, StepResult
@@ -84,6 +85,7 @@ class Sensors(Service[S]):
         # The channel's variant: rays and triangles are the same in all, and an embedded run with both
         # would change it twice a frame, which costs Sionna RT half of the frame.
         self.variant = choose_variant()
+        limit_threads()
         self.run.progress("loading scenery", 60.0)
         with active_variant(self.variant) as mi:
             self.traced = self._load(mi, preparation.assets)
