@@ -46,7 +46,7 @@ def digest(scenario: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
         pytest.param("caviar_services agent", signal.SIGKILL, marks=pytest.mark.exhaustive),
         pytest.param("caviar_services recorder", signal.SIGKILL, marks=pytest.mark.exhaustive),
         ("caviar_broker", signal.SIGKILL),
-        ("caviar_services channel", signal.SIGSTOP),
+        pytest.param("caviar_services channel", signal.SIGSTOP, marks=pytest.mark.exhaustive),
     ],
 )
 def test_whoever_is_lost_the_digest_is_the_same(

@@ -71,6 +71,7 @@ def test_where_the_agent_flies_decides_about_the_line_of_sight(tmp_path: Path) -
     assert seen == sorted(seen, reverse=True)  # lost once
 
 
+@pytest.mark.exhaustive
 def test_it_is_lost_and_found_again_on_the_shipped_flight(tmp_path: Path) -> None:
     finished = run(SCENARIOS / "uav-path.toml", tmp_path, "--embedded", timeout=120)
     seen = np.array(in_sight(finished))

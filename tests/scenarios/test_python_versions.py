@@ -85,7 +85,7 @@ def prepare(label: str, python: Path, wheel: Path) -> Environment:
     if not ready.exists():
         for outdated in CACHE.glob(f"{label}-*"):
             shutil.rmtree(outdated)
-        _run([python, "-m", "venv", environment.folder])
+        _run([python, "-m", "venv", "--without-pip", environment.folder])
         _pip(environment, *needs)
         ready.touch()
     _pip(environment, "--no-deps", "--force-reinstall", str(wheel))
@@ -93,8 +93,10 @@ def prepare(label: str, python: Path, wheel: Path) -> Environment:
 
 
 def _pip(environment: Environment, *arguments: str) -> None:
-    options = ("--quiet", "--disable-pip-version-check", "--no-input", "--prefer-binary")
-    _run([environment.python, "-m", "pip", "install", *options, *arguments])
+    """Install with the pip of this Python. Bytecode is left to the imports."""
+    pip = [sys.executable, "-m", "pip", "--python", environment.python, "--quiet", "--no-input"]
+    options = ("--disable-pip-version-check", "--prefer-binary", "--no-compile")
+    _run([*pip, "install", *options, *arguments])
 
 
 def _run(command: list[str | Path], folder: Path = ROOT, **extra: str) -> str:

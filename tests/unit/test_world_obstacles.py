@@ -103,7 +103,7 @@ def test_no_flight_comes_too_near_to_boxes(speed: float, step_s: float) -> None:
     """Also where one sub-step is longer than walls are thick; watched along the whole way."""
     rng = np.random.default_rng(int(speed))
     hits = 0
-    for _ in range(12):
+    for _ in range(5):
         bounds = [random_box(rng, 15.0) for _ in range(10)]
         clearance = float(rng.uniform(0.3, 1.5))
         made = flyer(Obstacles(triangles(*bounds)), speed, speed * 20, clearance)
