@@ -198,7 +198,8 @@ class Followed:
             rays = np.arange(samples)
         met = np.zeros(len(rays), np.bool_)
         for bounce in launch.bounces:
-            met |= (bounce.kind.numpy() != 0) & scene.is_body(bounce.shape.numpy())
+            on_body = (bounce.kind.numpy() != 0) & scene.is_body(bounce.shape.numpy())
+            met |= on_body.reshape(-1, len(rays)).any(0)  # in any pass
         if launch.bounces:
             self._on_object[rays] = met
 

@@ -3,6 +3,10 @@
 Neighbouring lanes of a kernel walk the ray tracer's tree together. Sionna RT launches its rays in the order
 of the Fibonacci lattice, where neighbours point into quite different directions; here the same rays
 are launched along a space-filling curve, which halved the time of the kernel in the street canyon.
+
+Where a ray may go on in several ways, Sionna RT draws one, so that fewer rays are left to be reflected:
+in Munich, refraction cost 10 of 57 reflected paths. So rays that draw are launched beside rays that are
+reflected alone, and an option that is switched on loses no reflection.
 """
 
 from __future__ import annotations
@@ -37,10 +41,31 @@ class LaunchOptions:
     diffuse_paths: int | None = None
     """How many diffuse paths of a receiver are chosen, about; None: those that were drawn."""
 
+    @property
+    def passes(self) -> tuple[int, ...]:
+        """Interactions that rays may draw from, as flags, for each time that all rays are launched: those
+        that draw come first, so that what they draw does not depend on the others."""
+        enabled = (
+            REFLECTED * self.reflection
+            | SCATTERED * self.scattering
+            | REFRACTED * self.refraction
+            | DIFFRACTED * self.diffraction
+        )
+        if not enabled:
+            return ()
+        if self.reflection and enabled != REFLECTED and not self.only_scattered:
+            return enabled, REFLECTED
+        return (enabled,)
+
+    @property
+    def lanes(self) -> int:
+        """Rays of all passes."""
+        return self.samples * len(self.passes)
+
 
 @dataclass(frozen=True, eq=False)
 class Bounce:
-    """One interaction of each of N rays, in the ray tracer's arrays."""
+    """One interaction of each of N rays, in the ray tracer's arrays; rays are in the order of the passes."""
 
     kind: Any
     """`mitsuba.UInt`: flag of the interaction; 0 where the ray has ended."""
@@ -93,15 +118,10 @@ class Launcher:
         self._first = first
         lattice = fibonacci_lattice(options.samples) if whole else _lattice(options.samples, first, end)
         self._directions = _along_curve(lattice)
-        self._enabled = (
-            REFLECTED * options.reflection
-            | SCATTERED * options.scattering
-            | REFRACTED * options.refraction
-            | DIFFRACTED * options.diffraction
-        )
 
     def __call__(self, source: Any, rays: Int64Array | None = None, number: int = 0) -> Launch:
-        """Launch from one position, a `mitsuba.Point3f` of width 1: all rays, or those of these numbers.
+        """Launch from one position, a `mitsuba.Point3f` of width 1: all rays, or those of these numbers, in
+        each pass.
 
         From launch to launch, by its ``number``, other things are drawn where a ray may go on in several
         ways, and all rays are turned by less than what lies between two of them; at 0 by nothing.
@@ -109,18 +129,24 @@ class Launcher:
         import drjit as dr
         import mitsuba as mi
 
-        if not self._enabled:
+        passes = self._options.passes
+        if not passes:
             return Launch((), None)
         samples = self._count if rays is None else len(rays)
-        self._sampler.seed(self._options.seed + number + self._first, samples)
-        origin = dr.repeat(source, samples)
+        lanes = samples * len(passes)
+        self._sampler.seed(self._options.seed + number + self._first, lanes)
+        origin = dr.repeat(source, lanes)
         direction = mi.Vector3f(self._directions)
         if rays is not None:
             direction = dr.gather(mi.Vector3f, self._directions, mi.UInt(aligned_indices(rays)))
+        if len(passes) > 1:
+            direction = dr.tile(direction, len(passes))
         turn = mi.Vector3f(*(dr.opaque(mi.Float, angle) for angle in self._turn(number)))
         direction = dr.normalize(direction + dr.cross(turn, direction))
-        active, enabled = dr.full(mi.Bool, True, samples), dr.full(mi.UInt, self._enabled, samples)
-        wedges = self._no_wedges(samples)
+        active, enabled = dr.full(mi.Bool, True, lanes), dr.full(mi.UInt, passes[0], lanes)
+        if len(passes) > 1:
+            enabled = dr.select(dr.arange(mi.UInt, lanes) < dr.opaque(mi.UInt, samples), enabled, passes[1])
+        wedges = self._no_wedges(lanes)
         dr.make_opaque(origin, direction, active, enabled, wedges)
         bounces = []
         for _ in range(self._options.max_depth):

@@ -279,7 +279,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
             return SphericalWaves(surfaces, self._tracer.look, traced_from, self.run.carriers, memory)
         if self.rung == "mimo-rt":
             # The rays of a launch are kept whole; the rest is for the candidates of some receivers at a time.
-            lanes = memory // LANE_BYTES - self._launched.samples * self._launched.max_depth
+            lanes = memory // LANE_BYTES - self._launched.lanes * self._launched.max_depth
             return ElementTracer(
                 self._tracer,
                 self._scene,
