@@ -319,6 +319,58 @@ def plot(
         typer.echo(picture)
 
 
+@app.command("map", rich_help_panel=LOOK)
+def radio_map(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            help="scenario, by name or file, or directory of a run that recorded `scene`",
+            show_default=False,
+            autocompletion=complete_scenario,
+        ),
+    ],
+    metric: Annotated[
+        list[str] | None,
+        typer.Option(help="gain, rss, sinr or best-server; by default gain; may be repeated"),
+    ] = None,
+    height: Annotated[float, typer.Option(help="of the cells above the ground [m]")] = 1.5,
+    cell: Annotated[float, typer.Option(help="side of a cell [m]")] = 5.0,
+    surface: Annotated[
+        str,
+        typer.Option(help="plane, ground, or a piece of scenery by its name, over which the cells follow"),
+    ] = "plane",
+    area: Annotated[
+        tuple[float, float, float, float] | None,
+        typer.Option(help="lowest x and y, highest x and y [m]; by default all of the scenery"),
+    ] = None,
+    frame: Annotated[int, typer.Option(min=0, help="instant of the first episode that is mapped")] = 0,
+    carrier: Annotated[str | None, typer.Option(help="by its name; by default the first")] = None,
+    beam: Annotated[
+        str, typer.Option(help="best of the codebook for each cell, wide (one element), or a beam's number")
+    ] = "best",
+    samples: Annotated[
+        int, typer.Option(min=1000, max=1_000_000_000, help="rays of each transmitter")
+    ] = 10_000_000,
+    memory_gib: Annotated[float, typer.Option(min=0.05, help="memory that it may take [GiB]")] = 2.0,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="PNG; the arrays go beside it as .npz; by default radio-map.png, here or in the run"
+        ),
+    ] = None,
+) -> None:
+    """Map best server, path gain, received power and SINR over a plane or the ground."""
+    from caviar_clients.cli.radio_map import draw_radio_map, options_of
+    from caviar_clients.cli.radio_map_inputs import Wanted
+
+    cells = Wanted(height=height, cell=cell, surface=surface, area=area)
+    options = options_of(
+        metric, cells, beam, frame=frame, carrier=carrier, samples=samples, memory_gib=memory_gib
+    )
+    for file in draw_radio_map(source, out, options, _errors):
+        typer.echo(file)
+
+
 @app.command(rich_help_panel=LOOK)
 def video(
     run: RunDirectory,

@@ -44,15 +44,17 @@ class _Shape:
 
 def footprints(meshes: Iterable[tuple[Path, Float64Array]]) -> Footprints:
     """Footprints of PLY meshes, each with its 4×4 transform into the world; ground is left out."""
-    shapes = [_shape(file, to_world) for file, to_world in meshes]
-    shapes = [shape for shape in shapes if len(shape.faces)]
-    lowest = min((shape.corners[..., 2].min() for shape in shapes), default=0.0)
-    walls = [_extent(shape) for shape in shapes if not _is_level(shape)]
-    buildings = [shape for shape in shapes if not _is_ground(shape, lowest, walls)]
+    _, buildings = _ground_and_buildings(meshes)
     return Footprints(
         faces=np.concatenate([_level(shape) for shape in buildings] or [np.zeros((0, 3, 2))]),
         edges=np.concatenate([_outline(shape) for shape in buildings] or [np.zeros((0, 2, 2))]),
     )
+
+
+def ground(meshes: Iterable[tuple[Path, Float64Array]]) -> Float64Array:
+    """Triangles [m] of the PLY meshes that are ground, Shape ``[F, 3, 3]``; each with its 4×4 transform."""
+    found, _ = _ground_and_buildings(meshes)
+    return np.concatenate([shape.corners for shape in found] or [np.zeros((0, 3, 3))])
 
 
 def with_boxes(drawn: Footprints | None, boxes: Sequence[Box]) -> Footprints:
@@ -63,6 +65,20 @@ def with_boxes(drawn: Footprints | None, boxes: Sequence[Box]) -> Footprints:
     if drawn is not None:
         faces, edges = np.concatenate([drawn.faces, faces]), np.concatenate([drawn.edges, edges])
     return Footprints(faces=faces, edges=edges)
+
+
+def _ground_and_buildings(
+    meshes: Iterable[tuple[Path, Float64Array]],
+) -> tuple[list[_Shape], list[_Shape]]:
+    shapes = [_shape(file, to_world) for file, to_world in meshes]
+    shapes = [shape for shape in shapes if len(shape.faces)]
+    lowest = min((shape.corners[..., 2].min() for shape in shapes), default=0.0)
+    walls = [_extent(shape) for shape in shapes if not _is_level(shape)]
+    level = [_is_ground(shape, lowest, walls) for shape in shapes]
+    return (
+        [shape for shape, is_ground in zip(shapes, level, strict=True) if is_ground],
+        [shape for shape, is_ground in zip(shapes, level, strict=True) if not is_ground],
+    )
 
 
 def _shape(file: Path, to_world: Float64Array) -> _Shape:

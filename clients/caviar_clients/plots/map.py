@@ -26,6 +26,9 @@ BeamGain = Callable[[AntennaArray, int, Float64Array], Float64Array]
 """``gain(array, beam, directions)``: amplitude of a codebook beam towards unit vectors in device
 axes, Shape ``[N, 3]`` to ``[N]``, 1 at its greatest."""
 
+OUTLINE = ((0.5, 0.5), (0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5))
+"""Corners of an object's box from above, of its length and width."""
+
 BEAM_ALPHA = 0.22
 """Opacity of the beam's area."""
 
@@ -212,13 +215,8 @@ def draw_objects(axes: Any, data: MapData, labels: Labels | None = None) -> None
     if not scene.names:
         return
     carriers = {device.parent for device in scene.devices}
-    outline = np.array([[0.5, 0.5], [0.5, -0.5], [-0.5, -0.5], [-0.5, 0.5]])
-    boxes, fronts = [], []
-    for i in range(len(scene.names)):
-        rotation = rotation_matrix(scene.orientation[i].tolist())[:2, :2]
-        centre, size = scene.position[i, :2], scene.dimensions[i, :2]
-        boxes.append(centre + (outline * size) @ rotation.T)
-        fronts.append(centre + (np.array([[0.25, 0.5], [0.25, -0.5], [0.5, 0.0]]) * size) @ rotation.T)
+    boxes: Any = from_above(scene, OUTLINE)
+    fronts: Any = from_above(scene, [[0.25, 0.5], [0.25, -0.5], [0.5, 0.0]])
     colors = [ORANGE if name in carriers else SKY for name in scene.names]
     axes.add_collection(PolyCollection(boxes, facecolors=colors, edgecolors=BLACK, linewidths=0.7, zorder=4))
     axes.add_collection(PolyCollection(fronts, facecolors=BLACK, linewidths=0, zorder=4.1))
@@ -231,7 +229,16 @@ def draw_objects(axes: Any, data: MapData, labels: Labels | None = None) -> None
     for color, label in ((ORANGE, "object with a device"), (SKY, "other object")):
         if color in colors:
             axes.scatter([], [], marker="s", s=60, color=color, edgecolors=BLACK, linewidths=0.7, label=label)
-    _name_objects(axes, scene, np.array(boxes), carriers, labels or Labels())
+    _name_objects(axes, scene, boxes, carriers, labels or Labels())
+
+
+def from_above(scene: Scene, points: Sequence[Sequence[float]]) -> Float64Array:
+    """Where points x and y of a box −½…½ are on each object of a scene [m], Shape ``[N, len(points), 2]``."""
+    found = np.zeros((len(scene.names), len(points), 2))
+    for i in range(len(scene.names)):
+        rotation = rotation_matrix(scene.orientation[i].tolist())[:2, :2]
+        found[i] = scene.position[i, :2] + (np.array(points) * scene.dimensions[i, :2]) @ rotation.T
+    return found
 
 
 def _name_objects(axes: Any, scene: Scene, boxes: Float64Array, carriers: set[str], labels: Labels) -> None:

@@ -92,6 +92,29 @@ def scenes_of(path: Path, frames: int) -> Scenes:
     return dataclasses.replace(found, instants=served, consecutive=_run(found.consecutive))
 
 
+def scene_at(path: Path, frame: int = 0) -> Scenes:
+    """The scene of one frame of the first episode of a scenario or a recording, as the only instant.
+
+    Raises `ScenarioError` or `RecordingError` for what is wrong with it or where there is no such frame,
+    `RunError` where the worlds fail.
+    """
+    if is_recording(path):
+        recording = Recording(path)
+        episode = recording.entry(0).episode if len(recording) else 0
+        recorded = recording.frame(episode, frame)
+        instant = _instant(recorded)
+        if instant is None:
+            raise RecordingError(f"frame {frame} of {path} has no scene; choose another with --frame")
+        return _recorded(recording, (instant,))
+    scenario = checked_scenario(path)
+    if not 0 <= frame < scenario.run.frames:
+        last = scenario.run.frames - 1
+        raise RunError(f"--frame {frame}: scenario {scenario.run.name!r} has the frames 0 to {last}")
+    scenario = checked_scenario(path, frames=frame + 1)
+    instants, assets = _simulated(scenario)
+    return _planned(path, scenario, instants[-1:], assets)
+
+
 def is_recording(path: Path) -> bool:
     """Whether it is a run directory or a segment, and not a scenario."""
     return path.is_dir() or path.suffix == ".mcap"
@@ -107,6 +130,12 @@ def _of_recording(path: Path, frames: int) -> Scenes:
         raise RecordingError(
             f'{path} holds no scene; record the topic: record = ["scene", …] in the table [run]'
         )
+    return _recorded(recording, tuple(instants), tuple(block))
+
+
+def _recorded(
+    recording: Recording, instants: tuple[Instant, ...], consecutive: tuple[Instant, ...] = ()
+) -> Scenes:
     metadata = recording.metadata
     try:
         scenario = metadata.scenario
@@ -114,18 +143,19 @@ def _of_recording(path: Path, frames: int) -> Scenes:
         devices = msgspec.convert(scenario.get("devices", ()), tuple[DeviceSpec, ...])
         services = msgspec.convert(scenario.get("services", {}), dict[str, ServiceSpec])
     except msgspec.ValidationError as error:
+        path = recording.directory
         raise RecordingError(f"{path}: the scenario in its metadata cannot be read: {error}") from error
     return Scenes(
         name=metadata.name,
         origin=f"recording {recording.directory.name}",
-        instants=tuple(instants),
+        instants=instants,
         carriers=carriers,
         devices=devices,
         assets=recording.assets,
         services=services,
         seed=metadata.seed,
         sampling_period_ns=metadata.sampling_period_ns,
-        consecutive=tuple(block),
+        consecutive=consecutive,
     )
 
 
@@ -136,6 +166,12 @@ def _instant(frame: RecordedFrame) -> Instant | None:
 
 def _of_scenario(path: Path, frames: int) -> Scenes:
     scenario = checked_scenario(path)
+    instants, assets = _simulated(scenario)
+    return _planned(path, scenario, _spread(instants, frames), assets, _middle(instants))
+
+
+def _simulated(scenario: Scenario) -> tuple[list[Instant], Mapping[str, Path]]:
+    """What the worlds of a scenario make of each frame, and the files of their scenery."""
     prepared: list[Preparation] = []
     run = EmbeddedRun(worlds_only(scenario), None, seats={KEEPER: _keeper(prepared.append)})
     seat, instants = run.seats[KEEPER], list[Instant]()
@@ -145,17 +181,27 @@ def _of_scenario(path: Path, frames: int) -> Scenes:
             seat.answer(StepResult())
     if run.outcome is None or run.outcome.error:
         raise RunError(run.outcome.error if run.outcome else "the worlds ended without an outcome")
+    return instants, prepared[0].assets if prepared else {}
+
+
+def _planned(
+    path: Path,
+    scenario: Scenario,
+    instants: Sequence[Instant],
+    assets: Mapping[str, Path],
+    consecutive: Sequence[Instant] = (),
+) -> Scenes:
     return Scenes(
         name=scenario.run.name,
         origin=f"scenario {path.name}, {scenario.run.frames} frames",
-        instants=tuple(_spread(instants, frames)),
+        instants=tuple(instants),
         carriers=scenario.carriers,
         devices=scenario.devices,
-        assets=prepared[0].assets if prepared else {},
+        assets=assets,
         services=scenario.services,
         seed=scenario.run.seed,
         sampling_period_ns=scenario.run.sampling_period_ns,
-        consecutive=tuple(_middle(instants)),
+        consecutive=tuple(consecutive),
     )
 
 

@@ -198,6 +198,11 @@ class Launcher:
         return bounce, onward.o, onward.d, active, enabled, wedges
 
 
+def lattice_directions(count: int, first: int, end: int) -> Any:
+    """Directions ``first`` to ``end`` of ``count`` that share the sphere, a `mitsuba.Vector3f`."""
+    return _along_curve(_lattice(count, first, end))
+
+
 def _lattice(count: int, first: int, end: int) -> Any:
     """Points ``first`` to ``end`` of `sionna.rt.utils.fibonacci_lattice`."""
     import drjit as dr

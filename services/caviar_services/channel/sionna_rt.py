@@ -132,7 +132,20 @@ class SionnaChannel(PathModel[SionnaSettings]):
         piece = self._scene.enclosing(self._scene.surfaces.cleared(position))
         return self._names[piece] if piece >= 0 else ""
 
-    def load(self, preparation: Preparation) -> tuple[str, ...]:
+    @property
+    def scene(self) -> SionnaScene:
+        """What waves meet; after `load_scene`."""
+        return self._scene
+
+    @property
+    def launch_seed(self) -> int:
+        """Of all rays."""
+        return self._asked.seed
+
+    def load_scene(self, preparation: Preparation) -> tuple[str, ...]:
+        """Start the ray tracer and load scenery and bodies; notes for the user.
+
+        `load` begins with it; a radio map needs the scene without the paths."""
         s = self.settings
         self.run.progress("importing the ray tracer", _COMPILE_GRACE_S)
         notes = self._start()
@@ -158,6 +171,12 @@ class SionnaChannel(PathModel[SionnaSettings]):
         if self._scene.detail_effect is not None:
             notes += (self._scene.detail_effect.note,)
             self._detail = self._scene.detail_effect.brief
+        return notes
+
+    def load(self, preparation: Preparation) -> tuple[str, ...]:
+        s = self.settings
+        notes = self.load_scene(preparation)
+        frequencies = tuple(carrier.frequency_hz for carrier in self.run.carriers)
         self._launched, switched = contributing(self._asked, self._scene.used_surfaces(), frequencies)
         self._wavelengths = SPEED_OF_LIGHT / np.array(frequencies)
         enumerated = s.enumerates(self._moving(preparation)) and self._launched.reflection

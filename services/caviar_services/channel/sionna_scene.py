@@ -136,6 +136,11 @@ class SionnaScene(NumberedTriangles):
         return self._scene.mi_scene
 
     @property
+    def rt_scene(self) -> Any:
+        """The `sionna.rt.Scene`, in metres relative to `centre`."""
+        return self._scene
+
+    @property
     def wavelengths(self) -> tuple[float, ...]:
         """Of the carriers [m]."""
         return tuple(SPEED_OF_LIGHT / frequency for frequency, _ in self._carriers)

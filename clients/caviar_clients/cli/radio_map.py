@@ -1,0 +1,248 @@
+"""``caviar map``: best server, gain, received power and SINR over a surface."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from caviar_clients.cli.radio_map_file import save
+from caviar_clients.cli.radio_map_inputs import (
+    Wanted,
+    carrier_of,
+    channel_of,
+    in_hertz,
+    noise_of,
+    surface_of,
+)
+from caviar_clients.files import reserved
+from caviar_clients.plots.footprints import footprints
+from caviar_clients.plots.radio_map import RadioMapView, draw_servers, draw_values
+from caviar_clients.tradeoff.scenes import is_recording, scene_at
+from caviar_protocol.errors import RunError, SetupError
+from caviar_protocol.extras import has_extra, install_command
+from caviar_protocol.tables import suggestion
+from caviar_protocol.topics import Scene
+from caviar_services.channel.radio_map.coverage import Coverage, decibels
+from caviar_services.channel.radio_map.mapping import (
+    BeamChoice,
+    RadioMap,
+    radio_map,
+    rays_at_once,
+    transmitters_of,
+)
+from caviar_services.scenery import find_scenery, read_scenery
+from caviar_services.service import Preparation
+
+METRICS = {
+    "gain": "Path gain of the best server [dB]",
+    "rss": "Received power from the best server [dBm]",
+    "sinr": "SINR of the best server [dB]",
+    "best-server": "",
+}
+"""What can be drawn, and the label of its colour bar."""
+
+
+_FEW_RAYS = 10
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapOptions:
+    """What is mapped, and how finely."""
+
+    metrics: tuple[str, ...] = ("gain",)
+    cells: Wanted = field(default_factory=Wanted)
+    frame: int = 0
+    carrier: str | None = None
+    beam: BeamChoice = "best"
+    samples: int = 10_000_000
+    """Rays of each transmitter."""
+    memory_gib: float = 2.0
+
+
+def options_of(metrics: Sequence[str] | None, cells: Wanted, beam: str, **others: Any) -> MapOptions:
+    """Options from the command line. Raises `RunError` for what cannot be."""
+    chosen = tuple(dict.fromkeys(metrics or ("gain",)))
+    for metric in chosen:
+        if metric not in METRICS:
+            raise RunError(f"--metric {metric!r} does not exist; {suggestion(metric, METRICS)}")
+    if not math.isfinite(cells.height):
+        raise RunError(f"--height {cells.height}: write a height in metres")
+    if not (math.isfinite(cells.cell) and cells.cell > 0):
+        raise RunError(f"--cell {cells.cell:g}: write the side of a cell in metres, above 0")
+    if cells.area is not None:
+        x0, y0, x1, y1 = cells.area
+        if not (x0 < x1 and y0 < y1 and all(map(math.isfinite, cells.area))):
+            given = " ".join(f"{value:g}" for value in cells.area)
+            raise RunError(f"--area {given}: write lowest x and y, then highest x and y, in metres")
+    return MapOptions(metrics=chosen, cells=cells, beam=_beam(beam), **others)
+
+
+def _beam(text: str) -> BeamChoice:
+    if text == "best" or text == "wide":
+        return "best" if text == "best" else "wide"
+    if not text.isdecimal():
+        raise RunError(f"--beam {text!r}: write best, wide, or the number of a beam of the codebook")
+    return int(text)
+
+
+def draw_radio_map(source: Path, out: Path | None, options: MapOptions, console: Console) -> list[Path]:
+    """Map a scenario or a recording, and write pictures and arrays.
+
+    ``out`` is the file of the picture, by default ``radio-map.png`` in this folder, or in that of the run;
+    the arrays are beside it, in a file ``.npz``. With several metrics, their names go into those of the
+    pictures.
+
+    Returns the files. Raises `CaviarError` for what is wrong with source or options.
+    """
+    _require_extras()
+    picture = out or (source if is_recording(source) and source.is_dir() else Path()) / "radio-map.png"
+    if picture.suffix.lower() != ".png":
+        raise RunError(f"--out {picture}: a radio map is a PNG; write a name that ends in .png")
+    several = len(options.metrics) > 1
+    pictures = {
+        metric: picture.with_stem(f"{picture.stem}-{metric}") if several else picture
+        for metric in options.metrics
+    }
+    arrays = picture.with_suffix(".npz")
+    with reserved(*pictures.values(), arrays):
+        mapped = _mapped(source, options, console)
+        save(mapped.found, mapped.metadata, arrays)
+        view = _view(mapped)
+        for metric, file in pictures.items():
+            _draw(view, mapped.found.coverage, metric, file)
+    for line in _summary(mapped):
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    return [*pictures.values(), arrays]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Mapped:
+    found: RadioMap
+    metadata: dict[str, Any]
+    scene: Scene
+    title: str
+    scenery: Path | None
+
+
+def _mapped(source: Path, options: MapOptions, console: Console) -> _Mapped:
+    scenes = scene_at(source, options.frame)
+    instant = scenes.instants[0]
+    devices = transmitters_of(instant.scene, f"frame {options.frame} of {scenes.origin}")
+    index = carrier_of(scenes.carriers, options.carrier)
+    carrier = scenes.carriers[index]
+    channel, assets = channel_of(scenes, instant.scene)
+    noise_w, noise = noise_of(scenes.services, carrier)
+    with _progress(console) as bar:
+        task = bar.add_task("loading the scene", total=None)
+        channel.load_scene(Preparation(demand={}, assets=assets))
+        surface, about = surface_of(channel, instant.scene, find_scenery(assets), options.cells)
+        memory = int(options.memory_gib * 2**30)
+        part = rays_at_once(surface, devices, options.beam, options.samples, memory)
+        bar.update(task, description="shooting rays")
+        found = radio_map(
+            channel, instant.scene, surface, options.samples,
+            carrier=index, beam=options.beam, noise_w=noise_w, part=part,
+            done=lambda done, parts: bar.update(task, completed=done, total=parts),
+        )  # fmt: skip
+    metadata = {
+        "scenario": scenes.name,
+        "source": scenes.origin,
+        "frame": instant.frame,
+        "t_ns": instant.t_ns,
+        "carrier": carrier.name,
+        "frequency_hz": carrier.frequency_hz,
+        "bandwidth_hz": carrier.bandwidth_hz,
+        "surface": about,
+        "cell_m": options.cells.cell,
+        "beam": options.beam,
+        "noise": noise,
+        "noise_w": noise_w,
+    }
+    at = f"frame {instant.frame}, t = {instant.t_ns * 1e-9:.2f} s, {in_hertz(carrier.frequency_hz)}"
+    beams = {"best": "best beam of each cell", "wide": "one element"}
+    served = beams.get(str(options.beam), f"beam {options.beam}")
+    return _Mapped(
+        found=found,
+        metadata=metadata,
+        scene=instant.scene,
+        title=f"{scenes.name}: {at}\n{about}, {served}",
+        scenery=find_scenery(assets),
+    )
+
+
+def _view(mapped: _Mapped) -> RadioMapView:
+    found, drawn = mapped.found, None
+    if mapped.scenery is not None:
+        shapes = read_scenery(mapped.scenery).shapes
+        drawn = footprints((shape.file, shape.to_world) for shape in shapes)
+    x, y = found.surface.x.tolist(), found.surface.y.tolist()
+    return RadioMapView(
+        area=(x[0], y[0], x[-1], y[-1]),
+        transmitters=found.names,
+        positions=found.positions[:, :2],
+        scene=mapped.scene,
+        footprints=drawn,
+        title=mapped.title,
+    )
+
+
+def _draw(view: RadioMapView, coverage: Coverage, metric: str, file: Path) -> None:
+    if metric == "best-server":
+        draw_servers(view, coverage.best_server, file)
+        return
+    values = {"gain": coverage.gain, "rss": coverage.rss, "sinr": coverage.sinr}[metric]
+    reference = 1e-3 if metric == "rss" else 1.0
+    draw_values(view, decibels(coverage.of_server(values), reference), METRICS[metric], file)
+
+
+def _summary(mapped: _Mapped) -> Iterator[str]:
+    """Lines for the screen."""
+    found, coverage = mapped.found, mapped.found.coverage
+    cells, reached = found.surface.covered, coverage.has_signal
+    ny, nx = found.surface.shape
+    share = np.count_nonzero(reached) / max(int(np.count_nonzero(cells)), 1)
+    yield f"{nx} × {ny} cells of {mapped.metadata['cell_m']:g} m, {mapped.metadata['surface']}"
+    yield f"noise {10 * math.log10(coverage.noise_w) + 30:.1f} dBm: {mapped.metadata['noise']}"
+    yield f"{share:.1%} of the cells have a signal"
+    few = np.count_nonzero(found.rays.max(axis=0)[reached] < _FEW_RAYS) / max(int(reached.sum()), 1)
+    if few > 0.1:
+        yield (
+            f"fewer than {_FEW_RAYS} rays passed through {few:.0%} of these; their errors are decibels. Give "
+            "more --samples or a larger --cell"
+        )
+    for t, name in enumerate(found.names):
+        served = coverage.best_server == t
+        if served.any():
+            gain, sinr = (np.median(decibels(v[t][served])) for v in (coverage.gain, coverage.sinr))
+            of = np.count_nonzero(served) / np.count_nonzero(reached)
+            yield f"{name} serves {of:.1%} of these: median path gain {gain:.1f} dB, SINR {sinr:.1f} dB"
+
+
+def _require_extras() -> None:
+    missing = [extra for extra in ("channel", "plot") if not has_extra(extra)]
+    if missing:
+        raise SetupError(
+            f"a radio map needs what is not installed ({', '.join(missing)}); "
+            f"run: {install_command(*missing)}"
+        )
+
+
+@contextmanager
+def _progress(console: Console) -> Iterator[Progress]:
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, transient=True) as bar:
+        yield bar

@@ -1,0 +1,193 @@
+"""What a radio map is made of: the channel of a run, its carrier and noise, and the cells."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from caviar_clients.plots.footprints import ground
+from caviar_clients.tradeoff.scenes import Scenes
+from caviar_protocol.arrays import Float64Array
+from caviar_protocol.errors import RunError, ScenarioError
+from caviar_protocol.ply import read_ply
+from caviar_protocol.scenario import ServiceSpec
+from caviar_protocol.scene import device_pose
+from caviar_protocol.tables import Place, convert_settings, suggestion
+from caviar_protocol.topics import Carrier, Scene
+from caviar_services.channel.adaptive.settings import AdaptiveSettings, models
+from caviar_services.channel.free_space import FreeSpaceChannel
+from caviar_services.channel.radio_map.measurement_surface import (
+    Area,
+    MeasurementSurface,
+    cell_counts,
+    draped_surface,
+    level_surface,
+)
+from caviar_services.channel.sionna_rt import SionnaChannel
+from caviar_services.channel.sionna_settings import SionnaSettings
+from caviar_services.link.beams import BeamLink, BeamLinkSettings, noise_power
+from caviar_services.registry import load
+from caviar_services.scenery import SceneryShape, read_scenery
+from caviar_services.service import RunInfo
+
+_MOST_CELLS = 20_000_000
+_AROUND = 100.0
+"""[m] around devices and objects where there is no scenery."""
+
+_RELIEF = 2.0
+"""[m] between lowest and highest ground; beyond, a level plane is hardly meant."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wanted:
+    """Which cells are wanted."""
+
+    height: float = 1.5
+    """[m] above the ground."""
+    cell: float = 5.0
+    """Side of a cell [m]."""
+    surface: str = "plane"
+    """``plane``, ``ground``, or the name of a piece of scenery that the cells are draped over."""
+    area: Area | None = None
+    """Absent: all of the scenery."""
+
+
+def carrier_of(carriers: Sequence[Carrier], name: str | None) -> int:
+    """Index of the carrier that is asked for; by default the first."""
+    names = [carrier.name for carrier in carriers]
+    if not names:
+        raise ScenarioError(
+            "a radio map needs a carrier; add [[carriers]] with name and frequency_hz", key="carriers"
+        )
+    if name is None:
+        return 0
+    if name not in names:
+        raise RunError(f"--carrier {name!r} does not exist; {suggestion(name, names)}")
+    return names.index(name)
+
+
+def channel_of(scenes: Scenes, scene: Scene) -> tuple[SionnaChannel, Mapping[str, Path]]:
+    """The ray-traced channel of the run, and the scenery that it stands in."""
+    refused = []
+    for name, spec in scenes.services.items():
+        if spec.role != "channel":
+            continue
+        cls, place = load("channel", spec.use), Place("services").at(name).at("settings")
+        settings = convert_settings(cls.Settings, spec.settings, place)
+        run = RunInfo(
+            name=name,
+            seed=scenes.seed,
+            sampling_period_ns=scenes.sampling_period_ns,
+            carriers=scenes.carriers,
+            devices=scenes.devices,
+        )
+        if isinstance(settings, AdaptiveSettings):
+            traced = [model for model in models(settings, place) if issubclass(model[0], SionnaChannel)]
+            cls, settings = traced[-1] if traced else (cls, settings)
+        if issubclass(cls, SionnaChannel) and isinstance(settings, SionnaSettings):
+            return cls(settings, run), scenes.assets
+        if issubclass(cls, FreeSpaceChannel):
+            nothing = SionnaSettings(
+                atmosphere=settings.atmosphere,  # type: ignore[attr-defined]  # those of its class
+                max_depth=0,
+                reflection=False,
+                bodies=0,
+                without_body=tuple(sorted(set(scene.classes))),
+            )
+            return SionnaChannel(nothing, run), {}
+        refused.append(f"channel {name!r} is {spec.use!r}, which traces no rays")
+    what = "; ".join(refused) or f"{scenes.origin} has no channel"
+    raise RunError(f"{what}; a radio map is made with the channel sionna-rt, adaptive or free-space")
+
+
+def noise_of(services: Mapping[str, ServiceSpec], carrier: Carrier) -> tuple[float, str]:
+    """Noise power [W] of a receiver, and what it follows from: the settings of the first link."""
+    for name, spec in services.items():
+        if spec.role == "link" and issubclass(load("link", spec.use), BeamLink):
+            settings = convert_settings(
+                BeamLinkSettings, spec.settings, Place("services").at(name).at("settings")
+            )
+            origin = f"of link {name!r}"
+            break
+    else:
+        settings, origin = BeamLinkSettings(), "by default"
+    figure, temperature = settings.noise_figure_db, settings.temperature_k
+    return (
+        noise_power(carrier, figure, temperature),
+        f"{in_hertz(carrier.bandwidth_hz)}, noise figure {figure:g} dB and {temperature:g} K {origin}",
+    )
+
+
+def surface_of(
+    channel: SionnaChannel, scene: Scene, description: Path | None, wanted: Wanted
+) -> tuple[MeasurementSurface, str]:
+    """The cells, and what they are at or over. Raises `RunError` where there is no such surface."""
+    area = wanted.area or _area(channel, scene)
+    ny, nx = cell_counts(area, wanted.cell)
+    if nx * ny > _MOST_CELLS:
+        raise RunError(
+            f"--cell {wanted.cell:g} makes {nx} × {ny} cells; take larger cells or a smaller --area"
+        )
+    shapes = read_scenery(description).shapes if description else ()
+    if wanted.surface == "plane":
+        return _plane(area, wanted, shapes)
+    surface = draped_surface(area, wanted.cell, wanted.height, _ground(wanted.surface, shapes))
+    if not surface.covered.any():
+        raise RunError(
+            f"--surface {wanted.surface!r}: none of it is in the area; choose another --area, "
+            "--surface plane, or a piece of the scenery by its name"
+        )
+    return surface, f"{wanted.height:g} m above {wanted.surface!r}"
+
+
+def _plane(area: Area, wanted: Wanted, shapes: Sequence[SceneryShape]) -> tuple[MeasurementSurface, str]:
+    level = ground((shape.file, shape.to_world) for shape in shapes)[..., 2]
+    z = wanted.height + (float(level.min()) if level.size else 0.0)
+    about = f"plane at z = {z:g} m"
+    if level.size and np.ptp(level) > _RELIEF:
+        about += f"; the ground rises by {np.ptp(level):.0f} m, --surface ground follows it"
+    return level_surface(area, wanted.cell, z), about
+
+
+def _ground(name: str, shapes: Sequence[SceneryShape]) -> Float64Array:
+    """Triangles [m] that the cells are over: those of all ground, or of a piece of scenery."""
+    if name == "ground":
+        return ground((shape.file, shape.to_world) for shape in shapes)
+    named = [shape for shape in shapes if shape.name == name]
+    if named:
+        return _triangles(named)
+    near = difflib.get_close_matches(name, ("plane", "ground", *(shape.name for shape in shapes)), n=1)
+    remedy = f"did you mean {near[0]!r}?" if near else "write plane, ground or the name of a piece of scenery"
+    raise RunError(f"--surface {name!r} does not exist; {remedy}")
+
+
+def _triangles(shapes: Sequence[SceneryShape]) -> Float64Array:
+    """Triangles [m] of pieces of scenery, Shape ``[F, 3, 3]``."""
+    found = [np.zeros((0, 3, 3))]
+    for shape in shapes:
+        vertices, faces = read_ply(shape.file)
+        found.append((vertices @ shape.to_world[:3, :3].T + shape.to_world[:3, 3])[faces])
+    return np.concatenate(found)
+
+
+def _area(channel: SionnaChannel, scene: Scene) -> Area:
+    """All of the scenery; without any, what is around devices and objects."""
+    if channel.scene.has_scenery:
+        low, high = channel.scene.low, channel.scene.high
+    else:
+        places = [device_pose(scene, device).position for device in scene.devices]
+        around = np.concatenate([np.array(places).reshape(-1, 3), scene.position])
+        low, high = around.min(axis=0) - _AROUND, around.max(axis=0) + _AROUND
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+
+def in_hertz(value: float) -> str:
+    """A frequency with a unit that suits it."""
+    for unit, size in (("GHz", 1e9), ("MHz", 1e6), ("kHz", 1e3)):
+        if value >= size:
+            return f"{value / size:g} {unit}"
+    return f"{value:g} Hz"

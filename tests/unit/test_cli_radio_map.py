@@ -1,0 +1,161 @@
+"""`caviar map`: what is asked for, what is drawn, and what the arrays say."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import struct
+import sys
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from recording_samples import record, scene
+from rich.console import Console
+
+from caviar_clients.cli import main as command
+from caviar_clients.cli.radio_map import draw_radio_map, options_of
+from caviar_clients.cli.radio_map_file import ARRAYS
+from caviar_clients.cli.radio_map_inputs import Wanted, channel_of, in_hertz, noise_of
+from caviar_clients.plots.radio_map import RadioMapView, colour_limits, draw_servers, draw_values
+from caviar_clients.tradeoff.scenes import scene_at
+from caviar_protocol.errors import RecordingError, RunError
+from caviar_protocol.scenario import ServiceSpec
+from caviar_protocol.topics import Carrier
+from caviar_services.channel.radio_map.mapping import transmitters_of
+
+pytest.importorskip("matplotlib")
+
+
+def view() -> RadioMapView:
+    return RadioMapView(
+        area=(0.0, 0.0, 30.0, 20.0),
+        transmitters=("west", "east"),
+        positions=np.array([[5.0, 5.0], [25.0, 15.0]]),
+        scene=scene(0),
+        footprints=None,
+        title="a map",
+    )
+
+
+def pixels(file: Path) -> tuple[int, int]:
+    """Width and height of a PNG."""
+    content = file.read_bytes()
+    assert content[:8] == b"\x89PNG\r\n\x1a\n"
+    width, height = struct.unpack(">II", content[16:24])
+    return width, height
+
+
+def test_pictures_of_values_and_of_servers(tmp_path: Path) -> None:
+    values = np.array([[-80.0, -90.0, np.nan], [-100.0, np.nan, -70.0]])
+    draw_values(view(), values, "Path gain [dB]", tmp_path / "new" / "gain.png")
+    draw_values(view(), np.full((2, 3), np.nan), "Path gain [dB]", tmp_path / "empty.png")
+    draw_servers(view(), np.array([[0, 1, -1], [1, 0, 0]], np.int32), tmp_path / "server.png")
+    drawn = [tmp_path / name for name in ("new/gain.png", "empty.png", "server.png")]
+    assert all(min(pixels(file)) > 400 for file in drawn)
+    assert len({file.read_bytes() for file in drawn}) == 3
+
+
+def test_the_colour_bar_leaves_out_what_is_rare() -> None:
+    assert colour_limits(np.array([])) == (0.0, 1.0, "neither")
+    assert colour_limits(np.array([-90.0, -90.0])) == (-90.5, -89.5, "neither")
+    low, high, ends = colour_limits(np.concatenate([np.linspace(-120, -60, 10_000), [-300.0, 0.0]]))
+    assert (low, high) == (pytest.approx(-119.4, abs=0.1), pytest.approx(-60, abs=0.1))
+    assert ends == "both"
+    low, high, ends = colour_limits(np.linspace(-250, -50, 1000))
+    assert high - low == pytest.approx(100.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--metric", "gian"), "--metric 'gian' does not exist; did you mean 'gain'?"),
+        (("--cell", "0"), "--cell 0: write the side of a cell in metres, above 0"),
+        (("--height", "nan"), "--height nan: write a height in metres"),
+        (("--area", "0", "0", "0", "1"), "--area 0 0 0 1: write lowest x and y"),
+        (("--beam", "widest"), "--beam 'widest': write best, wide, or the number"),
+        (("--out", "map.jpg"), "--out map.jpg: a radio map is a PNG"),
+        (("--frame", "400"), "--frame 400: scenario 'smoke' has the frames 0 to"),
+        (("--carrier", "mmwav"), "--carrier 'mmwav' does not exist; did you mean 'mmwave'?"),
+    ],
+)
+def test_a_mistake_is_named_and_leaves_nothing_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], options, words
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["caviar", "map", "smoke", *options])
+    with pytest.raises(SystemExit) as ended:
+        command.main()
+    assert ended.value.code == 1
+    assert words in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_scene_without_a_transmitter_is_refused() -> None:
+    """It may be mounted on an object that is not there yet."""
+    with pytest.raises(RunError, match="frame 7 has no transmitter; give a device"):
+        transmitters_of(msgspec.structs.replace(scene(0), devices=()), "frame 7")
+
+
+def test_a_run_without_a_channel_is_refused() -> None:
+    scenes = dataclasses.replace(scene_at(Path("smoke")), services={})
+    with pytest.raises(
+        RunError, match=r"smoke.* has no channel; a radio map is made with the channel sionna"
+    ):
+        channel_of(scenes, scenes.instants[0].scene)
+
+
+def test_a_channel_that_traces_no_rays_is_refused_and_leaves_nothing_behind(tmp_path: Path) -> None:
+    shipped = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
+    text = shipped.read_text()
+    assert 'use = "free-space"' in text
+    (tmp_path / "mine.toml").write_text(text.replace('use = "free-space"', 'use = "geometric"'))
+    with pytest.raises(RunError, match="channel 'channel' is 'geometric', which traces no rays"):
+        draw_radio_map(
+            tmp_path / "mine.toml", tmp_path / "map.png", options_of(None, Wanted(), "best"), Console()
+        )
+    assert [file.name for file in tmp_path.iterdir()] == ["mine.toml"]
+
+
+def test_a_recorded_instant_is_found_and_a_missing_one_is_named(tmp_path: Path) -> None:
+    run = record(tmp_path / "run", frames=3)
+    with pytest.raises(RecordingError, match="no frame 3 of episode 0"):
+        scene_at(run, 3)
+
+
+def test_noise_is_that_of_the_link() -> None:
+    carrier = Carrier(name="c", frequency_hz=28e9, bandwidth_hz=100e6)
+    link = ServiceSpec(role="link", use="beams", budget_ms=1, settings={"noise_figure_db": 5.0})
+    power, origin = noise_of({"mine": link}, carrier)
+    assert power == pytest.approx(1.380649e-23 * 290 * 100e6 * 10**0.5)
+    assert origin == "100 MHz, noise figure 5 dB and 290 K of link 'mine'"
+    power, origin = noise_of({}, carrier)
+    assert power == pytest.approx(1.380649e-23 * 290 * 100e6 * 10**0.9)
+    assert origin.endswith("by default")
+    assert [in_hertz(f) for f in (28e9, 100e6, 15e3, 10.0)] == ["28 GHz", "100 MHz", "15 kHz", "10 Hz"]
+
+
+@pytest.mark.channel
+def test_a_scenario_gives_pictures_and_arrays_that_agree(tmp_path: Path) -> None:
+    """`smoke` in free space: the arrays have the axes, the units and the numbers that they promise."""
+    cells = Wanted(cell=20.0, area=(-50.0, -40.0, 50.0, 40.0))
+    options = options_of(["gain", "best-server"], cells, "wide", samples=20_000, frame=2)
+    files = draw_radio_map(Path("smoke"), tmp_path / "out" / "smoke.png", options, Console(quiet=True))
+    assert [file.name for file in files] == ["smoke-gain.png", "smoke-best-server.png", "smoke.npz"]
+    arrays = np.load(files[-1], allow_pickle=False)
+    about = json.loads(str(arrays["metadata"]))
+    assert set(arrays.files) == {*ARRAYS, "metadata"}
+    sizes = {"x": 5, "y": 4, "transmitter": 1, "xyz": 3}
+    for name, described in about["arrays"].items():
+        assert arrays[name].shape == tuple(sizes[axis] for axis in described["axes"]), name
+    assert (about["frame"], about["t_ns"], about["carrier"]) == (2, 200_000_000, "mmwave")
+    assert arrays["x"].tolist() == [-40.0, -20.0, 0.0, 20.0, 40.0]
+    x, y = np.meshgrid(arrays["x"], arrays["y"])
+    distance = np.linalg.norm(np.stack([x, y, arrays["z"]], -1) - arrays["position"][0], axis=-1)
+    friis = 20 * np.log10(299_792_458.0 / about["frequency_hz"] / (4 * np.pi * distance))
+    far = distance > 30
+    np.testing.assert_allclose(arrays["gain"][0][far], friis[far], atol=1.0)
+    np.testing.assert_allclose(arrays["rss"] - arrays["gain"], arrays["power"][0], atol=1e-4)
+    noise = 10 * np.log10(about["noise_w"]) + 30
+    np.testing.assert_allclose(arrays["sinr"], arrays["rss"] - noise, atol=1e-4)
