@@ -132,11 +132,14 @@ def test_an_episode_begins_with_a_launch_also_where_nothing_moves(
     """All rays of the first launch: else it would begin with what the episode before had found in time."""
     channel = channels(5)
     launched: list[Any] = []
-    launcher = channel._tracer._launcher  # type: ignore[attr-defined]  # counted on its way
+    launcher = channel._tracer._launcher  # type: ignore[attr-defined]
+    each = launcher.each  # counted on its way
     monkeypatch.setattr(
-        channel._tracer,  # type: ignore[attr-defined]
-        "_launcher",
-        lambda source, rays, number: launched.append((rays, number)) or launcher(source, rays, number),
+        launcher,
+        "each",
+        lambda look, source, rays, number: (
+            launched.append((rays, number)) or each(look, source, rays, number)
+        ),
     )
     for _ in range(2):
         channel.reset(0, 0, 0)
@@ -164,8 +167,9 @@ def test_where_nothing_moves_but_receivers_the_rays_are_launched_once(
     """Bit by bit what a new channel computes, and receivers that stand still are not traced again."""
     channel = channels(None)
     launched: list[int] = []
-    launcher = channel._tracer._launcher  # type: ignore[attr-defined]  # counted on its way
-    monkeypatch.setattr(channel._tracer, "_launcher", lambda *a: launched.append(1) or launcher(*a))  # type: ignore[attr-defined]
+    launcher = channel._tracer._launcher  # type: ignore[attr-defined]
+    each = launcher.each  # counted on its way
+    monkeypatch.setattr(launcher, "each", lambda *a: launched.append(1) or each(*a))
     still = street(0)
     first = stepped(channel, 0, still)
     assert launched == [1]

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import astuple, dataclass, replace
+from functools import reduce
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from caviar_services.channel.plane_visibility import visible_pairs
 from caviar_services.channel.scene_faces import SceneFaces
 from caviar_services.channel.sionna_candidates import positions
 from caviar_services.channel.sionna_chains import chains_of
-from caviar_services.channel.sionna_launch import Launch, Launcher, LaunchOptions
+from caviar_services.channel.sionna_launch import Launch, Launcher, LaunchOptions, PartedLauncher
 from caviar_services.channel.sionna_reach import Faces
 from caviar_services.channel.sionna_scene import SionnaScene
 
@@ -34,9 +35,6 @@ _SAME_PLACE = 0.05
 
 _FEW, _MOST_CHAINS = 64, 20_000
 """Faces of scenery, and sequences of them, of which all are taken."""
-
-PART = 1_000_000
-"""Rays that are traced together: 1.25 GB."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +84,7 @@ class SceneryChains:
         cache: ChainCache | None,
     ) -> None:
         self._scene, self._options, self._launch, self._cache = scene, options, launch, cache
-        self._launcher = Launcher(scene.mi_scene, only_reflected(options, per_frame))
+        self._launcher = PartedLauncher(scene.mi_scene, only_reflected(options, per_frame))
         self._look = Faces(scene)
         self._faces = SceneFaces(scene)
         self._known: list[tuple[Float64Array, KnownScenery]] = []
@@ -123,8 +121,7 @@ class SceneryChains:
             return self._every
         last = self._last
         if last is None or last[:2] != (place.tobytes(), self._scene.version):
-            launch = self._launcher(positions(place[None]))
-            chains = scenery_of(launch, self._scene, self._options.max_depth)
+            chains = self._launched(place)
             scenery = KnownScenery(chains, self._sights(chains, _SIGHT_RAYS_PER_FRAME))
             last = self._last = place.tobytes(), self._scene.version, scenery
         return last[2]
@@ -137,6 +134,14 @@ class SceneryChains:
         sights = visible_pairs(self._look, faces, _SIGHT_RAYS, self._options.seed)
         chains = sequences(faces.plane, sights, self._options.max_depth)
         return None if chains is None else KnownScenery(chains, sights.astype(np.int32))
+
+    def _launched(self, place: Float64Array) -> Int32Array:
+        """Chains that one launch finds from a place in the ray tracer's coordinates [m], Shape ``[3]``."""
+
+        def look(_: Int64Array, launch: Launch) -> Int32Array:
+            return scenery_of(launch, self._scene, self._options.max_depth)
+
+        return reduce(united, self._launcher.each(look, positions(place[None])))
 
     def _sights(self, chains: Int32Array, rays: int) -> Int32Array:
         """Which planes of chains see one another."""
@@ -172,13 +177,14 @@ def launched_chains(
     """
     reflected = only_reflected(options, launch.samples)
     source = positions(transmitter[None])
-    parts = -(-launch.samples // PART)
+    part = options.rays_at_once
+    parts = -(-launch.samples // part)
     found = np.full((0, options.max_depth), -1, np.int32)
-    for part in range(parts):
-        rays = (part * PART, min((part + 1) * PART, launch.samples))
+    for index in range(parts):
+        rays = (index * part, min((index + 1) * part, launch.samples))
         launcher = Launcher(scene.mi_scene, reflected, rays)
         for number in range(launch.launches):
-            progress(part * launch.launches + number, parts * launch.launches)
+            progress(index * launch.launches + number, parts * launch.launches)
             chains = scenery_of(launcher(source, number=number), scene, options.max_depth)
             found = united(found, chains)
     return found

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
-from caviar_services.channel.sionna_chains import Chains, chains_of, scattered_of
+from caviar_services.channel.sionna_chains import Chains, Met
 from caviar_services.channel.sionna_launch import Launch, LaunchOptions
 from caviar_services.channel.sionna_planes import PlaneTable
 from caviar_services.channel.sionna_scene import SionnaScene
@@ -67,8 +67,8 @@ class Offer:
     ----------
     scene
         Where the rays went.
-    launch
-        The rays.
+    met
+        What its rays met.
     source
         Where they came from, a `mitsuba.Point3f` of width 1.
     options
@@ -80,12 +80,12 @@ class Offer:
     def __init__(
         self,
         scene: SionnaScene,
-        launch: Launch,
+        met: Met,
         source: Any,
         options: LaunchOptions,
         points: Points | None = None,
     ) -> None:
-        self.launch = launch
+        self.launch = met.launch
         self._mi_scene = scene.mi_scene
         self._source = source
         self._options = options
@@ -93,16 +93,16 @@ class Offer:
         """Whether straight lines to receivers that are not seen are candidates too."""
         self.planes = Planes(scene.plane_table)
         """What chains go by."""
-        self._chains = chains_of(launch, scene, options.max_depth)
+        self._chains = met.chains
         if options.only_scattered:
             self._chains = self._chains.take(~self._chains.straight)
         self._points = points
-        self._scattered = (points.ray, points.depth) if points else scattered_of(launch)
+        self._scattered = met.scattered
 
     @property
     def size(self) -> int:
         """Candidates for each receiver, those that cannot be included."""
-        return max(len(self._chains.ray), len(self._scattered[0]))
+        return max(len(self._chains.ray), len(self._scattered.ray))
 
     def candidates(self, targets: Any, count: int) -> tuple[Candidates, Launch, int]:
         """Direct paths, chains and scattering points that could be paths to the first ``count`` of receivers,
@@ -123,8 +123,8 @@ class Offer:
         none = np.zeros(len(direct), np.int64)
         any_plane = np.full((len(direct) + len(point), self._options.max_depth), -1, np.int32)
         every = Candidates(
-            np.concatenate([none, chains.ray[chain], scattered[0][point]]),
-            np.concatenate([none, chains.depth[chain], scattered[1][point]]),
+            np.concatenate([none, chains.ray[chain], scattered.ray[point]]),
+            np.concatenate([none, chains.depth[chain], scattered.depth[point]]),
             np.concatenate([direct, receiver, reached]),
             np.concatenate([any_plane[: len(direct)], chains.planes[chain], any_plane[len(direct) :]]),
             np.concatenate([seen, np.repeat([False, True], [len(chain), len(point)])]),
@@ -152,7 +152,7 @@ class Offer:
         import drjit as dr
         import mitsuba as mi
 
-        ray, depth = self._scattered
+        ray, depth = self._scattered.ray, self._scattered.depth
         if not len(ray):
             return ray, ray, np.zeros(0)
         parts: list[tuple[Int64Array, Int64Array]] = []

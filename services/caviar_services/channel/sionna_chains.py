@@ -5,11 +5,12 @@ A chain is a sequence of planes that some ray went along. Chains come from the t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from caviar_protocol.arrays import BoolArray, Int32Array, Int64Array
+from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
 from caviar_services.channel.sionna_launch import DIFFRACTED, REFLECTED, REFRACTED, SCATTERED, Launch
 from caviar_services.channel.sionna_scene import SionnaScene
 
@@ -27,9 +28,73 @@ class Chains:
     straight: BoolArray
     """Whether a chain has but reflections and transmissions, Shape ``[C]``."""
 
-    def take(self, which: BoolArray) -> Chains:
+    def take(self, which: BoolArray | Int64Array) -> Chains:
         """These chains."""
         return Chains(self.ray[which], self.depth[which], self.planes[which], self.straight[which])
+
+
+@dataclass(frozen=True, eq=False)
+class Scattered:
+    """P points of a launch from which waves go on diffusely, in the order of depth and ray."""
+
+    ray: Int64Array
+    """Shape ``[P]``."""
+    depth: Int64Array
+    """Which interaction of the ray, from 1, Shape ``[P]``."""
+    rows: Float64Array
+    """What a choice among them goes by (`Thinning.points`), Shape ``[K, P]``; K = 0 where all are taken."""
+
+
+@dataclass(frozen=True, eq=False)
+class Met:
+    """What rays met, as far as paths may come of it."""
+
+    launch: Launch
+    """The rays that went along a chain first, or were scattered; of a launch in one part all of them."""
+    chains: Chains
+    """By rays of ``launch``."""
+    scattered: Scattered
+
+
+def met_by(
+    launch: Launch, scene: SionnaScene, max_depth: int, scattered: Scattered | None = None, part: bool = False
+) -> Met:
+    """What a launch met; ``scattered`` where points of diffuse paths are not those that were drawn.
+
+    Of a ``part`` of a larger launch only the rays that matter are kept."""
+    chains = chains_of(launch, scene, max_depth)
+    scattered = scattered or scattered_of(launch)
+    if not part:
+        return Met(launch, chains, scattered)
+    # One at least: Dr.Jit gathers nothing from arrays without elements, not even with no lane active.
+    rays = np.union1d(np.append(chains.ray, 0), scattered.ray)
+    return Met(
+        launch.take(rays),
+        replace(chains, ray=np.searchsorted(rays, chains.ray)),
+        replace(scattered, ray=np.searchsorted(rays, scattered.ray)),
+    )
+
+
+def united(parts: Sequence[Met], scene: SionnaScene) -> Met:
+    """What the parts of a launch, one at least, met together; each chain once, as `chains_of` sorts."""
+    if len(parts) == 1:
+        return parts[0]
+    launch = Launch.joined([part.launch for part in parts])
+    widths = np.array([part.launch.rays for part in parts])
+    first = np.cumsum(widths) - widths
+    chains = Chains(
+        np.concatenate([part.chains.ray + begin for part, begin in zip(parts, first, strict=True)]),
+        np.concatenate([part.chains.depth for part in parts]),
+        np.concatenate([part.chains.planes for part in parts]),
+        np.concatenate([part.chains.straight for part in parts]),
+    )
+    signature = np.column_stack([chains.depth, _signature(launch, chains, scene)])
+    _, kept = np.unique(signature, axis=0, return_index=True)
+    ray = np.concatenate([part.scattered.ray + begin for part, begin in zip(parts, first, strict=True)])
+    depth = np.concatenate([part.scattered.depth for part in parts])
+    order = np.argsort(depth, kind="stable")
+    rows = np.concatenate([part.scattered.rows for part in parts], axis=1)
+    return Met(launch, chains.take(kept), Scattered(ray[order], depth[order], rows[:, order]))
 
 
 def chains_of(launch: Launch, scene: SionnaScene, max_depth: int) -> Chains:
@@ -94,29 +159,56 @@ def _tokens(
 ) -> tuple[Int64Array, Int64Array, Int64Array, int]:
     """Kind, plane, and what tells interactions of these rays apart: the plane of a reflection, the edge of a
     diffraction, else the kind alone; and how many of these there can be."""
+    kind, plane, token = _met_at(launch, d, ray, scene)
+    first_edge = _first_edge(scene)
+    bent = np.flatnonzero(token >= first_edge)
+    edges = 0
+    if len(bent):
+        _, edge = np.unique(token[bent], return_inverse=True)
+        edges = int(edge.max()) + 1
+        token[bent] = first_edge + edge.reshape(-1)
+    return kind, plane, token, first_edge + edges
+
+
+def _signature(launch: Launch, chains: Chains, scene: SionnaScene) -> Int64Array:
+    """What tells each interaction of chains apart, −1 behind the last, Shape ``[C, D]``."""
+    signature = np.full(chains.planes.shape, -1, np.int64)
+    for d in range(len(launch.bounces)):
+        used = chains.depth > d
+        signature[used, d] = _met_at(launch, d, chains.ray[used], scene)[2]
+    return signature
+
+
+def _met_at(
+    launch: Launch, d: int, ray: Int64Array, scene: SionnaScene
+) -> tuple[Int64Array, Int64Array, Int64Array]:
+    """Kind and plane of an interaction of rays, and a number that tells it apart in all launches: the
+    plane, or one for each kind, or one for each edge."""
     bounce = launch.bounces[d]
     kind = bounce.kind.numpy()[ray].astype(np.int64)
     shape = bounce.shape.numpy()[ray].astype(np.int64)
     plane = scene.surface_of[scene.triangle_numbers(shape, bounce.primitive.numpy()[ray].astype(np.int64))]
-    planes = len(scene.plane_table.triangle)
-    token = np.where(kind == REFLECTED, plane, planes + kind)
-    edges = 0
+    token = np.where(kind == REFLECTED, plane, _first_edge(scene) - 16 + kind)
     bent = kind == DIFFRACTED
     if bent.any():
         sides = np.stack([side.numpy()[ray[bent]] for side in (launch.wedges.prim0, launch.wedges.primn)])
         sides = np.sort(scene.triangle_numbers(shape[bent], sides.astype(np.int64)), axis=0)
-        _, edge = np.unique(sides[0] * len(scene.plane_of) + sides[1], return_inverse=True)
-        edges = int(edge.max()) + 1
-        token[bent] = planes + 16 + edge.reshape(-1)
-    return kind, plane, token, planes + 16 + edges
+        token[bent] = _first_edge(scene) + sides[0] * len(scene.plane_of) + sides[1]
+    return kind, plane, token
+
+
+def _first_edge(scene: SionnaScene) -> int:
+    """The first number of an edge: behind those of planes and kinds."""
+    return len(scene.plane_table.triangle) + 16
 
 
 def _stacked(parts: list[Int64Array], empty: tuple[int, ...]) -> Int64Array:
     return np.concatenate([np.zeros(empty, np.int64), *parts])
 
 
-def scattered_of(launch: Launch) -> tuple[Int64Array, Int64Array]:
-    """Ray and depth of every interaction of a launch that is a diffuse reflection."""
+def scattered_of(launch: Launch) -> Scattered:
+    """Every interaction of a launch that is a diffuse reflection."""
     rays = [np.flatnonzero(bounce.kind.numpy() == SCATTERED) for bounce in launch.bounces]
     depths = [np.full(len(ray), d + 1, np.int64) for d, ray in enumerate(rays)]
-    return _stacked(rays, (0,)), _stacked(depths, (0,))
+    ray = _stacked(rays, (0,))
+    return Scattered(ray, _stacked(depths, (0,)), np.zeros((0, len(ray))))

@@ -17,14 +17,14 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt64Array
 from caviar_services.channel.sionna_candidates import Candidates, Offer, positions
-from caviar_services.channel.sionna_chains import Chains, chains_of
+from caviar_services.channel.sionna_chains import Chains, Met, chains_of, scattered_of
 from caviar_services.channel.sionna_launch import (
     REFLECTED,
     REFRACTED,
     Bounce,
     Launch,
-    Launcher,
     LaunchOptions,
+    PartedLauncher,
 )
 from caviar_services.channel.sionna_scene import SionnaScene
 from caviar_services.columns import aligned_columns, aligned_indices
@@ -159,7 +159,7 @@ class Followed:
 
     def offer(
         self,
-        launcher: Launcher,
+        launcher: PartedLauncher,
         transmitter: Float64Array,
         scene: SionnaScene,
         names: tuple[str, ...],
@@ -170,9 +170,16 @@ class Followed:
         jumped = self._known is not None and np.linalg.norm(transmitter - self._from) > _JUMP
         known, number, source = None if jumped else self._known, self._number, positions(transmitter[None])
         rays = None if known is None else self._rays(number)
-        launch = launcher(source, rays, number)
-        self._note(launch, rays, scene, options.samples)
-        met = _met(launch, chains_of(launch, scene, options.max_depth), scene, number)
+        if rays is None:
+            self._on_object = np.zeros(options.samples, np.bool_)
+
+        def look(some: Int64Array, launch: Launch) -> _Table:
+            self._on_object[some] = _on_object(launch, scene, len(some))
+            return _met(launch, chains_of(launch, scene, options.max_depth), scene, number)
+
+        met, *others = launcher.each(look, source, rays, number)
+        for other in others:
+            met = met.with_those(other.take(~np.isin(_keys(other, scene), _keys(met, scene))))
         if known is not None:
             triangle = scene.moved_triangles(known.triangle, self._names, names)
             recent = known.seen > number - _KEPT * self._parts
@@ -191,18 +198,6 @@ class Followed:
         chosen[number % self._parts :: self._parts] = True
         return np.flatnonzero(chosen)
 
-    def _note(self, launch: Launch, rays: Int64Array | None, scene: SionnaScene, samples: int) -> None:
-        """Remember which of these rays met moving objects."""
-        if rays is None:
-            self._on_object = np.zeros(samples, np.bool_)
-            rays = np.arange(samples)
-        met = np.zeros(len(rays), np.bool_)
-        for bounce in launch.bounces:
-            on_body = (bounce.kind.numpy() != 0) & scene.is_body(bounce.shape.numpy())
-            met |= on_body.reshape(-1, len(rays)).any(0)  # in any pass
-        if launch.bounces:
-            self._on_object[rays] = met
-
 
 class FollowedOffer(Offer):
     """Known chains in place of those of a launch."""
@@ -220,11 +215,12 @@ class FollowedOffer(Offer):
         return TableState.of(self._table)
 
     def __init__(self, table: _Table, scene: SionnaScene, source: Any, options: LaunchOptions) -> None:
-        super().__init__(scene, Launch((), None), source, options)
-        self._scene, self._table = scene, table
         straight = (table.kind == 0) | (table.kind == REFLECTED) | (table.kind == REFRACTED)
         planes = _planes(table, scene).astype(np.int32)
-        self._chains = Chains(np.arange(len(table.depth)), table.depth, planes, straight.all(1))
+        chains = Chains(np.arange(len(table.depth)), table.depth, planes, straight.all(1))
+        nothing = Launch((), None)
+        super().__init__(scene, Met(nothing, chains, scattered_of(nothing)), source, options)
+        self._scene, self._table = scene, table
 
     def candidates(self, targets: Any, count: int) -> tuple[Candidates, Launch, int]:
         """As `Offer.candidates`, with a launch that has one ray for each candidate."""
@@ -255,6 +251,15 @@ class FollowedOffer(Offer):
                 )
             )
         return Launch(tuple(bounces), None)
+
+
+def _on_object(launch: Launch, scene: SionnaScene, rays: int) -> BoolArray:
+    """Which of so many rays met a moving object, in any pass."""
+    met = np.zeros(rays, np.bool_)
+    for bounce in launch.bounces:
+        on_body = (bounce.kind.numpy() != 0) & scene.is_body(bounce.shape.numpy())
+        met |= on_body.reshape(-1, rays).any(0)
+    return met
 
 
 def _met(launch: Launch, chains: Chains, scene: SionnaScene, number: int) -> _Table:

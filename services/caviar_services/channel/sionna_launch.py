@@ -12,16 +12,31 @@ reflected alone, and an option that is switched on loses no reflection.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, TypeVar
 
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_services.columns import aligned_indices
 
+T = TypeVar("T")
+
 REFLECTED, SCATTERED, REFRACTED, DIFFRACTED = 1, 2, 4, 8
 """Flags of `sionna.rt.constants.InteractionType`; 0 is none."""
+
+RAYS_AT_ONCE = 1_000_000
+"""More at once are no faster."""
+
+_INTERACTION_BYTES = 250
+"""Memory for each interaction of each ray while a part is launched and its chains are looked for."""
+
+
+def rays_within(memory_gib: float, max_depth: int) -> int:
+    """How many rays may be traced together: at least 10,000, and at most `RAYS_AT_ONCE`."""
+    fit = memory_gib * 2**30 / (_INTERACTION_BYTES * max(max_depth, 1))
+    return int(min(max(fit, 10_000), RAYS_AT_ONCE))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +55,9 @@ class LaunchOptions:
     """Whether paths without a diffuse reflection are left to another launch."""
     diffuse_paths: int | None = None
     """How many diffuse paths of a receiver are chosen, about; None: those that were drawn."""
+    rays_at_once: int = RAYS_AT_ONCE
+    """Rays that are traced together at most, of all passes: memory grows with them, and not with
+    ``samples``."""
 
     @property
     def passes(self) -> tuple[int, ...]:
@@ -80,6 +98,13 @@ class Bounce:
     probability: Any
     """`mitsuba.Float`: that this kind of interaction was drawn."""
 
+    def take(self, rays: Any) -> Bounce:
+        """Those of these rays, a `mitsuba.UInt`."""
+        import drjit as dr
+
+        columns = [getattr(self, field.name) for field in fields(self)]
+        return Bounce(*(dr.gather(type(column), column, rays) for column in columns))
+
 
 @dataclass(frozen=True, eq=False)
 class Launch:
@@ -89,6 +114,97 @@ class Launch:
     """First, second, … interaction."""
     wedges: Any
     """The ray tracer's `WedgeGeometry` of the edge that diffracted each ray; None without diffraction."""
+
+    @property
+    def rays(self) -> int:
+        """How many."""
+        import drjit as dr
+
+        return int(dr.width(self.bounces[0].kind)) if self.bounces else 0
+
+    def take(self, rays: Int64Array) -> Launch:
+        """These rays alone."""
+        import drjit as dr
+        import mitsuba as mi
+
+        index = mi.UInt(aligned_indices(rays))
+        bounces = tuple(bounce.take(index) for bounce in self.bounces)
+        wedges = None if self.wedges is None else dr.gather(type(self.wedges), self.wedges, index)
+        dr.eval([getattr(bounce, field.name) for bounce in bounces for field in fields(bounce)], wedges)
+        return Launch(bounces, wedges)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Launch]) -> Launch:
+        """The rays of several launches of one depth, one part at least, part by part."""
+        bounces = tuple(
+            Bounce(
+                *(_concatenated([getattr(bounce, field.name) for bounce in met]) for field in fields(Bounce))
+            )
+            for met in zip(*(part.bounces for part in parts), strict=True)
+        )
+        wedges = [part.wedges for part in parts]
+        return cls(bounces, None if wedges[0] is None else _concatenated(wedges))
+
+
+def _concatenated(parts: Sequence[Any]) -> Any:
+    """Arrays of Dr.Jit, or structures of them, one behind the other."""
+    import drjit as dr
+    import mitsuba as mi
+
+    whole = dr.zeros(type(parts[0]), sum(dr.width(part) for part in parts))
+    begin = 0
+    for part in parts:
+        dr.scatter(whole, part, dr.opaque(mi.UInt, begin) + dr.arange(mi.UInt, dr.width(part)))
+        begin += dr.width(part)
+    dr.eval(whole)
+    return whole
+
+
+class PartedLauncher:
+    """Launches the rays in parts, so that memory is bounded whatever their number.
+
+    Parameters
+    ----------
+    mi_scene
+        Where they go, a `mitsuba.Scene`.
+    options
+        What is traced.
+    """
+
+    def __init__(self, mi_scene: Any, options: LaunchOptions) -> None:
+        at_once = max(1, options.rays_at_once // max(len(options.passes), 1))
+        begins = range(0, options.samples, at_once)
+        bounds = [(begin, min(begin + at_once, options.samples)) for begin in begins]
+        self._parts = [(begin, end, Launcher(mi_scene, options, (begin, end))) for begin, end in bounds]
+
+    @property
+    def in_parts(self) -> bool:
+        """Whether a launch has more than one part."""
+        return len(self._parts) > 1
+
+    def each(
+        self,
+        look: Callable[[Int64Array, Launch], T],
+        source: Any,
+        rays: Int64Array | None = None,
+        number: int = 0,
+    ) -> list[T]:
+        """What ``look`` finds in each part of a launch, which it gets with the numbers of its rays.
+
+        The rest is as for `Launcher`; ``rays`` are in ascending order. A part's memory is free before
+        the next one is launched, unless ``look`` holds it.
+        """
+        if rays is None:
+            return [
+                look(np.arange(begin, end), part(source, None, number)) for begin, end, part in self._parts
+            ]
+        ends = np.searchsorted(rays, [end for _, end, _ in self._parts])
+        split = zip(self._parts, np.split(rays, ends[:-1]), strict=True)
+        return [
+            look(some, part(source, some - begin, number))
+            for (begin, _, part), some in split
+            if len(some) or not self.in_parts
+        ]
 
 
 class Launcher:

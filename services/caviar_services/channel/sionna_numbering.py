@@ -21,6 +21,7 @@ from caviar_services.channel.sionna_meshes import Shape
 from caviar_services.channel.sionna_planes import (
     PlaneTable,
     plane_numbers,
+    plane_numbers_of,
     shared_planes,
     two_sided_planes,
 )
@@ -283,7 +284,7 @@ class NumberedTriangles:
         """Number the planes of these pieces; bodies, each of which is a point yet, by their unit meshes."""
         still = len(meshes) - len(self._bodies)
         of_asset = {asset: plane_numbers(mesh) for asset, mesh in unit_meshes.items()}
-        numbers = [plane_numbers(mesh) for mesh in meshes[:still]]
+        numbers = plane_numbers_of(meshes[:still])
         numbers += [of_asset[asset] for asset, _ in self._bodies]
         self._face_of = np.concatenate(numbers)
         counts = np.array([int(number.max(initial=-1)) + 1 for number in numbers], np.int64)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
+from caviar_services.channel.plane_clustering import coplanar, cross
 from caviar_services.meshes import Mesh
 
 _OFF_PLANE = 2e-5
@@ -22,15 +23,6 @@ _RIM = 1e-3
 """[m]; a point this near a triangle is one of it."""
 
 
-def cross(one: Float64Array, other: Float64Array) -> Float64Array:
-    """Cross products of vectors, Shape ``[N, 3]``: of some thousands, four times as fast as NumPy's."""
-    product = np.empty(one.shape)
-    for axis in range(3):
-        i, j = (axis + 1) % 3, (axis + 2) % 3
-        product[:, axis] = one[:, i] * other[:, j] - one[:, j] * other[:, i]
-    return product
-
-
 def plane_numbers(mesh: Mesh) -> Int32Array:
     """Number of the plane that each triangle of a mesh lies in, Shape ``[F]``.
 
@@ -38,28 +30,29 @@ def plane_numbers(mesh: Mesh) -> Int32Array:
     mesh moves, turns and is stretched: what lies in one plane does so afterwards. Triangles need not touch:
     a path has one point in a plane at most. A triangle without area is a plane of its own.
     """
-    corners = mesh.vertices[mesh.faces]
-    count = len(corners)
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return plane_numbers_of([mesh])[0]
+
+
+def plane_numbers_of(meshes: Sequence[Mesh]) -> list[Int32Array]:
+    """`plane_numbers` of each of many meshes, all at once."""
+    if not meshes:
+        return []
+    counts = [len(mesh.faces) for mesh in meshes]
+    of = np.repeat(np.arange(len(meshes)), counts)
+    corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes])
+    normal = cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(normal, axis=1)
     flat = area > 0
     normal[flat] /= area[flat, None]
-    extent = float(np.ptp(mesh.vertices, axis=0).max()) if len(mesh.vertices) else 0.0
-    label = np.full(count, -1, np.int64)
+    extents = [float(np.ptp(mesh.vertices, axis=0).max()) if len(mesh.vertices) else 0.0 for mesh in meshes]
     # The largest triangle's normal is the most exact one: it defines the plane.
-    for first in np.argsort(-area, kind="stable").tolist():
-        if label[first] >= 0:
-            continue
-        label[first] = first
-        if not flat[first]:
-            continue
-        rest = np.flatnonzero((label < 0) & flat)
-        rest = rest[np.abs((corners[rest, 0] - corners[first, 0]) @ normal[first]) <= _OFF_PLANE * extent]
-        across = np.linalg.norm(np.cross(normal[rest], normal[first]), axis=1)
-        rest = rest[across <= _ANGLE]
-        off = np.abs((corners[rest] - corners[first, 0]) @ normal[first]).max(1, initial=0.0)
-        label[rest[off <= _OFF_PLANE * extent]] = first
-    return _in_order(label)
+    order = np.argsort(-area, kind="stable")
+    order = order[flat[order]]
+    distance = _OFF_PLANE * np.array(extents)
+    first = np.arange(len(of))
+    first[order] = order[coplanar(corners[order], normal[order], of[order], distance, _ANGLE)]
+    ends = np.cumsum(counts)
+    return [_in_order(label) for label in np.split(first, ends[:-1])]
 
 
 def _in_order(label: Int64Array) -> Int32Array:

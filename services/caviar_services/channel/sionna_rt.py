@@ -33,7 +33,7 @@ from caviar_services.channel.mimo_rt import ElementTracer
 from caviar_services.channel.paths import Antenna, PathTable
 from caviar_services.channel.scenery_chains import SceneryChains, SceneryLaunch
 from caviar_services.channel.sionna_following import Following, FollowingState
-from caviar_services.channel.sionna_launch import LaunchOptions
+from caviar_services.channel.sionna_launch import LaunchOptions, rays_within
 from caviar_services.channel.sionna_materials import MaterialPolicy, OutsideUse
 from caviar_services.channel.sionna_reach import Corners
 from caviar_services.channel.sionna_scene import SceneSettings, SionnaScene
@@ -105,6 +105,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
             refraction=settings.refraction,
             diffraction=settings.diffraction,
             scattering=settings.scattering,
+            rays_at_once=rays_within(settings.memory_gib, settings.max_depth),
         )
         self._launched = self._asked
 
@@ -297,8 +298,9 @@ class SionnaChannel(PathModel[SionnaSettings]):
             surfaces = traced_surfaces(launches, table.traced, table.types, table.points, self._scene)
             return SphericalWaves(surfaces, self._tracer.look, traced_from, self.run.carriers, memory)
         if self.rung == "mimo-rt":
-            # The rays of a launch are kept whole; the rest is for the candidates of some receivers at a time.
-            lanes = memory // LANE_BYTES - self._launched.lanes * self._launched.max_depth
+            # A part of a launch is held whole; the rest is for the candidates of some receivers at a time.
+            launched = self._launched
+            lanes = memory // LANE_BYTES - min(launched.lanes, launched.rays_at_once) * launched.max_depth
             return ElementTracer(
                 self._tracer,
                 self._scene,

@@ -91,8 +91,9 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
         int | None, quantity("1", "receivers looked at together; absent: as many as fit")
     ] = None
     memory_gib: Annotated[
-        float, quantity("GiB", "for element pairs looked at or traced together", gt=0, le=1024)
+        float, quantity("GiB", "for rays, and element pairs, looked at or traced together", gt=0, le=1024)
     ] = 4.0
+    """Rays are launched in parts of a million at most, and of fewer where this asks for it."""
     bodies: Annotated[int, quantity("1", "moving objects of one mesh at most", ge=0, le=4096)] = 32
     pool: dict[str, int] = msgspec.field(default_factory=dict)
     """Bodies of single meshes where ``bodies`` does not fit, by file name without ending: ``car = 64``;

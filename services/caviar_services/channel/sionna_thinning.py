@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt64Array
 from caviar_protocol.seeding import derive_seed
 from caviar_services.channel.patterns import element_amplitude
+from caviar_services.channel.sionna_chains import Scattered
 from caviar_services.channel.sionna_launch import (
     REFLECTED,
     REFRACTED,
@@ -107,8 +108,9 @@ class Thinning:
             self._roughness[number] = float(material.scattering_coefficient[0]) ** 2
             self._mirror[number] = _at_normal(material)
 
-    def points(self, launch: Launch, source: Float64Array, element: Element | None) -> Points:
-        """All points at which rays of a launch from ``source``, Shape ``[3]``, met something rough.
+    def points(self, launch: Launch, source: Float64Array, element: Element | None) -> Scattered:
+        """All points at which rays of a launch from ``source``, Shape ``[3]``, met something rough, with
+        position [m], normal and what each is expected to bring, Shape ``[7, P]``.
 
         ``element`` is the transmitter's; None: its gain is the same in all directions.
         """
@@ -132,7 +134,7 @@ class Thinning:
                 power = power * np.maximum(onward, _LEAST)
                 here = met.point
         ray, depth, rows = (np.concatenate(column, axis=-1) for column in zip(*parts, strict=True))
-        return Points(self, ray, depth, rows)
+        return Scattered(ray, depth, rows)
 
     def chosen(
         self, ray: Int64Array, depth: Int64Array, weight: Float64Array
@@ -191,18 +193,15 @@ def _turned(depth: Int64Array) -> UInt64Array:
 
 
 class Points:
-    """P points of a launch, in the order of depth and ray."""
+    """The points that `Thinning.points` found."""
 
-    def __init__(self, thinning: Thinning, ray: Int64Array, depth: Int64Array, rows: Float64Array) -> None:
+    def __init__(self, thinning: Thinning, found: Scattered) -> None:
         import mitsuba as mi
 
-        self.ray = ray
-        """Shape ``[P]``."""
-        self.depth = depth
-        """Shape ``[P]``."""
+        self._ray, self._depth, rows = found.ray, found.depth, found.rows
         self._thinning = thinning
         self._brings = rows[6]
-        self._all = several(len(ray))
+        self._all = several(len(self._ray))
         columns = [mi.Float(column) for column in aligned_columns(rows[:6, self._all])]
         self._point, self._normal = mi.Point3f(*columns[:3]), mi.Normal3f(*columns[3:])
 
@@ -212,9 +211,9 @@ class Points:
         ``targets`` are the receivers, a `mitsuba.Point3f`.
         """
         nobody = np.zeros(0, np.int64)
-        if not len(self.ray):
+        if not len(self._ray):
             return nobody, nobody, np.zeros(0)
-        kept, probability = self._thinning.chosen(self.ray, self.depth, self._weights(targets))
+        kept, probability = self._thinning.chosen(self._ray, self._depth, self._weights(targets))
         point, receiver = np.nonzero(kept)
         if not len(point):
             return nobody, nobody, np.zeros(0)
@@ -237,7 +236,7 @@ class Points:
         normal = mi.Vector3f(dr.gather(mi.Normal3f, self._normal, point))
         cosine = dr.dot(normal, mi.Vector3f(towards)) * dr.rsqrt(apart)
         weight: Any = dr.select(cosine > 0.0, (cosine + _GRAZING) / (apart + _NEAR), 0.0)
-        found: Float64Array = weight.numpy().reshape(-1, receivers)[: len(self.ray)].astype(np.float64)
+        found: Float64Array = weight.numpy().reshape(-1, receivers)[: len(self._ray)].astype(np.float64)
         found *= self._brings[:, None]
         return found
 

@@ -21,11 +21,12 @@ from caviar_protocol.arrays import (
 )
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.sionna_candidates import Candidates, Offer, Planes, positions
+from caviar_services.channel.sionna_chains import Met, met_by, united
 from caviar_services.channel.sionna_follow import Followed, FollowedOffer, TableState
-from caviar_services.channel.sionna_launch import SCATTERED, Launch, Launcher, LaunchOptions
+from caviar_services.channel.sionna_launch import SCATTERED, Launch, LaunchOptions, PartedLauncher
 from caviar_services.channel.sionna_reach import Corners, Faces, at_corners, reflected
 from caviar_services.channel.sionna_scene import SionnaScene
-from caviar_services.channel.sionna_thinning import Element, Thinning
+from caviar_services.channel.sionna_thinning import Element, Points, Thinning
 from caviar_services.channel.sionna_traced import Traced, geometry, joined, nothing, read
 from caviar_services.channel.specular import image_points, refined_points
 from caviar_services.channel.visibility import Look
@@ -87,7 +88,7 @@ class Tracer:
         # which any element pattern in any orientation is applied afterwards.
         self._patterns = antenna_pattern_registry.get("iso")(polarization="VH").patterns
         self._faces = Faces(scene)
-        self._launcher = Launcher(scene.mi_scene, options)
+        self._launcher = PartedLauncher(scene.mi_scene, options)
         self._thinning: Thinning | None = None
         if options.diffuse_paths is not None:
             self._thinning = Thinning(scene.mi_scene, options.diffuse_paths, options.seed)
@@ -154,15 +155,11 @@ class Tracer:
         transmitter, receivers = transmitter - centre, receivers - centre
         corners = corners and corners.relative_to(centre)
         key = transmitter.tobytes() + (element.key if element else b"")
+        self._drop_outdated()
         last = None if corners else self._last.get(key)
-        if last is None or last.version != self._scene.version:
+        if last is None:
             if followed is None:
-                source = positions(transmitter[None])
-                launch = self._launcher(source)
-                points = None
-                if self._thinning is not None:
-                    points = self._thinning.points(launch, transmitter, element)
-                offer = Offer(self._scene, launch, source, self._options, points)
+                offer = self._launched(transmitter, element)
             else:
                 offer = followed.offer(self._launcher, transmitter, self._scene, names, self._options)
             offer.everywhere = corners is not None
@@ -176,6 +173,27 @@ class Tracer:
         while len(self._last) > _REMEMBERED:
             del self._last[next(iter(self._last))]
         return traced
+
+    def _drop_outdated(self) -> None:
+        """Free the launches into the scene as it was: they match no frame any more."""
+        version = self._scene.version
+        self._last = {key: last for key, last in self._last.items() if last.version == version}
+
+    def _launched(self, transmitter: Float64Array, element: Element | None) -> Offer:
+        """What a launch of all rays offers."""
+        source = positions(transmitter[None])
+
+        def look(_: Int64Array, launch: Launch) -> Met:
+            scattered = None
+            if self._thinning is not None:
+                scattered = self._thinning.points(launch, transmitter, element)
+            return met_by(
+                launch, self._scene, self._options.max_depth, scattered, part=self._launcher.in_parts
+            )
+
+        met = united(self._launcher.each(look, source), self._scene)
+        points = None if self._thinning is None else Points(self._thinning, met.scattered)
+        return Offer(self._scene, met, source, self._options, points)
 
     def _since(
         self, last: _Last, transmitter: Float64Array, receivers: Float64Array, at_once: int | None
