@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from caviar_protocol.errors import CaviarError
+from caviar_protocol.host import steady_memory
 from caviar_protocol.keys import credentials
 from caviar_services.registry import find_modules_in
 from caviar_services.runner import CONNECT_TIMEOUT_S, run_service
@@ -37,6 +38,7 @@ def serve(
     if ":" in implementation:
         for folder in (*modules, Path.cwd()):
             find_modules_in(folder)
+    steady_memory()
     try:
         found = credentials(key, broker_key)
         return run_service(name, role, implementation, broker, connect_timeout_s, found, restarted=restarted)
