@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import math
+from pathlib import PurePath
+
+import msgspec
 
 from caviar_protocol.coordinates import Vector, quaternion_from_euler
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.scenario_checks import owned_by
 from caviar_protocol.topics.scene import AntennaArray, AntennaDevice, CameraDevice, Device, LidarDevice
+
+PATTERNS = "patterns/"
+"""What the names of assets begin with that are patterns of antenna elements."""
 
 _HEIGHT = {"centre": 0.0, "roof": 0.5, "floor": -0.5}
 """Mount point along z, in heights of the object's bounding box from its centre."""
@@ -30,6 +36,18 @@ def mounted_device(spec: DeviceSpec, parent: str, dimensions: Vector) -> Device:
     return _device(spec, f"{parent}/{spec.name}", parent, dimensions[2])
 
 
+def pattern_asset(path: str) -> str:
+    """Name of the asset that a pattern file of a scenario travels as."""
+    return f"{PATTERNS}{PurePath(path).name}"
+
+
+def _published(array: AntennaArray) -> AntennaArray:
+    """An array of a scenario as it is in a scene: its pattern file by the name of the asset."""
+    if not array.pattern_file:
+        return array
+    return msgspec.structs.replace(array, pattern_file=pattern_asset(array.pattern_file))
+
+
 def _device(spec: DeviceSpec, name: str, parent: str, height: float) -> Device:
     x, y, z = spec.position_m
     position = (x, y, z + _HEIGHT[spec.mount] * height)
@@ -48,7 +66,7 @@ def _device(spec: DeviceSpec, name: str, parent: str, height: float) -> Device:
                 position=position,
                 orientation=orientation,
                 role=spec.role,
-                array=spec.array or AntennaArray(),
+                array=_published(spec.array or AntennaArray()),
                 power_dbm=spec.power_dbm,
             )
         case "lidar":

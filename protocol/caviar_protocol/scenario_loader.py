@@ -5,16 +5,18 @@ from __future__ import annotations
 import difflib
 import re
 import tomllib
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from caviar_protocol.devices import pattern_asset
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.instants import with_instants
 from caviar_protocol.ofdm import with_numerology
-from caviar_protocol.scenario import Scenario
+from caviar_protocol.scenario import DeviceSpec, Scenario
 from caviar_protocol.scenario_checks import check_scenario, settings_place
 from caviar_protocol.tables import Place, Source, convert_table
 from caviar_protocol.toml_lines import dotted, key_lines
@@ -43,8 +45,8 @@ def find_scenario(scenario: Path | str) -> Path:
 def load_scenario(path: Path | str) -> Scenario:
     """Read and check a scenario, given as a path or as the name of one that ships (`find_scenario`).
 
-    Strings that begin with ``file:`` in settings of services are paths relative to the file's
-    folder; they come out as absolute paths.
+    Strings that begin with ``file:`` in settings of services, and in the ``pattern_file`` of antennas, are
+    paths relative to the file's folder; they come out as absolute paths.
 
     Raises `ScenarioError` naming file, line, key, value and what to write instead.
     """
@@ -139,7 +141,35 @@ def _with_files(scenario: Scenario, folder: Path) -> Scenario:
         )
         for name, service in scenario.services.items()
     }
-    return msgspec.structs.replace(scenario, services=services)
+    devices = tuple(
+        _with_pattern(device, folder, Place("devices", scenario.source).at(index).at("array"))
+        for index, device in enumerate(scenario.devices)
+    )
+    _check_patterns(devices, scenario.source)
+    return msgspec.structs.replace(scenario, services=services, devices=devices)
+
+
+def _with_pattern(device: DeviceSpec, folder: Path, array: Place) -> DeviceSpec:
+    """A device with the path of its pattern file made absolute."""
+    if device.array is None or not device.array.pattern_file:
+        return device
+    name, place = device.array.pattern_file, array.at("pattern_file")
+    if not name.startswith(_FILE) and not Path(name).is_absolute():
+        raise place.error(f'is {name!r}, write "file:" and a path relative to the folder of the scenario')
+    found = msgspec.structs.replace(device.array, pattern_file=_absolute(name, folder, place))
+    return msgspec.structs.replace(device, array=found)
+
+
+def _check_patterns(devices: Sequence[DeviceSpec], source: Source) -> None:
+    """Refuse different pattern files of one name, by which they travel."""
+    first: dict[str, str] = {}
+    for index, device in enumerate(devices):
+        file = device.array.pattern_file if device.array is not None else ""
+        if file and first.setdefault(pattern_asset(file), file) != file:
+            place = Place("devices", source).at(index).at("array").at("pattern_file")
+            raise place.error(
+                f"{file} has the name of {first[pattern_asset(file)]}, which is another file; rename one"
+            )
 
 
 def _absolute(value: Any, folder: Path, place: Place) -> Any:

@@ -45,6 +45,9 @@ SINCE: dict[str, str] = {
     "ChannelTaps": "1.4",
     "Channel.hf": "1.4",
     "Channel.taps": "1.4",
+    "AntennaArray.pattern_file": "1.4",
+    "AntennaArray.panels": "1.4",
+    "Panel": "1.4",
 }
 """Minor version that brought a field (``Grant.reports``) or a class (``Grant``); 1.0 unless said here."""
 

@@ -254,7 +254,7 @@ class Runner:
                 assets = [self._store.add(n, c) for n, c in sorted(service.scenery().items())]
                 if assets:
                     self._broker.send(m.AssetOffer(**self._identity, assets=tuple(assets)))
-                if service.uses_scenery:
+                if service.needs_assets:
                     assets = self._fetch(message.assets)
                 files = self._store.folder_of(assets) if assets else {}
                 prepared = service.prepare(preparation_of(message, files))

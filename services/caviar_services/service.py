@@ -279,6 +279,12 @@ class Service(ABC, Generic[S]):
         self.settings = settings
         self.run = run
 
+    @property
+    def needs_assets(self) -> bool:
+        """Whether the assets of the run are fetched before `prepare`: where the class uses scenery, or what
+        it is to do in this run needs files."""
+        return self.uses_scenery
+
     def scenery(self) -> Mapping[str, Path | bytes]:
         """Worlds: the files of scenery this world brings, by asset name (clause 4)."""
         return {}

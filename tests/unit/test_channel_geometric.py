@@ -10,8 +10,10 @@ import pytest
 
 from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.coordinates import quaternion_from_euler
+from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.messages import GrantInput, Status
-from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Channel, Scene
+from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Channel, Panel, Scene
 from caviar_services.channel.geometric import GeometricChannel
 from caviar_services.channel.geometric_settings import GeometricSettings
 from caviar_services.channel.occlusion import Boxes
@@ -240,3 +242,15 @@ def test_occlusion_agrees_with_points_along_the_segment(seed: int) -> None:
 def test_settings_that_do_nothing_are_refused(settings: dict[str, Any], told: str) -> None:
     with pytest.raises(msgspec.ValidationError, match=told):
         model(**settings)
+
+
+@pytest.mark.parametrize("array", [AntennaArray(polarization="cross"), AntennaArray(panels=(Panel(),))])
+def test_arrays_that_its_waves_have_no_polarization_for_are_refused(array: AntennaArray) -> None:
+    """Before the run where the scenario has them, else in the frame."""
+    spec = DeviceSpec(name="bs", kind="antenna", role="tx", array=array)
+    run = RunInfo(name="channel", carriers=CARRIERS, devices=(spec,))
+    with pytest.raises(ScenarioError, match=r"devices.bs.array: device 'bs' has an array of dual"):
+        GeometricChannel(GeometricSettings(), run).prepare(Preparation(demand={}))
+    bs = AntennaDevice(name="bs", role="tx", array=array)
+    with pytest.raises(PayloadError, match='use = "sionna-rt"'):
+        step(model(), scene(bs, device("ue", "rx", 9.0, 0.0, 0.0)))

@@ -9,7 +9,14 @@ import pytest
 
 pytest.importorskip("mitsuba")
 
+from caviar_protocol.topics import AntennaArray
+from caviar_services.channel.paths import Antenna
 from caviar_services.channel.sionna_thinning import Element, Thinning
+
+
+def element(pattern: str, rotation: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> Element:
+    array = AntennaArray(pattern=pattern)  # type: ignore[arg-type]
+    return Element(Antenna("tx", array, np.zeros(3), rotation, np.zeros(3)))
 
 
 def thinning(wanted: int, seed: int = 0) -> Thinning:
@@ -69,6 +76,6 @@ def test_without_weights_there_is_no_choice() -> None:
 def test_an_element_sends_along_its_own_axes() -> None:
     """The sector pattern of 3GPP TR 38.901 has 8 dBi ahead and 30 dB less behind; here ahead is +y."""
     turned = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    gain = Element("tr38901", turned).gain(np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]]))
+    gain = element("tr38901", turned).gain(np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]]))
     np.testing.assert_allclose(10 * np.log10(gain), [8.0, -22.0], atol=1e-9)
-    assert Element("tr38901", turned).key != Element("iso", turned).key
+    assert element("tr38901", turned).key != element("iso", turned).key

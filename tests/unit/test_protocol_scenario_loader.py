@@ -191,6 +191,25 @@ BROKEN_RULES = [
     ),
     ('on = "car.*"', 'on = "car.1"', "devices[1].count", 'write a pattern: on = "car.1*"'),
     ('on = "car.*"\ncount = 2\n', "", "devices[1].mount", "a parent to be mounted at"),
+    (
+        "{ rows = 8, columns = 4 }",
+        '{ pattern_file = "sector.msi" }',
+        "devices[0].array.pattern_file",
+        "is 'sector.msi', write \"file:\" and a path",
+    ),
+    (
+        "{ rows = 8, columns = 4 }",
+        '{ pattern_file = "file:nowhere.msi" }',
+        "devices[0].array.pattern_file",
+        "nowhere.msi; 'file:nowhere.msi' is relative to the folder of the scenario",
+    ),
+    (
+        "{ rows = 8, columns = 4 }",
+        "{ panels = [{ yaw = 90 }] }",
+        "devices[0].array.panels[0].yaw",
+        "unknown key 'yaw'; did you mean 'yaw_deg'?",
+    ),
+    ("{ rows = 8, columns = 4 }", '{ polarization = "HV" }', "devices[0].array.polarization", "VH"),
     ('role = "both"\n', "", "devices[0]", 'write role = "tx", "rx" or "both"'),
     (
         'role = "both"',
@@ -316,3 +335,20 @@ def test_a_name_that_is_too_long_for_a_directory_is_refused_with_the_limit(tmp_p
 def test_frames_of_the_command_line_are_within_the_longest_duration() -> None:
     with pytest.raises(ScenarioError, match=r"9000000000000 frames of \d+ ns are longer than"):
         with_overrides(load_scenario("smoke"), frames=9_000_000_000_000)
+
+
+def test_pattern_files_are_found_beside_the_scenario_and_differ_in_name(tmp_path: Path) -> None:
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "sector.msi").write_text("x")
+    (tmp_path / "roads.net.xml").write_text("x")
+    one = "{ pattern_file = 'file:a/sector.msi', panels = [{ yaw_deg = 90.0 }] }"
+    text = GOOD.replace("{ rows = 8, columns = 4 }", one)
+    (tmp_path / "one.toml").write_text(text)
+    array = load_scenario(tmp_path / "one.toml").devices[0].array
+    assert array is not None
+    assert (array.pattern_file, array.panels[0].yaw_deg) == (str(tmp_path / "a" / "sector.msi"), 90.0)
+    second = '\n[[devices]]\nname = "b2"\nkind = "antenna"\nrole = "rx"\n'
+    (tmp_path / "two.toml").write_text(text + second + "array.pattern_file = 'file:b/sector.msi'\n")
+    with pytest.raises(ScenarioError, match=r"two.toml:\d+: devices\[2\].array.pattern_file: .*rename one"):
+        load_scenario(tmp_path / "two.toml")

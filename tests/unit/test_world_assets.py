@@ -11,9 +11,12 @@ import numpy as np
 import pytest
 from world_builders import ScriptedWorld
 
+from caviar_protocol.devices import fixed_device
 from caviar_protocol.errors import AssetError, ScenarioError, SetupError
+from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.topics import AntennaArray, AntennaDevice
 from caviar_services.meshes import Mesh, placed
-from caviar_services.world.assets import object_assets, scenery_assets
+from caviar_services.world.assets import object_assets, pattern_assets, scenery_assets
 from caviar_services.world.base import WorldSettings
 from caviar_services.world.shapes import SHAPES, ply
 
@@ -181,3 +184,18 @@ def test_sionna_not_installed_is_answered_with_the_command(monkeypatch: pytest.M
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(SetupError, match=r"pip install 'caviar-sim\[world\]'"):
         scenery_assets("sionna:munich")
+
+
+def test_pattern_files_of_devices_travel_and_what_is_wrong_with_one_names_its_key(tmp_path: Path) -> None:
+    file = tmp_path / "sector.msi"
+    file.write_text("GAIN 10 dBi\nHORIZONTAL 2\n0 0\n180 20\nVERTICAL 2\n0 0\n90 12\n")
+    array = AntennaArray(pattern_file=str(file))
+    device = DeviceSpec(name="bs", kind="antenna", role="tx", array=array)
+    plain = DeviceSpec(name="ue", kind="antenna", role="rx")
+    assert pattern_assets((plain, device)) == {"patterns/sector.msi": file}
+    published = fixed_device(device)
+    assert isinstance(published, AntennaDevice)
+    assert published.array.pattern_file == "patterns/sector.msi"
+    file.write_text("GAIN ten dBi\n")
+    with pytest.raises(ScenarioError, match=r"devices.bs.array.pattern_file: .*sector.msi:1: is 'ten'"):
+        pattern_assets((device,))

@@ -16,11 +16,13 @@ from caviar_clients.plots.footprints import Box, Footprints, footprints, with_bo
 from caviar_clients.plots.lidar import draw_scan
 from caviar_clients.plots.map import MapData, draw_map
 from caviar_protocol.arrays import Float64Array
+from caviar_protocol.beams import subarray_of
+from caviar_protocol.coordinates import rotation_matrix
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.recording import RecordedFrame, Recording
 from caviar_protocol.topics import AntennaArray, Camera, Channel, Depth, Lidar, Link, Segmentation
 from caviar_services.antenna import steering_vector
-from caviar_services.channel.patterns import radiated_field
+from caviar_services.channel.patterns import element_amplitude
 from caviar_services.link.codebook import dft_codebook
 from caviar_services.scenery import find_scenery, read_scenery
 
@@ -96,11 +98,14 @@ def plot_run(
 def beam_gain(array: AntennaArray, beam: int, directions: Float64Array) -> Float64Array:
     """Amplitude of a codebook beam towards unit vectors in device axes, Shape ``[N, 3]`` to ``[N]``.
 
-    ``|c_k* a(k̂)| / sqrt(N)`` times the amplitude of the element pattern.
+    ``|c_k* a(k̂)| / sqrt(N)`` of the beam's subarray, times the amplitude of the element pattern, which is
+    left out where it comes from a file.
     """
-    response = steering_vector(array, directions) @ dft_codebook(array)[beam].conj()
-    element = np.linalg.norm(radiated_field(array, np.eye(3), directions), axis=1)
-    gain: Float64Array = np.abs(response) / np.sqrt(array.size) * element
+    part, own = subarray_of(array, beam)
+    local = directions @ rotation_matrix(part.orientation)
+    response = steering_vector(part.array, local) @ dft_codebook(part.array)[own].conj()
+    element = np.ones(len(local)) if array.pattern_file else element_amplitude(array.pattern, local)
+    gain: Float64Array = np.abs(response) / np.sqrt(part.array.size) * element
     return gain
 
 

@@ -109,7 +109,7 @@ class Place:
                 offered = [self._store.add(n, c) for n, c in sorted(service.scenery().items())]
                 if offered:
                     self._feed(ev.AssetsOffered(self._name, tuple(offered)))
-                if not service.uses_scenery:
+                if not service.needs_assets:
                     assets = offered
                 files = self._store.folder_of(assets) if assets else {}
                 prepared = service.prepare(preparation_of(message, files))

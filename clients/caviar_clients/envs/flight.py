@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from caviar_clients.envs.base import SessionEnv
 from caviar_clients.envs.observations import Moment
-from caviar_protocol.beams import beam_towards
+from caviar_protocol.beams import straight_beams
 from caviar_protocol.coordinates import Vector
 from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.pairs import directions
@@ -80,15 +80,10 @@ class FlightEnv(SessionEnv[NDArray[np.float32]]):
         """Beams along the straight line, of the receivers that the agent owns."""
         pairs = [pair for _, pair in moment.users if owned_by(self._steered, pair.rx.name)]
         at_tx, at_rx = directions(moment.scene, pairs)
-        choices = [
-            BeamChoice(
-                tx=pair.tx.name,
-                rx=pair.rx.name,
-                tx_beam=beam_towards(pair.tx.array, towards_rx),
-                rx_beam=beam_towards(pair.rx.array, towards_tx),
-            )
-            for pair, towards_rx, towards_tx in zip(pairs, at_tx, at_rx, strict=True)
-        ]
+        choices = []
+        for pair, towards_rx, towards_tx in zip(pairs, at_tx, at_rx, strict=True):
+            tx_beam, rx_beam = straight_beams(pair.tx.array, towards_rx, pair.rx.array, towards_tx)
+            choices.append(BeamChoice(tx=pair.tx.name, rx=pair.rx.name, tx_beam=tx_beam, rx_beam=rx_beam))
         return sorted(choices, key=lambda choice: (choice.rx, choice.tx))
 
     def _position(self, moment: Moment) -> NDArray[np.float64]:

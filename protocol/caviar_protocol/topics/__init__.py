@@ -31,6 +31,7 @@ from caviar_protocol.topics.scene import (
     AntennaDevice,
     CameraDevice,
     LidarDevice,
+    Panel,
     Scene,
 )
 from caviar_protocol.topics.sensors import (
@@ -91,6 +92,7 @@ __all__ = [
     "LidarScan",
     "Link",
     "OccupancyGrid",
+    "Panel",
     "Scene",
     "Segmentation",
     "SegmentationImage",

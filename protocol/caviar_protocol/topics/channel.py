@@ -144,7 +144,9 @@ class Channel(Payload, frozen=True, kw_only=True, omit_defaults=True):
     ``offsets[p]:offsets[p + 1]``. Within a pair paths are sorted by: number of interactions,
     interaction types, object names, then delay, departure and arrival angles. Angles are in
     world axes: zenith from +z, azimuth counter-clockwise from +x. ``a`` contains
-    exp(−j2πfτ): its phase is absolute, and τ is the true propagation delay.
+    exp(−j2πfτ): its phase is absolute, and τ is the true propagation delay. It is that between single
+    elements; where a device has several panels or dual polarization, between the two subarrays (elements of
+    one panel and one polarization) of its pair that most power passes between, on all carriers and paths.
 
     A path's ``id`` is unique in its pair. It is a hash of the interaction types, the names of the objects
     and, where a model knows them, the numbers of their faces, which are planes of an object; paths that agree

@@ -19,10 +19,11 @@ class Link(Payload, frozen=True, kw_only=True, omit_defaults=True):
     TX, then RX by name. A device that both transmits and receives is no user of itself.
 
     ``y`` is the equivalent channel w* H f of a beam pair (paper, eq. 1) with beams of unit norm
-    and without transmit power. Beam ``k`` of an array with N = rows·columns elements is
+    and without transmit power. Beam ``k`` of a panel of one polarization, with N = rows·columns elements, is
     c_k[i] = exp(+j2π(p·(i % rows)/rows + q·(i // rows)/columns))/sqrt(N) with p = k % rows and
     q = k // rows; a receiver uses w = c_k, a transmitter f = conj(c_k), so that an index means
-    the same direction at both ends.
+    the same direction at both ends. With several panels or dual polarization, beam ``s·N + k`` is beam ``k``
+    of the ``s``-th block of N elements and 0 at all others.
 
     A user without a path has ``has_path`` false and zeros; one that no agent served has beams −1
     and |y| 0. The lists of best pairs end with beams −1 and |y| 0 where a user has no path or

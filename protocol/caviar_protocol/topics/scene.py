@@ -8,13 +8,34 @@ import msgspec
 
 from caviar_protocol.arrays import Float64Array, Payload, Quaternion, Vector3, array, quantity
 
+DUAL_POLARIZATIONS = {"VH": ("V", "H"), "cross": ("-45", "+45"), "circular": ("RHCP", "LHCP")}
+"""Polarizations of two elements at one place."""
+
+
+class Panel(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Where one panel of an array stands, and how it is turned.
+
+    Angles are in degrees, as their names say: a world copies the map of the scenario as it is.
+    """
+
+    position_m: Annotated[Vector3, quantity("m", "centre of the panel, in the device's axes")] = (
+        0.0,
+        0.0,
+        0.0,
+    )
+    yaw_deg: Annotated[float, quantity("°", "counter-clockwise from the device's +x")] = 0.0
+    pitch_deg: Annotated[float, quantity("°", "positive lowers the nose")] = 0.0
+    roll_deg: Annotated[float, quantity("°", "about +x")] = 0.0
+
 
 class AntennaArray(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """A uniform linear (one row or one column) or planar antenna array.
+    """A uniform linear (one row or one column) or planar antenna array, of one or several panels.
 
-    The elements stand in the y–z plane of the device, boresight +x. Element order is
-    column-major: down a column from +z to −z, columns from −y to +y, as in Sionna RT. So
-    element ``i`` is row ``i % rows`` of column ``i // rows``.
+    The antennas of a panel stand in its y–z plane, boresight +x. Their order is column-major: down
+    a column from +z to −z, columns from −y to +y, as in Sionna RT. So antenna ``i`` is row
+    ``i % rows`` of column ``i // rows``. An antenna of dual polarization has two elements at one place.
+    Elements are in order of panels, then polarizations, then antennas: element
+    ``(panel·ports + port)·rows·columns + i``, as in Sionna RT for one panel.
     """
 
     rows: Annotated[int, quantity("1", "elements along z", ge=1, le=1024)] = 1
@@ -23,13 +44,30 @@ class AntennaArray(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
     horizontal_spacing: Annotated[float, quantity("wavelengths", "between columns", gt=0)] = 0.5
     pattern: Literal["iso", "dipole", "hw_dipole", "tr38901"] = "iso"
     """Of each element: isotropic, short dipole, half-wave dipole, 3GPP TR 38.901."""
-    polarization: Literal["V", "H"] = "V"
-    """Of each element: vertical (along the device's z) or horizontal (along its y)."""
+    polarization: Literal["V", "H", "-45", "+45", "RHCP", "LHCP", "VH", "cross", "circular"] = "V"
+    """Of each element: vertical (along the device's z), horizontal (along its y), slanted by ±45°, right- or
+    left-handed circular (IEEE); dual: ``VH``, ``cross`` (−45° and +45°), ``circular`` (RHCP and LHCP)."""
+    pattern_file: str = ""
+    """Asset with the pattern of each element, in place of ``pattern``; in a scenario ``file:`` and a path."""
+    panels: tuple[Panel, ...] = ()
+    """Panels, each with all rows and columns; empty: one, at the device's own position and orientation."""
+
+    @property
+    def polarizations(self) -> tuple[str, ...]:
+        """Those of the elements at one place, first port first: one, or the two of a dual polarization."""
+        return DUAL_POLARIZATIONS.get(self.polarization) or (self.polarization,)
+
+    @property
+    def is_uniform(self) -> bool:
+        """Whether the array is one panel of one polarization, where the device itself is."""
+        return not self.panels and self.polarization not in DUAL_POLARIZATIONS
 
     @property
     def size(self) -> int:
         """Number of elements."""
-        return self.rows * self.columns
+        if self.is_uniform:
+            return self.rows * self.columns
+        return self.rows * self.columns * len(self.polarizations) * max(1, len(self.panels))
 
 
 class _Device(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from caviar_protocol.beams import beam_towards
+from caviar_protocol.beams import straight_beams
 from caviar_protocol.pairs import Pair, directions
 from caviar_protocol.topics import BeamChoice, Scene
 from caviar_services.agent.base import Agent, AgentSettings
@@ -19,12 +19,8 @@ def straight_choices(scene: Scene, pairs: Sequence[Pair]) -> Iterator[BeamChoice
     """The straight-line pair of beams of each pair of devices, the same on every carrier."""
     at_tx, at_rx = directions(scene, pairs)
     for pair, towards_rx, towards_tx in zip(pairs, at_tx, at_rx, strict=True):
-        yield BeamChoice(
-            tx=pair.tx.name,
-            rx=pair.rx.name,
-            tx_beam=beam_towards(pair.tx.array, towards_rx),
-            rx_beam=beam_towards(pair.rx.array, towards_tx),
-        )
+        tx_beam, rx_beam = straight_beams(pair.tx.array, towards_rx, pair.rx.array, towards_tx)
+        yield BeamChoice(tx=pair.tx.name, rx=pair.rx.name, tx_beam=tx_beam, rx_beam=rx_beam)
 
 
 class LosBeamAgent(Agent[AgentSettings]):

@@ -22,10 +22,15 @@ from caviar_protocol.topics import (
 )
 from caviar_services.channel.atmosphere import amplitude_factor
 from caviar_services.channel.geometry import PathGeometry, path_geometry
-from caviar_services.channel.matrices import Located, Matrices, PlaneWaves
+from caviar_services.channel.matrices import (
+    Located,
+    Matrices,
+    PlaneWaves,
+    carrier_phase,
+    subarray_amplitudes,
+)
 from caviar_services.channel.path_ids import stable_ids
-from caviar_services.channel.paths import Antenna, PathTable
-from caviar_services.channel.patterns import radiated_field
+from caviar_services.channel.paths import Antenna, PathTable, antenna_fields
 from caviar_services.channel.wideband import Wideband, bins_of, wideband_parts
 
 
@@ -182,27 +187,28 @@ def _amplitudes(
     transmitters: Sequence[Antenna],
     receivers: Sequence[Antenna],
 ) -> Complex128Array:
-    """a = field_rx · transfer · field_tx · exp(−j2πfτ), Shape ``[C, P]``."""
+    """a = field_rx · transfer · field_tx · exp(−j2πfτ), Shape ``[C, P]``.
+
+    Of devices with several subarrays, between the two that most power passes between.
+    """
     tx, rx = np.divmod(table.pair, max(len(receivers), 1))
-    sent = _fields(transmitters, tx, geometry.departure)
-    taken = _fields(receivers, rx, geometry.arrival)
-    frequency = np.array([carrier.frequency_hz for carrier in carriers])
-    # The whole turns of f·τ go first: they are millions, and only the rest is a phase.
-    turns = frequency[:, None] * geometry.tau
-    phase = np.exp(-2j * np.pi * (turns - np.round(turns)))
+    sent = antenna_fields(transmitters, tx, geometry.departure)
+    taken = antenna_fields(receivers, rx, geometry.arrival)
+    phase = carrier_phase(carriers, geometry.tau)
     a: Complex128Array = np.einsum("pi,cpij,pj->cp", taken, table.transfer, sent) * phase
+    for t, transmitter in enumerate(transmitters):
+        for r, receiver in enumerate(receivers):
+            if len(transmitter.subarrays) * len(receiver.subarrays) > 1:
+                rows = np.flatnonzero(table.pair == t * len(receivers) + r)
+                every = subarray_amplitudes(
+                    (transmitter, receiver),
+                    (geometry.departure[rows], geometry.arrival[rows]),
+                    table.transfer[:, rows],
+                    phase[:, rows],
+                )
+                power = np.nansum(np.abs(every) ** 2, axis=(2, 3))
+                a[:, rows] = every[np.unravel_index(np.argmax(power), power.shape)]
     return a
-
-
-def _fields(antennas: Sequence[Antenna], which: Int64Array, directions: Float64Array) -> Float64Array:
-    """Field of the antenna that each path has at one end, towards the path, Shape ``[P, 3]``."""
-    if len(antennas) == 1:
-        return radiated_field(antennas[0].array, antennas[0].rotation, directions)
-    fields = np.zeros((len(which), 3))
-    for index, antenna in enumerate(antennas):
-        mine = which == index
-        fields[mine] = radiated_field(antenna.array, antenna.rotation, directions[mine])
-    return fields
 
 
 def _select(geometry: PathGeometry, which: Int64Array | BoolArray) -> PathGeometry:

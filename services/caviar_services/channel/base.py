@@ -14,18 +14,21 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array
+from caviar_protocol.devices import PATTERNS
 from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.paths import changes
 from caviar_protocol.scene import antennas
 from caviar_protocol.topics import AntennaDevice, Channel, ChannelOptions, Scene
-from caviar_protocol.topics.scene import Device
+from caviar_protocol.topics.scene import Device, Panel
 from caviar_services.channel.assemble import Product, assemble
 from caviar_services.channel.atmosphere import Atmosphere, specific_attenuation
 from caviar_services.channel.matrices import Matrices
 from caviar_services.channel.outage import outage_counts
 from caviar_services.channel.paths import Antenna, PathTable
+from caviar_services.channel.patterns import Patterns
 from caviar_services.channel.wideband import required_parts
+from caviar_services.pattern_files import read_pattern
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
 
 
@@ -97,6 +100,14 @@ class ChannelModel(Service[S]):
         """Whether somebody asks for the matrices."""
         self.wideband: frozenset[str] = frozenset()
         """Parts ``hf`` and ``taps`` that are in demand."""
+        self.patterns = Patterns()
+        """Of the elements of arrays, with those of the run's pattern files."""
+
+    @property
+    def needs_assets(self) -> bool:
+        """Pattern files are assets, too."""
+        arrays = [spec.array for spec in self.run.devices if spec.array is not None]
+        return self.uses_scenery or any(array.pattern_file for array in arrays)
 
     @property
     def options(self) -> ChannelOptions:
@@ -139,6 +150,13 @@ class ChannelModel(Service[S]):
         demand = preparation.demand.get("channel", frozenset())
         self.with_h = "h" in demand
         self.wideband = required_parts(demand, self.run.carriers)
+        self.patterns = Patterns(
+            {
+                name: read_pattern(file)
+                for name, file in preparation.assets.items()
+                if name.startswith(PATTERNS)
+            }
+        )
         return Prepared(notes=(*self.load(preparation), *self._absorption_notes()))
 
     def step(self, frame: Frame) -> StepResult:
@@ -196,7 +214,12 @@ def _numbers_of(devices: tuple[Device, ...]) -> float:
     for device in devices:
         if isinstance(device, AntennaDevice):
             numbers += (device.array.vertical_spacing, device.array.horizontal_spacing)
+            numbers += [number for panel in device.array.panels for number in _numbers_of_panel(panel)]
     return sum(numbers)
+
+
+def _numbers_of_panel(panel: Panel) -> tuple[float, ...]:
+    return (*panel.position_m, panel.yaw_deg, panel.pitch_deg, panel.roll_deg)
 
 
 def _refuse_not_finite(scene: Scene) -> None:
@@ -211,6 +234,8 @@ def _refuse_not_finite(scene: Scene) -> None:
         parts = {"position": device.position, "orientation": device.orientation}
         if isinstance(device, AntennaDevice):
             parts["element spacing"] = (device.array.vertical_spacing, device.array.horizontal_spacing)
+            for number, panel in enumerate(device.array.panels):
+                parts[f"panel {number}"] = _numbers_of_panel(panel)
         for name, part in parts.items():
             if not all(map(math.isfinite, part)):
                 raise PayloadError(f"device {device.name!r} has the {name} {part}; give finite numbers")
@@ -234,8 +259,8 @@ class PathModel(ChannelModel[S]):
         receivers: Sequence[AntennaDevice],
     ) -> Modelled:
         begin = time.perf_counter_ns()
-        tx = [Antenna.of(scene, device) for device in transmitters]
-        rx = [Antenna.of(scene, device) for device in receivers]
+        tx = [Antenna.of(scene, device, self.patterns) for device in transmitters]
+        rx = [Antenna.of(scene, device, self.patterns) for device in receivers]
         found = self.paths(scene, tx, rx)
         traced = time.perf_counter_ns()
         product = Product(

@@ -16,7 +16,7 @@ import numpy as np
 from caviar_protocol.arrays import Complex128Array, Float64Array, Int64Array
 from caviar_protocol.topics import AntennaArray
 from caviar_services.channel.paths import Antenna
-from caviar_services.channel.patterns import element_amplitude, spherical_basis
+from caviar_services.channel.patterns import Field, FormulaPattern, polarized_field
 
 
 class ElementGains:
@@ -81,7 +81,7 @@ def _fields(
     which: Int64Array,
     towards: Float64Array,
     wavelength: float,
-) -> Float64Array:
+) -> Field:
     """Fields towards paths at the places of an array, world axes, Shape ``[P, K, 3]``."""
     nodes, _ = _nodes(array)
     rotation = np.array([antenna.rotation for antenna in antennas])[which]
@@ -89,10 +89,10 @@ def _fields(
     away = (towards - centre)[:, None] @ rotation - wavelength * nodes
     length = np.sqrt((away**2).sum(-1, keepdims=True))
     local = (away / np.where(length > 0, length, 1.0)).reshape(-1, 3)
-    theta_hat, phi_hat = spherical_basis(local)
-    field = theta_hat if array.polarization == "V" else phi_hat
-    field *= element_amplitude(array.pattern, local)[:, None]
-    world: Float64Array = field.reshape(*away.shape) @ rotation.transpose(0, 2, 1)
+    # Antennas of one array have the same pattern.
+    pattern = next((antenna.pattern for antenna in antennas if antenna.array == array), None)
+    field = polarized_field(pattern or FormulaPattern(array.pattern), array.polarization, local)
+    world: Field = field.reshape(*away.shape) @ rotation.transpose(0, 2, 1)
     return world
 
 

@@ -23,6 +23,8 @@ antenna pattern, so that E‖H‖² = Nt·Nr. A single wave of amplitude 1 that 
 and 6.98 on average over the grid: the paper's optimum, "always larger than 5" with mean 6.81, is on
 this scale. ``path-loss``: times λ/(4πd) and the two element patterns, and ``nlos_loss_db`` weaker
 without line of sight.
+
+Waves have no polarization: arrays of dual polarization, and of several panels, are refused.
 """
 
 from __future__ import annotations
@@ -47,15 +49,16 @@ from caviar_protocol.arrays import (
     UInt64Array,
 )
 from caviar_protocol.coordinates import SPEED_OF_LIGHT, Pose
+from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.scene import device_pose
 from caviar_protocol.seeding import generator
+from caviar_protocol.tables import Place
 from caviar_protocol.topics import AntennaDevice, Channel, ChannelMatrix, ChannelOptions, Scene
 from caviar_services.antenna import steering_vector
 from caviar_services.channel.atmosphere import amplitude_factor
 from caviar_services.channel.base import ChannelModel, Modelled
 from caviar_services.channel.geometric_settings import GeometricSettings
 from caviar_services.channel.occlusion import Boxes
-from caviar_services.channel.patterns import element_amplitude
 from caviar_services.channel.waves import (
     Draws,
     Line,
@@ -68,13 +71,19 @@ from caviar_services.channel.waves import (
     with_phase,
 )
 from caviar_services.channel.wideband import Bins, Wideband, bins_of, superposed, wideband_parts
-from caviar_services.service import Frame, RunInfo
+from caviar_services.service import Frame, Preparation, RunInfo
 
 BLOCK = 256
 """Frames whose draws are made at once: a generator costs more than what one frame takes from it."""
 
 KEPT = 4096
 """Pairs whose draws are kept at most."""
+
+
+_NOT_UNIFORM = (
+    "has an array of dual polarization or of several panels, and the waves of the channel 'geometric' have "
+    'no polarization; take one of V, H, -45, +45, RHCP and LHCP without panels, or use = "sionna-rt"'
+)
 
 
 class GeometricChannel(ChannelModel[GeometricSettings]):
@@ -110,6 +119,14 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
     def options(self) -> ChannelOptions:
         return ChannelOptions(reflection=self.settings.components > 1, max_depth=1)
 
+    def load(self, preparation: Preparation) -> tuple[str, ...]:
+        """Raises `ScenarioError` for an array that the model has no waves for."""
+        for spec in self.run.devices:
+            if spec.array is not None and not spec.array.is_uniform:
+                place = Place("devices").at(spec.name).at("array")
+                raise ScenarioError(f"device {spec.name!r} {_NOT_UNIFORM}", key=place.key)
+        return ()
+
     def reset(self, episode: int, seed: int, t0_ns: int) -> None:
         """Forget the draws of the episode before."""
         self._draws.clear()
@@ -121,6 +138,9 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         transmitters: Sequence[AntennaDevice],
         receivers: Sequence[AntennaDevice],
     ) -> Modelled:
+        for device in (*transmitters, *receivers):
+            if not device.array.is_uniform:
+                raise PayloadError(f"device {device.name!r} {_NOT_UNIFORM}")
         waves, count = Waves(), self.settings.components
         offsets, los, blocked = [0], [], self._blocks(scene)
         poses = {device.name: device_pose(scene, device) for device in (*transmitters, *receivers)}
@@ -259,8 +279,8 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         """λ/(4πd), both element patterns and absorption, Shape ``[C, P]``."""
         patterns = np.ones(len(waves.tau))
         for pair in pairs:
-            patterns[pair.mine] = element_amplitude(pair.tx.array.pattern, pair.departures(waves))
-            patterns[pair.mine] *= element_amplitude(pair.rx.array.pattern, pair.arrivals(waves))
+            patterns[pair.mine] = self.patterns.of(pair.tx.array).amplitude(pair.departures(waves))
+            patterns[pair.mine] *= self.patterns.of(pair.rx.array).amplitude(pair.arrivals(waves))
         factor: Float64Array = (
             SPEED_OF_LIGHT / self._frequency / (4 * np.pi * np.array(waves.length)) * patterns
         )

@@ -5,13 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Protocol
+from typing import Protocol, TypeVar
+
+import numpy as np
 
 from caviar_protocol.arrays import Complex64Array, Complex128Array, Float64Array, Int64Array
+from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Carrier, ChannelMatrix
 from caviar_services.antenna import steering_vector
 from caviar_services.channel.geometry import PathGeometry
 from caviar_services.channel.paths import Antenna
+from caviar_services.channel.patterns import radiated_field
 from caviar_services.channel.stacked import summed
 from caviar_services.channel.wideband import Bins, superposed
 
@@ -58,7 +62,11 @@ class Matrices(Protocol):
 
 class PlaneWaves:
     """H[m, n] = Σ_p a[p] · receive[p, m] · transmit[p, n]: delays and phases within an array are those at
-    the carrier, so that its beams point where they do there on every subcarrier (no beam squint)."""
+    the carrier, so that its beams point where they do there on every subcarrier (no beam squint).
+
+    With several subarrays the sum holds for each block of H, with the amplitudes between these two and the
+    phases of their centres.
+    """
 
     def __call__(
         self,
@@ -67,7 +75,14 @@ class PlaneWaves:
         receivers: Sequence[Antenna],
         located: Located,
     ) -> tuple[ChannelMatrix, ...]:
-        return plane_waves(carriers, transmitters, receivers, located)
+        steered = _steered(transmitters, receivers, located)
+        return tuple(
+            ChannelMatrix(
+                carrier=index, tx=pair // len(receivers), rx=pair % len(receivers), h=of.h(index, c)
+            )
+            for index, c in enumerate(carriers)
+            for pair, of in enumerate(steered)
+        )
 
     def responses(
         self,
@@ -77,46 +92,129 @@ class PlaneWaves:
         located: Located,
     ) -> Iterator[Complex64Array]:
         geometry = located.geometry
-        steered = list(_steered(transmitters, receivers, located))
+        steered = _steered(transmitters, receivers, located)
         for asked in bins:
             doppler = geometry.doppler_ratio * asked.carrier.frequency_hz
-            for pair, (mine, receive, transmit) in enumerate(steered):
-                weights = asked.weights(pair, geometry.tau[mine], doppler[mine])
-                waves = receive[:, :, None] * transmit[:, None, :]
-                yield superposed(weights * located.a[asked.index, mine], waves)
+            for pair, of in enumerate(steered):
+                weights = asked.weights(pair, geometry.tau[of.mine], doppler[of.mine])
+                yield of.response(asked.index, asked.carrier, weights)
 
 
-def plane_waves(
-    carriers: Sequence[Carrier],
-    transmitters: Sequence[Antenna],
-    receivers: Sequence[Antenna],
-    located: Located,
-) -> tuple[ChannelMatrix, ...]:
-    """H[m, n] = Σ_p a[p] · receive[p, m] · transmit[p, n] of every carrier and pair."""
-    a = located.a
-    steered = list(_steered(transmitters, receivers, located))
-    return tuple(
-        ChannelMatrix(
-            carrier=carrier,
-            tx=pair // len(receivers),
-            rx=pair % len(receivers),
-            h=summed(receive * a[carrier, mine, None], transmit),
+@dataclass(frozen=True, eq=False)
+class _Steered:
+    """The paths of a pair of devices, p of them, and the phases of the elements of their subarrays on each."""
+
+    antennas: tuple[Antenna, Antenna]
+    """Transmitter and receiver."""
+    mine: slice
+    located: Located
+    transmit: list[Complex128Array]
+    """Of each subarray of the transmitter, Shape ``[p, N]`` each; ``receive`` likewise."""
+    receive: list[Complex128Array]
+
+    def h(self, index: int, carrier: Carrier) -> Complex128Array:
+        """H on a carrier, which is the ``index``-th."""
+        a = self._amplitudes(index, carrier)
+        return joined(
+            [
+                [summed(receive * a[r, t, :, None], transmit) for t, transmit in enumerate(self.transmit)]
+                for r, receive in enumerate(self.receive)
+            ]
         )
-        for carrier in range(len(carriers))
-        for pair, (mine, receive, transmit) in enumerate(steered)
-    )
+
+    def response(self, index: int, carrier: Carrier, weights: Complex128Array) -> Complex64Array:
+        """Σ_p weights[j, p] · (what path p adds to H), Shape ``[J, Nr, Nt]``."""
+        a = self._amplitudes(index, carrier)
+        return joined(
+            [
+                [
+                    superposed(weights * a[r, t], receive[:, :, None] * transmit[:, None, :])
+                    for t, transmit in enumerate(self.transmit)
+                ]
+                for r, receive in enumerate(self.receive)
+            ]
+        )
+
+    def _amplitudes(self, index: int, carrier: Carrier) -> Complex128Array:
+        """Of the paths between each subarray of the receiver and each of the transmitter, ``[R, T, p]``."""
+        located, mine = self.located, self.mine
+        if len(self.transmit) * len(self.receive) == 1:
+            return located.a[None, None, index, mine]
+        geometry = located.geometry
+        towards = geometry.departure[mine], geometry.arrival[mine]
+        phase = carrier_phase([carrier], geometry.tau[mine])
+        a = subarray_amplitudes(self.antennas, towards, located.transfer[index : index + 1, mine], phase)
+        return a[:, :, 0] * _centre_phases(carrier, self.antennas, towards)
 
 
 def _steered(
     transmitters: Sequence[Antenna], receivers: Sequence[Antenna], located: Located
-) -> Iterator[tuple[slice, Complex128Array, Complex128Array]]:
-    """Of each pair: its paths, and the phases of receiving and transmitting elements, Shape ``[p, N]``."""
-    geometry = located.geometry
+) -> list[_Steered]:
+    """The paths of each pair."""
+    geometry, found = located.geometry, []
     for pair, (begin, end) in enumerate(pairwise(located.offsets.tolist())):
-        tx, rx = divmod(pair, len(receivers))
+        antennas = transmitters[pair // len(receivers)], receivers[pair % len(receivers)]
         mine = slice(begin, end)
-        transmit = _steering(transmitters[tx], geometry.departure[mine])
-        yield mine, _steering(receivers[rx], geometry.arrival[mine]), transmit
+        transmit = [_steering(part, geometry.departure[mine]) for part in antennas[0].subarrays]
+        receive = [_steering(part, geometry.arrival[mine]) for part in antennas[1].subarrays]
+        found.append(_Steered(antennas, mine, located, transmit, receive))
+    return found
+
+
+Blocks = TypeVar("Blocks", Complex64Array, Complex128Array)
+
+
+def joined(rows: list[list[Blocks]]) -> Blocks:
+    """One array of blocks between subarrays, those of a receiver's subarray in a row; Shape ``[..., M, N]``."""
+    return rows[0][0] if len(rows) * len(rows[0]) == 1 else np.block(rows)
+
+
+def carrier_phase(carriers: Sequence[Carrier], tau: Float64Array) -> Complex128Array:
+    """exp(−j2πfτ), Shape ``[C, P]``."""
+    frequency = np.array([carrier.frequency_hz for carrier in carriers])
+    # The whole turns of f·τ go first: they are millions, and only the rest is a phase.
+    turns = frequency[:, None] * tau
+    phase: Complex128Array = np.exp(-2j * np.pi * (turns - np.round(turns)))
+    return phase
+
+
+def subarray_amplitudes(
+    antennas: tuple[Antenna, Antenna],
+    towards: tuple[Float64Array, Float64Array],
+    transfer: Complex128Array,
+    phase: Complex128Array,
+) -> Complex128Array:
+    """Amplitudes of paths between elements at the devices' positions, of each subarray of a receiver and each
+    of a transmitter, Shape ``[R, T, C, P]``.
+
+    Parameters
+    ----------
+    antennas
+        Transmitter and receiver.
+    towards
+        Directions of departure and of arrival in world axes, Shape ``[P, 3]`` each.
+    transfer, phase
+        As in `PathTable` and from `carrier_phase`, of these paths.
+    """
+    sent, taken = (
+        np.array([radiated_field(part.array, part.rotation, along, part.pattern) for part in end.subarrays])
+        for end, along in zip(antennas, towards, strict=True)
+    )
+    amplitudes: Complex128Array = np.einsum("rpi,cpij,tpj->rtcp", taken, transfer, sent) * phase
+    return amplitudes
+
+
+def _centre_phases(
+    carrier: Carrier, antennas: tuple[Antenna, Antenna], towards: tuple[Float64Array, Float64Array]
+) -> Complex128Array:
+    """What the phase at subarrays' centres is against those of their devices, Shape ``[R, T, P]``."""
+    nearer = [
+        np.array([along @ (part.position - end.position) for part in end.subarrays])
+        for end, along in zip(antennas, towards, strict=True)
+    ]
+    metres = nearer[1][:, None] + nearer[0][None]
+    phases: Complex128Array = np.exp(2j * np.pi * carrier.frequency_hz / SPEED_OF_LIGHT * metres)
+    return phases
 
 
 def _steering(antenna: Antenna, directions: Float64Array) -> Complex128Array:

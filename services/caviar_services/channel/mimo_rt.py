@@ -22,8 +22,7 @@ from caviar_services.channel.atmosphere import amplitude_factor
 from caviar_services.channel.clearance import with_near_pairs
 from caviar_services.channel.geometry import PathGeometry, path_geometry
 from caviar_services.channel.matrices import Located
-from caviar_services.channel.paths import Antenna, PathTable
-from caviar_services.channel.patterns import radiated_field
+from caviar_services.channel.paths import Antenna, PathTable, antenna_fields
 from caviar_services.channel.sionna_reach import Corners
 from caviar_services.channel.sionna_scene import SionnaScene
 from caviar_services.channel.sionna_table import path_table
@@ -134,12 +133,11 @@ class ElementTracer:
 
     def _ends(self, antennas: Sequence[Antenna], wavelength: float) -> list[_Element]:
         """All elements of these antennas, in order."""
-        placed = elements(antennas, wavelength)
+        parts = [part for antenna in antennas for part in antenna.subarrays]
+        placed = elements(parts, wavelength)
         return [
-            _Element(
-                replace(antenna, position=at), replace(antenna, position=self._scene.surfaces.cleared(at))
-            )
-            for index, antenna in enumerate(antennas)
+            _Element(replace(part, position=at), replace(part, position=self._scene.surfaces.cleared(at)))
+            for index, part in enumerate(parts)
             for at in placed.of(index)
         ]
 
@@ -211,12 +209,11 @@ class ElementTracer:
                 objects[table.objects],
                 np.array([target.velocity for target in targets]).reshape(-1, 3)[table.pair],
             )
-            sent = radiated_field(source.array, source.rotation, geometry.departure)
-            taken = np.zeros_like(ends)
-            names = np.array([target.name for target in targets], object)[table.pair]
-            for antenna in {target.name: target for target in targets}.values():
-                mine = names == antenna.name
-                taken[mine] = radiated_field(antenna.array, antenna.rotation, geometry.arrival[mine])
+            sent = source.radiated(geometry.departure)
+            parts = {(target.name, target.part): target for target in targets}
+            number = {key: index for index, key in enumerate(parts)}
+            which = np.array([number[target.name, target.part] for target in targets], np.int64)[table.pair]
+            taken = antenna_fields(list(parts.values()), which, geometry.arrival)
             turns = geometry.tau * SPEED_OF_LIGHT / wavelength
             phase = np.exp(-2j * np.pi * (turns - np.round(turns)))
             a: Complex128Array = np.einsum("pi,pij,pj->p", taken, table.transfer[carrier], sent) * phase

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -16,7 +18,9 @@ from caviar_protocol.arrays import (
 )
 from caviar_protocol.coordinates import rotation_matrix
 from caviar_protocol.scene import device_pose, device_velocity
+from caviar_protocol.subarrays import subarrays
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Scene
+from caviar_services.channel.patterns import ElementPattern, Field, Patterns, radiated_field
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,10 +35,17 @@ class Antenna:
     """Turns device axes into world axes, Shape ``[3, 3]``."""
     velocity: Float64Array
     """[m/s], Shape ``[3]``."""
+    pattern: ElementPattern | None = None
+    """Of its elements; None: the one that the array names."""
+    part: int = 0
+    """Which of a device's subarrays this is."""
 
     @classmethod
-    def of(cls, scene: Scene, device: AntennaDevice) -> Antenna:
-        """The antenna of a device, composed with its parent's pose."""
+    def of(cls, scene: Scene, device: AntennaDevice, patterns: Patterns | None = None) -> Antenna:
+        """The antenna of a device, composed with its parent's pose.
+
+        ``patterns`` knows those from files; without it the antenna is not to be asked for its field.
+        """
         pose = device_pose(scene, device)
         return cls(
             device.name,
@@ -42,7 +53,43 @@ class Antenna:
             np.array(pose.position),
             rotation_matrix(pose.orientation),
             device_velocity(scene, device),
+            None if patterns is None else patterns.of(device.array),
         )
+
+    @cached_property
+    def subarrays(self) -> tuple[Antenna, ...]:
+        """Its uniform parts, one for each panel and polarization, as antennas where they stand."""
+        if self.array.is_uniform:
+            return (self,)
+        return tuple(
+            replace(
+                self,
+                array=part.array,
+                position=self.position + self.rotation @ np.array(part.position),
+                rotation=self.rotation @ rotation_matrix(part.orientation),
+                part=number,
+            )
+            for number, part in enumerate(subarrays(self.array))
+        )
+
+    def radiated(self, directions: Float64Array) -> Field:
+        """Far field of an element of the first subarray, towards unit vectors in world axes, ``[P, 3]``."""
+        first = self.subarrays[0]
+        return radiated_field(first.array, first.rotation, directions, first.pattern)
+
+
+def antenna_fields(antennas: Sequence[Antenna], which: Int64Array, directions: Float64Array) -> Field:
+    """Field of the antenna that each path has at one end, towards the path, Shape ``[P, 3]``."""
+    if len(antennas) == 1:
+        return antennas[0].radiated(directions)
+    found: Field = np.zeros((len(which), 3))
+    for index, antenna in enumerate(antennas):
+        mine = which == index
+        field = antenna.radiated(directions[mine])
+        if np.iscomplexobj(field) and not np.iscomplexobj(found):
+            found = found.astype(np.complex128)
+        found[mine] = field
+    return found
 
 
 @dataclass(frozen=True, eq=False)

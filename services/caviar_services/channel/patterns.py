@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+
 import numpy as np
 
-from caviar_protocol.arrays import Float64Array
+from caviar_protocol.arrays import Complex128Array, Float64Array
+from caviar_protocol.errors import AssetError
+from caviar_protocol.subarrays import jones
+from caviar_protocol.tables import suggestion
 from caviar_protocol.topics import AntennaArray
+from caviar_services.pattern_files import PatternTable
+
+Field = Float64Array | Complex128Array
+"""Complex where an element is circularly polarized, or its file says so."""
 
 
 def spherical_basis(directions: Float64Array, pole: float = 0.0) -> tuple[Float64Array, Float64Array]:
@@ -24,30 +36,111 @@ def spherical_basis(directions: Float64Array, pole: float = 0.0) -> tuple[Float6
     return theta_hat, phi_hat
 
 
-def radiated_field(array: AntennaArray, rotation: Float64Array, directions: Float64Array) -> Float64Array:
+class ElementPattern(ABC):
+    """Far field of a vertically polarized element, before `polarized_field` turns it."""
+
+    @abstractmethod
+    def along_theta_phi(self, local: Float64Array) -> tuple[Field, Field | None]:
+        """E_θ and E_φ towards unit vectors in device axes, Shape ``[P]`` each; None: no E_φ.
+
+        ``|E_θ|² + |E_φ|²`` is the gain as a factor.
+        """
+
+    def amplitude(self, local: Float64Array) -> Float64Array:
+        """Root of the gain, whatever the polarization, Shape ``[P]``."""
+        along_theta, along_phi = self.along_theta_phi(local)
+        amplitude: Float64Array = np.abs(along_theta)
+        return amplitude if along_phi is None else np.hypot(amplitude, np.abs(along_phi))
+
+
+@dataclass(frozen=True)
+class FormulaPattern(ElementPattern):
+    """A pattern by its name in `AntennaArray`; see `element_amplitude`."""
+
+    name: str
+
+    def along_theta_phi(self, local: Float64Array) -> tuple[Field, Field | None]:
+        return element_amplitude(self.name, local), None
+
+
+@dataclass(frozen=True, eq=False)
+class TabulatedPattern(ElementPattern):
+    """A pattern from a file."""
+
+    table: PatternTable
+
+    def along_theta_phi(self, local: Float64Array) -> tuple[Field, Field | None]:
+        zenith = np.arctan2(np.hypot(local[:, 0], local[:, 1]), local[:, 2])
+        values = self.table.at(zenith, np.arctan2(local[:, 1], local[:, 0]))
+        if self.table.is_field:
+            return values[:, 0], values[:, 1]
+        amplitude: Float64Array = 10 ** (values.real / 20)
+        return amplitude, None
+
+
+class Patterns:
+    """Patterns of the elements of arrays, with those from files by the names of their assets."""
+
+    def __init__(self, tables: Mapping[str, PatternTable] | None = None) -> None:
+        self._tabulated = {name: TabulatedPattern(table) for name, table in (tables or {}).items()}
+
+    def of(self, array: AntennaArray) -> ElementPattern:
+        """The pattern of an array's elements. Raises `AssetError` for a file that no world brought."""
+        if not array.pattern_file:
+            return _formula(array.pattern)
+        try:
+            return self._tabulated[array.pattern_file]
+        except KeyError:
+            raise AssetError(
+                f"there is no pattern {array.pattern_file!r} among the assets of the run; "
+                + suggestion(array.pattern_file, self._tabulated)
+            ) from None
+
+
+@lru_cache(maxsize=16)
+def _formula(name: str) -> FormulaPattern:
+    return FormulaPattern(name)
+
+
+def radiated_field(
+    array: AntennaArray,
+    rotation: Float64Array,
+    directions: Float64Array,
+    pattern: ElementPattern | None = None,
+) -> Field:
     """Far field of one element, in world axes, Shape ``[P, 3]``; its squared norm is the gain.
 
     Parameters
     ----------
     array
-        Pattern and polarisation.
+        Pattern and polarization; of a dual one the first.
     rotation
         3×3 matrix that turns the device's axes into world axes.
     directions
         Unit vectors from the device outwards, in world axes, Shape ``[P, 3]``.
-
-    Notes
-    -----
-    Polarisation is model 2 of 3GPP TR 38.901, section 7.3.2: the field is along θ̂ (``V``) or φ̂ (``H``) of
-    the device's own axes.
+    pattern
+        Of the element; None: the one that the array names.
     """
     local = directions @ rotation
-    theta_hat, phi_hat = spherical_basis(local)
-    field = element_amplitude(array.pattern, local)[:, None] * (
-        theta_hat if array.polarization == "V" else phi_hat
-    )
-    world: Float64Array = field @ rotation.T
+    field = polarized_field(pattern or _formula(array.pattern), array.polarizations[0], local)
+    world: Field = field @ rotation.T
     return world
+
+
+def polarized_field(pattern: ElementPattern, polarization: str, local: Float64Array) -> Field:
+    """Far field of one element in its own axes towards unit vectors, Shape ``[P, 3]`` to ``[P, 3]``.
+
+    Linear polarizations are model 2 of 3GPP TR 38.901, section 7.3.2: the field of the vertical element is
+    turned about the direction by the slant. Of a circular one the horizontal part follows, or leads, by 90°.
+    """
+    theta_hat, phi_hat = spherical_basis(local)
+    cosine, sine = jones(polarization)
+    along_theta, along_phi = pattern.along_theta_phi(local)
+    co = theta_hat if sine == 0 else phi_hat if cosine == 0 else cosine * theta_hat + sine * phi_hat
+    field: Field = along_theta[:, None] * co
+    if along_phi is not None:
+        field = field + along_phi[:, None] * (cosine * phi_hat - sine * theta_hat)
+    return field
 
 
 def element_amplitude(pattern: str, local: Float64Array) -> Float64Array:

@@ -345,7 +345,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
             )
             found.append(launched if not found else unknown_paths(launched, found[0], self._scene))
         if self._diffuse is not None:
-            element = Element(transmitter.array.pattern, transmitter.rotation)
+            element = Element(transmitter)
             found.append(
                 self._diffuse.trace(transmitter.position, targets, s.receivers_at_once, element=element)
             )

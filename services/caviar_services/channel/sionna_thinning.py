@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt64Array
 from caviar_protocol.seeding import derive_seed
-from caviar_services.channel.patterns import element_amplitude
+from caviar_services.channel.paths import Antenna
+from caviar_services.channel.patterns import FormulaPattern
 from caviar_services.channel.sionna_chains import Scattered
 from caviar_services.channel.sionna_launch import (
     REFLECTED,
@@ -61,18 +62,20 @@ _WORD = np.uint64(0xFFFFFFFF)
 class Element:
     """How an antenna's elements send."""
 
-    pattern: str
-    rotation: Float64Array
-    """Turns device axes into world axes, Shape ``[3, 3]``."""
+    antenna: Antenna
 
     @property
     def key(self) -> bytes:
-        """The same for equal ones."""
-        return self.pattern.encode() + self.rotation.tobytes()
+        """The same for equal ones in a run."""
+        return repr(self.antenna.array).encode() + self.antenna.rotation.tobytes()
 
     def gain(self, directions: Float64Array) -> Float64Array:
-        """Power gain towards unit vectors in world axes, Shape ``[N, 3]``."""
-        gain: Float64Array = element_amplitude(self.pattern, directions @ self.rotation) ** 2
+        """Power gain towards unit vectors in world axes, Shape ``[N, 3]``; the mean over subarrays."""
+        gains = [
+            (part.pattern or FormulaPattern(part.array.pattern)).amplitude(directions @ part.rotation) ** 2
+            for part in self.antenna.subarrays
+        ]
+        gain: Float64Array = sum(gains[1:], gains[0]) / len(gains)
         return gain
 
 

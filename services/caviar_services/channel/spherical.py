@@ -18,7 +18,7 @@ from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Carrier, ChannelMatrix
 from caviar_services.channel.element_gains import ElementGains
 from caviar_services.channel.element_paths import Bend, ElementPaths, Lengths, Surfaces
-from caviar_services.channel.matrices import Located
+from caviar_services.channel.matrices import Blocks, Located, joined
 from caviar_services.channel.paths import Antenna
 from caviar_services.channel.visibility import Elements, Look, Visibility, elements, visibility
 from caviar_services.channel.wideband import Bins
@@ -35,7 +35,8 @@ class SphericalWaves:
 
     Coefficients of reflection, transmission, diffraction and scattering are those of the path between the
     arrays' centres, as in ``siso-rt``. Pattern and polarisation are each element's own, to first order in the
-    size of the arrays (`element_gains`).
+    size of the arrays (`element_gains`). Subarrays, of one panel and one polarisation, are looked at one by
+    one.
 
     Parameters
     ----------
@@ -61,6 +62,7 @@ class SphericalWaves:
     ) -> None:
         self._carriers = carriers
         self._made: list[_Field] = []
+        self._split: _Split
         self._memory = memory
         self._surfaces = surfaces
         self._look = look
@@ -74,10 +76,11 @@ class SphericalWaves:
         located: Located,
     ) -> tuple[ChannelMatrix, ...]:
         fields = self._fields(carriers, transmitters, receivers, located)
+        split = self._split
         return tuple(
             ChannelMatrix(carrier=carrier, tx=pair // len(receivers), rx=pair % len(receivers), h=h)
             for carrier, field in enumerate(fields)
-            for pair, h in enumerate(field.matrices(located.offsets))
+            for pair, h in enumerate(split.joined(list(field.matrices(split.offsets))))
         )
 
     def responses(
@@ -88,9 +91,10 @@ class SphericalWaves:
         located: Located,
     ) -> Iterator[Complex64Array]:
         fields = self._fields(self._carriers, transmitters, receivers, located)
+        split = self._split
         for asked in bins:
-            doppler = located.geometry.doppler_ratio * asked.carrier.frequency_hz
-            yield from fields[asked.index].responses(located.offsets, asked, doppler)
+            doppler = located.geometry.doppler_ratio[split.path] * asked.carrier.frequency_hz
+            yield from split.joined(list(fields[asked.index].responses(split, asked, doppler)))
 
     def _fields(
         self,
@@ -102,41 +106,112 @@ class SphericalWaves:
         """The field of each carrier, made once: the parts of a product share it."""
         if self._made:
             return self._made
-        paths = ElementPaths(self._surfaces.take(located.row))
-        tx, rx = np.divmod(located.pair, max(len(receivers), 1))
+        split = self._split = _Split.of(transmitters, receivers, located.pair)
+        paths = ElementPaths(self._surfaces.take(located.row[split.path]))
+        tx, rx = np.divmod(located.pair[split.path], max(len(receivers), 1))
         start, end = _positions(transmitters)[tx], _positions(receivers)[rx]
         # Amplitudes of paths that bend are as traced, those of others of their true length.
         traced = _positions(self._sources)[tx, None], _positions(self._targets)[rx, None]
         of_bent = paths.lengths(slice(0, len(tx)), *traced).spreading[:, 0, 0]
         bent = paths.bend != Bend.NONE
         without_spreading = np.where(
-            bent, 1 / np.where(bent, of_bent, 1.0), SPEED_OF_LIGHT * located.geometry.tau
+            bent, 1 / np.where(bent, of_bent, 1.0), SPEED_OF_LIGHT * located.geometry.tau[split.path]
         )
         towards = paths.ends(start, end)
+        ends = split.transmitter, split.receiver
         for carrier, properties in enumerate(carriers):
             wavelength = SPEED_OF_LIGHT / properties.frequency_hz
-            transmit, receive = elements(transmitters, wavelength), elements(receivers, wavelength)
-            looking = elements(self._sources, wavelength), elements(self._targets, wavelength)
-            seen = visibility(paths, tx, rx, *looking, self._look, self._memory)
+            transmit, receive = elements(split.transmit, wavelength), elements(split.receive, wavelength)
+            looking = elements(_parts(self._sources), wavelength), elements(_parts(self._targets), wavelength)
+            seen = visibility(paths, *ends, *looking, self._look, self._memory)
             self._made.append(
                 _Field(
                     paths=paths,
-                    seen=_far_enough(seen, paths, (tx, rx), (transmit, receive), wavelength),
+                    seen=_far_enough(seen, paths, ends, (transmit, receive), wavelength),
                     transmit=transmit,
                     receive=receive,
-                    transmitter=tx,
-                    receiver=rx,
+                    transmitter=split.transmitter,
+                    receiver=split.receiver,
                     gains=ElementGains(
-                        (transmitters, receivers),
-                        (tx, rx),
+                        (split.transmit, split.receive),
+                        ends,
                         towards,
-                        located.transfer[carrier] * without_spreading[:, None, None],
+                        located.transfer[carrier][split.path] * without_spreading[:, None, None],
                         wavelength,
                     ),
                     wavelength=wavelength,
                 )
             )
         return self._made
+
+
+@dataclass(frozen=True, eq=False)
+class _Split:
+    """Paths between devices as paths between their subarrays, which are uniform arrays."""
+
+    transmit: list[Antenna]
+    """Subarrays of all transmitters, in order; ``receive`` likewise."""
+    receive: list[Antenna]
+    of_transmitter: list[range]
+    """Subarrays of each transmitter; ``of_receiver`` likewise."""
+    of_receiver: list[range]
+    path: Int64Array
+    """Which path between devices each is, Shape ``[Q]``, sorted by pair of subarrays."""
+    transmitter: Int64Array
+    """Subarray that each starts at, Shape ``[Q]``."""
+    receiver: Int64Array
+    offsets: Int64Array
+    """As in `Located`, by pair of subarrays."""
+
+    @classmethod
+    def of(cls, transmitters: Sequence[Antenna], receivers: Sequence[Antenna], pair: Int64Array) -> _Split:
+        of_transmitter, of_receiver = _ranges(transmitters), _ranges(receivers)
+        bounds = np.searchsorted(pair, np.arange(len(transmitters) * len(receivers) + 1))
+        found, sizes, sent, taken = [np.zeros(0, np.int64)], [0], list[int](), list[int]()
+        for t, sending in enumerate(of_transmitter):
+            for s in sending:
+                for r, receiving in enumerate(of_receiver):
+                    between = t * len(receivers) + r
+                    mine = np.arange(bounds[between], bounds[between + 1])
+                    found += [mine] * len(receiving)
+                    sizes += [len(mine)] * len(receiving)
+                    sent += [s] * len(receiving)
+                    taken += receiving
+        return cls(
+            transmit=_parts(transmitters),
+            receive=_parts(receivers),
+            of_transmitter=of_transmitter,
+            of_receiver=of_receiver,
+            path=np.concatenate(found),
+            transmitter=np.repeat(np.array(sent, np.int64), sizes[1:]),
+            receiver=np.repeat(np.array(taken, np.int64), sizes[1:]),
+            offsets=np.cumsum(sizes),
+        )
+
+    @property
+    def pair(self) -> list[int]:
+        """Pair of devices that each pair of subarrays is of."""
+        of_t, of_r = (_owners(ranges) for ranges in (self.of_transmitter, self.of_receiver))
+        return [t * len(self.of_receiver) + r for t in of_t for r in of_r]
+
+    def joined(self, blocks: list[Blocks]) -> Iterator[Blocks]:
+        """Of each pair of devices, from what is of each pair of subarrays, Shape ``[..., M, N]``."""
+        for sent in self.of_transmitter:
+            for taken in self.of_receiver:
+                yield joined([[blocks[s * len(self.receive) + r] for s in sent] for r in taken])
+
+
+def _owners(ranges: Sequence[range]) -> list[int]:
+    return [number for number, parts in enumerate(ranges) for _ in parts]
+
+
+def _parts(antennas: Sequence[Antenna]) -> list[Antenna]:
+    return [part for antenna in antennas for part in antenna.subarrays]
+
+
+def _ranges(antennas: Sequence[Antenna]) -> list[range]:
+    ends = np.cumsum([0, *(len(antenna.subarrays) for antenna in antennas)]).tolist()
+    return [range(begin, end) for begin, end in pairwise(ends)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,10 +243,11 @@ class _Field:
                 for first, last in pairwise((offsets[pairs.start : pairs.stop + 1] - begin).tolist()):
                     yield waves[first:last].sum(0)
 
-    def responses(self, offsets: Int64Array, asked: Bins, doppler: Float64Array) -> Iterator[Complex64Array]:
-        """What is asked, of each pair of antennas in order, Shape ``[J, M, N]``."""
+    def responses(self, split: _Split, asked: Bins, doppler: Float64Array) -> Iterator[Complex64Array]:
+        """What is asked, of each pair of subarrays in order, Shape ``[J, M, N]``."""
         arrays = [(rx.size, tx.size) for tx in self.transmit.arrays for rx in self.receive.arrays]
-        for pair, (sizes, (begin, end)) in enumerate(zip(arrays, pairwise(offsets.tolist()), strict=True)):
+        ends = pairwise(split.offsets.tolist())
+        for pair, sizes, (begin, end) in zip(split.pair, arrays, ends, strict=True):
             response = np.zeros((asked.count, *sizes), np.complex64)
             at_once = max(1, _BINS // (asked.count * sizes[1]))
             for row in range(begin, end):

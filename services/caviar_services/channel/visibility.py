@@ -72,7 +72,8 @@ class Elements:
 
 
 def elements(antennas: Sequence[Antenna], wavelength: float) -> Elements:
-    """Elements of antennas where they stand at a wavelength [m]: arrays are given in wavelengths."""
+    """Elements of antennas of uniform arrays where they stand at a wavelength [m]: arrays are given in
+    wavelengths."""
     sizes = np.array([antenna.array.size for antenna in antennas], np.int64)
     first = np.cumsum(sizes) - sizes
     positions = np.empty((int(sizes.sum()), 3))
@@ -83,7 +84,14 @@ def elements(antennas: Sequence[Antenna], wavelength: float) -> Elements:
 
 
 def outermost(antennas: Sequence[Antenna], wavelength: float) -> Float64Array:
-    """Elements at the arrays' corners [m], Shape ``[A, L, 3]``; L is 1 for points, 2 for lines, else 4."""
+    """Elements at the arrays' corners [m], Shape ``[A, L, 3]``; L is 1 for points, 2 for lines, else 4, for
+    each subarray of the antenna that has most."""
+    if any(not antenna.array.is_uniform for antenna in antennas):
+        most = max(len(antenna.subarrays) for antenna in antennas)
+        # What is missing repeats the last one.
+        parts = [(antenna.subarrays + antenna.subarrays[-1:] * most)[:most] for antenna in antennas]
+        found = outermost([part for of_antenna in parts for part in of_antenna], wavelength)
+        return found.reshape(len(antennas), -1, 3)
     groups = _by_array(antennas)
     rows = max((array.rows > 1 for array in groups), default=False)
     columns = max((array.columns > 1 for array in groups), default=False)

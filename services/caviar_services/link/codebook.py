@@ -5,6 +5,9 @@ the direction it points to: a receiver combines with ``w = c_k``, a transmitter 
 ``f = conj(c_k)``, so that one index means one direction at both ends. With eq. (1) of the
 paper, ``y = w* H f``, a single path of amplitude a that lies on both grids gives
 ``|y| = sqrt(Nr·Nt)·|a|``.
+
+The codebook of an array with several panels or dual polarization is that of each of its subarrays
+(`caviar_protocol.subarrays`), block by block: a beam has the elements of one panel and one polarization.
 """
 
 from __future__ import annotations
@@ -16,6 +19,8 @@ from functools import lru_cache
 import numpy as np
 
 from caviar_protocol.arrays import Complex128Array, Float64Array
+from caviar_protocol.beams import subarray_of
+from caviar_protocol.coordinates import rotation_matrix
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.topics.scene import AntennaArray
 
@@ -23,12 +28,18 @@ from caviar_protocol.topics.scene import AntennaArray
 def dft_codebook(array: AntennaArray) -> Complex128Array:
     """All beams of an array, Shape ``[N, N]``: beam ``k`` is row ``k``, of norm 1.
 
-    Beam ``k`` combines row beam ``k % rows`` and column beam ``k // rows``, in the order of the
-    elements: the Kronecker product of two DFT matrices with entries
+    Of a uniform array, beam ``k`` combines row beam ``k % rows`` and column beam ``k // rows``, in the order
+    of the elements: the Kronecker product of two DFT matrices with entries
     ``exp(+j2πkn/N)/sqrt(N)`` (Tse and Viswanath, section 7.3.4).
     """
     columns, rows = _dft(array.columns), _dft(array.rows)
-    codebook: Complex128Array = np.einsum("ac,br->abcr", columns, rows).reshape(array.size, array.size)
+    size = array.rows * array.columns
+    uniform: Complex128Array = np.einsum("ac,br->abcr", columns, rows).reshape(size, size)
+    if array.is_uniform:
+        return uniform
+    codebook = np.zeros((array.size, array.size), np.complex128)
+    for begin in range(0, array.size, size):
+        codebook[begin : begin + size, begin : begin + size] = uniform
     return codebook
 
 
@@ -51,13 +62,16 @@ def _dft(size: int) -> Complex128Array:
 def pointing_directions(array: AntennaArray, beam: int) -> Float64Array:
     """Directions in which a beam has its full gain ``sqrt(N)``, Shape ``[L, 3]``, unit vectors.
 
-    Only the half space in front of the array (x ≥ 0) is listed; an array is blind to the sign
-    of x. Along an axis with a single element the beam is a fan, of which the centre is given.
+    Only the half space in front of the array, or of the beam's panel, (x ≥ 0) is listed; an array is blind to
+    the sign of x. Along an axis with a single element the beam is a fan, of which the centre is given.
     L > 1 where there are grating lobes (spacing ≥ λ/2), nearest to boresight first; L = 0 for a
     beam without a real direction (spacing < λ/2). Raises `PayloadError` for an unknown index.
     """
     if not 0 <= beam < array.size:
         raise PayloadError(f"beam {beam} does not exist, the codebook has beams 0 to {array.size - 1}")
+    if not array.is_uniform:
+        part, own = subarray_of(array, beam)
+        return pointing_directions(part.array, own) @ rotation_matrix(part.orientation).T
     along_y = _axis_cosines(array.columns, beam // array.rows, array.horizontal_spacing)
     along_z = [-u for u in _axis_cosines(array.rows, beam % array.rows, array.vertical_spacing)]
     found = [

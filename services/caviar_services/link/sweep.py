@@ -30,12 +30,14 @@ def sweep(h: Complex128Array, tx: AntennaArray, rx: AntennaArray) -> Float64Arra
 
     y = w* H f (paper, eq. 1) with the beams of `codebook.dft_codebook`. Both conj(w) and f have
     entries exp(−j2πkn/N)/sqrt(N), so the product over all pairs is a Fourier transform over the
-    columns and rows of both arrays, and no codebook of N² entries has to be formed.
+    columns and rows of both arrays, and no codebook of N² entries has to be formed. Of several panels or
+    polarizations each block is transformed by itself.
     """
     leading = h.shape[:-2]
-    elements = h.reshape(*leading, rx.columns, rx.rows, tx.columns, tx.rows)
+    grids = (rx.size // (rx.columns * rx.rows), rx.columns, rx.rows)
+    elements = h.reshape(*leading, *grids, tx.size // (tx.columns * tx.rows), tx.columns, tx.rows)
     y = elements
-    for axis in (-4, -3, -2, -1):
+    for axis in (-5, -4, -2, -1):
         size = elements.shape[axis]
         if size > SMALL:
             y = np.fft.fft(y, axis=axis, norm="ortho")

@@ -8,8 +8,12 @@ from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 from xml.parsers import expat
 
+from caviar_protocol.devices import pattern_asset
 from caviar_protocol.errors import AssetError, ScenarioError, SetupError
 from caviar_protocol.extras import install_command
+from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.tables import Place
+from caviar_services.pattern_files import read_pattern
 from caviar_services.scenery import read_scenery
 from caviar_services.world.shapes import SHAPES, ply
 
@@ -43,6 +47,24 @@ def scenery_assets(scenery: str) -> dict[str, Path | bytes]:
 def object_assets(classes: Iterable[str]) -> dict[str, Path | bytes]:
     """Asset name to PLY bytes of the unit meshes of object classes."""
     return {f"objects/{name}.ply": ply(SHAPES[name]()) for name in sorted(set(classes))}
+
+
+def pattern_assets(devices: Iterable[DeviceSpec]) -> dict[str, Path | bytes]:
+    """Asset name to file of the element patterns that devices name.
+
+    Raises `ScenarioError` naming the device's key where a file is wrong (`read_pattern`).
+    """
+    found: dict[str, Path | bytes] = {}
+    for device in devices:
+        if device.array is not None and device.array.pattern_file:
+            file = Path(device.array.pattern_file)
+            try:
+                read_pattern(file)  # what is wrong with it is told with the user's file, not with a copy
+            except AssetError as error:
+                key = Place("devices").at(device.name).at("array").at("pattern_file").key
+                raise ScenarioError(str(error), key=key) from error
+            found[pattern_asset(device.array.pattern_file)] = file
+    return found
 
 
 def _bundled(name: str) -> Path:

@@ -23,7 +23,7 @@ from caviar_protocol.messages import Role
 from caviar_protocol.tables import Place
 from caviar_protocol.topics import Scene
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
-from caviar_services.world.assets import object_assets, scenery_assets
+from caviar_services.world.assets import object_assets, pattern_assets, scenery_assets
 from caviar_services.world.devices import Mounts
 
 
@@ -100,8 +100,13 @@ class World(Service[W]):
         """
 
     def scenery(self) -> Mapping[str, Path | bytes]:
-        """The XML, the files it names, and the meshes of the objects that may come."""
-        return {**scenery_assets(self.settings.scenery), **object_assets(self.mesh_classes())}
+        """The XML, the files it names, the meshes of the objects that may come, and the pattern files of
+        antennas."""
+        return {
+            **scenery_assets(self.settings.scenery),
+            **object_assets(self.mesh_classes()),
+            **pattern_assets(self.run.devices),
+        }
 
     def prepare(self, preparation: Preparation) -> Prepared:
         """Declare the names: prefixes of objects, and fixed devices by their whole name."""

@@ -16,7 +16,7 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int64Array
 from caviar_protocol.coordinates import SPEED_OF_LIGHT, angles
 from caviar_protocol.errors import PayloadError
-from caviar_protocol.topics import Channel, ChannelMatrix, Scene
+from caviar_protocol.topics import AntennaDevice, Channel, ChannelMatrix, Scene
 from caviar_protocol.topics.channel import PLANE_WAVES
 from caviar_services.antenna import element_positions, steering_vector
 from caviar_services.channel.interpolation.course import Course, Courses
@@ -101,8 +101,8 @@ class Interpolation:
         ``scene`` is that of the instant, where it is known: with the keyframes' own it tells how ends and
         objects moved, whatever their acceleration; and matrices need the antennas in it.
 
-        Raises `PayloadError` for a time outside the interval, and for matrices without a scene or of a
-        rung whose matrices do not follow from its paths.
+        Raises `PayloadError` for a time outside the interval, for matrices without a scene or of a
+        rung whose matrices do not follow from its paths, and for antennas with several subarrays.
         """
         before, after = self._keyframes
         if not before.t_s <= t_s <= after.t_s:
@@ -112,6 +112,8 @@ class Interpolation:
                 f"matrices between keyframes need the scene of the instant and a rung of plane waves "
                 f"({', '.join(PLANE_WAVES)}), not {before.channel.rung!r}; take with_h=False"
             )
+        if scene is not None:
+            _refuse_subarrays(scene)
         s = (t_s - before.t_s) / self._h
         now = None if scene is None or not self._known else places(scene, self._joined)
         course = (self._by_doppler if now is None else self._by_places).at(s, now)
@@ -254,6 +256,16 @@ class Interpolation:
             objects=joined.objects[order],
             h=h,
         )
+
+
+def _refuse_subarrays(scene: Scene) -> None:
+    """Amplitudes of a product are those between two subarrays, which may be others at the next keyframe."""
+    for device in scene.devices:
+        if isinstance(device, AntennaDevice) and not device.array.is_uniform:
+            raise PayloadError(
+                f"device {device.name!r} has dual polarization or several panels, whose channels cannot be "
+                "interpolated; trace the instant"
+            )
 
 
 def _order(joined: Joined, tau: Float64Array, aod: Float64Array, aoa: Float64Array) -> Int64Array:

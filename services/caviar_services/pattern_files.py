@@ -1,0 +1,202 @@
+"""Element patterns from files: tables of gain or of the complex far field, and MSI/Planet files.
+
+A table is a CSV file, ``.csv``, with one direction a line, all zenith angles combined with all azimuths:
+
+- ``theta_deg,phi_deg,gain_dbi``: the gain; the polarization is that of the array, or
+- ``theta_deg,phi_deg,e_theta_re,e_theta_im,e_phi_re,e_phi_im``: the far field along θ̂ and φ̂, so that
+  ``|E_θ|² + |E_φ|²`` is the gain as a factor.
+
+Lines that begin with ``#`` are comments. Angles are those of the device: zenith from +z, 0° to 180°, azimuth
+counter-clockwise from +x, once around. Between the directions of a table, the gain [dB] or the field is
+bilinear in both angles.
+
+An MSI/Planet file, ``.msi`` or ``.pln``, has a horizontal and a vertical cut as attenuation [dB] against
+``GAIN`` (dBd unless it says dBi). Horizontal angles count clockwise from boresight, vertical ones downwards
+from the horizon. The directions between follow by summing: the attenuation is that of the horizontal cut at
+the azimuth plus that of the front half of the vertical cut at the elevation (T. G. Vasiliadis,
+A. G. Dimitriou and G. D. Sergiadis, "A novel technique for the approximation of 3-D antenna radiation
+patterns", IEEE Trans. Antennas Propag. 53(7), 2005).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from caviar_protocol.arrays import Complex128Array, Float64Array, Int64Array
+from caviar_protocol.errors import AssetError
+from caviar_protocol.limits import MAX_BODY
+
+SUFFIXES = (".csv", ".msi", ".pln")
+
+GAIN = ("theta_deg", "phi_deg", "gain_dbi")
+FIELD = ("theta_deg", "phi_deg", "e_theta_re", "e_theta_im", "e_phi_re", "e_phi_im")
+
+_DIPOLE_DBI = 2.15
+"""Gain of a half-wave dipole, which dBd refer to [dBi]."""
+
+_CUTS = {"HORIZONTAL": "horizontal", "VERTICAL": "vertical"}
+
+
+@dataclass(frozen=True, eq=False)
+class PatternTable:
+    """Values at directions; between them they are bilinear in both angles."""
+
+    theta: Float64Array
+    """Zenith angles [rad], ascending from 0 to π, Shape ``[T]``."""
+    phi: Float64Array
+    """Azimuths [rad], ascending, the last a whole turn behind the first, Shape ``[F]``."""
+    values: Float64Array | Complex128Array
+    """Gains [dBi], Shape ``[T, F]``, or E_θ and E_φ, Shape ``[T, F, 2]``."""
+
+    @property
+    def is_field(self) -> bool:
+        """Whether the values are fields."""
+        return self.values.ndim == 3
+
+    def at(self, theta: Float64Array, phi: Float64Array) -> Float64Array | Complex128Array:
+        """Gains [dBi], Shape ``[P]``, or fields, Shape ``[P, 2]``, at zenith angles and azimuths [rad]."""
+        turned = self.phi[0] + (phi - self.phi[0]) % (2 * np.pi)
+        row, down = _cells(self.theta, theta)
+        column, across = _cells(self.phi, turned)
+        if self.is_field:
+            down, across = down[:, None], across[:, None]
+        upper = self.values[row, column] * (1 - across) + self.values[row, column + 1] * across
+        lower = self.values[row + 1, column] * (1 - across) + self.values[row + 1, column + 1] * across
+        between: Float64Array | Complex128Array = upper * (1 - down) + lower * down
+        return between
+
+
+def _cells(nodes: Float64Array, at: Float64Array) -> tuple[Int64Array, Float64Array]:
+    """The interval of nodes that each value is in, and how far into it, 0 to 1."""
+    cell = np.clip(np.searchsorted(nodes, at, side="right") - 1, 0, len(nodes) - 2)
+    return cell, (at - nodes[cell]) / (nodes[cell + 1] - nodes[cell])
+
+
+def read_pattern(file: Path) -> PatternTable:
+    """The pattern in a file, by the ending of its name.
+
+    Raises `AssetError` naming file, line and what to write instead.
+    """
+    if file.suffix.lower() not in SUFFIXES:
+        raise AssetError(f"{file}: no pattern has the ending {file.suffix!r}; known: {', '.join(SUFFIXES)}")
+    try:
+        if file.stat().st_size > MAX_BODY:
+            raise AssetError(f"{file} has more than {MAX_BODY} B; write fewer directions")
+        # Planet files have comments in whatever encoding their maker used; what counts is ASCII.
+        lines = file.read_bytes().decode("latin-1").splitlines()
+    except OSError as error:
+        raise AssetError(f"pattern {file} cannot be read: {error.strerror}") from error
+    return _table(file, lines) if file.suffix.lower() == ".csv" else _planet(file, lines)
+
+
+def _table(file: Path, lines: list[str]) -> PatternTable:
+    header: tuple[str, ...] = ()
+    rows: list[list[float]] = []
+    for number, text in enumerate(map(str.strip, lines), 1):
+        if not text or text.startswith("#"):
+            continue
+        parts = tuple(part.strip() for part in text.split(","))
+        if not header:
+            header = parts
+            if header not in (GAIN, FIELD):
+                raise AssetError(f"{file}:{number}: is {text!r}; write {','.join(GAIN)} or {','.join(FIELD)}")
+        else:
+            rows.append(_numbers(file, number, parts, len(header)))
+    if not rows:
+        raise AssetError(f"{file} holds no direction; write {','.join(GAIN)}, then one direction a line")
+    table = np.array(rows)
+    theta, row = np.unique(table[:, 0], return_inverse=True)
+    around = table[:, 1] % 360.0
+    # A table that ends where it began has this azimuth twice: 0 and 360, or -180 and 180.
+    phi, column = np.unique(around, return_inverse=True)
+    if theta[0] != 0 or theta[-1] != 180:
+        raise AssetError(f"{file}: zenith angles go from {theta[0]:g}° to {theta[-1]:g}°; write 0° to 180°")
+    values = np.full((len(theta), len(phi), len(header) - 2), np.nan)
+    values[row, column] = table[:, 2:]
+    missing = np.argwhere(np.isnan(values[..., 0]))
+    if len(missing):
+        t, f = missing[0]
+        raise AssetError(
+            f"{file}: there is no line for theta_deg = {theta[t]:g}, phi_deg = {phi[f]:g} (modulo 360); "
+            "write each zenith angle with each azimuth"
+        )
+    if not np.array_equal(values[row, column], table[:, 2:]):
+        raise AssetError(f"{file}: a direction has two different values; remove one")
+    phi, values = np.append(phi, phi[0] + 360.0), np.concatenate([values, values[:, :1]], axis=1)
+    return _made(theta, phi, values)
+
+
+def _numbers(file: Path, line: int, parts: tuple[str, ...], count: int) -> list[float]:
+    try:
+        numbers = [float(part) for part in parts]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+        raise AssetError(f"{file}:{line}: is {','.join(parts)!r:.80}; write {count} finite numbers")
+    return numbers
+
+
+def _made(theta_deg: Float64Array, phi_deg: Float64Array, values: Float64Array) -> PatternTable:
+    """A table of gains, Shape ``[T, F, 1]``, or of both parts of both components, ``[T, F, 4]``."""
+    angles = np.radians(theta_deg), np.radians(phi_deg)
+    if values.shape[2] == 1:
+        return PatternTable(*angles, values[..., 0])
+    return PatternTable(*angles, values[..., 0::2] + 1j * values[..., 1::2])
+
+
+def _planet(file: Path, lines: list[str]) -> PatternTable:
+    gain_dbi: float | None = None
+    cuts: dict[str, dict[float, float]] = {}
+    cut: dict[float, float] | None = None
+    for number, text in enumerate(lines, 1):
+        parts = text.replace(",", ".").split()
+        key = parts[0].upper() if parts else ""
+        if key in _CUTS:
+            cut = cuts[key] = {}
+        elif key == "GAIN":
+            gain_dbi = _gain(file, number, parts[1:])
+        elif cut is not None and parts:
+            angle, loss = _numbers(file, number, tuple(parts), 2)
+            cut[angle % 360.0] = loss
+    if gain_dbi is None:
+        raise AssetError(f"{file} has no GAIN; add a line such as GAIN 15.5 dBi")
+    for key in _CUTS:
+        if len(cuts.get(key, {})) < 2:
+            raise AssetError(f"{file} has no {_CUTS[key]} cut; add {key} 360 and a line for each degree")
+    across, down = (_Cut.of(cuts[key]) for key in _CUTS)
+    # Nodes of the table are those of both cuts, so that it has their values.
+    azimuth = np.unique(-across.angle % 360.0)
+    depression = (down.angle + 180.0) % 360.0 - 180.0
+    front = np.abs(depression) <= 90.0
+    theta = np.unique(np.concatenate([90.0 + depression[front], [0.0, 180.0]]))
+    phi = np.append(azimuth, azimuth[0] + 360.0)
+    attenuation = down.at(theta - 90.0)[:, None] + across.at(-phi)[None]
+    return _made(theta, phi, (gain_dbi - attenuation)[..., None])
+
+
+def _gain(file: Path, line: int, parts: list[str]) -> float:
+    unit = parts[1].lower() if len(parts) > 1 else "dbd"
+    if not parts or unit not in ("dbd", "dbi"):
+        raise AssetError(f"{file}:{line}: is {' '.join(parts)!r:.80}; write GAIN, a number, and dBi or dBd")
+    (value,) = _numbers(file, line, (parts[0],), 1)
+    return value + (_DIPOLE_DBI if unit == "dbd" else 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Cut:
+    """Attenuation [dB] over angles [°] around, ascending from 0 to less than 360."""
+
+    angle: Float64Array
+    loss: Float64Array
+
+    @classmethod
+    def of(cls, cut: dict[float, float]) -> _Cut:
+        angles = sorted(cut)
+        return cls(np.array(angles), np.array([cut[angle] for angle in angles]))
+
+    def at(self, angle: Float64Array) -> Float64Array:
+        return np.interp(angle, self.angle, self.loss, period=360.0)
