@@ -19,7 +19,7 @@ from caviar_clients.conform.wire import Fields, Received, Wire
 EPOCH, ATTEMPT = 3, 2
 """Not 1, so that a client which does not repeat what it is told shows."""
 SEED = 11
-VERSION = (1, 3)
+VERSION = (1, 4)
 """Of the protocol that the kit plays."""
 CAPABILITIES = ("assets", "checkpoint", "episodes", "parts")
 """What a broker of that version has."""
