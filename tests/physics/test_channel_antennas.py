@@ -12,10 +12,13 @@ import pytest
 from channel_lab import Array, C, Thing, antenna, free_space, measure, scene, sionna, turn
 
 from caviar_protocol.coordinates import quaternion_from_euler
-from caviar_protocol.topics import AntennaArray, Channel, Panel
+from caviar_protocol.ofdm import subcarrier_offsets
+from caviar_protocol.topics import AntennaArray, Carrier, Channel, Panel
 from caviar_services.channel.base import ChannelModel
+from caviar_services.channel.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.channel.patterns import Patterns, element_amplitude
 from caviar_services.pattern_files import read_pattern
+from caviar_services.service import Preparation, RunInfo
 from caviar_services.world.assets import scenery_assets
 
 pytestmark = pytest.mark.channel
@@ -315,3 +318,26 @@ def test_a_table_of_gains_is_the_formula_it_was_made_of(tmp_path: Path) -> None:
     error = 20 * np.log10(found / element_amplitude("tr38901", k))
     assert np.abs(error[found > 10 ** (-21 / 20)]).max() < 2e-3
     assert np.abs(error).max() < 0.2
+
+
+@pytest.mark.parametrize("rung", ["free-space", "spherical"])
+def test_responses_over_the_band_have_all_subarrays(rung: str) -> None:
+    """On the middle subcarrier, which is the carrier itself, the response is H."""
+    array = AntennaArray(columns=2, pattern="tr38901", polarization="cross", panels=PANELS)
+    carrier = Carrier(name="c", frequency_hz=3.5e9, subcarriers=4, subcarrier_spacing_hz=60e3)
+    run = RunInfo(name="channel", seed=1, carriers=(carrier,))
+    model: ChannelModel[Any] = FreeSpaceChannel(FreeSpaceSettings(), run)
+    if rung == "spherical":
+        from caviar_services.channel.sionna_rt import SionnaChannel
+        from caviar_services.channel.sionna_settings import SionnaSettings
+
+        model = SionnaChannel(SionnaSettings(rung=rung, bodies=0, max_depth=1, samples=1000), run)
+    model.prepare(Preparation(demand={"channel": frozenset({"h", "hf"})}))
+    both = AntennaArray(polarization="VH")
+    channel = measure(
+        model, scene([antenna("t", "tx", (0, 0, 6), array), antenna("r", "rx", (40, 6, 2), both)])
+    )
+    h, response = channel.h[0].h, channel.hf[0].h
+    assert response.shape == (1, 4, *h.shape)
+    offset = subcarrier_offsets(carrier)
+    np.testing.assert_allclose(response[0, offset == 0][0], h, rtol=1e-5, atol=1e-6 * np.abs(h).max())

@@ -12,7 +12,7 @@ from caviar_protocol.beams import beam_gain, beam_towards, straight_beams
 from caviar_protocol.subarrays import coupled_polarizations, subarrays
 from caviar_protocol.topics import AntennaArray, Panel
 from caviar_services.antenna import steering_vector
-from caviar_services.link.codebook import dft_codebook, pointing_directions
+from caviar_services.link.codebook import dft_beam, dft_codebook, pointing_directions
 from caviar_services.link.sweep import sweep
 
 CROSS = AntennaArray(rows=2, columns=4, polarization="cross")
@@ -35,6 +35,7 @@ def test_elements_are_in_order_of_panels_then_polarizations() -> None:
 def test_a_codebook_has_the_beams_of_each_subarray_and_is_unitary(array: AntennaArray) -> None:
     codebook = dft_codebook(array)
     np.testing.assert_allclose(codebook @ codebook.conj().T, np.eye(array.size), atol=1e-13)
+    np.testing.assert_allclose([dft_beam(array, k) for k in range(array.size)], codebook, atol=1e-15)
     for part in subarrays(array):
         np.testing.assert_array_equal(codebook[part.elements, part.elements], dft_codebook(part.array))
         assert np.count_nonzero(codebook[part.elements]) == part.array.size**2

@@ -77,11 +77,9 @@ class PlaneWaves:
     ) -> tuple[ChannelMatrix, ...]:
         steered = _steered(transmitters, receivers, located)
         return tuple(
-            ChannelMatrix(
-                carrier=index, tx=pair // len(receivers), rx=pair % len(receivers), h=of.h(index, c)
-            )
-            for index, c in enumerate(carriers)
-            for pair, of in enumerate(steered)
+            ChannelMatrix(carrier=index, tx=pair // len(receivers), rx=pair % len(receivers), h=h)
+            for index, carrier in enumerate(carriers)
+            for pair, h in enumerate(of.h(index, carrier) for of in steered)
         )
 
     def responses(
@@ -102,7 +100,7 @@ class PlaneWaves:
 
 @dataclass(frozen=True, eq=False)
 class _Steered:
-    """The paths of a pair of devices, p of them, and the phases of the elements of their subarrays on each."""
+    """The p paths of a pair of devices, and the phases of the elements of their subarrays on each."""
 
     antennas: tuple[Antenna, Antenna]
     """Transmitter and receiver."""
@@ -165,7 +163,7 @@ Blocks = TypeVar("Blocks", Complex64Array, Complex128Array)
 
 
 def joined(rows: list[list[Blocks]]) -> Blocks:
-    """One array of blocks between subarrays, those of a receiver's subarray in a row; Shape ``[..., M, N]``."""
+    """One array of blocks between subarrays, in a row those of one receiving subarray; ``[..., M, N]``."""
     return rows[0][0] if len(rows) * len(rows[0]) == 1 else np.block(rows)
 
 

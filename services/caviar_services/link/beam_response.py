@@ -34,7 +34,7 @@ def beam_responses(
     ----------
     channel
         With its paths; on the rungs ``spherical`` and ``mimo-rt``, where an array does not see plane waves,
-        with part ``hf``.
+        with part ``hf``; so for arrays of dual polarization or several panels.
     scene
         Of the same frame.
     users
@@ -68,7 +68,9 @@ def beam_responses(
                 )
         ends = dft_beam(user.tx.array, tx_beam).conj(), dft_beam(user.rx.array, rx_beam).conj()
         index, tx, rx = place
-        if channel.rung in PLANE_WAVES:
+        # The one amplitude of a path is that between two of its devices' subarrays.
+        uniform = user.tx.array.is_uniform and user.rx.array.is_uniform
+        if channel.rung in PLANE_WAVES and uniform:
             paths = channel.pair(user.tx.name, user.rx.name)
             sent = _gains(scene, user.tx, channel.aod[paths], ends[0], rotations)
             taken = _gains(scene, user.rx, channel.aoa[paths], ends[1], rotations)

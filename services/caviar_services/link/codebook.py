@@ -45,8 +45,10 @@ def dft_codebook(array: AntennaArray) -> Complex128Array:
 
 def dft_beam(array: AntennaArray, beam: int) -> Complex128Array:
     """Row ``beam`` of `dft_codebook`, Shape ``[N]``, without the others."""
-    column, row = divmod(beam, array.rows)
-    vector: Complex128Array = np.multiply.outer(_dft(array.columns)[column], _dft(array.rows)[row]).ravel()
+    part, own = subarray_of(array, beam)
+    column, row = divmod(own, array.rows)
+    vector = np.zeros(array.size, np.complex128)
+    vector[part.elements] = np.multiply.outer(_dft(array.columns)[column], _dft(array.rows)[row]).ravel()
     return vector
 
 
