@@ -3,7 +3,7 @@
 Sionna RT's `RadioMapSolver` shoots rays from a transmitter and adds up the power of those that pass through
 each cell (A. Aoudia et al., "Sionna RT: Technical Report", 2025, section 4). It knows one precoding vector
 and one polarisation model, so that a codebook of 64 beams would be shot 64 times. Here the field that leaves
-is that of the channel engine's own element pattern (`patterns.radiated_field`), and each ray that passes
+is that of the channel engine's own element pattern (`Antenna.radiated`), and each ray that passes
 through a cell is counted once for every beam, with the beam's gain in the direction in which it left: a
 single-polarised array in the far field is the element times its array factor.
 """
@@ -20,7 +20,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_services.channel.paths import Antenna
-from caviar_services.channel.patterns import radiated_field, spherical_basis
+from caviar_services.channel.patterns import spherical_basis
 from caviar_services.channel.radio_map.measurement_surface import MeasurementSurface
 from caviar_services.channel.sionna_launch import lattice_directions
 from caviar_services.channel.sionna_meshes import Shape, mi_mesh
@@ -192,12 +192,12 @@ def _one_element(antenna: Antenna) -> Any:
         zenith, azimuth = np.array(theta, np.float64), np.array(phi, np.float64)
         sine = np.sin(zenith)
         towards = np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.cos(zenith)], axis=-1)
-        field = radiated_field(antenna.array, antenna.rotation, towards)
+        field = antenna.radiated(towards)
         theta_hat, phi_hat = spherical_basis(towards)
         along = np.stack([(field * theta_hat).sum(-1), (field * phi_hat).sum(-1)])
-        components = aligned_columns(along)
+        real, imaginary = aligned_columns(along.real), aligned_columns(along.imag)
         complex_of: Any = mi.Complex2f
-        c_theta, c_phi = (complex_of(mi.Float(component), mi.Float(0.0)) for component in components)
+        c_theta, c_phi = (complex_of(mi.Float(a), mi.Float(b)) for a, b in zip(real, imaginary, strict=True))
         return c_theta, c_phi
 
     radiated: Any = AntennaPattern()

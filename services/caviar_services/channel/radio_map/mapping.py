@@ -50,8 +50,18 @@ class RadioMap:
 
 
 def transmitters_of(scene: Scene, where: str) -> list[AntennaDevice]:
-    """The transmitters of a scene. Raises `RunError`, which names ``where`` it is from, without one."""
+    """The transmitters of a scene.
+
+    Raises `RunError`, which names ``where`` it is from, without one, and for one of dual polarization or of
+    several panels.
+    """
     found = list(antennas(scene, "tx"))
+    for device in found:
+        if not device.array.is_uniform:
+            raise RunError(
+                f"{where}: transmitter {device.name!r} has dual polarization or several panels, of which no map "
+                "is made; give it one of V, H, -45, +45, RHCP and LHCP and no panels"
+            )
     if not found:
         raise RunError(
             f'{where} has no transmitter; give a device of [[devices]] the role "tx", or choose another frame'
@@ -146,7 +156,7 @@ def radio_map(
     gain, interference, chosen, rays = [], [], [], []
     try:
         for t, device in enumerate(devices):
-            antenna = Antenna.of(scene, device)
+            antenna = Antenna.of(scene, device, channel.patterns)
             cleared = replace(antenna, position=rt.surfaces.cleared(antenna.position))
             beams = beams_of(device.array, beam, device.name)
 
