@@ -59,8 +59,8 @@ def transmitters_of(scene: Scene, where: str) -> list[AntennaDevice]:
     for device in found:
         if not device.array.is_uniform:
             raise RunError(
-                f"{where}: transmitter {device.name!r} has dual polarization or several panels, of which no map "
-                "is made; give it one of V, H, -45, +45, RHCP and LHCP and no panels"
+                f"{where}: transmitter {device.name!r} has dual polarization or several panels, of which no "
+                "map is made; give it one of V, H, -45, +45, RHCP and LHCP and no panels"
             )
     if not found:
         raise RunError(
