@@ -28,7 +28,10 @@ from channel_lab import (
 )
 
 from caviar_protocol.coordinates import quaternion_from_euler
-from caviar_protocol.topics import AntennaArray, Channel
+from caviar_protocol.topics import AntennaArray, Carrier, Channel
+from caviar_services.channel.sionna_rt import SionnaChannel
+from caviar_services.channel.sionna_settings import SionnaSettings
+from caviar_services.service import Preparation, RunInfo
 
 pytestmark = pytest.mark.channel
 
@@ -427,3 +430,49 @@ def test_a_pair_of_arrays_too_near_for_the_ray_tracer_has_its_waves(rung: str) -
     expected = wave(distances(receive, transmit), 60e9)
     assert np.abs(np.angle(channel.h[0].h / expected)).max() < 1e-6
     assert np.abs(np.abs(channel.h[0].h / expected) - 1).max() < 0.01
+
+
+@pytest.mark.parametrize("rung", ["spherical", "mimo-rt"])
+def test_over_the_band_every_antenna_pair_has_the_delay_of_its_own_distance(rung: str) -> None:
+    """A car two metres in front of a planar array, in line of sight: H(f) and H(t) are those of the distances
+    between elements; one delay for all of them would be off by a quarter of a radian at the band's edge."""
+    numerology = {"subcarriers": 9, "subcarrier_spacing_hz": 250e6, "taps": 24, "slots": 2}
+    carrier = Carrier(
+        name="c",
+        frequency_hz=28e9,
+        bandwidth_hz=2.5e9,
+        slot_duration_s=3e-3,
+        **numerology,  # type: ignore[arg-type]
+    )
+    arrays = AntennaArray(rows=2, columns=12), AntennaArray(columns=5)
+    speed = np.array([4.0, -11.0, 0.0])
+    car = Thing("car", (2.0, 0.6, 0.0), (0.2, 0.2, 0.1), velocity=tuple(speed.tolist()))
+    devices = [
+        antenna("t", "tx", (0, 0, 1), arrays[0]),
+        antenna("r", "rx", (0, 0, 1.0), arrays[1], parent="car"),
+    ]
+    model = SionnaChannel(
+        SionnaSettings(rung=rung, reflection=False, samples=1000),  # type: ignore[arg-type]
+        RunInfo(name="channel", carriers=(carrier,)),
+    )
+    model.prepare(Preparation(demand={"channel": frozenset({"h", "hf", "taps"})}))
+    channel = measure(model, scene(devices, [car]))
+    transmit, receive = (
+        places(array, np.array(centre), np.zeros(3), 28e9)
+        for array, centre in zip(arrays, ([0, 0, 1], [2.0, 0.6, 1.0]), strict=True)
+    )
+    tau = distances(receive, transmit) / C
+    along = receive[:, None] - transmit
+    rate = -(along @ speed) / np.linalg.norm(along, axis=-1) / C
+    if rung == "spherical":  # elements share the Doppler shift of the path between the arrays' centres
+        rate = np.full(rate.shape, channel.doppler[0, 0] / 28e9)
+        assert rate[0, 0] == pytest.approx(-unit(np.array([2.0, 0.6, 0.0])) @ speed / C, rel=1e-9)
+    h, response, taps = channel.h[0].h, channel.hf[0].h, channel.taps[0]
+    for s, t in enumerate((0.0, 3e-3)):
+        delay = tau - rate * t
+        turned = h * np.exp(2j * np.pi * 28e9 * rate * t)
+        f = (np.arange(9) - 4)[:, None, None] * 250e6
+        assert np.abs(response[s] - turned * np.exp(-2j * np.pi * f * delay)).max() < 1e-6 * np.abs(h).max()
+        samples = taps.first + np.arange(24)[:, None, None] - 2.5e9 * delay
+        assert np.abs(taps.h[s] - turned * np.sinc(samples)).max() < 1e-6 * np.abs(h).max()
+    assert 2 * np.pi * 1e9 * np.abs(tau - channel.tau[0]).max() > 0.2

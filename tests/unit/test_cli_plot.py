@@ -24,12 +24,20 @@ def full(folder: Path, frames: int = 4) -> Path:
     return folder
 
 
+@pytest.fixture
+def maps_alone(monkeypatch):
+    """Without the pictures of paths, which take as long again."""
+    monkeypatch.setattr("caviar_clients.cli.plot.user_paths", lambda recording, user: None)
+
+
 def test_all_pictures_go_into_the_run_directory(tmp_path):
     files = plot_run(full(tmp_path))
     assert [file.name for file in files] == [
         "map.png",
         "beams-over-time.png",
         "beams-over-angle.png",
+        "dispersion.png",
+        "frequency-response.png",
         "lidar.png",
     ]
     assert all(file.parent == tmp_path and file.stat().st_size > 5000 for file in files)
@@ -41,6 +49,7 @@ def test_what_was_not_recorded_is_not_drawn(tmp_path):
     assert all(file.is_file() for file in files)
 
 
+@pytest.mark.usefixtures("maps_alone")
 def test_another_frame_gives_another_map(tmp_path):
     run = record(tmp_path / "run")
     first = plot_run(run, tmp_path / "a", frame=0)[0].read_bytes()
@@ -48,6 +57,7 @@ def test_another_frame_gives_another_map(tmp_path):
     assert plot_run(run, tmp_path / "c", frame=3)[0].read_bytes() != first
 
 
+@pytest.mark.usefixtures("maps_alone")
 def test_by_default_the_map_shows_the_middle_of_the_frames_with_line_of_sight(tmp_path):
     run = record(tmp_path / "run", frames=6)  # the sample is NLOS in frames 0 and 5
     chosen = plot_run(run, tmp_path / "a")[0].read_bytes()

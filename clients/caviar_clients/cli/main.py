@@ -307,12 +307,13 @@ def plot(
     run: RunDirectory,
     out: Annotated[Path | None, typer.Option(help="where the PNGs go; by default into the run")] = None,
     frame: Annotated[int | None, typer.Option(help="frame of map, scan and images")] = None,
-    user: Annotated[str | None, typer.Option(help="receiver whose |y| is drawn")] = None,
+    user: Annotated[str | None, typer.Option(help="receiver whose |y| and paths are drawn")] = None,
     camera: Annotated[
         str | None, typer.Option(help="camera whose images are drawn, in files with its name")
     ] = None,
 ) -> None:
-    """Draw a run: the map with rays and beam, |y| over time and angle, a LIDAR scan, what a camera saw."""
+    """Draw a run: the map with rays and beam, |y| over time and angle, delay spread and frequency response, a
+    LIDAR scan, what a camera saw."""
     from caviar_clients.cli.plot import plot_run
 
     for picture in plot_run(run, out, frame, user, camera):

@@ -15,6 +15,7 @@ from caviar_clients.plots.fig8 import choose_user, draw_over_angle, draw_over_ti
 from caviar_clients.plots.footprints import Box, Footprints, footprints, with_boxes
 from caviar_clients.plots.lidar import draw_scan
 from caviar_clients.plots.map import MapData, draw_map
+from caviar_clients.plots.wideband import draw_dispersion, draw_frequency_response, user_paths
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.beams import subarray_of
 from caviar_protocol.coordinates import rotation_matrix
@@ -34,7 +35,8 @@ def plot_run(
     user: str | None = None,
     camera: str | None = None,
 ) -> list[Path]:
-    """Draw what a recording holds: map, |y| over time and angle of arrival, LIDAR scan, a camera's images.
+    """Draw what a recording holds: map, |y| over time and angle of arrival, a user's delay spread, K-factor,
+    coherence and frequency response, LIDAR scan, a camera's images.
 
     Parameters
     ----------
@@ -46,7 +48,7 @@ def plot_run(
         Frame of the first episode for map, scan and images; by default the middle of those that have
         most to show.
     user
-        Receiver, or its object, for |y| and the beam; by default the one that was there longest.
+        Receiver, or its object, for |y|, the beam and its paths; by default the one that was there longest.
     camera
         Camera whose images are drawn, in files with its name; by default the first, of those that are fixed
         if there are any.
@@ -54,7 +56,7 @@ def plot_run(
     Returns
     -------
     list of Path
-        The files, in the order map, |y|, LIDAR, camera. What was not recorded is not drawn.
+        The files, in the order map, |y|, dispersion, LIDAR, camera. What was not recorded is not drawn.
 
     Raises
     ------
@@ -77,6 +79,12 @@ def plot_run(
         data, agent = series(recording, chosen), agent_names(recording)
         draw_over_time(data, agent, files[-2])
         draw_over_angle(data, agent, files[-1])
+    paths = user_paths(recording, chosen) if "channel" in topics else None
+    if paths is not None:
+        files += [folder / "dispersion.png", folder / "frequency-response.png"]
+        draw_dispersion(paths, files[-2])
+        shown = _frame(recording, frame, "channel", chosen)
+        draw_frequency_response(paths, (shown.episode, shown.number), moment(shown), files[-1])
     if "lidar" in topics:
         files.append(folder / "lidar.png")
         at = _frame(recording, frame, "lidar", chosen)

@@ -1,0 +1,198 @@
+"""How a user's channel spreads in delay, Doppler shift and frequency: two pictures, from its paths.
+
+Amplitudes are those between the reference points of both arrays, element patterns included: the figures are
+those of single elements, not of what a beam leaves of the paths.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from caviar_clients.plots.style import BLUE, GREY, LIGHT_GREY, ORANGE, VERMILION, figure
+from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array
+from caviar_protocol.dispersion import coherence, delay_spread, doppler_spread, k_factor
+from caviar_protocol.ofdm import subcarrier_offsets, subcarrier_weights
+from caviar_protocol.recording import Recording
+from caviar_protocol.topics import Carrier
+
+_POINTS = 256
+"""Frequencies that are drawn of a carrier without subcarriers."""
+_RANGE_DB = 40.0
+"""Weaker paths and deeper fades than this below the strongest are at the edge of a picture."""
+
+
+@dataclass(frozen=True, eq=False)
+class UserPaths:
+    """The paths of one user through a run; P is the most that a frame has, NaN where it has fewer."""
+
+    tx: str
+    rx: str
+    carrier: Carrier
+    frames: list[tuple[int, int]]
+    """Episode and number of each frame."""
+    time: Float64Array
+    """[s], simulated; an episode begins where the one before ended. Shape ``[F]``."""
+    los: BoolArray
+    a: Complex128Array
+    """Shape ``[F, P]``."""
+    tau: Float64Array
+    """[s], Shape ``[F, P]``."""
+    doppler: Float64Array
+    """[Hz], Shape ``[F, P]``."""
+
+
+def user_paths(recording: Recording, user: tuple[str, str, str] | None) -> UserPaths | None:
+    """Paths of (tx, rx, carrier), by default of the first user; None where the channel has no such user."""
+    channel = recording["channel", recording.topics["channel"][0]]
+    if not channel.users:
+        return None
+    tx, rx, carrier = user or channel.users[0]
+    if (tx, rx, carrier) not in channel.users:
+        return None
+    mine = channel.select(tx=tx, rx=rx, carrier=carrier)
+    begins = np.flatnonzero(np.diff(channel.episode, prepend=-1))
+    period = recording.metadata.sampling_period_ns
+    lasted = np.diff(np.append(begins, len(channel)))
+    last = channel.t_ns[begins + lasted - 1] + period - channel.t_ns[begins]
+    ahead = np.repeat(np.concatenate([[0], np.cumsum(last[:-1])]) - channel.t_ns[begins], lasted)
+    return UserPaths(
+        tx=tx,
+        rx=rx,
+        carrier=channel.carriers[carrier],
+        frames=list(zip(channel.episode.tolist(), channel.frame.tolist(), strict=True)),
+        time=(channel.t_ns + ahead + channel.t_ns[0]) * 1e-9,
+        los=mine.los[:, 0],
+        a=mine.a[:, 0],
+        tau=mine.tau[:, 0],
+        doppler=mine.doppler[:, 0],
+    )
+
+
+def draw_dispersion(data: UserPaths, file: Path) -> None:
+    """Delay spread, K-factor, coherence bandwidth and time over simulated time; NLOS shaded."""
+    sigma_tau, sigma_nu = delay_spread(data.a, data.tau), doppler_spread(data.a, data.doppler)
+    with np.errstate(divide="ignore"):
+        k_db = 10 * np.log10(k_factor(data.a, data.tau, data.los))
+    rows = (
+        ("RMS delay\nspread [ns]", sigma_tau * 1e9, "linear", BLUE),
+        ("K-factor [dB]", np.where(np.isfinite(k_db), k_db, np.nan), "linear", BLUE),
+        ("Coherence\nbandwidth [MHz]", _finite(coherence(sigma_tau)) * 1e-6, "log", VERMILION),
+        ("Coherence\ntime [ms]", _finite(coherence(sigma_nu)) * 1e3, "log", VERMILION),
+    )
+    with figure(file, 9.0, 8.0) as drawn:
+        axes = drawn.subplots(len(rows), 1, sharex=True)
+        for place, (label, values, scale, color) in zip(axes, rows, strict=True):
+            place.plot(data.time, values, color=color, linewidth=1.6, marker=".", markersize=4)
+            place.set_ylabel(label)
+            if scale == "log" and np.isfinite(values).any():
+                place.set_yscale("log")
+                place.minorticks_off()
+            place.grid(color=LIGHT_GREY, linewidth=0.6)
+            _shade(place, data)
+        axes[0].set_title(
+            f"Dispersion of {data.rx}, served by {data.tx} ({data.carrier.name}); shaded: NLOS\n"
+            "coherence: correlation stays above 0.5 for at least 1/(6σ)"
+        )
+        axes[-1].set_xlabel("Time [s]")
+        axes[-1].margins(x=0)
+
+
+def draw_frequency_response(data: UserPaths, shown: tuple[int, int], moment: str, file: Path) -> None:
+    """Power delay profile and |H(f)| of one frame above, |H(f)| of all frames below.
+
+    ``shown`` is the frame's episode and number, ``moment`` its name.
+    """
+    frame = data.frames.index(shown)
+    carrier = data.carrier
+    if not carrier.subcarriers:
+        spacing = carrier.bandwidth_hz / _POINTS
+        carrier = msgspec.structs.replace(carrier, subcarriers=_POINTS, subcarrier_spacing_hz=spacing)
+    carrier = msgspec.structs.replace(carrier, slots=1)
+    offsets, gain_db = subcarrier_offsets(carrier) * 1e-6, _gains_db(data, carrier)
+    with figure(file, 10.0, 7.5) as drawn:
+        grid = drawn.add_gridspec(2, 2, height_ratios=(3, 4))
+        profile, response = drawn.add_subplot(grid[0, 0]), drawn.add_subplot(grid[0, 1])
+        _draw_profile(profile, data, frame)
+        response.plot(offsets, gain_db[frame], color=BLUE, linewidth=1.6)
+        response.set_xlabel("Frequency from the carrier [MHz]")
+        response.set_ylabel("|H(f)|² [dB]")
+        response.margins(x=0)
+        response.grid(color=LIGHT_GREY, linewidth=0.6)
+        drawn.suptitle(f"{data.rx}, served by {data.tx} ({data.carrier.name}): {moment}")
+        _draw_map(drawn.add_subplot(grid[1, :]), data, offsets, gain_db, frame)
+
+
+def _draw_profile(axes: Any, data: UserPaths, frame: int) -> None:
+    """Gain of each path over its delay."""
+    there = np.isfinite(data.tau[frame])
+    delay = data.tau[frame][there] * 1e9
+    with np.errstate(divide="ignore"):
+        gain_db = 20 * np.log10(np.abs(data.a[frame][there]))
+    axes.set_xlabel("Delay [ns]")
+    axes.set_ylabel("Gain of a path [dB]")
+    axes.grid(color=LIGHT_GREY, linewidth=0.6)
+    if not len(delay) or not np.isfinite(gain_db).any():
+        axes.text(0.5, 0.5, "no path", transform=axes.transAxes, ha="center", color=GREY)
+        return
+    floor = gain_db.max() - _RANGE_DB
+    shown = np.maximum(gain_db, floor)
+    direct = int(delay.argmin()) if data.los[frame] else -1
+    for index, (x, y) in enumerate(zip(delay, shown, strict=True)):
+        color = ORANGE if index == direct else BLUE
+        axes.vlines(x, floor, y, color=color, linewidth=1.6)
+        axes.plot(x, y, "o", color=color, markersize=5)
+    axes.set_ylim(floor, gain_db.max() + 3)
+    spread = float(delay_spread(data.a[frame], data.tau[frame]))
+    k = float(k_factor(data.a[frame], data.tau[frame], data.los[frame]))
+    texts = [f"σ = {spread * 1e9:.3g} ns"]
+    if np.isfinite(k) and k > 0:
+        texts.append(f"K = {10 * np.log10(k):.1f} dB (direct path: orange)".replace("-", "−"))
+    axes.set_title(", ".join(texts))
+
+
+def _draw_map(axes: Any, data: UserPaths, offsets: Float64Array, gain_db: Float64Array, frame: int) -> None:
+    """|H(f)|² over time and frequency."""
+    known = gain_db[np.isfinite(gain_db)]
+    if len(known):
+        least, most = float(known.min()), float(known.max())
+        floor = max(least, most - _RANGE_DB)
+        mesh = axes.pcolormesh(
+            data.time, offsets, gain_db.T, shading="nearest", cmap="viridis", vmin=floor, vmax=most
+        )
+        extend = "min" if floor > least else "neither"
+        axes.figure.colorbar(mesh, ax=axes, label="|H(f)|² [dB]", extend=extend)
+    axes.axvline(data.time[frame], color=VERMILION, linewidth=1.0, linestyle="--")
+    axes.set_xlabel("Time [s]")
+    axes.set_ylabel("Frequency from\nthe carrier [MHz]")
+
+
+def _gains_db(data: UserPaths, carrier: Carrier) -> Float64Array:
+    """|H(f)|² of each frame [dB], Shape ``[F, K]``; NaN in frames without a path."""
+    found = np.full((len(data.time), carrier.subcarriers), np.nan)
+    for frame, (a, tau, doppler) in enumerate(zip(data.a, data.tau, data.doppler, strict=True)):
+        there = np.isfinite(tau)
+        if there.any():
+            response = subcarrier_weights(carrier, tau[there], doppler[there])[0] @ a[there]
+            with np.errstate(divide="ignore"):
+                found[frame] = 20 * np.log10(np.abs(response))
+    return np.where(np.isfinite(found), found, np.nan)
+
+
+def _finite(values: Float64Array) -> Float64Array:
+    return np.where(np.isfinite(values), values, np.nan)
+
+
+def _shade(axes: Any, data: UserPaths) -> None:
+    """Background of frames with paths and without line of sight."""
+    half = np.median(np.diff(data.time)) / 2 if len(data.time) > 1 else 0.5
+    hidden = ~data.los & np.isfinite(data.tau).any(-1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], hidden, [False]]).astype(np.int8)))
+    for first, stop in edges.reshape(-1, 2):
+        axes.axvspan(
+            data.time[first] - half, data.time[stop - 1] + half, color=LIGHT_GREY, linewidth=0, zorder=0
+        )
