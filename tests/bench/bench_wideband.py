@@ -19,7 +19,6 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -89,44 +88,33 @@ def times(frames: int, repeat: int) -> dict[str, float]:
     carrier = msgspec.structs.replace(made.run.carriers[0], **NUMEROLOGY)
     run = replace(made.run, carriers=(carrier,))
     settings = {"max_depth": 3, "pool": made.settings["pool"]}
-    model = Model(run, made.preparation.assets, settings, set())
-    found: dict[str, list[float]] = {"beam pairs": [], "whole grid": [], "encoded": []}
-    paths = users = 0
+    model = Model(run, made.preparation.assets, settings, {"hf"})
+    rows, paths, users = [], 0, 0
     for number, scene in enumerate(made.scenes):
         channel = model(scene, number)
         of_scene = users_of(scene, channel.carriers)
-        beams = [(17, 3)] * len(of_scene)
         paths, users = max(paths, len(channel.tau)), max(users, len(of_scene))
-        grids: list[Channel] = []
-        digests: set[str] = set()
-        found["beam pairs"].append(
-            least(repeat, lambda c=channel, s=scene, u=of_scene, b=beams: beam_responses(c, s, u, b))
-        )
-        found["whole grid"].append(
-            least(repeat, lambda c=channel, s=scene, g=grids: g.append(whole_grid(c, s)))
-        )
-        found["encoded"].append(
-            least(repeat, lambda g=grids, d=digests: d.add(payload_digest(*encode_payload(g.pop()))))
-        )
+        taken, digests = [], set()
+        for _ in range(repeat):
+            began = time.perf_counter()
+            beam_responses(channel, scene, of_scene, [(17, 3)] * len(of_scene))
+            served = time.perf_counter()
+            grid = whole_grid(channel, scene)
+            made_at = time.perf_counter()
+            digests.add(payload_digest(*encode_payload(grid)))
+            taken.append(np.diff([began, served, made_at, time.perf_counter()]))
         if len(digests) != 1:
             raise SystemExit(f"frame {number}: digests differ between {repeat} makings")
-    figures = {f"{name} [ms]": float(np.median(values)) for name, values in found.items()}
-    together = np.array(found["whole grid"]) + np.array(found["encoded"])
-    return figures | {
-        "whole grid with digest [ms]": float(np.median(together)),
+        rows.append(np.min(taken, axis=0))
+    beams, grid_ms, encoded = 1e3 * np.median(rows, axis=0)
+    return {
+        "beam pairs [ms]": float(beams),
+        "whole grid [ms]": float(grid_ms),
+        "encoding and digest [ms]": float(encoded),
+        "whole grid with digest [ms]": 1e3 * float(np.median(np.array(rows)[:, 1:].sum(1))),
         "paths": paths,
         "users": users,
     }
-
-
-def least(repeat: int, call: Callable[[], object]) -> float:
-    """Shortest time of a call [ms]."""
-    taken = []
-    for _ in range(repeat):
-        began = time.perf_counter()
-        call()
-        taken.append(1e3 * (time.perf_counter() - began))
-    return min(taken)
 
 
 # --- beside Sionna RT ---------------------------------------------------------------------------------

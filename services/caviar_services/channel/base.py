@@ -16,6 +16,7 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Float64Array
 from caviar_protocol.devices import PATTERNS
 from caviar_protocol.errors import PayloadError, ScenarioError
+from caviar_protocol.host import keep_large_buffers
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.paths import changes
 from caviar_protocol.scene import antennas
@@ -157,6 +158,8 @@ class ChannelModel(Service[S]):
                 if name.startswith(PATTERNS)
             }
         )
+        if self.wideband:
+            keep_large_buffers()
         return Prepared(notes=(*self.load(preparation), *self._absorption_notes()))
 
     def step(self, frame: Frame) -> StepResult:

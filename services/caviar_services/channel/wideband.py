@@ -24,6 +24,8 @@ Part = Literal["hf", "taps"]
 
 _PRODUCTS = 1 << 15
 """Products of elements in one product of matrices: OpenBLAS shares larger ones out to threads (`stacked`)."""
+_DEPTH = 32
+"""Paths of one product of matrices."""
 
 
 class Wideband(msgspec.Struct, frozen=True):
@@ -112,10 +114,20 @@ def superposed(weights: Complex128Array, waves: Complex128Array) -> Complex64Arr
     columns = waves.reshape(paths, math.prod(sizes)).astype(np.complex64)
     single = weights.astype(np.complex64)
     total = np.zeros((len(weights), columns.shape[1]), np.complex64)
-    depth = 32
-    for begin in range(0, paths, depth):
-        block = slice(begin, begin + depth)
-        at_once = max(1, _PRODUCTS // max(1, columns.shape[1] * len(columns[block])))
-        for row in range(0, len(total), at_once):
-            total[row : row + at_once] += single[row : row + at_once, block] @ columns[block]
+    for begin in range(0, paths, _DEPTH):
+        block = slice(begin, begin + _DEPTH)
+        product = _product(np.ascontiguousarray(single[:, block]), columns[block])
+        total = product if not begin else np.add(total, product, out=total)
     return total.reshape(len(weights), *sizes)
+
+
+def _product(left: Complex64Array, right: Complex64Array) -> Complex64Array:
+    """Product of matrices, some rows at a time."""
+    (count, depth), width = left.shape, right.shape[1]
+    product = np.empty((count, width), np.complex64)
+    rows = max(1, _PRODUCTS // max(1, depth * width))
+    whole = count // rows * rows
+    stacked = product[:whole].reshape(-1, rows, width)
+    np.matmul(left[:whole].reshape(-1, rows, depth), right, out=stacked)
+    np.matmul(left[whole:], right, out=product[whole:])
+    return product
