@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from caviar_protocol.arrays import BoolArray
+from caviar_protocol.arrays import BoolArray, Int64Array
 from caviar_protocol.topics.channel import Channel
 
 
@@ -39,11 +39,21 @@ def changes(before: Channel, after: Channel) -> Changes:
     same = before.tx == after.tx and before.rx == after.rx
     if same and np.array_equal(before.offsets, after.offsets) and np.array_equal(before.id, after.id):
         return Changes(np.zeros(len(after.id), np.bool_), np.zeros(len(before.id), np.bool_))
-    born, died = np.ones(len(after.id), np.bool_), np.ones(len(before.id), np.bool_)
-    earlier = frozenset(before.rx)
-    for tx in sorted(frozenset(before.tx) & frozenset(after.tx)):
-        for rx in (name for name in after.rx if name in earlier):
-            old, new = before.pair(tx, rx), after.pair(tx, rx)
-            born[new] = ~np.isin(after.id[new], before.id[old])
-            died[old] = ~np.isin(before.id[old], after.id[new])
-    return Changes(born, died)
+    earlier, later = _keys(before, after)
+    return Changes(~np.isin(later, earlier), ~np.isin(earlier, later))
+
+
+def _keys(before: Channel, after: Channel) -> tuple[Int64Array, Int64Array]:
+    """Numbers that two paths of the products, Shape ``[P]`` each, have in common where they are the same."""
+    channels = (before, after)
+    tx, rx = (
+        {name: number for number, name in enumerate(dict.fromkeys(names))}
+        for names in (before.tx + after.tx, before.rx + after.rx)
+    )
+    numbers, places = np.unique(np.concatenate([c.id for c in channels]), return_inverse=True)
+    pairs = [
+        np.repeat([tx[t] * len(rx) + rx[r] for t in c.tx for r in c.rx], np.diff(c.offsets)).astype(np.int64)
+        for c in channels
+    ]
+    keys = np.concatenate(pairs) * len(numbers) + places.reshape(-1)
+    return keys[: len(before.id)], keys[len(before.id) :]

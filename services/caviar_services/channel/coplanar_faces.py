@@ -15,6 +15,7 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_services.channel.face_rectangles import ranges
 from caviar_services.channel.sionna_planes import PlaneTable
+from caviar_services.channel.vectors import cross
 
 COPLANAR = 1e-5
 """[m]; faces are in one plane to this, and `COPLANAR_RELATIVE` of their coordinates: about what float32 tells
@@ -161,24 +162,24 @@ class CoplanarFaces:
 
     def _touched(self, body: Int64Array, still: Int64Array) -> Int64Array:
         """Of pairs of planes, the first triangle of scenery whose box the body's face touches; −1: none."""
-        found = np.full(len(body), -1, np.int64)
-        for row, (plane, other) in enumerate(zip(body.tolist(), still.tolist(), strict=True)):
-            triangles = self._table.triangles_of(np.array([other]))[0]
-            corners = self._table.corners_of(triangles)
-            low, high = corners.min(1), corners.max(1)
-            touch = (low <= self._table.high[plane] + _TOUCHING) & (
-                self._table.low[plane] <= high + _TOUCHING
-            )
-            hits = triangles[touch.all(1)]
-            found[row] = hits.min(initial=np.iinfo(np.int64).max) if len(hits) else -1
-        return found
+        triangles, sizes = self._table.triangles_of(still)
+        own = np.repeat(np.arange(len(still)), sizes)
+        corners = self._table.corners_of(triangles)
+        plane = body[own]
+        touch = (corners.min(1) <= self._table.high[plane] + _TOUCHING) & (
+            self._table.low[plane] <= corners.max(1) + _TOUCHING
+        )
+        hits = touch.all(1)
+        found = np.full(len(body), np.iinfo(np.int64).max)
+        np.minimum.at(found, own[hits], triangles[hits])
+        return np.where(found < np.iinfo(np.int64).max, found, -1)
 
     def _coplanar(self, one: Int64Array, other: Int64Array) -> BoolArray:
         """Of pairs of planes, whether all corners of the one are in the other."""
         if not len(one):
             return np.zeros(0, np.bool_)
         table = self._table
-        across = np.abs(np.cross(table.normal[one], table.normal[other])).max(1)
+        across = np.abs(cross(table.normal[one], table.normal[other])).max(1)
         within: BoolArray = across <= _ANGLE
         rows = np.flatnonzero(within)
         triangles, sizes = table.triangles_of(one[rows])

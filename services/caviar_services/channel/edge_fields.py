@@ -32,6 +32,7 @@ from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int
 from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.contributing import slab
+from caviar_services.channel.vectors import cross
 
 _IN_PLANE = 1e-8
 """[rad]; a ray this near the plane of a face is in it, and this near a shadow boundary on its lit side."""
@@ -210,7 +211,7 @@ class Wall:
         te, tm = np.where(through, passed, back * np.sqrt(1 - self.scattering**2))
         s = _unit(_perpendicular(k, normal))
         out = np.where(through[:, None], k, k - 2 * across[:, None] * normal)
-        return _outer(te[:, None] * s, s) + _outer(tm[:, None] * np.cross(out, s), np.cross(k, s))
+        return _outer(te[:, None] * s, s) + _outer(tm[:, None] * cross(out, s), cross(k, s))
 
 
 def _diffracted(
@@ -297,10 +298,10 @@ def _sine(one: Float64Array, other: Float64Array) -> Float64Array:
 
 def _perpendicular(k: Float64Array, normal: Float64Array) -> Float64Array:
     """A direction across both; any across ``k`` where both are one."""
-    across = np.cross(k, normal)
+    across = cross(k, normal)
     axis = np.eye(3)[np.argmin(np.abs(k), axis=-1)]
     lost = (across**2).sum(-1, keepdims=True) < _ALONG**2
-    perpendicular: Float64Array = np.where(lost, np.cross(k, axis), across)
+    perpendicular: Float64Array = np.where(lost, cross(k, axis), across)
     return perpendicular
 
 

@@ -15,6 +15,7 @@ from collections.abc import Callable
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
+from caviar_services.channel.vectors import cross
 
 _SLACK = 1.001
 """Room for rounding beyond the tolerances, so that no pair within them falls into separate cells."""
@@ -170,15 +171,6 @@ def _about_middles(points: Float64Array, mesh: Int64Array, meshes: int) -> tuple
     reach = np.zeros(meshes)
     np.maximum.at(reach, mesh, np.sqrt(np.einsum("fx,fx->f", points, points)))
     return points, reach
-
-
-def cross(one: Float64Array, other: Float64Array) -> Float64Array:
-    """Cross products of vectors, Shape ``[N, 3]``: of some thousands, four times as fast as NumPy's."""
-    product = np.empty(one.shape)
-    for axis in range(3):
-        i, j = (axis + 1) % 3, (axis + 2) % 3
-        product[:, axis] = one[:, i] * other[:, j] - one[:, j] * other[:, i]
-    return product
 
 
 def _begins(values: Int64Array) -> BoolArray:

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
-from caviar_services.channel.plane_clustering import coplanar, cross
+from caviar_services.channel.plane_clustering import coplanar
+from caviar_services.channel.vectors import cross
 from caviar_services.meshes import Mesh
 
 _OFF_PLANE = 2e-5
@@ -185,13 +186,13 @@ class PlaneTable:
 
 def _holds(triangles: Float64Array, points: Float64Array) -> BoolArray:
     """Whether points lie in triangles of their plane or at most `_RIM` outside, Shape ``[N]``."""
-    normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    normal = cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     length = np.linalg.norm(normal, axis=1)
     inside: BoolArray = length > 0
     normal /= np.where(inside, length, 1.0)[:, None]
     for corner in range(3):
         edge = triangles[:, (corner + 1) % 3] - triangles[:, corner]
-        across = (np.cross(edge, points - triangles[:, corner]) * normal).sum(1)
+        across = (cross(edge, points - triangles[:, corner]) * normal).sum(1)
         inside &= across >= -_RIM * np.linalg.norm(edge, axis=1)
     return inside
 

@@ -21,6 +21,7 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt8Array
 from caviar_protocol.topics import Interaction
+from caviar_services.channel.vectors import cross
 
 _NEAR = 0.05
 """[m]; a point that moves less is the same."""
@@ -112,7 +113,7 @@ def _found(
 ) -> Float64Array:
     depth = types.shape[1]
     a, b, c = np.moveaxis(triangles, -2, 0)
-    origin, normal = a, np.cross(b - a, c - a)
+    origin, normal = a, cross(b - a, c - a)
     fixed = traced.copy()
     scattered = types == Interaction.SCATTERING
     if scattered.any():
