@@ -1,6 +1,6 @@
 """Wideband parts of the street canyon: their time, and how near they come to Sionna RT's own.
 
-    python tests/bench/bench_wideband.py [--frames N] [--repeat N] [--sionna] [--json FILE]
+    python tests/bench/bench_wideband.py [--frames N] [--repeat N] [--sionna] [--markdown FILE]
 
 Times are those of 10 users of 64 × 8 elements on 264 subcarriers, in frames of `street-canyon`: the response
 of one beam pair of each user from the paths, and the whole grid, encoded and with its digest. The least of
@@ -17,7 +17,6 @@ traffic, receiver by receiver. Sionna computes the phase of the carrier in float
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -108,10 +107,10 @@ def times(frames: int, repeat: int) -> dict[str, float]:
         rows.append(np.min(taken, axis=0))
     beams, grid_ms, encoded = 1e3 * np.median(rows, axis=0)
     return {
-        "beam pairs [ms]": float(beams),
-        "whole grid [ms]": float(grid_ms),
-        "encoding and digest [ms]": float(encoded),
-        "whole grid with digest [ms]": 1e3 * float(np.median(np.array(rows)[:, 1:].sum(1))),
+        "beam pairs of all users [ms]": float(beams),
+        "whole grid of all users [ms]": float(grid_ms),
+        "its encoding and digest [ms]": float(encoded),
+        "whole grid, its encoding and digest [ms]": 1e3 * float(np.median(np.array(rows)[:, 1:].sum(1))),
         "paths": paths,
         "users": users,
     }
@@ -233,16 +232,28 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=20)
     parser.add_argument("--repeat", type=int, default=5)
     parser.add_argument("--sionna", action="store_true", help="hold the parts against Paths.cfr and taps")
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--markdown", type=Path, help="where the figures go as tables")
     args = parser.parse_args()
     figures: dict[str, dict[str, float]] = {"times": times(args.frames, args.repeat)}
     if args.sionna:
         for frequency_hz in (3.5e9, 28e9):
-            figures[f"{frequency_hz / 1e9:g} GHz [dB]"] = beside_sionna(frequency_hz)
+            figures[f"{frequency_hz / 1e9:g} GHz"] = beside_sionna(frequency_hz)
     for name, of in figures.items():
         print(f"{name}: " + ", ".join(f"{key} {value:.4g}" for key, value in of.items()))
-    if args.json:
-        args.json.write_text(json.dumps(figures, indent=1))
+    if args.markdown:
+        args.markdown.write_text(as_markdown(figures), "utf-8")
+
+
+def as_markdown(figures: dict[str, dict[str, float]]) -> str:
+    """Two tables: times, and errors of each carrier."""
+    times = figures.pop("times")
+    lines = ["# Times", "", "| 10 users of 64 × 8 elements, 264 subcarriers | ms |", "| --- | ---: |"]
+    lines += [f"| {name[:-5]} | {value:.1f} |" for name, value in times.items() if name.endswith(" [ms]")]
+    if figures:
+        lines += ["", "# Sionna RT", "", f"| NMSE [dB] | {' | '.join(figures)} |", "| --- | ---: | ---: |"]
+        for name in next(iter(figures.values())):
+            lines.append(f"| {name} | {' | '.join(f'{of[name]:.1f}' for of in figures.values())} |")
+    return "\n".join(lines).replace("| -", "| −") + "\n"
 
 
 if __name__ == "__main__":
