@@ -17,6 +17,7 @@ traffic, receiver by receiver. Sionna computes the phase of the carrier in float
 from __future__ import annotations
 
 import argparse
+import re
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -253,7 +254,7 @@ def as_markdown(figures: dict[str, dict[str, float]]) -> str:
         lines += ["", "# Sionna RT", "", f"| NMSE [dB] | {' | '.join(figures)} |", "| --- | ---: | ---: |"]
         for name in next(iter(figures.values())):
             lines.append(f"| {name} | {' | '.join(f'{of[name]:.1f}' for of in figures.values())} |")
-    return "\n".join(lines).replace("| -", "| −") + "\n"
+    return re.sub(r"-(?=\d)", "−", "\n".join(lines)) + "\n"
 
 
 if __name__ == "__main__":

@@ -19,7 +19,9 @@ from typing import Any
 import pytest
 
 from caviar_clients.embedded.run import EmbeddedRun
-from caviar_protocol.scenario_loader import load_scenario
+from caviar_protocol.recording import Recording
+from caviar_protocol.scenario_loader import find_scenario, load_scenario, parse_scenario
+from caviar_services.link.users import users_of
 
 PACKAGES = ("caviar_protocol", "caviar_broker", "caviar_services", "caviar_clients")
 ROOT = Path(__file__).parents[2]
@@ -60,8 +62,25 @@ def _channel_model() -> dict[str, Any]:
     return {"MyModel": FreeSpaceChannel, "MyChannel": FreeSpaceChannel}
 
 
+def _wideband() -> dict[str, Any]:
+    """Two frames of `smoke` with both wideband parts, and what a link has of the first."""
+    text = find_scenario("smoke").read_text()
+    keys = "subcarriers = 264\nsubcarrier_spacing_hz = 120e3\ntaps = 64\nslots = 4\nslot_duration_s = 125e-6"
+    text = text.replace("[[carriers]]", f"[[carriers]]\n{keys}")
+    text = re.sub(r"(?m)^frames = .*", "frames = 2", text)
+    text = re.sub(r"(?m)^record = .*", 'record = ["scene", "channel.hf", "channel.taps"]', text)
+    run = Path("runs/smoke-wideband")
+    run.mkdir(parents=True)
+    EmbeddedRun(parse_scenario(text, folder=find_scenario("smoke").parent), run).run()
+    scene = Recording(run)["scene"][0]
+    assert scene is not None
+    users = users_of(scene, tuple(Recording(run)["channel"].carriers.values()))
+    return {"scene": scene, "users": users, "beams": [(3, 1), (5, 0)]}
+
+
 GIVEN: dict[str, Callable[[], dict[str, Any]]] = {
     "CONTRIBUTING.md": _channel_model,
+    "docs/wideband.md": _wideband,
     "services/CHANNEL.md": _keyframes,
     "caviar_broker.core.clock": _clock,
     "caviar_services.testing": _channel_model,
