@@ -10,9 +10,11 @@ and a single figure, by table, row and column, within a sentence::
 
     about <!-- figure: keyframes | siso-rt 1e5 d3, keyframes every 2 | NMSE dB -->−7.4<!-- end --> dB
 
-``python docs/figures.py record NAME FILE`` takes a table over from the Markdown that a command wrote
-(``caviar tradeoff --out``, ``caviar stability --markdown``, ``tests/bench``), and
-``python docs/figures.py render`` writes into all pages what the file says. A test compares pages and file.
+``python docs/figures.py measure [NAME …]`` runs the commands that tables of the channel come from, and takes
+these over: in a short form of minutes, or in the long one with ``--full``. ``python docs/figures.py record
+NAME FILE`` takes over a single table from the Markdown that a command wrote (``caviar stability --markdown``,
+``tests/bench``), and ``python docs/figures.py render`` writes into all pages what the file says. A test
+compares pages and file.
 """
 
 from __future__ import annotations
@@ -21,17 +23,63 @@ import argparse
 import difflib
 import json
 import re
+import shlex
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, TypedDict
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple, TypedDict
 
 ROOT = Path(__file__).resolve().parents[1]
 FIGURES = ROOT / "docs" / "figures.json"
 FOLDERS = ("docs", "protocol", "broker", "services", "clients", "deploy", "examples")
 """Where pages are, beside the root."""
+
+_BENCH, _CAVIAR = "python tests/bench/bench_enumerated.py", "caviar tradeoff street-canyon"
+_BASE = "'siso-rt enumerated d3'"
+
+
+class Measurement(NamedTuple):
+    """A command that writes tables."""
+
+    short: str
+    """Takes some minutes; ``{out}`` is where it writes."""
+    full: str
+    file: str
+    """That the tables are in, below ``{out}``."""
+    tables: Mapping[str, str]
+    """By name, a part of the heading above each."""
+
+
+MEASUREMENTS: Mapping[str, Measurement] = {
+    "enumerated": Measurement(
+        f"{_BENCH} --scene street-canyon uav munich --frames 4 --rays 500000 --launches 2 --own-rays 500000 "
+        "--own-launches 2 --markdown {out}/enumerated.md",
+        f"{_BENCH} --scene street-canyon uav munich --own-launches 6 --markdown {{out}}/enumerated.md",
+        "enumerated.md",
+        {"enumerated": ""},
+    ),
+    "keyframes": Measurement(
+        f"{_CAVIAR} --part keyframes --baseline {_BASE} --reference {_BASE} --minutes 3 --out {{out}}",
+        f"{_CAVIAR} --part keyframes --baseline {_BASE} --reference {_BASE} --minutes 13 --out {{out}}",
+        "tradeoff.md",
+        {"tradeoff-keyframes": "keyframes"},
+    ),
+    "tradeoff": Measurement(
+        f"{_CAVIAR} --part ladder --minutes 5 --out {{out}}",
+        f"{_CAVIAR} --part ladder --part spacing --part arrays --part convergence --minutes 13 --out {{out}}",
+        "tradeoff.md",
+        {
+            "tradeoff-ladder": "The ladder",
+            "tradeoff-spacing": "Ray spacing",
+            "tradeoff-arrays": "Elements of the arrays",
+            "tradeoff-convergence": "Convergence",
+        },
+    ),
+}
+"""What tables of the channel come from, by the name that ``measure`` takes."""
 
 _TABLE = re.compile(
     r"^(?P<indent> *)(?P<begin><!-- table: (?P<what>.*?) -->\n).*?(?P<end><!-- end -->)$",
@@ -165,6 +213,28 @@ def record(name: str, file: Path, heading: str, command: str, commit: str, machi
     save(tables)
 
 
+def measure(measurement: Measurement, full: bool) -> None:
+    """Run a command in its short or full form, and take over the tables that it wrote, as far as there are
+    any: a short form leaves some as they are."""
+    command = measurement.full if full else measurement.short
+    begun = f"{datetime.now(UTC):%Y-%m-%d}"
+    with TemporaryDirectory(prefix="caviar-figures-") as folder:
+        words = shlex.split(command.format(out=folder))
+        beside = Path(sys.executable).with_name(words[0])
+        words[0] = str(beside) if beside.exists() else words[0]
+        finished = subprocess.run(words, cwd=ROOT, check=False)  # noqa: S603
+        if finished.returncode:
+            raise FigureError(
+                f"{command!r} ended with status {finished.returncode}; its tables stay as they are"
+            )
+        written = Path(folder) / measurement.file
+        headings = [heading for heading, _, _ in markdown_tables(written.read_text(encoding="utf-8"))]
+        shown = re.sub(r" --(out|markdown) {out}\S*", "", command)
+        for name, heading in measurement.tables.items():
+            if any(heading in found for found in headings):
+                record(name, written, heading, shown, _commit(), _machine(), begun)
+
+
 def _commit() -> str:
     command = ["git", "-C", str(ROOT), "describe", "--always", "--dirty", "--abbrev=7"]
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()  # noqa: S603
@@ -182,6 +252,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Measured figures of the documentation.")
     commands = parser.add_subparsers(dest="action", required=True)
     commands.add_parser("render", help="write the figures into all pages")
+    measuring = commands.add_parser(
+        "measure", help="run the commands that tables come from, and take these over"
+    )
+    measuring.add_argument("name", nargs="*", help=f"of {', '.join(MEASUREMENTS)}; by default all")
+    measuring.add_argument("--full", action="store_true", help="the long form of each")
     recording = commands.add_parser("record", help="take a table over from Markdown that a command wrote")
     recording.add_argument("name", help="name of the table")
     recording.add_argument("file", type=Path, help="what the command wrote")
@@ -192,6 +267,9 @@ def main() -> int:
     recording.add_argument("--date", default=f"{datetime.now(UTC):%Y-%m-%d}", help="by default today")
     options = parser.parse_args()
     try:
+        if options.action == "measure":
+            for name in options.name or MEASUREMENTS:
+                measure(_known(name, MEASUREMENTS, "measurement"), options.full)
         if options.action == "record":
             where = (options.commit or _commit(), options.machine or _machine(), options.date)
             record(options.name, options.file, options.heading, options.command, *where)

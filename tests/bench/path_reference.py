@@ -176,13 +176,14 @@ class OwnLaunches:
         self._channel, self._launches = channel, launches
         self._tracer: Any = channel._tracer
         self._launcher = self._tracer._launcher
+        self._each = self._launcher.each
 
     def __call__(self, step: Any, scene: Scene) -> list[list[Path]]:
         """Paths of each receiver; ``step`` gives the product of the channel for the scene."""
         found: list[list[Path]] = [[] for _ in antennas(scene, "rx")]
         for number in range(self._launches):
             self._tracer.forget()
-            self._tracer._launcher = partial(self._launcher, number=number)
+            self._launcher.each = partial(self._each, number=number)
             more = paths_of(step(scene), scene)
             found = [united(known, new) for known, new in zip(found, more, strict=True)]
         self._tracer.forget()

@@ -119,3 +119,31 @@ def test_a_table_is_taken_over_from_what_a_command_wrote(
     }  # fmt: skip
     with pytest.raises(figures.FigureError, match="has 2 tables; name one by --heading"):
         figures.record("any", written, "", *where)
+
+
+def test_measuring_takes_over_the_tables_that_a_command_wrote_and_leaves_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(figures, "FIGURES", tmp_path / "figures.json")
+    figures.save({"other": TABLE})
+    lines = "# Head\\n\\n| a | b |\\n| --- | --- |\\n| {form} | 1 |\\n"
+    command = "python -c \"open('{out}/t.md', 'w').write('" + lines + "')\" --out {out}"
+    forms = [command.replace("{form}", form) for form in ("brief", "whole")]
+    measurement = figures.Measurement(*forms, "t.md", {"one": "Head", "other": "Elsewhere"})
+    figures.measure(measurement, full=False)
+    assert figures.load()["one"]["rows"] == [["brief", "1"]]
+    assert figures.load()["other"] == TABLE
+    figures.measure(measurement, full=True)
+    assert figures.load()["one"]["rows"] == [["whole", "1"]]
+    assert "--out" not in figures.load()["one"]["command"]
+
+
+def test_a_measurement_that_fails_leaves_the_file_as_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(figures, "FIGURES", tmp_path / "figures.json")
+    figures.save({"one": TABLE})
+    failing = figures.Measurement("python -c exit(3)", "", "t.md", {"one": ""})
+    with pytest.raises(figures.FigureError, match="ended with status 3"):
+        figures.measure(failing, full=False)
+    assert figures.load() == {"one": TABLE}

@@ -88,6 +88,9 @@ LADDER: tuple[Setting, ...] = (
     Setting(label="siso-rt 1e4 d3", use=_SIONNA, settings=_traced(10_000, 3)),
     Setting(label="siso-rt 1e5 d3", use=_SIONNA, settings=_traced(100_000, 3)),
     Setting(label="siso-rt 1e6 d3", use=_SIONNA, settings=_traced(1_000_000, 3)),
+    Setting(
+        label="siso-rt enumerated d3", use=_SIONNA, settings=_traced(1_000_000, 3, candidates="enumerated")
+    ),
     Setting(label="siso-rt 1e5 d3 +refraction", use=_SIONNA, settings=_traced(100_000, 3, refraction=True)),
     Setting(label="siso-rt 1e5 d3 +diffraction", use=_SIONNA, settings=_traced(100_000, 3, diffraction=True)),
     Setting(

@@ -76,16 +76,18 @@ class CoplanarFaces:
         moving = np.arange(self._first, len(table.normal))
         moving = moving[(table.normal[moving] != 0).any(1)]
         one, other = self._of_bodies()
+        together = self._coplanar(one, other)
+        one, other = one[together], other[together]
         body, still = self._with_scenery(moving)
+        together = self._coplanar(body, still)
+        body, still = body[together], still[together]
         triangle = self._touched(body, still)
-        kept = triangle >= 0
-        body, still, triangle = body[kept], still[kept], triangle[kept]
-        together = self._coplanar(np.append(one, body), np.append(other, still))
-        if not together.any():
+        touching = triangle >= 0
+        body, still, triangle = body[touching], still[touching], triangle[touching]
+        if not len(one) + len(body):
             return self.none
-        pairs = np.column_stack([np.append(other, still), np.append(one, body)])[together]
-        touching = together[len(one) :]
-        return self._joined(pairs, still[touching], triangle[touching])
+        pairs = np.column_stack([np.append(other, still), np.append(one, body)])
+        return self._joined(pairs, still, triangle)
 
     def _joined(self, pairs: Int64Array, still: Int64Array, triangle: Int64Array) -> JoinedFaces:
         """Surfaces of planes that are one, pair by pair, and the triangles of planes of scenery that these

@@ -7,6 +7,7 @@ which; planes that are hidden but for less than one ray meets count as hidden.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 
@@ -56,17 +57,22 @@ def visible_pairs(look: Faces, faces: FaceRectangles, rays: int, seed: int) -> I
 def seen_planes(look: Faces, points: Float64Array, planes: Int64Array, rays: int) -> BoolArray:
     """Which of some planes, in ascending order, each of some points [m], Shape ``[R, 3]``, sees, Shape
     ``[R, U]``: those that rays in all directions meet first."""
-    number = np.arange(rays) + 0.5
-    z, turn = 1 - 2 * number / rays, np.pi * (1 + math.sqrt(5.0)) * number
-    flat = np.sqrt(1 - z**2)
-    directions = np.column_stack([flat * np.cos(turn), flat * np.sin(turn), z])
     seen = np.zeros((len(points), len(planes) + 1), np.bool_)
     start = np.repeat(points, rays, axis=0)
-    behind, plane = look.nearest(start, start + np.tile(directions, (len(points), 1)))
+    behind, plane = look.nearest(start, start + np.tile(_directions(rays), (len(points), 1)))
     place = np.searchsorted(planes, plane)
     known = np.isfinite(behind) & (np.append(planes, -1)[place] == plane)
     seen[np.repeat(np.arange(len(points)), rays), np.where(known, place, len(planes))] = True
     return seen[:, :-1]
+
+
+@lru_cache(maxsize=4)
+def _directions(rays: int) -> Float64Array:
+    """Unit vectors that are spread evenly, Shape ``[N, 3]``."""
+    number = np.arange(rays) + 0.5
+    z, turn = 1 - 2 * number / rays, np.pi * (1 + math.sqrt(5.0)) * number
+    flat = np.sqrt(1 - z**2)
+    return np.column_stack([flat * np.cos(turn), flat * np.sin(turn), z])
 
 
 def _points(faces: FaceRectangles, count: int, rng: np.random.Generator) -> Float64Array:

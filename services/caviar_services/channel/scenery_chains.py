@@ -18,8 +18,8 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int32Array, Int64Array
 from caviar_services.channel.chain_cache import ChainCache, cache_key
-from caviar_services.channel.face_rectangles import ranges
-from caviar_services.channel.plane_visibility import visible_pairs
+from caviar_services.channel.chain_tree import ChainTree
+from caviar_services.channel.plane_visibility import seen_planes, visible_pairs
 from caviar_services.channel.scene_faces import SceneFaces
 from caviar_services.channel.sionna_candidates import positions
 from caviar_services.channel.sionna_chains import chains_of
@@ -33,8 +33,11 @@ _SIGHT_RAYS, _SIGHT_RAYS_PER_FRAME = 4096, 64
 _SAME_PLACE = 0.05
 """[m]; a transmitter this near has the same chains: what stands off a surface may be moved by less."""
 
-_FEW, _MOST_CHAINS = 64, 20_000
-"""Faces of scenery, and sequences of them, of which all are taken."""
+_SEEN_RAYS = 8192
+"""Of a transmitter that moves, to find the faces that may come first: 2.2° apart."""
+
+_FEW = 64
+"""Faces of scenery of which all sequences are taken."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,6 +92,7 @@ class SceneryChains:
         self._faces = SceneFaces(scene)
         self._known: list[tuple[Float64Array, KnownScenery]] = []
         self._every = self._every_chain()
+        """All chains, and which planes see one another; None: too many."""
         self._last: tuple[bytes, int, KnownScenery] | None = None
 
     def prepare(self, transmitter: Float64Array, progress: Callable[[int, int], None]) -> str:
@@ -117,23 +121,28 @@ class SceneryChains:
         for known, scenery in self._known:
             if np.abs(known - place).max() <= _SAME_PLACE:
                 return scenery
-        if self._every is not None:
-            return self._every
         last = self._last
         if last is None or last[:2] != (place.tobytes(), self._scene.version):
-            chains = self._launched(place)
-            scenery = KnownScenery(chains, self._sights(chains, _SIGHT_RAYS_PER_FRAME))
-            last = self._last = place.tobytes(), self._scene.version, scenery
+            last = self._last = place.tobytes(), self._scene.version, self._now(place)
         return last[2]
 
-    def _every_chain(self) -> KnownScenery | None:
-        """Chains that serve from everywhere; None: too many."""
+    def _now(self, place: Float64Array) -> KnownScenery:
+        """What the frame tells about the scenery from a place in the ray tracer's coordinates."""
+        if self._every is None:
+            chains = self._launched(place)
+            return KnownScenery(chains, self._sights(chains, _SIGHT_RAYS_PER_FRAME))
+        tree, sights = self._every
+        return KnownScenery(
+            tree.chains(place, seen_planes(self._look, place[None], tree.planes, _SEEN_RAYS)[0]), sights
+        )
+
+    def _every_chain(self) -> tuple[ChainTree, Int32Array] | None:
         faces = self._faces.scenery(np.arange(self._scene.first_moving_plane))
         if not 0 < len(faces) <= _FEW:
             return None
         sights = visible_pairs(self._look, faces, _SIGHT_RAYS, self._options.seed)
-        chains = sequences(faces.plane, sights, self._options.max_depth)
-        return None if chains is None else KnownScenery(chains, sights.astype(np.int32))
+        tree = ChainTree.of(faces, sights, self._options.max_depth)
+        return None if tree is None else (tree, sights.astype(np.int32))
 
     def _launched(self, place: Float64Array) -> Int32Array:
         """Chains that one launch finds from a place in the ray tracer's coordinates [m], Shape ``[3]``."""
@@ -187,24 +196,6 @@ def launched_chains(
             progress(index * launch.launches + number, parts * launch.launches)
             chains = scenery_of(launcher(source, number=number), scene, options.max_depth)
             found = united(found, chains)
-    return found
-
-
-def sequences(planes: Int64Array, sights: Int64Array, depth: int) -> Int32Array | None:
-    """All sequences of planes, Shape ``[U]``, each of which sees the next one, as in `launched_chains`; None
-    where there are more than 20,000.
-
-    ``sights`` are pairs of planes that see one another, in both orders and sorted, Shape ``[M, 2]``.
-    """
-    longer = np.unique(planes)[:, None].astype(np.int32)
-    found = np.full((0, depth), -1, np.int32)
-    for length in range(1, depth + 1):
-        if len(found) + len(longer) > _MOST_CHAINS:
-            return None
-        found = np.concatenate([found, np.pad(longer, ((0, 0), (0, depth - length)), constant_values=-1)])
-        begin, end = (np.searchsorted(sights[:, 0], longer[:, -1], side) for side in ("left", "right"))
-        before, behind = ranges(begin, end - begin)
-        longer = np.column_stack([longer[before], sights[behind, 1]]).astype(np.int32)
     return found
 
 
