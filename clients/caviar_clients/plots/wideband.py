@@ -144,8 +144,9 @@ def _draw_profile(axes: Any, data: UserPaths, frame: int) -> None:
     direct = int(delay.argmin()) if data.los[frame] else -1
     for index, (x, y) in enumerate(zip(delay, shown, strict=True)):
         color = ORANGE if index == direct else BLUE
-        axes.vlines(x, floor, y, color=color, linewidth=1.6)
-        axes.plot(x, y, "o", color=color, markersize=5)
+        above = 4 if index == direct else 3
+        axes.vlines(x, floor, y, color=color, linewidth=1.6, zorder=above)
+        axes.plot(x, y, "o", color=color, markersize=5, zorder=above)
     axes.set_ylim(floor, gain_db.max() + 3)
     spread = float(delay_spread(data.a[frame], data.tau[frame]))
     k = float(k_factor(data.a[frame], data.tau[frame], data.los[frame]))
