@@ -276,6 +276,10 @@ class ChannelArrays(UserArrays[Channel]):
     def _interactions(self, channel: Channel) -> Rows:
         return [channel.interactions[cut] for _, cut in _cuts(channel)]
 
+    def _bounds(self, channel: Channel) -> Rows:
+        stated = channel.error_bound_db
+        return [np.float64(np.nan) if stated is None else stated[t, r] for _, t, r in _pairs(channel)]
+
     def _points(self, channel: Channel) -> Rows:
         return [channel.points[cut] for _, cut in _cuts(channel)]
 
@@ -315,6 +319,9 @@ class ChannelArrays(UserArrays[Channel]):
     path_id = Column(np.uint64, "P", doc="stable id of each path in its pair", rows=_ids)
     interactions = Column(np.uint8, "P", "D", doc="`Interaction` at each point, TX to RX", rows=_interactions)
     points = Column(np.float64, "P", "D", 3, unit="m", doc="interaction points; 0 where none", rows=_points)
+    error_bound_db = Column(
+        np.float64, unit="dB", doc="stated NMSE of H; nine of ten users have no larger one", rows=_bounds
+    )
 
     @property
     def carriers(self) -> dict[str, Carrier]:
@@ -330,9 +337,14 @@ class ChannelArrays(UserArrays[Channel]):
 
     @property
     def expected_error_db(self) -> Float64Array:
-        """Stated NMSE of H against the highest rung [dB]; NaN where none is stated. Shape ``[F]``."""
+        """Stated bound on the NMSE of all H together [dB]; NaN where none is stated. Shape ``[F]``."""
         stated = (None if channel is None else channel.expected_error_db for channel in self)
         return np.array([np.nan if value is None else value for value in stated], dtype=np.float64)
+
+    @property
+    def error_reference(self) -> tuple[str, ...]:
+        """What stated errors are relative to in each frame; empty where none is stated. Length F."""
+        return tuple("" if channel is None else channel.error_reference for channel in self)
 
     def keys_of(self, payload: Channel) -> Sequence[User]:
         carriers, tx, rx = payload.carriers, payload.tx, payload.rx

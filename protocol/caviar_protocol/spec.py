@@ -48,6 +48,8 @@ SINCE: dict[str, str] = {
     "AntennaArray.pattern_file": "1.4",
     "AntennaArray.panels": "1.4",
     "Panel": "1.4",
+    "Channel.error_bound_db": "1.4",
+    "Channel.error_reference": "1.4",
 }
 """Minor version that brought a field (``Grant.reports``) or a class (``Grant``); 1.0 unless said here."""
 

@@ -138,7 +138,7 @@ def test_an_adaptive_channel_is_served_and_repeated(tmp_path: Path) -> None:
     for library in ("libsumo", "mitsuba", "sionna.rt"):
         pytest.importorskip(library, reason="needs the extras")
     changes = [
-        ('\n[[services.channel.settings.ladder]]\nlabel = "1e6"\nsettings = { samples = 1_000_000 }\n', "")
+        ('candidates = "enumerated"', 'candidates = "enumerated"\nsamples = 4_000'),
     ]
     scenario = scenario_file(tmp_path, changes, base="adaptive")
     text = scenario.read_text().replace("file:street", f"file:{SCENARIOS}/street")
@@ -151,10 +151,10 @@ def test_an_adaptive_channel_is_served_and_repeated(tmp_path: Path) -> None:
     taken = recorded_decisions(Recording(first.directory))
     assert recorded_decisions(Recording(served.directory)) == taken
     assert recorded_decisions(Recording(repeated.directory)) == taken
-    coarse = replayed(first.directory, tmp_path / "coarse", "--set", "channel.fixed=1e3", timeout=300)
+    coarse = replayed(first.directory, tmp_path / "coarse", "--set", "channel.fixed=d1", timeout=300)
     assert products(coarse.directory, "traffic") == products(first.directory, "traffic")
     rungs = recorded_decisions(Recording(coarse.directory))
-    assert {rungs["channel", 0, number]["rung"] for number in range(6)} == {"1e3"}
+    assert {rungs["channel", 0, number]["rung"] for number in range(6)} == {"d1"}
 
 
 def test_budget_predicts_the_frame_rate_of_its_own_run(smoke: Path, tmp_path: Path) -> None:

@@ -43,12 +43,25 @@ class TimedSettings(FreeSpaceSettings, frozen=True, kw_only=True):
     takes_ms: float = 1.0
     error: float = 0.0
     """Relative, of the amplitudes of odd frames; even frames are exact to a tenth of it."""
+    remembers: bool = False
+    """A scene in which nothing moved takes no time."""
+    bodies: int = 0
+    """Boxes that a scene may have."""
 
 
 class TimedRung(FreeSpaceChannel):
     """Free space, after a while, with an error."""
 
     Settings: ClassVar[type[msgspec.Struct]] = TimedSettings
+    _seen: bytes = b""
+
+    @property
+    def room(self) -> Mapping[str, int]:
+        bodies: int = getattr(self.settings, "bodies", 0)
+        return {"": bodies} if bodies else {}
+
+    def reset(self, episode: int, seed: int, t0_ns: int) -> None:
+        self._seen = b""
 
     def model(
         self,
@@ -59,7 +72,9 @@ class TimedRung(FreeSpaceChannel):
     ) -> Modelled:
         made = super().model(frame, scene, transmitters, receivers)
         settings: Any = self.settings
-        Time.now_ns += round(settings.takes_ms * Time.load * MS)
+        remembered = settings.remembers and self._seen == scene.position.tobytes()
+        self._seen = scene.position.tobytes()
+        Time.now_ns += 0 if remembered else round(settings.takes_ms * Time.load * MS)
         factor = 1 + settings.error * (1.0 if frame.number % 2 else 0.1)
         channel = made.channel
         h = tuple(msgspec.structs.replace(matrix, h=matrix.h * factor) for matrix in channel.h)

@@ -14,7 +14,7 @@ WORK = Workload(pairs=10, objects=0)
 def model(*timings_ms: float, quantile: float = 0.95) -> CostModel:
     """Rungs that took so long with 10 pairs, with a little scatter."""
     timings = [[round(t * f * MS) for f in (0.98, 1.0, 1.02)] for t in timings_ms]
-    return CostModel(timings, pairs=10, quantile=quantile)
+    return CostModel(timings, WORK, quantile=quantile)
 
 
 def in_ms(costs: CostModel, work: Workload = WORK) -> list[float]:

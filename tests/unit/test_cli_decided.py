@@ -25,6 +25,12 @@ def test_shares_changes_and_coverage_are_counted() -> None:
     ]
 
 
+def test_what_was_known_when_an_episode_began_is_no_choice() -> None:
+    decisions = Decisions()
+    decisions.add(1, [Report(source="channel", decisions={"rung": "low", "state:errors": "{}"})])
+    assert decided_lines(decisions.summary()) == ["channel: rung low 100%; 0 changes"]
+
+
 def test_a_new_episode_is_no_change() -> None:
     decisions = Decisions()
     decisions.add(0, [report("low")])

@@ -11,6 +11,9 @@ import msgspec
 from caviar_protocol.arrays import quantity
 from caviar_protocol.messages import Report
 
+STATE = "state:"
+"""Begins the name of a decision that is no choice, but what a service knew when the episode began."""
+
 
 def counted(number: int, what: str) -> str:
     """``1 frame``, ``2 frames``."""
@@ -26,8 +29,8 @@ class Decided(msgspec.Struct, kw_only=True):
     """How many had each value, the most frequent first."""
     changes: int
     """Frames whose value is not that of the frame before, in the same episode."""
-    error_checks: Annotated[int, quantity("frame", "in which a stated error was measured")]
-    error_covered: Annotated[int, quantity("frame", "of these, in which it held")]
+    error_checks: Annotated[int, quantity("1", "stated errors that were measured, of all pairs and frames")]
+    error_covered: Annotated[int, quantity("1", "of these, those that held")]
 
 
 class Decisions:
@@ -46,6 +49,8 @@ class Decisions:
                 continue
             self._counts.setdefault(report.source, Counter()).update(report.counts)
             for name, value in report.decisions.items():
+                if name.startswith(STATE):
+                    continue
                 key = report.source, name
                 self._values.setdefault(key, Counter())[value] += 1
                 before, last = self._last.get(key, (episode, value))

@@ -161,7 +161,10 @@ class Channel(Payload, frozen=True, kw_only=True, omit_defaults=True):
     options: ChannelOptions = ChannelOptions()
     """What was modelled."""
     expected_error_db: Annotated[
-        float | None, quantity("dB", "expected NMSE of H against the ladder's highest rung; absent: unknown")
+        float | None,
+        quantity(
+            "dB", "bound on the NMSE of all H together, if each pair is within its own; absent: unknown"
+        ),
     ] = None
     carriers: tuple[Carrier, ...]
     """The carriers that axis C counts."""
@@ -200,6 +203,12 @@ class Channel(Payload, frozen=True, kw_only=True, omit_defaults=True):
     taps: tuple[ChannelTaps, ...] = ()
     """One impulse response per carrier with taps and pair, likewise; empty unless part ``taps`` is in
     demand."""
+    error_bound_db: Annotated[
+        Float64Array | None,
+        array("<f8", "T", "R", unit="dB", doc="NMSE of H that nine of ten pairs are within; absent: unknown"),
+    ] = None
+    error_reference: str = ""
+    """What errors are relative to: the rung and label of the channel that counts as exact; empty: unknown."""
 
     def check(self) -> None:
         """``offsets`` cuts the path axis into one run for each pair."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import ClassVar, TypeVar
@@ -54,6 +54,9 @@ class Found:
     counts: dict[str, int] = field(default_factory=dict)
     matrices: Matrices | None = None
     """How H is made where it is not of plane waves."""
+    split_nmse: Float64Array | None = None
+    """Expected ‖H − Hₕ‖²/‖H‖² of what half of the rays would have found, Hₕ, paths added up by power, Shape
+    ``[T, R]``; absent: not asked for, or no rays were launched."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +67,8 @@ class Modelled:
     counts: dict[str, int] = field(default_factory=dict)
     measured: dict[str, int] = field(default_factory=dict)
     """Nanoseconds that named phases took."""
+    split_nmse: Float64Array | None = None
+    """See `Found.split_nmse`."""
 
 
 class ChannelModel(Service[S]):
@@ -101,6 +106,8 @@ class ChannelModel(Service[S]):
         """Whether somebody asks for the matrices."""
         self.wideband: frozenset[str] = frozenset()
         """Parts ``hf`` and ``taps`` that are in demand."""
+        self.with_split = False
+        """Whether `Modelled.split_nmse` is asked for."""
         self.patterns = Patterns()
         """Of the elements of arrays, with those of the run's pattern files."""
 
@@ -132,6 +139,12 @@ class ChannelModel(Service[S]):
         """Name of the object of the last frame that a point [m], Shape ``[3]``, is inside; empty: none that
         the model knows."""
         return ""
+
+    @property
+    def room(self) -> Mapping[str, int]:
+        """How many objects of each mesh a scene may have, by asset, ``""`` for those without one; known once
+        `load` is through. Empty: objects are no obstacles to the model."""
+        return {}
 
     def load(self, preparation: Preparation) -> tuple[str, ...]:
         """Load scenery, compile, warm up; notes for the user."""
@@ -280,6 +293,7 @@ class PathModel(ChannelModel[S]):
             channel=channel,
             counts={**self._turnover(frame, channel), **found.counts},
             measured={"paths": traced - begin, "assemble": done - traced},
+            split_nmse=found.split_nmse,
         )
 
     def _turnover(self, frame: Frame, channel: Channel) -> dict[str, int]:

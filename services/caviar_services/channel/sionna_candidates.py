@@ -99,6 +99,10 @@ class Offer:
         self._points = points
         self._scattered = met.scattered
 
+    def rays_of(self, planes: Int64Array, depth: Int64Array) -> Int64Array:
+        """See `Chains.rays_of`."""
+        return self._chains.rays_of(planes, depth)
+
     @property
     def size(self) -> int:
         """Candidates for each receiver, those that cannot be included."""

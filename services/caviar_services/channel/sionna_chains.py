@@ -10,9 +10,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
+from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array, UInt64Array
 from caviar_services.channel.sionna_launch import DIFFRACTED, REFLECTED, REFRACTED, SCATTERED, Launch
 from caviar_services.channel.sionna_scene import SionnaScene
+
+MANY_RAYS = 1000
+"""Of a chain that no half of a launch would miss."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,10 +30,35 @@ class Chains:
     """Plane at each interaction that is a reflection, −1 elsewhere, Shape ``[C, D]``."""
     straight: BoolArray
     """Whether a chain has but reflections and transmissions, Shape ``[C]``."""
+    rays: Int64Array
+    """How many rays went along each, Shape ``[C]``."""
 
     def take(self, which: BoolArray | Int64Array) -> Chains:
         """These chains."""
-        return Chains(self.ray[which], self.depth[which], self.planes[which], self.straight[which])
+        return Chains(
+            self.ray[which], self.depth[which], self.planes[which], self.straight[which], self.rays[which]
+        )
+
+    def rays_of(self, planes: Int64Array, depth: Int64Array) -> Int64Array:
+        """Rays that went along the chains of paths with these planes, Shape ``[P, D]``, and depths, Shape
+        ``[P]``; chains that differ in other things than planes count together. ``MANY_RAYS`` for a path of
+        none of these chains.
+        """
+        known, which = np.unique(_chain_keys(self.planes, self.depth), return_inverse=True)
+        if not len(known):
+            return np.full(len(depth), MANY_RAYS)
+        rays = np.bincount(which.reshape(-1), weights=self.rays).astype(np.int64)
+        keys = _chain_keys(planes, depth)
+        place = np.minimum(np.searchsorted(known, keys), len(known) - 1)
+        return np.where(known[place] == keys, rays[place], MANY_RAYS)
+
+
+def _chain_keys(planes: Int32Array | Int64Array, depth: Int64Array) -> UInt64Array:
+    """A hash of each chain: planes are too many for a key that counts all sequences of them."""
+    key = depth.astype(np.uint64)
+    for column in planes.T:
+        key = key * np.uint64(1_000_003) + (column + 2).astype(np.uint64)
+    return key
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,14 +115,16 @@ def united(parts: Sequence[Met], scene: SionnaScene) -> Met:
         np.concatenate([part.chains.depth for part in parts]),
         np.concatenate([part.chains.planes for part in parts]),
         np.concatenate([part.chains.straight for part in parts]),
+        np.concatenate([part.chains.rays for part in parts]),
     )
     signature = np.column_stack([chains.depth, _signature(launch, chains, scene)])
-    _, kept = np.unique(signature, axis=0, return_index=True)
+    _, kept, which = np.unique(signature, axis=0, return_index=True, return_inverse=True)
+    rays = np.bincount(which.reshape(-1), weights=chains.rays).astype(np.int64)
     ray = np.concatenate([part.scattered.ray + begin for part, begin in zip(parts, first, strict=True)])
     depth = np.concatenate([part.scattered.depth for part in parts])
     order = np.argsort(depth, kind="stable")
     rows = np.concatenate([part.scattered.rows for part in parts], axis=1)
-    return Met(launch, chains.take(kept), Scattered(ray[order], depth[order], rows[:, order]))
+    return Met(launch, replace(chains.take(kept), rays=rays), Scattered(ray[order], depth[order], rows[:, order]))
 
 
 def chains_of(launch: Launch, scene: SionnaScene, max_depth: int) -> Chains:
@@ -123,6 +153,8 @@ def chains_of(launch: Launch, scene: SionnaScene, max_depth: int) -> Chains:
         before = chain[first]
         planes, straight = planes[before], straight[before] & ((kind == REFLECTED) | (kind == REFRACTED))
         planes[:, d] = np.where(kind == REFLECTED, plane, -1)
+        run_lengths = np.diff(np.append(heads, len(ray)))
+        rays = np.bincount(inverse.reshape(-1), weights=run_lengths).astype(np.int64)
         chain = inverse.reshape(-1)[np.cumsum(begins) - 1]
         specular = kind != SCATTERED
         found.append(
@@ -131,6 +163,7 @@ def chains_of(launch: Launch, scene: SionnaScene, max_depth: int) -> Chains:
                 np.full(int(specular.sum()), d + 1, np.int64),
                 planes[specular],
                 straight[specular],
+                rays[specular],
             )
         )
     return Chains(
@@ -138,6 +171,7 @@ def chains_of(launch: Launch, scene: SionnaScene, max_depth: int) -> Chains:
         _stacked([part.depth for part in found], (0,)),
         np.concatenate([np.zeros((0, max_depth), np.int32), *(part.planes for part in found)]),
         np.concatenate([np.zeros(0, np.bool_), *(part.straight for part in found)]),
+        _stacked([part.rays for part in found], (0,)),
     )
 
 

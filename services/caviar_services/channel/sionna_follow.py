@@ -17,7 +17,7 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt64Array
 from caviar_services.channel.sionna_candidates import Candidates, Offer, positions
-from caviar_services.channel.sionna_chains import Chains, Met, chains_of, scattered_of
+from caviar_services.channel.sionna_chains import MANY_RAYS, Chains, Met, chains_of, scattered_of
 from caviar_services.channel.sionna_launch import (
     REFLECTED,
     REFRACTED,
@@ -217,7 +217,8 @@ class FollowedOffer(Offer):
     def __init__(self, table: _Table, scene: SionnaScene, source: Any, options: LaunchOptions) -> None:
         straight = (table.kind == 0) | (table.kind == REFLECTED) | (table.kind == REFRACTED)
         planes = _planes(table, scene).astype(np.int32)
-        chains = Chains(np.arange(len(table.depth)), table.depth, planes, straight.all(1))
+        count = len(table.depth)
+        chains = Chains(np.arange(count), table.depth, planes, straight.all(1), np.full(count, MANY_RAYS))
         nothing = Launch((), None)
         super().__init__(scene, Met(nothing, chains, scattered_of(nothing)), source, options)
         self._scene, self._table = scene, table

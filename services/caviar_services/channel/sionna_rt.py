@@ -8,7 +8,7 @@ They are one implementation with one scene and one set of options, so a rung is 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import ClassVar
 
@@ -93,8 +93,11 @@ class SionnaChannel(PathModel[SionnaSettings]):
         self._following: Following | None = None
         self._outside: tuple[OutsideUse, ...] = ()
         self._detail = ""
+        self._room: dict[str, int] = {}
         self._names: tuple[str, ...] = ()
         """Of the pieces of the scene in the last frame."""
+        self._missed = np.zeros((0, 0))
+        """Power that half of the rays would have missed in the last frame, Shape ``[T, R]``."""
         seed = settings.launch_seed
         self._asked = LaunchOptions(
             max_depth=settings.max_depth,
@@ -128,6 +131,10 @@ class SionnaChannel(PathModel[SionnaSettings]):
     def extent(self) -> tuple[Float64Array, Float64Array] | None:
         return (self._scene.low, self._scene.high) if self._scene.has_scenery else None
 
+    @property
+    def room(self) -> Mapping[str, int]:
+        return self._room
+
     def enclosing(self, position: Float64Array) -> str:
         """See `ChannelModel.enclosing`; an antenna at a surface is on the side that it is traced from."""
         piece = self._scene.enclosing(self._scene.surfaces.cleared(position))
@@ -152,9 +159,10 @@ class SionnaChannel(PathModel[SionnaSettings]):
         notes = self._start()
         self.run.progress("loading the scene", _COMPILE_GRACE_S)
         frequencies = tuple(carrier.frequency_hz for carrier in self.run.carriers)
+        self._room = s.pool_sizes(preparation.assets, self.run.name)
         self._scene = scene_of(
             preparation.assets,
-            s.pool_sizes(preparation.assets, self.run.name),
+            self._room,
             SceneSettings(
                 frequencies_hz=frequencies,
                 body_material=s.body_material,
@@ -167,6 +175,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
                 detail=s.detail,
             ),
         )
+        self._names = self._scene.names
         self._outside = self._scene.outside
         notes += tuple(use.note(self.run.carriers[use.carrier].name) for use in self._outside)
         if self._scene.detail_effect is not None:
@@ -258,6 +267,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         else:
             names, velocity = self._scene.place(scene, frozenset(self.settings.without_body))
         self._names = names
+        self._missed = np.zeros((len(transmitters), len(receivers)))
         clear = [self._cleared(antenna) for antenna in (*transmitters, *receivers)]
         sources, targets = clear[: len(transmitters)], clear[len(transmitters) :]
         self._without_edge = 0
@@ -282,7 +292,20 @@ class SionnaChannel(PathModel[SionnaSettings]):
                 **({} if self._edge_range is None else {"no_edge_in_range": self._without_edge}),
             },
             matrices=self._matrices([part for _, part in parts], table, (sources, targets)),
+            split_nmse=self._split_nmse(parts),
         )
+
+    def _split_nmse(self, parts: Sequence[tuple[Int64Array, Traced]]) -> Float64Array | None:
+        """See `Found.split_nmse`; antennas count as isotropic."""
+        if not (self.with_split and self._launches):
+            return None
+        power = np.zeros(self._missed.size)
+        for pair, traced in parts:
+            power += _power(pair, traced, self._missed.size)
+        split: Float64Array = self._missed / np.maximum(power, np.finfo(np.float64).tiny).reshape(
+            self._missed.shape
+        )
+        return split
 
     def _activate(self) -> None:
         """The variant of Mitsuba is the process's, and others may have set theirs."""
@@ -344,6 +367,9 @@ class SionnaChannel(PathModel[SionnaSettings]):
                 transmitter.position, targets, s.receivers_at_once, followed, names, corners=corners
             )
             found.append(launched if not found else unknown_paths(launched, found[0], self._scene))
+            if self.with_split:
+                missed = tracer.missed_by_half(transmitter.position, found[-1])
+                self._missed[t, others] = _power(found[-1].receiver, found[-1], len(others), missed)
         if self._diffuse is not None:
             element = Element(transmitter)
             found.append(
@@ -423,6 +449,12 @@ class SionnaChannel(PathModel[SionnaSettings]):
         )
         self.run.progress("kernels compiled", 0.0)
         return (f"kernels compiled in {time.monotonic() - begin:.1f} s",)
+
+
+def _power(where: Int64Array, traced: Traced, count: int, weight: Float64Array | float = 1.0) -> Float64Array:
+    """Weighted power of the paths that arrive at each of ``count`` places, with isotropic antennas."""
+    power = (np.abs(traced.transfer) ** 2).sum((0, 2, 3))
+    return np.bincount(where, weights=weight * power, minlength=count).astype(np.float64)
 
 
 def _refuse_buried(scene: Scene, without_body: Sequence[str]) -> None:

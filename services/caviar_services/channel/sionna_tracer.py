@@ -21,7 +21,7 @@ from caviar_protocol.arrays import (
 )
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.sionna_candidates import Candidates, Offer, Planes, positions
-from caviar_services.channel.sionna_chains import Met, met_by, united
+from caviar_services.channel.sionna_chains import MANY_RAYS, Met, met_by, united
 from caviar_services.channel.sionna_follow import Followed, FollowedOffer, TableState
 from caviar_services.channel.sionna_launch import SCATTERED, Launch, LaunchOptions, PartedLauncher
 from caviar_services.channel.sionna_reach import Corners, Faces, at_corners, reflected
@@ -113,6 +113,26 @@ class Tracer:
         for position, state in offers:
             offer = FollowedOffer.again(state, np.frombuffer(position), self._scene, self._options)
             self._last[position] = _Last(self._scene.version, offer, np.zeros((0, 3)), self.nothing)
+
+    def missed_by_half(self, transmitter: Float64Array, traced: Traced) -> Float64Array:
+        """Probability that half of the rays would not have found a path, Shape ``[P]``.
+
+        A path whose chain n rays went along is missing from one half, over all ways to halve the launch, with
+        probability 2⁻ⁿ. So the power of paths times this is the expected error of half of the rays against
+        all of them: what a launch in two halves would show, without a second one. Straight and diffuse paths
+        have 0. ``traced`` is what the last `trace` from ``transmitter`` returned.
+        """
+        last = self._last.get((transmitter - self._scene.centre).tobytes())
+        depth = (traced.types != 0).sum(1)
+        if last is None:
+            return np.zeros(len(depth))
+        triangles = self._scene.triangle_numbers(traced.shapes, traced.primitives)
+        reflected = traced.types == Interaction.REFLECTION
+        planes = np.where(reflected, self._scene.plane_of[triangles], -1)
+        rays = last.offer.rays_of(planes, depth)
+        rays[(depth == 0) | (traced.types == Interaction.SCATTERING).any(1)] = MANY_RAYS
+        missed: Float64Array = np.ldexp(1.0, -rays)
+        return missed
 
     @property
     def look(self) -> Look:

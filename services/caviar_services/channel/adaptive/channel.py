@@ -2,26 +2,30 @@
 
 Every rung is a channel model of its own, loaded and compiled before the first frame. Which one computed
 a frame is a decision in DONE, which a replay imposes: durations differ from run to run, products then do not.
-With ``calibrate_every`` some frames are computed by the highest rung, too, beyond the budget; from its
-matrices follows what error each rung is expected to have, which stands in its products.
+With ``calibrate_every`` some frames are computed by the reference, too, beyond the budget; from its matrices
+follows a bound on the error of each pair (`error_bounds`), which stands in the products of the other frames.
+What is known of errors where an episode begins is a decision of its first frame, so that a replay of it, or a
+process that takes over, states the same.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar
 
 import msgspec
+import numpy as np
 from msgspec.structs import replace
 
+from caviar_protocol.coordinates import Vector
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.scene import antennas
 from caviar_protocol.tables import Place
-from caviar_protocol.topics import AntennaDevice, Channel, Scene
+from caviar_protocol.topics import AntennaDevice, Scene
+from caviar_services.channel.adaptive.calibration import Calibration, CalibrationState
 from caviar_services.channel.adaptive.controller import Choice, Controller, ControllerState
 from caviar_services.channel.adaptive.cost_model import CostModel, CostState, Workload
-from caviar_services.channel.adaptive.errors_stated import ErrorState, StatedError, nmse_db
 from caviar_services.channel.adaptive.rehearsal import rehearsal_scene
 from caviar_services.channel.adaptive.settings import AdaptiveSettings, Rung, built, models, rung_of
 from caviar_services.channel.base import Modelled
@@ -44,11 +48,11 @@ Devices = tuple[Sequence[AntennaDevice], Sequence[AntennaDevice]]
 
 class _State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     costs: CostState
-    errors: tuple[ErrorState, ...]
+    errors: CalibrationState
     controller: ControllerState
     current: int | None
     rungs: tuple[bytes, ...]
-    """State of each rung's model; empty where it has none."""
+    """State of the model of each rung and of the reference; empty where it has none."""
 
 
 class AdaptiveChannel(Service[AdaptiveSettings]):
@@ -70,8 +74,12 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
 
     def __init__(self, settings: AdaptiveSettings, run: RunInfo) -> None:
         super().__init__(settings, run)
-        self.rungs: tuple[Rung, ...] = built(settings, run)
-        self.errors = [StatedError(rung.expected_error_db) for rung in self.rungs]
+        self._every: tuple[Rung, ...] = built(settings, run)
+        self.rungs = self._every[: len(settings.ladder)]
+        """The ladder, without a reference that is none of its rungs."""
+        self.calibration = Calibration(self._every, settings.calibrate_every)
+        for rung in self._every:
+            rung.model.with_split = bool(settings.calibrate_every)
         self.costs: CostModel
         """Known once the service is prepared."""
         self._controller = Controller(settings.share, settings.margin, settings.patience)
@@ -84,46 +92,78 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
         self._with_h = "h" in preparation.demand.get("channel", frozenset())
         notes: list[str] = []
         with shared_scenes():
-            for rung in self.rungs:
+            for rung in self._every:
                 told = rung.model.prepare(preparation).notes
                 notes += [note for note in told if note not in notes]
         notes += self._time_rungs()
         return Prepared(notes=tuple(notes))
 
     def _time_rungs(self) -> list[str]:
-        """Try every rung on the scenario's antennas, and begin to predict from how long it took."""
-        scene = rehearsal_scene(self.run.devices)
-        devices = antennas(scene, "tx"), antennas(scene, "rx")
-        frame = Frame(episode=0, number=0, t_ns=0, service=self.run.name, seed=self.run.seed)
+        """Try every rung on the scenario's antennas in traffic, and begin to predict from how long it took.
+
+        Bodies drive, and each time a rung forgets what it traced before, as it would have to in a run.
+        """
+        room = self._room()
+        scenes = [
+            rehearsal_scene(self.run.devices, room, self._ground_m(), self._is_free, step)
+            for step in range(TIMINGS + 1)
+        ]
         timings = []
-        for rung in self.rungs:
+        for rung in self._every:
             self.run.progress(f"timing rung {rung.label}", _TIMING_GRACE_S)
-            runs = [self._modelled(rung, frame, scene, devices)[1] for _ in range(TIMINGS + 1)]
-            timings.append(runs[1:])
+            timings.append([self._timed(rung, number, scene) for number, scene in enumerate(scenes)][1:])
             rung.model.reset(0, self.run.seed, 0)
-        pairs = len(devices[0]) * len(devices[1])
-        self.costs = CostModel(timings, pairs, self.settings.quantile)
+        timings = timings[: len(self.rungs)]
+        work = _workload(scenes[0])
+        self.costs = CostModel(timings, work, self.settings.quantile)
         self.run.progress("rungs timed", 0.0)
         return [
-            f"rung {rung.label}: {sorted(taken)[len(taken) // 2] / 1e6:.1f} ms for {pairs} pairs"
+            f"rung {rung.label}: {sorted(taken)[len(taken) // 2] / 1e6:.1f} ms for {work.pairs} pairs among "
+            f"{work.objects} objects"
             for rung, taken in zip(self.rungs, timings, strict=True)
         ]
+
+    def _timed(self, rung: Rung, number: int, scene: Scene) -> int:
+        """How long a rung takes for a scene that it has not seen [ns]."""
+        rung.model.reset(0, self.run.seed, 0)
+        frame = Frame(episode=0, number=number, t_ns=0, service=self.run.name, seed=self.run.seed)
+        return self._modelled(rung, frame, scene, (antennas(scene, "tx"), antennas(scene, "rx")))[1]
+
+    def _room(self) -> Mapping[str, int]:
+        """Objects of each mesh that every model has room for."""
+        rooms = [rung.model.room for rung in self._every if rung.model.room]
+        shared = set.intersection(*map(set, rooms)) if rooms else set()
+        return {asset: min(room[asset] for room in rooms) for asset in sorted(shared)}
+
+    def _ground_m(self) -> float:
+        """Height of the lowest point of the scenery [m]."""
+        extents = [rung.model.extent for rung in self._every]
+        return min((float(extent[0][2]) for extent in extents if extent is not None), default=0.0)
+
+    def _is_free(self, place: Vector) -> bool:
+        """Whether a point is in the open."""
+        model = self._every[-1].model
+        if model.extent is not None:
+            low, high = model.extent
+            if not (low[:2] < place[:2]).all() or not (place[:2] < high[:2]).all():
+                return False
+        return not model.enclosing(np.array(place))
 
     # --- frames ------------------------------------------------------------------------------------
 
     def reset(self, episode: int, seed: int, t0_ns: int) -> None:
-        """Forget errors and rung, but not how fast this machine is."""
-        for rung in self.rungs:
+        """Forget the rung, but not how fast this machine is, nor what errors were in the episode before."""
+        for rung in self._every:
             rung.model.reset(episode, seed, t0_ns)
-        for error in self.errors:
-            error.reset()
+        self.calibration.reset(episode)
         self._controller.reset()
         self._current = None
 
     def step(self, frame: Frame) -> StepResult:
         scene = frame.scene()
         devices = antennas(scene, "tx"), antennas(scene, "rx")
-        work = Workload(pairs=len(devices[0]) * len(devices[1]), objects=len(scene.names))
+        known = self.calibration.begin(frame.imposed)
+        work = _workload(scene)
         predicted = self.costs.predict(work)
         choice = self._choice(frame, predicted)
         rung = self.rungs[choice.rung]
@@ -132,20 +172,21 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
             "no-rung-fits": int(not choice.fits),
         }
         self._current = choice.rung
-        stated = self.errors[choice.rung].stated_db
-        calibrates = self._calibrates(frame)
+        calibrates = self.calibration.is_due(frame.number)
         made, taken = self._modelled(rung, frame, scene, devices, with_h=calibrates)
         self._observe(choice.rung, work, taken, calibrates)
         measured = {**made.measured, "rung": taken, "rung-predicted": round(predicted[choice.rung])}
+        channel = self.calibration.stated(choice.rung, frame.number, made)
         if calibrates:
             began = self.clock()
-            counts |= self._calibrate(choice.rung, made.channel, frame, scene, devices)
+            counts |= self._calibrate(choice.rung, made, frame, scene, devices)
             measured["calibrate"] = self.clock() - began
-        channel = replace(made.channel, expected_error_db=stated, h=made.channel.h if self._with_h else ())
+        stated = channel.expected_error_db
+        channel = replace(channel, h=channel.h if self._with_h else ())
         return StepResult(
             products={"channel": channel},
             fidelity=f"{channel.rung} {rung.label}" + ("" if stated is None else f", NMSE ≤ {stated:.1f} dB"),
-            decisions={DECISION: rung.label},
+            decisions={DECISION: rung.label, **known},
             counts={
                 "paths": len(channel.tau),
                 "dropped": channel.dropped,
@@ -168,10 +209,6 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
         self._controller.impose(rung)
         return Choice(rung=rung, fits=True)
 
-    def _calibrates(self, frame: Frame) -> bool:
-        every = self.settings.calibrate_every
-        return bool(every) and frame.number % every == 0 and len(self.rungs) > 1
-
     def _modelled(
         self, rung: Rung, frame: Frame, scene: Scene, devices: Devices, *, with_h: bool = False
     ) -> tuple[Modelled, int]:
@@ -190,19 +227,19 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
             self.costs.observe(rung, work, taken)
 
     def _calibrate(
-        self, chosen: int, channel: Channel, frame: Frame, scene: Scene, devices: Devices
+        self, chosen: int, made: Modelled, frame: Frame, scene: Scene, devices: Devices
     ) -> dict[str, int]:
-        """Measure the error of the chosen rung; where that is the highest, of the one least known."""
-        highest = len(self.rungs) - 1
-        checked = chosen
-        if chosen == highest:
-            checked = min(range(highest), key=lambda rung: self.errors[rung].measured)
-        other = self.rungs[checked if chosen == highest else highest]
-        second = self._modelled(other, frame, scene, devices, with_h=True)[0].channel
-        mine, true = (second, channel) if chosen == highest else (channel, second)
-        error = nmse_db(mine, true)
-        held = None if error is None else self.errors[checked].check(error)
-        return {} if held is None else {"error-checks": 1, "error-covered": int(held)}
+        """Have another rung compute the frame too, and measure the errors of the less accurate one."""
+        partner = self.calibration.partner(chosen)
+        model = self._every[partner].model
+        demanded, model.wideband = model.wideband, frozenset()
+        try:
+            other = self._modelled(self._every[partner], frame, scene, devices, with_h=True)[0]
+        finally:
+            model.wideband = demanded
+        if partner == self.calibration.reference:
+            return self.calibration.check(chosen, frame.number, made, other.channel)
+        return self.calibration.check(partner, frame.number, other, made.channel)
 
     def checkpoint(self) -> bytes:
         """What is known of costs and errors, the rung, and what the rungs follow.
@@ -211,21 +248,20 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
         """
         state = _State(
             costs=self.costs.state,
-            errors=tuple(error.state for error in self.errors),
+            errors=self.calibration.state,
             controller=self._controller.state,
             current=self._current,
-            rungs=tuple(rung.model.checkpoint() if rung.model.checkpoints else b"" for rung in self.rungs),
+            rungs=tuple(rung.model.checkpoint() if rung.model.checkpoints else b"" for rung in self._every),
         )
-        return saved(self, 1, state)
+        return saved(self, 2, state)
 
     def restore(self, state: bytes) -> None:
         """See `checkpoint`."""
-        was = restored(self, 1, _State, state)
-        for error, known in zip(self.errors, was.errors, strict=True):
-            error.go_on(known)
-        for rung, model_state in zip(self.rungs, was.rungs, strict=True):
+        was = restored(self, 2, _State, state)
+        for rung, model_state in zip(self._every, was.rungs, strict=True):
             if rung.model.checkpoints:
                 rung.model.restore(model_state)
+        self.calibration.go_on(was.errors)
         self.costs.go_on(was.costs)
         self._controller.go_on(was.controller)
         self._current = was.current
@@ -233,13 +269,18 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
     # --- the rest of its life ------------------------------------------------------------------------
 
     def release_memory(self) -> None:
-        for rung in self.rungs:
+        for rung in self._every:
             rung.model.release_memory()
 
     def end_episode(self, frames: int) -> None:
-        for rung in self.rungs:
+        for rung in self._every:
             rung.model.end_episode(frames)
 
     def close(self) -> None:
-        for rung in self.rungs:
+        for rung in self._every:
             rung.model.close()
+
+
+def _workload(scene: Scene) -> Workload:
+    pairs = len(antennas(scene, "tx")) * len(antennas(scene, "rx"))
+    return Workload(pairs=pairs, objects=len(scene.names))

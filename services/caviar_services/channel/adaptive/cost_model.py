@@ -1,11 +1,12 @@
 """How long a frame takes on each rung: learned while running, from durations that others measured.
 
-    log duration = log timing + load + bias + α · log(pairs / pairs₀) + β · log(1 + objects / 10) + scatter
+    log duration = log timing + load + bias
+                   + α · log(pairs / pairs₀) + β · log((10 + objects) / (10 + objects₀)) + scatter
 
-``timing`` is what a rung took before the first frame with pairs₀; its ``bias``, α and β are learned. ``load``
-is common to all rungs, since what slows one of them slows its neighbours: so a rung that does not run is
-still judged by how busy the machine is now. Recursive least squares (a Kalman filter: Kalman, "A New
-Approach to Linear Filtering and Prediction Problems", 1960) tells these apart: load wanders from frame
+``timing`` is what a rung took before the first frame with pairs₀ and objects₀; its ``bias``, α and β are
+learned. ``load`` is common to all rungs, since what slows one of them slows its neighbours: so a rung that
+does not run is still judged by how busy the machine is now. Recursive least squares (a Kalman filter: Kalman,
+"A New Approach to Linear Filtering and Prediction Problems", 1960) tells these apart: load wanders from frame
 to frame, and what changes with the rung is the rung's. What a rung has learned goes back towards its
 prior in time, so that one that was slow once is tried again.
 
@@ -78,6 +79,7 @@ class CostState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
     timing: Packed
     pairs: int
+    objects: int
     mean: Packed
     covariance: Packed
     side: int
@@ -96,15 +98,15 @@ class CostModel:
     ----------
     timings_ns
         What each rung took before the first frame [ns], a few times each.
-    pairs
-        TX/RX pairs of those timings.
+    work
+        What those timings are of.
     quantile
         That predictions state, in (0, 1).
     """
 
-    def __init__(self, timings_ns: Sequence[Sequence[int]], pairs: int, quantile: float) -> None:
+    def __init__(self, timings_ns: Sequence[Sequence[int]], work: Workload, quantile: float) -> None:
         self._timing = np.log([max(float(np.median(timings)), 1.0) for timings in timings_ns])
-        self._pairs, self._quantile, count = pairs, quantile, len(timings_ns)
+        self._timed, self._quantile, count = work, quantile, len(timings_ns)
         self._prior = np.concatenate([[0.0], np.tile(_PRIOR, count)])
         self._mean = self._prior.copy()
         deviation = np.tile(_PRIOR_DEVIATION, count)
@@ -127,7 +129,7 @@ class CostModel:
 
     def _assume(self, timings_ns: Sequence[Sequence[int]]) -> None:
         """Frames as those timings, with the scatter that frames are assumed to have."""
-        rows = [self._row(rung, Workload(pairs=self._pairs, objects=0)) for rung in range(len(timings_ns))]
+        rows = [self._row(rung, self._timed) for rung in range(len(timings_ns))]
         timed = [
             (rung, math.log(max(duration, 1)) - float(self._timing[rung]))
             for rung, timings in enumerate(timings_ns)
@@ -147,7 +149,8 @@ class CostModel:
         """All that was learned, and what it is relative to."""
         return CostState(
             timing=Packed.of(self._timing, "<f8"),
-            pairs=self._pairs,
+            pairs=self._timed.pairs,
+            objects=self._timed.objects,
             mean=Packed.of(self._mean, "<f8"),
             covariance=Packed.of(self._covariance, "<f8"),
             side=self._side,
@@ -165,7 +168,8 @@ class CostModel:
         Its timings come with what it learned, which is relative to them; how this machine differs from
         the other's is learned as a change of load.
         """
-        self._timing, self._pairs = state.timing.array(np.float64), state.pairs
+        self._timing = state.timing.array(np.float64)
+        self._timed = Workload(pairs=state.pairs, objects=state.objects)
         self._mean, self._covariance = state.mean.array(np.float64), state.covariance.array(np.float64)
         self._side, self._changed, self._rung = state.side, state.changed, state.rung
         self._raised = state.raised
@@ -230,8 +234,8 @@ class CostModel:
         row[0] = 1.0
         row[1 + 3 * rung : 4 + 3 * rung] = (
             1.0,
-            math.log((1 + work.pairs) / (1 + self._pairs)),
-            math.log1p(work.objects / OBJECTS),
+            math.log((1 + work.pairs) / (1 + self._timed.pairs)),
+            math.log((OBJECTS + work.objects) / (OBJECTS + self._timed.objects)),
         )
         return row
 

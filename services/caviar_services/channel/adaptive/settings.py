@@ -28,7 +28,8 @@ class LadderRung(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     settings: dict[str, Any] = msgspec.field(default_factory=dict)
     """Its own, beside and before those in ``common``."""
     expected_error_db: (
-        Annotated[float, quantity("dB", "NMSE of H against the highest rung, until it is measured")] | None
+        Annotated[float, quantity("dB", "NMSE of a pair's H against the reference, until it is measured")]
+        | None
     ) = None
 
 
@@ -51,8 +52,11 @@ class AdaptiveSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     patience: Annotated[int, quantity("frame", "that must have it in a row", ge=1)] = 10
     calibrate_every: Annotated[
         int,
-        quantity("frame", "from one that the highest rung computes too to the next; 0: none", ge=0),
+        quantity("frame", "from one that the reference computes too to the next; 0: none", ge=0),
     ] = 0
+    reference: LadderRung | None = None
+    """The channel that counts as exact where errors are measured: more accurate than any rung, and too slow
+    to be one. Absent: the highest rung."""
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -70,21 +74,31 @@ class Rung:
 
 
 def built(settings: AdaptiveSettings, run: RunInfo) -> tuple[Rung, ...]:
-    """The ladder of a scenario. Raises `ScenarioError` naming the key for whatever cannot be."""
+    """The ladder of a scenario, and behind it the reference where that is no rung. Raises `ScenarioError`
+    naming the key for whatever cannot be."""
     place = Place("services").at(run.name).at("settings")
     return tuple(
         Rung(label=rung.label, model=cls(own, run), expected_error_db=rung.expected_error_db)
-        for rung, (cls, own) in zip(settings.ladder, models(settings, place), strict=True)
+        for rung, (cls, own) in zip(_every(settings), models(settings, place), strict=True)
     )
 
 
+def _every(settings: AdaptiveSettings) -> tuple[LadderRung, ...]:
+    """The rungs, and the reference where it is none."""
+    return settings.ladder if settings.reference is None else (*settings.ladder, settings.reference)
+
+
 def models(settings: AdaptiveSettings, place: Place) -> list[tuple[type[ChannelModel[Any]], Any]]:
-    """The channel model of each rung, with its settings. Errors as those of `built`.
+    """The channel model of each rung, and of a reference that is none, with its settings. Errors as those of
+    `built`.
 
     ``place`` is where ``settings`` stand.
     """
     _check(settings, place)
-    found = [_model(rung.use, place.at("ladder").at(index)) for index, rung in enumerate(settings.ladder)]
+    every = _every(settings)
+    places = [place.at("ladder").at(index) for index in range(len(settings.ladder))]
+    places += [place.at("reference")] * (len(every) - len(places))
+    found = [_model(rung.use, where) for rung, where in zip(every, places, strict=True)]
     known = [frozenset(cls.Settings.__struct_fields__) for cls in found]
     for name in settings.common:
         if not any(name in fields for fields in known):
@@ -95,9 +109,9 @@ def models(settings: AdaptiveSettings, place: Place) -> list[tuple[type[ChannelM
                 .error(f"no rung has a setting {name!r}; {suggestion(name, everything)}")
             )
     made: list[tuple[type[ChannelModel[Any]], Any]] = []
-    for index, (rung, cls, fields) in enumerate(zip(settings.ladder, found, known, strict=True)):
+    for rung, at, cls, fields in zip(every, places, found, known, strict=True):
         shared = {n: v for n, v in settings.common.items() if n in fields and n not in rung.settings}
-        where = place.at("ladder").at(index).at("settings")
+        where = at.at("settings")
         try:
             own = convert_settings(cls.Settings, {**shared, **rung.settings}, where)
         except ScenarioError as error:
@@ -138,7 +152,7 @@ def _check(settings: AdaptiveSettings, place: Place) -> None:
     ladder = place.at("ladder")
     if not settings.ladder:
         raise ladder.error(f"has no rung; write [[{ladder.key}]] with label, use and settings for each")
-    for label, count in Counter(settings.labels).items():
+    for label, count in Counter(rung.label for rung in _every(settings)).items():
         if count > 1:
             raise ladder.error(f"has {count} rungs with the label {label!r}; give each its own")
     if settings.fixed and settings.fixed not in settings.labels:
