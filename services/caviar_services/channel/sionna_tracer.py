@@ -124,11 +124,11 @@ class Tracer:
         """
         last = self._last.get((transmitter - self._scene.centre).tobytes())
         depth = (traced.types != 0).sum(1)
-        if last is None:
+        if last is None or last.version != self._scene.version:
             return np.zeros(len(depth))
         triangles = self._scene.triangle_numbers(traced.shapes, traced.primitives)
         reflected = traced.types == Interaction.REFLECTION
-        planes = np.where(reflected, self._scene.plane_of[triangles], -1)
+        planes = np.where(reflected, self._scene.surface_of[triangles], -1)
         rays = last.offer.rays_of(planes, depth)
         rays[(depth == 0) | (traced.types == Interaction.SCATTERING).any(1)] = MANY_RAYS
         missed: Float64Array = np.ldexp(1.0, -rays)
