@@ -320,7 +320,10 @@ class ChannelArrays(UserArrays[Channel]):
     interactions = Column(np.uint8, "P", "D", doc="`Interaction` at each point, TX to RX", rows=_interactions)
     points = Column(np.float64, "P", "D", 3, unit="m", doc="interaction points; 0 where none", rows=_points)
     error_bound_db = Column(
-        np.float64, unit="dB", doc="stated NMSE of H that nine of ten users are within; NaN where none is", rows=_bounds
+        np.float64,
+        unit="dB",
+        doc="stated NMSE of H that nine of ten users are within; NaN where none is",
+        rows=_bounds,
     )
 
     @property

@@ -227,7 +227,7 @@ def table(rows: Rows, every: int) -> str:
     lines = ["| " + " | ".join(HEAD) + " |", "| --- |" + " ---: |" * (len(HEAD) - 1)]
     for name in dict.fromkeys(rows["rung"].tolist()):
         of_rung = rows[rows["rung"] == name]
-        cells = [f"{len(of_rung):,}", f"{np.median(of_rung['error']):.1f}"]
+        cells = [f"{len(of_rung):,}", f"{np.median(of_rung['error']):.1f}".replace("-", "−")]
         lines.append("| " + " | ".join([f"`{name}`", *cells, *judged(of_rung, every).described()]) + " |")
     return "\n".join(lines)
 

@@ -49,9 +49,11 @@ _MOST_AT_ONCE = 50
 
 _ASSUMED_DB = (3.0, 6.0)
 """Errors that count as measured before the first check: twice as much power as there is, and four times."""
+_ASSUMED_ABOVE_DB = (0.0, 3.0)
+"""Behind it: that much above the largest one that was measured, where this is less."""
 _ASSUMED_UNTIL = 10
 """Measured errors up to which each of the assumed ones weighs as much as one of them; of n its weight is
-(10/n)², so that bounds are wide in the first frames alone."""
+(10/n)³, so that bounds are wide in the first frames alone."""
 
 _WIDTH_DB = 8.0
 """Distance of scores, or of last errors, at which a measured error weighs exp(−1/2)."""
@@ -180,11 +182,14 @@ class ErrorBound:
         weight = np.exp(-(distance + np.where(known, apart, _UNKNOWN)) / 2) + _LEAST_WEIGHT
         if count:
             weight *= count / weight.sum(1, keepdims=True)
-        weight_assumed = (_ASSUMED_UNTIL / max(count, _ASSUMED_UNTIL)) ** 2
-        assumed = np.full((len(pairs), len(self._assumed)), weight_assumed)
-        every = np.concatenate([values[:, 2], self._assumed])
+        assumed = self._assumed
+        if count:
+            assumed = np.minimum(_ASSUMED_DB, values[:, 2].max() + np.array(_ASSUMED_ABOVE_DB))
+        of_assumed = (_ASSUMED_UNTIL / max(count, _ASSUMED_UNTIL)) ** 3
+        weight = np.pad(weight, ((0, 0), (0, len(assumed))), constant_values=of_assumed)
+        every = np.concatenate([values[:, 2], assumed])
         order = np.argsort(every, kind="stable")
-        share = np.cumsum(np.concatenate([weight, assumed], axis=1)[:, order], axis=1)
+        share = np.cumsum(weight[:, order], axis=1)
         below = share < (self._level - 1e-9) * share[:, -1:]
         bound = every[order][np.minimum(below.sum(1), len(every) - 1)]
         bound = bound + max(self._level - 1.0, 0.0) * _BEYOND_DB
