@@ -124,7 +124,9 @@ def united(parts: Sequence[Met], scene: SionnaScene) -> Met:
     depth = np.concatenate([part.scattered.depth for part in parts])
     order = np.argsort(depth, kind="stable")
     rows = np.concatenate([part.scattered.rows for part in parts], axis=1)
-    return Met(launch, replace(chains.take(kept), rays=rays), Scattered(ray[order], depth[order], rows[:, order]))
+    return Met(
+        launch, replace(chains.take(kept), rays=rays), Scattered(ray[order], depth[order], rows[:, order])
+    )
 
 
 def chains_of(launch: Launch, scene: SionnaScene, max_depth: int) -> Chains:
