@@ -14,8 +14,8 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int64Array
 from caviar_protocol.coordinates import SPEED_OF_LIGHT
+from caviar_services.channel.object_materials import Constants
 from caviar_services.channel.sionna_launch import LaunchOptions
-from caviar_services.channel.sionna_materials import Constants
 from caviar_services.meshes import Mesh
 
 _EPSILON_0 = 8.8541878128e-12

@@ -34,11 +34,12 @@ def loaded(description: Path | None) -> Any:
     return scene
 
 
-def by_material(scene: Any, meshes: Mapping[str, Mesh]) -> list[Shape]:
-    """What was loaded, joined to one shape a material."""
+def by_material(scene: Any, meshes: Mapping[str, Mesh], changed: Mapping[str, Any]) -> list[Shape]:
+    """What was loaded, joined to one shape a material; ``changed`` has the materials of pieces that are given
+    another one than the scenery's."""
     groups: dict[str, Shape] = {}
     for name, item in scene.objects.items():
-        material = item.radio_material
+        material = changed.get(name, item.radio_material)
         group = groups.setdefault(material.name, Shape(f"caviar-scenery-{material.name}", material, [], []))
         group.names.append(name)
         group.meshes.append(meshes[name])

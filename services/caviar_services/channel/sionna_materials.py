@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -10,13 +10,18 @@ from typing import Any, Literal
 import msgspec
 
 from caviar_protocol.errors import ScenarioError
+from caviar_protocol.tables import Place, suggestion
+from caviar_services.channel.object_materials import OTHER_MATERIALS, Constants, ObjectMaterials
+
+OBJECT_MATERIAL = "caviar-object-"
+"""What the ray tracer's names of materials begin with that objects are given."""
+
+_BODY_THICKNESS = 0.1
+"""[m]; of walls of bodies, where a scenario does not say."""
 
 OutsideRange = Literal["error", "nearest", "extrapolate"]
 """Where a carrier lies in none of the ranges that ITU-R P.2040 defines a material in: refuse it; take the
 constants of the nearest end of a range; or follow the power law of that range beyond its end."""
-
-Constants = tuple[float, float]
-"""Relative permittivity and conductivity [S/m]."""
 
 
 class MaterialSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -71,6 +76,11 @@ class ItuMaterial:
     constants: Constants
 
     @property
+    def label(self) -> str:
+        """Name of the material, with ITU where the Recommendation has it."""
+        return self.itu_type if self.itu_type in OTHER_MATERIALS else f"ITU {self.itu_type}"
+
+    @property
     def is_outside(self) -> bool:
         """Whether the frequency lies outside all ranges."""
         return not self.taken_ghz[0] <= self.frequency_hz / 1e9 <= self.taken_ghz[1]
@@ -103,7 +113,7 @@ class OutsideUse:
         """For the user, with the constants."""
         permittivity, conductivity = self.constants
         return (
-            f"material {self.name!r} (ITU {self.itu.itu_type}) is defined for {_spans(self.itu.ranges_ghz)}; "
+            f"material {self.name!r} ({self.itu.label}) is defined for {_spans(self.itu.ranges_ghz)}; "
             f"on carrier {carrier!r} at {self.itu.frequency_hz / 1e9:g} GHz it has ({self.itu.source}) "
             f"relative permittivity {permittivity:.4g}, conductivity {conductivity:.4g} S/m"
         )
@@ -112,7 +122,8 @@ class OutsideUse:
 def itu_material(
     name: str, itu_type: str, frequency_hz: float, policy: MaterialPolicy, remedy: str = ""
 ) -> ItuMaterial:
-    """A material by its ITU-R P.2040 type: a·f^b and c·f^d with f in GHz (P.2040-3, eqs. 28 and 29, table 3).
+    """A material by its ITU-R P.2040 type: a·f^b and c·f^d with f in GHz (P.2040-3, eqs. 28 and 29, table 3);
+    or one of `OTHER_MATERIALS` by its name.
 
     Outside of all ranges the nearest one counts, by the distance [Hz] of its nearest end; of two equally
     near, the first of the table. Raises `ScenarioError` naming material, ranges and remedies under the policy
@@ -120,20 +131,24 @@ def itu_material(
     """
     from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
 
+    other = OTHER_MATERIALS.get(itu_type)
     table: Mapping[tuple[float, float], tuple[float, ...]] | None = ITU_MATERIALS_PROPERTIES.get(itu_type)
+    if other is not None:
+        table = {other.range_ghz: ()}
     if table is None:
+        known = sorted({*ITU_MATERIALS_PROPERTIES, *OTHER_MATERIALS})
         raise ScenarioError(
-            f"there is no ITU material {itu_type!r}; known: {', '.join(sorted(ITU_MATERIALS_PROPERTIES))}",
+            f"there is no ITU material {itu_type!r}; {suggestion(itu_type, known)}",
             key=f"{policy.key}.{name}" if remedy else f"{policy.key}.materials.{name}",
         )
-    gigahertz = frequency_hz / 1e9
+    gigahertz, label = frequency_hz / 1e9, itu_type if other else f"ITU {itu_type}"
     taken = next((r for r in table if r[0] <= gigahertz <= r[1]), None)
     evaluated = gigahertz
     if taken is None:
         if policy.outside == "error":
             own = f"give it relative_permittivity and conductivity_s_per_m in {policy.key}.materials.{name}"
             raise ScenarioError(
-                f"material {name!r} (ITU {itu_type}) is defined for {_spans(tuple(table))}, the carrier is "
+                f"material {name!r} ({label}) is defined for {_spans(tuple(table))}, the carrier is "
                 f"at {gigahertz:g} GHz; choose a carrier within, {remedy or own}, or set outside_itu_range = "
                 '"nearest" (constants of the nearest end) or "extrapolate" (power law of the nearest range)',
                 key=f"{policy.key}.outside_itu_range",
@@ -141,14 +156,18 @@ def itu_material(
         taken = min(table, key=lambda r: abs(gigahertz - _clamped(gigahertz, r)))
         if policy.outside == "nearest":
             evaluated = _clamped(gigahertz, taken)
-    a, b, c, d = table[taken]
+    if other is not None:
+        constants = other.constants(evaluated)
+    else:
+        a, b, c, d = table[taken]
+        constants = a * evaluated**b, c * evaluated**d
     return ItuMaterial(
         itu_type=itu_type,
         frequency_hz=frequency_hz,
         ranges_ghz=tuple(table),
         taken_ghz=taken,
         policy=policy.outside,
-        constants=(a * evaluated**b, c * evaluated**d),
+        constants=constants,
     )
 
 
@@ -175,27 +194,66 @@ def freeze(scene: Any) -> None:
             material.frequency_update_callback = None
 
 
-def set_materials(scene: Any, frequency_hz: float, policy: MaterialPolicy) -> None:
+@dataclass(frozen=True, eq=False)
+class ObjectMaterial:
+    """A material that objects are given, in the ray tracer."""
+
+    name: str
+    radio: Any
+    """The `sionna.rt.RadioMaterial`."""
+    itu: tuple[ItuMaterial, ...]
+    """On each carrier; empty where its constants are the scenario's."""
+    constants: tuple[Constants, ...]
+    """On each carrier, as used."""
+
+
+def object_materials(
+    objects: ObjectMaterials, frequencies_hz: tuple[float, ...], policy: MaterialPolicy
+) -> dict[str, ObjectMaterial]:
+    """The materials that objects are given, by name.
+
+    Raises `ScenarioError` naming the key for one that neither ITU-R P.2040 nor `OTHER_MATERIALS` has, without
+    constants of the scenario's own.
+    """
+    from sionna.rt import RadioMaterial
+
+    made = {}
+    for name in objects.names:
+        change, key = policy.of(name), Place("object_materials").at(objects.key_of(name)).key
+        remedy = f"choose another material, give {policy.key}.materials.{name} constants of its own"
+        itu: tuple[ItuMaterial, ...] = ()
+        if not change.is_electric:
+            itu = tuple(itu_material(key, name, f, policy, remedy) for f in frequencies_hz)
+        defined = [of.constants for of in itu] or [(1.0, 0.0)] * len(frequencies_hz)
+        constants = tuple(change.applied(of_carrier) for of_carrier in defined)
+        radio = RadioMaterial(f"{OBJECT_MATERIAL}{name}", _BODY_THICKNESS)
+        _checked_change(radio, name, change, policy)
+        radio.relative_permittivity, radio.conductivity = constants[0]
+        made[name] = ObjectMaterial(name, radio, itu, constants)
+    return made
+
+
+def set_materials(
+    scene: Any, frequency_hz: float, policy: MaterialPolicy, others: Iterable[str] = ()
+) -> None:
     """Give all materials of a `sionna.rt.Scene` their constants at the carrier.
 
     Constants are set here rather than by Sionna RT, whose float32 frequency puts 60 GHz outside of
-    a range that ends at 60 GHz; the scene's own materials are frozen. Raises `ScenarioError` for an unknown
-    name or a bad value.
+    a range that ends at 60 GHz; the scene's own materials are frozen. ``others`` are those that objects are
+    given. Raises `ScenarioError` for an unknown name or a bad value.
     """
     materials = scene.radio_materials
-    unknown = sorted(policy.changes.keys() - materials.keys())
+    unknown = sorted(policy.changes.keys() - materials.keys() - set(others))
     if unknown:
         raise ScenarioError(
             f"the scenery has no material {unknown[0]!r}; it has: {', '.join(sorted(materials))}",
             key=f"{policy.key}.materials.{unknown[0]}",
         )
     for name, material in materials.items():
-        try:
-            _set_material(name, material, frequency_hz, policy)
-        except ValueError as error:
-            raise ScenarioError(
-                f"material {name!r}: {error}; correct it", key=f"{policy.key}.materials.{name}"
-            ) from error
+        itu = _itu_of(name, material, frequency_hz, policy)
+        if itu is not None:
+            material.relative_permittivity, material.conductivity = itu.constants
+        _checked_change(material, name, policy.of(name), policy)
     scene.frequency = frequency_hz
 
 
@@ -219,19 +277,22 @@ def _itu_of(name: str, material: Any, frequency_hz: float, policy: MaterialPolic
     return itu_material(name, material.itu_type, frequency_hz, policy)
 
 
-def _set_material(name: str, material: Any, frequency_hz: float, policy: MaterialPolicy) -> None:
-    change, itu = policy.of(name), _itu_of(name, material, frequency_hz, policy)
-    if itu is not None:
-        material.relative_permittivity, material.conductivity = itu.constants
-    for attribute, value in (
-        ("relative_permittivity", change.relative_permittivity),
-        ("conductivity", change.conductivity_s_per_m),
-        ("scattering_coefficient", change.scattering_coefficient),
-        ("xpd_coefficient", change.xpd_coefficient),
-        ("thickness", change.thickness_m),
-    ):
-        if value is not None:
-            setattr(material, attribute, value)
+def _checked_change(material: Any, name: str, change: MaterialSettings, policy: MaterialPolicy) -> None:
+    """Give a material what a scenario changes about it. Raises `ScenarioError` for a bad value."""
+    try:
+        for attribute, value in (
+            ("relative_permittivity", change.relative_permittivity),
+            ("conductivity", change.conductivity_s_per_m),
+            ("scattering_coefficient", change.scattering_coefficient),
+            ("xpd_coefficient", change.xpd_coefficient),
+            ("thickness", change.thickness_m),
+        ):
+            if value is not None:
+                setattr(material, attribute, value)
+    except ValueError as error:
+        raise ScenarioError(
+            f"material {name!r}: {error}; correct it", key=f"{policy.key}.materials.{name}"
+        ) from error
 
 
 def _clamped(gigahertz: float, span: tuple[float, float]) -> float:

@@ -38,7 +38,7 @@ _LYING = 0.5
 
 
 class NumberedTriangles:
-    """The triangles of shapes, of which the last one may move; bodies are its last pieces.
+    """The triangles of shapes, of which the last ones may move; bodies are their last pieces.
 
     Parameters
     ----------
@@ -52,6 +52,8 @@ class NumberedTriangles:
         Of the bodies, by asset.
     centre
         What the ray tracer's coordinates are relative to [m], Shape ``[3]``.
+    moving
+        How many shapes may move, one of each material of bodies.
     """
 
     def __init__(
@@ -61,6 +63,7 @@ class NumberedTriangles:
         bodies: Sequence[Body],
         unit_meshes: Mapping[str, Mesh],
         centre: Float64Array,
+        moving: int = 1,
     ) -> None:
         self.centre = centre
         """What the ray tracer's coordinates are relative to [m], Shape ``[3]``."""
@@ -68,7 +71,7 @@ class NumberedTriangles:
         """Counts how often anything has moved."""
         self._bodies = tuple(bodies)
         meshes = [mesh for shape in shapes for mesh in shape.meshes]
-        self._number_shapes(shapes, ids)
+        self._number_shapes(shapes, ids, moving)
         corners = np.array([len(mesh.vertices) for mesh in meshes])
         before = np.cumsum(corners) - corners
         self._corners = np.concatenate([mesh.vertices for mesh in meshes])
@@ -79,7 +82,7 @@ class NumberedTriangles:
         self.joined: JoinedFaces
         """Which faces are one surface."""
         self._number_planes(meshes, unit_meshes)
-        last = shapes[-1].meshes
+        last = [mesh for shape in shapes[-moving:] for mesh in shape.meshes]
         self._vertices = self._corners[len(self._corners) - sum(len(mesh.vertices) for mesh in last) :]
         self._first_moving = len(self._faces) - sum(len(mesh.faces) for mesh in last)
         self.surfaces = Surfaces(self._corners[self._faces], self._points_outside)
@@ -87,11 +90,11 @@ class NumberedTriangles:
 
     @property
     def moving_vertices(self) -> Float64Array:
-        """Vertices of the last shape [m], Shape ``[V, 3]``; a copy."""
+        """Vertices of the shapes that may move [m], Shape ``[V, 3]``; a copy."""
         return self._vertices.copy()
 
     def move(self, vertices: Float64Array) -> bool:
-        """Put the vertices of the last shape there [m], Shape ``[V, 3]``. Returns whether any has moved."""
+        """Put the vertices that may move there [m], Shape ``[V, 3]``. Returns whether any has moved."""
         changed = (vertices != self._vertices).any(1)
         if not changed.any():
             return False
@@ -257,8 +260,7 @@ class NumberedTriangles:
 
     def is_body(self, shapes: NDArray[np.uint32]) -> BoolArray:
         """Whether process-local shapes are of moving bodies."""
-        body: BoolArray = shapes == self._body_id
-        return body
+        return np.isin(shapes, self._body_ids)
 
     def object_index(self, shapes: Int64Array, primitives: Int64Array) -> Int32Array:
         """Index into the names of `place` of triangles of process-local shapes; −1 for no shape."""
@@ -266,14 +268,14 @@ class NumberedTriangles:
         piece = np.searchsorted(self._first_triangles, self._offsets[where] + primitives, side="right") - 1
         return np.where(self._ids[where] == shapes, piece, -1).astype(np.int32)
 
-    def _number_shapes(self, shapes: Sequence[Shape], ids: Int64Array) -> None:
+    def _number_shapes(self, shapes: Sequence[Shape], ids: Int64Array, moving: int) -> None:
         """Number the triangles of shapes and of their pieces."""
         counts = [[len(mesh.faces) for mesh in shape.meshes] for shape in shapes]
         totals = np.array([sum(count) for count in counts], np.int64)
         self.offset_by_shape = np.zeros(int(ids.max(initial=0)) + 1, np.int64)
         """Number of the first triangle of each process-local shape."""
         self.offset_by_shape[ids] = np.cumsum(totals) - totals
-        self._body_id = int(ids[-1]) if self._bodies else -1
+        self._body_ids = ids[-moving:] if self._bodies else ids[:0]
         order = np.argsort(ids)
         self._ids, self._shape_order = ids[order], order
         self._offsets = (np.cumsum(totals) - totals)[order]

@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import PurePosixPath
 from typing import ClassVar
 
 import msgspec
@@ -30,6 +31,7 @@ from caviar_services.channel.edge_range import EdgeRange
 from caviar_services.channel.enumerated_tracer import EnumeratedTracer, unknown_paths
 from caviar_services.channel.matrices import Matrices
 from caviar_services.channel.mimo_rt import ElementTracer
+from caviar_services.channel.object_materials import ObjectMaterials
 from caviar_services.channel.paths import Antenna, PathTable
 from caviar_services.channel.scenery_chains import SceneryChains, SceneryLaunch
 from caviar_services.channel.sionna_following import Following, FollowingState
@@ -173,10 +175,12 @@ class SionnaChannel(PathModel[SionnaSettings]):
                 ),
                 weld=s.diffraction,
                 detail=s.detail,
+                objects=ObjectMaterials(s.object_materials),
             ),
         )
         self._names = self._scene.names
         self._outside = self._scene.outside
+        notes += self._unmatched(preparation)
         notes += tuple(use.note(self.run.carriers[use.carrier].name) for use in self._outside)
         if self._scene.detail_effect is not None:
             notes += (self._scene.detail_effect.note,)
@@ -377,6 +381,15 @@ class SionnaChannel(PathModel[SionnaSettings]):
             )
         first, index = t * len(receivers), np.array(others, np.int64)
         return [(first + index[traced.receiver], traced) for traced in found]
+
+    def _unmatched(self, preparation: Preparation) -> tuple[str, ...]:
+        """Keys of ``object_materials`` that neither a mesh nor a piece of scenery is called."""
+        known = {*self._scene.names, *(PurePosixPath(name).stem for name in preparation.assets)}
+        return tuple(
+            f"object_materials: no mesh and no piece of scenery is called {key!r}; it counts for objects of "
+            "this name, and for those of this class without a mesh"
+            for key in ObjectMaterials(self.settings.object_materials).unmatched(known)
+        )
 
     def _moving(self, preparation: Preparation) -> bool:
         """Whether objects move in the run, for all that is known before its first frame."""

@@ -11,7 +11,7 @@ scenery's corners as they stand in the files, and those of moving bodies from th
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -27,13 +27,15 @@ from caviar_protocol.topics import Scene
 from caviar_services.channel.contributing import SurfaceMaterial, UsedSurfaces, edges_of, has_edge
 from caviar_services.channel.edge_fields import Media
 from caviar_services.channel.mesh_detail import DetailSettings
+from caviar_services.channel.object_materials import Constants, ObjectMaterials, body_kind
 from caviar_services.channel.sionna_loading import by_material, loaded, with_detail
 from caviar_services.channel.sionna_materials import (
-    Constants,
+    OBJECT_MATERIAL,
     MaterialPolicy,
     OutsideUse,
     itu_material,
     itu_materials,
+    object_materials,
     set_materials,
 )
 from caviar_services.channel.sionna_meshes import (
@@ -79,6 +81,8 @@ class SceneSettings:
     """Join vertices at one place, so that edges between faces are known (diffraction)."""
     detail: DetailSettings = field(default_factory=DetailSettings)
     """What of the scenery is left out."""
+    objects: ObjectMaterials = field(default_factory=ObjectMaterials)
+    """Of what objects and pieces of scenery are made that differ from the others."""
 
 
 class SionnaScene(NumberedTriangles):
@@ -98,20 +102,35 @@ class SionnaScene(NumberedTriangles):
         files = {} if description is None else file_vertices(description)  # says what is wrong with a file
         self._scene = loaded(description)
         self._scenery = frozenset(self._scene.objects)
-        full = by_material(self._scene, file_meshes(self._scene, files, settings.weld))
+        self._objects = settings.objects
+        made = object_materials(self._objects, settings.frequencies_hz, settings.materials)
+        changed = {name: made[m].radio for name in self._scenery if (m := self._objects.of(name))}
+        full = by_material(self._scene, file_meshes(self._scene, files, settings.weld), changed)
         key = f"{settings.materials.key}.detail"
         shapes, self.detail_effect = with_detail(full, settings.detail, key)
         self.low, self.high = _bounds(shapes)
-        self._pool = dict(pool)
-        self._meshes = {asset: unit_mesh(asset, assets) for asset in pool}
-        bodies = [(asset, slot) for asset in sorted(pool) for slot in range(pool[asset])]
+        meshes = {asset: unit_mesh(asset, assets) for asset in pool}
+        # Each material of bodies is a shape of its own, with a pool of its own.
+        kinds = {(asset, m): body_kind(asset, m) for m in ("", *made) for asset in sorted(pool)}
+        self._pool = {kind: pool[asset] for (asset, _), kind in kinds.items()}
+        self._meshes = {kind: meshes[asset] for (asset, _), kind in kinds.items()}
+        of_material = {
+            m: [(kind, slot) for (asset, of), kind in kinds.items() if of == m for slot in range(pool[asset])]
+            for m in ("", *made)
+        }
+        bodies = [body for of in of_material.values() for body in of]
         self._standing: frozenset[Body] = frozenset()
         is_metal = settings.body_material == "metal"
-        moving = self._moving_shapes(bodies, skins[0].constants if skins else None, is_metal)
-        self._shapes = [*shapes, *moving]
+        moving = self._moving_shapes(of_material[""], skins[0].constants if skins else None, is_metal)
+        self._moving = [moving[-1]]
+        if bodied:
+            self._moving += [self._body_shape(of_material[m], m, of.radio) for m, of in made.items()]
+        self._shapes = [*shapes, *moving[:-1], *self._moving]
         centre = np.round((self.low + self.high) / (2 * _CENTRE_STEP)) * _CENTRE_STEP
-        super().__init__(self._shapes, self._replace_shapes(centre), bodies, self._meshes, centre)
-        set_materials(self._scene, settings.frequencies_hz[0], settings.materials)
+        super().__init__(
+            self._shapes, self._replace_shapes(centre), bodies, self._meshes, centre, len(self._moving)
+        )
+        set_materials(self._scene, settings.frequencies_hz[0], settings.materials, made)
         self._carriers: list[_Tuning] = []
         outside: list[OutsideUse] = []
         for carrier, frequency in enumerate(settings.frequencies_hz):
@@ -121,6 +140,8 @@ class SionnaScene(NumberedTriangles):
             if skins:
                 used.append((_SKIN_NAME, skins[carrier], skins[carrier].constants))
                 tuning.append((moving[-1].material, skins[carrier].constants))
+            used += [(name, of.itu[carrier], of.constants[carrier]) for name, of in made.items() if of.itu]
+            tuning += [(of.radio, of.constants[carrier]) for of in made.values()]
             self._carriers.append((frequency, tuning))
             outside += [
                 OutsideUse(name=name, carrier=carrier, itu=itu, constants=constants)
@@ -157,12 +178,12 @@ class SionnaScene(NumberedTriangles):
         constants, slabs = self._surface_materials
         used = [(i, shape) for i, shape in enumerate(self._shapes) if shape.id != _PARKING]
         shapes = [shape for _, shape in used]
-        still = [mesh for shape in shapes if shape.id != _SKIN for mesh in shape.meshes]
-        bodies = [mesh for asset, mesh in self._meshes.items() if self._pool[asset]]
+        still = [mesh for shape in shapes if not shape.id.startswith(_SKIN) for mesh in shape.meshes]
+        bodies = [mesh for kind, mesh in self._meshes.items() if self._pool[kind]]
         return UsedSurfaces(
             materials=tuple(
                 SurfaceMaterial(
-                    name=_SKIN_NAME if shape.id == _SKIN else shape.material.name,
+                    name=_material_name(shape),
                     constants=tuple((float(p), float(c)) for p, c in constants[:, :, i].T),
                     thickness_m=float(slabs[0, i]),
                     scattering_coefficient=float(slabs[1, i]),
@@ -213,8 +234,8 @@ class SionnaScene(NumberedTriangles):
 
     @property
     def unit_meshes(self) -> Mapping[str, Mesh]:
-        """Of the assets that have bodies."""
-        return {asset: mesh for asset, mesh in self._meshes.items() if self._pool[asset]}
+        """Of the kinds of bodies that there are (`body_kind`)."""
+        return {kind: mesh for kind, mesh in self._meshes.items() if self._pool[kind]}
 
     @property
     def standing_bodies(self) -> tuple[int, ...]:
@@ -246,7 +267,8 @@ class SionnaScene(NumberedTriangles):
         if clash:
             raise PayloadError(f"object {min(clash)!r} has the name of a piece of scenery; rename one")
         # A new assignment each frame: the product follows from this frame alone, also after a restart.
-        taken = BodyPool(self._pool).assign((scene.names[i], scene.assets[i]) for i in solid)
+        kinds = ((scene.names[i], self._kind(scene, i)) for i in solid)
+        taken = BodyPool(self._pool).assign(kinds)
         standing = {body: index[name] for name, body in taken.items()}
         names, velocity = list(self.names), np.zeros((len(self.names), 3))
         first = len(names) - len(self._bodies)
@@ -262,9 +284,12 @@ class SionnaScene(NumberedTriangles):
                 names[number], velocity[number] = scene.names[i], scene.velocity[i]
             elif body in self._standing:
                 vertices[rows] = self._middle
+        before = self._vertices.copy() if len(self._moving) > 1 else None
         if self.move(vertices):
             params = self._scene.mi_scene_params
-            params[f"{_SKIN}.vertex_positions"] = floats(vertices - self.centre)
+            for shape, rows in self._moving_rows():
+                if before is None or not np.array_equal(before[rows], vertices[rows]):
+                    params[f"{shape.id}.vertex_positions"] = floats(vertices[rows] - self.centre)
             params.update()
         self._standing = frozenset(standing)
         return tuple(names), velocity
@@ -300,10 +325,7 @@ class SionnaScene(NumberedTriangles):
         h = _HALF_BOX
         walls = box((x - h, x + h), (y - h, y + h), (z - h, z + h))
         names = [f"{_SKIN}-{asset or 'box'}-{slot}" for asset, slot in bodies]
-        points = [
-            Mesh(np.tile(self._middle, (len(mesh.vertices), 1)), mesh.faces)
-            for mesh in (self._meshes[asset] for asset, _ in bodies)
-        ]
+        points = [self._parked(kind) for kind, _ in bodies]
         if constants is not None and metal:
             skin = RadioMaterial(f"{_SKIN}-skin", 0.1, *constants)
             return [Shape(_SKIN, skin, [_PARKING, *names], [walls, *points])]
@@ -312,6 +334,29 @@ class SionnaScene(NumberedTriangles):
             return [closed]
         skin = RadioMaterial(f"{_SKIN}-skin", 0.1, *constants)
         return [closed, Shape(_SKIN, skin, names, points)]
+
+    def _body_shape(self, bodies: Sequence[Body], material: str, radio: Any) -> Shape:
+        """Moving bodies of one material, none of which stands for anything yet."""
+        name = f"{_SKIN}-of-{material}"
+        names = [f"{_SKIN}-{kind or 'box'}-{slot}" for kind, slot in bodies]
+        return Shape(name, radio, names, [self._parked(kind) for kind, _ in bodies])
+
+    def _parked(self, kind: str) -> Mesh:
+        """A body that stands for nothing: a point."""
+        mesh = self._meshes[kind]
+        return Mesh(np.tile(self._middle, (len(mesh.vertices), 1)), mesh.faces)
+
+    def _moving_rows(self) -> Iterator[tuple[Shape, slice]]:
+        """The shapes that may move, and which of all moving vertices are theirs."""
+        begin = 0
+        for shape in self._moving:
+            end = begin + sum(len(mesh.vertices) for mesh in shape.meshes)
+            yield shape, slice(begin, end)
+            begin = end
+
+    def _kind(self, scene: Scene, i: int) -> str:
+        """Which bodies may stand for an object of a scene."""
+        return body_kind(scene.assets[i], self._objects.of(scene.names[i], scene.classes[i]))
 
     def _replace_shapes(self, centre: Float64Array) -> Int64Array:
         """Put the shapes in place of what was loaded. Returns their process-local numbers."""
@@ -323,6 +368,12 @@ class SionnaScene(NumberedTriangles):
         ]
         self._scene.edit(add=added, remove=list(self._scene.objects))
         return np.array([item.object_id for item in added], np.int64)
+
+
+def _material_name(shape: Shape) -> str:
+    """Of a shape, as a scenario has it."""
+    name: str = shape.material.name
+    return _SKIN_NAME if shape.id == _SKIN else name.removeprefix(OBJECT_MATERIAL)
 
 
 def _bounds(shapes: Sequence[Shape]) -> tuple[Float64Array, Float64Array]:

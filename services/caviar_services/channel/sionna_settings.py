@@ -102,8 +102,12 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     """Classes of objects that the waves pass through."""
     body_material: str = "metal"
     """ITU-R P.2040 material of moving objects."""
+    object_materials: dict[str, str] = msgspec.field(default_factory=dict)
+    """Materials of moving objects by class, ``pedestrian = "skin"``, and of objects and pieces of scenery by
+    name or a pattern of names with ``*``: those of ITU-R P.2040, ``skin``, ``plastic``, and those that
+    ``materials`` gives both electric constants. The first of name, pattern and class that fits counts."""
     materials: dict[str, MaterialSettings] = msgspec.field(default_factory=dict)
-    """Changes to materials of the scenery, by name."""
+    """Changes to materials of the scenery, and of ``object_materials``, by name."""
     detail: DetailSettings = msgspec.field(default_factory=DetailSettings)
     """What of the scenery is left out; absent, nothing is."""
     outside_itu_range: OutsideRange = "error"
