@@ -163,6 +163,37 @@ def test_the_gain_is_that_of_the_channel_in_the_mean_over_a_cell(yard: SionnaCha
     assert np.sort(error.ravel())[:7].max() < 0.3
 
 
+def test_diffraction_brings_a_signal_into_the_shadow() -> None:
+    """Behind a block, of which one edge is in sight of the shadow: 1 to 6 dB above the channel, whose
+    coefficients differ, also where rays are shot in parts. Draped surfaces leave it out, with a note."""
+    model = sionna(
+        FREQUENCY,
+        samples=20_000,
+        max_depth=1,
+        candidates="launched",
+        diffraction=True,
+        body_material="concrete",
+    )
+    assert isinstance(model, SionnaChannel)
+    block, source = (
+        Thing("block", (0.0, 0.0, 4.0), (30.0, 10.0, 8.0)),
+        antenna("bs", "tx", (1.0, -30.0, 14.0)),
+    )
+    area = (-2.0, 10.0, 2.0, 18.0)
+    surface = level_surface(area, 4.0, 1.5)
+    found = mapped(model, scene([source], [block]), surface)
+    receivers = [antenna(f"r{i}", "rx", centre) for i, centre in enumerate(surface.centres.reshape(-1, 3))]
+    channel = measure(model, scene([source, *receivers], [block]))
+    assert channel.offsets.tolist() == [0, 1, 2]
+    error = db(found.coverage.gain.ravel() / np.abs(channel.a[0]) ** 2)
+    assert ((error > 1.0) & (error < 6.0)).all()
+    slope = np.array([[(-9.0, 0.0, 1.4), (9.0, 0.0, 1.5), (0.0, 40.0, 1.6)]])
+    draped = mapped(model, scene([source], [block]), draped_surface(area, 4.0, 0.1, slope))
+    assert not draped.coverage.has_signal.any()
+    assert "diffraction is left out" in draped.notes[0]
+    assert not draped.shooting.diffraction
+
+
 def test_what_no_ray_reaches_has_no_signal(yard: SionnaChannel) -> None:
     """Behind the wall, which is opaque without refraction."""
     at = scene([antenna("bs", "tx", (0.0, 10.0, 6.0))])

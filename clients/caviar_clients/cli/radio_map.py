@@ -211,6 +211,7 @@ def _summary(mapped: _Mapped) -> Iterator[str]:
     share = np.count_nonzero(reached) / max(int(np.count_nonzero(cells)), 1)
     yield f"{nx} × {ny} cells of {mapped.metadata['cell_m']:g} m, {mapped.metadata['surface']}"
     yield f"noise {10 * math.log10(coverage.noise_w) + 30:.1f} dBm: {mapped.metadata['noise']}"
+    yield from found.notes
     yield f"{share:.1%} of the cells have a signal"
     few = np.count_nonzero(found.rays.max(axis=0)[reached] < _FEW_RAYS) / max(int(reached.sum()), 1)
     if few > 0.1:

@@ -314,17 +314,19 @@ class Launcher:
         return bounce, onward.o, onward.d, active, enabled, wedges
 
 
-def lattice_directions(count: int, first: int, end: int) -> Any:
-    """Directions ``first`` to ``end`` of ``count`` that share the sphere, a `mitsuba.Vector3f`."""
-    return _along_curve(_lattice(count, first, end))
+def spread_directions(count: int, part: int, parts: int) -> Any:
+    """Every ``parts``-th of ``count`` directions that share the sphere, from number ``part`` on, a
+    `mitsuba.Vector3f`; each part is spread over all of it."""
+    return _along_curve(_lattice(count, part, count, parts))
 
 
-def _lattice(count: int, first: int, end: int) -> Any:
-    """Points ``first`` to ``end`` of `sionna.rt.utils.fibonacci_lattice`."""
+def _lattice(count: int, first: int, end: int, step: int = 1) -> Any:
+    """Points ``first`` to ``end`` of `sionna.rt.utils.fibonacci_lattice`, each ``step``-th."""
     import drjit as dr
     import mitsuba as mi
 
-    number = dr.opaque(mi.Float64, first) + dr.arange(mi.Float64, end - first)
+    points = -(-(end - first) // step)
+    number = dr.opaque(mi.Float64, first) + dr.opaque(mi.Float64, step) * dr.arange(mi.Float64, points)
     x = number / ((1.0 + math.sqrt(5.0)) / 2.0)
     return mi.Point2f(x - dr.floor(x), number / dr.opaque(mi.Float64, count - 1))
 

@@ -22,7 +22,7 @@ from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_services.channel.paths import Antenna
 from caviar_services.channel.patterns import spherical_basis
 from caviar_services.channel.radio_map.measurement_surface import MeasurementSurface
-from caviar_services.channel.sionna_launch import lattice_directions
+from caviar_services.channel.sionna_launch import spread_directions
 from caviar_services.channel.sionna_meshes import Shape, mi_mesh
 from caviar_services.channel.sionna_scene import SionnaScene
 from caviar_services.columns import aligned_columns, aligned_indices
@@ -121,7 +121,7 @@ def cell_gains(
         rt_scene.tx_array = _one_element(transmitter)
         solver: Any = _solver(rt_scene, surface, scene.centre, transmitter, beams)
         for number in range(parts):
-            with _launched(lattice_directions(part * parts, number * part, (number + 1) * part)):
+            with _launched(spread_directions(part * parts, number, parts)):
                 sums, passed = solver.shoot(part, shooting, shooting.seed + number)
             total += sums
             rays += passed
@@ -239,28 +239,20 @@ def _solver(
     import drjit as dr
     import mitsuba as mi
     from sionna.rt import RadioMapSolver
-    from sionna.rt.radio_map_solvers.mesh_radio_map import MeshRadioMap
-    from sionna.rt.scene_utils import extend_scene_with_mesh
 
-    mesh, cell_of = surface.triangles()
     cells = surface.shape[0] * surface.shape[1]
-    material = next(iter(rt_scene.objects.values())).radio_material  # never met: rays pass through
-    measured = mi_mesh(Shape(_SURFACE, material, [_SURFACE], [mesh]), centre)
-    measured.set_bsdf(material)
-    extended = extend_scene_with_mesh(rt_scene.mi_scene, measured)
+    geometry = _level(surface, centre) if surface.is_level else _draped(rt_scene, surface, centre)
 
-    class Sums(MeshRadioMap):  # type: ignore[misc]
+    class Sums(geometry.map_class):  # type: ignore[misc,name-defined]
         """Adds up what passes through each cell, for one element and for every beam."""
 
         def __init__(self, samples: int) -> None:
-            super().__init__(rt_scene, measured)
+            super().__init__(rt_scene, **geometry.map_arguments)
             # Opaque, so that maps of other cells and beams have the same kernels.
             self._samples, self._cells, self._beams = (
                 dr.opaque(mi.UInt, count) for count in (samples, cells, len(beams))
             )
             self._ray = dr.arange(mi.UInt, samples)
-            self._cell_of = mi.UInt(aligned_indices(cell_of))
-            self._per_area = mi.Float(aligned_columns((1 / _areas(mesh, cell_of, cells))[None])[0])
             self.power = dr.zeros(mi.Float, (len(beams) + 1) * cells)
             self.rays = dr.zeros(mi.UInt, cells)
             self._beam_gains: Any = None
@@ -275,15 +267,15 @@ def _solver(
             diffracted_paths: bool, solid_angle: Any = None, tx_positions: Any = None, wedges: Any = None,
             diff_point: Any = None, wedges_samples_cnt: Any = None, diffraction_angular_measure: Any = None,
         ) -> None:  # fmt: skip
-            """What `MeshRadioMap.add_paths` does, for every beam."""
+            """What `RadioMap.add_paths` does, for every beam."""
             if diffracted_paths:
                 source = dr.gather(mi.Point3f, tx_positions, tx_indices, active=active)
                 width = self._diffraction_integration_weight(wedges, source, diff_point, k_world, si)
                 width *= wedges.length * diffraction_angular_measure / wedges_samples_cnt
             else:
                 width = solid_angle * dr.rcp(dr.abs(dr.dot(si.n, k_world)))
-            cell = dr.gather(mi.UInt, self._cell_of, si.prim_index, active)
-            width *= dr.gather(mi.Float, self._per_area, cell, active) * self._normalization_factor
+            cell, weight = geometry.cell(self, si, active)
+            width *= weight * self._normalization_factor
             power = dr.squared_norm(e_fields[0]) * width
             dr.scatter_add(self.power, power, cell, active)
             dr.scatter_add(self.rays, mi.UInt(1), cell, active)
@@ -307,8 +299,7 @@ def _solver(
             self._sums = Sums(samples)
             self(
                 rt_scene,
-                measurement_surface=measured,
-                modified_scene=extended,
+                **geometry.solver_arguments,
                 samples_per_tx=samples,
                 max_depth=shooting.max_depth,
                 los=shooting.los,
@@ -331,6 +322,75 @@ def _solver(
             super()._evaluate_first_order_diffraction(scene, self._sums, *rest)
 
     return Solver()
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Geometry:
+    """How the ray tracer has a surface."""
+
+    map_class: Any
+    """The `sionna.rt.RadioMap` of such surfaces."""
+    map_arguments: dict[str, Any]
+    """Of its constructor, beside the scene."""
+    solver_arguments: dict[str, Any]
+    """Of the solver."""
+    cell: Callable[[Any, Any, Any], tuple[Any, Any]]
+    """From the map, where rays meet the surface and which of them do: the cell, and what its powers are
+    weighted with, beside the map's own factor."""
+
+
+def _level(surface: MeasurementSurface, centre: Float64Array) -> _Geometry:
+    """A rectangle, which rays are intersected with by formula."""
+    import mitsuba as mi
+    from sionna.rt.radio_map_solvers.planar_radio_map import PlanarRadioMap
+
+    low, high = np.array([surface.x[0], surface.y[0]]), np.array([surface.x[-1], surface.y[-1]])
+    ny, nx = surface.shape
+    middle = np.append((low + high) / 2, surface.z[0, 0]) - centre
+    size = high - low
+    plane = {
+        "center": mi.Point3f(*middle.tolist()),
+        "orientation": mi.Point3f(0.0, 0.0, 0.0),
+        # A little less: the number of cells is rounded up.
+        "size": mi.Point2f(*(size * (1 - 1e-4 / np.array([nx, ny]))).tolist()),
+        "cell_size": mi.Point2f(*(size / [nx, ny]).tolist()),
+    }
+    return _Geometry(
+        map_class=PlanarRadioMap,
+        map_arguments=plane,
+        solver_arguments=plane,
+        cell=lambda radio_map, si, active: (mi.UInt(radio_map._local_to_cell_ind(si.uv)), 1.0),
+    )
+
+
+def _draped(rt_scene: Any, surface: MeasurementSurface, centre: Float64Array) -> _Geometry:
+    """A mesh in the scene, with two triangles for each cell."""
+    import drjit as dr
+    import mitsuba as mi
+    from sionna.rt.radio_map_solvers.mesh_radio_map import MeshRadioMap
+    from sionna.rt.scene_utils import extend_scene_with_mesh
+
+    mesh, cell_of = surface.triangles()
+    cells = surface.shape[0] * surface.shape[1]
+    material = next(iter(rt_scene.objects.values())).radio_material  # never met: rays pass through
+    measured = mi_mesh(Shape(_SURFACE, material, [_SURFACE], [mesh]), centre)
+    measured.set_bsdf(material)
+    index = mi.UInt(aligned_indices(cell_of))
+    per_area = mi.Float(aligned_columns((1 / _areas(mesh, cell_of, cells))[None])[0])
+
+    def cell(_: Any, si: Any, active: Any) -> tuple[Any, Any]:
+        found = dr.gather(mi.UInt, index, si.prim_index, active)
+        return found, dr.gather(mi.Float, per_area, found, active)
+
+    return _Geometry(
+        map_class=MeshRadioMap,
+        map_arguments={"meas_surface": measured},
+        solver_arguments={
+            "measurement_surface": measured,
+            "modified_scene": extend_scene_with_mesh(rt_scene.mi_scene, measured),
+        },
+        cell=cell,
+    )
 
 
 def _areas(mesh: Any, cell_of: Int64Array, cells: int) -> Float64Array:

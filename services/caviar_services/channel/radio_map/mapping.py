@@ -30,6 +30,12 @@ BeamChoice = Literal["best", "wide"] | int
 beamforming. A number: that beam, everywhere."""
 
 
+_NO_DIFFRACTION = (
+    "diffraction is left out: Sionna RT's solver finds none over a surface that is not level; a plane has it"
+)
+"""Its test for what is in the way ends after 1 m there (`spawn_ray_to`, sionna-rt 2.2.0)."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RadioMap:
     """What T transmitters bring to a surface."""
@@ -47,6 +53,8 @@ class RadioMap:
     rays: Int64Array
     """That passed through each cell, Shape ``[T, ny, nx]``: few rays, large error."""
     shooting: Shooting
+    notes: tuple[str, ...]
+    """What of the channel's settings the map leaves out, for the user."""
 
 
 def transmitters_of(scene: Scene, where: str) -> list[AntennaDevice]:
@@ -148,7 +156,7 @@ def radio_map(
         los=s.los,
         reflection=s.reflection,
         refraction=s.refraction,
-        diffraction=s.diffraction,
+        diffraction=s.diffraction and surface.is_level,
         scattering=s.scattering,
     )
     rt.place(scene, frozenset(s.without_body))
@@ -187,6 +195,7 @@ def radio_map(
         beam=np.stack(chosen),
         rays=np.stack(rays),
         shooting=shooting,
+        notes=(_NO_DIFFRACTION,) * (s.diffraction and not surface.is_level),
     )
 
 

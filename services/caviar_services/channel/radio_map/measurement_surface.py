@@ -31,6 +31,11 @@ class MeasurementSurface:
         return len(self.y) - 1, len(self.x) - 1
 
     @property
+    def is_level(self) -> bool:
+        """Whether it is a horizontal plane without a gap."""
+        return bool((self.z == self.z[0, 0]).all())
+
+    @property
     def centres(self) -> Float64Array:
         """Middle of each cell [m], Shape ``[ny, nx, 3]``; NaN heights where a corner has no ground."""
         x, y = np.meshgrid((self.x[:-1] + self.x[1:]) / 2, (self.y[:-1] + self.y[1:]) / 2)
