@@ -40,6 +40,7 @@ class LidarScan(Payload, frozen=True, kw_only=True, omit_defaults=True):
     Ray ``r`` belongs to beam ``r // azimuth_steps`` (lowest elevation first) and azimuth step
     ``r % azimuth_steps`` (counter-clockwise from the device's +x axis). A LIDAR may be set to leave
     ``points_world`` out since 1.4; then they are the points turned by the orientation, at the position.
+    Readers of earlier versions need it: where one is in the run, leave it in.
     """
 
     sensor: str
