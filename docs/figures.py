@@ -39,6 +39,7 @@ FOLDERS = ("docs", "protocol", "broker", "services", "clients", "deploy", "examp
 
 _BENCH, _CAVIAR = "python tests/bench/bench_enumerated.py", "caviar tradeoff street-canyon"
 _BASE = "'siso-rt enumerated d3'"
+_STATED = "python tests/bench/bench_stated_errors.py"
 
 
 class Measurement(NamedTuple):
@@ -66,6 +67,18 @@ MEASUREMENTS: Mapping[str, Measurement] = {
         f"{_CAVIAR} --part keyframes --baseline {_BASE} --reference {_BASE} --minutes 13 --out {{out}}",
         "tradeoff.md",
         {"tradeoff-keyframes": "keyframes"},
+    ),
+    "stated-errors-canyon": Measurement(
+        f"{_STATED} --seeds 3 --frames 30 --out {{out}}/canyon.md",
+        f"{_STATED} --rungs 1e4,1e5,d1,d2 --frames 40 --out {{out}}/canyon.md",
+        "canyon.md",
+        {"stated-errors-canyon": ""},
+    ),
+    "stated-errors-munich": Measurement(
+        f"{_STATED} --scene munich --seeds 3 --frames 20 --out {{out}}/munich.md",
+        f"{_STATED} --scene munich --frames 40 --out {{out}}/munich.md",
+        "munich.md",
+        {"stated-errors-munich": ""},
     ),
     "tradeoff": Measurement(
         f"{_CAVIAR} --part ladder --minutes 5 --out {{out}}",
