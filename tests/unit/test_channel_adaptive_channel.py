@@ -258,7 +258,7 @@ class TestEpisodes:
         channel.reset(1, 1, 0)
         second = self.played(channel)
         assert bounds(first[0]) == [6.0, 6.0]
-        assert bounds(second[0]) == [-20.0, -20.0]
+        assert bounds(second[0]) == [-19.0, -19.0], "1 dB above the largest as long as few are known"
         assert list(first[0].decisions) == ["rung"]
         assert [list(result.decisions) for result in second] == [["rung", "state:errors"], *5 * [["rung"]]]
 

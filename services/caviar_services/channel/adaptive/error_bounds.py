@@ -49,7 +49,7 @@ _MOST_AT_ONCE = 50
 
 _ASSUMED_DB = (3.0, 6.0)
 """Errors that count as measured before the first check: twice as much power as there is, and four times."""
-_ASSUMED_ABOVE_DB = (0.0, 3.0)
+_ASSUMED_ABOVE_DB = (1.0, 3.0)
 """Behind it: that much above the largest one that was measured, where this is less."""
 _ASSUMED_UNTIL = 10
 """Measured errors up to which each of the assumed ones weighs as much as one of them; of n its weight is
@@ -62,7 +62,7 @@ _LEAST_WEIGHT = 0.02
 _UNKNOWN = 0.5
 """Squared distance, in widths, to a last error that is not known."""
 
-_TRACKING = 0.03
+_TRACKING = 0.04
 """Change of the level by an error beyond its bound, over `SHARE`."""
 _TRACKED_AT_ONCE = 10
 """Errors of one check that count: more of one frame, which are alike, would throw the level to and fro."""
