@@ -144,9 +144,16 @@ class SceneArrays(NamedArrays[Scene]):
 
     axis: ClassVar[str] = "N"
 
+    def _turning(self, scene: Scene) -> Rows:
+        turning = scene.angular_velocity
+        return list(np.zeros_like(scene.velocity) if turning is None else turning)
+
     position = payload_column(np.float64, Scene, "position")
     orientation = payload_column(np.float64, Scene, "orientation")
     velocity = payload_column(np.float64, Scene, "velocity")
+    angular_velocity = Column(
+        np.float64, 3, unit="rad/s", doc="in world axes; 0 where the world does not tell", rows=_turning
+    )
     dimensions = payload_column(np.float64, Scene, "dimensions")
 
     @property

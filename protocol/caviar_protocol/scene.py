@@ -38,6 +38,10 @@ def merge_scenes(scenes: Mapping[str, Scene]) -> Scene:
         stacked: Float64Array = np.concatenate([getattr(scene, field) for scene in parts])
         return stacked[order]
 
+    turning = None
+    if any(scene.angular_velocity is not None for scene in parts):
+        known = [(scene.angular_velocity, np.zeros_like(scene.velocity)) for scene in parts]
+        turning = np.concatenate([still if turns is None else turns for turns, still in known])[order]
     return Scene(
         names=tuple(names[i] for i in order),
         classes=tuple(classes[i] for i in order),
@@ -47,6 +51,7 @@ def merge_scenes(scenes: Mapping[str, Scene]) -> Scene:
         velocity=joined("velocity"),
         dimensions=joined("dimensions"),
         devices=tuple(sorted((d for scene in parts for d in scene.devices), key=lambda device: device.name)),
+        angular_velocity=turning,
     )
 
 
@@ -75,11 +80,15 @@ def device_pose(scene: Scene, device: Device) -> Pose:
 
 
 def device_velocity(scene: Scene, device: Device) -> Float64Array:
-    """Velocity [m/s] of a device in world axes, Shape ``[3]``; that of its parent."""
+    """Velocity [m/s] of a device in world axes, Shape ``[3]``: that of its parent, at the device's place."""
     if not device.parent:
         return np.zeros(3)
-    velocity: Float64Array = scene.velocity[_parent_index(scene, device)]
-    return velocity
+    index = _parent_index(scene, device)
+    velocity: Float64Array = scene.velocity[index]
+    if scene.angular_velocity is None:
+        return velocity
+    arm = np.array(device_pose(scene, device).position) - scene.position[index]
+    return velocity + np.cross(scene.angular_velocity[index], arm)
 
 
 _antennas: dict[str, tuple[tuple[Device, ...], list[AntennaDevice]]] = {}

@@ -25,7 +25,7 @@ UNIT_TOLERANCE = 1e-3
 MAX_COORDINATE_M = 1e9
 """[m] from the origin, along an axis."""
 MAX_SPEED = SPEED_OF_LIGHT
-"""[m/s] along an axis."""
+"""[m/s]; every object, and every corner of one that turns, is slower."""
 MAX_DIMENSION_M = 1e5
 """[m] of a side of a bounding box."""
 FEW_OBJECTS = 8
@@ -66,9 +66,10 @@ def numbers_are_right(scene: Scene) -> bool:
         # |n − 1| ≤ |n² − 1| for any norm n
         excess.dot(excess) <= UNIT_TOLERANCE**2
         and np.vdot(scene.position, scene.position) <= MAX_COORDINATE_M**2
-        and np.vdot(scene.velocity, scene.velocity) <= MAX_SPEED**2
+        and np.vdot(scene.velocity, scene.velocity) < MAX_SPEED**2
         and np.vdot(scene.dimensions, scene.dimensions) <= MAX_DIMENSION_M**2
         and scene.dimensions.min() > 0
+        and (scene.angular_velocity is None or not _too_fast(scene).any())
     )
 
 
@@ -80,12 +81,23 @@ def _few_numbers_are_right(scene: Scene) -> bool:
             # |n − 1| ≤ |n² − 1| for any norm n
             abs(w * w + x * x + y * y + z * z - 1.0) <= UNIT_TOLERANCE
             and e * e + n * n + u * u <= MAX_COORDINATE_M**2
-            and ve * ve + vn * vn + vu * vu <= MAX_SPEED**2
+            and ve * ve + vn * vn + vu * vu < MAX_SPEED**2
             and min(a, b, c) > 0.0
             and a + b + c <= MAX_DIMENSION_M
         ):
             return False
-    return True
+    return scene.angular_velocity is None or not _too_fast(scene).any()
+
+
+def _too_fast(scene: Scene) -> BoolArray:
+    """Objects of which some point may be as fast as light, or whose velocities are not finite."""
+    with np.errstate(all="ignore"):
+        speed = np.linalg.norm(scene.velocity, axis=1)
+        if scene.angular_velocity is not None:
+            turning = np.linalg.norm(scene.angular_velocity, axis=1)
+            speed = speed + turning * np.linalg.norm(scene.dimensions, axis=1) / 2
+    slower: BoolArray = speed < MAX_SPEED
+    return ~slower
 
 
 def wrong_number(scene: Scene) -> str:
@@ -102,12 +114,22 @@ def wrong_orientation(scene: Scene) -> str:
 
 
 def wrong_place(scene: Scene) -> str:
-    """The first object whose position or velocity is not finite, or absurd."""
-    far, fast = _beyond(scene.position, MAX_COORDINATE_M), _beyond(scene.velocity, MAX_SPEED)
-    bounds = f"finite numbers, at most {MAX_COORDINATE_M:g} m from the origin, are needed"
-    return _first(scene, far, "position", scene.position, lambda _: f"m: {bounds}") or _first(
-        scene, fast, "velocity", scene.velocity, lambda _: "m/s: finite numbers below light's are needed"
-    )
+    """The first object whose position or motion is not finite, or absurd."""
+    far, bounds = _beyond(scene.position, MAX_COORDINATE_M), f"at most {MAX_COORDINATE_M:g} m from the origin"
+    needed = f"m: finite numbers, {bounds}, are needed"
+    return _first(scene, far, "position", scene.position, lambda _: needed) or too_fast(scene)
+
+
+def too_fast(scene: Scene) -> str:
+    """The first object that moves, or of which a corner may move, at the speed of light or faster."""
+    with np.errstate(all="ignore"):
+        fast = ~(np.linalg.norm(scene.velocity, axis=1) < MAX_SPEED)
+    below = f"m/s: a finite speed below light's, {MAX_SPEED:g} m/s, is needed"
+    found = _first(scene, fast, "velocity", scene.velocity, lambda _: below)
+    if found or scene.angular_velocity is None:
+        return found
+    below = f"rad/s: finite numbers are needed, and corners slower than light, {MAX_SPEED:g} m/s"
+    return _first(scene, _too_fast(scene), "angular_velocity", scene.angular_velocity, lambda _: below)
 
 
 def wrong_dimensions(scene: Scene) -> str:

@@ -36,6 +36,7 @@ SINCE: dict[str, str] = {
     "Prepare.prefixes": "1.3",
     "Fault.culprit": "1.3",
     "WaypointCommand.at_once": "1.3",
+    "Scene.angular_velocity": "1.4",
     "Carrier.subcarriers": "1.4",
     "Carrier.subcarrier_spacing_hz": "1.4",
     "Carrier.taps": "1.4",

@@ -143,6 +143,8 @@ class Thing:
     size: Sequence[float] = (4.5, 1.8, 1.5)
     quaternion: Sequence[float] = (1.0, 0.0, 0.0, 0.0)
     velocity: Sequence[float] = (0.0, 0.0, 0.0)
+    turning: Sequence[float] = (0.0, 0.0, 0.0)
+    """Angular velocity [rad/s]."""
 
 
 def scene(devices: Sequence[AntennaDevice], things: Sequence[Thing] = ()) -> Scene:
@@ -160,6 +162,7 @@ def scene(devices: Sequence[AntennaDevice], things: Sequence[Thing] = ()) -> Sce
         velocity=stacked("velocity", 3),
         dimensions=stacked("size", 3),
         devices=tuple(sorted(devices, key=lambda device: device.name)),
+        angular_velocity=stacked("turning", 3) if any(any(thing.turning) for thing in things) else None,
     )
 
 

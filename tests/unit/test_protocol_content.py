@@ -123,6 +123,18 @@ WRONG: dict[str, tuple[Callable[[], Scene], str]] = {
     "far": (at("position", 0, 0, -1e10), r"object 'car.00': position \(-1e\+10, 1, 2\) m: finite"),
     "infinite velocity": (at("velocity", 1, 1, -np.inf), "object 'car.01': velocity .* below light's"),
     "faster than light": (at("velocity", 1, 1, 3e8), "object 'car.01': velocity"),
+    "as fast as light, in no direction alone": (
+        at("velocity", 1, slice(None), 299_792_458.0 / 3**0.5 * (1 + 1e-12)),
+        "object 'car.01': velocity .* below light's",
+    ),
+    "corners faster than light": (
+        lambda: replace(scene(), angular_velocity=np.full((COUNT, 3), 1e8)),
+        "object 'car.00': angular_velocity .* corners slower than light",
+    ),
+    "angular velocity not finite": (
+        lambda: replace(scene(), angular_velocity=np.full((COUNT, 3), np.nan)),
+        "object 'car.00': angular_velocity .* finite",
+    ),
     "negative side": (at("dimensions", 5, 1, -1.8), r"'car.05': dimensions \(4.5, -1.8, 1.5\) m: .* above 0"),
     "no side": (at("dimensions", 5, 2, 0.0), "object 'car.05': dimensions"),
     "absurd side": (at("dimensions", 5, 2, 1e300), "object 'car.05': dimensions .* at most 100000"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -80,6 +81,30 @@ def test_a_mounted_device_moves_and_turns_with_its_parent() -> None:
     np.testing.assert_allclose(pose.position, expected, rtol=0, atol=1e-12)
     np.testing.assert_allclose(pose.orientation, parent.orientation, rtol=0, atol=1e-15)
     np.testing.assert_array_equal(device_velocity(world, device), world.velocity[1])
+
+
+def test_a_mounted_device_moves_with_the_turn_of_its_parent() -> None:
+    """By hand: the body faces north, turns left by 3 rad/s and about its front by 0.5 rad/s; 2 m to the
+    front of it that leads west with 6 m/s, 1 m above it east with 0.5 m/s."""
+    still = scene("a", "b")
+    world = msgspec.structs.replace(
+        still,
+        orientation=np.array([[1.0, 0, 0, 0], quaternion_from_euler(math.pi / 2)]),
+        angular_velocity=np.array([[9.0, 9.0, 9.0], [0.0, 0.5, 3.0]]),
+    )
+    device = CameraDevice(name="c", parent="b", position=(2.0, 0.0, 1.0))
+    added = device_velocity(world, device) - world.velocity[1]
+    np.testing.assert_allclose(added, [-3.0 * 2.0 + 0.5 * 1.0, 0.0, 0.0], rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(device_velocity(world, CameraDevice(name="d")), np.zeros(3))
+
+
+def test_worlds_that_know_how_objects_turn_are_merged_with_those_that_do_not() -> None:
+    turning = np.array([[0.0, 0.0, 0.5], [0.1, 0.0, 0.0]])
+    knows = msgspec.structs.replace(scene("a", "c"), angular_velocity=turning)
+    merged = merge_scenes({"w1": knows, "w2": scene("b")})
+    assert merged.angular_velocity is not None
+    np.testing.assert_array_equal(merged.angular_velocity, [turning[0], np.zeros(3), turning[1]])
+    assert merge_scenes({"w1": scene("a"), "w2": scene("b")}).angular_velocity is None
 
 
 def test_a_device_without_its_parent_is_named() -> None:

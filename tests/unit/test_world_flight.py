@@ -110,6 +110,22 @@ def test_a_velocity_is_taken_up_with_the_greatest_acceleration(asked: Vector) ->
         np.testing.assert_allclose(velocity, min(ACCELERATION * t, speed) * direction, atol=1e-9)
 
 
+def test_a_bend_is_told_as_a_yaw_rate() -> None:
+    """From east to north: the course turns, and its rate is the change of the yaw over 0.1 ms."""
+    made = world()
+    fly(made, VelocityCommand(object="uav", velocity=(6.0, 0.0, 0.0)), 30)
+    north = VelocityCommand(object="uav", velocity=(0.0, 6.0, 0.0))
+    bend = fly(made, north, 4, first=31)[-1].products["scene"]
+    assert isinstance(bend, Scene)
+    assert bend.angular_velocity is not None
+    velocity, acceleration = bend.velocity[0], np.array([-1.0, 1.0, 0.0]) * ACCELERATION / math.sqrt(2)
+    yaws = [math.atan2(*(velocity + acceleration * t)[1::-1]) for t in (-1e-4, 1e-4)]
+    assert bend.angular_velocity[0] == pytest.approx((0.0, 0.0, (yaws[1] - yaws[0]) / 2e-4), rel=1e-6)
+    straight = fly(made, north, 40, first=35)[-1].products["scene"]
+    assert isinstance(straight, Scene)
+    assert straight.angular_velocity is None
+
+
 def test_without_a_command_it_brakes_and_hovers_and_keeps_its_yaw() -> None:
     made = world()
     fast = fly(made, VelocityCommand(object="uav", velocity=(6.0, -8.0, 0.0)), 30)[-1]

@@ -9,13 +9,14 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 from world_builders import T_SAM_NS, scene_at, wire_bytes
 
-from caviar_protocol.coordinates import rotation_matrix
+from caviar_protocol.coordinates import euler_from_quaternion, rotation_matrix
 from caviar_protocol.errors import CaviarError, RunError, ScenarioError, SetupError
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.topics import Scene
@@ -128,14 +129,8 @@ LORRY = """<routes>
 </routes>"""
 
 
-@pytest.fixture
-def ramp(tmp_path: Path) -> tuple[Path, np.ndarray, np.ndarray]:
-    """A straight road at no special angle, uphill, and its two ends."""
-    begin, end = np.array([30.0, -20.0, 5.0]), np.array([-130.0, 220.0, 22.0])
-    names = dict(zip(("x0", "y0", "z0", "x1", "y1", "z1"), (*begin, *end), strict=True))
-    (tmp_path / "r.nod.xml").write_text(NODES.format(**names))
-    (tmp_path / "r.edg.xml").write_text(EDGES)
-    (tmp_path / "r.rou.xml").write_text(LORRY)
+def converted(folder: Path) -> None:
+    """Make a network of the nodes and edges there."""
     import sumo
 
     subprocess.run(
@@ -144,10 +139,21 @@ def ramp(tmp_path: Path) -> tuple[Path, np.ndarray, np.ndarray]:
             *("--node-files", "r.nod.xml", "--edge-files", "r.edg.xml", "-o", "r.net.xml"),
             *("--offset.disable-normalization", "true", "--junctions.endpoint-shape", "true"),
         ],
-        cwd=tmp_path,
+        cwd=folder,
         check=True,
         capture_output=True,
     )
+
+
+@pytest.fixture
+def ramp(tmp_path: Path) -> tuple[Path, np.ndarray, np.ndarray]:
+    """A straight road at no special angle, uphill, and its two ends."""
+    begin, end = np.array([30.0, -20.0, 5.0]), np.array([-130.0, 220.0, 22.0])
+    names = dict(zip(("x0", "y0", "z0", "x1", "y1", "z1"), (*begin, *end), strict=True))
+    (tmp_path / "r.nod.xml").write_text(NODES.format(**names))
+    (tmp_path / "r.edg.xml").write_text(EDGES)
+    (tmp_path / "r.rou.xml").write_text(LORRY)
+    converted(tmp_path)
     return tmp_path, begin, end
 
 
@@ -198,6 +204,38 @@ def test_velocity_agrees_with_how_positions_change(make: Make) -> None:
             assert way / 0.1 == pytest.approx(after.velocity[j], abs=1e-6)
             checked += 1
     assert checked >= 5
+
+
+def test_the_yaw_rate_is_how_the_heading_changed_in_the_last_step(make: Make) -> None:
+    """On the way along the street nothing turns, and where vehicles change lanes or turn they say so."""
+    turned = 0
+    for before, after in pairwise(scenes(make(), 3, 60)):
+        for j, name in enumerate(after.names):
+            if name in before.names:
+                i = before.names.index(name)
+                yaws = [euler_from_quaternion(q)[0] for q in (before.orientation[i], after.orientation[j])]
+                rate = math.remainder(yaws[1] - yaws[0], 2 * math.pi) / 0.1
+                turning = after.angular_velocity
+                told = (0.0, 0.0, 0.0) if turning is None else turning[j].tolist()
+                assert told == pytest.approx((0.0, 0.0, rate), abs=1e-8)
+                turned += rate != 0
+    assert turned < 60
+
+
+def test_a_lorry_in_a_bend_turns_with_its_speed_over_the_radius(make: Make, tmp_path: Path) -> None:
+    """A quarter of a circle of 60 m to the left, at 12 m/s: 0.2 rad/s counter-clockwise. Its bend is a
+    polygon of 2° a side."""
+    angle = np.radians(np.arange(0.0, 91.0, 2.0))
+    arc = " ".join(f"{60 * math.sin(a):.6f},{60 - 60 * math.cos(a):.6f},0" for a in angle)
+    ends = dict(zip(("x0", "y0", "z0", "x1", "y1", "z1"), (0, 0, 0, 60, 60, 0), strict=True))
+    (tmp_path / "r.nod.xml").write_text(NODES.format(**ends))
+    (tmp_path / "r.edg.xml").write_text(EDGES.replace("<edge ", f'<edge shape="{arc}" '))
+    (tmp_path / "r.rou.xml").write_text(LORRY)
+    converted(tmp_path)
+    world = make(net=str(tmp_path / "r.net.xml"), routes=str(tmp_path / "r.rou.xml"), begin_s=1.0)
+    turning = [s.angular_velocity[0] for s in scenes(world, 1, 60) if s.angular_velocity is not None]
+    assert len(turning) > 50
+    assert np.mean(turning, axis=0) == pytest.approx((0.0, 0.0, 0.2), rel=0.05)
 
 
 def test_all_vehicles_stand_on_the_ground_on_their_side_of_the_road(make: Make) -> None:

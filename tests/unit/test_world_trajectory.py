@@ -111,6 +111,24 @@ def test_a_steady_flight_is_steady() -> None:
 
 
 @given(tracks())
+def test_the_yaw_rate_is_the_derivative_of_the_yaw(waypoints: list[Waypoint]) -> None:
+    track = Track(waypoints)
+    for a, b in pairwise(waypoints):
+        for s in (0.2, 0.5, 0.8):
+            t, h = a.t + s * (b.t - a.t), 1e-5 * (b.t - a.t)
+            velocity = track.velocity(t)
+            if 0 < math.hypot(*velocity[:2]) < 0.1:
+                continue  # near a point of rest the course turns within no time
+            turned = math.remainder(track.yaw(t + h) - track.yaw(t - h), 2 * math.pi)
+            assert track.yaw_rate(t, velocity) == pytest.approx(turned / (2 * h), rel=1e-3, abs=1e-5)
+
+
+def test_a_straight_flight_does_not_turn_not_even_by_rounding() -> None:
+    track = Track([Waypoint(0.7 * k, (0.3 * k, 0.1 * k, 5.0)) for k in range(6)])
+    assert {track.yaw_rate(t, track.velocity(t)) for t in np.linspace(-1.0, 4.0, 77).tolist()} == {0.0}
+
+
+@given(tracks())
 def test_it_looks_along_its_horizontal_course(waypoints: list[Waypoint]) -> None:
     track = Track(waypoints)
     for t in instants(waypoints):

@@ -143,3 +143,12 @@ class Scene(Payload, frozen=True, kw_only=True, omit_defaults=True, dict=True):
     ]
     devices: tuple[Device, ...] = ()
     """Devices that exist in this frame. A device whose parent left is not listed."""
+    angular_velocity: (
+        Annotated[
+            Float64Array,
+            array("<f8", "N", 3, unit="rad/s", doc="about the bounding-box centre, in world axes"),
+        ]
+        | None
+    ) = None
+    """How objects turn [rad/s, world axes]: what is at r from an object's position moves with velocity +
+    angular_velocity × r; absent: no object turns, or the world does not know."""

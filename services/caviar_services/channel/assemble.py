@@ -140,7 +140,7 @@ def _located(
 def _canonical_names(table: PathTable) -> PathTable:
     """Names that occur, sorted; points and objects behind the last interaction set to their filler."""
     if not table.types.shape[1]:
-        return replace(table, object_names=(), object_velocity=np.zeros((0, 3)))
+        return replace(table, object_names=(), object_velocity=np.zeros((0, 3)), object_turning=None)
     used = table.types != 0
     objects = np.where(used, table.objects, -1)
     occurring = np.unique(objects[used])
@@ -155,6 +155,7 @@ def _canonical_names(table: PathTable) -> PathTable:
         points=np.where(used[..., None], table.points, 0.0),
         object_names=tuple(table.object_names[i] for i in order),
         object_velocity=table.object_velocity[order],
+        object_turning=None if table.object_turning is None else table.object_turning.take(order),
         faces=None if table.faces is None else np.where(used, table.faces, 0).astype(np.int32),
         joined_faces=table.joined_faces,
         hidden=table.hidden,
@@ -168,14 +169,13 @@ def _geometry(
         return np.array([getattr(antenna, field) for antenna in antennas]).reshape(-1, 3)
 
     tx, rx = np.divmod(table.pair, max(len(receivers), 1))
-    standing = np.concatenate([table.object_velocity, np.zeros((1, 3))])
     return path_geometry(
         start=stacked(transmitters, "position")[tx],
         points=table.points,
         end=stacked(receivers, "position")[rx],
         count=(table.types != 0).sum(1),
         start_velocity=stacked(transmitters, "velocity")[tx],
-        point_velocity=standing[table.objects],
+        point_velocity=table.point_velocity,
         end_velocity=stacked(receivers, "velocity")[rx],
     )
 

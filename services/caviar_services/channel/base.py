@@ -14,12 +14,14 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array
+from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.devices import PATTERNS
 from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.host import keep_large_buffers
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.paths import changes
 from caviar_protocol.scene import antennas
+from caviar_protocol.scene_content import too_fast
 from caviar_protocol.topics import AntennaDevice, Channel, ChannelOptions, Scene
 from caviar_protocol.topics.scene import Device, Panel
 from caviar_services.channel.assemble import Product, assemble
@@ -181,6 +183,10 @@ class ChannelModel(Service[S]):
             self._summed = scene.devices, _numbers_of(scene.devices)
         if not math.isfinite(self._summed[1] + _numbers_in(scene)):
             _refuse_not_finite(scene)
+        if scene.angular_velocity is not None or np.vdot(scene.velocity, scene.velocity) >= SPEED_OF_LIGHT**2:
+            wrong = too_fast(scene)
+            if wrong:
+                raise PayloadError(f"{wrong}; is it in km/h, or of another unit of time?")
         made = self.model(frame, scene, antennas(scene, "tx"), antennas(scene, "rx"))
         channel = made.channel
         return StepResult(
@@ -220,7 +226,9 @@ class ChannelModel(Service[S]):
 
 def _numbers_in(scene: Scene) -> float:
     """The sum of all numbers of objects; most scenes are small, and each frame has a new one."""
-    arrays = (scene.position, scene.orientation, scene.velocity, scene.dimensions)
+    arrays = [scene.position, scene.orientation, scene.velocity, scene.dimensions]
+    if scene.angular_velocity is not None:
+        arrays.append(scene.angular_velocity)
     return sum([sum(values.ravel().tolist()) for values in arrays])
 
 
@@ -240,8 +248,10 @@ def _numbers_of_panel(panel: Panel) -> tuple[float, ...]:
 
 def _refuse_not_finite(scene: Scene) -> None:
     """Raise `PayloadError` naming a NaN or an infinity of a scene: no channel follows from one."""
-    arrays = (scene.position, scene.orientation, scene.velocity, scene.dimensions)
-    for name, values in zip(("position", "orientation", "velocity", "dimensions"), arrays, strict=True):
+    for name in ("position", "orientation", "velocity", "dimensions", "angular_velocity"):
+        values = getattr(scene, name)
+        if values is None:
+            continue
         for i in np.flatnonzero(~np.isfinite(values).all(-1))[:1].tolist():
             raise PayloadError(
                 f"object {scene.names[i]!r} has the {name} {values[i].tolist()}; give finite numbers"
@@ -255,6 +265,23 @@ def _refuse_not_finite(scene: Scene) -> None:
         for name, part in parts.items():
             if not all(map(math.isfinite, part)):
                 raise PayloadError(f"device {device.name!r} has the {name} {part}; give finite numbers")
+
+
+def _refuse_amplified(channel: Channel) -> None:
+    """Raise `PayloadError` naming the strongest path of those that bring more power than was sent."""
+    carrier, path = np.unravel_index(int(np.abs(channel.a).argmax()), channel.a.shape)
+    pair = int(np.searchsorted(channel.offsets, path, side="right")) - 1
+    tx, rx = divmod(pair, len(channel.rx))
+    through = [channel.object_names[o] for o in channel.objects[path].tolist() if o >= 0]
+    length = float(channel.tau[path]) * SPEED_OF_LIGHT
+    wavelength = SPEED_OF_LIGHT / channel.carriers[carrier].frequency_hz
+    gain = 20 * np.log10(abs(channel.a[carrier, path]))
+    raise PayloadError(
+        f"the path from {channel.tx[tx]!r} to {channel.rx[rx]!r}{' by way of ' * bool(through)}"
+        f"{', '.join(through)} has a gain of {gain:.1f} dB on carrier {channel.carriers[carrier].name!r}, "
+        f"more than was sent: {length:.3g} m, {length / wavelength:.3g} wavelengths, are within the near "
+        "field of its antennas, where far-field gains do not hold; move them apart, or off that surface"
+    )
 
 
 class PathModel(ChannelModel[S]):
@@ -288,6 +315,8 @@ class PathModel(ChannelModel[S]):
             absorption_db_per_km=self.absorption_db_per_km,
         )
         channel = assemble(product, tx, rx, found.table, found.los, found.matrices)
+        if np.abs(channel.a).max(initial=0.0) > 1:
+            _refuse_amplified(channel)
         done = time.perf_counter_ns()
         return Modelled(
             channel=channel,

@@ -198,7 +198,6 @@ class ElementTracer:
         """With the phase of lengths in float64, Shape ``[P]``, and what follows from the paths' points."""
         ends = np.array([target.position for target in targets]).reshape(-1, 3)[table.pair]
         start = np.broadcast_to(source.position, ends.shape)
-        objects = np.concatenate([table.object_velocity, np.zeros((1, 3))])
         with np.errstate(invalid="ignore"):  # what is not finite is left out
             geometry = path_geometry(
                 start,
@@ -206,7 +205,7 @@ class ElementTracer:
                 ends,
                 (table.types != 0).sum(1),
                 np.broadcast_to(source.velocity, ends.shape),
-                objects[table.objects],
+                table.point_velocity,
                 np.array([target.velocity for target in targets]).reshape(-1, 3)[table.pair],
             )
             sent = source.radiated(geometry.departure)

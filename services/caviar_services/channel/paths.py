@@ -93,6 +93,27 @@ def antenna_fields(antennas: Sequence[Antenna], which: Int64Array, directions: F
 
 
 @dataclass(frozen=True, eq=False)
+class Turning:
+    """How K named objects turn."""
+
+    centre: Float64Array
+    """What they turn about [m], Shape ``[K, 3]``."""
+    angular_velocity: Float64Array
+    """In world axes [rad/s], Shape ``[K, 3]``."""
+
+    def take(self, which: Sequence[int]) -> Turning:
+        """Those of these objects, in this order."""
+        return Turning(self.centre[list(which)], self.angular_velocity[list(which)])
+
+    def velocity(self, objects: Int32Array, points: Float64Array) -> Float64Array:
+        """What turning adds to the velocity [m/s] of points [m] of objects, by number, −1 for what stands,
+        Shape ``[..., 3]``: ω × r."""
+        centre = np.concatenate([self.centre, np.zeros((1, 3))])[objects]
+        turning = np.concatenate([self.angular_velocity, np.zeros((1, 3))])[objects]
+        return np.cross(turning, points - centre)
+
+
+@dataclass(frozen=True, eq=False)
 class PathTable:
     """Paths as a model found them: any order, no antennas applied, no carrier phase.
 
@@ -124,6 +145,16 @@ class PathTable:
     absent: unknown. Below 0: −1 minus the place of a surface in ``joined_faces``."""
     joined_faces: tuple[tuple[str, int], ...] = ()
     """Object and number of the plane that surfaces of several objects are known by."""
+    object_turning: Turning | None = None
+    """How named objects turn; absent: none does."""
+
+    @property
+    def point_velocity(self) -> Float64Array:
+        """Velocity [m/s] of what stands at each point, there, Shape ``[P, D, 3]``."""
+        velocity: Float64Array = np.concatenate([self.object_velocity, np.zeros((1, 3))])[self.objects]
+        if self.object_turning is not None:
+            velocity = velocity + self.object_turning.velocity(self.objects, self.points)
+        return velocity
 
     def take(self, which: Int64Array | BoolArray) -> PathTable:
         """These paths, in this order."""
@@ -139,4 +170,5 @@ class PathTable:
             joined_faces=self.joined_faces,
             hidden=None if self.hidden is None else self.hidden[which],
             traced=None if self.traced is None else self.traced[which],
+            object_turning=self.object_turning,
         )

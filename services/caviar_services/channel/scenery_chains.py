@@ -101,6 +101,8 @@ class SceneryChains:
         ``progress`` is called before each part with its number and how many there are. Returns what was
         found.
         """
+        if not self._scene.has_scenery:
+            return "there is no scenery"
         place = transmitter - self._scene.centre
         key = self._key(place)
         known = self._cache.load(key, (self._options.max_depth, 2)) if self._cache else None
@@ -128,6 +130,9 @@ class SceneryChains:
 
     def _now(self, place: Float64Array) -> KnownScenery:
         """What the frame tells about the scenery from a place in the ray tracer's coordinates."""
+        if not self._scene.has_scenery:
+            depth = self._options.max_depth
+            return KnownScenery(np.zeros((0, depth), np.int32), np.zeros((0, 2), np.int32))
         if self._every is None:
             chains = self._launched(place)
             return KnownScenery(chains, self._sights(chains, _SIGHT_RAYS_PER_FRAME))

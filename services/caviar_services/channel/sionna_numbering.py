@@ -93,6 +93,13 @@ class NumberedTriangles:
         """Vertices of the shapes that may move [m], Shape ``[V, 3]``; a copy."""
         return self._vertices.copy()
 
+    def count_from(self, centre: Float64Array) -> None:
+        """Move everything to stand about another centre [m], Shape ``[3]``, as it stood about the last."""
+        self._corners += centre - self.centre
+        self.centre = centre
+        self.version += 1
+        self.surfaces.move(np.arange(len(self._faces)), self._corners[self._faces])
+
     def move(self, vertices: Float64Array) -> bool:
         """Put the vertices that may move there [m], Shape ``[V, 3]``. Returns whether any has moved."""
         changed = (vertices != self._vertices).any(1)

@@ -28,6 +28,7 @@ from caviar_services.channel.contributing import SurfaceMaterial, UsedSurfaces, 
 from caviar_services.channel.edge_fields import Media
 from caviar_services.channel.mesh_detail import DetailSettings
 from caviar_services.channel.object_materials import Constants, ObjectMaterials, body_kind
+from caviar_services.channel.paths import Turning
 from caviar_services.channel.sionna_loading import by_material, loaded, with_detail
 from caviar_services.channel.sionna_materials import (
     OBJECT_MATERIAL,
@@ -120,13 +121,15 @@ class SionnaScene(NumberedTriangles):
         }
         bodies = [body for of in of_material.values() for body in of]
         self._standing: frozenset[Body] = frozenset()
+        self.turning: Turning | None = None
+        """How the objects turn that bodies stand for, by the names that `place` returned; None: none does."""
         is_metal = settings.body_material == "metal"
         moving = self._moving_shapes(of_material[""], skins[0].constants if skins else None, is_metal)
         self._moving = [moving[-1]]
         if bodied:
             self._moving += [self._body_shape(of_material[m], m, of.radio) for m, of in made.items()]
         self._shapes = [*shapes, *moving[:-1], *self._moving]
-        centre = np.round((self.low + self.high) / (2 * _CENTRE_STEP)) * _CENTRE_STEP
+        centre = _near_middle(self.low, self.high)
         super().__init__(
             self._shapes, self._replace_shapes(centre), bodies, self._meshes, centre, len(self._moving)
         )
@@ -266,11 +269,16 @@ class SionnaScene(NumberedTriangles):
         clash = self._scenery & index.keys()
         if clash:
             raise PayloadError(f"object {min(clash)!r} has the name of a piece of scenery; rename one")
+        if not self.has_scenery and solid:
+            self._count_from_objects(scene.position[solid])
         # A new assignment each frame: the product follows from this frame alone, also after a restart.
         kinds = ((scene.names[i], self._kind(scene, i)) for i in solid)
         taken = BodyPool(self._pool).assign(kinds)
         standing = {body: index[name] for name, body in taken.items()}
         names, velocity = list(self.names), np.zeros((len(self.names), 3))
+        turning = None
+        if scene.angular_velocity is not None and scene.angular_velocity.any():
+            turning = Turning(np.zeros_like(velocity), np.zeros_like(velocity))
         first = len(names) - len(self._bodies)
         vertices = self.moving_vertices
         begin = len(vertices) - sum(len(self._meshes[asset].vertices) for asset, _ in self._bodies)
@@ -282,6 +290,9 @@ class SionnaScene(NumberedTriangles):
             if i is not None:
                 vertices[rows] = placed(mesh, scene.dimensions[i], object_pose(scene, i))
                 names[number], velocity[number] = scene.names[i], scene.velocity[i]
+                if turning is not None and scene.angular_velocity is not None:
+                    turning.centre[number] = scene.position[i]
+                    turning.angular_velocity[number] = scene.angular_velocity[i]
             elif body in self._standing:
                 vertices[rows] = self._middle
         before = self._vertices.copy() if len(self._moving) > 1 else None
@@ -291,8 +302,16 @@ class SionnaScene(NumberedTriangles):
                 if before is None or not np.array_equal(before[rows], vertices[rows]):
                     params[f"{shape.id}.vertex_positions"] = floats(vertices[rows] - self.centre)
             params.update()
-        self._standing = frozenset(standing)
+        self._standing, self.turning = frozenset(standing), turning
         return tuple(names), velocity
+
+    def _count_from_objects(self, positions: Float64Array) -> None:
+        """Let the ray tracer count from the middle of the objects [m], Shape ``[N, 3]``: nothing else says
+        where a world without scenery is, and far from the origin its float32 is coarse."""
+        centre = _near_middle(positions.min(0), positions.max(0))
+        if (centre != self.centre).any():
+            self.low, self.high = self.low + (centre - self.centre), self.high + (centre - self.centre)
+            self.count_from(centre)
 
     @property
     def has_scenery(self) -> bool:
@@ -374,6 +393,12 @@ def _material_name(shape: Shape) -> str:
     """Of a shape, as a scenario has it."""
     name: str = shape.material.name
     return _SKIN_NAME if shape.id == _SKIN else name.removeprefix(OBJECT_MATERIAL)
+
+
+def _near_middle(low: Float64Array, high: Float64Array) -> Float64Array:
+    """Multiples of `_CENTRE_STEP` next to the middle of a box [m], Shape ``[3]``; no negative zeros."""
+    middle: Float64Array = np.round((low + high) / (2 * _CENTRE_STEP)) * _CENTRE_STEP + 0.0
+    return middle
 
 
 def _bounds(shapes: Sequence[Shape]) -> tuple[Float64Array, Float64Array]:

@@ -69,6 +69,7 @@ def path_table(
         traced=np.arange(len(pair)),
         object_names=names,
         object_velocity=velocity,
+        object_turning=scene.turning,
         faces=faces,
         joined_faces=joined,
     )

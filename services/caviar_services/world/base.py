@@ -40,6 +40,8 @@ class ObjectState(NamedTuple):
     """[m/s], world axes."""
     dimensions: Vector
     """Length (x), width (y), height (z) [m]."""
+    yaw_rate: float = 0.0
+    """[rad/s] about the vertical through its position, counter-clockwise; 0 also where it is not known."""
 
 
 class WorldSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -163,7 +165,18 @@ class World(Service[W]):
             velocity=velocity,
             dimensions=dimensions,
             devices=devices,
+            angular_velocity=_turning(states),
         )
+
+
+def _turning(states: Sequence[ObjectState]) -> Float64Array | None:
+    """Angular velocities, Shape ``[N, 3]``; None where nothing turns, so that such scenes stay as short."""
+    rates = [state.yaw_rate for state in states]
+    if not any(rates):
+        return None
+    turning = np.zeros((len(states), 3))
+    turning[:, 2] = rates
+    return turning + 0.0  # as in `_tables`
 
 
 def _tables(states: Sequence[ObjectState]) -> tuple[Float64Array, ...]:

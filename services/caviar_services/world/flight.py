@@ -211,6 +211,7 @@ class FlightWorld(TrajectoryWorld):
                 orientation=quaternion_from_euler(flyer.yaw),
                 velocity=flyer.velocity,
                 dimensions=thing.dimensions_m,
+                yaw_rate=flyer.yaw_rate,
             )
 
 

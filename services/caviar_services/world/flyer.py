@@ -19,6 +19,7 @@ import msgspec
 
 from caviar_protocol.coordinates import Vector
 from caviar_services.world.obstacles import Obstacles
+from caviar_services.world.yaw_rate import course_rate
 
 SUB_STEP_NS = 10_000_000
 """[ns]"""
@@ -109,6 +110,10 @@ class _Piece(NamedTuple):
             return position, _sum(self.velocity, self.acceleration, u)
         return _sum(position, self.after, t - self.ramp), self.after
 
+    def acceleration_at(self, t: float) -> Vector:
+        """[m/s²] up to a time [s]."""
+        return self.acceleration if t <= self.ramp else _REST
+
 
 class FlyerState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A `Flyer` between two frames."""
@@ -125,10 +130,11 @@ class FlyerState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     pieces: tuple[_Piece, ...]
     """It and those looked at behind it."""
     at_once: Annotated[int, msgspec.Meta(ge=1, le=_AT_ONCE)]
+    yaw_rate: float = 0.0
 
 
 class Flyer:
-    """Position, velocity and yaw of one object."""
+    """Position, velocity, yaw and its rate, of one object."""
 
     def __init__(self, limits: Limits) -> None:
         self.limits = limits
@@ -140,6 +146,7 @@ class Flyer:
         self.position: Vector = position
         self.velocity: Vector = _REST
         self.yaw = yaw
+        self.yaw_rate = 0.0
         self._motion = _HOVER
         self._restart()
 
@@ -163,6 +170,7 @@ class Flyer:
             into_ns=self._into_ns,
             pieces=tuple(self._pieces),
             at_once=self._at_once,
+            yaw_rate=self.yaw_rate,
         )
 
     def go_on(self, state: FlyerState) -> None:
@@ -171,6 +179,7 @@ class Flyer:
         self._motion = state.motion
         self._begin, self._begin_yaw, self._into_ns = state.begin, state.begin_yaw, state.into_ns
         self._pieces, self._at_once = deque(state.pieces), state.at_once
+        self.yaw_rate = state.yaw_rate
 
     def fly(self, motion: Motion | None, length_ns: int) -> Counter[str]:
         """Move for a time [ns]; without a motion brake and hover.
@@ -186,16 +195,21 @@ class Flyer:
             self._motion = wanted
             self._restart()
         self._into_ns += length_ns
+        acceleration = _REST
         while self._into_ns >= SUB_STEP_NS:
             events.add(self._next().event)
-            self._begin = self._pieces.popleft().at(_H)
+            piece = self._pieces.popleft()
+            self._begin, acceleration = piece.at(_H), piece.acceleration_at(_H)
             self._begin_yaw = _course(self._begin[1], self._begin_yaw)
             self._into_ns -= SUB_STEP_NS
         self.position, self.velocity = self._begin
         if self._into_ns:
             events.add(self._next().event)
             self.position, self.velocity = self._next().at(self._into_ns / 1e9)
+            acceleration = self._next().acceleration_at(self._into_ns / 1e9)
         self.yaw = _course(self.velocity, self._begin_yaw)
+        is_on_course = math.hypot(*self.velocity[:2]) > _HOVERING
+        self.yaw_rate = course_rate(self.velocity, acceleration) if is_on_course else 0.0
         return Counter(events - {""})
 
     def _next(self) -> _Piece:

@@ -19,10 +19,14 @@ from caviar_services.world.base import ObjectState, World, WorldSettings
 from caviar_services.world.shapes import SHAPES
 from caviar_services.world.sumo_frame import Placement, body_pose, heading, object_class
 from caviar_services.world.sumo_process import Simulation, check_file, load_libsumo
+from caviar_services.world.yaw_rate import turning
 
 _NS_PER_MS = 1_000_000
 _LONGEST_STEP_MS = 1000
 """SUMO's car-following models are made for steps up to one second."""
+
+_JUMP_DEG = 90.0
+"""A vehicle that turns by more in a step has not turned: SUMO has put it elsewhere."""
 
 _TOLD_EVERY = 1000
 """Steps at which SUMO's way to an instant long before is told."""
@@ -100,6 +104,7 @@ class SumoWorld(World[SumoSettings]):
         self._placement = Placement(settings.offset_m, math.radians(settings.yaw_deg))
         self._simulation: Simulation | None = None
         self._steps = 0
+        self._angles: dict[str, float] = {}
         self._vehicles: dict[str, _Kind] = {}
         self._persons: dict[str, _Kind] = {}
         if not settings.net and not settings.config:
@@ -142,6 +147,7 @@ class SumoWorld(World[SumoSettings]):
             if self._steps % _TOLD_EVERY == 0:
                 self.run.progress(f"fill the roads: {simulation.api.simulation.getTime():.0f} s", 0.0)
         self._steps = 0
+        self._angles = {}
 
     def objects_at(self, elapsed_ns: int) -> Iterable[ObjectState]:
         """Vehicles, then persons, each in the order of their departure."""
@@ -220,9 +226,10 @@ class SumoWorld(World[SumoSettings]):
         return [*arguments, *quiet, *step, *s.options]
 
     def _step(self, simulation: Simulation) -> None:
+        api = simulation.api
+        self._angles = {name: api.vehicle.getAngle(name) for name in api.vehicle.getIDList()}
         simulation.step()
         self._steps += 1
-        api = simulation.api
         for name in api.simulation.getDepartedIDList():
             self._vehicles[name] = self._kind(api.vehicle, name)
         for name in api.simulation.getDepartedPersonIDList():
@@ -242,7 +249,8 @@ class SumoWorld(World[SumoSettings]):
                 continue
             if domain is api.person and domain.getVehicle(name):
                 continue
-            towards = heading(domain.getAngle(name), domain.getSlope(name), self._placement)
+            angle = domain.getAngle(name)
+            towards = heading(angle, domain.getSlope(name), self._placement)
             speed = domain.getSpeed(name)
             pose = body_pose(bumper, towards, dimensions[0], dimensions[2], self._placement)
             fx, fy, fz = towards.forward
@@ -253,7 +261,14 @@ class SumoWorld(World[SumoSettings]):
                 orientation=pose.orientation,
                 velocity=(speed * fx, speed * fy, speed * fz),
                 dimensions=dimensions,
+                yaw_rate=self._yaw_rate(name, angle) if domain is api.vehicle else 0.0,
             )
+
+    def _yaw_rate(self, vehicle: str, angle: float) -> float:
+        """[rad/s] Of a vehicle whose angle [°] is this, clockwise: over the last step. A person turns on the
+        spot, from one step to the next, and so does a vehicle that SUMO puts elsewhere: these have none."""
+        turned = math.remainder(angle - self._angles.get(vehicle, angle), 360.0)
+        return turning(-math.radians(turned) * 1000.0 / self._step_ms) if abs(turned) < _JUMP_DEG else 0.0
 
 
 def step_length_ms(sampling_period_ns: int, step_ms: int | None) -> int:

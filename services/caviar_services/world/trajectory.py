@@ -18,6 +18,7 @@ from caviar_services.service import RunInfo
 from caviar_services.world.base import ObjectState, World, WorldSettings
 from caviar_services.world.curve import MonotoneCurve
 from caviar_services.world.shapes import SHAPES
+from caviar_services.world.yaw_rate import course_rate, turning
 
 COLUMNS = ("t_s", "x_m", "y_m", "z_m")
 YAW_COLUMN = "yaw_deg"
@@ -93,6 +94,7 @@ class TrajectoryWorld(World[TrajectorySettings]):
                 orientation=quaternion_from_euler(track.yaw(t, velocity)),
                 velocity=velocity,
                 dimensions=thing.dimensions_m,
+                yaw_rate=track.yaw_rate(t, velocity),
             )
 
 
@@ -147,6 +149,20 @@ class Track:
         start, end = self._hover[k]
         s = (t - float(times[k])) / float(times[k + 1] - times[k])
         return start + (end - start) * s * s * (3 - 2 * s)
+
+    def yaw_rate(self, t: float, velocity: Vector) -> float:
+        """[rad/s] at instant ``t`` [s], where the velocity [m/s] is this: the derivative of `yaw`."""
+        if self._given is not None:
+            return turning(self._given.at(t, 1)[0])
+        k = self._curve.segment(t)
+        if k < 0:
+            return 0.0
+        if self._moves(k):
+            return course_rate(velocity, self._curve.at(t, 2)) if math.hypot(*velocity[:2]) > _SLOW else 0.0
+        start, end = self._hover[k]
+        length = float(self._curve.times[k + 1] - self._curve.times[k])
+        s = (t - float(self._curve.times[k])) / length
+        return turning((end - start) * 6 * s * (1 - s) / length)
 
     def _moves(self, k: int) -> bool:
         return self._moving[k]

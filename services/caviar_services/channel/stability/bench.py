@@ -30,6 +30,8 @@ class Plate:
     name: str
     corners: Sequence[Point]
     material: str = "surface"
+    faces: Sequence[Sequence[int]] = ()
+    """Corners of its triangles; empty: those of a convex polygon."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,8 @@ class Thing:
     size: Point = (4.5, 1.8, 1.5)
     quaternion: Point = (1.0, 0.0, 0.0, 0.0)
     velocity: Point = (0.0, 0.0, 0.0)
+    turning: Point = (0.0, 0.0, 0.0)
+    """Angular velocity [rad/s]."""
 
 
 class Bench:
@@ -111,7 +115,7 @@ class Bench:
         assets = {}
         for plate in plates:
             mesh = folder / "meshes" / f"{plate.name}.ply"
-            mesh.write_text(_ply(plate.corners))
+            mesh.write_text(_ply(plate))
             assets[f"scenery/meshes/{plate.name}.ply"] = mesh
             parts.append(
                 f'<shape type="ply" id="mesh-{plate.name}">'
@@ -144,6 +148,7 @@ def world(devices: Sequence[AntennaDevice], things: Sequence[Thing] = ()) -> Sce
         velocity=column("velocity", 3),
         dimensions=column("size", 3),
         devices=tuple(sorted(devices, key=lambda device: device.name)),
+        angular_velocity=column("turning", 3) if any(any(thing.turning) for thing in things) else None,
     )
 
 
@@ -200,12 +205,14 @@ def room(size: Point) -> list[Plate]:
     return plates
 
 
-def _ply(corners: Sequence[Point]) -> str:
+def _ply(plate: Plate) -> str:
+    corners = plate.corners
+    faces = plate.faces or [(0, i, i + 1) for i in range(1, len(corners) - 1)]
     lines = ["ply", "format ascii 1.0", f"element vertex {len(corners)}"]
     lines += [f"property double {axis}" for axis in "xyz"]
-    lines += [f"element face {len(corners) - 2}", "property list uchar int vertex_index", "end_header"]
+    lines += [f"element face {len(faces)}", "property list uchar int vertex_index", "end_header"]
     lines += [" ".join(repr(float(x)) for x in corner) for corner in corners]
-    lines += [f"3 0 {i} {i + 1}" for i in range(1, len(corners) - 1)]
+    lines += ["3 {} {} {}".format(*face) for face in faces]
     return "\n".join(lines) + "\n"
 
 

@@ -51,7 +51,7 @@ def _(bench: Bench) -> Outcome:
     return all_of(equal(1, len(channel.tau), "paths"), close("|H|", expected, abs(total(channel)), 1e-5))
 
 
-def _room(order: int, samples: int, bench: Bench) -> Outcome:
+def _room(order: int, samples: int, bench: Bench, **settings: object) -> Outcome:
     """Every image of a room of a conductor, 4n² + 2 of order n, each with its length.
 
     The places are such that no path has a segment below 6 cm: those under 1 cm are not found.
@@ -59,7 +59,13 @@ def _room(order: int, samples: int, bench: Bench) -> Outcome:
     size = (16.03, 15.04, 14.56)
     tx, rx = np.array([2.55, 4.47, 8.15]), np.array([6.66, 13.44, 12.22])
     model = bench.traced(
-        2.8e9, room(size), {"surface": CONDUCTOR}, max_depth=order, samples=samples, receivers_at_once=1
+        2.8e9,
+        room(size),
+        {"surface": CONDUCTOR},
+        max_depth=order,
+        samples=samples,
+        receivers_at_once=1,
+        **settings,
     )
     channel = link(model, tx.tolist(), rx.tolist())
     images = formulas.room_images(size, tx, rx, order)
@@ -73,6 +79,11 @@ def _room(order: int, samples: int, bench: Bench) -> Outcome:
 
 case("paths", "25 in a room, two reflections at most")(partial(_room, 2, 20_000))
 case("paths", "1,159 in a room, nine reflections at most")(partial(_room, 9, 200_000))
+
+
+@case("paths", "25 in a room, of 200,000 rays of which memory holds 10,000 at once")
+def _(bench: Bench) -> Outcome:
+    return _room(2, 200_000, bench, candidates="launched", memory_gib=1e-3)
 
 
 @case("paths", "64 at most of the drawn channel: their mean power is 1", traced=False)

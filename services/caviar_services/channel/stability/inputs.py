@@ -77,6 +77,21 @@ for _bad in BAD:
             )
 
 
+@case("input", "a speed above that of light", traced=False)
+def _(bench: Bench) -> Outcome:
+    car = Thing("car", (40.0, 0.0, 0.0), velocity=(2.5e8, 2.5e8, 0.0))
+    words = "object 'car': velocity (2.5e+08, 2.5e+08, 0) m/s: a finite speed below light's"
+    ends = [antenna("t", "tx", (0, 0, 9)), antenna("r", "rx", (20, 3, 1))]
+    return refused(PayloadError, words, lambda: answer(bench.free_space(F), world(ends, [car])))
+
+
+@case("input", "a path gain above 1: 100 MHz, both antennas 5 cm above a conductor")
+def _(bench: Bench) -> Outcome:
+    model = bench.traced(100e6, [Plate("ground", square(50.0))], {"surface": CONDUCTOR})
+    words = "the path from 't' to 'r' by way of ground has a gain of"
+    return refused(PayloadError, words, lambda: link(model, (0, 0, 0.05), (0.02, 0, 0.05)))
+
+
 def _setting(error: type[CaviarError], words: str, make: Callable[[Bench], object], bench: Bench) -> Outcome:
     return refused(error, words, lambda: make(bench))
 

@@ -11,6 +11,9 @@ from caviar_services.channel.stability.case import Outcome, all_of, case, close,
 from caviar_services.channel.stability.places import F, two_rays
 from caviar_services.channel.stability.waves import LOSSY, ground
 
+HALVES = (0, 1, 2), (0, 2, 3)
+"""Corners of the triangles of a square."""
+
 SPLIT = [(-300, -300, 0), (300, -300, 0), (300, 300, 0), (-300, 300, 0)]
 
 
@@ -53,6 +56,21 @@ for _name, _plates in ODD.items():
     case("mesh", _name)(partial(_ground_and, _plates))
 for _name in ("a surface three times, one of them flipped", "a triangle without area within a surface"):
     case("mesh", f"{_name}, with diffraction")(partial(_ground_and, ODD[_name], diffraction=True))
+
+
+_SIDE = 40
+"""Squares along a side of the ground of many triangles."""
+
+
+@case("mesh", f"a surface of {2 * _SIDE**2:,} triangles")
+def _(bench: Bench) -> Outcome:
+    """They are one plane, which reflects once."""
+    x, y = np.meshgrid(*[np.linspace(-300, 300, _SIDE + 1)] * 2)
+    corners = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3)
+    i = np.arange(len(corners)).reshape(_SIDE + 1, _SIDE + 1)
+    squares = i[:-1, :-1], i[:-1, 1:], i[1:, 1:], i[1:, :-1]
+    faces = np.concatenate([np.stack([squares[c] for c in half], -1).reshape(-1, 3) for half in HALVES])
+    return _ground_and([Plate("ground", corners.tolist(), faces=faces.tolist())], bench)
 
 
 def _seam(shift: Point, bench: Bench) -> Outcome:

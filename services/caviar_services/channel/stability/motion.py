@@ -81,6 +81,38 @@ def _(bench: Bench) -> Outcome:
     return close("Hz", 0.0, got, absolute=1e-6)
 
 
+def _corner(traced: bool, bench: Bench) -> Outcome:
+    """An antenna 2.5 m before the middle of a car that turns on the spot moves sideways with ω·r."""
+    model = bench.traced(F, without_body=["car"]) if traced else bench.free_space(F)
+    car = Thing("car", (60.0, 0.0, 0.0), velocity=(3.0, 0.0, 0.0), turning=(0.0, 0.0, 1.2))
+    ends = [antenna("t", "tx", (62.5, -40.0, 0)), antenna("car/r", "rx", (2.5, 0, 0), parent="car")]
+    got = float(answer(model, world(ends, [car])).doppler[0, 0])
+    return close("Hz", -formulas.doppler(1.2 * 2.5, F), got, absolute=0.06)
+
+
+for _traced, _rung in ((False, "free-space"), (True, "siso-rt")):
+    case("speed", f"an antenna at the corner of a car that turns, {_rung}", traced=_traced)(
+        partial(_corner, _traced)
+    )
+
+
+@case("speed", "reflected by a wall that turns")
+def _(bench: Bench) -> Outcome:
+    """The shift is that of the wall where the wave meets it: by differences of the image's distance."""
+    rate, middle = 0.8, np.array([30.0, 0.0, 0.0])
+    wall = Thing("wall", middle.tolist(), (2.0, 60.0, 60.0), turning=(0.0, 0.0, rate))
+    tx, rx = np.array([0.0, -9.0, 1.0]), np.array([4.0, 8.0, -2.0])
+
+    def length(t: float) -> float:
+        normal = -np.array([math.cos(rate * t), math.sin(rate * t), 0.0])
+        return float(np.linalg.norm(formulas.mirrored(tx, middle + normal, normal) - rx))
+
+    channel = link(bench.traced(F), tx.tolist(), rx.tolist(), wall)
+    (path,) = np.flatnonzero((channel.interactions == 1).any(1))
+    shift = -F / formulas.C * (length(1e-4) - length(-1e-4)) / 2e-4
+    return close("Hz", shift, float(channel.doppler[0, path]), absolute=1.0)
+
+
 @case("jump", "a vehicle that jumps into the line of sight, 700 m from frame to frame, and out again")
 def _(bench: Bench) -> Outcome:
     """What a frame says follows from that frame: no path by way of where the vehicle was."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from caviar_protocol.errors import PayloadError
 from caviar_services.channel.stability import formulas
 from caviar_services.channel.stability.bench import (
@@ -50,6 +52,22 @@ def _(bench: Bench) -> Outcome:
     model = bench.traced(F, [ground(50.0)], {"surface": CONDUCTOR})
     got = total(link(model, (3, 4, 5), (3, 4, 5)))
     return close("|H|", formulas.friis(10.0, F), abs(got), relative=5e-3)
+
+
+@case("place", "a body at UTM coordinates and no scenery: its reflection")
+def _(bench: Bench) -> Outcome:
+    """456 km east and 5,412 km north: length and amplitude are those of the image."""
+    origin = np.array([456_789.125, 5_412_345.625, 211.5])
+    tx, rx = origin + np.array([0.0, -9.0, 1.0]), origin + np.array([4.0, 8.0, -2.0])
+    wall = Thing("wall", (origin + np.array([30.0, 0.0, 0.0])).tolist(), (2.0, 60.0, 60.0))
+    channel = link(bench.traced(F), tx.tolist(), rx.tolist(), wall)
+    image = formulas.mirrored(tx, origin + np.array([29.0, 0.0, 0.0]), np.array([-1.0, 0.0, 0.0]))
+    length = float(np.linalg.norm(image - rx))
+    (path,) = np.flatnonzero((channel.interactions == 1).any(1))
+    return all_of(
+        close("m", length, float(channel.tau[path] * formulas.C), absolute=1e-8),
+        close("|a|", formulas.friis(length, F), float(abs(channel.a[0, path])), relative=5e-3),
+    )
 
 
 @case("place", "RX on the ground")
