@@ -23,12 +23,13 @@ from caviar_clients.plots.map import (
     draw_map,
     draw_objects,
     receiver_mark,
+    served_object,
     view_of,
 )
 from caviar_clients.plots.rays import rays
 from caviar_protocol.beams import beam_towards
 from caviar_protocol.scene import device_pose
-from caviar_protocol.topics import AntennaArray, LidarDevice, LidarScan
+from caviar_protocol.topics import AntennaArray, AntennaDevice, LidarDevice, LidarScan
 from caviar_services.link.codebook import pointing_directions
 
 pytest.importorskip("matplotlib")
@@ -159,6 +160,36 @@ def test_names_lose_what_all_have_in_common():
     assert common_prefix(["vehicle.east.1", "vehicle.west.1"]) == "vehicle."
     assert common_prefix(["car", "uav"]) == ""
     assert common_prefix(["world.car"]) == ""
+
+
+def test_of_many_objects_the_one_that_the_beam_is_for_stands_out_and_is_named_first():
+    """Forty cars in one spot leave room for some names only, and that one's comes last in the alphabet."""
+    from matplotlib.figure import Figure
+
+    crowd = scene(2)
+    names = tuple(f"car.{i:02}" for i in range(40))
+    place = np.tile(crowd.position[:1], (40, 1)) + np.arange(40)[:, None] * [0.3, 0.0, 0.0]
+    many = {
+        "names": names,
+        "classes": crowd.classes[:1] * 40,
+        "assets": crowd.assets[:1] * 40,
+        "position": place,
+        "orientation": np.tile(crowd.orientation[:1], (40, 1)),
+        "velocity": np.tile(crowd.velocity[:1], (40, 1)),
+        "dimensions": np.tile(crowd.dimensions[:1], (40, 1)),
+        "devices": tuple(AntennaDevice(name=f"{name}/rx", parent=name, role="rx") for name in names),
+    }
+    data = a_map(scene=msgspec.structs.replace(crowd, **many), user=("bs", "car.39/rx", "c0"))
+    assert served_object(data) == "car.39"
+    assert served_object(a_map(user=None)) == ""
+    axes = Figure().subplots()
+    axes.set_xlim(place[0, 0] - 20, place[0, 0] + 30)
+    axes.set_ylim(place[0, 1] - 20, place[0, 1] + 20)
+    draw_objects(axes, data, Labels(marked=served_object(data)))
+    shown = {text.get_text(): text.get_fontweight() for text in axes.texts}
+    assert shown["39"] == "bold"
+    assert len(shown) < 40
+    assert [name for name, weight in shown.items() if weight == "bold"] == ["39"]
 
 
 def test_the_range_image_has_ahead_in_the_middle_and_left_on_the_left():

@@ -67,7 +67,7 @@ def draw_map(data: MapData, file: Path) -> None:
         _add_rays(drawn, axes, data)
         if beam is not None:
             draw_beam(axes, beam)
-        draw_objects(axes, data)
+        draw_objects(axes, data, Labels(marked=served_object(data)))
         draw_antennas(axes, data)
         axes.set_aspect("equal")
         axes.set_xlabel("x, east [m]")
@@ -241,8 +241,17 @@ def from_above(scene: Scene, points: Sequence[Sequence[float]]) -> Float64Array:
     return found
 
 
+def served_object(data: MapData) -> str:
+    """The object that carries the receiver whose beam is shown; empty where none does."""
+    receiver = data.user[1] if data.user else ""
+    return next((device.parent for device in data.scene.devices if device.name == receiver), "")
+
+
 def _name_objects(axes: Any, scene: Scene, boxes: Float64Array, carriers: set[str], labels: Labels) -> None:
-    """Names without what all have in common, where there is room; those with a device come first."""
+    """Names without what all have in common, where there is room.
+
+    The marked one comes first, then those with a device.
+    """
     from matplotlib.patheffects import withStroke
 
     halo = [withStroke(linewidth=2.0, foreground="white")]
@@ -259,7 +268,12 @@ def _name_objects(axes: Any, scene: Scene, boxes: Float64Array, carriers: set[st
             x, y, _ = device_pose(scene, device).position
             wide = 3.5 * len(device.name) * unit
             taken.append((x - max(wide, 6 * unit), y - 6 * unit, x + max(wide, 6 * unit), y + 22 * unit))
-    for i in sorted(range(len(boxes)), key=lambda i: (scene.names[i] not in carriers, scene.names[i])):
+
+    def rank(i: int) -> tuple[bool, bool, str]:
+        name = scene.names[i]
+        return name != labels.marked, name not in carriers, name
+
+    for i in sorted(range(len(boxes)), key=rank):
         name = scene.names[i]
         text = name.removeprefix(prefix)
         places = _places(taken[i], 5.0 * len(text) * unit, 9.0 * unit, 2.0 * unit)
