@@ -75,7 +75,7 @@ def diffracted_levels(
             at = (channel.points[path] - offset) @ turned * (channel.interactions[path] != 0)[:, None]
             key = (
                 *(sender, int(pairs[path])),
-                *channel.interactions[path].tolist(),
+                *filter(None, channel.interactions[path].tolist()),
                 *(np.round(at[channel.interactions[path] == DIFFRACTED][0] + 0.017, 1) + 0.0).tolist(),
             )
             found[key] = float(20 * np.log10(max(abs(channel.a[0, path]), FAINT)))
@@ -110,7 +110,7 @@ def test_levels_do_not_depend_on_how_deep_is_traced(tmp_path: Path) -> None:
         diffracted_levels(tmp_path / str(d), np.array([70.0, -20, 0]), np.zeros(3), 0.2, max_depth=d)
         for d in (1, 3)
     )
-    alone = {key[:2] + key[-3:]: level for key, level in three.items() if key[3] == 0}
+    alone = {key[:2] + key[-3:]: level for key, level in three.items() if len(key) == 6}
     single = {key[:2] + key[-3:]: level for key, level in one.items()}
     both = alone.keys() & single.keys()
     assert len(both) > 20
@@ -123,11 +123,12 @@ def both_fields(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Array, Array]]:
     seen: list[tuple[Array, Array]] = []
     replaced = sionna_table._diffract_anew
 
-    def keep(scene_: Any, parts: Any, met: Any, traced: Any, ends: Any, transfer: Any) -> None:
+    def keep(scene_: Any, edges: Any, met: Any, traced: Any, ends: Any, transfer: Any) -> Any:
         before = transfer.copy()
-        replaced(scene_, parts, met, traced, ends, transfer)
-        rows = (met[0] == DIFFRACTED).any(1) & (met[0] != 0).all(1)
+        found = replaced(scene_, edges, met, traced, ends, transfer)
+        rows = (met.types == DIFFRACTED).any(1) & (met.types != 0).all(1) & found[0]
         seen.append((before[:, rows], transfer[:, rows]))
+        return found
 
     monkeypatch.setattr(sionna_table, "_diffract_anew", keep)
     monkeypatch.setattr(module, "_SIGN", 1.0)  # the ray tracer's, which is wrong
@@ -179,16 +180,26 @@ def wedge(interior: float, length: float = 100.0) -> Array:
     return np.array([[low, high, side * length] for side in along])
 
 
+def edge_of(triangles: Array) -> tuple[Array, Array]:
+    """Ends of the edge that comes first in both of two triangles, and their other corners."""
+    return triangles[None, 0, :2], triangles[None, :, 2]
+
+
+def made_of(eta: float) -> Media:
+    """High conductivity, or permittivity ``eta``."""
+    slab = eta if np.isfinite(eta) else 1.0, 0.1 if np.isfinite(eta) else 1e12
+    return Media(*(np.full((1, 1, 1), x) for x in slab), *(np.full((1, 1), x) for x in (1e3, 0.0)))
+
+
 def over_edge(angle: float, at: float, interior: float, eta: float, along_edge: bool) -> complex:
     """Field over the edge of a wedge of high conductivity or of permittivity ``eta``, along it or across."""
     places = [leg * np.array([np.cos(a), np.sin(a), 0.0]) for leg, a in ((S_IN, at), (S_OUT, angle))]
-    faces, is_edge = faces_of(wedge(interior)[None], np.array([[[0.0, 0, -100], [0, 0, 100]]]))
+    faces, is_edge = faces_of(*edge_of(wedge(interior)))
     assert is_edge.all()
-    slab = eta if np.isfinite(eta) else 1.0, 0.1 if np.isfinite(eta) else 1e12
-    media = Media(*(np.full((1, 1, 1), x) for x in slab), *(np.full((1, 1), x) for x in (1e3, 0.0)))
+    media = made_of(eta)
     corners = np.array([[places[0], np.zeros(3), places[1]]])
     types = np.array([[DIFFRACTED]], np.uint8)
-    dyad = edge_fields(corners, types, np.array([[[0.0, 1, 0]]]), faces, media, [WAVELENGTH])[0, 0]
+    dyad = edge_fields(corners, types, np.array([[[0.0, 1, 0]]]), faces, media, media, [WAVELENGTH])[0, 0]
     up = np.array([0.0, 0, 1])
     sent, taken = (up, up) if along_edge else (np.cross(up, -places[0]), np.cross(up, places[1]))
     return complex(unit(taken) @ dyad @ unit(sent)) * np.exp(-2j * np.pi / WAVELENGTH * (S_IN + S_OUT))
@@ -244,22 +255,37 @@ def test_behind_a_half_plane_is_sommerfelds_field() -> None:
         assert abs(over_edge(angle, at, 0.0, np.inf, True)) == pytest.approx(expected, rel=0.02)
 
 
-def test_triangles_that_share_no_side_are_no_wedge() -> None:
-    apart = wedge(1.0)[None].copy()
-    apart[0, 1] += [0, 0, 0.5]
-    flat = wedge(1.0)[None].copy()
-    flat[0, 0, 2] = flat[0, 0, 0]
-    ends = np.zeros((1, 2, 3))
-    assert not faces_of(apart, ends)[1].any()
-    assert not faces_of(flat, ends)[1].any()
+def test_what_has_no_length_or_no_width_is_no_wedge() -> None:
+    ends, apexes = edge_of(wedge(1.0))
+    assert not faces_of(ends[:, :1].repeat(2, 1), apexes)[1].any()
+    assert not faces_of(ends, np.stack([apexes[:, 0], ends[:, 0]], axis=1))[1].any()
+
+
+def test_each_face_of_an_edge_has_its_own_material() -> None:
+    """Deep in the shadow of neither face, of a wedge of a conductor and a dielectric: between the fields of
+    wedges of one of these, and the same from the other side with the materials swapped."""
+    faces, _ = faces_of(*edge_of(wedge(np.pi / 2)))
+    places = [leg * np.array([np.cos(a), np.sin(a), 0.0]) for leg, a in ((S_IN, 1.9), (S_OUT, 2.9))]
+    types, normal = np.array([[DIFFRACTED]], np.uint8), np.array([[[0.0, 1, 0]]])
+
+    def level(first: float, second: float, path: list[Array]) -> complex:
+        corners = np.array([[path[0], np.zeros(3), path[1]]])
+        dyad = edge_fields(corners, types, normal, faces, made_of(first), made_of(second), [WAVELENGTH])
+        return complex(dyad[0, 0, 2, 2])
+
+    alike = [level(eta, eta, places) for eta in (np.inf, 5.0)]
+    mixed = level(np.inf, 5.0, places)
+    assert min(abs(mixed - one) for one in alike) > 1e-3 * abs(mixed)
+    # The wedge is its own mirror image about the plane between both faces, which swaps these.
+    mirror = np.array([[0.0, -1, 0], [-1, 0, 0], [0, 0, 1]])
+    assert level(5.0, np.inf, [mirror @ place for place in places]) == pytest.approx(mixed, rel=1e-9)
 
 
 def test_faces_look_outward_from_a_wedge_that_stands_anywhere() -> None:
     rng = np.random.default_rng(2)
     for interior in (0.3, 1.2, 2.7):
         moved = wedge(interior) @ turn(*rng.uniform(-3, 3, 3)).T + rng.uniform(-1e4, 1e4, 3)
-        moved[1] = moved[1, rng.permutation(3)]
-        faces, is_edge = faces_of(moved[None], moved[None, 0, :2])
+        faces, is_edge = faces_of(*edge_of(moved))
         assert is_edge.all()
         assert faces.exterior[0] == pytest.approx(2 * np.pi - interior, abs=1e-9)
         middle = unit(moved[:, 2].mean(0) - moved[0, :2].mean(0))

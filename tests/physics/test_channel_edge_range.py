@@ -19,7 +19,7 @@ from caviar_services.service import Frame, FrameInput
 pytestmark = pytest.mark.channel
 
 NEAR = Thing("car", (4.0, 1.0, 0.76))
-FAR = Thing("van", (160.0, 3.0, 1.31), (6.0, 2.0, 2.6))
+FAR = Thing("van", (55.0, 3.0, 1.31), (6.0, 2.0, 2.6))
 SENDER = (-3.0, 0.0, 3.0)
 RECEIVERS = ((9.0, 1.5, 0.9), (8.0, 3.0, 1.4), (6.0, -4.0, 2.0))
 
@@ -53,8 +53,8 @@ def over(channel: Channel, name: str) -> list[int]:
 
 
 def test_only_edges_in_range_diffract_and_the_others_hardly_matter(assets: dict[str, Path]) -> None:
-    """A car beside the receivers and a van 150 m off: with a range of 30 m the car's paths stay as they are,
-    bit by bit, the van's are gone, and the power of what is diffracted changes by less than 0.1 dB."""
+    """A car beside the receivers and a van 45 m off: with a range of 30 m the car's paths stay as they are,
+    bit by bit, the van's are gone, and the power of what is diffracted changes by less than 0.2 dB."""
     every, _ = traced(model(assets, diffraction=True), [NEAR, FAR])
     ranged, counts = traced(model(assets, diffraction=True, edges_within_m=30.0), [NEAR, FAR])
     assert over(every, "van")
@@ -68,7 +68,7 @@ def test_only_edges_in_range_diffract_and_the_others_hardly_matter(assets: dict[
         (np.abs(channel.a[0][(channel.interactions == int(Interaction.DIFFRACTION)).any(1)]) ** 2).sum()
         for channel in (every, ranged)
     ]
-    assert abs(10 * np.log10(bent[1] / bent[0])) < 0.1
+    assert abs(10 * np.log10(bent[1] / bent[0])) < 0.2
 
 
 def test_where_no_edge_is_in_range_diffraction_is_switched_off(assets: dict[str, Path]) -> None:

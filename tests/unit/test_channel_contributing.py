@@ -11,11 +11,9 @@ from caviar_services.channel.contributing import (
     SurfaceMaterial,
     UsedSurfaces,
     contributing,
-    has_edge,
     slab,
 )
 from caviar_services.channel.sionna_launch import LaunchOptions
-from caviar_services.meshes import Mesh, unit_box
 
 ASKED = LaunchOptions(
     max_depth=3,
@@ -78,33 +76,6 @@ def test_a_slab_is_that_of_the_wave_matrix() -> None:
 def test_a_lossless_slab_loses_nothing() -> None:
     back, through = slab(np.cos(np.linspace(0, 1.55, 40)), (4.2, 0.0), 0.03, 28e9)
     assert np.allclose(np.abs(back) ** 2 + np.abs(through) ** 2, 1.0, atol=1e-12)
-
-
-def test_a_mesh_has_an_edge_where_faces_meet_at_an_angle() -> None:
-    assert has_edge(unit_box())
-
-
-@pytest.mark.parametrize(
-    ("lift", "faces", "edge"),
-    [
-        (0.0, [[0, 1, 2], [0, 2, 3]], False),
-        (0.0, [[0, 1, 2], [2, 3, 0]], False),
-        (0.0, [[0, 1, 2], [0, 3, 2]], False),  # one face seen from behind
-        (0.05, [[0, 1, 2], [0, 2, 3]], True),
-        (0.05, [[0, 1, 2]], False),  # a rim is no wedge
-        (0.0, [[0, 1, 2], [0, 1, 3]], True),  # folded onto each other
-    ],
-)
-def test_faces_in_one_plane_have_none(lift: float, faces: list[list[int]], edge: bool) -> None:
-    """A quadrilateral far out, with a slope."""
-    corners = np.array([[0, 0, 0], [9, 0, 4], [9, 7, 4], [0, 7, lift]], float) + np.array([1e3, -2e3, 50.0])
-    assert has_edge(Mesh(corners, np.array(faces, np.int32))) is edge
-
-
-def test_faces_that_touch_without_sharing_corners_have_none() -> None:
-    box = unit_box()
-    apart = Mesh(box.vertices[box.faces].reshape(-1, 3), np.arange(36, dtype=np.int32).reshape(-1, 3))
-    assert not has_edge(apart)
 
 
 def test_all_that_contribute_stay() -> None:

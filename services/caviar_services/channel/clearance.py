@@ -90,6 +90,13 @@ class Surfaces:
                 return True
         return False
 
+    def met_between(self, start: Float64Array, end: Float64Array) -> Int64Array:
+        """Triangles on the segment between two points [m], nearest first: each to its very border."""
+        near = self._within(np.minimum(start, end), np.maximum(start, end), 0.0)
+        behind = set(_met(self._triangles[near], end, end - start).tolist())
+        met = [row for row in _met(self._triangles[near], start, end - start).tolist() if row not in behind]
+        return near[np.array(met, np.int64)]
+
     def above(self, position: Float64Array) -> Iterator[Int64Array]:
         """Triangles that each of some rising rays from a point [m], Shape ``[3]``, meets, nearest first."""
         height = max(float(self._high[2].max(initial=position[2]) - position[2]), 0.0)
@@ -198,15 +205,16 @@ def with_near_pairs(
         free |= np.isin(near, table.pair[straight & table.hidden])
     table = table.take(~(straight & np.isin(table.pair, near)))
     direct = near[far & free]
-    return _with_direct(table, direct, ~los[direct], distance, wavelengths), int(np.count_nonzero(~far))
+    made = with_direct(table, direct, ~los[direct], distance[direct], wavelengths)
+    return made, int(np.count_nonzero(~far))
 
 
-def _with_direct(
+def with_direct(
     table: PathTable, pairs: Int64Array, hidden: BoolArray, distance: Float64Array, wavelengths: Float64Array
 ) -> PathTable:
-    """The table and a direct path for each of these pairs."""
+    """The table and a direct path for each of these N pairs, over these distances [m]."""
     depth = table.types.shape[1]
-    spreading = wavelengths[:, None] / (4 * np.pi * distance[pairs])
+    spreading = wavelengths[:, None] / (4 * np.pi * distance)
     made = spreading[:, :, None, None] * np.eye(3, dtype=np.complex128)
     empty = np.zeros((len(pairs), depth), np.uint8)
     return replace(

@@ -12,11 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int64Array
+from caviar_protocol.arrays import Complex128Array, Float64Array
 from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_services.channel.object_materials import Constants
 from caviar_services.channel.sionna_launch import LaunchOptions
-from caviar_services.meshes import Mesh
 
 _EPSILON_0 = 8.8541878128e-12
 """Permittivity of vacuum [F/m] (CODATA 2018)."""
@@ -33,9 +32,6 @@ _VANISHED = 2.0**-150
 
 _INCIDENCE = np.radians(np.linspace(0.0, 89.9, 900))
 """Angles [rad] between ray and normal at which slabs are looked at."""
-
-_FLAT = 1e-6
-"""Corners this near a common plane, as a part of the longest edge, make no edge."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +52,7 @@ class UsedSurfaces:
     materials: tuple[SurfaceMaterial, ...]
     """Of all surfaces; empty where there are none."""
     has_edges: bool
-    """Whether two faces meet at an angle anywhere (`has_edge`)."""
+    """Whether anything diffracts (`mesh_edges`)."""
 
 
 def contributing(
@@ -105,49 +101,6 @@ def slab(
     through = np.exp(-2j * np.pi * thickness_m * frequency_hz / SPEED_OF_LIGHT * root)
     many = 1 - (single * through) ** 2
     return single * (1 - through**2) / many, (1 - single**2) * through / many
-
-
-def has_edge(mesh: Mesh) -> bool:
-    """Whether a mesh has any of `edges_of`."""
-    return len(edges_of(mesh)) > 0
-
-
-def edges_of(mesh: Mesh) -> Int64Array:
-    """Both vertices of each edge that is a wedge of the ray tracer, Shape ``[E, 2]``: two faces that share
-    two vertices and do not lie in one plane.
-
-    Faces that touch without sharing vertices have no edge for it, and neither has the rim of a face.
-    """
-    faces = mesh.faces.astype(np.int64)
-    if len(faces) < 2:
-        return np.zeros((0, 2), np.int64)
-    corners = mesh.vertices[faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.linalg.norm(normal, axis=1)
-    normal /= np.where(length > 0, length, 1.0)[:, None]
-    sides = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1), axis=-1).reshape(-1, 2)
-    opposite = np.roll(faces, 1, axis=1).reshape(-1)
-    order = np.lexsort((sides[:, 1], sides[:, 0]))
-    same = np.flatnonzero((sides[order[1:]] == sides[order[:-1]]).all(1))
-    first, second = order[same], order[same + 1]
-    across = mesh.vertices[opposite[second]] - mesh.vertices[sides[first, 0]]
-    off = np.abs((across * normal[first // 3]).sum(1))
-    size = np.linalg.norm(np.ptp(corners, axis=1), axis=1)
-    size = np.maximum(size[first // 3], size[second // 3])
-    # Two faces on the same side of their edge are folded onto each other.
-    away = _beyond(mesh.vertices, sides[first], opposite[first], opposite[second])
-    is_edge = (off > _FLAT * size) | ~away
-    edges: Int64Array = sides[first[is_edge]]
-    return edges
-
-
-def _beyond(vertices: Float64Array, edge: Int64Array, first: Int64Array, second: Int64Array) -> BoolArray:
-    """Whether two points lie on different sides of a line in their plane."""
-    start, end = vertices[edge[:, 0]], vertices[edge[:, 1]]
-    a = np.cross(end - start, vertices[first] - start)
-    b = np.cross(end - start, vertices[second] - start)
-    beyond: BoolArray = (a * b).sum(1) <= 0
-    return beyond
 
 
 def _transmits(material: SurfaceMaterial, options: LaunchOptions, frequencies_hz: Sequence[float]) -> bool:

@@ -27,7 +27,9 @@ class EdgeRange:
 
     def reaches(self, places: Float64Array) -> bool:
         """Whether any edge is in range of any of these places [m], Shape ``[N, 3]``."""
-        edges = self._scene.edges
+        if self._scene.edges is None:
+            return False
+        edges = self._scene.edges.all_ends
         begin, along = edges[:, 0], edges[:, 1] - edges[:, 0]
         square = (along**2).sum(-1)
         begin, along, square = begin[square > 0], along[square > 0], square[square > 0]

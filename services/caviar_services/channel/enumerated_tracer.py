@@ -26,7 +26,6 @@ from caviar_services.channel.sionna_candidates import first_of_each
 from caviar_services.channel.sionna_reach import Faces
 from caviar_services.channel.sionna_scene import SionnaScene
 from caviar_services.channel.sionna_traced import Traced, nothing
-from caviar_services.channel.sionna_wedges import Wedges
 
 _NO_SHAPE = 0xFFFFFFFF
 
@@ -143,7 +142,7 @@ class EnumeratedTracer:
             shapes=shapes,
             primitives=primitives,
             points=points,
-            wedge=Wedges.none(len(count)),
+            edge=np.full(len(count), -1),
             hidden=np.zeros(len(count), np.bool_),
             settled=np.zeros(len(count), np.bool_),
             lost=0,

@@ -182,7 +182,7 @@ def _begins(launch: Launch, d: int, ray: Int64Array, chain: Int64Array) -> BoolA
     bounce = launch.bounces[d]
     told_apart = [chain, *(column.numpy()[ray] for column in (bounce.kind, bounce.shape, bounce.primitive))]
     if launch.wedges is not None:
-        told_apart += [side.numpy()[ray] for side in (launch.wedges.prim0, launch.wedges.primn)]
+        told_apart.append(launch.wedges.local_edge.numpy()[ray])
     begins = np.ones(len(ray), np.bool_)
     begins[1:] = False
     for column in told_apart:
@@ -227,9 +227,8 @@ def _met_at(
     token = np.where(kind == REFLECTED, plane, _first_edge(scene) - 16 + kind)
     bent = kind == DIFFRACTED
     if bent.any():
-        sides = np.stack([side.numpy()[ray[bent]] for side in (launch.wedges.prim0, launch.wedges.primn)])
-        sides = np.sort(scene.triangle_numbers(shape[bent], sides.astype(np.int64)), axis=0)
-        token[bent] = _first_edge(scene) + sides[0] * len(scene.plane_of) + sides[1]
+        edge = launch.wedges.local_edge.numpy()[ray[bent]].astype(np.int64)
+        token[bent] = _first_edge(scene) + edge
     return kind, plane, token
 
 

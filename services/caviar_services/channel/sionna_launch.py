@@ -113,7 +113,8 @@ class Launch:
     bounces: tuple[Bounce, ...]
     """First, second, … interaction."""
     wedges: Any
-    """The ray tracer's `WedgeGeometry` of the edge that diffracted each ray; None without diffraction."""
+    """The ray tracer's `WedgeGeometry` of the edge that diffracted each ray, the number of the edge in
+    ``local_edge``; None without diffraction."""
 
     @property
     def rays(self) -> int:
@@ -169,13 +170,17 @@ class PartedLauncher:
         Where they go, a `mitsuba.Scene`.
     options
         What is traced.
+    generator
+        See `Launcher`.
     """
 
-    def __init__(self, mi_scene: Any, options: LaunchOptions) -> None:
+    def __init__(self, mi_scene: Any, options: LaunchOptions, generator: Any = None) -> None:
         at_once = max(1, options.rays_at_once // max(len(options.passes), 1))
         begins = range(0, options.samples, at_once)
         bounds = [(begin, min(begin + at_once, options.samples)) for begin in begins]
-        self._parts = [(begin, end, Launcher(mi_scene, options, (begin, end))) for begin, end in bounds]
+        self._parts = [
+            (begin, end, Launcher(mi_scene, options, (begin, end), generator)) for begin, end in bounds
+        ]
 
     @property
     def in_parts(self) -> bool:
@@ -218,15 +223,23 @@ class Launcher:
         What is traced.
     part
         Numbers of the first ray and of the one behind the last; absent: all rays.
+    generator
+        What says how rays go on, a `SBCandidateGenerator` of Sionna RT; absent: that itself.
     """
 
-    def __init__(self, mi_scene: Any, options: LaunchOptions, part: tuple[int, int] | None = None) -> None:
+    def __init__(
+        self,
+        mi_scene: Any,
+        options: LaunchOptions,
+        part: tuple[int, int] | None = None,
+        generator: Any = None,
+    ) -> None:
         from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
         from sionna.rt.utils import fibonacci_lattice
 
         self._mi_scene = mi_scene
         self._options = options
-        self._generator = SBCandidateGenerator()
+        self._generator = SBCandidateGenerator() if generator is None else generator
         self._sampler = self._generator._sampler
         first, end = part or (0, options.samples)
         self._count = end - first

@@ -54,14 +54,12 @@ def _check_material(shape: SceneryShape) -> None:
         )
 
 
-def file_meshes(scene: Any, vertices: Mapping[str, Float64Array], weld: bool) -> dict[str, Mesh]:
+def file_meshes(scene: Any, vertices: Mapping[str, Float64Array]) -> dict[str, Mesh]:
     """The meshes of what was loaded, by name, in world coordinates."""
     meshes = {}
     for name, item in scene.objects.items():
         mesh = _mesh_of(item.mi_mesh)
-        if name in vertices:
-            mesh = _as_in_file(mesh, vertices[name])
-        meshes[name] = _welded(mesh) if weld else mesh
+        meshes[name] = _as_in_file(mesh, vertices[name]) if name in vertices else mesh
     return meshes
 
 
@@ -71,12 +69,6 @@ def _as_in_file(mesh: Mesh, vertices: Float64Array) -> Mesh:
     if same and len(vertices):
         same = bool(np.abs(vertices - mesh.vertices).max() <= _SAME_VERTEX * max(np.abs(vertices).max(), 1.0))
     return Mesh(vertices, mesh.faces) if same else mesh
-
-
-def _welded(mesh: Mesh) -> Mesh:
-    """A mesh whose vertices at one place are one vertex."""
-    vertices, first = np.unique(mesh.vertices, axis=0, return_inverse=True)
-    return Mesh(vertices, first.reshape(-1)[mesh.faces].astype(np.int32))
 
 
 def unit_mesh(asset: str, assets: Mapping[str, Path]) -> Mesh:

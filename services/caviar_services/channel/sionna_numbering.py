@@ -73,7 +73,7 @@ class NumberedTriangles:
         meshes = [mesh for shape in shapes for mesh in shape.meshes]
         self._number_shapes(shapes, ids, moving)
         corners = np.array([len(mesh.vertices) for mesh in meshes])
-        before = np.cumsum(corners) - corners
+        before = self._first_vertices = np.cumsum(corners) - corners
         self._corners = np.concatenate([mesh.vertices for mesh in meshes])
         self._faces = np.concatenate([mesh.faces + b for mesh, b in zip(meshes, before, strict=True)])
         self.names = tuple(name for shape in shapes for name in shape.names)
@@ -147,6 +147,20 @@ class NumberedTriangles:
             )
             numbers[its] = -len(known)
         return numbers, tuple(known)
+
+    @property
+    def vertices(self) -> Float64Array:
+        """All vertices as they stand [m], Shape ``[V, 3]``."""
+        return self._corners
+
+    @property
+    def triangle_vertices(self) -> Int32Array:
+        """Vertices of each triangle, Shape ``[F, 3]``."""
+        return self._faces
+
+    def begin_of(self, piece: int) -> tuple[int, int]:
+        """Numbers of the first vertex and of the first triangle of a piece."""
+        return int(self._first_vertices[piece]), int(self._first_triangles[piece])
 
     @property
     def first_moving_plane(self) -> int:
@@ -302,6 +316,8 @@ class NumberedTriangles:
         faces = self._faces.astype(np.int64)
         apart = PlaneTable(parts.astype(np.int64), faces)
         apart.update(self._relative)
+        self.part_of = parts.astype(np.int64)
+        """Plane face of each triangle, numbered through all objects, of which none share any."""
         shared = shared_planes(apart, int(counts[:still].sum()))
         self.plane_of = shared[parts]
         """Infinite plane of each triangle, numbered through all objects."""

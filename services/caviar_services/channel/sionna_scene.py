@@ -24,11 +24,12 @@ from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.scene import object_pose
 from caviar_protocol.topics import Scene
-from caviar_services.channel.contributing import SurfaceMaterial, UsedSurfaces, edges_of, has_edge
+from caviar_services.channel.contributing import SurfaceMaterial, UsedSurfaces
 from caviar_services.channel.edge_fields import Media
 from caviar_services.channel.mesh_detail import DetailSettings
 from caviar_services.channel.object_materials import Constants, ObjectMaterials, body_kind
 from caviar_services.channel.paths import Turning
+from caviar_services.channel.sionna_edges import SceneEdges
 from caviar_services.channel.sionna_loading import by_material, loaded, with_detail
 from caviar_services.channel.sionna_materials import (
     OBJECT_MATERIAL,
@@ -78,8 +79,10 @@ class SceneSettings:
     """Of the carriers. The scene is at the first one, unless it is tuned to another."""
     body_material: str
     materials: MaterialPolicy
-    weld: bool
-    """Join vertices at one place, so that edges between faces are known (diffraction)."""
+    edges: bool
+    """Look for the edges between faces (diffraction)."""
+    free_edges: bool = False
+    """Whether the rims of open surfaces are edges too."""
     detail: DetailSettings = field(default_factory=DetailSettings)
     """What of the scenery is left out."""
     objects: ObjectMaterials = field(default_factory=ObjectMaterials)
@@ -106,7 +109,7 @@ class SionnaScene(NumberedTriangles):
         self._objects = settings.objects
         made = object_materials(self._objects, settings.frequencies_hz, settings.materials)
         changed = {name: made[m].radio for name in self._scenery if (m := self._objects.of(name))}
-        full = by_material(self._scene, file_meshes(self._scene, files, settings.weld), changed)
+        full = by_material(self._scene, file_meshes(self._scene, files), changed)
         key = f"{settings.materials.key}.detail"
         shapes, self.detail_effect = with_detail(full, settings.detail, key)
         self.low, self.high = _bounds(shapes)
@@ -133,6 +136,11 @@ class SionnaScene(NumberedTriangles):
         super().__init__(
             self._shapes, self._replace_shapes(centre), bodies, self._meshes, centre, len(self._moving)
         )
+        self.edges: SceneEdges | None = None
+        """None where nothing is diffracted."""
+        if settings.edges:
+            parking = self.names.index(_PARKING)
+            self.edges = SceneEdges(self, self.unit_meshes, parking, settings.free_edges)
         set_materials(self._scene, settings.frequencies_hz[0], settings.materials, made)
         self._carriers: list[_Tuning] = []
         outside: list[OutsideUse] = []
@@ -177,12 +185,9 @@ class SionnaScene(NumberedTriangles):
         self._scene.frequency = frequency
 
     def used_surfaces(self) -> UsedSurfaces:
-        """What waves can meet, at rest and moving; unwelded scenery has no edges."""
+        """What waves can meet, at rest and moving."""
         constants, slabs = self._surface_materials
         used = [(i, shape) for i, shape in enumerate(self._shapes) if shape.id != _PARKING]
-        shapes = [shape for _, shape in used]
-        still = [mesh for shape in shapes if not shape.id.startswith(_SKIN) for mesh in shape.meshes]
-        bodies = [mesh for kind, mesh in self._meshes.items() if self._pool[kind]]
         return UsedSurfaces(
             materials=tuple(
                 SurfaceMaterial(
@@ -193,7 +198,7 @@ class SionnaScene(NumberedTriangles):
                 )
                 for i, shape in used
             ),
-            has_edges=any(has_edge(mesh) for mesh in [*still, *bodies]),
+            has_edges=self.edges is not None and len(self.edges) > 0,
         )
 
     @cached_property
@@ -216,24 +221,6 @@ class SionnaScene(NumberedTriangles):
         of = self._shape_order[self._where(shapes)]
         constants, slabs = self._surface_materials
         return Media(*constants[..., of], *slabs[:, of])
-
-    @property
-    def edges(self) -> Float64Array:
-        """Both ends of every edge between two faces, as it stands [m], Shape ``[E, 2, 3]``; those of bodies
-        that stand for nothing have no length."""
-        return self._corners[self._edge_corners]
-
-    @cached_property
-    def _edge_corners(self) -> Int64Array:
-        meshes = [mesh for shape in self._shapes for mesh in shape.meshes]
-        bodies = [self._meshes[asset] for asset, _ in self._bodies]
-        still = len(meshes) - len(bodies)
-        found, begin = [np.zeros((0, 2), np.int64)], 0
-        for name, mesh in zip(self.names, [*meshes[:still], *bodies], strict=True):
-            if name != _PARKING:
-                found.append(begin + edges_of(mesh))
-            begin += len(mesh.vertices)
-        return np.concatenate(found)
 
     @property
     def unit_meshes(self) -> Mapping[str, Mesh]:

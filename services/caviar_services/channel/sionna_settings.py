@@ -56,6 +56,9 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     reflection: bool = True
     refraction: bool = False
     diffraction: bool = False
+    free_edges: bool = False
+    """Whether the rims of open surfaces diffract, too, that of the ground or of a screen without thickness:
+    edges at which one face ends and no other begins."""
     edges_within_m: (
         Annotated[float, quantity("m", "from an edge that diffracts to the nearer end of a path", gt=0)]
         | None
@@ -125,6 +128,8 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
             raise ValueError(
                 'rung = "mimo-rt" traces all paths of an antenna pair at once; leave out scattering_samples'
             )
+        if self.free_edges and not self.diffraction:
+            raise ValueError("free_edges needs diffraction = true; write both or neither")
         if self.edges_within_m is not None and (not self.diffraction or self.rung == "mimo-rt"):
             raise ValueError(
                 'edges_within_m needs diffraction = true and a rung other than "mimo-rt"; leave it out'

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from caviar_protocol.arrays import Complex128Array, Float64Array, Int64Array, UInt8Array
+from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int64Array, UInt8Array
 from caviar_protocol.topics import Interaction
-from caviar_services.channel.clearance import spread_anew
-from caviar_services.channel.edge_fields import edge_fields, faces_of
+from caviar_services.channel.clearance import spread_anew, with_direct
+from caviar_services.channel.edge_fields import Bends, edge_fields
 from caviar_services.channel.paths import Antenna, PathTable
+from caviar_services.channel.shadow_boundaries import Chains, Sight, beyond_edges, waves_beside
+from caviar_services.channel.sionna_edges import SceneEdges
 from caviar_services.channel.sionna_scene import SionnaScene
 from caviar_services.channel.sionna_traced import Traced
-from caviar_services.channel.sionna_wedges import Wedges
 from caviar_services.channel.specular import distinct, path_lengths, refined_points
 
 Ends = tuple[Sequence[Antenna], Sequence[Antenna]]
@@ -41,19 +43,23 @@ def path_table(
     antennas, traced_from
         Where they are, and where they were traced from.
     """
-    pair = np.concatenate([pair for pair, _ in parts])
-    types = np.concatenate([part.types for _, part in parts])
-    shapes = np.concatenate([part.shapes for _, part in parts])
-    primitives = np.concatenate([part.primitives for _, part in parts])
-    hidden = np.concatenate([part.hidden for _, part in parts])
+    met = _Met.of(scene, parts)
+    pair, types = met.pair, met.types
     (start, end), ends = path_ends(pair, *antennas), path_ends(pair, *traced_from)
     traced = np.concatenate([part.points for _, part in parts])
-    points = refined_points(start, traced, end, types, scene.triangles(shapes, primitives), ends)
+    corners, of_edges = scene.corners(met.triangles), None
+    if scene.edges is not None:
+        of_edges = scene.edges.ends(met.edge)
+    points = refined_points(start, traced, end, types, corners, of_edges, ends)
     transfer = np.concatenate([part.transfer for _, part in parts], axis=1)
-    _diffract_anew(scene, [part for _, part in parts], (types, shapes, primitives), traced, ends, transfer)
+    faces, joined = scene.surface_names(met.triangles, names)
+    kept = np.ones(len(pair), np.bool_)
+    sights: Mapping[int, Sight] = {}
+    if scene.edges is not None and (met.edge >= 0).any():
+        faces = np.where(types == Interaction.DIFFRACTION, scene.edges.number[met.edge][:, None], faces)
+        kept, sights = _diffract_anew(scene, scene.edges, met, traced, ends, transfer)
     specular = ((types != Interaction.DIFFRACTION) & (types != Interaction.SCATTERING)).all(1)
-    objects = scene.object_index(shapes, primitives)
-    faces, joined = scene.surface_names(scene.triangle_numbers(shapes, primitives), names)
+    objects = scene.object_index(met.shapes, met.primitives)
     table = PathTable(
         pair=pair,
         transfer=spread_anew(
@@ -65,7 +71,7 @@ def path_table(
         types=types,
         objects=objects,
         points=points,
-        hidden=hidden,
+        hidden=met.hidden,
         traced=np.arange(len(pair)),
         object_names=names,
         object_velocity=velocity,
@@ -74,49 +80,112 @@ def path_table(
         joined_faces=joined,
     )
     # What only other elements have may have its points where the centres' path has them, on another face.
-    kept = hidden.copy()
-    shown = np.flatnonzero(~hidden)
+    shown = np.flatnonzero(~met.hidden & kept)
+    kept &= met.hidden
     kept[shown] = distinct(pair[shown], types[shown], points[shown])
-    return table.take(kept & ~(scene.is_parking(names, objects) & (types != 0)).any(1))
+    table = table.take(kept & ~(scene.is_parking(names, objects) & (types != 0)).any(1))
+    return _with_sights(table, scene, sights, antennas, traced_from) if sights else table
+
+
+@dataclass(frozen=True, eq=False)
+class _Met:
+    """What P paths of all launches meet."""
+
+    pair: Int64Array
+    types: UInt8Array
+    shapes: Int64Array
+    primitives: Int64Array
+    triangles: Int64Array
+    """Numbers through all shapes."""
+    edge: Int64Array
+    hidden: BoolArray
+
+    @classmethod
+    def of(cls, scene: SionnaScene, parts: Sequence[tuple[Int64Array, Traced]]) -> _Met:
+        """Launch by launch."""
+        shapes = np.concatenate([part.shapes for _, part in parts])
+        primitives = np.concatenate([part.primitives for _, part in parts])
+        return cls(
+            pair=np.concatenate([pair for pair, _ in parts]),
+            types=np.concatenate([part.types for _, part in parts]),
+            shapes=shapes,
+            primitives=primitives,
+            triangles=scene.triangle_numbers(shapes, primitives),
+            edge=np.concatenate([part.edge for _, part in parts]),
+            hidden=np.concatenate([part.hidden for _, part in parts]),
+        )
 
 
 def _diffract_anew(
     scene: SionnaScene,
-    parts: Sequence[Traced],
-    met: tuple[UInt8Array, Int64Array, Int64Array],
+    edges: SceneEdges,
+    met: _Met,
     traced: Float64Array,
     ends: tuple[Float64Array, Float64Array],
     transfer: Complex128Array,
-) -> None:
+) -> tuple[BoolArray, Mapping[int, Sight]]:
     """Give diffracted paths the fields of their exact geometry, in place.
 
-    ``met`` are types, shapes and triangles of all paths, ``traced`` their points and ``ends`` where they run.
+    ``traced`` are the points of paths and ``ends`` where they run. Returns which of all paths do not run
+    beyond the ends of an edge, and of pairs whose line of sight passes an edge closely whether it is lit.
     """
-    types, shapes, primitives = met
-    rows = np.flatnonzero((types == Interaction.DIFFRACTION).sum(1) == 1)
-    if not len(rows):
-        return
-    types, shapes, primitives = types[rows], shapes[rows], primitives[rows]
-    at = np.argmax(types == Interaction.DIFFRACTION, axis=1)
-    wedge = Wedges.joined([part.wedge for part in parts])
-    of_edge = np.broadcast_to(shapes[np.arange(len(rows)), at][:, None], (len(rows), 2))
-    faces, is_edge = faces_of(scene.triangles(of_edge, wedge.faces[rows]), wedge.ends[rows])
-    triangles = scene.triangles(shapes, primitives) - scene.centre
+    rows = np.flatnonzero(met.edge >= 0)
+    types, edge = met.types[rows], met.edge[rows]
+    bent = np.argmax(types == Interaction.DIFFRACTION, axis=1)
+    of_edges = edges.ends(edge) - scene.centre
+    corners = scene.corners(met.triangles[rows]) - scene.centre
     start, end = (place[rows] - scene.centre for place in ends)
-    points = refined_points(start, traced[rows] - scene.centre, end, types, triangles)
+    points = refined_points(start, traced[rows] - scene.centre, end, types, corners, of_edges)
+    kept = np.ones(len(met.edge), np.bool_)
+    kept[rows] = ~beyond_edges(points[np.arange(len(rows)), bent], of_edges)
     points = np.where((types != 0)[..., None], points, end[:, None])
-    a, b, c = np.moveaxis(triangles, -2, 0)
+    path = np.concatenate([start[:, None], points, end[:, None]], axis=1)
+    a, b, c = np.moveaxis(corners, -2, 0)
+    faces, is_edge = edges.faces(edge)
+    chains = Chains(np.where(met.hidden, -1, met.pair), met.types, scene.surface_of[met.triangles])
     with np.errstate(invalid="ignore", divide="ignore"):  # such paths stay as traced
+        planes = scene.surface_of[edges.triangles[edge]]
+        lit, sights = waves_beside(Bends.of(path, types, faces), planes, rows, chains)
         fields = edge_fields(
-            np.concatenate([start[:, None], points, end[:, None]], axis=1),
+            path,
             types,
             np.cross(b - a, c - a),
             faces,
-            scene.media(shapes),
+            scene.media(met.shapes[rows]),
+            scene.media(scene.shapes_of(edges.triangles[edge, 1])[0][:, None]),
             scene.wavelengths,
+            lit,
         )
     good = is_edge & np.isfinite(fields).all((0, 2, 3))
     transfer[:, rows[good]] = fields[:, good]
+    return kept, sights
+
+
+def _with_sights(
+    table: PathTable,
+    scene: SionnaScene,
+    sights: Mapping[int, Sight],
+    antennas: Ends,
+    traced_from: Ends,
+) -> PathTable:
+    """The table with those lines of sight that are lit, if nothing else is in their way, and no others."""
+    dark = np.array([pair for pair, sight in sights.items() if not sight.lit], np.int64)
+    straight = (table.types == 0).all(1)
+    if table.hidden is not None:
+        straight &= ~table.hidden
+    missing = np.array(
+        sorted(sights.keys() - set(table.pair[straight].tolist()) - set(dark.tolist())), np.int64
+    )
+    table = table.take(~(straight & np.isin(table.pair, dark)))
+    start, end = path_ends(missing, *traced_from)
+    free = [
+        set(scene.surface_of[scene.surfaces.met_between(one, other)].tolist()) <= sights[pair].passed
+        for pair, one, other in zip(missing.tolist(), start, end, strict=True)
+    ]
+    pairs = missing[free]
+    start, end = path_ends(pairs, *antennas)
+    distance = np.sqrt(((end - start) ** 2).sum(1))
+    return with_direct(table, pairs, np.zeros(len(pairs), np.bool_), distance, np.array(scene.wavelengths))
 
 
 def path_ends(

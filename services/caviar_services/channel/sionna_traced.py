@@ -17,7 +17,6 @@ from caviar_protocol.arrays import (
 )
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.patterns import spherical_basis
-from caviar_services.channel.sionna_wedges import Wedges
 
 _POLE = 1.2e-5
 """Below this horizontal part of a direction Sionna RT sets its azimuth to 0 (100 float32 epsilons)."""
@@ -49,8 +48,9 @@ class Traced:
     """Triangle of that shape, Shape ``[P, D]``."""
     points: Float64Array
     """Interaction points [m], Shape ``[P, D, 3]``."""
-    wedge: Wedges
-    """Where paths are diffracted."""
+    edge: Int64Array
+    """Number of the edge that diffracts each path, −1 for none, Shape ``[P]``; of an edge, ``shapes`` and
+    ``primitives`` say its first face."""
     hidden: BoolArray
     """Paths that only other elements than the centres of the arrays have, Shape ``[P]``."""
     settled: BoolArray
@@ -67,7 +67,7 @@ class Traced:
             shapes=self.shapes[which],
             primitives=self.primitives[which],
             points=self.points[which],
-            wedge=self.wedge.take(which),
+            edge=self.edge[which],
             hidden=self.hidden[which],
             settled=self.settled[which],
             lost=self.lost,
@@ -87,7 +87,7 @@ def nothing(carriers: int, depth: int, lost: int) -> Traced:
         shapes=np.zeros((0, depth), np.int64),
         primitives=np.zeros((0, depth), np.int64),
         points=np.zeros((0, depth, 3)),
-        wedge=Wedges.none(0),
+        edge=np.zeros(0, np.int64),
         hidden=np.zeros(0, np.bool_),
         settled=np.zeros(0, np.bool_),
         lost=lost,
@@ -106,7 +106,7 @@ def joined(parts: Sequence[Traced], carriers: int, depth: int) -> Traced:
         shapes=np.concatenate([part.shapes for part in parts]),
         primitives=np.concatenate([part.primitives for part in parts]),
         points=np.concatenate([part.points for part in parts]),
-        wedge=Wedges.joined([part.wedge for part in parts]),
+        edge=np.concatenate([part.edge for part in parts]),
         hidden=np.concatenate([part.hidden for part in parts]),
         settled=np.concatenate([part.settled for part in parts]),
         lost=sum(part.lost for part in parts),
@@ -153,11 +153,20 @@ def read(
         shapes=shapes,
         primitives=primitives,
         points=points,
-        wedge=Wedges.of(buffer),
+        edge=edge_numbers(buffer, types),
         hidden=np.zeros(len(receiver), np.bool_),
         settled=np.zeros(len(receiver), np.bool_),
         lost=lost,
     )
+
+
+def edge_numbers(buffer: Any, types: UInt8Array) -> Int64Array:
+    """Number of the edge in each path that is diffracted, −1 in others, Shape ``[P]``."""
+    wedges = buffer.diffracting_wedges
+    if wedges is None:
+        return np.full(len(types), -1)
+    number = wedges.local_edge.numpy().astype(np.int64)
+    return np.where((types == Interaction.DIFFRACTION).any(1), number, -1)
 
 
 def _dyad(

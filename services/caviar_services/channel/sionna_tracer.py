@@ -22,12 +22,20 @@ from caviar_protocol.arrays import (
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.sionna_candidates import Candidates, Offer, Planes, positions
 from caviar_services.channel.sionna_chains import MANY_RAYS, Met, met_by, united
+from caviar_services.channel.sionna_edges import edge_generator
 from caviar_services.channel.sionna_follow import Followed, FollowedOffer, TableState
 from caviar_services.channel.sionna_launch import SCATTERED, Launch, LaunchOptions, PartedLauncher
 from caviar_services.channel.sionna_reach import Corners, Faces, at_corners, reflected
 from caviar_services.channel.sionna_scene import SionnaScene
 from caviar_services.channel.sionna_thinning import Element, Points, Thinning
-from caviar_services.channel.sionna_traced import Traced, geometry, joined, nothing, read
+from caviar_services.channel.sionna_traced import (
+    Traced,
+    edge_numbers,
+    geometry,
+    joined,
+    nothing,
+    read,
+)
 from caviar_services.channel.specular import image_points, refined_points
 from caviar_services.channel.visibility import Look
 from caviar_services.columns import aligned_columns, aligned_indices, several
@@ -88,7 +96,8 @@ class Tracer:
         # which any element pattern in any orientation is applied afterwards.
         self._patterns = antenna_pattern_registry.get("iso")(polarization="VH").patterns
         self._faces = Faces(scene)
-        self._launcher = PartedLauncher(scene.mi_scene, options)
+        generator = edge_generator(scene.edges) if scene.edges and options.diffraction else None
+        self._launcher = PartedLauncher(scene.mi_scene, options, generator)
         self._thinning: Thinning | None = None
         if options.diffuse_paths is not None:
             self._thinning = Thinning(scene.mi_scene, options.diffuse_paths, options.seed)
@@ -252,7 +261,7 @@ class Tracer:
         ]
         found = joined(parts, len(self._wavelengths), self._options.max_depth)
         centre = self._scene.centre
-        return replace(found, points=found.points + centre, wedge=found.wedge.moved(centre))
+        return replace(found, points=found.points + centre)
 
     def _batch(
         self,
@@ -288,7 +297,7 @@ class Tracer:
         self._settle(buffer, candidates.take(kept), hidden[kept], transmitter, receivers)
         self._compute_fields(buffer, source, targets)
         traced = read(buffer, len(self._wavelengths), transmitter, receivers, lost)
-        traced = replace(traced, hidden=hidden[kept], settled=settled[kept])
+        traced = self._named_by_edge(replace(traced, hidden=hidden[kept], settled=settled[kept]))
         found = buffer.valid.numpy() & (np.arange(len(kept)) < len(valid))
         return traced.take(found).seen_from(begin)
 
@@ -366,11 +375,26 @@ class Tracer:
         shapes[met], primitives[met] = self._scene.shapes_of(first)
         buffer._shapes = _tensor(mi.TensorXu, mi.UInt(aligned_indices(shapes.ravel())), shapes)
         buffer._primitives = _tensor(mi.TensorXu, mi.UInt(aligned_indices(primitives.ravel())), shapes)
+        centre = self._scene.centre
+        ends = None
+        if self._scene.edges is not None:
+            ends = self._scene.edges.ends(edge_numbers(buffer, types)) - centre
         exact = refined_points(
-            start, points, end, types, self._scene.triangles(shapes, primitives) - self._scene.centre
+            start, points, end, types, self._scene.triangles(shapes, primitives) - centre, ends
         )
         for axis, column in zip("xyz", aligned_columns(exact.reshape(-1, 3).T), strict=True):
             setattr(buffer, f"_vertices_{axis}", _tensor(mi.TensorXf, mi.Float(column), shapes))
+
+    def _named_by_edge(self, traced: Traced) -> Traced:
+        """The same, diffracted at the first face of an edge, whichever of both a ray has hit."""
+        edges = self._scene.edges
+        if edges is None:
+            return traced
+        shapes, primitives = traced.shapes.copy(), traced.primitives.copy()
+        path, at = np.nonzero(traced.types == Interaction.DIFFRACTION)
+        first = edges.triangles[traced.edge[path], 0]
+        shapes[path, at], primitives[path, at] = self._scene.shapes_of(first)
+        return replace(traced, shapes=shapes, primitives=primitives)
 
     def _compute_fields(self, buffer: Any, source: Any, targets: Any) -> None:
         """Give the buffer the amplitudes of all carriers, in their order; valid is what any of them has."""

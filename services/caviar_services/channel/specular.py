@@ -46,6 +46,7 @@ def refined_points(
     end: Float64Array,
     types: UInt8Array,
     triangles: Float64Array,
+    edges: Float64Array | None = None,
     traced_ends: tuple[Float64Array, Float64Array] | None = None,
 ) -> Float64Array:
     """Points of the paths start → points → end, computed anew.
@@ -62,8 +63,9 @@ def refined_points(
     types
         `Interaction` at each, Shape ``[P, D]``; diffraction at most once in a path.
     triangles
-        Corners [m] of the triangle at each interaction, Shape ``[P, D, 3, 3]``; at a diffraction, one
-        that has the edge.
+        Corners [m] of the triangle at each interaction, Shape ``[P, D, 3, 3]``.
+    edges
+        Both ends [m] of the edge of each path that is diffracted, Shape ``[P, 2, 3]``; None: none is.
     traced_ends
         From where and to where the points were traced, where that was not from start to end.
     """
@@ -71,13 +73,16 @@ def refined_points(
     if not len(some):
         return points
     kind, traced = types[some], points[some]
+    edges = np.zeros((len(types), 2, 3)) if edges is None else edges
     with np.errstate(invalid="ignore", divide="ignore"):  # such paths stay as traced
         one, other = (start, end) if traced_ends is None else traced_ends
-        found = _found(one[some], traced, other[some], kind, triangles[some])
+        found = _found(one[some], traced, other[some], kind, triangles[some], edges[some])
         good = _same(one[some], traced, found, other[some], kind)
         moved = good & ((one != start) | (other != end)).any(1)[some]
         there = some[moved]
-        found[moved] = _found(start[there], found[moved], end[there], kind[moved], triangles[there])
+        found[moved] = _found(
+            start[there], found[moved], end[there], kind[moved], triangles[there], edges[there]
+        )
         good &= np.isfinite(found).all((1, 2))
     refined = points.copy()
     refined[some[good]] = found[good]
@@ -109,7 +114,12 @@ def path_lengths(
 
 
 def _found(
-    start: Float64Array, traced: Float64Array, end: Float64Array, types: UInt8Array, triangles: Float64Array
+    start: Float64Array,
+    traced: Float64Array,
+    end: Float64Array,
+    types: UInt8Array,
+    triangles: Float64Array,
+    edges: Float64Array,
 ) -> Float64Array:
     depth = types.shape[1]
     a, b, c = np.moveaxis(triangles, -2, 0)
@@ -123,8 +133,7 @@ def _found(
         paths, at = np.nonzero(diffracted)
         before = _images(start, fixed, types, origin, normal)
         behind = _images(end, fixed[:, ::-1], types[:, ::-1], origin[:, ::-1], normal[:, ::-1])
-        edge = _nearest_edges(triangles[paths, at], traced[paths, at])
-        fixed[paths, at] = _keller(before[at, paths], behind[depth - 1 - at, paths], *edge)
+        fixed[paths, at] = _keller(before[at, paths], behind[depth - 1 - at, paths], edges[paths])
     return _traced_back(_images(start, fixed, types, origin, normal), fixed, end, types, origin, normal)
 
 
@@ -205,21 +214,10 @@ def _square(vectors: Float64Array) -> Float64Array:
     return square
 
 
-def _nearest_edges(triangles: Float64Array, points: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Origin and unit vector of that edge of each triangle whose line passes nearest to a point."""
-    along = np.roll(triangles, -1, axis=1) - triangles
-    along = along / np.sqrt((along**2).sum(-1, keepdims=True))
-    towards = points[:, None] - triangles
-    across = towards - (towards * along).sum(-1, keepdims=True) * along
-    nearest = np.nan_to_num((across**2).sum(-1), nan=np.inf).argmin(1)
-    rows = np.arange(len(points))
-    return triangles[rows, nearest], along[rows, nearest]
-
-
-def _keller(
-    source: Float64Array, target: Float64Array, origin: Float64Array, along: Float64Array
-) -> Float64Array:
-    """Where the shortest path from source to target over a line meets it."""
+def _keller(source: Float64Array, target: Float64Array, edges: Float64Array) -> Float64Array:
+    """Where the shortest path from source to target over the line of an edge meets it."""
+    origin, along = edges[:, 0], edges[:, 1] - edges[:, 0]
+    along = along / np.sqrt(_square(along))
     s = ((source - origin) * along).sum(-1, keepdims=True)
     t = ((target - origin) * along).sum(-1, keepdims=True)
     from_source = np.sqrt(((source - origin - s * along) ** 2).sum(-1, keepdims=True))

@@ -7,13 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array, UInt8Array
-from caviar_protocol.topics import Interaction
 from caviar_services.channel.element_paths import Surfaces
 from caviar_services.channel.sionna_scene import SionnaScene
 from caviar_services.channel.sionna_traced import Traced
-
-_SAME_CORNER = 0.01
-"""[m]; a corner of a mesh this near the end of an edge is that end."""
 
 
 def traced_surfaces(
@@ -32,15 +28,11 @@ def traced_surfaces(
     none = np.zeros((1, depth), np.int64)
     shapes = np.concatenate([*(launch.shapes for launch in launches), none])[traced]
     primitives = np.concatenate([*(launch.primitives for launch in launches), none])[traced]
-    edge = np.concatenate([*(launch.wedge.ends for launch in launches), np.zeros((1, 2, 3))])[traced]
-    outward = np.concatenate([*(launch.wedge.outward for launch in launches), np.zeros((1, 3))])[traced]
+    edge = np.concatenate([*(launch.edge for launch in launches), [-1]])[traced]
     settled = np.concatenate([*(launch.settled for launch in launches), np.zeros(1, np.bool_)])[traced]
     triangles = scene.triangle_numbers(shapes, primitives)
-    bent = types == Interaction.DIFFRACTION
-    some = np.flatnonzero(bent.any(1))
-    if len(some):
-        at = np.argmax(bent[some], axis=1)
-        edge[some] = _snapped(edge[some], scene.corners(triangles[some, at]))
+    edges = scene.edges
+    count = len(traced)
     origin, normal = scene.planes(shapes, primitives)
     return Surfaces(
         types=types,
@@ -48,16 +40,7 @@ def traced_surfaces(
         origin=origin,
         plane=scene.surface_of[triangles],
         normal=normal,
-        edge=edge,
-        outward=outward,
+        edge=np.zeros((count, 2, 3)) if edges is None else edges.ends(edge),
+        outward=np.zeros((count, 3)) if edges is None else edges.outward(edge),
         settled=settled,
     )
-
-
-def _snapped(ends: Float64Array, corners: Float64Array) -> Float64Array:
-    """Ends ``[P, 2, 3]`` at the nearest of the corners ``[P, 3, 3]``, where one is there."""
-    apart = np.sqrt(((ends[:, :, None] - corners[:, None]) ** 2).sum(-1))
-    nearest: Int64Array = np.argmin(apart, axis=-1)
-    rows = np.arange(len(ends))[:, None]
-    there = np.take_along_axis(apart, nearest[..., None], axis=-1) < _SAME_CORNER
-    return np.where(there, corners[rows, nearest], ends)

@@ -87,3 +87,14 @@ def room_images(
                     ]
                     found.append((count, math.dist(image, target.tolist())))
     return found
+
+
+def behind_half_plane(at: float, angle: float, s_in: float, s_out: float, frequency: float) -> float:
+    """|H| deep in the shadow of a conducting half-plane, the field along its edge.
+
+    A. Sommerfeld (1896), asymptotically: angles [rad] from the lit face, distances from the edge [m].
+    """
+    k = 2 * math.pi * frequency / C
+    secants = 1 / math.cos((angle - at) / 2) - 1 / math.cos((angle + at) / 2)
+    coefficient = abs(secants) / (2 * math.sqrt(2 * math.pi * k))
+    return 1 / (2 * k) * coefficient / math.sqrt(s_in * s_out * (s_in + s_out))

@@ -17,7 +17,7 @@ from caviar_services.channel.stability.case import CASES, Case, Outcome, Result
 EXTRA = "channel"
 """Extra of the distribution that brings the ray tracer."""
 
-GROUPS = ("waves", "places", "counts", "motion", "meshes", "inputs")
+GROUPS = ("waves", "places", "counts", "motion", "meshes", "edges", "inputs")
 """Modules with cases, in the order of the table."""
 
 
