@@ -77,7 +77,14 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
 
 
-@pytest.mark.parametrize("client", RIGHT)
+LONG_FORM = {"control", "control-recorder", "world:trajectory"}
+"""Clients whose role another one has too."""
+
+
+@pytest.mark.parametrize(
+    "client",
+    [pytest.param(name, marks=[pytest.mark.exhaustive] if name in LONG_FORM else []) for name in RIGHT],
+)
 def test_a_right_client_fails_nothing(client: str) -> None:
     command, settings = RIGHT[client]
     verdicts = conform(ANY, command=command, rules=Rules(name="mine", settings=settings))

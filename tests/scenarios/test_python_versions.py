@@ -37,6 +37,8 @@ NEWEST_ALONE = [
 CACHE = ROOT / ".venvs"
 GENERATED = ("codec", "keys", "messages", "paths", "recording")
 """Modules of the protocol whose tests generate inputs for most of a minute."""
+WIRE = ("arrays", "content", "digest", "nesting", "scenario_loader", "scene", "tables")
+"""Modules of the protocol that lean most on the Python and the libraries at hand."""
 TEST_TOOLS = ("hypothesis", "psutil", "pytest", "pytest-timeout")
 
 
@@ -151,9 +153,18 @@ def test_the_wheel_runs_smoke_by_name_with_the_same_digest(
 def test_the_protocol_passes_its_vectors_and_unit_tests(
     label: str, environments: dict[str, Environment]
 ) -> None:
-    units = set((ROOT / "tests" / "unit").glob("test_protocol_*.py")) - set(_generated())
+    """Of the unit tests those of the wire: the others run on every Python in the long form."""
+    wire = [ROOT / "tests" / "unit" / f"test_protocol_{name}.py" for name in WIRE]
     vectors = ROOT / "tests" / "vectors" / "test_protocol_vectors.py"
-    run_tests(_present(label, environments), [vectors, *sorted(units)])
+    run_tests(_present(label, environments), [vectors, *wire])
+
+
+@pytest.mark.exhaustive
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("label", ENVIRONMENTS)
+def test_the_protocol_passes_its_other_unit_tests(label: str, environments: dict[str, Environment]) -> None:
+    units = set((ROOT / "tests" / "unit").glob("test_protocol_*.py")) - set(_generated())
+    run_tests(_present(label, environments), sorted(units))
 
 
 @pytest.mark.exhaustive

@@ -20,7 +20,7 @@ def settings(**changes: Any) -> SceneSettings:
         "frequencies_hz": (28e9,),
         "body_material": "metal",
         "materials": MaterialPolicy(),
-        "weld": False,
+        "edges": True,
     }
     return SceneSettings(**plain | changes)
 
@@ -42,7 +42,7 @@ def test_equal_requests_get_one_scene() -> None:
     [
         ({"scenery/scene.xml": Path("/b/scene.xml")}, {"": 3}, {}),
         (ASSETS, {"": 4}, {}),
-        (ASSETS, {"": 3}, {"weld": True}),
+        (ASSETS, {"": 3}, {"free_edges": True}),
         (ASSETS, {"": 3}, {"frequencies_hz": (28e9, 60e9)}),
         (ASSETS, {"": 3}, {"materials": MaterialPolicy(changes={"wall": MaterialSettings(thickness_m=1)})}),
     ],
