@@ -55,6 +55,7 @@ BUNDLED = (
     "simple_wedge",
     "triple_reflector",
 )
+LARGE = ("florence", "munich", "san_francisco")
 BRICK = {
     "nearest": ("brick@c2: nearest 40 GHz", "brick@c3: nearest 110 GHz"),
     "extrapolate": ("brick@c2: extrapolate 1–40 GHz", "brick@c3: extrapolate 110–330 GHz"),
@@ -202,7 +203,9 @@ def test_these_are_all_bundled_scenes() -> None:
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=[pytest.mark.exhaustive] if name in ("munich", "san_francisco") else [])
+        pytest.param(
+            name, marks=[pytest.mark.exhaustive] if name in ("florence", "munich", "san_francisco") else []
+        )
         for name in BUNDLED
     ],
 )

@@ -22,6 +22,7 @@ def powers(channel: Channel) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     return np.add.reduceat(np.append(power, 0.0), channel.offsets[:-1]) * (np.diff(channel.offsets) > 0)
 
 
+@pytest.mark.exhaustive
 def test_power_of_the_chosen_is_in_the_mean_that_of_all_points() -> None:
     """Over 40 choices among one launch's points, to four standard errors and 0.5 % each, and 3 % in all."""
     where = places(3, CANYON, 10)

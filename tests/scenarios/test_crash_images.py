@@ -11,7 +11,7 @@ pytestmark = pytest.mark.skipif(bool(REASON), reason=f"crash images: {REASON}")
 
 def test_a_run_goes_on_from_what_a_loss_of_power_left(capsys: pytest.CaptureFixture[str]) -> None:
     """One image under ``frame``, one under ``periodic``."""
-    status = crash_images.main(["--images", "2", "--frames", "150", "--seed", "4"])
+    status = crash_images.main(["--images", "2", "--frames", "100", "--seed", "4"])
     assert status == 0, capsys.readouterr().out
 
 
