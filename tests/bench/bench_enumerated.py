@@ -54,7 +54,7 @@ LAUNCHED = 100_000
 
 @dataclass(frozen=True)
 class Case:
-    """Scenes of moving traffic, and what a channel service is told before them."""
+    """Scenes of moving traffic, and the preparation that a channel service gets before them."""
 
     run: RunInfo
     preparation: Preparation

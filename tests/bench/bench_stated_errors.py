@@ -136,20 +136,20 @@ def _rows(
                 yield (seed, number, name, receiver, error, score)
 
 
-def collected(told: argparse.Namespace) -> Rows:
+def collected(arguments: argparse.Namespace) -> Rows:
     """The rows of all frames, with progress and time left on the screen."""
-    rungs = told.rungs.split(",")
-    seeds = range(told.first_seed, told.first_seed + told.seeds)
-    total, found, began = told.seeds * told.frames, [], 0.0
-    for count, rows in enumerate(measured(told.scene, rungs, seeds, told.frames)):
+    rungs = arguments.rungs.split(",")
+    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
+    total, found, began = arguments.seeds * arguments.frames, [], 0.0
+    for count, rows in enumerate(measured(arguments.scene, rungs, seeds, arguments.frames)):
         began = began or time.monotonic()
         found.append(rows)
         if count and count % 10 == 0:
             left = (time.monotonic() - began) / count * (total - count - 1)
             print(f"frame {count + 1} of {total}, {left / 60:.1f} min left", flush=True)
     every = np.concatenate(found)
-    if told.streams:
-        np.save(told.streams, every)
+    if arguments.streams:
+        np.save(arguments.streams, every)
     return every
 
 
@@ -244,12 +244,16 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=10, help="frames from one check to the next")
     parser.add_argument("--streams", type=Path, help="file of errors (.npy); read if it is there")
     parser.add_argument("--out", type=Path, help="Markdown file for the table")
-    told = parser.parse_args()
-    rows = np.load(told.streams) if told.streams and told.streams.exists() else collected(told)
-    text = table(rows, told.every)
+    arguments = parser.parse_args()
+    rows = (
+        np.load(arguments.streams)
+        if arguments.streams and arguments.streams.exists()
+        else collected(arguments)
+    )
+    text = table(rows, arguments.every)
     print(text)
-    if told.out:
-        told.out.write_text(text + "\n")
+    if arguments.out:
+        arguments.out.write_text(text + "\n")
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import msgspec
 import numpy as np
@@ -16,6 +17,7 @@ from caviar_services.channel.adaptive.error_bounds import (
     WINDOW,
     ErrorBound,
     errors_db,
+    pair_powers,
     scores_db,
 )
 from caviar_services.channel.base import Modelled
@@ -207,3 +209,8 @@ class TestKnowledge:
         bound.check(0, PAIRS, np.zeros(10), np.full(10, -3.0))
         bound.check(10, many, np.full(1000, -50.0), np.full(1000, -50.0))
         assert bound.bounds_db(20, PAIRS[:1], np.zeros(1))[0] >= -3.0
+
+
+def test_a_weak_pair_keeps_its_power_beside_a_strong_one() -> None:
+    channel = SimpleNamespace(a=np.array([[1.0, 1e-10, 2e-10]]), offsets=np.array([0, 1, 1, 3]))
+    np.testing.assert_allclose(pair_powers(channel), [1.0, 0.0, 5e-20], rtol=1e-12)  # type: ignore[arg-type]

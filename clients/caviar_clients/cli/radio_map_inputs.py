@@ -19,7 +19,7 @@ from caviar_protocol.scene import device_pose
 from caviar_protocol.tables import Place, convert_settings, suggestion
 from caviar_protocol.topics import Carrier, Scene
 from caviar_services.channel.adaptive.settings import AdaptiveSettings, models
-from caviar_services.channel.free_space import FreeSpaceChannel
+from caviar_services.channel.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.channel.radio_map.measurement_surface import (
     Area,
     MeasurementSurface,
@@ -90,9 +90,9 @@ def channel_of(scenes: Scenes, scene: Scene) -> tuple[SionnaChannel, Mapping[str
             cls, settings = traced[-1] if traced else (cls, settings)
         if issubclass(cls, SionnaChannel) and isinstance(settings, SionnaSettings):
             return cls(settings, run), scenes.assets
-        if issubclass(cls, FreeSpaceChannel):
+        if issubclass(cls, FreeSpaceChannel) and isinstance(settings, FreeSpaceSettings):
             nothing = SionnaSettings(
-                atmosphere=settings.atmosphere,  # type: ignore[attr-defined]  # those of its class
+                atmosphere=settings.atmosphere,
                 max_depth=0,
                 reflection=False,
                 bodies=0,

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
+from caviar_services.channel.face_rectangles import ranges
 
 _FLAT_ANGLE = 2e-4
 """[rad]; faces that deviate less from one plane are one, as in `sionna_planes`."""
@@ -142,16 +143,23 @@ class _Pieces:
 
 def _welded(vertices: Float64Array, tolerance: float) -> tuple[Int64Array, Int64Array]:
     """Number of the place of each vertex, Shape ``[V]``, and a vertex at each place."""
-    from scipy.sparse import coo_array  # type: ignore[import-untyped]
-    from scipy.sparse.csgraph import connected_components  # type: ignore[import-untyped]
     from scipy.spatial import cKDTree  # type: ignore[import-untyped]
 
     exact, place = np.unique(vertices, axis=0, return_inverse=True)
     pairs = cKDTree(exact).query_pairs(tolerance, output_type="ndarray")
-    links = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(len(exact), len(exact)))
-    _, cluster = connected_components(links, directed=False)
+    cluster = _connected(pairs, len(exact))
     _, at, place = np.unique(cluster[place.reshape(-1)], return_index=True, return_inverse=True)
     return place.reshape(-1), at
+
+
+def _connected(pairs: Int64Array, count: int) -> Int64Array:
+    """Number of the component that each of ``count`` nodes is in, with links between pairs ``[N, 2]``."""
+    from scipy.sparse import coo_array  # type: ignore[import-untyped]
+    from scipy.sparse.csgraph import connected_components  # type: ignore[import-untyped]
+
+    links = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(count, count))
+    number: Int64Array = connected_components(links, directed=False)[1].astype(np.int64)
+    return number
 
 
 def _widths(corners: Float64Array) -> Float64Array:
@@ -220,10 +228,8 @@ def _on(
         begin, sizes = first[rows, axis], (behind - first)[rows, axis]
         batch = np.cumsum(sizes) // _AT_ONCE
         for some in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(batch)) + 1):
-            size = sizes[some]
-            side = np.repeat(rows[some], size)
-            place = np.arange(len(side)) + np.repeat(begin[some] - np.cumsum(size) + size, size)
-            corner = order[place, axis]
+            own, place = ranges(begin[some], sizes[some])
+            side, corner = rows[some][own], order[place, axis]
             near = ((corners[corner] >= low[side]) & (corners[corner] <= high[side])).all(1)
             side, corner = side[near], corner[near]
             line, offset = sides[side, 1] - sides[side, 0], corners[corner] - sides[side, 0]
@@ -281,9 +287,6 @@ def _first_largest(values: Float64Array, begins: Int64Array) -> Int64Array:
 
 def _runs(pieces: _Pieces, at: Float64Array, face_of_side: Int64Array) -> Int64Array:
     """Number of the edge that each piece is a part of: pieces of the same faces, one behind the other."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     count = len(pieces.ends)
     _, pair = np.unique(np.sort(face_of_side[pieces.faces], axis=1), axis=0, return_inverse=True)
     piece, place = np.tile(np.arange(count), 2), pieces.ends.T.reshape(-1)
@@ -294,10 +297,7 @@ def _runs(pieces: _Pieces, at: Float64Array, face_of_side: Int64Array) -> Int64A
     one, other = order[:-1], order[1:]
     straight = (pair[one] == pair[other]) & (place[one] == place[other])
     straight &= ((onward[one] + onward[other]) ** 2).sum(1) < _STRAIGHT**2
-    one, other = piece[one[straight]], piece[other[straight]]
-    links = coo_array((np.ones(len(one)), (one, other)), shape=(count, count))
-    number: Int64Array = connected_components(links, directed=False)[1].astype(np.int64)
-    return number
+    return _connected(np.column_stack([piece[one[straight]], piece[other[straight]]]), count)
 
 
 def _joined(

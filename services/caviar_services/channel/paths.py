@@ -21,6 +21,7 @@ from caviar_protocol.scene import device_pose, device_velocity
 from caviar_protocol.subarrays import subarrays
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Scene
 from caviar_services.channel.patterns import ElementPattern, Field, Patterns, radiated_field
+from caviar_services.channel.vectors import cross
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +111,7 @@ class Turning:
         Shape ``[..., 3]``: ω × r."""
         centre = np.concatenate([self.centre, np.zeros((1, 3))])[objects]
         turning = np.concatenate([self.angular_velocity, np.zeros((1, 3))])[objects]
-        return np.cross(turning, points - centre)
+        return cross(turning, points - centre)
 
 
 @dataclass(frozen=True, eq=False)

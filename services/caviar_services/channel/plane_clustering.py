@@ -15,6 +15,7 @@ from collections.abc import Callable
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
+from caviar_services.channel.face_rectangles import ranges
 from caviar_services.channel.vectors import cross
 
 _SLACK = 1.001
@@ -108,9 +109,8 @@ def _claim_by_cells(
         some = np.isin(first, defining)
         cells, first = cells[some], first[some]
         for part in np.split(np.arange(len(cells)), _parts(size[cells])):
-            held = np.repeat(begin[cells[part]] - np.cumsum(size[cells[part]]), size[cells[part]])
-            held += np.repeat(size[cells[part]], size[cells[part]]) + np.arange(len(held))
-            these, by = entry[held], np.repeat(first[part], size[cells[part]])
+            of, held = ranges(begin[cells[part]], size[cells[part]])
+            these, by = entry[held], first[part][of]
             # Of several planes that of the earliest triangle, also where a later one has claimed it before.
             later = np.flatnonzero(plane[these] > by)
             these, by = these[later], by[later]

@@ -91,7 +91,8 @@ def bins_of(
 
 def wideband_parts(bins: Sequence[Bins], responses: Iterable[Complex64Array], receivers: int) -> Wideband:
     """Both parts from the responses ``[J, Nr, Nt]`` of each of the bins and pairs, pairs fastest."""
-    made: dict[str, list[ChannelResponse | ChannelTaps]] = {"hf": [], "taps": []}
+    hf: list[ChannelResponse] = []
+    taps: list[ChannelTaps] = []
     rest = iter(responses)
     for asked in bins:
         for pair, first in enumerate(asked.first.tolist()):
@@ -99,10 +100,10 @@ def wideband_parts(bins: Sequence[Bins], responses: Iterable[Complex64Array], re
             response = next(rest)
             h = response.reshape(asked.carrier.slots, -1, *response.shape[1:])
             if asked.part == "hf":
-                made["hf"].append(ChannelResponse(carrier=asked.index, tx=tx, rx=rx, h=h))
+                hf.append(ChannelResponse(carrier=asked.index, tx=tx, rx=rx, h=h))
             else:
-                made["taps"].append(ChannelTaps(carrier=asked.index, tx=tx, rx=rx, first=first, h=h))
-    return Wideband(tuple(made["hf"]), tuple(made["taps"]))  # type: ignore[arg-type]
+                taps.append(ChannelTaps(carrier=asked.index, tx=tx, rx=rx, first=first, h=h))
+    return Wideband(tuple(hf), tuple(taps))
 
 
 def superposed(weights: Complex128Array, waves: Complex128Array) -> Complex64Array:

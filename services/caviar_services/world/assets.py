@@ -59,7 +59,7 @@ def pattern_assets(devices: Iterable[DeviceSpec]) -> dict[str, Path | bytes]:
         if device.array is not None and device.array.pattern_file:
             file = Path(device.array.pattern_file)
             try:
-                read_pattern(file)  # what is wrong with it is told with the user's file, not with a copy
+                read_pattern(file)  # so that an error names the user's file, not a copy of it
             except AssetError as error:
                 key = Place("devices").at(device.name).at("array").at("pattern_file").key
                 raise ScenarioError(str(error), key=key) from error

@@ -109,10 +109,9 @@ def pair_powers(channel: Channel) -> Float64Array:
 
 
 def _of_pairs(channel: Channel, values: Float64Array) -> Float64Array:
-    """Sums over the paths of each pair."""
-    sums = np.concatenate([[0.0], np.cumsum(values)])
-    found: Float64Array = np.diff(sums[channel.offsets])
-    return found
+    """Sums over the paths of each pair, each by itself: beside a strong pair a weak one keeps its digits."""
+    pair = np.repeat(np.arange(len(channel.offsets) - 1), np.diff(channel.offsets))
+    return np.bincount(pair, weights=values, minlength=len(channel.offsets) - 1).astype(np.float64)
 
 
 def in_db(ratio: Float64Array) -> Float64Array:
