@@ -2,7 +2,7 @@
 
 A Unix socket in the run's directory, served by the broker's own loop. A request is one line of JSON,
 ``{"do": "why"}``; so is its answer, ``{"ok": true, …}`` or ``{"ok": false, "error": TEXT}``. After
-``subscribe`` come lines with ``event`` too. See CONTROL.md.
+``subscribe`` come lines with ``event`` too. See docs/howto/control-a-run.md.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@
 ('car', 'uav')
 
 `newest_run` gives the directory of the newest run, `Recording.__getitem__` a topic as arrays over all frames,
-`Recording.frames` the products frame by frame; docs/reading-recordings.md has more.
+`Recording.frames` the products frame by frame; docs/reference/recordings.md has more.
 
 A recording is a directory with ``recording-0000.mcap``, ``recording-0001.mcap``, … and the
 scenery in ``assets/``. After a crash it is readable up to the last frame whose record was

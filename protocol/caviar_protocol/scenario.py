@@ -57,7 +57,7 @@ class Timeouts(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Limits(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What one peer may use of the broker; whoever takes more is cut off and named (broker/SECURITY.md)."""
+    """What one peer may use of the broker; a peer that exceeds a limit is disconnected and named."""
 
     connections: Annotated[int, quantity("1", "open connections in all", ge=1, le=1_000_000)] = 4096
     connections_before_hello: Annotated[

@@ -10,7 +10,7 @@ from caviar_services.channel.stability.run import cases, run
 
 pytestmark = pytest.mark.channel
 
-DOCUMENT = Path(__file__).parents[2] / "services" / "STABILITY.md"
+DOCUMENT = Path(__file__).parents[2] / "docs" / "topics" / "channel-stability.md"
 GROUPS = sorted({case.group for case in cases() if case.traced})
 
 

@@ -1,4 +1,4 @@
-"""broker/SECURITY.md promises only what a test holds."""
+"""docs/topics/threat-model.md promises only what a test holds."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from caviar_broker.security.guard import PeerLimits
 from caviar_protocol.scenario import Limits
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "broker" / "SECURITY.md").read_text()
+PAGE = (ROOT / "docs" / "topics" / "threat-model.md").read_text()
 
 
 def known_tests() -> set[str]:

@@ -80,8 +80,8 @@ def _wideband() -> dict[str, Any]:
 
 GIVEN: dict[str, Callable[[], dict[str, Any]]] = {
     "CONTRIBUTING.md": _channel_model,
-    "docs/wideband.md": _wideband,
-    "services/CHANNEL.md": _keyframes,
+    "docs/howto/wideband.md": _wideband,
+    "docs/topics/channel.md": _keyframes,
     "caviar_broker.core.clock": _clock,
     "caviar_services.testing": _channel_model,
 }

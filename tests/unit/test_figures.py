@@ -10,8 +10,8 @@ from types import ModuleType
 import pytest
 
 ROOT = Path(__file__).parents[2]
-MEASURED = ("CHANNEL.md", "FIDELITY.md", "STABILITY.md", "TRADEOFF.md")
-"""Pages below services/ whose tables of measurements are all in the file."""
+MEASURED = ("channel.md", "adaptive-fidelity.md", "channel-stability.md", "channel-tradeoff.md")
+"""Pages below docs/topics/ whose tables of measurements are all in the file."""
 
 
 def module() -> ModuleType:
@@ -69,7 +69,7 @@ def test_every_table_of_the_file_is_shown_and_says_where_it_is_from() -> None:
 def test_no_measured_table_stands_outside_of_the_file(page: str) -> None:
     """A level in dB, a time or a share in a cell is a measurement."""
     text = re.sub(
-        r"<!-- table: .*?<!-- end -->", "", (ROOT / "services" / page).read_text("utf-8"), flags=re.S
+        r"<!-- table: .*?<!-- end -->", "", (ROOT / "docs" / "topics" / page).read_text("utf-8"), flags=re.S
     )
     for _, columns, rows in figures.markdown_tables(text):
         measured = [cell for row in rows for cell in row if re.match(r"−?[\d.,]+ (dB|ms|µs|s|%)", cell)]

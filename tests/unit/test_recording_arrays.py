@@ -410,8 +410,8 @@ def test_the_page_lists_every_array(repository: Path, section: str) -> None:
         doc = column.doc.replace("|", "\\|")
         lines.append(f"| `{name}` | {axes} | {column.dtype.name} | {doc} [{column.unit}] |")
     wanted = "\n".join(lines) + "\n"
-    page = (repository / "docs" / "reading-recordings.md").read_text()
-    assert wanted in page, f"docs/reading-recordings.md lacks\n{wanted}"
+    page = (repository / "docs" / "reference" / "recordings.md").read_text()
+    assert wanted in page, f"docs/reference/recordings.md lacks\n{wanted}"
 
 
 def test_a_recording_and_its_topics_say_what_they_hold(
