@@ -43,11 +43,11 @@ from caviar_broker.security.guard import PeerLimits
 from caviar_broker.security.local import check_bind
 from caviar_broker.server import BrokerServer
 from caviar_broker.versions import changes, versions_of
-from caviar_protocol.durability import file_system_of
 from caviar_protocol.errors import CaviarError, RunError
+from caviar_protocol.files import file_system_of
 from caviar_protocol.host import steady_memory
-from caviar_protocol.scenario_checks import with_overrides
-from caviar_protocol.scenario_loader import load_scenario
+from caviar_protocol.scenario import load_scenario
+from caviar_protocol.scenario.rules import with_overrides
 
 JOURNAL = "journal.msgpack"
 LATENCIES = "latency.npz"

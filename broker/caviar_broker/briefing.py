@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 
 from caviar_protocol.scenario import Scenario, ServiceSpec
-from caviar_protocol.scenario_checks import resolved, world_of
+from caviar_protocol.scenario.rules import resolved, world_of
 
 
 def briefings(scenario: Scenario, directory: Path) -> dict[str, dict[str, Any]]:

@@ -8,9 +8,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from caviar_protocol.durability import replace_file, sync_file
 from caviar_protocol.errors import RunError
-from caviar_protocol.regular_file import read_regular
+from caviar_protocol.files import read_regular, replace_file, sync_file
 
 FOLDER = "checkpoints"
 

@@ -16,7 +16,7 @@ from typing import Any
 
 from caviar_broker.aside import call_aside
 from caviar_protocol.errors import RunError
-from caviar_protocol.regular_file import read_regular, refuse_other_kinds
+from caviar_protocol.files import read_regular, refuse_other_kinds
 
 SOCKET, NOTE = "control.sock", "control.json"
 BACKLOG = 16

@@ -27,8 +27,8 @@ from caviar_broker.journal_format import (
     framed,
 )
 from caviar_broker.retention import EntryIndex, Located, needed
-from caviar_protocol.durability import sync_file
 from caviar_protocol.errors import RunError
+from caviar_protocol.files import sync_file
 
 COMPACT_BYTES = 8 << 20
 """[B] that a journal grows by before it is compacted."""

@@ -17,8 +17,8 @@ from pathlib import Path
 import msgspec
 
 from caviar_protocol.errors import RecordingError
+from caviar_protocol.files import open_regular
 from caviar_protocol.messages import GrantInput
-from caviar_protocol.regular_file import open_regular
 
 MAGIC = b"CAVIAR journal 2\n"
 HEAD = struct.Struct("<QI")

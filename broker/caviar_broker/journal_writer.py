@@ -18,8 +18,8 @@ from caviar_broker.aside import call_aside
 from caviar_broker.core.events import Journal
 from caviar_broker.core.resumption import Snapshot
 from caviar_broker.journal import JournalFile
-from caviar_protocol.durability import SYNC_PERIOD_S, Durability
 from caviar_protocol.errors import RunError
+from caviar_protocol.files import SYNC_PERIOD_S, Durability
 
 END_S = 10.0
 """[s] that closing waits for the disk: a busy one takes seconds for the last entries."""

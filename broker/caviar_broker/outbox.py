@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from caviar_protocol.regular_file import open_to_append
+from caviar_protocol.files import open_to_append
 
 MAX_PENDING = 1 << 18
 """[B] of lines kept in memory; what comes behind them is read back from the log."""

@@ -8,11 +8,10 @@ from pathlib import Path
 
 import msgspec
 
-from caviar_protocol.durability import replace_file
 from caviar_protocol.errors import RecordingError, RunError
-from caviar_protocol.regular_file import read_regular
+from caviar_protocol.files import read_regular, replace_file
 from caviar_protocol.scenario import Scenario
-from caviar_protocol.tables import Source
+from caviar_protocol.scenario.conversion import Source
 
 NAME = "run.json"
 _UNSET = "0" * 64

@@ -5,10 +5,10 @@ from __future__ import annotations
 from contextlib import suppress
 from pathlib import Path
 
-from caviar_protocol.durability import sync_file
 from caviar_protocol.errors import RunError
-from caviar_protocol.recording_layout import SEGMENT_PATTERN
-from caviar_protocol.recording_segments import recorded_until
+from caviar_protocol.files import sync_file
+from caviar_protocol.recording.integrity import recorded_until
+from caviar_protocol.recording.layout import SEGMENT_PATTERN
 from caviar_protocol.scenario import Scenario
 
 

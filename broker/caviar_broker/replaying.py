@@ -8,7 +8,7 @@ from dataclasses import replace
 from caviar_broker.core.plan import RunPlan
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.recording import Recording
-from caviar_protocol.replay import recorded_decisions
+from caviar_protocol.recording.reader import recorded_decisions
 from caviar_protocol.scenario import ReplaySpec
 
 

@@ -7,11 +7,10 @@ from pathlib import Path
 
 from caviar_broker.journal_format import run_of_journal
 from caviar_protocol.errors import RecordingError, RunError
-from caviar_protocol.recording_layout import SEGMENT_PATTERN
-from caviar_protocol.recording_manifest import MANIFEST_NAME, read_manifest
-from caviar_protocol.recording_segments import metadata_of
-from caviar_protocol.regular_file import PUT_BACK, refuse_other_kinds
-from caviar_protocol.segment import Segment
+from caviar_protocol.files import PUT_BACK, refuse_other_kinds
+from caviar_protocol.recording.integrity import metadata_of
+from caviar_protocol.recording.layout import MANIFEST_NAME, SEGMENT_PATTERN, read_manifest
+from caviar_protocol.recording.segment import Segment
 
 
 def check_run_files(directory: Path, journal: Path, run: str) -> None:

@@ -31,11 +31,11 @@ from caviar_broker.standby import Standby
 from caviar_broker.statistics import Statistics
 from caviar_broker.watchdog import CHECK_NS, Watchdog
 from caviar_protocol import messages as m
-from caviar_protocol.alive import SignOfLife
 from caviar_protocol.assets import AssetStore
 from caviar_protocol.codec import check_parts, decode_message, encode_message
-from caviar_protocol.durability import Durability, file_system_of
 from caviar_protocol.errors import ProtocolError
+from caviar_protocol.files import Durability, file_system_of
+from caviar_protocol.host import SignOfLife
 
 LOOK_NS, UNHURRIED_LOOK_NS = 1_000_000, 4_000_000
 """[ns] until deadlines are looked at again, however busy the port is; where none can come soon, longer."""

@@ -14,7 +14,7 @@ import msgspec
 
 from caviar_protocol.messages import PROTOCOL_VERSION
 from caviar_protocol.scenario import Scenario
-from caviar_protocol.tables import Source
+from caviar_protocol.scenario.conversion import Source
 
 PACKAGES = ("caviar_protocol", "caviar_broker", "caviar_services")
 """Code that takes part in every run."""

@@ -22,6 +22,9 @@ the user's and end a command with a status other than 0.
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
+
 
 class CaviarError(Exception):
     """Base of all errors raised on purpose; its text is meant for the user."""
@@ -116,3 +119,12 @@ class RecordingError(CaviarError):
 
 class RunError(CaviarError):
     """A run ended before its last frame. The text names the service, the frame and the phase."""
+
+
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """``did you mean 'frames'?``, or the known names where none is near."""
+    names = sorted(known)
+    near = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
+    if near:
+        return f"did you mean {near[0]!r}?"
+    return f"known: {', '.join(names)}" if names else "none is known here"

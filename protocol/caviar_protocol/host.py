@@ -1,8 +1,13 @@
-"""Which kernel and process namespace this process lives in."""
+"""What a process asks of its machine: identity, memory, a sign of life, installed extras."""
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
+import importlib.util
+import os
+import sys
+import time
 from pathlib import Path
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
@@ -59,3 +64,51 @@ def _glibc(function: str, *arguments: int) -> None:
         getattr(ctypes.CDLL(None), function)(*arguments)
     except (OSError, AttributeError):
         return  # another C library: it has a strategy of its own
+
+
+VARIABLE = "CAVIAR_ALIVE"
+"""Environment variable with the path of the file; without it no sign is given."""
+INTERVAL_S = 1.0
+"""[s] between signs at least."""
+
+
+class SignOfLife:
+    """A file that is as old as the last sign of life."""
+
+    def __init__(self) -> None:
+        name = os.environ.get(VARIABLE, "")
+        self._path = Path(name) if name else None
+        self._due = 0.0
+
+    def give(self) -> None:
+        """Touch the file, unless that has just been done.
+
+        A file that cannot be written is no reason to end a run: the health check tells of it.
+        """
+        now = time.monotonic()
+        if self._path is None or now < self._due:
+            return
+        self._due = now + INTERVAL_S
+        with contextlib.suppress(OSError):
+            self._path.touch()
+
+
+DISTRIBUTION = "caviar-sim"
+"""Name under which pip knows this project."""
+
+_MODULES = {"channel": "sionna", "sensors": "mitsuba", "world": "libsumo", "plot": "matplotlib"}
+"""A module that each extra brings and the base install does not."""
+
+
+def has_extra(extra: str) -> bool:
+    """Whether the libraries of an extra can be imported; they are not imported for that."""
+    return importlib.util.find_spec(_MODULES[extra]) is not None
+
+
+def install_command(*extras: str) -> str:
+    """Shell command that adds extras to this installation: ``/…/python -m pip install 'caviar-sim[plot]'``.
+
+    It names the interpreter that runs, so that it works without an activated environment; pip takes the
+    requirements of the extras from the metadata of what is installed, be that a wheel or a checkout.
+    """
+    return f"{sys.executable} -m pip install '{DISTRIBUTION}[{','.join(extras)}]'"

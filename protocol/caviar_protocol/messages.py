@@ -13,6 +13,7 @@ from typing import Annotated, Any
 import msgspec
 
 from caviar_protocol.arrays import quantity
+from caviar_protocol.fields import Asset as Asset
 from caviar_protocol.fields import (
     Attempt,
     Count,
@@ -36,15 +37,14 @@ from caviar_protocol.fields import (
     Word,
     few,
 )
-from caviar_protocol.items import Asset as Asset
-from caviar_protocol.items import Demand as Demand
-from caviar_protocol.items import GrantInput as GrantInput
-from caviar_protocol.items import Input as Input
-from caviar_protocol.items import Policy as Policy
-from caviar_protocol.items import ProductHeader as ProductHeader
-from caviar_protocol.items import Report as Report
-from caviar_protocol.items import Role as Role
-from caviar_protocol.items import Status as Status
+from caviar_protocol.fields import Demand as Demand
+from caviar_protocol.fields import GrantInput as GrantInput
+from caviar_protocol.fields import Input as Input
+from caviar_protocol.fields import Policy as Policy
+from caviar_protocol.fields import ProductHeader as ProductHeader
+from caviar_protocol.fields import Report as Report
+from caviar_protocol.fields import Role as Role
+from caviar_protocol.fields import Status as Status
 
 PROTOCOL_VERSION = (1, 4)
 """Major and minor version of the protocol that this package speaks."""

@@ -1,6 +1,6 @@
 """Uniform antenna arrays as the channel, the link and the agents all see them.
 
-An array with dual polarization or several panels is a set of these (`caviar_protocol.subarrays`).
+An array with dual polarization or several panels is a set of these (`caviar_protocol.space.beams`).
 
 One phase convention for all of them. The element at ``r`` [wavelengths] sees a plane wave of
 direction k̂ (unit vector from the array *towards* the other end, device axes) with the phase

@@ -16,7 +16,7 @@ class Encoded(Payload, frozen=True, kw_only=True):
 
 
 def encoded(payload: Payload) -> tuple[bytes, bytes]:
-    """Header and body of a product (`caviar_protocol.codec.encode_payload`)."""
+    """Header and body of a product (`caviar_protocol.codec.payloads.encode_payload`)."""
     return (payload.header, payload.body) if isinstance(payload, Encoded) else encode_payload(payload)
 
 

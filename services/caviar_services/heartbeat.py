@@ -11,9 +11,9 @@ from collections.abc import Callable
 
 import zmq
 
-from caviar_protocol.alive import SignOfLife
 from caviar_protocol.codec import decode_message, encode_message
 from caviar_protocol.errors import ProtocolError
+from caviar_protocol.host import SignOfLife
 from caviar_protocol.keys import Credentials
 from caviar_protocol.messages import Attach, Heartbeat, HeartbeatAck, Welcome
 from caviar_services.handshake import dress

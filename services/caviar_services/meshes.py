@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int32Array
-from caviar_protocol.coordinates import Pose, rotation_matrix
 from caviar_protocol.errors import PayloadError
+from caviar_protocol.space.coordinates import Pose, rotation_matrix
 
 
 @dataclass(frozen=True, eq=False)

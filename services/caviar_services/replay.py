@@ -18,7 +18,7 @@ from msgspec import Meta
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.messages import GrantInput, Role, Status
 from caviar_protocol.recording import RecordedFrame, Recording
-from caviar_protocol.tables import Place
+from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.topics import PAYLOADS
 from caviar_services.encoded import Encoded
 from caviar_services.service import Frame, Preparation, Prepared, Service, StepResult

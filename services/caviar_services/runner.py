@@ -19,12 +19,12 @@ import zmq
 from caviar_protocol import messages as m
 from caviar_protocol.assets import AssetStore, Incoming
 from caviar_protocol.codec import check_version, encode_message, message_type
-from caviar_protocol.content import ContentCheck
 from caviar_protocol.errors import AssetError, ProtocolError, RunError
 from caviar_protocol.host import host_identity, trim_memory
 from caviar_protocol.keys import Credentials
 from caviar_protocol.keys import credentials as find_credentials
-from caviar_protocol.tables import convert_settings
+from caviar_protocol.scenario.conversion import convert_settings
+from caviar_protocol.validation import ContentCheck
 from caviar_services.answers import Answers, Guard
 from caviar_services.connection import (
     Connection,

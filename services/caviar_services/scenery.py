@@ -18,8 +18,7 @@ from xml.parsers import expat
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array
-from caviar_protocol.errors import AssetError
-from caviar_protocol.tables import suggestion
+from caviar_protocol.errors import AssetError, suggestion
 
 ITU_MATERIALS = frozenset(
     (

@@ -24,14 +24,14 @@ import numpy as np
 
 from caviar_protocol.arrays import Payload
 from caviar_protocol.codec import decode_payload
-from caviar_protocol.content import ContentCheck
 from caviar_protocol.errors import PayloadError, ProductError, ProtocolError
 from caviar_protocol.messages import GrantInput, Input, Report, Role, Status
 from caviar_protocol.scenario import DeviceSpec
-from caviar_protocol.scene import merge_scenes
+from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.seeding import generator
-from caviar_protocol.tables import Place
+from caviar_protocol.space.scene import merge_scenes
 from caviar_protocol.topics import Carrier, Scene
+from caviar_protocol.validation import ContentCheck
 
 S = TypeVar("S", bound=msgspec.Struct)
 P = TypeVar("P", bound=Payload)

@@ -20,9 +20,9 @@ import numpy as np
 from bench_lidar import traffic
 
 from caviar_protocol.codec import encode_payload
-from caviar_protocol.coordinates import Pose, compose, quaternion_from_euler
 from caviar_protocol.messages import GrantInput, Status
-from caviar_protocol.scene import object_pose
+from caviar_protocol.space.coordinates import Pose, compose, quaternion_from_euler
+from caviar_protocol.space.scene import object_pose
 from caviar_protocol.topics import Camera, CameraDevice, Scene
 from caviar_services.sensors.camera import CameraSensors, CameraSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo, StepResult

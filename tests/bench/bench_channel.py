@@ -22,10 +22,10 @@ import numpy as np
 import psutil
 
 from caviar_protocol.codec import encode_payload
-from caviar_protocol.coordinates import quaternion_from_euler
 from caviar_protocol.digest import payload_digest
-from caviar_protocol.extras import install_command
+from caviar_protocol.host import install_command
 from caviar_protocol.messages import GrantInput, Status
+from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Scene
 from caviar_services.channel.sionna_rt import SionnaChannel
 from caviar_services.channel.sionna_settings import SionnaSettings

@@ -39,7 +39,7 @@ from path_reference import Path as Ray
 
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.scenario import DeviceSpec
-from caviar_protocol.scene import antennas
+from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import Carrier, Channel, Scene
 from caviar_services.channel.sionna_rt import SionnaChannel
 from caviar_services.channel.sionna_settings import SionnaSettings

@@ -23,9 +23,9 @@ import msgspec
 import numpy as np
 from bench_camera import street
 
-from caviar_protocol.coordinates import Pose
 from caviar_protocol.messages import GrantInput, Status
-from caviar_protocol.scene import device_pose
+from caviar_protocol.space.coordinates import Pose
+from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Channel, Scene
 from caviar_services.channel.sionna_rt import SionnaChannel
 from caviar_services.channel.sionna_settings import SionnaSettings

@@ -29,9 +29,9 @@ from caviar_broker.journal import JournalFile
 from caviar_broker.journal_writer import JournalWriter
 from caviar_broker.resume import read_resumption
 from caviar_protocol.digest import RunDigest, payload_digest
-from caviar_protocol.durability import Durability
+from caviar_protocol.files import Durability
 from caviar_protocol.messages import GrantInput, Status
-from caviar_protocol.scenario_loader import find_scenario
+from caviar_protocol.scenario import find_scenario
 
 SERVICES = {"world": "scene", "channel": "channel", "agent": "action", "link": "link", "recorder": ""}
 STATEFUL, CHECKPOINT_FRAMES = "world", 20

@@ -31,8 +31,7 @@ import numpy as np
 
 from caviar_clients.embedded.run import EmbeddedRun
 from caviar_protocol.messages import GrantInput, Status
-from caviar_protocol.scenario import Scenario
-from caviar_protocol.scenario_loader import load_scenario
+from caviar_protocol.scenario import Scenario, load_scenario
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Channel, Scene
 from caviar_services.channel.base import ChannelModel, ChannelSettings, Modelled
 from caviar_services.channel.mimo_rt import ElementTracer

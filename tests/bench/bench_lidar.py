@@ -17,8 +17,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from caviar_protocol.codec import encode_payload
-from caviar_protocol.coordinates import quaternion_from_euler
 from caviar_protocol.messages import GrantInput, Status
+from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import LidarDevice, Scene
 from caviar_services.sensors.geometry import active_variant
 from caviar_services.sensors.lidar import LidarSensors, LidarSettings, ray_directions

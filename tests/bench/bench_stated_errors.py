@@ -29,7 +29,7 @@ import numpy as np
 from bench_enumerated import Case, munich
 from numpy.typing import NDArray
 
-from caviar_protocol.scene import antennas
+from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import Scene
 from caviar_services.channel.adaptive.error_bounds import ErrorBound, errors_db, scores_db
 from caviar_services.channel.sionna_rt import SionnaChannel

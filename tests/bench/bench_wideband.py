@@ -30,11 +30,11 @@ from bench_ladder import world
 
 from caviar_protocol.arrays import Complex64Array, Complex128Array
 from caviar_protocol.codec import encode_payload
-from caviar_protocol.coordinates import SPEED_OF_LIGHT, quaternion_from_euler
 from caviar_protocol.digest import payload_digest
 from caviar_protocol.messages import GrantInput, Status
-from caviar_protocol.ofdm import subcarrier_offsets
-from caviar_protocol.scene import antennas
+from caviar_protocol.multipath import subcarrier_offsets
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, quaternion_from_euler
+from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Channel, Scene
 from caviar_services.channel.geometry import PathGeometry
 from caviar_services.channel.matrices import Located, PlaneWaves

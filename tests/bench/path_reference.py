@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from caviar_protocol.arrays import Complex128Array, Float64Array
-from caviar_protocol.coordinates import rotation_matrix
-from caviar_protocol.scene import antennas, device_pose
+from caviar_protocol.space.coordinates import rotation_matrix
+from caviar_protocol.space.scene import antennas, device_pose
 from caviar_protocol.topics import Channel, Interaction, Scene
 from caviar_services.antenna import steering_vector
 from caviar_services.channel.paths import Antenna

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from bench_memory import Growth, measure
 
-from caviar_protocol.scenario_loader import find_scenario
+from caviar_protocol.scenario import find_scenario
 
 
 def test_the_slope_is_that_of_the_last_frames() -> None:

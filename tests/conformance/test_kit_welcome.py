@@ -17,7 +17,7 @@ from caviar_clients.conform.session import Rules, Seen, Session
 from caviar_clients.conform.street import SCENARIO
 from caviar_protocol import messages as m
 from caviar_protocol.codec import encode_message
-from caviar_protocol.scenario_loader import parse_scenario
+from caviar_protocol.scenario import parse_scenario
 
 ROLES = {service: spec.role for service, spec in parse_scenario(SCENARIO).services.items()}
 

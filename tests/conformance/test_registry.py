@@ -11,9 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from caviar_protocol.scenario import Scenario
-from caviar_protocol.scenario_checks import devices_of
-from caviar_protocol.scenario_loader import load_scenario
+from caviar_protocol.scenario import Scenario, load_scenario
+from caviar_protocol.scenario.rules import devices_of
 from caviar_services.registry import BUILT_IN, load
 from caviar_services.testing import CONFORMANCE, ServiceConformance
 

@@ -14,8 +14,8 @@ from camera_world import EMPTY, prepared, products, projected, seen
 from lidar_world import Body, scene_of, slab_ranges
 
 from caviar_protocol.arrays import Float64Array
-from caviar_protocol.coordinates import Pose, compose, quaternion_from_euler, rotation_matrix
 from caviar_protocol.errors import PayloadError
+from caviar_protocol.space.coordinates import Pose, compose, quaternion_from_euler, rotation_matrix
 from caviar_protocol.topics import CameraDevice
 from caviar_services.meshes import box
 from caviar_services.sensors.camera import CameraSensors, CameraSettings

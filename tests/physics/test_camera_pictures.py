@@ -11,8 +11,8 @@ from lidar_world import Body, scene_of
 
 from caviar_protocol.arrays import UInt8Array
 from caviar_protocol.codec import encode_payload
-from caviar_protocol.coordinates import quaternion_from_euler
 from caviar_protocol.errors import ScenarioError
+from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import CameraDevice, Scene
 from caviar_services.meshes import box
 from caviar_services.sensors.camera import CameraSensors, CameraSettings

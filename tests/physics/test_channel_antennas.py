@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from channel_lab import Array, C, Thing, antenna, free_space, measure, scene, sionna, turn
 
-from caviar_protocol.coordinates import quaternion_from_euler
-from caviar_protocol.ofdm import subcarrier_offsets
+from caviar_protocol.multipath import subcarrier_offsets
+from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import AntennaArray, Carrier, Channel, Panel
 from caviar_services.channel.base import ChannelModel
 from caviar_services.channel.free_space import FreeSpaceChannel, FreeSpaceSettings

@@ -22,7 +22,7 @@ from channel_lab import (
     write_scenery,
 )
 
-from caviar_protocol.coordinates import quaternion_from_euler
+from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import Interaction
 from caviar_services.channel import edge_fields as module
 from caviar_services.channel import sionna_table

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from channel_lab import Array, C, Plate, Thing, antenna, measure, scene, sionna, total, write_scenery
 
-from caviar_protocol.coordinates import quaternion_from_euler
+from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import Channel, Interaction
 from caviar_services.channel.base import ChannelModel
 

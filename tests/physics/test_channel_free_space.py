@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from channel_lab import C, Thing, antenna, free_space, measure, scene, spherical_wave, turn, vertical
 
-from caviar_protocol.coordinates import quaternion_from_euler
+from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import AntennaArray
 
 

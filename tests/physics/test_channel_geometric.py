@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from channel_lab import Thing, antenna, free_space, geometric, measure, scene, spherical_wave
 
-from caviar_protocol.coordinates import quaternion_from_euler
+from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import AntennaArray, Channel, Scene
 
 C = 299_792_458.0

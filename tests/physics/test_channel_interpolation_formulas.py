@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from channel_lab import Array, C, Thing, antenna, carriers, mirrored, scene, spherical_wave
 
-from caviar_protocol.coordinates import angles
 from caviar_protocol.errors import PayloadError
+from caviar_protocol.space.coordinates import angles
 from caviar_protocol.topics import AntennaArray, Channel, ChannelMatrix, Scene
 from caviar_services.channel.interpolation import Interpolation, Keyframe
 

@@ -10,7 +10,7 @@ from channel_lab import C, Plate, Thing, antenna, measure, scene, sionna, write_
 from same_paths import SCENES, model
 
 from caviar_protocol.messages import GrantInput, Status
-from caviar_protocol.paths import changes
+from caviar_protocol.multipath import changes
 from caviar_protocol.topics import Channel, Scene
 from caviar_services.service import Frame, FrameInput
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from channel_lab import Array, C, Plate, Thing, antenna, measure, scene, sionna, turn, write_scenery
 
-from caviar_protocol.coordinates import quaternion_from_euler
 from caviar_protocol.errors import RunError
+from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import AntennaArray, Scene
 from caviar_services.antenna import steering_vector
 from caviar_services.channel.paths import Antenna

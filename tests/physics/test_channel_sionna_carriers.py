@@ -23,7 +23,7 @@ from channel_lab import (
     write_scenery,
 )
 
-from caviar_protocol.coordinates import quaternion_from_euler
+from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import AntennaArray, Scene
 
 pytestmark = pytest.mark.channel

@@ -24,8 +24,8 @@ from channel_lab import (
 from msgspec.structs import replace
 
 from caviar_protocol.codec import encode_payload
-from caviar_protocol.coordinates import multiply, quaternion_from_euler
 from caviar_protocol.digest import payload_digest
+from caviar_protocol.space.coordinates import multiply, quaternion_from_euler
 from caviar_protocol.topics import AntennaArray, Channel, Interaction, Scene
 from caviar_services.channel.base import ChannelModel
 

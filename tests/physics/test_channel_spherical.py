@@ -27,7 +27,7 @@ from channel_lab import (
     write_scenery,
 )
 
-from caviar_protocol.coordinates import quaternion_from_euler
+from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import AntennaArray, Carrier, Channel
 from caviar_services.channel.sionna_rt import SionnaChannel
 from caviar_services.channel.sionna_settings import SionnaSettings

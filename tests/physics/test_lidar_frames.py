@@ -15,9 +15,9 @@ from lidar_world import Body, observed, prepared, scene_of
 
 from caviar_protocol.arrays import Float32Array
 from caviar_protocol.codec import encode_payload
-from caviar_protocol.coordinates import quaternion_from_euler
 from caviar_protocol.errors import AssetError, PayloadError
 from caviar_protocol.host import trim_memory
+from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import AntennaDevice, Lidar, LidarDevice
 from caviar_services.meshes import box
 from caviar_services.runner import TRIM_EVERY

@@ -26,7 +26,7 @@ from lidar_world import observed
 from lidar_world import prepared as lidars
 
 from caviar_protocol.arrays import BoolArray, Float64Array
-from caviar_protocol.coordinates import quaternion_from_euler
+from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import (
     AntennaDevice,
     CameraDevice,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from caviar_protocol.errors import SetupError
-from caviar_protocol.scenario_loader import load_scenario
+from caviar_protocol.scenario import load_scenario
 from caviar_services.llvm import activate_llvm
 from caviar_services.scenery import read_scenery
 from caviar_services.sensors.geometry import active_variant, load_scenery

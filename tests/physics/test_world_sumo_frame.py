@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from caviar_protocol.coordinates import rotation_matrix
+from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_services.world.sumo_frame import Placement, body_pose, heading, object_class
 
 compass = st.floats(0.0, 360.0, exclude_max=True)

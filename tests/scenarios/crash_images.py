@@ -33,9 +33,9 @@ from scenarios_support import SCENARIOS, Finished, caviar, marked, run, running
 
 from caviar_broker.deskplace import ask
 from caviar_broker.journal_format import read_journal
-from caviar_protocol.durability import SYNC_PERIOD_S
 from caviar_protocol.errors import RecordingError, RunError
-from caviar_protocol.recording_segments import recorded_until
+from caviar_protocol.files import SYNC_PERIOD_S
+from caviar_protocol.recording.integrity import recorded_until
 
 EXT4_IOC_SHUTDOWN, NOLOGFLUSH = 0x8004587D, struct.pack("I", 2)
 """Stop a file system without writing its journal, as a loss of power does."""

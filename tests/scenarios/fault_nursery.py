@@ -196,7 +196,7 @@ def follow(case: Case) -> Result:
     """Run a case as ``caviar run`` would."""
     from caviar_clients.cli import children, launch
     from caviar_protocol.errors import CaviarError
-    from caviar_protocol.scenario_loader import load_scenario
+    from caviar_protocol.scenario import load_scenario
 
     global _case
     _case = case

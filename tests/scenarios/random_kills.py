@@ -32,7 +32,7 @@ from scenarios_support import SCENARIOS, caviar, environment
 
 from caviar_broker.deskplace import ask
 from caviar_protocol.errors import RunError
-from caviar_protocol.scenario_loader import load_scenario
+from caviar_protocol.scenario import load_scenario
 
 FRAMES_A_KILL = 24
 """Frames of the run for each kill."""

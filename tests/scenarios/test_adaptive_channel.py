@@ -19,10 +19,9 @@ from caviar_clients.embedded.run import EmbeddedRun
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.recording import Recording
-from caviar_protocol.replay import Imposed, recorded_decisions
-from caviar_protocol.scenario import Scenario
-from caviar_protocol.scenario_loader import load_scenario
-from caviar_protocol.tables import convert_settings
+from caviar_protocol.recording.reader import Imposed, recorded_decisions
+from caviar_protocol.scenario import Scenario, load_scenario
+from caviar_protocol.scenario.conversion import convert_settings
 from caviar_protocol.topics import Channel, Scene
 from caviar_services.channel.adaptive.channel import TIMINGS, AdaptiveChannel
 from caviar_services.channel.adaptive.cost_model import Workload

@@ -14,7 +14,7 @@ from scenarios_support import Finished, caviar, run, scenario_file
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import Recording
-from caviar_protocol.scenario_loader import load_scenario
+from caviar_protocol.scenario import load_scenario
 
 BUDGET_MS, LATE_S = 500, 1.25
 """Late by so much that the next frame comes while the service is busy, and the one behind it does not."""

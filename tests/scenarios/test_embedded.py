@@ -19,9 +19,9 @@ from scenarios_support import (
     scenario_file,
 )
 
-from caviar_protocol.instants import instants_ns
 from caviar_protocol.recording import Recording
-from caviar_protocol.scenario_loader import load_scenario
+from caviar_protocol.scenario import load_scenario
+from caviar_protocol.scenario.loader import instants_ns
 
 SICK = """
 [services.sick]

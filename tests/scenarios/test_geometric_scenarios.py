@@ -13,7 +13,7 @@ from scenarios_support import SCENARIOS, run
 
 from caviar_protocol.codec import decode_payload
 from caviar_protocol.recording import Recording
-from caviar_protocol.scene import antennas, device_pose, merge_scenes
+from caviar_protocol.space.scene import antennas, device_pose, merge_scenes
 from caviar_protocol.topics import Channel, Link, Scene
 
 C = 299_792_458.0

@@ -10,7 +10,7 @@ from scenarios_support import SCENARIOS, Finished, caviar, run, scenario_file
 
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.recording import Recording
-from caviar_protocol.replay import recorded_decisions
+from caviar_protocol.recording.reader import recorded_decisions
 
 FRAMES = 20
 

@@ -9,8 +9,7 @@ import wrong_worlds
 from scenarios_support import SCENARIOS, run, scenario_file
 
 from caviar_clients.embedded.run import EmbeddedRun
-from caviar_protocol.scenario import Scenario
-from caviar_protocol.scenario_loader import parse_scenario
+from caviar_protocol.scenario import Scenario, parse_scenario
 
 OBJECTS = "[[services.world.settings.objects]]"
 WORDS = {

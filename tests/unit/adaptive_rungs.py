@@ -10,7 +10,7 @@ import numpy as np
 
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.scenario import DeviceSpec
-from caviar_protocol.tables import convert_settings
+from caviar_protocol.scenario.conversion import convert_settings
 from caviar_protocol.topics import AntennaDevice, Carrier, Channel, Scene
 from caviar_services.channel.adaptive.channel import AdaptiveChannel
 from caviar_services.channel.base import Modelled

@@ -20,9 +20,8 @@ from websockets.typing import Origin, Subprotocol
 
 from caviar_broker.deskplace import ask
 from caviar_protocol import messages as m
-from caviar_protocol.codec import decode_message, encode_message
+from caviar_protocol.codec import decode_message, encode_message, join_parts, split_frame
 from caviar_protocol.digest import payload_digest
-from caviar_protocol.websocket import join_parts, split_frame
 
 M = TypeVar("M", bound=m.Message)
 CAVIAR = Subprotocol("caviar.v1")

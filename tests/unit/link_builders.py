@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from caviar_protocol.arrays import Complex128Array, Payload
-from caviar_protocol.coordinates import quaternion_from_euler
 from caviar_protocol.messages import GrantInput, Status
+from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import (
     Action,
     AntennaArray,

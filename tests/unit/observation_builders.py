@@ -11,8 +11,7 @@ from msgspec.structs import replace
 
 from caviar_clients.envs.observations import Moment, part
 from caviar_clients.envs.users import Users
-from caviar_protocol.scenario import DeviceSpec, Scenario
-from caviar_protocol.scenario_loader import load_scenario
+from caviar_protocol.scenario import DeviceSpec, Scenario, load_scenario
 from caviar_protocol.topics import (
     Link,
     Scene,

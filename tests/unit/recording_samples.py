@@ -9,10 +9,10 @@ import numpy as np
 
 from caviar_protocol.arrays import Payload
 from caviar_protocol.codec import encode_payload
-from caviar_protocol.coordinates import quaternion_from_euler, rotation_matrix
 from caviar_protocol.digest import payload_digest
 from caviar_protocol.messages import GrantInput, Status
-from caviar_protocol.scene import device_pose
+from caviar_protocol.space.coordinates import quaternion_from_euler, rotation_matrix
+from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import (
     AntennaArray,
     AntennaDevice,

@@ -9,7 +9,7 @@ from link_builders import antenna, frame_of, given, scene_of
 
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.errors import ScenarioError
-from caviar_protocol.pairs import Pair
+from caviar_protocol.space.scene import Pair
 from caviar_protocol.topics import Action, BeamChoice, Scene, VelocityCommand
 from caviar_services.agent.base import Agent, AgentSettings
 from caviar_services.registry import load

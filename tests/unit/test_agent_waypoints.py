@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from link_builders import antenna, frame_of, given, scene_of
 
-from caviar_protocol.coordinates import Vector
 from caviar_protocol.errors import ScenarioError
-from caviar_protocol.tables import convert_settings
+from caviar_protocol.scenario.conversion import convert_settings
+from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.topics import Action, BeamChoice, Scene, WaypointCommand
 from caviar_services.agent.base import AgentSettings
 from caviar_services.agent.los_beam import LosBeamAgent

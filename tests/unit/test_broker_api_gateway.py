@@ -24,8 +24,8 @@ from websockets.typing import Subprotocol
 from caviar_broker.api.gateway import Gateway
 from caviar_broker.api.tokens import Tokens
 from caviar_protocol import messages as m
-from caviar_protocol.codec import decode_message, encode_message
-from caviar_protocol.websocket import MAX_FRAME, join_parts, split_frame
+from caviar_protocol.codec import decode_message, encode_message, join_parts, split_frame
+from caviar_protocol.codec.messages import MAX_FRAME
 
 LIMITS = {"heartbeat": 50 * MS, "liveness": 300 * MS}
 SECRET = "a-token-of-the-world"  # noqa: S105

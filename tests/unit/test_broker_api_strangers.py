@@ -27,8 +27,7 @@ from caviar_broker.api import strangers
 from caviar_broker.api.front import gateway_in_front
 from caviar_broker.api.gateway import MESSAGES_BEFORE_HELLO
 from caviar_protocol import messages as m
-from caviar_protocol.codec import encode_message
-from caviar_protocol.websocket import join_parts
+from caviar_protocol.codec import encode_message, join_parts
 
 MIB = 1 << 20
 UPGRADE = (

@@ -10,7 +10,7 @@ from caviar_broker.briefing import briefings, with_ownership
 from caviar_protocol.codec import decode_message, encode_message
 from caviar_protocol.host import host_identity
 from caviar_protocol.messages import Welcome
-from caviar_protocol.scenario_loader import load_scenario, parse_scenario
+from caviar_protocol.scenario import load_scenario, parse_scenario
 
 SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
 SECOND_AGENT = """

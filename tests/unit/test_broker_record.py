@@ -11,7 +11,7 @@ import pytest
 from caviar_broker.record import RunRecord, read_record
 from caviar_broker.versions import changes, versions_of
 from caviar_protocol.errors import RecordingError
-from caviar_protocol.scenario_loader import find_scenario, load_scenario
+from caviar_protocol.scenario import find_scenario, load_scenario
 
 SMOKE = load_scenario(find_scenario("smoke"))
 

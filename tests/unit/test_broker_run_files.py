@@ -17,9 +17,9 @@ from caviar_broker.record import RunRecord
 from caviar_broker.versions import versions_of
 from caviar_clients.embedded.run import EmbeddedRun
 from caviar_protocol.errors import CaviarError, RunError
-from caviar_protocol.recording_manifest import read_manifest
-from caviar_protocol.scenario_checks import with_overrides
-from caviar_protocol.scenario_loader import load_scenario
+from caviar_protocol.recording.layout import read_manifest
+from caviar_protocol.scenario import load_scenario
+from caviar_protocol.scenario.rules import with_overrides
 
 SMOKE = with_overrides(load_scenario("smoke"), 2, None, None)
 FILES = ["run.json", "journal.msgpack", "recording.json", "recording-0000.mcap"]

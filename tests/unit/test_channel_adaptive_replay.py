@@ -10,8 +10,8 @@ from msgspec.structs import replace
 
 from caviar_clients.embedded.run import EmbeddedRun
 from caviar_protocol.recording import Recording
-from caviar_protocol.replay import Imposed, recorded_decisions
-from caviar_protocol.scenario_loader import load_scenario
+from caviar_protocol.recording.reader import Imposed, recorded_decisions
+from caviar_protocol.scenario import load_scenario
 from caviar_services.channel.adaptive.channel import AdaptiveChannel
 
 SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from caviar_protocol.codec import decode_payload, encode_payload
-from caviar_protocol.coordinates import quaternion_from_euler, rotation_matrix
+from caviar_protocol.space.coordinates import quaternion_from_euler, rotation_matrix
 from caviar_protocol.topics import AntennaArray, Carrier, Channel, ChannelOptions, Interaction
 from caviar_services.channel.assemble import Product, assemble
 from caviar_services.channel.paths import Antenna, PathTable

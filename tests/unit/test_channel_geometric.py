@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from caviar_protocol.codec import decode_payload, encode_payload
-from caviar_protocol.coordinates import quaternion_from_euler
 from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Channel, Panel, Scene
 from caviar_services.channel.geometric import GeometricChannel
 from caviar_services.channel.geometric_settings import GeometricSettings

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from caviar_protocol.coordinates import SPEED_OF_LIGHT
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.geometry import path_geometry
 from caviar_services.channel.specular import distinct, image_points, refined_points

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from caviar_protocol.arrays import Float64Array
-from caviar_protocol.coordinates import Vector
 from caviar_protocol.messages import GrantInput, Status
+from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.topics import AntennaDevice, Carrier, Channel, Scene
 from caviar_services.channel.clearance import RISING_RAYS, Surfaces
 from caviar_services.channel.outage import outage_counts

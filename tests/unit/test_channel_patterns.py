@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from caviar_protocol.coordinates import direction, quaternion_from_euler, rotation_matrix
+from caviar_protocol.space.coordinates import direction, quaternion_from_euler, rotation_matrix
 from caviar_protocol.topics import AntennaArray
 from caviar_services.channel.patterns import radiated_field, spherical_basis
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from caviar_protocol.codec import decode_payload, encode_payload
-from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.errors import ScenarioError
-from caviar_protocol.ofdm import slot_offsets, subcarrier_offsets
+from caviar_protocol.multipath import slot_offsets, subcarrier_offsets
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import AntennaArray, Carrier, Channel, ChannelOptions
 from caviar_services.antenna import element_positions
 from caviar_services.channel.assemble import Product, assemble

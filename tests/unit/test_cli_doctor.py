@@ -58,7 +58,7 @@ def test_a_dependency_with_which_no_frame_is_computed_is_found(monkeypatch: pyte
     def refused(*_: object) -> object:
         raise KeyError("NDArray[numpy.float64]")
 
-    monkeypatch.setattr("caviar_protocol.codec.plain", refused)
+    monkeypatch.setattr("caviar_protocol.codec.payloads.plain", refused)
     check = doctor.check_frames()
     assert not check.ok
     assert "NDArray[numpy.float64]" in check.found

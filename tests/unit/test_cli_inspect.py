@@ -12,7 +12,7 @@ from caviar_clients.cli.inspect import inspect_command, summarise
 from caviar_clients.cli.main import main
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import Recording
-from caviar_protocol.segment import Segment
+from caviar_protocol.recording.segment import Segment
 
 
 def test_the_digest_is_one_line_and_that_of_the_bytes(tmp_path, capsys):

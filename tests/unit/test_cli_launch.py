@@ -17,7 +17,7 @@ from caviar_clients.cli import launch
 from caviar_clients.cli.children import TAIL, Child
 from caviar_clients.cli.launch import Launcher
 from caviar_protocol.errors import RunError
-from caviar_protocol.scenario_loader import load_scenario
+from caviar_protocol.scenario import load_scenario
 
 ROOT = Path(__file__).parents[2]
 SMOKE = ROOT / "deploy" / "caviar_scenarios" / "smoke.toml"

@@ -10,7 +10,7 @@ import pytest
 
 from caviar_clients.cli import main as command
 from caviar_clients.embedded.run import EmbeddedRun
-from caviar_protocol.scenario_loader import load_scenario
+from caviar_protocol.scenario import load_scenario
 
 SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
 

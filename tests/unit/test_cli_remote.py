@@ -17,9 +17,8 @@ from caviar_clients.sessions.checking import TOPICS_OF, checked_scenario
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.keys import credentials, read_authorized, read_public
 from caviar_protocol.messages import Role
-from caviar_protocol.scenario import ServiceSpec
-from caviar_protocol.scenario_checks import refuse_remote
-from caviar_protocol.scenario_loader import load_scenario
+from caviar_protocol.scenario import ServiceSpec, load_scenario
+from caviar_protocol.scenario.rules import refuse_remote
 from caviar_services.registry import BUILT_IN, load
 
 SCENARIOS = Path(__file__).parents[2] / "deploy" / "caviar_scenarios"

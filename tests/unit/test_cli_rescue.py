@@ -16,9 +16,9 @@ from caviar_clients.cli.inspect import inspect_command
 from caviar_clients.cli.rescue import rescue_run
 from caviar_protocol.errors import RunError
 from caviar_protocol.recording import Recording
-from caviar_protocol.recording_manifest import Manifest, SegmentRecord
-from caviar_protocol.scenario_loader import load_scenario
-from caviar_protocol.segment import Segment
+from caviar_protocol.recording.layout import Manifest, SegmentRecord
+from caviar_protocol.recording.segment import Segment
+from caviar_protocol.scenario import load_scenario
 
 
 def rescue(run: Path) -> tuple[int, str]:

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from caviar_clients.cli.run import _Watcher
-from caviar_protocol.scenario_loader import load_scenario
+from caviar_protocol.scenario import load_scenario
 
 SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
 

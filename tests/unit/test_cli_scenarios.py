@@ -17,9 +17,9 @@ from caviar_clients.cli import scenarios
 from caviar_clients.cli.main import app
 from caviar_clients.embedded.run import EmbeddedRun
 from caviar_clients.sessions.checking import check_implementations, checked_scenario
-from caviar_protocol import extras
+from caviar_protocol import host
 from caviar_protocol.errors import RunError, SetupError
-from caviar_protocol.scenario_loader import load_scenario, parse_scenario, shipped_scenarios
+from caviar_protocol.scenario import load_scenario, parse_scenario, shipped_scenarios
 
 runner = CliRunner()
 ENVIRONMENT = {"COLUMNS": "150", "TERM": "dumb"}
@@ -74,10 +74,10 @@ def test_a_run_without_its_extras_is_refused_with_one_command(monkeypatch: pytes
 
 
 def test_the_install_command_names_this_interpreter_and_an_extra_that_exists(repository: Path) -> None:
-    python, *_, wanted = shlex.split(extras.install_command("plot"))
+    python, *_, wanted = shlex.split(host.install_command("plot"))
     assert (python, wanted) == (sys.executable, "caviar-sim[plot]")
     provided = metadata.metadata("caviar-sim").get_all("Provides-Extra") or []
-    assert {*extras._MODULES} <= {*provided}
+    assert {*host._MODULES} <= {*provided}
 
 
 def test_a_new_scenario_runs_as_it_is_and_has_the_name_that_was_given(

@@ -20,7 +20,7 @@ from caviar_clients.replay.recorded import RecordedRun
 from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.recording import Recording
-from caviar_protocol.scenario_loader import load_scenario
+from caviar_protocol.scenario import load_scenario
 
 SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
 FRAMES = 40

@@ -15,8 +15,7 @@ from caviar_clients.replay.request import request_of
 from caviar_clients.replay.toml import scenario_text
 from caviar_protocol.errors import CaviarError, RecordingError, RunError
 from caviar_protocol.recording import Recording, RecordingWarning
-from caviar_protocol.scenario import Scenario
-from caviar_protocol.scenario_loader import load_scenario, parse_scenario
+from caviar_protocol.scenario import Scenario, load_scenario, parse_scenario
 
 SCENARIOS = Path(__file__).parents[2] / "deploy" / "caviar_scenarios"
 FRAMES = 6

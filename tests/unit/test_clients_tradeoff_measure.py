@@ -16,7 +16,7 @@ from caviar_clients.tradeoff.rows import error_fields
 from caviar_clients.tradeoff.scenes import Instant, Scenes
 from caviar_clients.tradeoff.users import Noise, UserChannel, difference, differences
 from caviar_protocol.errors import ScenarioError
-from caviar_protocol.scene import antennas
+from caviar_protocol.space.scene import antennas
 
 NOISE = Noise(figure_db=9.0, temperature_k=290.0)
 

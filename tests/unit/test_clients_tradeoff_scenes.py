@@ -9,7 +9,7 @@ from recording_samples import frame, link, product, recorder, scene
 
 from caviar_clients.tradeoff.scenes import KEEPER, scenes_of, worlds_only
 from caviar_protocol.errors import RecordingError
-from caviar_protocol.scenario_loader import load_scenario
+from caviar_protocol.scenario import load_scenario
 
 SCENARIOS = Path(__file__).parents[2] / "deploy" / "caviar_scenarios"
 

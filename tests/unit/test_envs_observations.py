@@ -18,9 +18,9 @@ from observation_builders import (
 
 from caviar_clients.envs.observations import PARTS, Part, part
 from caviar_clients.envs.users import Users
-from caviar_protocol.coordinates import quaternion_from_euler
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.scenario import Scenario
+from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import (
     AntennaDevice,
     Scene,

@@ -23,7 +23,7 @@ from caviar_clients.envs.observations import part
 from caviar_clients.envs.users import Users
 from caviar_protocol.errors import RunError, ScenarioError
 from caviar_protocol.scenario import DeviceSpec, Scenario
-from caviar_protocol.tables import convert_settings
+from caviar_protocol.scenario.conversion import convert_settings
 from caviar_protocol.topics import (
     Camera,
     CameraImage,

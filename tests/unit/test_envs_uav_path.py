@@ -13,9 +13,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from caviar_clients.envs.uav_path import UavPathEnv
-from caviar_protocol.beams import beam_towards
 from caviar_protocol.errors import PayloadError, RunError, ScenarioError
 from caviar_protocol.recording import Recording
+from caviar_protocol.space.beams import beam_towards
 from caviar_protocol.topics import Action, BeamChoice, VelocityCommand
 
 SHIPPED = Path(__file__).parents[2] / "deploy" / "caviar_scenarios"

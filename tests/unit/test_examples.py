@@ -20,7 +20,7 @@ import pytest
 
 from caviar_clients.embedded.run import EmbeddedRun
 from caviar_protocol.recording import Recording
-from caviar_protocol.scenario_loader import find_scenario, load_scenario, parse_scenario
+from caviar_protocol.scenario import find_scenario, load_scenario, parse_scenario
 from caviar_services.link.users import users_of
 
 PACKAGES = ("caviar_protocol", "caviar_broker", "caviar_services", "caviar_clients")

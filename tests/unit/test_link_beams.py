@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from link_builders import CARRIER, antenna, channel_of, choices, frame_of, given, random_h, scene_of
 
 from caviar_protocol.arrays import Complex128Array
-from caviar_protocol.beams import beam_towards
 from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.errors import PayloadError
-from caviar_protocol.pairs import directions, pairs_of
+from caviar_protocol.space.beams import beam_towards
+from caviar_protocol.space.scene import directions, pairs_of
 from caviar_protocol.topics import AntennaDevice, Carrier, Channel, Link
 from caviar_services.link.beams import BeamLink, BeamLinkSettings
 from caviar_services.link.codebook import dft_codebook

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from caviar_protocol.beams import beam_towards
 from caviar_protocol.errors import PayloadError
+from caviar_protocol.space.beams import beam_towards
 from caviar_protocol.topics import AntennaArray
 from caviar_services.antenna import element_positions, steering_vector
 from caviar_services.link.codebook import dft_codebook, pointing_directions

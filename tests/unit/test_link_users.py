@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from link_builders import CARRIER, antenna, channel_of, random_h, scene_of
 
-from caviar_protocol.coordinates import angles
 from caviar_protocol.errors import PayloadError
-from caviar_protocol.pairs import directions, pairs_of
+from caviar_protocol.space.coordinates import angles
+from caviar_protocol.space.scene import directions, pairs_of
 from caviar_protocol.topics import Carrier
 from caviar_services.link.users import channels_of, sweep_users, users_of
 

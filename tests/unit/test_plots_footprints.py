@@ -10,7 +10,7 @@ import pytest
 
 from caviar_clients.plots.footprints import footprints, with_boxes
 from caviar_protocol.errors import AssetError
-from caviar_protocol.ply import read_ply
+from caviar_protocol.space.ply import read_ply
 
 QUADS = [(0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)]
 

@@ -27,8 +27,8 @@ from caviar_clients.plots.map import (
     view_of,
 )
 from caviar_clients.plots.rays import rays
-from caviar_protocol.beams import beam_towards
-from caviar_protocol.scene import device_pose
+from caviar_protocol.space.beams import beam_towards
+from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import AntennaArray, AntennaDevice, LidarDevice, LidarScan
 from caviar_services.link.codebook import pointing_directions
 

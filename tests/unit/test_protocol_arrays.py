@@ -24,8 +24,7 @@ from caviar_protocol.arrays import (
     quantity,
     require_finite,
 )
-from caviar_protocol.body import BodyReader, BodyWriter
-from caviar_protocol.canonical import plain
+from caviar_protocol.codec.payloads import BodyReader, BodyWriter, plain
 from caviar_protocol.errors import DecodeError, LimitError, PayloadError, ProtocolError
 
 

@@ -15,11 +15,9 @@ from msgspec.structs import replace
 from caviar_clients.conform.street import product
 from caviar_protocol.arrays import Payload
 from caviar_protocol.codec import decode_payload, encode_payload
-from caviar_protocol.content import FIRST_LOOKS, ContentCheck, check_digest, wrong_values
 from caviar_protocol.errors import ProductError
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.scenario import DeviceSpec
-from caviar_protocol.scene_content import SceneRules, numbers_are_right, wrong_number
 from caviar_protocol.topics import (
     Action,
     AntennaArray,
@@ -33,6 +31,15 @@ from caviar_protocol.topics import (
     WaypointCommand,
 )
 from caviar_protocol.topics.scene import Device
+from caviar_protocol.validation import (
+    FIRST_LOOKS,
+    ContentCheck,
+    SceneRules,
+    check_digest,
+    numbers_are_right,
+    wrong_number,
+    wrong_values,
+)
 
 COUNT = 20
 NAMES = tuple(f"car.{index:02d}" for index in range(COUNT))

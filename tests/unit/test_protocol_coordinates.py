@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from caviar_protocol.coordinates import (
+from caviar_protocol.space.coordinates import (
     Pose,
     angles,
     compose,

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from caviar_protocol.dispersion import coherence, delay_spread, doppler_spread, k_factor
+from caviar_protocol.multipath import coherence, delay_spread, doppler_spread, k_factor
 
 NAN = float("nan")
 

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from caviar_protocol import limits
 from caviar_protocol.codec import decode_message
+from caviar_protocol.codec.decoding import HARMLESS, _deeper_than, check_nesting
 from caviar_protocol.errors import LimitError
-from caviar_protocol.nesting import HARMLESS, _deeper_than, check_nesting
 
 SCALARS = (
     st.none()

@@ -10,17 +10,17 @@ import pytest
 
 from caviar_protocol.arrays import Complex128Array
 from caviar_protocol.errors import ScenarioError
-from caviar_protocol.ofdm import (
+from caviar_protocol.multipath import (
     TAPS_BEFORE,
     first_tap,
     slot_offsets,
     subcarrier_offsets,
     subcarrier_weights,
     tap_weights,
-    with_numerology,
 )
-from caviar_protocol.scenario_loader import parse_scenario
-from caviar_protocol.tables import Place
+from caviar_protocol.scenario import parse_scenario
+from caviar_protocol.scenario.conversion import Place
+from caviar_protocol.scenario.rules import with_numerology
 from caviar_protocol.topics import Carrier
 
 FREQUENCY = 28e9

@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from caviar_protocol.paths import changes
+from caviar_protocol.multipath import changes
 from caviar_protocol.topics import Carrier, Channel
 
 

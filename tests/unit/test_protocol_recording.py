@@ -15,7 +15,7 @@ from caviar_protocol.digest import RunDigest
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import Recording, RecordingWarning, newest_run
-from caviar_protocol.segment import Segment
+from caviar_protocol.recording.segment import Segment
 from caviar_protocol.topics import Link, Scene
 
 SEAL = b"\xca\x04\0\0\0\0\0\0\0"

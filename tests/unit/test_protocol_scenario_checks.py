@@ -11,18 +11,17 @@ import pytest
 from caviar_broker.core.plan import plan_run
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import ScenarioError
-from caviar_protocol.scenario import DeviceSpec, Limits, Run, Scenario, ServiceSpec
-from caviar_protocol.scenario_checks import (
+from caviar_protocol.scenario import DeviceSpec, Limits, Run, Scenario, ServiceSpec, parse_scenario
+from caviar_protocol.scenario.conversion import Source, convert_settings
+from caviar_protocol.scenario.rules import (
     check_scenario,
     devices_of,
-    owned_by,
     resolved,
     scenario_error,
     settings_place,
     with_overrides,
 )
-from caviar_protocol.scenario_loader import parse_scenario
-from caviar_protocol.tables import Source, convert_settings
+from caviar_protocol.scenario.schema import owned_by
 
 
 def world(prefix: str = "") -> ServiceSpec:

@@ -7,10 +7,9 @@ from pathlib import Path
 import pytest
 
 from caviar_protocol.errors import ScenarioError
-from caviar_protocol.scenario import Scenario
-from caviar_protocol.scenario_checks import with_overrides
-from caviar_protocol.scenario_loader import find_scenario, load_scenario, parse_scenario
-from caviar_protocol.tables import located
+from caviar_protocol.scenario import Scenario, find_scenario, load_scenario, parse_scenario
+from caviar_protocol.scenario.conversion import located
+from caviar_protocol.scenario.rules import with_overrides
 
 GOOD = """\
 [run]

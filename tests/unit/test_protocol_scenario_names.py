@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from caviar_protocol.errors import ScenarioError
-from caviar_protocol.scenario_loader import find_scenario, load_scenario, shipped_scenarios
+from caviar_protocol.scenario import find_scenario, load_scenario, shipped_scenarios
 
 
 def test_every_shipped_scenario_is_loaded_by_its_name_from_any_folder(

@@ -8,9 +8,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from caviar_protocol.coordinates import quaternion_from_euler
 from caviar_protocol.errors import PayloadError
-from caviar_protocol.scene import antennas, device_pose, device_velocity, merge_scenes, object_pose
+from caviar_protocol.space.coordinates import quaternion_from_euler
+from caviar_protocol.space.scene import antennas, device_pose, device_velocity, merge_scenes, object_pose
 from caviar_protocol.topics import AntennaDevice, CameraDevice, Scene
 
 

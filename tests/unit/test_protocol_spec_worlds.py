@@ -10,11 +10,11 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from caviar_protocol.coordinates import rotated, rotation_matrix
 from caviar_protocol.host import host_identity
 from caviar_protocol.keys import Pair, read_pair
-from caviar_protocol.ply import read_ply
 from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.space.coordinates import rotated, rotation_matrix
+from caviar_protocol.space.ply import read_ply
 from caviar_services.scenery import find_scenery, read_scenery
 
 SPEC = (Path(__file__).parents[2] / "protocol" / "SPEC.md").read_text("utf-8")

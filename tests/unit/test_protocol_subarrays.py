@@ -8,8 +8,13 @@ import numpy as np
 import pytest
 from link_builders import random_h
 
-from caviar_protocol.beams import beam_gain, beam_towards, straight_beams
-from caviar_protocol.subarrays import coupled_polarizations, subarrays
+from caviar_protocol.space.beams import (
+    beam_gain,
+    beam_towards,
+    coupled_polarizations,
+    straight_beams,
+    subarrays,
+)
 from caviar_protocol.topics import AntennaArray, Panel
 from caviar_services.antenna import steering_vector
 from caviar_services.link.codebook import dft_beam, dft_codebook, pointing_directions

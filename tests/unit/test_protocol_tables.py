@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from caviar_protocol.scenario_loader import parse_scenario
-from caviar_protocol.tables import Source, located
+from caviar_protocol.scenario import parse_scenario
+from caviar_protocol.scenario.conversion import Source, located
 
 TEXT = """\
 [run]

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from caviar_protocol.toml_lines import KeyPath, dotted, key_lines
+from caviar_protocol.scenario.toml import KeyPath, dotted, key_lines
 
 DOCUMENT = '''\
 # a comment with [brackets] and key = value

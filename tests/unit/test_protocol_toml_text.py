@@ -8,8 +8,8 @@ import tomllib
 import pytest
 
 from caviar_protocol.errors import ScenarioError
-from caviar_protocol.scenario_loader import load_scenario, parse_scenario, shipped_scenarios
-from caviar_protocol.toml_text import MAX_DEPTH, MAX_SIZE, parse_toml
+from caviar_protocol.scenario import load_scenario, parse_scenario, shipped_scenarios
+from caviar_protocol.scenario.toml import MAX_DEPTH, MAX_SIZE, parse_toml
 
 BOMBS = {
     "arrays": ("# one\na = " + "[" * 100_000 + "]" * 100_000, r":2: not TOML: arrays and tables are nested"),

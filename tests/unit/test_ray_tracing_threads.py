@@ -10,7 +10,7 @@ import pytest
 
 from caviar_clients.cli.launch import Launcher
 from caviar_protocol.errors import SetupError
-from caviar_protocol.scenario_loader import load_scenario
+from caviar_protocol.scenario import load_scenario
 from caviar_services.ray_tracing_threads import ENVIRONMENT, limited_threads, share_of_each
 
 SCENARIOS = Path(__file__).parents[2] / "deploy" / "caviar_scenarios"

@@ -8,11 +8,10 @@ import pytest
 from mcap.reader import make_reader
 from recording_samples import PERIOD_NS, SCENARIO, absent, frame, link, product
 
-from caviar_protocol import recording_segments
 from caviar_protocol.errors import RunError
 from caviar_protocol.messages import Status
-from caviar_protocol.recording import Recording
-from caviar_protocol.recording_manifest import Manifest, read_manifest
+from caviar_protocol.recording import Recording, integrity
+from caviar_protocol.recording.layout import Manifest, read_manifest
 from caviar_services.recorder.mcap import McapRecorder, McapSettings
 from caviar_services.service import Frame, Preparation, RunInfo
 
@@ -198,5 +197,5 @@ def test_a_reader_that_began_before_it_went_back_reads_again(
             go_back_to_frame_2(tmp_path)
         return manifest
 
-    monkeypatch.setattr(recording_segments, "read_manifest", read_and_go_back)
+    monkeypatch.setattr(integrity, "read_manifest", read_and_go_back)
     assert len(Recording(tmp_path)) == 3

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 from recording_samples import PERIOD_NS, SCENARIO, frame, recorder
 
-from caviar_protocol.durability import Durability
 from caviar_protocol.errors import RunError
+from caviar_protocol.files import Durability
 from caviar_protocol.recording import Recording
 from caviar_services.recorder import persistence
 from caviar_services.recorder.base import failure

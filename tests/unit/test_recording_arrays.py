@@ -12,9 +12,10 @@ from recording_samples import absent, channel, frame, lidar, link, product, reco
 
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.messages import Status
-from caviar_protocol.recording import TOPIC_ARRAYS, Recording
-from caviar_protocol.recording_arrays import TopicArrays
-from caviar_protocol.recording_topics import DeviceArrays, MotionArrays, User
+from caviar_protocol.recording import Recording
+from caviar_protocol.recording.arrays import TopicArrays
+from caviar_protocol.recording.reader import TOPIC_ARRAYS
+from caviar_protocol.recording.topics import DeviceArrays, MotionArrays, User
 from caviar_protocol.topics import (
     Action,
     BeamChoice,
@@ -424,5 +425,5 @@ def test_a_recording_and_its_topics_say_what_they_hold(
     assert "  link of 'link'" in lines
     links = recording["link"]
     assert f"  abs_y: {type(links).columns['abs_y'].__doc__} Here {links.abs_y.shape}." in repr(links)
-    monkeypatch.setattr("caviar_protocol.recording_arrays.MEASURED_B", 0)
+    monkeypatch.setattr("caviar_protocol.recording.arrays.MEASURED_B", 0)
     assert "Here" not in repr(links)

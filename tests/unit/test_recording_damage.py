@@ -14,15 +14,11 @@ import pytest
 from mcap.writer import CompressionType, Writer
 from recording_samples import SCENARIO, frame, link, product, record, recorder
 
-from caviar_protocol import recording_segments
 from caviar_protocol.errors import RecordingError
-from caviar_protocol.expansion import expand, may_expand
-from caviar_protocol.recording import Recording, RecordingWarning
-from caviar_protocol.recording_digest import declared_digest
-from caviar_protocol.recording_layout import METADATA_NAME, PROFILE
-from caviar_protocol.recording_manifest import read_manifest
-from caviar_protocol.recording_segments import recorded_until
-from caviar_protocol.segment import Segment
+from caviar_protocol.recording import Recording, RecordingWarning, integrity
+from caviar_protocol.recording.integrity import declared_digest, recorded_until
+from caviar_protocol.recording.layout import METADATA_NAME, PROFILE, read_manifest
+from caviar_protocol.recording.segment import Segment, expand, may_expand
 from caviar_protocol.topics import Link
 
 FLIPS = 500
@@ -261,6 +257,6 @@ def test_a_warning_says_it_once(tmp_path):
 @pytest.mark.parametrize("past_gaps", [False, True])
 def test_a_segment_that_its_recorder_removes_meanwhile_is_no_recording(tmp_path, monkeypatch, past_gaps):
     gone = tmp_path / "recording-0000.mcap"
-    monkeypatch.setattr(recording_segments, "_files", lambda _: [gone])
+    monkeypatch.setattr(integrity, "_files", lambda _: [gone])
     with pytest.raises(RecordingError, match=r"is missing|no recording any more"):
-        recording_segments.RecordedSegments(tmp_path, past_gaps=past_gaps)
+        integrity.RecordedSegments(tmp_path, past_gaps=past_gaps)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from caviar_protocol.errors import ScenarioError, SetupError
-from caviar_protocol.tables import convert_settings
+from caviar_protocol.scenario.conversion import convert_settings
 from caviar_services.registry import load
 from caviar_services.sensors.camera import CameraSensors, CameraSettings
 from caviar_services.service import Frame, Preparation, RunInfo

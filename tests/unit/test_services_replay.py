@@ -13,7 +13,7 @@ from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.digest import payload_digest
 from caviar_protocol.errors import DeclarationError, RecordingError, ScenarioError
 from caviar_protocol.messages import GrantInput, Report, Status
-from caviar_protocol.tables import Place
+from caviar_protocol.scenario.conversion import Place
 from caviar_services.encoded import Encoded
 from caviar_services.exchange import done_of, plain_done_of
 from caviar_services.recorder.mcap import McapRecorder, McapSettings

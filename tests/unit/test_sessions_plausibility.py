@@ -14,7 +14,7 @@ from caviar_clients.cli.run import run_scenario
 from caviar_clients.envs.beam_selection import BeamSelectionEnv
 from caviar_clients.sessions.checking import checked_scenario
 from caviar_clients.sessions.plausibility import implausible_values
-from caviar_protocol.scenario_loader import shipped_scenarios
+from caviar_protocol.scenario import shipped_scenarios
 from caviar_services.meshes import Mesh
 from caviar_services.world.shapes import ply
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from world_builders import ScriptedWorld
 
-from caviar_protocol.devices import fixed_device
 from caviar_protocol.errors import AssetError, ScenarioError, SetupError
 from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.scenario.schema import fixed_device
 from caviar_protocol.topics import AntennaArray, AntennaDevice
 from caviar_services.meshes import Mesh, placed
 from caviar_services.world.assets import object_assets, pattern_assets, scenery_assets
@@ -97,7 +97,7 @@ def test_vehicles_are_symmetric_left_to_right_and_lower_in_front(name: str) -> N
 
 
 def test_a_placed_mesh_fills_the_objects_box() -> None:
-    from caviar_protocol.coordinates import Pose
+    from caviar_protocol.space.coordinates import Pose
 
     corners = placed(SHAPES["bus"](), np.array([12.0, 2.5, 3.2]), Pose((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0)))
     assert corners.min(axis=0) == pytest.approx([-5.0, 0.75, 1.4])

@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from world_builders import ScriptedWorld, scene_at, state, wire_bytes
 
-from caviar_protocol.coordinates import quaternion_from_euler
 from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.scenario import DeviceSpec
-from caviar_protocol.scene import device_pose, device_velocity
+from caviar_protocol.space.coordinates import quaternion_from_euler
+from caviar_protocol.space.scene import device_pose, device_velocity
 from caviar_protocol.topics import AntennaDevice, CameraDevice, LidarDevice
 from caviar_protocol.topics.scene import AntennaArray
 from caviar_services.service import Preparation

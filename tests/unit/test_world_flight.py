@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from caviar_protocol.codec import encode_payload
-from caviar_protocol.coordinates import Vector, euler_from_quaternion
 from caviar_protocol.errors import PayloadError, RunError, ScenarioError
 from caviar_protocol.messages import GrantInput, Status
+from caviar_protocol.space.coordinates import Vector, euler_from_quaternion
 from caviar_protocol.topics import Action, BeamChoice, Scene, VelocityCommand, WaypointCommand
 from caviar_protocol.topics.action import Command
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo, StepResult

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from caviar_protocol.arrays import Float64Array
-from caviar_protocol.coordinates import Vector
+from caviar_protocol.space.coordinates import Vector
 from caviar_services.meshes import box
 from caviar_services.service import Preparation, RunInfo
 from caviar_services.world.assets import scenery_assets

@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from caviar_protocol.scenario import Scenario
-from caviar_protocol.scenario_checks import devices_of, settings_place
-from caviar_protocol.scenario_loader import load_scenario
-from caviar_protocol.scene import device_pose
-from caviar_protocol.tables import convert_settings
+from caviar_protocol.scenario import Scenario, load_scenario
+from caviar_protocol.scenario.conversion import convert_settings
+from caviar_protocol.scenario.rules import devices_of, settings_place
+from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import AntennaDevice, LidarDevice, Scene
 from caviar_services.registry import load
 from caviar_services.service import Frame, Preparation, RunInfo

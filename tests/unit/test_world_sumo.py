@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 from world_builders import T_SAM_NS, scene_at, wire_bytes
 
-from caviar_protocol.coordinates import euler_from_quaternion, rotation_matrix
 from caviar_protocol.errors import CaviarError, RunError, ScenarioError, SetupError
 from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.space.coordinates import euler_from_quaternion, rotation_matrix
 from caviar_protocol.topics import Scene
 from caviar_services.service import Frame, Preparation, RunInfo
 from caviar_services.world.sumo import SumoSettings, SumoWorld, step_length_ms

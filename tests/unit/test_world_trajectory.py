@@ -12,9 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from world_builders import scene_at, wire_bytes
 
-from caviar_protocol.coordinates import euler_from_quaternion
 from caviar_protocol.errors import ScenarioError
-from caviar_protocol.tables import convert_settings
+from caviar_protocol.scenario.conversion import convert_settings
+from caviar_protocol.space.coordinates import euler_from_quaternion
 from caviar_services.service import Preparation, RunInfo
 from caviar_services.world.trajectory import (
     MovingObject,

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from caviar_protocol.codec import decode_message, decode_payload, encode_payload
-from caviar_protocol.coordinates import quaternion_from_euler
 from caviar_protocol.messages import Welcome
 from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import Scene
 from caviar_services.world.devices import Mounts
 

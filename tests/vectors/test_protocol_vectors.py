@@ -12,7 +12,6 @@ import pytest
 from vector_files import FOLDER, Vector, all_vectors, array_of, assert_means, is_array, load, named
 
 from caviar_protocol.arrays import WIRE_DTYPES, Payload
-from caviar_protocol.body import BodyReader, BodyWriter
 from caviar_protocol.codec import (
     check_parts,
     check_version,
@@ -22,6 +21,7 @@ from caviar_protocol.codec import (
     encode_payload,
     message_type,
 )
+from caviar_protocol.codec.payloads import BodyReader, BodyWriter
 from caviar_protocol.digest import payload_digest
 from caviar_protocol.errors import ProtocolError
 from caviar_protocol.messages import Grant, Hello, Message

@@ -10,8 +10,8 @@ from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from caviar_broker.api.tokens import Tokens, is_loopback
+from caviar_protocol.codec import SUBPROTOCOL
 from caviar_protocol.keys import Token
-from caviar_protocol.websocket import SUBPROTOCOL
 
 BEARER = "bearer."
 """Before a token among the subprotocols, where a browser has no header for it."""

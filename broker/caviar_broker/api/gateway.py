@@ -21,10 +21,10 @@ from caviar_broker.api.strangers import ADMIT
 from caviar_broker.api.tokens import Tokens
 from caviar_broker.grumbles import Grumbles
 from caviar_protocol import messages as m
-from caviar_protocol.codec import decode_message, encode_message, message_type
+from caviar_protocol.codec import decode_message, encode_message, join_parts, message_type, split_frame
+from caviar_protocol.codec.messages import MAX_FRAME
 from caviar_protocol.errors import ProtocolError
 from caviar_protocol.keys import Credentials, Token
-from caviar_protocol.websocket import MAX_FRAME, join_parts, split_frame
 
 SLOW_S = 5.0
 """[s] that a peer may take nothing of what is sent to it."""

@@ -10,9 +10,9 @@ from typing import Any
 import uvicorn
 
 from caviar_broker.api.strangers import Strangers
+from caviar_protocol.codec.messages import MAX_FRAME
 from caviar_protocol.errors import RunError
 from caviar_protocol.host import steady_memory
-from caviar_protocol.websocket import MAX_FRAME
 
 UNREACHABLE_MS = 8000
 """[ms] for which a peer's machine may acknowledge nothing, or have no room, until its connection is gone."""

@@ -13,7 +13,7 @@ from caviar_broker.core.schedule import EpisodeSchedule
 from caviar_broker.core.tasks import GrantOrder
 from caviar_broker.core.transitions import RunEvent, RunState, ServiceEvent, ServiceState, TaskState
 from caviar_protocol.messages import RUN_COMPLETE, Cancel, Done, EpisodeEnd, Fault, Grant, Report, Reset
-from caviar_protocol.tables import located
+from caviar_protocol.scenario.conversion import located
 
 _ACTIVE, _RUNNING = ServiceState.ACTIVE, RunState.RUNNING
 

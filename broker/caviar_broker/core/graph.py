@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from caviar_protocol.errors import DeclarationError
 from caviar_protocol.messages import Demand, Hello
-from caviar_protocol.scenario_checks import patterns_overlap
+from caviar_protocol.scenario.rules import patterns_overlap
 
 WILDCARD = "*"
 """Topic of an input that takes every topic (recorders)."""

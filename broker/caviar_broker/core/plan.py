@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from caviar_protocol.instants import instants_ns
 from caviar_protocol.messages import GrantInput, Policy, Role
 from caviar_protocol.scenario import REMOTE_REJOIN_S, Scenario
-from caviar_protocol.tables import Source
+from caviar_protocol.scenario.conversion import Source
+from caviar_protocol.scenario.loader import instants_ns
 
 SECOND = 1_000_000_000
 """[ns]"""
@@ -37,7 +37,7 @@ class ServicePlan:
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """How long the core waits for what [ns]; see `caviar_protocol.scenario.Timeouts`."""
+    """How long the core waits for what [ns]; see `caviar_protocol.scenario.schema.Timeouts`."""
 
     connect: int = 30 * SECOND
     ready: int = 120 * SECOND

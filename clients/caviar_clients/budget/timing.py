@@ -13,9 +13,9 @@ import numpy.typing as npt
 
 from caviar_clients.replay.recorded import RecordedRun
 from caviar_protocol.errors import RecordingError
+from caviar_protocol.files import open_regular
 from caviar_protocol.messages import GrantInput, Status
-from caviar_protocol.recording_layout import FrameEntry
-from caviar_protocol.regular_file import open_regular
+from caviar_protocol.recording.layout import FrameEntry
 
 LATENCIES = "latency.npz"
 At: TypeAlias = tuple[int, int]

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from caviar_protocol.regular_file import open_to_append
+from caviar_protocol.files import open_to_append
 
 KILLED_S = 2.0
 """[s] within which a process ends that is killed, unless it waits for a disk."""

@@ -17,7 +17,7 @@ from caviar_clients.conform.report import as_json, as_markdown, repeated, summar
 from caviar_clients.conform.session import Rules
 from caviar_clients.files import write_file
 from caviar_protocol.errors import SetupError
-from caviar_protocol.toml_text import MAX_SIZE, parse_toml
+from caviar_protocol.scenario.toml import MAX_SIZE, parse_toml
 
 STYLES = {"pass": "green", "fail": "bold red", "not applicable": "dim"}
 

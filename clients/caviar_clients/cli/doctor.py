@@ -30,7 +30,7 @@ from caviar_clients.cli.summary import recorded_figures
 from caviar_clients.embedded.run import EmbeddedRun
 from caviar_clients.sessions.checking import checked_scenario
 from caviar_protocol.errors import CaviarError, SetupError
-from caviar_protocol.extras import DISTRIBUTION, install_command
+from caviar_protocol.host import DISTRIBUTION, install_command
 from caviar_services import llvm
 
 EXTRAS = ("channel", "sensors", "world", "plot", "learning")

@@ -10,9 +10,8 @@ from typing import Annotated, cast
 import typer
 
 from caviar_protocol import keys as k
-from caviar_protocol.errors import SetupError
+from caviar_protocol.errors import SetupError, suggestion
 from caviar_protocol.messages import Role
-from caviar_protocol.tables import suggestion
 from caviar_protocol.topics import PAYLOADS
 
 app = typer.Typer(no_args_is_help=True, help="Keys: who may take part in a run, and as what.")

@@ -17,9 +17,8 @@ from caviar_broker.processes import describe_exit, describe_stop, is_stopped
 from caviar_clients.cli.borrowed import BorrowedKey
 from caviar_clients.cli.children import Child, end, wait
 from caviar_clients.sessions.checking import module_folders
-from caviar_protocol.durability import file_system_of
 from caviar_protocol.errors import RunError
-from caviar_protocol.regular_file import open_to_append
+from caviar_protocol.files import file_system_of, open_to_append
 from caviar_protocol.scenario import Scenario, ServiceSpec
 from caviar_services.ray_tracing_threads import ENVIRONMENT, share_of_each
 

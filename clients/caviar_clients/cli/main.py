@@ -28,7 +28,7 @@ from caviar_clients.cli.options import (
 )
 from caviar_clients.cli.scenarios import complete_scenario
 from caviar_protocol.errors import CaviarError, RunError
-from caviar_protocol.extras import DISTRIBUTION
+from caviar_protocol.host import DISTRIBUTION
 
 RUN, LOOK, MEASURE, OPERATE = "Run", "Look", "Measure", "Operate"
 """Groups of commands in the help."""

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 import msgspec
 
 from caviar_protocol.messages import Report
-from caviar_protocol.outage import INSIDE_PREFIX, Cause
+from caviar_protocol.topics.channel import INSIDE_PREFIX, Cause
 
 _CAUSES = {cause.count_name: cause for cause in Cause}
 

@@ -17,10 +17,10 @@ from caviar_clients.plots.lidar import draw_scan
 from caviar_clients.plots.map import MapData, draw_map
 from caviar_clients.plots.wideband import draw_dispersion, draw_frequency_response, user_paths
 from caviar_protocol.arrays import Float64Array
-from caviar_protocol.beams import subarray_of
-from caviar_protocol.coordinates import rotation_matrix
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.recording import RecordedFrame, Recording
+from caviar_protocol.space.beams import subarray_of
+from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.topics import AntennaArray, Camera, Channel, Depth, Lidar, Link, Segmentation
 from caviar_services.antenna import steering_vector
 from caviar_services.channel.patterns import element_amplitude

@@ -26,9 +26,8 @@ from caviar_clients.files import reserved
 from caviar_clients.plots.footprints import footprints
 from caviar_clients.plots.radio_map import RadioMapView, draw_servers, draw_values
 from caviar_clients.tradeoff.scenes import is_recording, scene_at
-from caviar_protocol.errors import RunError, SetupError
-from caviar_protocol.extras import has_extra, install_command
-from caviar_protocol.tables import suggestion
+from caviar_protocol.errors import RunError, SetupError, suggestion
+from caviar_protocol.host import has_extra, install_command
 from caviar_protocol.topics import Scene
 from caviar_services.channel.radio_map.coverage import Coverage, decibels
 from caviar_services.channel.radio_map.mapping import (

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from caviar_clients.files import writing
-from caviar_protocol.extras import DISTRIBUTION
+from caviar_protocol.host import DISTRIBUTION
 from caviar_services.channel.radio_map.coverage import decibels
 from caviar_services.channel.radio_map.mapping import RadioMap
 

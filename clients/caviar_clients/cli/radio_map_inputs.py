@@ -12,11 +12,11 @@ import numpy as np
 from caviar_clients.plots.footprints import ground
 from caviar_clients.tradeoff.scenes import Scenes
 from caviar_protocol.arrays import Float64Array
-from caviar_protocol.errors import RunError, ScenarioError
-from caviar_protocol.ply import read_ply
+from caviar_protocol.errors import RunError, ScenarioError, suggestion
 from caviar_protocol.scenario import ServiceSpec
-from caviar_protocol.scene import device_pose
-from caviar_protocol.tables import Place, convert_settings, suggestion
+from caviar_protocol.scenario.conversion import Place, convert_settings
+from caviar_protocol.space.ply import read_ply
+from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import Carrier, Scene
 from caviar_services.channel.adaptive.settings import AdaptiveSettings, models
 from caviar_services.channel.free_space import FreeSpaceChannel, FreeSpaceSettings

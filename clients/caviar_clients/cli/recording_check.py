@@ -9,7 +9,7 @@ from typing import Any
 
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.recording import Recording
-from caviar_protocol.recording_digest import declared_digest
+from caviar_protocol.recording.integrity import declared_digest
 from caviar_protocol.scenario import Scenario
 
 

@@ -26,10 +26,9 @@ from caviar_clients.cli.inspect import resume_hint
 from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import Recording, RecordingWarning
-from caviar_protocol.recording_layout import ASSET_FOLDER, segment_name
-from caviar_protocol.recording_manifest import frame_name
+from caviar_protocol.recording.layout import ASSET_FOLDER, frame_name, segment_name
+from caviar_protocol.recording.segment import Segment
 from caviar_protocol.scenario import Scenario
-from caviar_protocol.segment import Segment
 from caviar_services.recorder.base import failure
 from caviar_services.recorder.continuing import stored_products
 from caviar_services.recorder.persistence import Persistence

@@ -10,8 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from caviar_broker.record import NAME as RECORD
-from caviar_protocol.durability import replace_file
 from caviar_protocol.errors import RunError
+from caviar_protocol.files import replace_file
 
 
 class RunInProgress:

@@ -34,9 +34,8 @@ from caviar_clients.files import printable, reason, write_file
 from caviar_clients.sessions.checking import checked_scenario
 from caviar_clients.sessions.plausibility import implausible_values
 from caviar_protocol.errors import RunError, SetupError
-from caviar_protocol.scenario import Scenario
-from caviar_protocol.scenario_checks import refuse_remote
-from caviar_protocol.scenario_loader import find_scenario
+from caviar_protocol.scenario import Scenario, find_scenario
+from caviar_protocol.scenario.rules import refuse_remote
 
 QUIET = frozenset({"stale", "note", "lag"})
 """Kinds of notices that are logged, and only counted on the screen."""

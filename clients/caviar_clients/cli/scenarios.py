@@ -11,9 +11,8 @@ from rich.table import Table
 from rich.text import Text
 
 from caviar_protocol.errors import RunError, SetupError
-from caviar_protocol.extras import has_extra, install_command
-from caviar_protocol.scenario import Scenario, ServiceSpec
-from caviar_protocol.scenario_loader import load_scenario, shipped_scenarios
+from caviar_protocol.host import has_extra, install_command
+from caviar_protocol.scenario import Scenario, ServiceSpec, load_scenario, shipped_scenarios
 from caviar_services.registry import load
 
 TEMPLATE = "new/scenario.toml"

@@ -20,9 +20,8 @@ from caviar_clients.tradeoff.plot import draw_convergence, draw_pareto
 from caviar_clients.tradeoff.report import PARTS, Options, Report, compare
 from caviar_clients.tradeoff.scenes import is_recording, scenes_of, services_kept
 from caviar_clients.tradeoff.tables import by_reason, markdown, screen_table
-from caviar_protocol.errors import RunError, SetupError
-from caviar_protocol.extras import has_extra, install_command
-from caviar_protocol.tables import suggestion
+from caviar_protocol.errors import RunError, SetupError, suggestion
+from caviar_protocol.host import has_extra, install_command
 from caviar_services.recorder.base import machine
 from caviar_services.registry import load
 

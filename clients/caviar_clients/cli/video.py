@@ -21,7 +21,7 @@ from caviar_clients.plots.rays import rays, scale
 from caviar_protocol.arrays import UInt8Array
 from caviar_protocol.errors import RecordingError, SetupError
 from caviar_protocol.recording import RecordedFrame, Recording
-from caviar_protocol.scene import antennas
+from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import Camera
 
 SLOWEST, FASTEST = 5.0, 30.0

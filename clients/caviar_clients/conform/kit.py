@@ -16,9 +16,8 @@ from caviar_clients.conform.case import Case, Failed, NotApplicable, Outcome, Ve
 from caviar_clients.conform.client import ByHand, Client, Started
 from caviar_clients.conform.session import CONNECTING, JOINED, PATIENCE, READY, Rules, Seen, Session
 from caviar_clients.conform.wire import Wire
-from caviar_protocol.errors import RunError, SetupError
+from caviar_protocol.errors import RunError, SetupError, suggestion
 from caviar_protocol.keys import ROLES
-from caviar_protocol.tables import suggestion
 
 LONGEST = 600
 """Characters of what came, in a verdict."""

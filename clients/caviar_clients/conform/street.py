@@ -15,9 +15,9 @@ import numpy as np
 from caviar_clients.conform.wire import Fields
 from caviar_protocol.arrays import Payload
 from caviar_protocol.codec import encode_payload
-from caviar_protocol.coordinates import quaternion_from_euler
-from caviar_protocol.scenario_checks import resolved
-from caviar_protocol.scenario_loader import parse_scenario
+from caviar_protocol.scenario import parse_scenario
+from caviar_protocol.scenario.rules import resolved
+from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import (
     Action,
     AntennaArray,

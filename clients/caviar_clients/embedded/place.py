@@ -9,9 +9,9 @@ from typing import Any, TypeAlias
 from caviar_broker.core import events as ev
 from caviar_protocol import messages as m
 from caviar_protocol.assets import AssetStore
-from caviar_protocol.content import ContentCheck
 from caviar_protocol.errors import RunError
-from caviar_protocol.tables import convert_settings
+from caviar_protocol.scenario.conversion import convert_settings
+from caviar_protocol.validation import ContentCheck
 from caviar_services.answers import Guard
 from caviar_services.exchange import (
     done_of,

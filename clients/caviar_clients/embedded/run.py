@@ -26,10 +26,10 @@ from caviar_broker.statistics import Statistics
 from caviar_clients.embedded.place import Place, Seat
 from caviar_protocol import messages as m
 from caviar_protocol.assets import AssetStore
-from caviar_protocol.content import ContentCheck
 from caviar_protocol.errors import RunError
-from caviar_protocol.replay import Imposed
+from caviar_protocol.recording.reader import Imposed
 from caviar_protocol.scenario import Scenario
+from caviar_protocol.validation import ContentCheck
 from caviar_services.registry import load
 from caviar_services.service import Service
 
@@ -40,7 +40,7 @@ class EmbeddedRun:
     Parameters
     ----------
     scenario
-        Checked, as `caviar_protocol.scenario_loader.load_scenario` returns it.
+        Checked, as `caviar_protocol.scenario.loader.load_scenario` returns it.
     directory
         Where the recorder and the journal write. None: nothing is written, recorders are left out, and
         products go from service to service as they are, so that the outcome has no digest and `statistics`
@@ -51,7 +51,7 @@ class EmbeddedRun:
         By name, services that decide outside of the run (`Seat`), with the class that declares them.
     imposed
         Decisions that services take over in place of their own, as
-        `caviar_protocol.replay.recorded_decisions` finds them.
+        `caviar_protocol.recording.reader.recorded_decisions` finds them.
     """
 
     def __init__(

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from caviar_clients.envs.base import SessionEnv
 from caviar_clients.envs.observations import Moment
-from caviar_protocol.beams import straight_beams
-from caviar_protocol.coordinates import Vector
 from caviar_protocol.errors import PayloadError, ScenarioError
-from caviar_protocol.pairs import directions
-from caviar_protocol.scenario_checks import owned_by
+from caviar_protocol.scenario.schema import owned_by
+from caviar_protocol.space.beams import straight_beams
+from caviar_protocol.space.coordinates import Vector
+from caviar_protocol.space.scene import directions
 from caviar_protocol.topics import BeamChoice, VelocityCommand
 from caviar_protocol.topics.action import Command
 

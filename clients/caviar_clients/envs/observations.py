@@ -20,9 +20,8 @@ from caviar_clients.envs.users import Users
 from caviar_clients.sessions.base import Frame
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.messages import Input
-from caviar_protocol.pairs import Pair, directions
 from caviar_protocol.scenario import Scenario
-from caviar_protocol.scene import device_pose, device_velocity
+from caviar_protocol.space.scene import Pair, device_pose, device_velocity, directions
 from caviar_protocol.topics import Camera, Depth, Lidar, Link, Scene
 
 

@@ -9,11 +9,10 @@ import numpy as np
 from caviar_clients.plots.map import MapData, chosen_beam, draw_antennas, draw_beam, draw_objects
 from caviar_clients.plots.style import GREY
 from caviar_protocol.arrays import UInt8Array
-from caviar_protocol.beams import beam_gain
 from caviar_protocol.errors import SetupError
-from caviar_protocol.extras import install_command
-from caviar_protocol.pairs import Pair
-from caviar_protocol.scene import device_pose
+from caviar_protocol.host import install_command
+from caviar_protocol.space.beams import beam_gain
+from caviar_protocol.space.scene import Pair, device_pose
 from caviar_protocol.topics import Link, Scene
 
 SIZE_IN, DPI = (6.4, 4.8), 100

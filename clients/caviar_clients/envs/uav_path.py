@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from caviar_clients.envs.base import Observation
 from caviar_clients.envs.flight import FlightEnv, point
 from caviar_clients.envs.observations import FAR, Moment
-from caviar_protocol.coordinates import Vector
 from caviar_protocol.errors import ScenarioError
+from caviar_protocol.space.coordinates import Vector
 
 
 class UavPathEnv(FlightEnv):

@@ -18,9 +18,9 @@ from caviar_clients.envs.flight import FlightEnv, point
 from caviar_clients.envs.observations import Moment
 from caviar_clients.sessions.airspace import Airspace
 from caviar_protocol.arrays import Float64Array
-from caviar_protocol.coordinates import Vector
 from caviar_protocol.errors import RunError, ScenarioError
 from caviar_protocol.seeding import generator
+from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.topics import Action, Link, WaypointCommand
 
 OWN_PARTS = ("position", "velocity", "goal", "rate", "outage")

@@ -6,9 +6,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from caviar_protocol.errors import ScenarioError
-from caviar_protocol.pairs import Pair, pairs_of
 from caviar_protocol.scenario import DeviceSpec, Scenario
-from caviar_protocol.scenario_checks import owned_by, patterns_overlap
+from caviar_protocol.scenario.rules import patterns_overlap
+from caviar_protocol.scenario.schema import owned_by
+from caviar_protocol.space.scene import Pair, pairs_of
 from caviar_protocol.topics import AntennaArray, Scene
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array
-from caviar_protocol.ply import read_ply
+from caviar_protocol.space.ply import read_ply
 
 Box = tuple[Sequence[float], Sequence[float]]
 """Lowest and highest corner [m]."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from caviar_clients.plots.style import BLACK, LIGHT_GREY, ORANGE, figure, legend_below
 from caviar_protocol.arrays import BoolArray, Float64Array
-from caviar_protocol.coordinates import rotation_matrix
+from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.topics import Lidar, LidarDevice, LidarScan, Scene
 
 

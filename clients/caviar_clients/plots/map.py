@@ -14,8 +14,8 @@ from caviar_clients.plots.footprints import Footprints
 from caviar_clients.plots.rays import Rays, rays, scale
 from caviar_clients.plots.style import BLACK, GREY, LIGHT_GREY, ORANGE, SKY, VERMILION, figure, legend_below
 from caviar_protocol.arrays import Float64Array
-from caviar_protocol.coordinates import rotation_matrix
-from caviar_protocol.scene import antennas, device_pose
+from caviar_protocol.space.coordinates import rotation_matrix
+from caviar_protocol.space.scene import antennas, device_pose
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Channel, Link, Scene
 from caviar_protocol.topics.channel import Interaction
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array
-from caviar_protocol.scene import device_pose
+from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import Channel, Scene
 from caviar_protocol.topics.channel import Interaction
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from caviar_clients.files import writing
 from caviar_protocol.errors import SetupError
-from caviar_protocol.extras import install_command
+from caviar_protocol.host import install_command
 
 # Okabe and Ito, "Color Universal Design", 2008.
 BLACK, GREY, LIGHT_GREY = "#222222", "#8c8c8c", "#dcdcdc"

@@ -15,8 +15,14 @@ import numpy as np
 
 from caviar_clients.plots.style import BLUE, GREY, LIGHT_GREY, ORANGE, VERMILION, figure
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array
-from caviar_protocol.dispersion import coherence, delay_spread, doppler_spread, k_factor
-from caviar_protocol.ofdm import subcarrier_offsets, subcarrier_weights
+from caviar_protocol.multipath import (
+    coherence,
+    delay_spread,
+    doppler_spread,
+    k_factor,
+    subcarrier_offsets,
+    subcarrier_weights,
+)
 from caviar_protocol.recording import Recording
 from caviar_protocol.topics import Carrier
 

@@ -13,7 +13,7 @@ from caviar_clients.replay.request import Request, merged, typed
 from caviar_protocol.errors import RunError
 from caviar_protocol.messages import Hello, Input
 from caviar_protocol.scenario import REMOTE, ReplaySpec, Scenario, ServiceSpec
-from caviar_protocol.scenario_checks import world_of
+from caviar_protocol.scenario.rules import world_of
 from caviar_services.registry import load
 from caviar_services.replay import use_of
 

@@ -9,10 +9,9 @@ from typing import Any
 
 import msgspec
 
-from caviar_protocol.errors import RunError
+from caviar_protocol.errors import RunError, suggestion
 from caviar_protocol.scenario import ServiceSpec
-from caviar_protocol.tables import suggestion
-from caviar_protocol.toml_text import parse_toml
+from caviar_protocol.scenario.toml import parse_toml
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,7 +13,7 @@ from caviar_protocol.scenario import Scenario
 
 
 def scenario_text(scenario: Scenario) -> str:
-    """What `caviar_protocol.scenario_loader.load_scenario` reads as this scenario."""
+    """What `caviar_protocol.scenario.loader.load_scenario` reads as this scenario."""
     table = lean(scenario)
     table.pop("source", None)
     if table["run"].get("instants_s"):  # which tell the others

@@ -9,7 +9,7 @@ from typing import ClassVar
 import msgspec
 
 from caviar_protocol.messages import Input, Role
-from caviar_protocol.scenario_checks import BEAM
+from caviar_protocol.scenario.rules import BEAM
 from caviar_services.service import Frame, Preparation, Prepared, Service, StepResult
 
 PATIENCE_S = 600.0

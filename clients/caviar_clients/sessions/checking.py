@@ -8,11 +8,10 @@ from typing import Any
 
 import msgspec
 
-from caviar_protocol.errors import DeclarationError
-from caviar_protocol.scenario import Scenario, ServiceSpec
-from caviar_protocol.scenario_checks import scenario_error, settings_place, with_overrides
-from caviar_protocol.scenario_loader import load_scenario
-from caviar_protocol.tables import Place, convert_settings, suggestion
+from caviar_protocol.errors import DeclarationError, suggestion
+from caviar_protocol.scenario import Scenario, ServiceSpec, load_scenario
+from caviar_protocol.scenario.conversion import Place, convert_settings
+from caviar_protocol.scenario.rules import scenario_error, settings_place, with_overrides
 from caviar_services.registry import find_modules_in, load, registered_names
 from caviar_services.service import Service
 

@@ -28,7 +28,7 @@ class EmbeddedSession(Session):
     Parameters
     ----------
     scenario
-        Checked, as `caviar_protocol.scenario_loader.load_scenario` returns it.
+        Checked, as `caviar_protocol.scenario.loader.load_scenario` returns it.
     agent
         Name of the agent whose place is taken.
     inputs

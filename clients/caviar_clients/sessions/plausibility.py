@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array
-from caviar_protocol.coordinates import Vector
 from caviar_protocol.errors import AssetError, ScenarioError, SetupError
 from caviar_protocol.scenario import Scenario
-from caviar_protocol.scenario_checks import scenario_error, settings_place
-from caviar_protocol.tables import convert_settings
+from caviar_protocol.scenario.conversion import convert_settings
+from caviar_protocol.scenario.rules import scenario_error, settings_place
+from caviar_protocol.space.coordinates import Vector
 from caviar_services.channel.clearance import Surfaces
 from caviar_services.registry import load
 from caviar_services.world.assets import scenery_assets

@@ -17,8 +17,7 @@ from caviar_clients.tradeoff.scenes import Scenes
 from caviar_clients.tradeoff.schedule import Cost, predicted_s, shares, spread_order
 from caviar_clients.tradeoff.users import Key, Noise, UserChannel
 from caviar_clients.tradeoff.worker import Sample, Worker
-from caviar_protocol.errors import CaviarError, RunError
-from caviar_protocol.tables import suggestion
+from caviar_protocol.errors import CaviarError, RunError, suggestion
 
 ROUNDS = 3
 """Times that each scene is measured, where time allows: for the 99th percentile."""

@@ -16,8 +16,8 @@ from caviar_clients.tradeoff.users import Noise, user_channels
 from caviar_clients.tradeoff.worker import Loaded, Sample
 from caviar_protocol.errors import CaviarError, RunError, ScenarioError
 from caviar_protocol.messages import GrantInput, Status
-from caviar_protocol.scene import antennas
-from caviar_protocol.tables import convert_settings
+from caviar_protocol.scenario.conversion import convert_settings
+from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Channel, Scene
 from caviar_services.registry import load
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo

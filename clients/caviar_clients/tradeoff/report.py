@@ -20,7 +20,7 @@ from caviar_clients.tradeoff.scenes import Scenes
 from caviar_clients.tradeoff.users import differences
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import RunError
-from caviar_protocol.scene import antennas
+from caviar_protocol.space.scene import antennas
 
 Part = Literal["ladder", "keyframes", "spacing", "arrays", "convergence"]
 PARTS: tuple[Part, ...] = get_args(Part)

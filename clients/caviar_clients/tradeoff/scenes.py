@@ -16,9 +16,9 @@ from caviar_clients.embedded.run import EmbeddedRun
 from caviar_clients.sessions.checking import checked_scenario
 from caviar_protocol.errors import RecordingError, RunError, ScenarioError
 from caviar_protocol.messages import Input, Role
-from caviar_protocol.pairs import pairs_of
 from caviar_protocol.recording import RecordedFrame, Recording
 from caviar_protocol.scenario import DeviceSpec, Scenario, ServiceSpec
+from caviar_protocol.space.scene import pairs_of
 from caviar_protocol.topics import Carrier, Scene
 from caviar_services.registry import load
 from caviar_services.service import Preparation, Prepared, Service, StepResult

@@ -14,7 +14,7 @@ import numpy as np
 from caviar_clients.tradeoff import errors
 from caviar_clients.tradeoff.scenes import Scenes
 from caviar_protocol.arrays import Complex128Array, Float64Array
-from caviar_protocol.tables import convert_settings
+from caviar_protocol.scenario.conversion import convert_settings
 from caviar_protocol.topics import Channel, Scene
 from caviar_services.link.beams import BeamLinkSettings, noise_power, transmit_power
 from caviar_services.link.sweep import sweep

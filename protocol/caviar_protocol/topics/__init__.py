@@ -9,13 +9,7 @@ time.
 from __future__ import annotations
 
 from caviar_protocol.arrays import Payload
-from caviar_protocol.topics.action import (
-    Action,
-    BeamChoice,
-    UserSchedule,
-    VelocityCommand,
-    WaypointCommand,
-)
+from caviar_protocol.topics.action import Action, BeamChoice, UserSchedule, VelocityCommand, WaypointCommand
 from caviar_protocol.topics.channel import (
     Carrier,
     Channel,
@@ -26,14 +20,7 @@ from caviar_protocol.topics.channel import (
     Interaction,
 )
 from caviar_protocol.topics.link import Link
-from caviar_protocol.topics.scene import (
-    AntennaArray,
-    AntennaDevice,
-    CameraDevice,
-    LidarDevice,
-    Panel,
-    Scene,
-)
+from caviar_protocol.topics.scene import AntennaArray, AntennaDevice, CameraDevice, LidarDevice, Panel, Scene
 from caviar_protocol.topics.sensors import (
     Camera,
     CameraImage,

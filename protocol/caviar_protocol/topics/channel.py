@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from enum import IntEnum
+from enum import Enum, IntEnum
 from typing import Annotated, ClassVar
 
 import msgspec
@@ -151,7 +151,7 @@ class Channel(Payload, frozen=True, kw_only=True, omit_defaults=True):
     A path's ``id`` is unique in its pair. It is a hash of the interaction types, the names of the objects
     and, where a model knows them, the numbers of their faces, which are planes of an object; paths that agree
     in all that are told apart by their rank. So a path keeps its id while ends and objects move;
-    `caviar_protocol.paths.changes` says which were born and died between two products.
+    `caviar_protocol.multipath.changes` says which were born and died between two products.
     """
 
     sizes_from: ClassVar[dict[str, tuple[str, ...]]] = {"C": ("carriers",), "T": ("tx",), "R": ("rx",)}
@@ -223,3 +223,28 @@ class Channel(Payload, frozen=True, kw_only=True, omit_defaults=True):
         """Slice of the path axis that belongs to one TX/RX pair; `ValueError` if unknown."""
         p = self.tx.index(tx) * len(self.rx) + self.rx.index(rx)
         return slice(int(self.offsets[p]), int(self.offsets[p + 1]))
+
+
+class Cause(Enum):
+    """Why no path reaches a user; of several causes the one that stands first."""
+
+    INSIDE = "inside an object"
+    """An end is inside a building or a body, its own or another."""
+    TOO_CLOSE = "too close"
+    """The ends are nearer to each other than one wavelength, where no path loss holds."""
+    OUT_OF_RANGE = "out of range"
+    """An end is beside the scenery or below its lowest point, and its line of sight is not free."""
+    BLOCKED = "blocked"
+    """Something stands between the ends, and no way around it was found."""
+    NOT_FOUND = "no path found"
+    """The line of sight is free, but not modelled, or of amplitude 0."""
+
+    @property
+    def count_name(self) -> str:
+        """Name in the counts of a report, as ``no-path/out-of-range``."""
+        return f"no-path/{self.value.replace(' ', '-')}"
+
+
+INSIDE_PREFIX = "inside/"
+"""Before ``ANTENNA in OBJECT`` in the counts of a report: an antenna that no path reaches, and the object
+that it stands inside."""

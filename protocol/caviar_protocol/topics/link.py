@@ -4,14 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-from caviar_protocol.arrays import (
-    BoolArray,
-    Float64Array,
-    Int32Array,
-    Payload,
-    array,
-    quantity,
-)
+from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Payload, array, quantity
 
 
 class Link(Payload, frozen=True, kw_only=True, omit_defaults=True):

@@ -74,7 +74,7 @@ class _Device(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """What all devices share.
 
     The pose is relative to the parent's pose (centre of its bounding box, body axes), or to
-    the world where ``parent`` is empty. `caviar_protocol.scene.device_pose` composes the two.
+    the world where ``parent`` is empty. `caviar_protocol.space.scene.device_pose` composes the two.
     """
 
     name: str

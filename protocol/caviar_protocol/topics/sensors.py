@@ -18,7 +18,7 @@ from caviar_protocol.arrays import (
     array,
     quantity,
 )
-from caviar_protocol.coordinates import rotation_matrix
+from caviar_protocol.space.coordinates import rotation_matrix
 
 
 class OccupancyGrid(Payload, frozen=True, kw_only=True, omit_defaults=True):

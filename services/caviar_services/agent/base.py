@@ -14,8 +14,8 @@ import msgspec
 
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.messages import Input, Role
-from caviar_protocol.pairs import Pair, pairs_of
-from caviar_protocol.scenario_checks import BEAM
+from caviar_protocol.scenario.rules import BEAM
+from caviar_protocol.space.scene import Pair, pairs_of
 from caviar_protocol.topics import Action, BeamChoice, Scene
 from caviar_protocol.topics.action import Command
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from caviar_protocol.beams import straight_beams
-from caviar_protocol.pairs import Pair, directions
+from caviar_protocol.space.beams import straight_beams
+from caviar_protocol.space.scene import Pair, directions
 from caviar_protocol.topics import BeamChoice, Scene
 from caviar_services.agent.base import Agent, AgentSettings
 from caviar_services.service import Frame

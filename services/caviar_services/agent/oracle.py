@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.messages import Input
-from caviar_protocol.pairs import Pair
+from caviar_protocol.space.scene import Pair
 from caviar_protocol.topics import BeamChoice, Channel, Scene
 from caviar_services.agent.base import Agent, AgentSettings
 from caviar_services.link.sweep import best_pairs

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from caviar_protocol.pairs import Pair
+from caviar_protocol.space.scene import Pair
 from caviar_protocol.topics import BeamChoice, Scene
 from caviar_services.agent.base import Agent, AgentSettings
 from caviar_services.service import Frame

@@ -9,8 +9,8 @@ from typing import Annotated, ClassVar
 import msgspec
 
 from caviar_protocol.arrays import quantity
-from caviar_protocol.coordinates import Vector
-from caviar_protocol.pairs import Pair
+from caviar_protocol.space.coordinates import Vector
+from caviar_protocol.space.scene import Pair
 from caviar_protocol.topics import BeamChoice, Scene, WaypointCommand
 from caviar_services.agent.base import Agent, AgentSettings
 from caviar_services.agent.los_beam import straight_choices

@@ -13,7 +13,7 @@ from caviar_protocol.arrays import (
     Float64Array,
     Int64Array,
 )
-from caviar_protocol.coordinates import angles
+from caviar_protocol.space.coordinates import angles
 from caviar_protocol.topics import (
     Carrier,
     Channel,

@@ -13,8 +13,8 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, quantity
-from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.errors import ScenarioError
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 
 FREQUENCIES_GHZ = (1.0, 1000.0)
 """Where Annex 1 is defined."""

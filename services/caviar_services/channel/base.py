@@ -14,16 +14,16 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array
-from caviar_protocol.coordinates import SPEED_OF_LIGHT
-from caviar_protocol.devices import PATTERNS
 from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.host import keep_large_buffers
 from caviar_protocol.messages import Input, Role
-from caviar_protocol.paths import changes
-from caviar_protocol.scene import antennas
-from caviar_protocol.scene_content import too_fast
+from caviar_protocol.multipath import changes
+from caviar_protocol.scenario.schema import PATTERNS
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
+from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import AntennaDevice, Channel, ChannelOptions, Scene
 from caviar_protocol.topics.scene import Device, Panel
+from caviar_protocol.validation import too_fast
 from caviar_services.channel.assemble import Product, assemble
 from caviar_services.channel.atmosphere import Atmosphere, specific_attenuation
 from caviar_services.channel.matrices import Matrices

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Int32Array
-from caviar_protocol.durability import replace_file
+from caviar_protocol.files import replace_file
 from caviar_services.state import Packed
 
 _FORMAT: Literal["caviar-chains-1"] = "caviar-chains-1"

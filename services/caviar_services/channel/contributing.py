@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from caviar_protocol.arrays import Complex128Array, Float64Array
-from caviar_protocol.coordinates import SPEED_OF_LIGHT
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_services.channel.object_materials import Constants
 from caviar_services.channel.sionna_launch import LaunchOptions
 

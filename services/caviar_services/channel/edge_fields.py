@@ -33,7 +33,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int64Array, UInt8Array
-from caviar_protocol.coordinates import SPEED_OF_LIGHT
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.contributing import slab
 from caviar_services.channel.vectors import cross

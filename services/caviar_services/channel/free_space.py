@@ -11,7 +11,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from caviar_protocol.coordinates import SPEED_OF_LIGHT
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Scene
 from caviar_services.channel.base import ChannelSettings, Found, PathModel
 from caviar_services.channel.paths import Antenna, PathTable

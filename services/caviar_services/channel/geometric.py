@@ -48,11 +48,11 @@ from caviar_protocol.arrays import (
     UInt8Array,
     UInt64Array,
 )
-from caviar_protocol.coordinates import SPEED_OF_LIGHT, Pose
 from caviar_protocol.errors import PayloadError, ScenarioError
-from caviar_protocol.scene import device_pose
+from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.seeding import generator
-from caviar_protocol.tables import Place
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, Pose
+from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import AntennaDevice, Channel, ChannelMatrix, ChannelOptions, Scene
 from caviar_services.antenna import steering_vector
 from caviar_services.channel.atmosphere import amplitude_factor

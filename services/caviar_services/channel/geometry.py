@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array
-from caviar_protocol.coordinates import SPEED_OF_LIGHT
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from caviar_protocol.arrays import Complex64Array, Complex128Array, Float64Array, Int64Array
-from caviar_protocol.coordinates import SPEED_OF_LIGHT
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Carrier, ChannelMatrix
 from caviar_services.antenna import steering_vector
 from caviar_services.channel.geometry import PathGeometry

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from caviar_protocol.arrays import Complex64Array, Complex128Array, Float64Array, Int64Array
-from caviar_protocol.coordinates import SPEED_OF_LIGHT
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Carrier, ChannelMatrix, Interaction
 from caviar_services.channel.atmosphere import amplitude_factor
 from caviar_services.channel.clearance import with_near_pairs

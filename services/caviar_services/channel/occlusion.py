@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array
-from caviar_protocol.coordinates import rotation_matrix
+from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.topics import Scene
 
 

@@ -12,10 +12,10 @@ from typing import Protocol
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
-from caviar_protocol.coordinates import SPEED_OF_LIGHT
-from caviar_protocol.outage import INSIDE_PREFIX, Cause
-from caviar_protocol.scene import device_pose
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
+from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import Channel, Scene
+from caviar_protocol.topics.channel import INSIDE_PREFIX, Cause
 from caviar_protocol.topics.scene import Device
 
 

@@ -16,9 +16,9 @@ from caviar_protocol.arrays import (
     Int64Array,
     UInt8Array,
 )
-from caviar_protocol.coordinates import rotation_matrix
-from caviar_protocol.scene import device_pose, device_velocity
-from caviar_protocol.subarrays import subarrays
+from caviar_protocol.space.beams import subarrays
+from caviar_protocol.space.coordinates import rotation_matrix
+from caviar_protocol.space.scene import device_pose, device_velocity
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Scene
 from caviar_services.channel.patterns import ElementPattern, Field, Patterns, radiated_field
 from caviar_services.channel.vectors import cross

@@ -10,9 +10,8 @@ from functools import lru_cache
 import numpy as np
 
 from caviar_protocol.arrays import Complex128Array, Float64Array
-from caviar_protocol.errors import AssetError
-from caviar_protocol.subarrays import jones
-from caviar_protocol.tables import suggestion
+from caviar_protocol.errors import AssetError, suggestion
+from caviar_protocol.space.beams import jones
 from caviar_protocol.topics import AntennaArray
 from caviar_services.pattern_files import PatternTable
 

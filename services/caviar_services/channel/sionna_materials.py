@@ -9,8 +9,8 @@ from typing import Any, Literal
 
 import msgspec
 
-from caviar_protocol.errors import ScenarioError
-from caviar_protocol.tables import Place, suggestion
+from caviar_protocol.errors import ScenarioError, suggestion
+from caviar_protocol.scenario.conversion import Place
 from caviar_services.channel.object_materials import OTHER_MATERIALS, Constants, ObjectMaterials
 
 OBJECT_MATERIAL = "caviar-object-"

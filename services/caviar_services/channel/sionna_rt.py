@@ -18,10 +18,10 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_protocol.assets import default_folder
-from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.errors import PayloadError, SetupError
-from caviar_protocol.extras import install_command
+from caviar_protocol.host import install_command
 from caviar_protocol.seeding import derive_seed
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import AntennaDevice, ChannelOptions, Scene
 from caviar_services.channel.base import Found, PathModel
 from caviar_services.channel.chain_cache import ChainCache

@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
-from caviar_protocol.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.errors import PayloadError
-from caviar_protocol.scene import object_pose
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
+from caviar_protocol.space.scene import object_pose
 from caviar_protocol.topics import Scene
 from caviar_services.channel.contributing import SurfaceMaterial, UsedSurfaces
 from caviar_services.channel.edge_fields import Media

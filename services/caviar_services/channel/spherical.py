@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 
 from caviar_protocol.arrays import Complex64Array, Complex128Array, Float64Array, Int64Array
-from caviar_protocol.coordinates import SPEED_OF_LIGHT
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Carrier, ChannelMatrix
 from caviar_services.channel.element_gains import ElementGains
 from caviar_services.channel.element_paths import Bend, ElementPaths, Lengths, Surfaces

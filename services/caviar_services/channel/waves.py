@@ -11,8 +11,8 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array
-from caviar_protocol.coordinates import Pose, Vector, unrotated
-from caviar_protocol.scene import device_velocity
+from caviar_protocol.space.coordinates import Pose, Vector, unrotated
+from caviar_protocol.space.scene import device_velocity
 from caviar_protocol.topics import AntennaDevice, Scene
 from caviar_services.channel.geometric_settings import GeometricSettings
 

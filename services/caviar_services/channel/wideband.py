@@ -1,7 +1,8 @@
 """Wideband parts of a channel: responses over subcarriers, taps, and both over the slots of a frame.
 
-`caviar_protocol.ofdm` says what a path's delay and Doppler shift make of each subcarrier and tap, `matrices`
-and the rungs have the waves between antenna elements; here they become the parts ``hf`` and ``taps``.
+`caviar_protocol.multipath` says what a path's delay and Doppler shift make of each subcarrier and tap,
+`matrices` and the rungs have the waves between antenna elements; here they become the parts ``hf`` and
+``taps``.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ import numpy as np
 
 from caviar_protocol.arrays import Complex64Array, Complex128Array, Float64Array, Int64Array
 from caviar_protocol.errors import ScenarioError
-from caviar_protocol.ofdm import first_tap, subcarrier_weights, tap_weights, undefined_part
+from caviar_protocol.multipath import first_tap, subcarrier_weights, tap_weights
+from caviar_protocol.scenario.rules import undefined_part
 from caviar_protocol.topics import Carrier, ChannelResponse, ChannelTaps
 
 Part = Literal["hf", "taps"]

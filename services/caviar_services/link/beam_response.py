@@ -14,10 +14,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from caviar_protocol.arrays import Complex128Array, Float64Array
-from caviar_protocol.coordinates import rotation_matrix
 from caviar_protocol.errors import PayloadError
-from caviar_protocol.ofdm import subcarrier_weights
-from caviar_protocol.scene import device_pose
+from caviar_protocol.multipath import subcarrier_weights
+from caviar_protocol.space.coordinates import rotation_matrix
+from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import AntennaDevice, Channel, Scene
 from caviar_protocol.topics.channel import PLANE_WAVES
 from caviar_services.antenna import steering_vector

@@ -16,10 +16,10 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int32Array, quantity
-from caviar_protocol.beams import straight_beams
-from caviar_protocol.coordinates import Vector
 from caviar_protocol.errors import PayloadError
-from caviar_protocol.pairs import directions
+from caviar_protocol.space.beams import straight_beams
+from caviar_protocol.space.coordinates import Vector
+from caviar_protocol.space.scene import directions
 from caviar_protocol.topics import Carrier, Channel, Link, Scene
 from caviar_protocol.topics.scene import Device
 from caviar_services.link.base import LinkModel

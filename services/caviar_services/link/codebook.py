@@ -7,7 +7,7 @@ paper, ``y = w* H f``, a single path of amplitude a that lies on both grids give
 ``|y| = sqrt(Nr·Nt)·|a|``.
 
 The codebook of an array with several panels or dual polarization is that of each of its subarrays
-(`caviar_protocol.subarrays`), block by block: a beam has the elements of one panel and one polarization.
+(`caviar_protocol.space.beams`), block by block: a beam has the elements of one panel and one polarization.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from functools import lru_cache
 import numpy as np
 
 from caviar_protocol.arrays import Complex128Array, Float64Array
-from caviar_protocol.beams import subarray_of
-from caviar_protocol.coordinates import rotation_matrix
 from caviar_protocol.errors import PayloadError
+from caviar_protocol.space.beams import subarray_of
+from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.topics.scene import AntennaArray
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array
 from caviar_protocol.errors import PayloadError
-from caviar_protocol.pairs import Pair, pairs_of
+from caviar_protocol.space.scene import Pair, pairs_of
 from caviar_protocol.topics import AntennaArray, Carrier, Channel, Scene
 from caviar_services.link.sweep import sweep
 

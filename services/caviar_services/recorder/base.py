@@ -21,8 +21,8 @@ from typing import ClassVar, Generic, TypeVar
 
 import msgspec
 
-from caviar_protocol.durability import sync_file
 from caviar_protocol.errors import AssetError, RunError
+from caviar_protocol.files import sync_file
 from caviar_protocol.messages import Asset, Input, Role
 from caviar_services.service import Service
 

@@ -10,13 +10,12 @@ from typing import TypeAlias
 
 import msgspec
 
-from caviar_protocol.durability import sync_file
 from caviar_protocol.errors import RecordingError, RunError
+from caviar_protocol.files import sync_file
 from caviar_protocol.messages import GrantInput, Status
-from caviar_protocol.recording_layout import SEGMENT_PATTERN
-from caviar_protocol.recording_manifest import Manifest, SegmentRecord, frame_name
-from caviar_protocol.recording_segments import RecordedSegments, follows
-from caviar_protocol.segment import Channel, Segment
+from caviar_protocol.recording.integrity import RecordedSegments, follows
+from caviar_protocol.recording.layout import SEGMENT_PATTERN, Manifest, SegmentRecord, frame_name
+from caviar_protocol.recording.segment import Channel, Segment
 from caviar_services.recorder.segment_writer import SegmentWriter
 from caviar_services.service import FrameInput
 

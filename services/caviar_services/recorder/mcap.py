@@ -8,17 +8,17 @@ scenery in ``assets/``. In a segment:
   wire bytes as they were. So SHA-256 of a message is the product's digest. ``sequence`` is the
   frame the product was computed for.
 * One channel ``frame``, schema ``caviar.frame/1``, message encoding ``msgpack``: a
-  `caviar_protocol.recording_layout.FrameEntry` with the provenance of every product, absent ones too. A
+  `caviar_protocol.recording.layout.FrameEntry` with the provenance of every product, absent ones too. A
   held product is not written again: it stands in the chunk of its own frame.
 * ``log_time`` is run time in nanoseconds: ``t_ns`` of the frame in the first episode; a later
   episode begins one sampling period after the end of the one before. ``publish_time`` is the
   same for the instant the product was computed for.
 * One chunk a frame, and behind it a seal with the CRC-32 of all bytes before it
-  (`caviar_protocol.segment`), handed to the operating system before DONE, and on disk as the run's
+  (`caviar_protocol.recording.segment`), handed to the operating system before DONE, and on disk as the run's
   ``durability`` says (`persistence`). MCAP's index and statistics are written when a segment is full or the
   run ends; then the manifest ``recording.json`` lists it as finished
-  (`caviar_protocol.recording_manifest`).
-* Metadata record ``caviar``: `caviar_protocol.recording_layout.RecordingMetadata`, a JSON text a field.
+  (`caviar_protocol.recording.layout`).
+* Metadata record ``caviar``: `caviar_protocol.recording.layout.RecordingMetadata`, a JSON text a field.
 """
 
 from __future__ import annotations
@@ -35,20 +35,20 @@ import msgspec
 
 from caviar_protocol.arrays import quantity
 from caviar_protocol.codec import encode_payload
-from caviar_protocol.content import check_digest
 from caviar_protocol.digest import payload_digest
-from caviar_protocol.durability import Durability, sync_file
 from caviar_protocol.errors import CaviarError, RunError
+from caviar_protocol.files import Durability, sync_file
 from caviar_protocol.messages import GrantInput
-from caviar_protocol.recording_layout import (
+from caviar_protocol.recording.layout import (
     ASSET_FOLDER,
     SEGMENT_PATTERN,
     FrameEntry,
     RecordingMetadata,
+    SegmentRecord,
     segment_name,
 )
-from caviar_protocol.recording_manifest import SegmentRecord
-from caviar_protocol.segment import Segment
+from caviar_protocol.recording.segment import Segment
+from caviar_protocol.validation import check_digest
 from caviar_services.recorder.base import Recorder, copy_assets, failure, machine, versions
 from caviar_services.recorder.continuing import Continuation, RunTime, Stored
 from caviar_services.recorder.persistence import Persistence

@@ -12,8 +12,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from caviar_protocol.durability import SYNC_PERIOD_S, Durability, sync_file
-from caviar_protocol.recording_manifest import Manifest, SegmentRecord
+from caviar_protocol.files import SYNC_PERIOD_S, Durability, sync_file
+from caviar_protocol.recording.layout import Manifest, SegmentRecord
 from caviar_services.recorder.segment_writer import SegmentWriter
 
 _PAUSE_S = SYNC_PERIOD_S / 2

@@ -10,9 +10,8 @@ from typing import BinaryIO
 
 import msgspec
 
-from caviar_protocol.recording_layout import FRAME_TOPIC, METADATA_NAME, PROFILE, FrameEntry
-from caviar_protocol.recording_manifest import SegmentRecord
-from caviar_protocol.segment import seal
+from caviar_protocol.recording.layout import FRAME_TOPIC, METADATA_NAME, PROFILE, FrameEntry, SegmentRecord
+from caviar_protocol.recording.segment import seal
 from caviar_services.service import FrameInput
 
 _SCHEMA_ENCODING = "x-caviar-text"

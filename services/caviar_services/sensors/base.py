@@ -17,11 +17,11 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Payload, quantity
-from caviar_protocol.coordinates import Pose, rotation_matrix
 from caviar_protocol.errors import PayloadError, ScenarioError, SetupError
-from caviar_protocol.extras import install_command
+from caviar_protocol.host import install_command
 from caviar_protocol.messages import Input, Role
-from caviar_protocol.scene import device_pose
+from caviar_protocol.space.coordinates import Pose, rotation_matrix
+from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import Scene
 from caviar_protocol.topics.scene import Device
 from caviar_services.llvm import activate_llvm, choose_variant, cuda_devices

@@ -11,8 +11,8 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float32Array, Float64Array, Payload, quantity
-from caviar_protocol.coordinates import Pose
 from caviar_protocol.errors import ScenarioError
+from caviar_protocol.space.coordinates import Pose
 from caviar_protocol.topics import (
     Camera,
     CameraDevice,

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from caviar_protocol.arrays import Float32Array, Float64Array, Int32Array, Int64Array
-from caviar_protocol.coordinates import Vector
 from caviar_protocol.errors import AssetError, PayloadError
-from caviar_protocol.scene import object_pose
+from caviar_protocol.space.coordinates import Vector
+from caviar_protocol.space.scene import object_pose
 from caviar_protocol.topics import Scene
 from caviar_services.columns import aligned_columns, aligned_indices
 from caviar_services.meshes import BodyPool, Mesh, placed

@@ -15,8 +15,8 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float32Array, Float64Array, Int64Array, quantity
-from caviar_protocol.coordinates import Vector
-from caviar_protocol.scene import antennas, device_pose
+from caviar_protocol.space.coordinates import Vector
+from caviar_protocol.space.scene import antennas, device_pose
 from caviar_protocol.topics import LidarDevice, OccupancyGrid, Scene
 
 FREE, OBSTACLE, TX, RX = 0, 1, -1, -2

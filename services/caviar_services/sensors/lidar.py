@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caviar_protocol.arrays import Float32Array, Float64Array, Int32Array, Int64Array, Payload, quantity
-from caviar_protocol.coordinates import Pose, rotation_matrix
 from caviar_protocol.errors import ScenarioError
+from caviar_protocol.space.coordinates import Pose, rotation_matrix
 from caviar_protocol.topics import Lidar, LidarDevice, LidarScan, Scene
 from caviar_protocol.topics.scene import Device
 from caviar_services.columns import aligned_doubles, aligned_indices, several

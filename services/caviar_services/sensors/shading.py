@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from caviar_protocol.arrays import Float32Array, Float64Array, Int64Array, UInt8Array
-from caviar_protocol.coordinates import Pose, rotation_matrix
+from caviar_protocol.space.coordinates import Pose, rotation_matrix
 from caviar_protocol.topics import Intrinsics
 from caviar_services.columns import aligned_columns
 from caviar_services.sensors.geometry import TracedScene

@@ -18,7 +18,7 @@ from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.errors import CaviarError, ScenarioError
 from caviar_protocol.messages import Role
 from caviar_protocol.scenario import DeviceSpec
-from caviar_protocol.tables import convert_settings
+from caviar_protocol.scenario.conversion import convert_settings
 from caviar_protocol.topics import PARTS, PAYLOADS, Carrier
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
 from caviar_services.testing import samples

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from caviar_protocol.arrays import Float64Array, Payload
-from caviar_protocol.coordinates import Pose
-from caviar_protocol.scene import antennas, device_pose
+from caviar_protocol.space.coordinates import Pose
+from caviar_protocol.space.scene import antennas, device_pose
 from caviar_protocol.topics import (
     PAYLOADS,
     Action,

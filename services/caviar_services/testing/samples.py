@@ -15,10 +15,10 @@ import numpy as np
 
 from caviar_protocol.arrays import Payload
 from caviar_protocol.codec import encode_payload
-from caviar_protocol.coordinates import quaternion_from_euler
 from caviar_protocol.digest import payload_digest
 from caviar_protocol.messages import GrantInput, Input, Status
 from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import (
     PARTS,
     PAYLOADS,

@@ -8,11 +8,11 @@ from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 from xml.parsers import expat
 
-from caviar_protocol.devices import pattern_asset
 from caviar_protocol.errors import AssetError, ScenarioError, SetupError
-from caviar_protocol.extras import install_command
+from caviar_protocol.host import install_command
 from caviar_protocol.scenario import DeviceSpec
-from caviar_protocol.tables import Place
+from caviar_protocol.scenario.conversion import Place
+from caviar_protocol.scenario.schema import pattern_asset
 from caviar_services.pattern_files import read_pattern
 from caviar_services.scenery import read_scenery
 from caviar_services.world.shapes import SHAPES, ply

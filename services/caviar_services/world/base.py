@@ -17,10 +17,10 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, quantity
-from caviar_protocol.coordinates import UnitQuaternion, Vector
 from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.messages import Role
-from caviar_protocol.tables import Place
+from caviar_protocol.scenario.conversion import Place
+from caviar_protocol.space.coordinates import UnitQuaternion, Vector
 from caviar_protocol.topics import Scene
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
 from caviar_services.world.assets import object_assets, pattern_assets, scenery_assets

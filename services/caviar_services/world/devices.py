@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from caviar_protocol.coordinates import Vector
-from caviar_protocol.devices import carries, fixed_device, mounted_device
 from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.scenario.schema import carries, fixed_device, mounted_device
+from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.topics.scene import Device
 
 

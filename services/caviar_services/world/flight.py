@@ -14,9 +14,9 @@ import msgspec
 from msgspec.structs import replace
 
 from caviar_protocol.arrays import quantity
-from caviar_protocol.coordinates import Vector, quaternion_from_euler
 from caviar_protocol.errors import PayloadError, RunError, ScenarioError
 from caviar_protocol.messages import Input
+from caviar_protocol.space.coordinates import Vector, quaternion_from_euler
 from caviar_protocol.topics import Action, VelocityCommand, WaypointCommand
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 from caviar_services.state import restored, saved

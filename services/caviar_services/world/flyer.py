@@ -17,7 +17,7 @@ from typing import Annotated, NamedTuple
 
 import msgspec
 
-from caviar_protocol.coordinates import Vector
+from caviar_protocol.space.coordinates import Vector
 from caviar_services.world.obstacles import Obstacles
 from caviar_services.world.yaw_rate import course_rate
 

@@ -13,9 +13,9 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array
-from caviar_protocol.coordinates import Vector
 from caviar_protocol.errors import AssetError
-from caviar_protocol.ply import read_ply
+from caviar_protocol.space.coordinates import Vector
+from caviar_protocol.space.ply import read_ply
 from caviar_services.scenery import read_scenery
 
 _CELL = 10.0

@@ -10,9 +10,9 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 import msgspec
 
 from caviar_protocol.arrays import Vector3, quantity
-from caviar_protocol.coordinates import Vector
 from caviar_protocol.errors import RunError, ScenarioError
 from caviar_protocol.seeding import derive_seed
+from caviar_protocol.space.coordinates import Vector
 from caviar_services.service import Preparation, Prepared, RunInfo
 from caviar_services.state import restored, saved
 from caviar_services.world.base import ObjectState, World, WorldSettings

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from caviar_protocol.coordinates import Pose, Vector, quaternion_from_euler
+from caviar_protocol.space.coordinates import Pose, Vector, quaternion_from_euler
 
 
 class Placement(NamedTuple):

@@ -19,7 +19,7 @@ from typing import Any
 from xml.parsers import expat
 
 from caviar_protocol.errors import RunError, ScenarioError, SetupError
-from caviar_protocol.extras import install_command
+from caviar_protocol.host import install_command
 
 _ROOTS = {
     "net": ("net",),

@@ -12,8 +12,8 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import quantity
-from caviar_protocol.coordinates import Vector, quaternion_from_euler
 from caviar_protocol.errors import ScenarioError
+from caviar_protocol.space.coordinates import Vector, quaternion_from_euler
 from caviar_services.service import RunInfo
 from caviar_services.world.base import ObjectState, World, WorldSettings
 from caviar_services.world.curve import MonotoneCurve

@@ -18,10 +18,10 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from caviar_protocol.coordinates import Vector
 from caviar_protocol.messages import Input, Role
-from caviar_protocol.scene import antennas
-from caviar_protocol.tables import Place
+from caviar_protocol.scenario.conversion import Place
+from caviar_protocol.space.coordinates import Vector
+from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import AntennaDevice, Scene
 from caviar_services.channel.adaptive.calibration import Calibration, CalibrationState
 from caviar_services.channel.adaptive.controller import Choice, Controller, ControllerState

@@ -9,9 +9,9 @@ from itertools import count, islice
 import numpy as np
 from msgspec.structs import replace
 
-from caviar_protocol.coordinates import Vector, quaternion_from_euler
-from caviar_protocol.devices import fixed_device, mounted_device
 from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.scenario.schema import fixed_device, mounted_device
+from caviar_protocol.space.coordinates import Vector, quaternion_from_euler
 from caviar_protocol.topics import Scene
 from caviar_protocol.topics.scene import Device
 

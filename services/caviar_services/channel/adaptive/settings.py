@@ -11,8 +11,8 @@ from typing import Annotated, Any
 import msgspec
 
 from caviar_protocol.arrays import quantity
-from caviar_protocol.errors import DeclarationError, ScenarioError
-from caviar_protocol.tables import Place, convert_settings, suggestion
+from caviar_protocol.errors import DeclarationError, ScenarioError, suggestion
+from caviar_protocol.scenario.conversion import Place, convert_settings
 from caviar_services.channel.base import ChannelModel
 from caviar_services.registry import load
 from caviar_services.service import RunInfo

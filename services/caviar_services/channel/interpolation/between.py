@@ -14,8 +14,8 @@ from functools import cached_property
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int64Array
-from caviar_protocol.coordinates import SPEED_OF_LIGHT, angles
 from caviar_protocol.errors import PayloadError
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, angles
 from caviar_protocol.topics import AntennaDevice, Channel, ChannelMatrix, Scene
 from caviar_protocol.topics.channel import PLANE_WAVES
 from caviar_services.antenna import element_positions, steering_vector

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array
-from caviar_protocol.coordinates import SPEED_OF_LIGHT
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_services.channel.geometry import path_geometry
 from caviar_services.channel.interpolation.joined import Joined
 from caviar_services.channel.interpolation.motion import Places, corners, image_moves, normals

@@ -8,7 +8,7 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array
 from caviar_protocol.errors import PayloadError
-from caviar_protocol.scene import antennas
+from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import Interaction, Scene
 from caviar_services.channel.interpolation.joined import Joined
 from caviar_services.channel.paths import Antenna

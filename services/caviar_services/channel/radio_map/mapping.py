@@ -10,7 +10,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int32Array, Int64Array
 from caviar_protocol.errors import RunError
-from caviar_protocol.scene import antennas
+from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Scene
 from caviar_services.channel.paths import Antenna
 from caviar_services.channel.radio_map.cell_gains import (

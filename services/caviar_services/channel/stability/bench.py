@@ -11,7 +11,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.messages import GrantInput, Status
-from caviar_protocol.tables import convert_settings
+from caviar_protocol.scenario.conversion import convert_settings
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Channel, Scene
 from caviar_services.channel.base import ChannelModel
 from caviar_services.channel.free_space import FreeSpaceChannel, FreeSpaceSettings

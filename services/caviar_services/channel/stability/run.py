@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from caviar_protocol.extras import has_extra
+from caviar_protocol.host import has_extra
 from caviar_services.channel.stability.bench import Bench
 from caviar_services.channel.stability.case import CASES, Case, Outcome, Result
 

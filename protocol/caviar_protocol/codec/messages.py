@@ -1,0 +1,245 @@
+"""Message headers to bytes and back, and messages as WebSocket frames.
+
+Nothing here trusts its input: sizes are checked before anything is decoded, and whatever is wrong with the
+bytes comes out as a `ProtocolError`. All functions may be called from any thread.
+
+A message of several parts travels over a WebSocket as one binary frame (SPEC.md, section WebSocket)::
+
+    u32  number of parts        little-endian, as all of these
+    u32  length of each part    as many as there are parts
+         the parts, one after the other
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from types import NoneType
+from typing import Any
+
+import msgspec
+
+from caviar_protocol import limits
+from caviar_protocol.codec.decoding import Buffer, decode_bounded
+from caviar_protocol.errors import DecodeError, LimitError, PayloadError, VersionError
+from caviar_protocol.fields import Version
+from caviar_protocol.messages import (
+    PROTOCOL_VERSION,
+    AssetData,
+    CheckpointDone,
+    Done,
+    Grant,
+    Message,
+    Restore,
+    Status,
+    Welcome,
+)
+
+# On the path of every frame: a member that is looked up in its class costs four times as much.
+_ABSENT = Status.ABSENT
+
+
+class _Opening(msgspec.Struct):
+    """What HELLO and WELCOME have in every major version."""
+
+    type: str
+    version: Version
+
+
+_message_encoder = msgspec.msgpack.Encoder(order="deterministic")  # sorts the keys of free maps
+_message_decoder: msgspec.msgpack.Decoder[Message] = msgspec.msgpack.Decoder(Message)
+_opening_decoder = msgspec.msgpack.Decoder(_Opening)
+
+
+def encode_message(message: Message) -> bytes:
+    """Header part of a message.
+
+    Raises `PayloadError` where a field holds what cannot travel, `LimitError` where the header
+    gets too large.
+    """
+    if isinstance(message, Welcome):
+        _check_settings(message, PayloadError)
+    try:
+        header = _message_encoder.encode(message)
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
+        raise PayloadError(f"{message_type(message)} holds a value that cannot travel: {error}") from error
+    if len(header) > limits.MAX_HEADER:
+        raise LimitError(
+            f"{message_type(message)} header has {len(header)} B, at most {limits.MAX_HEADER} may travel"
+        )
+    return header
+
+
+def decode_message(header: Buffer) -> Message:
+    """Typed message of a header part.
+
+    Raises
+    ------
+    LimitError
+        The header is larger than `limits.MAX_HEADER` or nested too deeply.
+    VersionError
+        It is a HELLO or WELCOME of another major version, which this one cannot read.
+    DecodeError
+        The bytes are not a message of this protocol.
+    """
+    if not len(header):
+        raise DecodeError(
+            "message header: the first part is empty; send the header first, from a DEALER socket: the empty "
+            "delimiter of a REQ socket has no place in front of it"
+        )
+    try:
+        message = decode_bounded(_message_decoder, header, "message header")
+    except DecodeError:
+        _check_opening(header)
+        raise
+    if isinstance(message, Welcome):
+        _check_settings(message, DecodeError)
+    return message
+
+
+def message_type(message: Message) -> str:
+    """The word that stands in the field ``type``: ``"GRANT"``."""
+    return str(type(message).__struct_config__.tag)
+
+
+def part_count(message: Message) -> int:
+    """Number of parts that a message has on the wire, its header included."""
+    match message:
+        case Done():
+            return 1 + 2 * len(message.products)
+        case Grant():
+            return 1 + 2 * sum([entry.status is not _ABSENT for entry in message.inputs])
+        case AssetData() | Restore() | CheckpointDone():
+            return 2
+        case _:
+            return 1
+
+
+def check_parts(message: Message, parts: Sequence[Any]) -> None:
+    """Check the parts (header included) that came with ``message``, without decoding them.
+
+    Raises
+    ------
+    DecodeError
+        They are not as many as the message announces, or reach beyond the end of an asset.
+    LimitError
+        One of them is too large.
+    """
+    expected = part_count(message)
+    if len(parts) != expected:
+        raise DecodeError(f"{message_type(message)} announces {expected} parts, {len(parts)} came")
+    if isinstance(message, AssetData):
+        _check_chunk(message, len(parts[1]))
+        return
+    payload_header = limits.MAX_HEADER if isinstance(message, (Grant, Done)) else limits.MAX_BODY
+    for index, part in enumerate(parts[1:], 1):
+        limit = payload_header if index % 2 else limits.MAX_BODY
+        if len(part) > limit:
+            raise LimitError(
+                f"part {index} of {message_type(message)} has {len(part)} B, at most {limit} are accepted"
+            )
+
+
+def check_version(version: tuple[int, int]) -> None:
+    """Raise `VersionError` unless a peer with this version can be talked to.
+
+    Any minor version of our major version will do: what one side does not know, it ignores.
+    """
+    if version[0] != PROTOCOL_VERSION[0]:
+        raise VersionError(
+            f"the peer speaks protocol {version[0]}.{version[1]}, this side speaks "
+            f"{PROTOCOL_VERSION[0]}.{PROTOCOL_VERSION[1]}: the major versions must be equal"
+        )
+
+
+def _check_opening(header: Buffer) -> None:
+    """Raise `VersionError` where an unreadable header opens a connection in another major version."""
+    try:
+        opening = _opening_decoder.decode(header)
+    except (msgspec.MsgspecError, ValueError, RecursionError):
+        return
+    if opening.type in ("HELLO", "WELCOME"):
+        check_version(opening.version)
+
+
+def _check_chunk(message: AssetData, length: int) -> None:
+    if length > limits.MAX_ASSET_CHUNK:
+        raise LimitError(f"ASSET_DATA carries {length} B, at most {limits.MAX_ASSET_CHUNK} are accepted")
+    if message.offset + length > message.size:
+        raise DecodeError(
+            f"ASSET_DATA carries bytes {message.offset} to {message.offset + length} of an asset of "
+            f"{message.size} B"
+        )
+
+
+def _check_settings(message: Welcome, error: type[PayloadError] | type[DecodeError]) -> None:
+    """Settings are plain data that every language has: what JSON has, with integers and floats apart."""
+    for name in ("settings", "scenario"):
+        _check_plain(getattr(message, name), f"WELCOME.{name}", 2, error)
+
+
+_PLAIN = (str, int, float, bool, NoneType)
+
+
+def _check_plain(value: Any, path: str, depth: int, error: type[PayloadError] | type[DecodeError]) -> None:
+    if isinstance(value, _PLAIN):
+        return
+    if depth > limits.MAX_NESTING:
+        raise LimitError(f"{path} nests deeper than {limits.MAX_NESTING} levels")
+    if isinstance(value, dict):
+        for key, item in value.items():
+            if not isinstance(key, str):
+                raise error(f"{path} has the key {key!r:.40}, keys are strings")
+            if not isinstance(item, _PLAIN):
+                _check_plain(item, f"{path:.200}.{key:.40}", depth + 1, error)
+    elif isinstance(value, list | tuple):
+        for item in value:
+            if not isinstance(item, _PLAIN):
+                _check_plain(item, path, depth + 1, error)
+    else:
+        raise error(f"{path} holds {type(value).__name__}, expected text, numbers, flags, lists and tables")
+
+
+SUBPROTOCOL = "caviar.v1"
+"""What a client may ask for in ``Sec-WebSocket-Protocol``."""
+MAX_FRAME = 1 << 28
+"""Bytes of a frame."""
+BIG_ENDIAN = "; these numbers are big-endian, write them little-endian"
+"""What is said of a frame whose numbers are right with their bytes reversed."""
+_COUNT = struct.Struct("<I")
+
+
+def join_parts(parts: Sequence[Buffer]) -> bytes:
+    """The frame of a message."""
+    views = [memoryview(part) for part in parts]
+    return struct.pack(f"<{len(views) + 1}I", len(views), *(view.nbytes for view in views)) + b"".join(views)
+
+
+def split_frame(frame: Buffer) -> list[memoryview]:
+    """The parts of the message in a frame, without a copy.
+
+    Raises `DecodeError` or `LimitError` where the bytes are no such frame.
+    """
+    view = memoryview(frame).toreadonly().cast("B")
+    if len(view) > MAX_FRAME:
+        raise LimitError(f"a frame has {len(view)} B, at most {MAX_FRAME} are accepted")
+    if len(view) < _COUNT.size:
+        raise DecodeError(f"a frame has {len(view)} B, it begins with the number of its parts in 4 B")
+    (count,) = _COUNT.unpack_from(view)
+    if not 1 <= count <= limits.MAX_PARTS:
+        swapped = 1 <= int.from_bytes(view[: _COUNT.size], "big") <= limits.MAX_PARTS
+        text = f"a frame announces {count} parts, a message has 1 to {limits.MAX_PARTS}"
+        raise LimitError(text + BIG_ENDIAN * swapped)
+    place = _COUNT.size * (1 + count)
+    if len(view) < place:
+        raise DecodeError(f"a frame of {len(view)} B has no room for the lengths of {count} parts")
+    lengths = struct.unpack_from(f"<{count}I", view, _COUNT.size)
+    if place + sum(lengths) != len(view):
+        swapped = place + sum(struct.unpack_from(f">{count}I", view, _COUNT.size)) == len(view)
+        text = f"a frame has {len(view)} B, its lengths add up to {place + sum(lengths)}"
+        raise DecodeError(text + BIG_ENDIAN * swapped)
+    parts = []
+    for length in lengths:
+        parts.append(view[place : place + length])
+        place += length
+    return parts

@@ -1,0 +1,354 @@
+"""Payloads to bytes and back, in one canonical form (contract, clause 20).
+
+The header has the fields in declared order behind the tag, without those that equal their default, every
+number as the type its field declares. Equal payloads therefore give equal bytes, however they were made:
+`msgspec` alone leaves out a default only where it is the very same object.
+
+The body has the arrays in the order in which their references stand in the header, each at the next multiple
+of 8 bytes; what lies between is zero.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+import threading
+from collections.abc import Callable
+from functools import cache
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from caviar_protocol import limits
+from caviar_protocol.arrays import MAX_DIMENSIONS, WIRE_DTYPES, Payload, require_finite
+from caviar_protocol.codec.decoding import Buffer, decode_bounded
+from caviar_protocol.errors import DecodeError, LimitError, PayloadError
+from caviar_protocol.topics import PAYLOADS
+
+ALIGNMENT = 8
+"""[B] Offsets are multiples of this."""
+
+_VIEWED = 1 << 16
+"""[B] Arrays from this size on are copied once, into the body; of smaller ones a view costs more."""
+
+
+_CODES = {dtype: code for code, dtype in WIRE_DTYPES.items()}
+
+
+class BodyWriter:
+    """Lays arrays behind each other."""
+
+    def __init__(self) -> None:
+        self._chunks: list[bytes | memoryview] = []
+        self.length = 0
+
+    def place(self, value: NDArray[Any]) -> dict[str, Any]:
+        """Append an array; returns the reference that stands for it in the header."""
+        code = _CODES.get(value.dtype)
+        if code is None:
+            dtype = value.dtype.newbyteorder("<")
+            if dtype not in _CODES:
+                raise PayloadError(f"dtype {dtype.str} cannot travel; one of {', '.join(WIRE_DTYPES)}")
+            code, value = _CODES[dtype], value.astype(dtype)
+        if value.ndim > MAX_DIMENSIONS:
+            raise PayloadError(f"{value.ndim} dimensions cannot travel, at most {MAX_DIMENSIONS}")
+        is_viewed = value.nbytes >= _VIEWED and value.flags.c_contiguous
+        data = value.reshape(-1).view(np.uint8).data if is_viewed else value.tobytes()
+        padding = -self.length % ALIGNMENT
+        if padding:
+            self._chunks.append(bytes(padding))
+        offset = self.length + padding
+        self._chunks.append(data)
+        self.length = offset + len(data)
+        return {"dtype": code, "shape": value.shape, "offset": offset}
+
+    def body(self) -> bytes:
+        """All arrays so far."""
+        return b"".join(self._chunks)
+
+
+class BodyReader:
+    """Gives out read-only views into a body, each behind the one before."""
+
+    def __init__(self, body: memoryview) -> None:
+        self._body = body
+        self._end = 0
+
+    def take(self, reference: Any) -> NDArray[Any]:
+        """The array that ``reference`` points to.
+
+        Raises `DecodeError` or `LimitError` unless it is well-formed and lies in the body, behind
+        the arrays taken before.
+        """
+        code, shape, offset = _reference(reference)
+        dtype, count, room = WIRE_DTYPES[code], 1, 1
+        for size in shape:
+            count *= size
+            room *= size or 1
+        if room > limits.MAX_BODY:
+            raise DecodeError(f"array shape {shape} is larger than any body")
+        end = offset + count * dtype.itemsize
+        if end > len(self._body):
+            raise DecodeError(
+                f"array of shape {shape} and dtype {code} at offset {offset} ends at byte {end} "
+                f"of a body of {len(self._body)} B"
+            )
+        if offset < self._end:
+            raise DecodeError(f"array at offset {offset} overlaps the one before, which ends at {self._end}")
+        self._end = end
+        array: NDArray[Any] = np.ndarray(shape, dtype, self._body, offset)
+        if code == "|b1" and bytes(self._body[offset:end]).strip(b"\0\1"):
+            raise DecodeError("a |b1 array holds a byte other than 0 and 1")
+        return array
+
+
+def _reference(reference: Any) -> tuple[str, list[int], int]:
+    """Fields of an array reference, each checked by itself."""
+    try:
+        code, shape, offset = reference["dtype"], reference["shape"], reference["offset"]
+    except (TypeError, KeyError, IndexError):
+        raise DecodeError("an array is a map with dtype, shape and offset") from None
+    if type(code) is not str or code not in WIRE_DTYPES:
+        raise DecodeError(f"array dtype {code!r:.40} is not one of {', '.join(WIRE_DTYPES)}")
+    if type(shape) is not list:
+        raise DecodeError(f"array shape {shape!r:.80} is not a list of sizes")
+    for size in shape:
+        if type(size) is not int or not 0 <= size <= limits.MAX_BODY:
+            raise DecodeError(f"array shape {shape!r:.80} is not a list of sizes")
+    if len(shape) > MAX_DIMENSIONS:
+        raise LimitError(f"array has {len(shape)} dimensions, at most {MAX_DIMENSIONS} are accepted")
+    if type(offset) is not int or offset < 0 or offset % ALIGNMENT:
+        raise DecodeError(f"array offset {offset!r:.40} is not a multiple of {ALIGNMENT}")
+    return code, shape, offset
+
+
+Convert = Callable[[Any, BodyWriter], Any]
+_payload_encoder = msgspec.msgpack.Encoder()
+
+
+def encode_payload(payload: Payload) -> tuple[bytes, bytes]:
+    """Header and body of a product.
+
+    Equal payloads give equal bytes. Raises `PayloadError` for a non-finite value (clause 21) and
+    `LimitError` for a product too large to travel.
+    """
+    writer = BodyWriter()
+    fields = plain(payload, writer)
+    try:
+        header = _payload_encoder.encode(fields)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise PayloadError(f"{type(payload).__name__} holds a value that cannot travel: {error}") from error
+    if len(header) > limits.MAX_HEADER:
+        raise LimitError(f"payload header has {len(header)} B, at most {limits.MAX_HEADER} may travel")
+    if writer.length > limits.MAX_BODY:
+        raise LimitError(f"payload body has {writer.length} B, at most {limits.MAX_BODY} may travel")
+    return header, writer.body()
+
+
+class _Reading(threading.local):
+    """The body that this thread is decoding: decoders are shared, what they read is not."""
+
+    reader: BodyReader
+
+
+_reading = _Reading()
+
+
+@cache
+def _payload_decoder(cls: type[Payload]) -> msgspec.msgpack.Decoder[Payload]:
+    return msgspec.msgpack.Decoder(cls, dec_hook=lambda _, reference: _reading.reader.take(reference))
+
+
+def decode_payload(topic: str, header: Buffer, body: Buffer) -> Payload:
+    """Typed payload of a product; its arrays are read-only views into ``body``.
+
+    Raises
+    ------
+    DecodeError
+        The topic is unknown, or the bytes are not a payload of it.
+    LimitError
+        A size exceeds its limit.
+    """
+    cls = PAYLOADS.get(topic)
+    if cls is None:
+        raise DecodeError(f"unknown topic {topic!r}; one of {', '.join(PAYLOADS)}")
+    view = memoryview(body).toreadonly().cast("B")
+    if len(view) > limits.MAX_BODY:
+        raise LimitError(f"payload body has {len(view)} B, at most {limits.MAX_BODY} are accepted")
+    _reading.reader = BodyReader(view)
+    try:
+        return decode_bounded(_payload_decoder(cls), header, f"{topic} payload")
+    finally:
+        del _reading.reader
+
+
+class _NonFiniteError(Exception):
+    """A float that may not travel; `require_finite` then says which."""
+
+
+def plain(payload: Payload, writer: BodyWriter) -> dict[str, Any]:
+    """Header of a payload as plain objects, its arrays placed in ``writer``.
+
+    Raises `PayloadError` for a non-finite value (clause 21) or one of the wrong type.
+    """
+    try:
+        return _struct(type(payload))(payload, writer)  # type: ignore[no-any-return]
+    except _NonFiniteError:
+        require_finite(payload)
+        raise
+
+
+@cache
+def _struct(cls: type[msgspec.Struct]) -> Convert:
+    config = cls.__struct_config__
+    hints = get_type_hints(cls, include_extras=True)
+    fields = []
+    for field in msgspec.structs.fields(cls):
+        empty = field.default_factory() if field.default_factory is not msgspec.NODEFAULT else field.default
+        fields.append((field.name, empty, _converter(hints[field.name])))
+
+    def convert(value: Any, writer: BodyWriter) -> dict[str, Any]:
+        found: dict[str, Any] = {config.tag_field: config.tag} if config.tag_field else {}
+        for name, default, inner in fields:
+            item = getattr(value, name)
+            if item is default:
+                continue
+            try:
+                converted = inner(item, writer)
+            except PayloadError:
+                raise
+            except (TypeError, ValueError, OverflowError) as error:
+                raise PayloadError(f"{cls.__name__}.{name} = {item!r:.80} cannot travel: {error}") from error
+            if default is msgspec.NODEFAULT or default is None or item != default:
+                found[name] = converted
+        return found
+
+    return convert
+
+
+def _converter(hint: Any) -> Convert:
+    hint = _without_alias(hint)
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return _converter(arguments[0])
+    if origin in (Union, UnionType):
+        return _union(arguments)
+    if origin is Literal:
+        return _literal(frozenset(arguments))
+    if origin is tuple:
+        return _sequence(arguments[0]) if arguments[1:] == (...,) else _tuple(arguments)
+    if origin is np.ndarray:
+        return _array
+    if isinstance(hint, type) and issubclass(hint, msgspec.Struct):
+        return lambda value, writer: _struct(hint)(_instance(value, hint), writer)
+    return _SCALARS[hint]
+
+
+def _without_alias(hint: Any) -> Any:
+    """What a hint stands for where it is a `TypeAliasType`, as NDArray is from NumPy 2.5 on."""
+    alias = get_origin(hint) or hint
+    if not hasattr(alias, "__value__"):
+        return hint
+    arguments = get_args(hint)
+    return _without_alias(alias.__value__[arguments] if arguments else alias.__value__)
+
+
+def _instance(value: Any, cls: type) -> Any:
+    if type(value) is not cls:
+        raise TypeError(f"expected {cls.__name__}")
+    return value
+
+
+def _union(members: tuple[Any, ...]) -> Convert:
+    converters = {_runtime_type(member): _converter(member) for member in members if member is not NoneType}
+
+    def convert(value: Any, writer: BodyWriter) -> Any:
+        if value is None and NoneType in members:
+            return None
+        inner = converters.get(type(value))
+        if inner is None and len(converters) == 1:
+            inner = next(iter(converters.values()))
+        if inner is None:
+            raise TypeError(f"expected one of {', '.join(cls.__name__ for cls in converters)}")
+        return inner(value, writer)
+
+    return convert
+
+
+def _runtime_type(hint: Any) -> type:
+    hint = _without_alias(hint)
+    if get_origin(hint) is Annotated:
+        return _runtime_type(get_args(hint)[0])
+    found: type = get_origin(hint) or hint
+    return found
+
+
+def _literal(allowed: frozenset[Any]) -> Convert:
+    def convert(value: Any, _: BodyWriter) -> Any:
+        if value not in allowed:
+            raise ValueError(f"expected one of {', '.join(sorted(map(str, allowed)))}")
+        return value
+
+    return convert
+
+
+def _sequence(item: Any) -> Convert:
+    if item is str:
+        return _strings
+    inner = _converter(item)
+    return lambda value, writer: [inner(entry, writer) for entry in value]
+
+
+def _tuple(items: tuple[Any, ...]) -> Convert:
+    converters = [_converter(item) for item in items]
+    return lambda value, writer: [c(v, writer) for c, v in zip(converters, value, strict=True)]
+
+
+def _array(value: Any, writer: BodyWriter) -> Any:
+    # A sum of squares that is finite has none but finite terms, and is quicker than a look at each.
+    if (
+        value.dtype.kind in "fc"
+        and not np.vdot(value, value).real < math.inf
+        and not np.isfinite(value).all()
+    ):
+        raise _NonFiniteError
+    return writer.place(value)
+
+
+def _float(value: Any, _: BodyWriter) -> float:
+    number = float(value)
+    if not math.isfinite(number):
+        raise _NonFiniteError
+    return number
+
+
+def _flag(value: Any, _: BodyWriter) -> bool:
+    if not isinstance(value, bool | np.bool_):
+        raise TypeError("expected true or false")
+    return bool(value)
+
+
+def _string(value: Any, _: BodyWriter) -> str:
+    if not isinstance(value, str):
+        raise TypeError("expected a string")
+    return value
+
+
+def _strings(value: Any, _: BodyWriter) -> Any:
+    if not isinstance(value, tuple):
+        raise TypeError("expected a tuple of strings")
+    for entry in value:
+        if type(entry) is not str:
+            raise TypeError(f"expected a tuple of strings, it holds {entry!r:.40}")
+    return value
+
+
+_SCALARS: dict[Any, Convert] = {
+    float: _float,
+    int: lambda value, _: operator.index(value),
+    bool: _flag,
+    str: _string,
+}

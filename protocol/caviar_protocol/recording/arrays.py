@@ -1,0 +1,411 @@
+"""The products of one topic over the frames of a recording, as NumPy arrays.
+
+`Recording.__getitem__` makes a `TopicArrays`: ``recording["channel"]``. It knows which frames it covers, and
+reads them when an attribute is asked for. A `Column` says how the rows of one product (users, objects,
+sensors) become rows of an array whose first axis counts frames. `caviar_protocol.recording.topics` and
+`caviar_protocol.recording.sensors` have a class for each topic.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from contextlib import suppress
+from functools import cached_property
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    ClassVar,
+    Generic,
+    Self,
+    TypeAlias,
+    TypeVar,
+    get_type_hints,
+    overload,
+)
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, Payload, array_fields
+from caviar_protocol.errors import RecordingError, suggestion
+from caviar_protocol.fields import GrantInput, Status
+
+if TYPE_CHECKING:
+    from caviar_protocol.recording.reader import Recording
+
+P = TypeVar("P", bound=Payload)
+K = TypeVar("K", bound=Hashable)
+S = TypeVar("S", bound=np.generic)
+Rows: TypeAlias = Sequence[Any] | NDArray[Any]
+"""One array or number a row of a product, in the order of its keys; an array counts rows along axis 0."""
+
+_MISSING: dict[str, Any] = {"f": np.nan, "c": complex(np.nan, np.nan), "i": -1, "u": 0, "b": False}
+"""What stands where there is no value, by kind of element."""
+_FRESHNESS = (Status.ABSENT, Status.HELD, Status.FRESH)
+
+
+MEASURED_B = 16 * 2**20
+"""Size of a recording up to which the text of a topic has the sizes of its arrays, for which all of the topic
+is read."""
+
+
+class Column(Generic[S]):
+    """An array attribute of a `TopicArrays`, read from the recording each time it is asked for.
+
+    Parameters
+    ----------
+    dtype
+        Element type.
+    shape
+        Of one row: fixed sizes, or the name of one that differs between rows. Such an axis is as long as the
+        longest row, and the others are padded with the missing value.
+    rows
+        Rows of one product; by default the payload's field of this attribute's name.
+    """
+
+    def __init__(
+        self,
+        dtype: type[S],
+        *shape: int | str,
+        unit: str = "1",
+        doc: str = "",
+        rows: Callable[[Any, Any], Rows] | None = None,
+    ) -> None:
+        self.dtype, self.shape, self.unit, self.doc = np.dtype(dtype), shape, unit, doc
+        self.name = ""
+        self._rows = rows
+
+    def __set_name__(self, owner: type[TopicArrays[Any, Any]], name: str) -> None:
+        self.name = name
+        owner.columns = {**owner.columns, name: self}
+        axes = ", ".join(["F", owner.axis, *map(str, self.shape)])
+        self.__doc__ = f"{self.doc} [{self.unit}], {self.dtype.name}, Shape ``[{axes}]``."
+
+    @overload
+    def __get__(self, view: None, owner: type[Any]) -> Self: ...
+    @overload
+    def __get__(self, view: TopicArrays[Any, Any], owner: type[Any]) -> NDArray[S]: ...
+    def __get__(self, view: TopicArrays[Any, Any] | None, owner: type[Any]) -> Self | NDArray[S]:
+        return self if view is None else view.stack(self)
+
+    def rows(self, view: TopicArrays[Any, Any], payload: Payload) -> Rows:
+        """Rows of one product, in the order of ``view.keys_of(payload)``."""
+        found: Rows = getattr(payload, self.name) if self._rows is None else self._rows(view, payload)
+        return found
+
+
+def payload_column(dtype: type[S], cls: type[Payload], name: str) -> Column[S]:
+    """The column of an array field of a payload whose first axis counts its rows."""
+    spec = array_fields(cls)[name]
+    return Column(dtype, *spec.shape[1:], unit=spec.unit, doc=_description(cls, name))
+
+
+def _description(cls: type[Payload], name: str) -> str:
+    hint = get_type_hints(cls, include_extras=True)[name]
+    return next(str(meta.description) for meta in hint.__metadata__ if isinstance(meta, msgspec.Meta))
+
+
+class TopicArrays(Generic[P, K]):
+    """Products of one topic in some frames of a recording.
+
+    Nothing is read before it is asked for, and no array is kept: an attribute costs the memory of its array,
+    which ``[i:j]``, `select` and `blocks` make smaller. Indexing with an integer gives the payload of a frame
+    (None where it is absent), with a slice, a list of positions or a mask the same topic in these frames.
+
+    Where a frame has no product, or a product lacks a row that other frames have, arrays hold NaN, or −1 for
+    integers, 0 for unsigned ones and false for booleans; `present` tells which rows are there, `status` why.
+    Axis F counts the frames.
+
+    Raises
+    ------
+    RecordingError
+        On reading: the bytes of a product are damaged or not in this file; the message names frame and place.
+    """
+
+    axis: ClassVar[str] = ""
+    """Name of the second axis of the arrays."""
+    columns: ClassVar[dict[str, Column[Any]]] = {}
+    """The arrays by attribute name."""
+
+    def __init__(
+        self, recording: Recording, topic: str, sources: tuple[str, ...], indices: Int64Array
+    ) -> None:
+        self.topic = topic
+        self.sources = sources
+        """Services that produced it. Several only of ``scene``, whose worlds are merged."""
+        self._recording, self._indices = recording, indices
+        self._wanted: tuple[tuple[int, frozenset[str]], ...] = ()
+        self._reference: TopicArrays[Any, K] | None = None
+        self._known_sizes: dict[str, tuple[int, ...]] = {}
+
+    # --- frames -------------------------------------------------------------------------------
+
+    @property
+    def place(self) -> str:
+        """File or directory, and topic, as an error names them."""
+        return f"{self._recording.path}: {self.topic}"
+
+    def __len__(self) -> int:
+        """Number of frames F."""
+        return len(self._indices)
+
+    @cached_property
+    def episode(self) -> Int64Array:
+        """Episode of each frame, from 0. Shape ``[F]``."""
+        return self._of_entries("episode")
+
+    @cached_property
+    def frame(self) -> Int64Array:
+        """Number of each frame in its episode, from 0. Shape ``[F]``."""
+        return self._of_entries("frame")
+
+    @cached_property
+    def t_ns(self) -> Int64Array:
+        """Simulated time of each frame in its episode [ns]. Shape ``[F]``."""
+        return self._of_entries("t_ns")
+
+    @property
+    def t(self) -> Float64Array:
+        """Simulated time of each frame in its episode [s]. Shape ``[F]``."""
+        return self.t_ns.astype(np.float64) * 1e-9
+
+    @cached_property
+    def status(self) -> NDArray[np.str_]:
+        """``fresh``, ``held`` (an earlier product, used again) or ``absent``. Shape ``[F]``.
+
+        It is what the consumers of the frame got: where a product came late, the status is ``held`` or
+        ``absent``. Of several sources it is the least fresh.
+        """
+        found = [min((item.status for item in items), key=_FRESHNESS.index) for items in self._provenance]
+        return np.array(found, dtype=np.str_)
+
+    @property
+    def fresh(self) -> BoolArray:
+        """Frames with a product of their own, as a mask: ``channel[channel.fresh].h``. Shape ``[F]``."""
+        mask: BoolArray = self.status == Status.FRESH
+        return mask
+
+    @cached_property
+    def age(self) -> Int64Array:
+        """Frames since the product was computed; −1 where it is absent. Shape ``[F]``."""
+        found = [
+            max((item.age if item.status is not Status.ABSENT else -1) for item in items)
+            for items in self._provenance
+        ]
+        return np.array(found, dtype=np.int64)
+
+    @property
+    def cause(self) -> tuple[str, ...]:
+        """Why the product of each frame is held or absent: service and frame of origin. Length F."""
+        return tuple("; ".join(item.cause for item in items if item.cause) for items in self._provenance)
+
+    # --- choosing -----------------------------------------------------------------------------
+
+    @overload
+    def __getitem__(self, frames: int | np.integer[Any]) -> P | None: ...
+    @overload
+    def __getitem__(self, frames: slice | Sequence[int] | NDArray[Any]) -> Self: ...
+    def __getitem__(
+        self, frames: int | np.integer[Any] | slice | Sequence[int] | NDArray[Any]
+    ) -> P | Self | None:
+        if isinstance(frames, slice):
+            return self._view(self._indices[frames])
+        if isinstance(frames, np.ndarray | Sequence):
+            return self._view(self._indices[np.asarray(frames, dtype=None if len(frames) else np.int64)])
+        return self._payload(int(self._indices[operator.index(frames)]))
+
+    def __iter__(self) -> Iterator[P | None]:
+        """The payload of each frame, None where it is absent."""
+        return (self._payload(int(index)) for index in self._indices)
+
+    def select(self, *, episode: int | None = None, frames: Iterable[int] | None = None) -> Self:
+        """The frames with these numbers, of this episode.
+
+        Raises `RecordingError` naming an episode or frame that was not recorded, and what was.
+        """
+        chosen = np.ones(len(self), dtype=bool)
+        if episode is not None:
+            chosen &= self._chosen("episode", self.episode, [episode])
+        if frames is not None:
+            chosen[chosen] = self._chosen("frame", self.frame[chosen], frames)
+        return self._view(self._indices[chosen])
+
+    def blocks(self, frames: int) -> Iterator[Self]:
+        """Parts of at most so many frames, one after the other, with the rows and sizes of the whole.
+
+        So a recording of any length is read in the memory of one block.
+        """
+        if frames < 1:
+            raise ValueError(f"a block has at least 1 frame, got {frames}")
+        for start in range(0, len(self), frames):
+            yield self[start : start + frames].like(self)
+
+    def like(self, other: TopicArrays[Any, K]) -> Self:
+        """These frames with the rows of ``other``, in its order; of one topic, with its sizes, too."""
+        view = self._view(self._indices)
+        view._reference = other
+        return view
+
+    # --- rows ---------------------------------------------------------------------------------
+
+    @cached_property
+    def keys(self) -> tuple[K, ...]:
+        """What the second axis counts: everything that occurs in one of these frames, sorted."""
+        if self._reference is not None:
+            return tuple(key for key in self._reference.keys if self._is_wanted(key))
+        found: dict[K, None] = {}
+        seen: Sequence[K] | None = None
+        for payload in self:
+            if payload is not None and (keys := self.keys_of(payload)) != seen:
+                found.update(dict.fromkeys(keys))
+                seen = keys
+        return tuple(key for key in self.sorted_keys(found) if self._is_wanted(key))
+
+    @property
+    def present(self) -> BoolArray:
+        """Whether the frame's product has the row. Shape ``[F, rows]``."""
+        found = np.zeros((len(self), len(self.keys)), dtype=bool)
+        for at, payload in enumerate(self):
+            if payload is not None:
+                found[at, self._places(self.keys_of(payload))[1]] = True
+        return found
+
+    def stack(self, column: Column[S]) -> NDArray[S]:
+        """The array of a column, Shape ``[F, rows, …]``."""
+        shape = self._shape(column)
+        out: NDArray[S] = np.full(shape, _MISSING[column.dtype.kind], dtype=column.dtype)
+        for at, payload in enumerate(self):
+            if payload is None:
+                continue
+            rows, (own, places) = column.rows(self, payload), self._places(self.keys_of(payload))
+            if isinstance(rows, np.ndarray) and rows.shape[1:] == shape[2:]:
+                out[at, places] = rows[own]
+            else:
+                for row, place in zip(own, places, strict=True):
+                    part = out[at, place, ...]
+                    part[tuple(map(slice, np.shape(rows[row])))] = rows[row]
+        return out
+
+    def __repr__(self) -> str:
+        lines = [f"{self.topic} of {', '.join(map(repr, self.sources))}, F = {len(self)} frames"]
+        shapes: dict[str, tuple[int, ...]] = {}
+        with suppress(OSError):  # damaged: reading an array says where
+            if sum(file.stat().st_size for file in self._recording.files) <= MEASURED_B:
+                for name, column in self.columns.items():
+                    with suppress(RecordingError):  # damaged likewise, or a part that was not recorded
+                        shapes[name] = self._shape(column)
+        for name, column in self.columns.items():
+            lines.append(f"  {name}: {column.__doc__}" + (f" Here {shapes[name]}." if name in shapes else ""))
+        return "\n".join(lines)
+
+    def _shape(self, column: Column[Any]) -> tuple[int, ...]:
+        return len(self), len(self.keys), *self._sizes(column)
+
+    # --- what a topic defines -------------------------------------------------------------------
+
+    def keys_of(self, payload: P) -> Sequence[K]:
+        """Key of each row of one product."""
+        raise NotImplementedError
+
+    def sorted_keys(self, keys: Iterable[K]) -> Iterable[K]:
+        """All keys in the order of the second axis; ``keys`` come in the order in which they occurred."""
+        raise NotImplementedError
+
+    def merged(self, payloads: dict[str, P]) -> P:
+        """The payloads of several sources as one; only a topic that allows them defines it."""
+        raise NotImplementedError
+
+    # --- reading --------------------------------------------------------------------------------
+
+    def _view(self, indices: Int64Array) -> Self:
+        view = type(self)(self._recording, self.topic, self.sources, indices)
+        view._wanted, view._reference = self._wanted, self._reference
+        return view
+
+    def _narrowed(self, wanted: Iterable[tuple[int, str, str | Iterable[str] | None]]) -> Self:
+        """The rows whose key has one of the given names in a field, given as (field, its name, names)."""
+        view = self._view(self._indices)
+        for field, label, names in wanted:
+            if names is None:
+                continue
+            chosen = {names} if isinstance(names, str) else set(names)
+            known = {_field(key, field) for key in self.keys}
+            for name in sorted(chosen - known):
+                raise RecordingError(
+                    f"{self.place} has no {label} {name!r} in these frames; {suggestion(name, known)}"
+                )
+            view._wanted = (*view._wanted, (field, frozenset(chosen)))
+        return view
+
+    def _is_wanted(self, key: K) -> bool:
+        return all(_field(key, field) in names for field, names in self._wanted)
+
+    def _payload(self, index: int) -> P | None:
+        found: dict[str, P] = {}
+        for item in self._items(index):
+            if item.status is not Status.ABSENT:
+                found[item.source] = self._recording.recorded_product(index, item).payload  # type: ignore[assignment]
+        if len(found) < 2:
+            return next(iter(found.values()), None)
+        return self.merged(found)
+
+    def _items(self, index: int) -> list[GrantInput]:
+        """Provenance by source; a source that the frame does not list is absent."""
+        listed = {
+            item.source: item
+            for item in self._recording.entry(index).inputs
+            if item.topic == self.topic and item.status is not Status.LATE
+        }
+        return [
+            listed.get(source) or GrantInput(topic=self.topic, source=source, status=Status.ABSENT)
+            for source in self.sources
+        ]
+
+    @cached_property
+    def _provenance(self) -> list[list[GrantInput]]:
+        return [self._items(int(index)) for index in self._indices]
+
+    def _of_entries(self, field: str) -> Int64Array:
+        entries = (self._recording.entry(int(index)) for index in self._indices)
+        return np.array([getattr(entry, field) for entry in entries], dtype=np.int64)
+
+    def _chosen(self, label: str, values: Int64Array, wanted: Iterable[int]) -> BoolArray:
+        numbers = np.unique(np.fromiter(wanted, dtype=np.int64))
+        for number in numbers[~np.isin(numbers, values)][:1]:
+            has = f"{values.min()} to {values.max()}" if len(values) else "none"
+            raise RecordingError(f"{self.place} has no {label} {number} here; it has {has}")
+        chosen: BoolArray = np.isin(values, numbers)
+        return chosen
+
+    @cached_property
+    def _place_of(self) -> dict[K, int]:
+        return {key: place for place, key in enumerate(self.keys)}
+
+    def _places(self, keys: Sequence[K]) -> tuple[list[int], list[int]]:
+        """Rows of a product that are wanted, and where each of them stands on the second axis."""
+        known = self._place_of
+        own = [row for row, key in enumerate(keys) if key in known]
+        return own, [known[keys[row]] for row in own]
+
+    def _sizes(self, column: Column[Any]) -> tuple[int, ...]:
+        """Sizes of one row of the array."""
+        if type(self._reference) is type(self):
+            return self._reference._sizes(column)
+        if all(isinstance(size, int) for size in column.shape):
+            return tuple(size for size in column.shape if isinstance(size, int))
+        if column.name not in self._known_sizes:
+            found = np.array([size if isinstance(size, int) else 0 for size in column.shape])
+            for payload in self:
+                if payload is not None:
+                    rows, (own, _) = column.rows(self, payload), self._places(self.keys_of(payload))
+                    for row in own:
+                        found = np.maximum(found, np.shape(rows[row]))
+            self._known_sizes[column.name] = tuple(found.tolist())
+        return self._known_sizes[column.name]
+
+
+def _field(key: Any, field: int) -> str:
+    """A field of a key that has several; a key that is a name is its own."""
+    return key if isinstance(key, str) else str(key[field])

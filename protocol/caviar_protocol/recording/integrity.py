@@ -1,0 +1,421 @@
+"""The segments of a recording: which are there, how far they can be read, what is damaged."""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+
+import msgspec
+
+from caviar_protocol.digest import RunDigest
+from caviar_protocol.errors import RecordingError
+from caviar_protocol.files import open_regular
+from caviar_protocol.messages import Status
+from caviar_protocol.recording.layout import (
+    ASSET_FOLDER,
+    FORMAT,
+    MANIFEST_NAME,
+    SEGMENT_PATTERN,
+    FrameEntry,
+    Manifest,
+    RecordingMetadata,
+    SegmentRecord,
+    frame_name,
+    read_manifest,
+    segment_name,
+)
+from caviar_protocol.recording.segment import Channel, Chunk, Segment
+
+_READINGS = 8
+"""A recorder replaces the manifest a few times while it goes on with a recording, then once a segment."""
+
+
+@dataclass
+class RecordedSegments:
+    """A recording up to the first segment that is missing or broken.
+
+    A recorder that goes on with it meanwhile replaces manifest and segments: where they contradict each other
+    and the manifest is another one by then, everything is read again.
+
+    Raises `RecordingError` where there is no recording, or nothing of it can be read.
+    """
+
+    path: Path
+    """The run directory, or one ``.mcap`` file of it."""
+    trusted_before: tuple[int, int] | None = None
+    """Finished segments all of whose frames are before this (episode, frame), and whose size is that of the
+    manifest, are not opened, the last one excepted; None: all are opened."""
+    past_gaps: bool = False
+    """Whether segments behind one that is missing, broken or of another run are read too."""
+    trusted: list[SegmentRecord] = field(default_factory=list)
+    """Those before `segments`."""
+    manifest: Manifest | None = None
+    """None where there is none, or it is damaged."""
+    segments: list[Segment] = field(default_factory=list)
+    damage: list[str] = field(default_factory=list)
+    """What is missing or cannot be read, as far as can be told without reading products: a line each."""
+    closed: bool = False
+    """Whether the recorder closed the recording, and all of it is there."""
+    _listed: dict[str, SegmentRecord] = field(default_factory=dict, init=False)
+    """What the manifest says, by file name."""
+    _on_disk: Manifest | None = field(default=None, init=False)
+    """The manifest as it was read, also where it is of another run."""
+
+    def __post_init__(self) -> None:
+        for _ in range(_READINGS - 1):
+            try:
+                self._read()
+            except RecordingError:
+                if not self._has_changed():
+                    raise
+            else:
+                if not self.damage or not self._has_changed():
+                    return
+        self._read()
+
+    def _read(self) -> None:
+        self.trusted, self.segments, self.damage, self.manifest = [], [], [], None
+        alone = self.path.is_file()
+        files = [self.path] if alone else _files(self.path)
+        try:
+            self.manifest = self._on_disk = read_manifest(self._folder)
+        except RecordingError as error:
+            self.damage.append(str(error))
+        self._listed = {record.name: record for record in self.manifest.segments} if self.manifest else {}
+        expected = files if alone else _expected(self._folder, files, self._listed)
+        if self.trusted_before is not None:
+            self._trust(expected, self._listed, self.trusted_before)
+        for number, file in enumerate(expected):
+            if number < len(self.trusted):
+                continue
+            record = self._listed.get(file.name)
+            if not self._open(file, record, expected[number + 1 :]) and not self.past_gaps:
+                break
+        if not self.segments and not self.trusted:
+            raise RecordingError(
+                self.damage[0] if self.damage else f"{self.path} holds no recording any more"
+            )
+        there = len(self.trusted) + len(self.segments)
+        self.closed = there == len(expected) and self.segments[-1].finished and not self.damage
+        if self.manifest is not None and not alone:
+            self.closed &= self.manifest.closed
+
+    @property
+    def _folder(self) -> Path:
+        return self.path.parent if self.path.is_file() else self.path
+
+    def _has_changed(self) -> bool:
+        """Whether the manifest is another one than when it was read."""
+        try:
+            return read_manifest(self._folder) != self._on_disk
+        except RecordingError:
+            return False
+
+    @property
+    def instants(self) -> list[tuple[int, int]]:
+        """(episode, frame) of every frame in `segments`."""
+        return [(entry.episode, entry.frame) for segment in self.segments for entry in segment.entries]
+
+    def record(self, segment: Segment) -> SegmentRecord | None:
+        """What the manifest says about a segment, where it was finished."""
+        records = self.manifest.segments if self.manifest else ()
+        found = next((record for record in records if record.name == segment.path.name), None)
+        return found if found is not None and found.finished else None
+
+    def _trust(self, files: list[Path], known: dict[str, SegmentRecord], before: tuple[int, int]) -> None:
+        for file, later in pairwise(files):
+            record = known.get(file.name)
+            if record is None or record.last is None or record.last >= before or not later.exists():
+                return
+            if not file.exists() or file.stat().st_size != record.size:
+                return
+            self.trusted.append(record)
+
+    def _open(self, file: Path, record: SegmentRecord | None, later: list[Path]) -> bool:
+        """Add a segment; whether the next one may follow it."""
+        if not file.exists():
+            if self._has_nothing and not self.past_gaps:
+                raise RecordingError(f"{file} is missing, although {_first_there(later)} is there")
+            if record is None and not any(path.exists() for path in later):
+                return False  # only the manifest of another run has it, or its recorder removed it just now
+            self._lost(f"{file} is missing", record, later)
+            return False
+        try:
+            segment = _opened(file)
+            if strange := self._strange(segment):
+                self._lost(strange, record, later)
+                return False
+        except RecordingError as error:
+            if self._has_nothing and not self.past_gaps:
+                raise
+            if record is not None or later:  # else it was killed while it opened this segment
+                self._lost(str(error), record, later)
+            return False
+        record = self._listed.get(file.name)
+        self.segments.append(segment)
+        self.damage += [f"{file}: {line}" for line in segment.damage]
+        if record is not None and record.finished and len(segment) != record.size:
+            what = f"{file} has {len(segment)} B of {record.size} B"
+        elif record is not None and record.finished and not segment.finished:
+            what = f"{file} breaks off at byte {segment.readable}"
+        else:
+            what = ""
+        if what and record is not None and self.instants[-1:] == [record.last]:
+            self.damage.append(f"{what}: its index is damaged, and no frame is lost")
+            return True
+        if what:
+            self._lost(what, record, later)
+            return False
+        if not segment.finished and later:
+            self._lost(f"{file} breaks off at byte {segment.readable}", record, later)
+            return False
+        if not segment.finished and segment.damage:
+            self._lost(f"{file} is readable up to byte {segment.readable} of {len(segment)}", record, later)
+        return True
+
+    @property
+    def _has_nothing(self) -> bool:
+        return not self.segments and not self.trusted
+
+    def _strange(self, segment: Segment) -> str:
+        """What is said of a segment of another run than those before it; empty where it is of the same.
+
+        The first one tells of which run the recording is. A manifest of another run is left aside.
+        """
+        if self.segments and not self.past_gaps:
+            return ""  # where several runs are mixed, `Recording` refuses them all
+        run = metadata_of(segment).run
+        listed = self.manifest.run if self.manifest else ""
+        own = metadata_of(self.segments[0]).run if self.segments else listed if self.trusted else run
+        if own != run:
+            return f"{segment.path} is of run {run!r}, and what is before it of run {own!r}"
+        if listed not in ("", own):
+            other = f"{segment.path.parent / MANIFEST_NAME} is of run {listed!r}"
+            self.damage.append(f"{other}, and {segment.path.name} of run {own!r}: it is left aside")
+            self.manifest, self._listed = None, {}
+        return ""
+
+    def _lost(self, what: str, record: SegmentRecord | None, later: list[Path]) -> None:
+        """Say what is lost, and from which frame."""
+        if self.past_gaps and any(path.exists() for path in later):
+            extent = f", {record.extent}" if record is not None else ""
+            self.damage.insert(0, f"{what}: its frames are lost{extent}")
+            return
+        instants = self.instants or [record.last for record in self.trusted[-1:] if record.last]
+        since = f"all frames behind {frame_name(instants[-1])}" if instants else "every frame"
+        until = f" up to {frame_name(record.last)}" if record is not None and record.last else ""
+        if later:
+            until += f", and those of {later[0].name}" + (" and later segments" if len(later) > 1 else "")
+        self.damage.insert(0, f"{what}: lost are {since}{until}")
+
+
+def recorded_until(path: Path) -> tuple[tuple[int, int] | None, tuple[str, ...]]:
+    """How far a recording goes without a gap.
+
+    Returns
+    -------
+    last
+        (episode, frame) of the last frame before anything is missing; None: there is no frame.
+    damage
+        What is missing or cannot be read: a line each.
+    """
+    try:
+        found = RecordedSegments(path, trusted_before=(sys.maxsize, 0))
+    except RecordingError as error:
+        return None, (str(error),)
+    last = found.trusted[-1].last if found.trusted else None
+    for instant in found.instants:
+        if last is not None and not follows(last, instant):
+            break
+        last = instant
+    return last, tuple(found.damage)
+
+
+def metadata_of(segment: Segment) -> RecordingMetadata:
+    """The metadata of a segment. `RecordingError` naming the file where they cannot be read."""
+    try:
+        raw = {key: msgspec.json.decode(text) for key, text in segment.metadata.items()}
+        metadata = msgspec.convert(raw, RecordingMetadata)
+    except (msgspec.MsgspecError, RecursionError) as error:
+        raise RecordingError(f"{segment.path}: the metadata are damaged: {error}") from error
+    if metadata.format != FORMAT:
+        raise RecordingError(
+            f"{segment.path} has format {metadata.format}, this version reads format {FORMAT}"
+        )
+    return metadata
+
+
+def _opened(file: Path) -> Segment:
+    segment = Segment(file)
+    if not segment.metadata:
+        raise RecordingError(f"{file} breaks off at {len(segment)} B, before its metadata")
+    return segment
+
+
+def follows(earlier: tuple[int, int], later: tuple[int, int]) -> bool:
+    """Whether no frame is between two (episode, frame), as far as they tell: episodes may end early."""
+    return later in ((earlier[0], earlier[1] + 1), (earlier[0] + 1, 0))
+
+
+def _files(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        raise RecordingError(f"{folder} does not exist: give a run directory or a {SEGMENT_PATTERN} file")
+    try:
+        files = sorted(folder.glob(SEGMENT_PATTERN), key=lambda file: (len(file.name), file.name))
+    except OSError as error:
+        raise RecordingError(
+            f"cannot read the folder {folder}: {error.strerror}; check its file system (fsck)"
+        ) from error
+    if not files:
+        raise RecordingError(f"{folder} holds no recording: there is no {SEGMENT_PATTERN} in it")
+    return files
+
+
+def _expected(folder: Path, files: list[Path], known: dict[str, SegmentRecord]) -> list[Path]:
+    """The segments by number, up to the last one that is there or that the manifest lists."""
+    names = {file.name for file in files} | set(known)
+    numbered = [number for number in range(2 * len(names) + 1) if segment_name(number) in names]
+    return [folder / segment_name(number) for number in range(max(numbered, default=-1) + 1)]
+
+
+def _first_there(files: list[Path]) -> str:
+    return next((file.name for file in files if file.exists()), "another one")
+
+
+def newest_run(root: str | Path = "runs", name: str = "*") -> Path:
+    """The run directory below ``root`` whose recording was written last.
+
+    Parameters
+    ----------
+    root
+        Directory in which `caviar run` makes the directories of runs (its ``--out``).
+    name
+        Glob pattern of the run directory's name, such as ``"smoke-*"``.
+
+    A directory without a recording, as a run leaves that failed while starting, is passed over.
+    Raises `RecordingError` where there is no other.
+    """
+    written = {
+        file.parent: file.stat().st_mtime_ns for file in sorted(Path(root).glob(f"{name}/{SEGMENT_PATTERN}"))
+    }
+    if not written:
+        where = Path(root).resolve() / name
+        raise RecordingError(f"no run with a recording is at {where}; make one with: caviar run SCENARIO")
+    return max(written, key=lambda directory: (written[directory], directory.name))
+
+
+class RunDigestReport(msgspec.Struct, frozen=True, kw_only=True):
+    """A run's digest as its recorded bytes give it, and what in them is damaged."""
+
+    digest: str
+    frames: int
+    damage: tuple[str, ...] = ()
+    """Each names file, frame, topic and source; empty: every byte is as it was written."""
+
+
+def recorded_digest(recorded: RecordedSegments) -> RunDigestReport:
+    """The digest of a recording (`caviar_protocol.recording.reader.Recording.run_digest`)."""
+    chain, damage = RunDigest(), list(recorded.damage)
+    earlier: FrameEntry | None = None
+    for segment in recorded.segments:
+        places: list[tuple[int, int]] = []
+        """Bytes of which damage is told frame by frame."""
+        for entry, chunk in zip(segment.entries, segment.chunks, strict=True):
+            at = (
+                f"{recorded.path}: episode {entry.episode}, frame {entry.frame} "
+                f"({segment.path.name}, offset {chunk.offset})"
+            )
+            fresh, faults = _faults(entry, segment, chunk)
+            if faults:
+                places.append((chunk.offset, chunk.stop))
+            if earlier is not None and (gap := _gap(earlier, entry)):
+                faults.append(gap)
+            earlier = entry
+            damage += [f"{at}: {fault}" for fault in faults]
+            chain.add_frame(entry.episode, entry.frame, fresh)
+        damage += _altered(segment, recorded, places)
+    damage += damaged_assets(recorded)
+    frames = sum(len(segment.entries) for segment in recorded.segments)
+    return RunDigestReport(digest=chain.hexdigest(), frames=frames, damage=tuple(damage))
+
+
+def declared_digest(entries: Iterable[FrameEntry]) -> str:
+    """The digest of frames by the digests that stand in their records; no product is read."""
+    chain = RunDigest()
+    for entry in entries:
+        fresh = [(i.topic, i.source, i.digest) for i in entry.inputs if i.status is Status.FRESH]
+        chain.add_frame(entry.episode, entry.frame, fresh)
+    return chain.hexdigest()
+
+
+def damaged_assets(recorded: RecordedSegments) -> list[str]:
+    """Files of the recorded scenery that are missing or altered: a line each."""
+    if not recorded.segments or recorded.path.is_file():
+        return []
+    found = []
+    for asset in metadata_of(recorded.segments[0]).assets:
+        file = recorded.path / ASSET_FOLDER / asset.name
+        try:
+            with open_regular(file) as stream:
+                digest = hashlib.file_digest(stream, "sha256").hexdigest()
+        except OSError as error:
+            found.append(f"{file} cannot be read: {error.strerror}")
+            continue
+        if digest != asset.digest:
+            found.append(f"{file}: its digest is {digest}, was {asset.digest}")
+    return found
+
+
+def _altered(segment: Segment, recorded: RecordedSegments, told: list[tuple[int, int]]) -> list[str]:
+    """Ranges of a segment that are not as they were written, other than those of damage ``told`` already."""
+    record = recorded.record(segment)
+    found = segment.altered(record.crc if record is not None and len(segment) == record.size else None)
+    return [
+        f"{segment.path}: bytes {start} to {stop} are not what was written (CRC-32)"
+        for start, stop in found
+        if not any(start < end and begin < stop for begin, end in told)
+    ]
+
+
+def _faults(
+    entry: FrameEntry, segment: Segment, chunk: Chunk
+) -> tuple[list[tuple[str, str, str]], list[str]]:
+    """(topic, source, digest) of the fresh products of a frame as stored, and what is wrong there."""
+    try:
+        fresh, faults = _rehash(entry, segment, chunk)
+        if segment.damaged(chunk):
+            faults.append("the CRC-32 of its chunk differs")
+    except RecordingError as error:
+        return [], [str(error)]
+    return fresh, faults
+
+
+def _rehash(
+    entry: FrameEntry, segment: Segment, chunk: Chunk
+) -> tuple[list[tuple[str, str, str]], list[str]]:
+    """(topic, source, digest) of the fresh products of a frame as stored, and what is wrong there."""
+    stored = {(message.channel, message.frame): message.data for message in segment.messages(chunk)}
+    fresh, faults = [], []
+    for item in entry.inputs:
+        if item.status not in (Status.FRESH, Status.LATE):
+            continue
+        data = stored.get((Channel(item.topic, item.source), item.frame))
+        if data is None:
+            faults.append(f"{item.topic} of {item.source!r}: its bytes are missing")
+            continue
+        digest = hashlib.sha256(data).hexdigest()
+        if digest != item.digest:
+            faults.append(f"{item.topic} of {item.source!r}: its digest is {digest}, was {item.digest}")
+        if item.status is Status.FRESH:
+            fresh.append((item.topic, item.source, digest))
+    return fresh, faults
+
+
+def _gap(earlier: FrameEntry, later: FrameEntry) -> str:
+    if later.episode != earlier.episode or later.frame == earlier.frame + 1:
+        return ""
+    return f"it follows frame {earlier.frame}: what was between is lost"

@@ -1,0 +1,459 @@
+"""Reading what a run recorded.
+
+>>> from caviar_protocol.recording import Recording
+>>> recording = Recording("runs/smoke-20261122-101500")
+>>> recording["channel"].h.shape  # frames × users × Nr × Nt
+(100, 2, 4, 32)
+>>> recording.frame(episode=0, frame=7).scene().names
+('car', 'uav')
+
+`newest_run` gives the directory of the newest run, `Recording.__getitem__` a topic as arrays over all frames,
+`Recording.frames` the products frame by frame; docs/reference/recordings.md has more.
+
+A recording is a directory with ``recording-0000.mcap``, ``recording-0001.mcap``, … and the
+scenery in ``assets/``. After a crash it is readable up to the last frame whose record was
+written whole; `Recording.complete` then is false. What is damaged or missing is in `Recording.damage`, and
+said by a `RecordingWarning`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import warnings
+from bisect import bisect_right
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Literal, TypeAlias, TypeVar, cast, overload
+
+import numpy as np
+
+from caviar_protocol.arrays import Payload
+from caviar_protocol.codec.payloads import decode_payload
+from caviar_protocol.errors import ProtocolError, RecordingError, suggestion
+from caviar_protocol.messages import GrantInput, Report, Status
+from caviar_protocol.recording.arrays import TopicArrays
+from caviar_protocol.recording.integrity import (
+    RecordedSegments,
+    RunDigestReport,
+    metadata_of,
+    recorded_digest,
+)
+from caviar_protocol.recording.integrity import newest_run as newest_run
+from caviar_protocol.recording.layout import ASSET_FOLDER, FrameEntry, RecordingMetadata
+from caviar_protocol.recording.segment import Channel, Chunk, Segment
+from caviar_protocol.recording.sensors import CameraArrays, DepthArrays, LidarArrays, SegmentationArrays
+from caviar_protocol.recording.topics import ActionArrays, ChannelArrays, LinkArrays, SceneArrays
+from caviar_protocol.space.scene import merge_scenes
+from caviar_protocol.topics import PAYLOADS, Scene
+
+P = TypeVar("P", bound=Payload)
+T = TypeVar("T", bound=str)
+Key: TypeAlias = T | tuple[T, str]
+"""A topic, or a topic and a source."""
+
+
+TOPIC_ARRAYS: dict[str, type[TopicArrays[Any, Any]]] = {
+    "scene": SceneArrays,
+    "channel": ChannelArrays,
+    "lidar": LidarArrays,
+    "camera": CameraArrays,
+    "depth": DepthArrays,
+    "segmentation": SegmentationArrays,
+    "action": ActionArrays,
+    "link": LinkArrays,
+}
+"""Class of the arrays of each topic."""
+
+
+def check_topic(topic: str) -> str:
+    """The topic; `RecordingError` with a suggestion where there is none of this name."""
+    if topic not in PAYLOADS:
+        raise RecordingError(f"there is no topic {topic!r}; {suggestion(topic, PAYLOADS)}")
+    return topic
+
+
+class RecordingWarning(UserWarning):
+    """A recording is damaged, and only a part of it can be read; the text says which."""
+
+
+class RecordedProduct:
+    """One product of a frame; its payload is decoded on first use."""
+
+    def __init__(self, provenance: GrantInput, data: memoryview, place: str) -> None:
+        self.provenance = provenance
+        self.place = place
+        """Recording, frame, topic and source, as errors name them."""
+        self._data = data
+
+    @property
+    def size(self) -> int:
+        """Stored bytes."""
+        return len(self._data)
+
+    @property
+    def header(self) -> memoryview:
+        """The wire bytes of the payload's header."""
+        return self._data[8 : 8 + self._header_length]
+
+    @property
+    def body(self) -> memoryview:
+        """The wire bytes of the payload's arrays."""
+        return self._data[8 + self._header_length :]
+
+    @property
+    def _header_length(self) -> int:
+        length = int.from_bytes(self._data[:8], "little")
+        if len(self._data) < 8 or 8 + length > len(self._data):
+            raise RecordingError(f"{self.place}: a header of {length} B does not fit {len(self._data)} B")
+        return length
+
+    @cached_property
+    def payload(self) -> Payload:
+        """The typed payload; its arrays are read-only views into the file."""
+        try:
+            return decode_payload(self.provenance.topic, self.header, self.body)
+        except ProtocolError as error:
+            raise RecordingError(f"{self.place}: {error}") from error
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the recorded bytes (`caviar_protocol.digest.payload_digest`)."""
+        return hashlib.sha256(self._data).hexdigest()
+
+
+class RecordedFrame:
+    """One frame: the provenance of all its products, and the products, read on first use."""
+
+    def __init__(self, recording: Recording, index: int) -> None:
+        self._recording = recording
+        self._index = index
+        self.entry = recording.entry(index)
+        self.episode = self.entry.episode
+        self.number = self.entry.frame
+        self.t_ns = self.entry.t_ns
+
+    @property
+    def inputs(self) -> tuple[GrantInput, ...]:
+        """Provenance of every product, absent ones included."""
+        return self.entry.inputs
+
+    @property
+    def reports(self) -> tuple[Report, ...]:
+        """What services reported beside their products: decisions, counts, wall times."""
+        return self.entry.reports
+
+    @cached_property
+    def products(self) -> tuple[RecordedProduct, ...]:
+        """What is not absent, in the order of `inputs`.
+
+        Raises `RecordingError` naming the place where the bytes are damaged or missing.
+        """
+        return self._recording.products_of(self._index)
+
+    def of(self, topic: str, cls: type[P]) -> dict[str, P]:
+        """Payloads of a topic by source, fresh and held ones.
+
+        Raises `RecordingError` where there is no such topic, or ``cls`` is not its payload class.
+        """
+        if PAYLOADS.get(topic) is not cls:
+            check_topic(topic)
+            raise RecordingError(f"payloads of {topic!r} are {PAYLOADS[topic].__name__}, not {cls.__name__}")
+        return {
+            product.provenance.source: cast(P, product.payload)
+            for product in self.products
+            if product.provenance.topic == topic and product.provenance.status is not Status.LATE
+        }
+
+    def scene(self) -> Scene | None:
+        """The scenes of all worlds as one (contract, clause 3); None where there is none."""
+        scenes = self.of("scene", Scene)
+        return merge_scenes(scenes) if scenes else None
+
+
+class Recording:
+    """A recorded run, or one segment of it.
+
+    Parameters
+    ----------
+    path
+        The run directory, or one ``.mcap`` file of it.
+    past_gaps
+        Whether what is behind a segment that is missing or broken is read too.
+
+    Raises
+    ------
+    RecordingError
+        It is not a recording, nothing of it can be read, or the content contradicts itself.
+
+    Warns
+    -----
+    RecordingWarning
+        It is damaged, or a segment is missing. What precedes can be read, and `damage` says what cannot.
+        A last segment that breaks off, as a killed recorder leaves it, is no damage.
+    """
+
+    def __init__(self, path: str | Path, *, past_gaps: bool = False) -> None:
+        self.path = Path(path)
+        self._found = RecordedSegments(self.path, past_gaps=past_gaps)
+        self._segments = self._found.segments
+        self.complete = self._found.closed
+        """Whether the recorder closed it, and nothing of it is missing."""
+        self.damage = tuple(self._found.damage)
+        """What is missing or cannot be read: a line each. `run_digest` looks at every byte."""
+        if self.damage:
+            more = f" (and {len(self.damage) - 1} more)" if len(self.damage) > 1 else ""
+            warnings.warn(f"the recording is damaged: {self.damage[0]}{more}", RecordingWarning, stacklevel=2)
+        self.metadata = self._read_metadata()
+        self._starts = [0]
+        for segment in self._segments:
+            self._starts.append(self._starts[-1] + len(segment.chunks))
+        self._index = self._build_index()
+
+    def __len__(self) -> int:
+        return self._starts[-1]
+
+    def __repr__(self) -> str:
+        episodes = len({episode for episode, _ in self._index})
+        of = f"{len(self)} frames in {episodes} episode{'s' * (episodes != 1)}"
+        lines = [f"Recording of {self.path}: {of}{'' if self.complete else ', breaks off'}"]
+        lines += [f"  {topic} of {', '.join(map(repr, sources))}" for topic, sources in self.topics.items()]
+        return "\n".join(lines)
+
+    @property
+    def directory(self) -> Path:
+        """The run directory."""
+        return self.path if self.path.is_dir() else self.path.parent
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The segments that were read."""
+        return tuple(segment.path for segment in self._segments)
+
+    @property
+    def assets(self) -> dict[str, Path]:
+        """Files of scenery that were recorded, by asset name."""
+        folder = self.directory / ASSET_FOLDER
+        found = {asset.name: folder / asset.name for asset in self.metadata.assets}
+        return {name: file for name, file in found.items() if file.is_file()}
+
+    @property
+    def topics(self) -> dict[str, tuple[str, ...]]:
+        """Topics of which at least one product is stored, with their sources."""
+        found: dict[str, set[str]] = {}
+        for segment in self._segments:
+            for channel in segment.channels.values():
+                if channel.source:
+                    found.setdefault(channel.topic, set()).add(channel.source)
+        return {topic: tuple(sorted(found[topic])) for topic in sorted(found)}
+
+    @overload
+    def __getitem__(self, key: Key[Literal["scene"]]) -> SceneArrays: ...
+    @overload
+    def __getitem__(self, key: Key[Literal["channel"]]) -> ChannelArrays: ...
+    @overload
+    def __getitem__(self, key: Key[Literal["lidar"]]) -> LidarArrays: ...
+    @overload
+    def __getitem__(self, key: Key[Literal["camera"]]) -> CameraArrays: ...
+    @overload
+    def __getitem__(self, key: Key[Literal["depth"]]) -> DepthArrays: ...
+    @overload
+    def __getitem__(self, key: Key[Literal["segmentation"]]) -> SegmentationArrays: ...
+    @overload
+    def __getitem__(self, key: Key[Literal["action"]]) -> ActionArrays: ...
+    @overload
+    def __getitem__(self, key: Key[Literal["link"]]) -> LinkArrays: ...
+    @overload
+    def __getitem__(self, key: Key[str]) -> TopicArrays[Any, Any]: ...
+    def __getitem__(self, key: Key[str]) -> TopicArrays[Any, Any]:
+        """A topic as arrays over all frames: ``recording["channel"].h``, ``recording["lidar", "l1"].range``.
+
+        Parameters
+        ----------
+        key
+            A topic; with the source where several services produce it. The scenes of several worlds are one.
+
+        Raises
+        ------
+        RecordingError
+            There is no such topic, none of its products is in the recording, or the source is not one of it.
+        """
+        topic, source = (key, "") if isinstance(key, str) else key
+        return TOPIC_ARRAYS[check_topic(topic)](
+            self, topic, self._sources(topic, source), np.arange(len(self), dtype=np.int64)
+        )
+
+    def _sources(self, topic: str, source: str) -> tuple[str, ...]:
+        """The services to take a topic from."""
+        known = self.topics.get(topic, ())
+        if not known:
+            raise RecordingError(
+                f"{self.path} holds no product of {topic!r}; it holds {', '.join(self.topics) or 'none'}"
+            )
+        if source:
+            if source not in known:
+                raise RecordingError(f"{self.path} has no {topic} of {source!r}; {suggestion(source, known)}")
+            return (source,)
+        if len(known) > 1 and topic != "scene":
+            raise RecordingError(
+                f"{self.path} has {topic} of {', '.join(map(repr, known))}: choose one, as in "
+                f"recording[{topic!r}, {known[0]!r}]"
+            )
+        return known
+
+    def frames(self) -> Iterator[RecordedFrame]:
+        """All frames, in the order of (episode, frame)."""
+        return (RecordedFrame(self, index) for index in range(len(self)))
+
+    def frame(self, episode: int, frame: int) -> RecordedFrame:
+        """One frame. Raises `RecordingError` naming what there is where it was not recorded."""
+        index = self._index.get((episode, frame))
+        if index is None:
+            has = f"frames {min(self._index)} to {max(self._index)}" if self._index else "no frame"
+            raise RecordingError(
+                f"{self.path} has no frame {frame} of episode {episode}; it has {has} (episode, frame)"
+            )
+        return RecordedFrame(self, index)
+
+    def product(self, episode: int, frame: int, topic: str, source: str) -> Payload:
+        """The payload of one product, fresh or held. Raises `RecordingError` where absent."""
+        check_topic(topic)
+        for product in self.frame(episode, frame).products:
+            entry = product.provenance
+            if (entry.topic, entry.source) == (topic, source) and entry.status is not Status.LATE:
+                return product.payload
+        raise RecordingError(f"{self._at(episode, frame)} has no {topic} of {source!r}")
+
+    def of(self, topic: str) -> Iterator[tuple[RecordedFrame, RecordedProduct]]:
+        """Every fresh or held product of a topic, with its frame.
+
+        Raises `RecordingError` where there is no topic of this name.
+        """
+        return self._products(check_topic(topic))
+
+    def _products(self, topic: str) -> Iterator[tuple[RecordedFrame, RecordedProduct]]:
+        for frame in self.frames():
+            for product in frame.products:
+                if product.provenance.topic == topic and product.provenance.status is not Status.LATE:
+                    yield frame, product
+
+    def run_digest(self) -> RunDigestReport:
+        """The run's digest, recomputed from the payload bytes alone (contract, clause 20).
+
+        It does not stop at damage: a changed payload gives another digest and is named.
+        """
+        return recorded_digest(self._found)
+
+    def entry(self, index: int) -> FrameEntry:
+        """The frame record of the ``index``-th frame of the recording."""
+        segment, place = self.segment_of(index)
+        return segment.entries[place]
+
+    def segment_of(self, index: int) -> tuple[Segment, int]:
+        """The segment of the ``index``-th frame of the recording, and the frame's place in it."""
+        number = bisect_right(self._starts, index) - 1
+        return self._segments[number], index - self._starts[number]
+
+    def products_of(self, index: int) -> tuple[RecordedProduct, ...]:
+        """The products of the ``index``-th frame, held ones fetched from where they stand."""
+        own = self._messages(index)
+        return tuple(
+            self._product(index, item, own)
+            for item in self.entry(index).inputs
+            if item.status is not Status.ABSENT
+        )
+
+    def recorded_product(self, index: int, item: GrantInput) -> RecordedProduct:
+        """One product of the ``index``-th frame, which is not absent, wherever it stands.
+
+        Of the frame only this product's bytes are read; `RecordingError` where their digest is another.
+        """
+        product = self._product(index, item, self._stored(index))
+        if product.digest != item.digest:
+            raise RecordingError(f"{product.place}: its bytes are damaged, their digest is not {item.digest}")
+        return product
+
+    def _product(
+        self, index: int, item: GrantInput, own: Mapping[tuple[Channel, int], memoryview]
+    ) -> RecordedProduct:
+        entry, key = self.entry(index), (Channel(item.topic, item.source), item.frame)
+        place = f"{self._at(entry.episode, entry.frame)}, {item.topic} of {item.source!r}"
+        data = own.get(key)
+        if data is None and item.status is Status.HELD:
+            data = self._held(entry.episode, *key)
+        if data is None:
+            remedy = "" if self.path.is_dir() else f"; open {self.directory}, which may have them"
+            raise RecordingError(f"{place}: its bytes, of frame {item.frame}, are not in {self.path}{remedy}")
+        return RecordedProduct(item, data, place)
+
+    def _held(self, episode: int, channel: Channel, frame: int) -> memoryview | None:
+        for index in (self._index.get((episode, frame)), self._late.get((episode, channel, frame))):
+            if index is not None and (channel, frame) in (stored := self._messages(index)):
+                return stored[channel, frame]
+        return None
+
+    def _messages(self, index: int) -> dict[tuple[Channel, int], memoryview]:
+        segment, chunk = self._place(index)
+        if segment.damaged(chunk):
+            entry = self.entry(index)
+            raise RecordingError(
+                f"{self._at(entry.episode, entry.frame)}: the chunk at offset {chunk.offset} of "
+                f"{segment.path} is damaged, its CRC-32 differs; `caviar inspect --digest` names the product"
+            )
+        return self._stored(index)
+
+    def _stored(self, index: int) -> dict[tuple[Channel, int], memoryview]:
+        """The products in a frame's chunk, whose CRC is not looked at."""
+        segment, chunk = self._place(index)
+        return {(m.channel, m.frame): m.data for m in segment.messages(chunk)}
+
+    def _place(self, index: int) -> tuple[Segment, Chunk]:
+        segment, place = self.segment_of(index)
+        return segment, segment.chunks[place]
+
+    @cached_property
+    def _late(self) -> dict[tuple[int, Channel, int], int]:
+        return {
+            (entry.episode, Channel(item.topic, item.source), item.frame): index
+            for index, entry in enumerate(self.entry(i) for i in range(len(self)))
+            for item in entry.inputs
+            if item.status is Status.LATE
+        }
+
+    def _build_index(self) -> dict[tuple[int, int], int]:
+        order = [(entry.episode, entry.frame) for segment in self._segments for entry in segment.entries]
+        for earlier, later in pairwise(order):
+            if later <= earlier:
+                raise RecordingError(
+                    f"{self.path}: frame {later[1]} of episode {later[0]} follows frame {earlier[1]} of "
+                    f"episode {earlier[0]}: segments of two runs are mixed"
+                )
+        return {key: index for index, key in enumerate(order)}
+
+    def _read_metadata(self) -> RecordingMetadata:
+        found = [metadata_of(segment) for segment in self._segments]
+        for segment, metadata in zip(self._segments, found, strict=True):
+            if (metadata.run, metadata.seed) != (found[0].run, found[0].seed):
+                raise RecordingError(
+                    f"{segment.path} belongs to run {metadata.run!r} with seed {metadata.seed}, "
+                    f"{self._segments[0].path.name} to run {found[0].run!r} with seed {found[0].seed}"
+                )
+        return found[0]
+
+    def _at(self, episode: int, frame: int) -> str:
+        return f"{self.path}: episode {episode}, frame {frame}"
+
+
+Imposed: TypeAlias = Mapping[tuple[str, int, int], Mapping[str, str]]
+"""Decisions to impose, by (service, episode, frame) (contract, clause 6)."""
+
+
+def recorded_decisions(recording: Recording) -> Imposed:
+    """All decisions that services took in a recorded run."""
+    return {
+        (report.source, frame.episode, frame.number): report.decisions
+        for frame in recording.frames()
+        for report in frame.reports
+        if report.decisions
+    }

@@ -1,0 +1,468 @@
+"""What a recording has as arrays of topics ``scene``, ``channel``, ``link`` and ``action``.
+
+The second axis counts users (`User`) in ``channel``, ``link`` and ``action``, objects in ``scene``, and
+devices in ``scene.devices``. `caviar_protocol.recording.sensors` has the sensors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, ClassVar, Generic, NamedTuple, Self, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from caviar_protocol.arrays import Float64Array, Int64Array, Payload
+from caviar_protocol.errors import RecordingError, suggestion
+from caviar_protocol.recording.arrays import Column, Rows, TopicArrays, payload_column
+from caviar_protocol.space.scene import device_pose, device_velocity, merge_scenes
+from caviar_protocol.topics import (
+    Action,
+    AntennaDevice,
+    BeamChoice,
+    Carrier,
+    Channel,
+    Link,
+    Scene,
+    VelocityCommand,
+    WaypointCommand,
+)
+from caviar_protocol.topics.scene import Device
+
+P = TypeVar("P", bound=Payload)
+
+
+class User(NamedTuple):
+    """A receiver that a transmitter serves on a carrier, all by name."""
+
+    tx: str
+    rx: str
+    carrier: str
+
+
+def recorded_part(
+    view: TopicArrays[Any, Any], part: str, rows: Sequence[NDArray[Any] | None]
+) -> list[NDArray[Any]]:
+    """Rows of a part that is computed only where a consumer asks for it."""
+    found = [row for row in rows if row is not None]
+    if len(found) < len(rows):
+        raise RecordingError(
+            f"{view.place} was recorded without {part}: write it into `record` below [run] of the scenario, "
+            "and run again"
+        )
+    return found
+
+
+class UserArrays(TopicArrays[P, User], Generic[P]):
+    """A topic with a row for each user: carriers as the channel lists them, then TX, then RX by name."""
+
+    axis: ClassVar[str] = "U"
+
+    @property
+    def users(self) -> tuple[User, ...]:
+        """What axis U counts."""
+        return self.keys
+
+    @property
+    def tx(self) -> tuple[str, ...]:
+        """Transmitting device of each user."""
+        return tuple(user.tx for user in self.keys)
+
+    @property
+    def rx(self) -> tuple[str, ...]:
+        """Receiving device of each user."""
+        return tuple(user.rx for user in self.keys)
+
+    @property
+    def carrier(self) -> tuple[str, ...]:
+        """Carrier of each user."""
+        return tuple(user.carrier for user in self.keys)
+
+    def select(
+        self,
+        *,
+        episode: int | None = None,
+        frames: Iterable[int] | None = None,
+        tx: str | Iterable[str] | None = None,
+        rx: str | Iterable[str] | None = None,
+        carrier: str | Iterable[str] | None = None,
+    ) -> Self:
+        """These frames and these users only; each argument that is left out allows all.
+
+        Raises `RecordingError` for a frame, an episode or a name that is not there, with what is.
+        """
+        chosen = super().select(episode=episode, frames=frames)
+        return chosen._narrowed([(0, "transmitter", tx), (1, "receiver", rx), (2, "carrier", carrier)])
+
+    def sorted_keys(self, keys: Iterable[User]) -> Iterable[User]:
+        found = list(keys)
+        rank = {name: at for at, name in enumerate(dict.fromkeys(user.carrier for user in found))}
+        return sorted(found, key=lambda user: (rank[user.carrier], user.tx, user.rx))
+
+
+class NamedArrays(TopicArrays[P, str], Generic[P]):
+    """A topic whose arrays have a row for each name, sorted."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What the second axis counts."""
+        return self.keys
+
+    def index(self, names: Iterable[str]) -> Int64Array:
+        """Place of each name on the second axis, to align arrays: ``position[:, devices.index(channel.rx)]``.
+
+        Raises `RecordingError` for a name that is not there.
+        """
+        found = []
+        for name in names:
+            if name not in self._place_of:
+                hint = suggestion(name, self.keys)
+                raise RecordingError(f"{self.place} has no {name!r} in these frames; {hint}")
+            found.append(self._place_of[name])
+        return np.array(found, dtype=np.int64)
+
+    def select(
+        self,
+        *,
+        episode: int | None = None,
+        frames: Iterable[int] | None = None,
+        names: str | Iterable[str] | None = None,
+    ) -> Self:
+        """These frames and these names only; each argument that is left out allows all.
+
+        Raises `RecordingError` for a frame, an episode or a name that is not there, with what is.
+        """
+        return super().select(episode=episode, frames=frames)._narrowed([(0, "row named", names)])
+
+    def sorted_keys(self, keys: Iterable[str]) -> Iterable[str]:
+        return sorted(keys)
+
+
+class SceneArrays(NamedArrays[Scene]):
+    """Topic ``scene``: objects, of all worlds."""
+
+    axis: ClassVar[str] = "N"
+
+    def _turning(self, scene: Scene) -> Rows:
+        turning = scene.angular_velocity
+        return list(np.zeros_like(scene.velocity) if turning is None else turning)
+
+    position = payload_column(np.float64, Scene, "position")
+    orientation = payload_column(np.float64, Scene, "orientation")
+    velocity = payload_column(np.float64, Scene, "velocity")
+    angular_velocity = Column(
+        np.float64, 3, unit="rad/s", doc="in world axes; 0 where the world does not tell", rows=_turning
+    )
+    dimensions = payload_column(np.float64, Scene, "dimensions")
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Class of each object (``car``, ``uav``, …), where it first occurs. Length N."""
+        found: dict[str, str] = {}
+        for scene in self:
+            if scene is not None:
+                for name, kind in zip(scene.names, scene.classes, strict=True):
+                    found.setdefault(name, kind)
+        return tuple(found.get(name, "") for name in self.keys)
+
+    @property
+    def devices(self) -> DeviceArrays:
+        """The antennas and sensors of the same frames, where they are in the world."""
+        return DeviceArrays(self._recording, self.topic, self.sources, self._indices)
+
+    def keys_of(self, payload: Scene) -> Sequence[str]:
+        return payload.names
+
+    def merged(self, payloads: dict[str, Scene]) -> Scene:
+        return merge_scenes(payloads)
+
+
+class DeviceArrays(NamedArrays[Scene]):
+    """Devices of topic ``scene``, fixed ones and those mounted on objects, in world axes."""
+
+    axis: ClassVar[str] = "D"
+
+    def _positions(self, scene: Scene) -> Rows:
+        return [device_pose(scene, device).position for device in scene.devices]
+
+    def _orientations(self, scene: Scene) -> Rows:
+        return [device_pose(scene, device).orientation for device in scene.devices]
+
+    def _velocities(self, scene: Scene) -> Rows:
+        return [device_velocity(scene, device) for device in scene.devices]
+
+    position = Column(np.float64, 3, unit="m", doc="reference point, in the world", rows=_positions)
+    orientation = Column(np.float64, 4, doc="(w, x, y, z), device axes into world axes", rows=_orientations)
+    velocity = Column(np.float64, 3, unit="m/s", doc="in world axes", rows=_velocities)
+
+    @property
+    def devices(self) -> dict[str, Device]:
+        """Each device as its first frame states it: role, array, power, optics. By name."""
+        found: dict[str, Device] = {}
+        for scene in self:
+            for device in scene.devices if scene is not None else ():
+                found.setdefault(device.name, device)
+        return {name: found[name] for name in self.keys if name in found}
+
+    def antennas(self, role: str) -> tuple[str, ...]:
+        """Names of the antennas that transmit (``"tx"``) or receive (``"rx"``)."""
+        return tuple(
+            name
+            for name, device in self.devices.items()
+            if isinstance(device, AntennaDevice) and device.role in (role, "both")
+        )
+
+    def keys_of(self, payload: Scene) -> Sequence[str]:
+        return [device.name for device in payload.devices]
+
+    def merged(self, payloads: dict[str, Scene]) -> Scene:
+        return merge_scenes(payloads)
+
+
+class ChannelArrays(UserArrays[Channel]):
+    """Topic ``channel``: H, and the paths that it is the sum of, by user.
+
+    A user without a path has zeros in ``h``. Axes Nr and Nt are as long as the largest receive and transmit
+    array, P as the most paths of a user, D as the most interactions of a path.
+    """
+
+    def _matrices(self, channel: Channel) -> Rows:
+        found = {(m.carrier, m.tx, m.rx): m.h for m in channel.h}
+        return recorded_part(self, "channel.h", [found.get(pair) for pair in _pairs(channel)])
+
+    def _responses(self, channel: Channel) -> Rows:
+        return self._wideband("hf", channel)
+
+    def _impulses(self, channel: Channel) -> Rows:
+        return self._wideband("taps", channel)
+
+    def _first_taps(self, channel: Channel) -> Rows:
+        if not channel.taps:
+            return self._wideband("taps", channel)
+        first = {(t.carrier, t.tx, t.rx): t.first for t in channel.taps}
+        return [first.get(pair, 0) for pair in _pairs(channel)]
+
+    def _wideband(self, part: str, channel: Channel) -> Rows:
+        """Rows of a part that only carriers with a numerology have; empty ones for the others."""
+        found = {(r.carrier, r.tx, r.rx): r.h for r in getattr(channel, part)}
+        keys = {"hf": "subcarriers", "taps": "taps"}
+        rows = [
+            found.get(pair) if getattr(channel.carriers[pair[0]], keys[part]) else _NO_BINS
+            for pair in _pairs(channel)
+        ]
+        if not found and rows:
+            rows = [None]
+        return recorded_part(self, f"channel.{part}", rows)
+
+    def _sights(self, channel: Channel) -> Rows:
+        return [channel.los[t, r] for _, t, r in _pairs(channel)]
+
+    def _counts(self, channel: Channel) -> Rows:
+        counts = np.diff(channel.offsets)
+        return [counts[t * len(channel.rx) + r] for _, t, r in _pairs(channel)]
+
+    def _amplitudes(self, channel: Channel) -> Rows:
+        return [channel.a[c, cut] for c, cut in _cuts(channel)]
+
+    def _shifts(self, channel: Channel) -> Rows:
+        return [channel.doppler[c, cut] for c, cut in _cuts(channel)]
+
+    def _delays(self, channel: Channel) -> Rows:
+        return [channel.tau[cut] for _, cut in _cuts(channel)]
+
+    def _departures(self, channel: Channel) -> Rows:
+        return [channel.aod[cut] for _, cut in _cuts(channel)]
+
+    def _arrivals(self, channel: Channel) -> Rows:
+        return [channel.aoa[cut] for _, cut in _cuts(channel)]
+
+    def _ids(self, channel: Channel) -> Rows:
+        return [channel.id[cut] for _, cut in _cuts(channel)]
+
+    def _interactions(self, channel: Channel) -> Rows:
+        return [channel.interactions[cut] for _, cut in _cuts(channel)]
+
+    def _bounds(self, channel: Channel) -> Rows:
+        stated = channel.error_bound_db
+        return [np.float64(np.nan) if stated is None else stated[t, r] for _, t, r in _pairs(channel)]
+
+    def _points(self, channel: Channel) -> Rows:
+        return [channel.points[cut] for _, cut in _cuts(channel)]
+
+    h = Column(
+        np.complex128, "Nr", "Nt", doc="narrowband gain from TX element n to RX element m", rows=_matrices
+    )
+    hf = Column(
+        np.complex64,
+        "S",
+        "K",
+        "Nr",
+        "Nt",
+        doc="gain on each subcarrier in each slot, from TX element n to RX element m",
+        rows=_responses,
+    )
+    taps = Column(
+        np.complex64,
+        "S",
+        "L",
+        "Nr",
+        "Nt",
+        doc="gain in each tap and slot, from TX element n to RX element m",
+        rows=_impulses,
+    )
+    first_tap = Column(np.int64, doc="sample of the first tap; 0 is the delay 0", rows=_first_taps)
+    los = Column(np.bool_, doc="line of sight is free", rows=_sights)
+    paths = Column(np.int64, doc="number of paths", rows=_counts)
+    a = Column(np.complex128, "P", doc="amplitude gain of each path, incl. exp(−j2πfτ)", rows=_amplitudes)
+    tau = Column(np.float64, "P", unit="s", doc="absolute delay", rows=_delays)
+    doppler = Column(np.float64, "P", unit="Hz", doc="Doppler shift", rows=_shifts)
+    aod = Column(
+        np.float64, "P", 2, unit="rad", doc="departure (zenith, azimuth) in world axes", rows=_departures
+    )
+    aoa = Column(
+        np.float64, "P", 2, unit="rad", doc="direction the wave comes from, likewise", rows=_arrivals
+    )
+    path_id = Column(np.uint64, "P", doc="stable id of each path in its pair", rows=_ids)
+    interactions = Column(np.uint8, "P", "D", doc="`Interaction` at each point, TX to RX", rows=_interactions)
+    points = Column(np.float64, "P", "D", 3, unit="m", doc="interaction points; 0 where none", rows=_points)
+    error_bound_db = Column(
+        np.float64,
+        unit="dB",
+        doc="stated NMSE of H that nine of ten users are within; NaN where none is",
+        rows=_bounds,
+    )
+
+    @property
+    def carriers(self) -> dict[str, Carrier]:
+        """Frequency [Hz] and bandwidth [Hz] of each carrier, by name."""
+        return {
+            carrier.name: carrier for channel in self if channel is not None for carrier in channel.carriers
+        }
+
+    @property
+    def rung(self) -> tuple[str, ...]:
+        """Step of the fidelity ladder in each frame; empty where the channel is absent. Length F."""
+        return tuple("" if channel is None else channel.rung for channel in self)
+
+    @property
+    def expected_error_db(self) -> Float64Array:
+        """Stated bound on the NMSE of all H together [dB]; NaN where none is stated. Shape ``[F]``."""
+        stated = (None if channel is None else channel.expected_error_db for channel in self)
+        return np.array([np.nan if value is None else value for value in stated], dtype=np.float64)
+
+    @property
+    def error_reference(self) -> tuple[str, ...]:
+        """What stated errors are relative to in each frame; empty where none is stated. Length F."""
+        return tuple("" if channel is None else channel.error_reference for channel in self)
+
+    def keys_of(self, payload: Channel) -> Sequence[User]:
+        carriers, tx, rx = payload.carriers, payload.tx, payload.rx
+        return [User(tx[t], rx[r], carriers[c].name) for c, t, r in _pairs(payload)]
+
+
+_NO_BINS = np.zeros((0, 0, 0, 0), np.complex64)
+"""Of a carrier without subcarriers or taps."""
+
+
+def _pairs(channel: Channel) -> Iterator[tuple[int, int, int]]:
+    """Carrier, TX and RX of each user as indices; a device is no user of itself."""
+    for c in range(len(channel.carriers)):
+        for t, tx in enumerate(channel.tx):
+            for r, rx in enumerate(channel.rx):
+                if tx != rx:
+                    yield c, t, r
+
+
+def _cuts(channel: Channel) -> Iterator[tuple[int, slice]]:
+    """Carrier, and run on the path axis, of each user."""
+    for c, t, r in _pairs(channel):
+        pair = t * len(channel.rx) + r
+        yield c, slice(int(channel.offsets[pair]), int(channel.offsets[pair + 1]))
+
+
+class LinkArrays(UserArrays[Link]):
+    """Topic ``link``: chosen and best beams, |y|, SNR, rates and reward, by user.
+
+    |y| = |w* H f| is the equivalent channel of a beam pair; axis K counts the best pairs, best first.
+    """
+
+    has_path = payload_column(np.bool_, Link, "has_path")
+    los = payload_column(np.bool_, Link, "los")
+    tx_beam = payload_column(np.int32, Link, "tx_beam")
+    rx_beam = payload_column(np.int32, Link, "rx_beam")
+    abs_y = payload_column(np.float64, Link, "abs_y")
+    top_tx_beam = payload_column(np.int32, Link, "top_tx_beam")
+    top_rx_beam = payload_column(np.int32, Link, "top_rx_beam")
+    top_abs_y = payload_column(np.float64, Link, "top_abs_y")
+    baseline_abs_y = payload_column(np.float64, Link, "baseline_abs_y")
+    aod_azimuth = payload_column(np.float64, Link, "aod_azimuth")
+    aoa_azimuth = payload_column(np.float64, Link, "aoa_azimuth")
+    snr = payload_column(np.float64, Link, "snr")
+    snr_best = payload_column(np.float64, Link, "snr_best")
+    spectral_efficiency = payload_column(np.float64, Link, "spectral_efficiency")
+    bit_rate = payload_column(np.float64, Link, "bit_rate")
+    reward = payload_column(np.float64, Link, "reward")
+
+    def _buffers(self, link: Link) -> Rows:
+        return np.full(len(link.tx), np.nan) if link.buffered is None else link.buffered
+
+    buffered = Column(
+        np.float64, unit="bit", doc="waiting in the user's buffer; NaN where there is none", rows=_buffers
+    )
+
+    def keys_of(self, payload: Link) -> Sequence[User]:
+        return [User(*user) for user in zip(payload.tx, payload.rx, payload.carrier, strict=True)]
+
+
+class ActionArrays(UserArrays[Action]):
+    """Topic ``action``: the beams that an agent chose, by user; an empty carrier stands for all of them."""
+
+    def _tx_beams(self, action: Action) -> Rows:
+        return [choice.tx_beam for choice in _choices(action)]
+
+    def _rx_beams(self, action: Action) -> Rows:
+        return [choice.rx_beam for choice in _choices(action)]
+
+    tx_beam = Column(np.int32, doc="chosen TX beam; −1: none chosen", rows=_tx_beams)
+    rx_beam = Column(np.int32, doc="chosen RX beam; −1: none chosen", rows=_rx_beams)
+
+    @property
+    def motion(self) -> MotionArrays:
+        """Where the agent sent objects, in the same frames."""
+        return MotionArrays(self._recording, self.topic, self.sources, self._indices)
+
+    def keys_of(self, payload: Action) -> Sequence[User]:
+        return [User(choice.tx, choice.rx, choice.carrier) for choice in _choices(payload)]
+
+
+def _choices(action: Action) -> list[BeamChoice]:
+    return [command for command in action.commands if isinstance(command, BeamChoice)]
+
+
+class MotionArrays(NamedArrays[Action]):
+    """Commands of topic ``action`` that move objects, by object."""
+
+    axis: ClassVar[str] = "N"
+
+    def _waypoints(self, action: Action) -> Rows:
+        return [c.position if isinstance(c, WaypointCommand) else _NO_VECTOR for c in _motions(action)]
+
+    def _speeds(self, action: Action) -> Rows:
+        return [c.speed if isinstance(c, WaypointCommand) else np.nan for c in _motions(action)]
+
+    def _velocities(self, action: Action) -> Rows:
+        return [c.velocity if isinstance(c, VelocityCommand) else _NO_VECTOR for c in _motions(action)]
+
+    waypoint = Column(np.float64, 3, unit="m", doc="where to; NaN: not commanded", rows=_waypoints)
+    speed = Column(np.float64, unit="m/s", doc="at most, towards the waypoint", rows=_speeds)
+    velocity = Column(np.float64, 3, unit="m/s", doc="in world axes; NaN: not commanded", rows=_velocities)
+
+    def keys_of(self, payload: Action) -> Sequence[str]:
+        return [command.object for command in _motions(payload)]
+
+
+_NO_VECTOR = (np.nan, np.nan, np.nan)
+
+
+def _motions(action: Action) -> list[WaypointCommand | VelocityCommand]:
+    return [c for c in action.commands if isinstance(c, WaypointCommand | VelocityCommand)]

@@ -1,0 +1,412 @@
+"""The rules of a scenario that concern several keys at once, and what follows from its keys."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import PurePosixPath
+from typing import Any
+
+import msgspec
+
+from caviar_protocol.errors import ScenarioError, suggestion
+from caviar_protocol.scenario.conversion import Place, convert_table
+from caviar_protocol.scenario.schema import DeviceSpec, Scenario, ServiceSpec
+from caviar_protocol.topics import PARTS, PAYLOADS
+from caviar_protocol.topics.channel import Carrier
+
+_STRICT_ROLES = ("world", "recorder")
+LONGEST_NS = 2**62
+"""[ns] Longest episode: an instant is a 64-bit integer."""
+BEAM = "beam:"
+"""Prefix of the actuators that steer beams; the receiver's name follows. Users may be written without."""
+
+_KIND_KEYS = {
+    "antenna": ("role", "array", "power_dbm"),
+    "lidar": ("beams", "azimuth_steps", "elevation_deg", "range_m"),
+    "camera": ("size_px", "field_of_view_deg"),
+}
+
+
+def scenario_error(scenario: Scenario, key: str, message: str) -> ScenarioError:
+    """An error about a key of a scenario, for a check made later than the loader's.
+
+    ``key`` is dotted: ``services.channel.use``, ``devices[0].on``. The line is found from it.
+    """
+    return Place(key, scenario.source).error(message)
+
+
+def settings_place(scenario: Scenario, service: str) -> Place:
+    """Where the settings of a service stand, for `caviar_protocol.scenario.conversion.convert_settings`."""
+    return Place("services", scenario.source).at(service).at("settings")
+
+
+def check_scenario(scenario: Scenario) -> None:
+    """Raise `ScenarioError` for the first rule that the scenario breaks."""
+    root = Place("", scenario.source)
+    _check_duration(scenario, root.at("run"))
+    _check_record(scenario, root.at("run").at("record"))
+    _check_timeouts(scenario, root.at("timeouts"))
+    _check_limits(scenario, root.at("limits"))
+    _unique((carrier.name for carrier in scenario.carriers), "carrier", root.at("carriers"))
+    _unique((device.name for device in scenario.devices), "device", root.at("devices"))
+    _check_services(scenario, root.at("services"))
+    for index, device in enumerate(scenario.devices):
+        _check_device(device, root.at("devices").at(index))
+        world_of(scenario, index)
+    _check_antennas(scenario, root.at("devices"))
+    _check_users(scenario, root.at("services"))
+
+
+def _check_duration(scenario: Scenario, place: Place) -> None:
+    """Every instant is a 64-bit number of nanoseconds, also where it is doubled."""
+    run = scenario.run
+    if not run.instants_s and run.frames * run.sampling_period_ns > LONGEST_NS:
+        raise place.at("sampling_period_ns").error(
+            f"{run.frames} frames of {run.sampling_period_ns} ns are longer than {LONGEST_NS / 1e9:.3g} s; "
+            "write a shorter period or fewer frames"
+        )
+
+
+def refuse_remote(scenario: Scenario) -> None:
+    """Raise `ScenarioError` for a remote service, in a run that has no broker to connect to."""
+    for name, spec in scenario.services.items():
+        if spec.remote:
+            raise scenario_error(
+                scenario,
+                f"services.{name}.use",
+                f"is {spec.use!r}, but a run in one process has no address to connect to; "
+                f"name an implementation of {spec.role}, or run it without --embedded",
+            )
+
+
+def devices_of(scenario: Scenario, world: str) -> tuple[DeviceSpec, ...]:
+    """The devices that a world publishes.
+
+    A device belongs to the world it names, or to the only world of the run, or to the one with
+    whose ``prefix`` (a setting; else its name and a dot) ``on`` begins. Raises `ScenarioError` for a device
+    whose world these do not tell.
+    """
+    return tuple(
+        device for index, device in enumerate(scenario.devices) if world_of(scenario, index) == world
+    )
+
+
+def world_of(scenario: Scenario, index: int) -> str:
+    """Name of the world that publishes device ``index``; see `devices_of`."""
+    device = scenario.devices[index]
+    worlds = [name for name, service in scenario.services.items() if service.role == "world"]
+    place = Place("devices", scenario.source).at(index)
+    if device.world:
+        if device.world not in worlds:
+            hint = suggestion(device.world, worlds)
+            raise place.at("world").error(f"no world of this run is named {device.world!r}; {hint}")
+        return device.world
+    if len(worlds) == 1:
+        return worlds[0]
+    literal = device.on.partition("*")[0].partition("?")[0].partition("[")[0]
+    matching = [name for name in worlds if literal.startswith(_prefix(name, scenario.services[name]))]
+    if len(matching) == 1:
+        return matching[0]
+    where = f"on {device.on!r}" if device.on else "without `on`"
+    raise place.error(
+        f"device {device.name!r} {where} could belong to any of the worlds {', '.join(worlds)}; "
+        f'write world = "{worlds[0]}"'
+    )
+
+
+def with_overrides(
+    scenario: Scenario, frames: int | None = None, seed: int | None = None, pace: str | None = None
+) -> Scenario:
+    """The scenario with values from the command line in place of its own.
+
+    Raises `ScenarioError` where one is out of range.
+    """
+    given = {"frames": frames, "seed": seed, "pace": None if pace is None else _number_or_word(pace)}
+    changes = {name: value for name, value in given.items() if value is not None}
+    if not changes:
+        return scenario
+    run = type(scenario.run)
+    instants = len(scenario.run.instants_s)
+    if frames is not None and 0 < instants < frames:
+        raise (
+            Place("run")
+            .at("frames")
+            .error(f"is {frames}, and the scenario has {instants} instants; write at most {instants}")
+        )
+    values = msgspec.structs.asdict(scenario.run) | changes
+    changed = msgspec.structs.replace(scenario, run=convert_table(run, values, Place("run")))
+    _check_duration(changed, Place("", scenario.source).at("run"))
+    return changed
+
+
+def resolved(scenario: Scenario, settings: Mapping[str, msgspec.Struct] | None = None) -> dict[str, Any]:
+    """Everything the scenario says, defaults included, as built-in types.
+
+    ``settings`` are those of services by name after conversion, so that their defaults show too.
+    """
+    plain = _plain(scenario)
+    del plain["source"]
+    for name, value in (settings or {}).items():
+        plain["services"][name]["settings"] = _plain(value)
+    return plain  # type: ignore[no-any-return]  # a struct becomes a dict
+
+
+def patterns_overlap(a: str, b: str) -> bool:
+    """Whether some name matches both patterns, in which ``*`` is any text and ``?`` any character."""
+    reachable = {(0, 0)}
+    todo = [(0, 0)]
+    while todo:
+        i, j = todo.pop()
+        if i == len(a) and j == len(b):
+            return True
+        head_a, head_b = a[i : i + 1], b[j : j + 1]
+        steps = set()
+        if head_a == "*":
+            steps |= {(i + 1, j)} | ({(i, j + 1)} if head_b else set())
+        if head_b == "*":
+            steps |= {(i, j + 1)} | ({(i + 1, j)} if head_a else set())
+        if head_a and head_b and (head_a == head_b or "?" in (head_a, head_b)):
+            steps.add((i + 1, j + 1))
+        todo += steps - reachable
+        reachable |= steps
+    return False
+
+
+def _number_or_word(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def _plain(value: Any) -> Any:
+    """Built-in types, with every field of a struct; `msgspec.to_builtins` leaves out defaults."""
+    if isinstance(value, msgspec.Struct):
+        tag = value.__struct_config__.tag_field
+        head = {tag: value.__struct_config__.tag} if tag else {}
+        return head | {name: _plain(getattr(value, name)) for name in value.__struct_fields__}
+    if isinstance(value, Mapping):
+        return {str(name): _plain(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return msgspec.to_builtins(value)
+
+
+def _prefix(name: str, world: ServiceSpec) -> str:
+    """What the names of a world's objects begin with: its setting, else its own name and a dot."""
+    return str(world.settings.get("prefix") or f"{name}.")
+
+
+def _unique(names: Iterable[str], what: str, place: Place) -> None:
+    first: dict[str, int] = {}
+    for index, name in enumerate(names):
+        here = place.at(index).at("name")
+        if not name:
+            raise here.error(f"a {what} needs a name")
+        if name in first:
+            line = place.source.line(place.at(first[name]).at("name").key)
+            known = f" (the first stands in line {line})" if line else ""
+            raise here.error(f"a second {what} is named {name!r}{known}; give it another name")
+        first[name] = index
+
+
+def _check_record(scenario: Scenario, place: Place) -> None:
+    for index, entry in enumerate(scenario.run.record):
+        topic, dot, part = entry.partition(".")
+        if topic not in PAYLOADS:
+            raise place.at(index).error(f"no topic is named {topic!r}; {suggestion(topic, PAYLOADS)}")
+        if dot and part not in PARTS.get(topic, ()):
+            known = suggestion(part, PARTS.get(topic, ())) if topic in PARTS else f'write "{topic}"'
+            raise place.at(index).error(f"topic {topic!r} has no part {part!r}; {known}")
+        if topic == "channel" and (problem := undefined_part(part, scenario.carriers)):
+            raise place.at(index).error(problem)
+    if scenario.run.record and not any(s.role == "recorder" for s in scenario.services.values()):
+        raise place.error('topics to record need a recorder; add [services.recorder] with role = "recorder"')
+
+
+def _check_timeouts(scenario: Scenario, place: Place) -> None:
+    timeouts = scenario.timeouts
+    if timeouts.heartbeat_s >= timeouts.liveness_s:
+        raise place.error(
+            f"heartbeat_s = {timeouts.heartbeat_s} leaves no heartbeat within liveness_s = "
+            f"{timeouts.liveness_s}; write at most {timeouts.liveness_s / 2}"
+        )
+
+
+def _check_limits(scenario: Scenario, place: Place) -> None:
+    """What services need to take part at all is not too much."""
+    limits, heartbeat_s = scenario.limits, scenario.timeouts.heartbeat_s
+    needed = 2 * len(scenario.services)
+    for key, value in (
+        ("connections", limits.connections),
+        ("connections_before_hello", limits.connections_before_hello),
+    ):
+        if value < needed:
+            raise place.at(key).error(
+                f"is {value}, and each of the {len(scenario.services)} services has one and another "
+                f"for its heartbeats, perhaps at the same time; write at least {needed}"
+            )
+    if limits.messages_per_s < 1.0 / heartbeat_s:
+        raise place.at("messages_per_s").error(
+            f"is {limits.messages_per_s:g}, and a heartbeat each {heartbeat_s:g} s (timeouts.heartbeat_s) is "
+            f"more; write at least {2.0 / heartbeat_s:g}"
+        )
+    if limits.waiting_mib <= limits.part_mib:
+        raise place.at("waiting_mib").error(
+            f"is {limits.waiting_mib}, so that a product of part_mib = {limits.part_mib} cannot come in; "
+            f"write at least {limits.part_mib + 1}, or part_mib = {limits.waiting_mib - 1}"
+        )
+
+
+def _check_services(scenario: Scenario, place: Place) -> None:
+    by_role: dict[str, list[str]] = {}
+    for name, service in scenario.services.items():
+        by_role.setdefault(service.role, []).append(name)
+        _check_service(name, service, place.at(name))
+    if "world" not in by_role:
+        raise place.error('no service has role = "world", so nothing publishes a scene; add one')
+    recorders = by_role.get("recorder", [])
+    if len(recorders) > 1:
+        raise place.at(recorders[1]).error(
+            f"a second recorder; a run has at most one, which is {recorders[0]!r}. Remove this one"
+        )
+    if by_role.get("channel") and not scenario.carriers:
+        raise place.at(by_role["channel"][0]).error(
+            "a channel needs a carrier; add [[carriers]] with name and frequency_hz"
+        )
+
+
+def _check_service(name: str, service: ServiceSpec, place: Place) -> None:
+    if not name or len(name) > 64 or PurePosixPath(name).name != name or not name.isprintable():
+        raise place.error(f"{name!r} cannot name a service; use at most 64 letters, digits, - and _")
+    if service.role in _STRICT_ROLES and service.policy not in ("wait", "abort"):
+        raise place.at("policy").error(
+            f"a {service.role} cannot {service.policy}: nothing in a run can do without its products "
+            '(clause 9); write "wait" or "abort"'
+        )
+    if service.max_in_flight > 1 and service.policy != "wait":
+        raise place.at("max_in_flight").error(
+            f'is {service.max_in_flight}, but several grants at once need policy = "wait" (clause 7), '
+            f"not {service.policy!r}; write max_in_flight = 1"
+        )
+    if service.users and service.role != "agent":
+        raise place.at("users").error(f"only agents own users, this is a {service.role}; remove the key")
+
+
+def _check_device(device: DeviceSpec, place: Place) -> None:
+    blank = DeviceSpec(name=device.name, kind=device.kind)
+    for kind, keys in _KIND_KEYS.items():
+        for key in keys:
+            here = place.at(key)
+            is_given = here.key in here.source.lines or getattr(device, key) != getattr(blank, key)
+            if kind != device.kind and is_given:
+                others = ", ".join(_KIND_KEYS[device.kind])
+                raise here.error(f"belongs to kind {kind!r}, this is {device.kind!r}, with: {others}")
+    if device.kind == "antenna" and not device.role:
+        raise place.error(f'antenna {device.name!r} lacks its role; write role = "tx", "rx" or "both"')
+    if device.count > 1 and not any(sign in device.on for sign in "*?["):
+        raise place.at("count").error(
+            f'is {device.count}, but {device.on!r} is one object; write a pattern: on = "{device.on}*"'
+        )
+    if device.mount != "centre" and not device.on:
+        raise place.at("mount").error("only a device with `on` has a parent to be mounted at; remove the key")
+    _check_ascending(device.elevation_deg, place.at("elevation_deg"), -90.0, 90.0)
+    _check_ascending(device.range_m, place.at("range_m"), 0.0)
+    for index, size in enumerate(device.size_px):
+        if not 1 <= size <= 8192:
+            raise place.at("size_px").at(index).error(f"is {size}, write 1 to 8192 [px]")
+
+
+def _check_antennas(scenario: Scenario, place: Place) -> None:
+    """A channel has paths only between a transmitter and a receiver."""
+    roles = {device.role for device in scenario.devices if device.kind == "antenna"}
+    has_channel = any(service.role == "channel" for service in scenario.services.values())
+    if not has_channel or not roles or "both" in roles or roles >= {"tx", "rx"}:
+        return
+    lacking = ({"tx", "rx"} - roles).pop()
+    raise place.error(f'no antenna has role = "{lacking}", so the channel has no path; add one')
+
+
+def _check_users(scenario: Scenario, place: Place) -> None:
+    """Users that an agent owns are receivers of the scenario; remote worlds may bring others."""
+    if any(service.role == "world" and service.remote for service in scenario.services.values()):
+        return
+    there = [
+        f"{device.on}/{device.name}" if device.on else device.name
+        for device in scenario.devices
+        if device.kind == "antenna" and device.role in ("rx", "both")
+    ]
+    for name, service in scenario.services.items():
+        for index, text in enumerate(service.users):
+            pattern = text.removeprefix(BEAM)
+            if ":" in pattern or any(patterns_overlap(receiver, pattern) for receiver in there):
+                continue  # another actuator (``motion:uav``), or somebody
+            known = f"there are: {', '.join(there)}" if there else 'no antenna has role = "rx"'
+            raise place.at(name).at("users").at(index).error(f"no receiver is named {pattern!r}; {known}")
+
+
+def _check_ascending(
+    pair: tuple[float, float], place: Place, least: float, most: float = float("inf")
+) -> None:
+    low, high = pair
+    if not least <= low < high <= most:
+        upper = "" if most == float("inf") else f" and at most {most}"
+        raise place.error(f"is [{low}, {high}], write two ascending numbers, at least {least}{upper}")
+
+
+def with_numerology(carrier: Carrier, sampling_period_ns: int | None, place: Place) -> Carrier:
+    """The carrier with the spacing, number or slot duration that follows from its other keys.
+
+    Parameters
+    ----------
+    carrier
+        As the scenario has it.
+    sampling_period_ns
+        Between frames [ns]; None where it is not the same between all of them.
+    place
+        Where the carrier stands in the scenario.
+
+    Raises
+    ------
+    ScenarioError
+        Naming the key, where subcarriers do not fit into the bandwidth, or slots have no duration.
+    """
+    count, spacing, bandwidth = carrier.subcarriers, carrier.subcarrier_spacing_hz, carrier.bandwidth_hz
+    if spacing and not count:
+        count = math.floor(bandwidth / spacing * (1 + 1e-12))
+        if not count:
+            raise place.at("subcarrier_spacing_hz").error(
+                f"is {spacing:g} Hz, wider than bandwidth_hz = {bandwidth:g}; write at most the bandwidth"
+            )
+    elif count and not spacing:
+        spacing = bandwidth / count
+    if count * spacing > bandwidth * (1 + 1e-9):
+        raise place.at("subcarriers").error(
+            f"{count} subcarriers of {spacing:g} Hz take {count * spacing:g} Hz, more than bandwidth_hz = "
+            f"{bandwidth:g}; write bandwidth_hz = {count * spacing:g}, or at most "
+            f"{math.floor(bandwidth / spacing)} subcarriers"
+        )
+    duration = carrier.slot_duration_s
+    if carrier.slots > 1 and not duration:
+        if sampling_period_ns is None:
+            raise place.at("slots").error(
+                f"are {carrier.slots}, and run.instants_s has no period that they could share; write "
+                "slot_duration_s"
+            )
+        duration = sampling_period_ns * 1e-9 / carrier.slots
+    return msgspec.structs.replace(
+        carrier, subcarriers=count, subcarrier_spacing_hz=spacing, slot_duration_s=duration
+    )
+
+
+def undefined_part(part: str, carriers: Sequence[Carrier]) -> str:
+    """What to write where no carrier says what a wideband part consists of; empty: one does."""
+    if part == "hf" and not any(c.subcarriers or c.subcarrier_spacing_hz for c in carriers):
+        return (
+            "channel.hf needs a carrier with subcarriers; write, for instance, subcarriers = 264 and "
+            "subcarrier_spacing_hz = 120e3 below [[carriers]]"
+        )
+    if part == "taps" and not any(c.taps for c in carriers):
+        return "channel.taps needs a carrier with taps; write, for instance, taps = 64 below [[carriers]]"
+    return ""

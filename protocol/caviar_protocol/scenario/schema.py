@@ -1,0 +1,285 @@
+"""The types of a scenario file: what a run consists of, and the devices that it mounts.
+
+TOML, validated as a whole before anything starts. A key that is not known here is an error that names the
+file, the line and the key that was probably meant. `scenario.loader` reads files, `scenario.rules` holds the
+rules between keys.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import math
+from collections.abc import Iterable
+from pathlib import PurePath
+from typing import Annotated, Any, ClassVar, Literal
+
+import msgspec
+from msgspec import Meta
+
+from caviar_protocol.arrays import Vector3, quantity
+from caviar_protocol.errors import ScenarioError
+from caviar_protocol.files import Durability
+from caviar_protocol.messages import Policy, Role
+from caviar_protocol.scenario.conversion import Source
+from caviar_protocol.space.coordinates import Vector, quaternion_from_euler
+from caviar_protocol.topics.channel import Carrier
+from caviar_protocol.topics.scene import AntennaArray, AntennaDevice, CameraDevice, Device, LidarDevice
+
+REMOTE = "remote"
+"""What ``use`` says of a service that the user starts, anywhere: its place in the run is held free."""
+REMOTE_REJOIN_S = 30.0
+"""[s] that a remote service gets to come back, where ``rejoin_s`` is not given."""
+
+
+class _Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Base of all tables of a scenario: unknown keys are refused."""
+
+
+LONGEST_S = 1e8
+"""[s] Longest wait and budget that a scenario may ask for, three years: nanoseconds are 64-bit numbers."""
+
+
+class Timeouts(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How long the broker waits for what."""
+
+    connect_s: Annotated[float, quantity("s", "for HELLO of every service", gt=0, le=LONGEST_S)] = 30.0
+    ready_s: Annotated[float, quantity("s", "for READY, beyond a declared grace", gt=0, le=LONGEST_S)] = 120.0
+    reset_s: Annotated[float, quantity("s", "for RESET_DONE", gt=0, le=LONGEST_S)] = 60.0
+    stall_s: Annotated[float, quantity("s", "without progress, under wait", gt=0, le=LONGEST_S)] = 30.0
+    rejoin_s: (
+        Annotated[
+            float, quantity("s", "for a service that died to come back; 0: the run ends", ge=0, le=LONGEST_S)
+        ]
+        | None
+    ) = None
+    """Absent: `REMOTE_REJOIN_S` for remote services, 0 for those that `caviar run` starts."""
+    shutdown_s: Annotated[float, quantity("s", "for BYE; then the process is killed", gt=0, le=LONGEST_S)] = (
+        2.0
+    )
+    heartbeat_s: Annotated[float, quantity("s", "between heartbeats", gt=0, le=LONGEST_S)] = 0.25
+    liveness_s: Annotated[
+        float, quantity("s", "silence after which a remote peer is gone", gt=0, le=LONGEST_S)
+    ] = 1.5
+
+
+class Limits(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What one peer may use of the broker; a peer that exceeds a limit is disconnected and named."""
+
+    connections: Annotated[int, quantity("1", "open connections in all", ge=1, le=1_000_000)] = 4096
+    connections_before_hello: Annotated[
+        int, quantity("1", "open connections of one address before HELLO", ge=1, le=1_000_000)
+    ] = 256
+    messages_before_hello: Annotated[int, quantity("1", "of one connection", ge=1, le=1_000_000)] = 16
+    waiting_before_hello_mib: Annotated[
+        int, quantity("MiB", "that wait of a connection before HELLO", ge=1, le=1024)
+    ] = 4
+    messages_at_once: Annotated[
+        int, quantity("1", "of a service, beyond one for each that it was sent", ge=100, le=1_000_000_000)
+    ] = 4000
+    messages_per_s: Annotated[
+        float, quantity("1/s", "of a service on and on, beyond the same", gt=0, le=1e9)
+    ] = 500.0
+    part_mib: Annotated[int, quantity("MiB", "of one part of a message, as a product", ge=4, le=1024)] = 1024
+    waiting_mib: Annotated[int, quantity("MiB", "that wait of a service, or for it", ge=2, le=2**20)] = 1088
+
+
+class Run(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The run as a whole."""
+
+    # The name of the run's directory has a date and a time behind it, and 255 B at most.
+    name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,199}$")]
+    frames: Annotated[int, quantity("frame", "of an episode", ge=1)]
+    sampling_period_ns: Annotated[int, quantity("ns", "T_sam", gt=0)] = 100_000_000
+    instants_s: tuple[Annotated[float, quantity("s", "instant of a frame", ge=0)], ...] = ()
+    """Instants of the frames of an episode, in place of ``frames`` and ``sampling_period_ns``, which
+    follow from it. ``instants_ns`` and ``file:PATH.csv`` are read into it."""
+    episodes: Annotated[int, quantity("1", "episodes", ge=1)] = 1
+    seed: Annotated[int, quantity("1", "seed of everything random", ge=0, le=2**63 - 1)] = 1
+    pace: Literal["free", "realtime", "fast"] | Annotated[float, quantity("1", "", ge=1e-6, le=1e6)] = "free"
+    """When frames are released: ``free`` (``fast`` is its older name) as soon as they can be, ``realtime``
+    as simulated time passes, a number that many times as fast. Never is a frame skipped (clause 8)."""
+    record: tuple[str, ...] = ()
+    """Topics that are produced because they shall be recorded, though nobody else asks (clause 5):
+    ``lidar``, or with a part of it ``lidar.grid``."""
+    checkpoint_frames: Annotated[
+        int, quantity("frame", "after which services that can do so save their state; 0: never", ge=0)
+    ] = 20
+    frames_in_flight: Annotated[int, quantity("frame", "frames that may overlap at most", ge=1, le=64)] = 4
+    durability: Durability = "periodic"
+    """What a loss of power costs: ``frame`` at most the frame in progress, ``periodic`` at most
+    `caviar_protocol.files.SYNC_PERIOD_S` and a frame, ``none`` what the system had not written yet."""
+
+
+class DeviceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A device, or one on each of several objects.
+
+    With ``on`` the device is mounted: on the object of that name, or with ``*`` on up to
+    ``count`` of the matching objects, those that came first; when one leaves, the next gets a
+    device. A mounted device is named ``<object>/<name>``.
+    """
+
+    name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
+    kind: Literal["antenna", "lidar", "camera"]
+    on: str = ""
+    count: Annotated[int, quantity("1", "devices at most, with a pattern", ge=1)] = 1
+    mount: Literal["centre", "roof", "floor"] = "centre"
+    """What ``position_m`` is relative to: a point of the parent's bounding box."""
+    world: str = ""
+    """The world that publishes a device; needed where it cannot be told from ``on``."""
+    position_m: Vector3 = (0.0, 0.0, 0.0)
+    yaw_deg: Annotated[float, quantity("°", "counter-clockwise from +x")] = 0.0
+    pitch_deg: Annotated[float, quantity("°", "positive lowers the nose")] = 0.0
+    roll_deg: Annotated[float, quantity("°", "about +x")] = 0.0
+    # antenna
+    role: Literal["tx", "rx", "both", ""] = ""
+    array: AntennaArray | None = None
+    power_dbm: Annotated[float, quantity("dBm", "transmit power")] = 0.0
+    # lidar
+    beams: Annotated[int, quantity("1", "beams", ge=1, le=1024)] = 64
+    azimuth_steps: Annotated[int, quantity("1", "rays of a beam in a turn", ge=1, le=36000)] = 1800
+    elevation_deg: Annotated[tuple[float, float], quantity("°", "lowest and highest beam")] = (-25.0, 3.0)
+    range_m: Annotated[tuple[float, float], quantity("m", "nearest and farthest hit")] = (0.0, 100.0)
+    # camera
+    size_px: Annotated[tuple[int, int], quantity("px", "width, height")] = (640, 480)
+    field_of_view_deg: Annotated[float, quantity("°", "horizontal", gt=0, lt=180)] = 90.0
+
+
+class ServiceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One service of the run."""
+
+    unknown_key_hint: ClassVar[str] = "settings of the implementation stand in its table `settings`"
+
+    role: Role
+    use: str
+    """Registered implementation of that role; `REMOTE`: whatever the user starts and connects."""
+    budget_ms: Annotated[
+        float, quantity("ms", "wall time for a frame; misses are counted", gt=0, le=1e3 * LONGEST_S)
+    ]
+    policy: Policy = "wait"
+    max_in_flight: Annotated[
+        int, quantity("1", "grants queued; more than 1 only under wait", ge=1, le=64)
+    ] = 1
+    users: tuple[str, ...] = ()
+    """Agents: the receivers (or actuators) this agent owns, as patterns; empty: a default agent,
+    which serves whoever is left (clause 17)."""
+    settings: dict[str, Any] = {}
+
+    @property
+    def remote(self) -> bool:
+        """Whether the user starts this service, and not `caviar run`."""
+        return self.use == REMOTE
+
+
+class ReplaySpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a run repeats of a recorded one; `caviar replay` writes it."""
+
+    recording: Annotated[str, Meta(min_length=1)]
+    """Directory of the recorded run."""
+    served: tuple[str, ...] = ()
+    """Services whose products are the recorded ones; those that were held or absent are so again."""
+    imposed: tuple[str, ...] = ()
+    """Services that run again and take over their recorded decisions (contract, clause 6)."""
+    digest: str = ""
+    """Of the recorded run, as far as it is repeated."""
+
+
+class Scenario(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A whole scenario file."""
+
+    not_in_file: ClassVar[tuple[str, ...]] = ("source",)
+
+    run: Run
+    services: dict[str, ServiceSpec]
+    timeouts: Timeouts = Timeouts()
+    limits: Limits = Limits()
+    carriers: tuple[Carrier, ...] = ()
+    devices: tuple[DeviceSpec, ...] = ()
+    replay: ReplaySpec | None = None
+    source: Source = Source()
+    """Where this was read from, so that whatever turns out wrong later can name the line."""
+
+
+PATTERNS = "patterns/"
+"""What the names of assets begin with that are patterns of antenna elements."""
+
+_HEIGHT = {"centre": 0.0, "roof": 0.5, "floor": -0.5}
+"""Mount point along z, in heights of the object's bounding box from its centre."""
+
+
+def carries(spec: DeviceSpec, name: str) -> bool:
+    """Whether the device may be mounted on the object ``name``."""
+    # The whole name comes first: names of objects may hold brackets, which are special in patterns.
+    return name == spec.on or owned_by((spec.on,), name)
+
+
+def fixed_device(spec: DeviceSpec) -> Device:
+    """The device of a scenario that stands in the world, without ``on``."""
+    return _device(spec, spec.name, "", 0.0)
+
+
+def mounted_device(spec: DeviceSpec, parent: str, dimensions: Vector) -> Device:
+    """The device of a scenario on the object ``parent`` with a bounding box of ``dimensions`` [m]."""
+    return _device(spec, f"{parent}/{spec.name}", parent, dimensions[2])
+
+
+def pattern_asset(path: str) -> str:
+    """Name of the asset that a pattern file of a scenario travels as."""
+    return f"{PATTERNS}{PurePath(path).name}"
+
+
+def _published(array: AntennaArray) -> AntennaArray:
+    """An array of a scenario as it is in a scene: its pattern file by the name of the asset."""
+    if not array.pattern_file:
+        return array
+    return msgspec.structs.replace(array, pattern_file=pattern_asset(array.pattern_file))
+
+
+def _device(spec: DeviceSpec, name: str, parent: str, height: float) -> Device:
+    x, y, z = spec.position_m
+    position = (x, y, z + _HEIGHT[spec.mount] * height)
+    orientation = quaternion_from_euler(
+        math.radians(spec.yaw_deg), math.radians(spec.pitch_deg), math.radians(spec.roll_deg)
+    )
+    match spec.kind:
+        case "antenna":
+            if not spec.role:
+                raise ScenarioError(
+                    f'antenna {spec.name!r} lacks its role; write role = "tx", "rx" or "both"', key="devices"
+                )
+            return AntennaDevice(
+                name=name,
+                parent=parent,
+                position=position,
+                orientation=orientation,
+                role=spec.role,
+                array=_published(spec.array or AntennaArray()),
+                power_dbm=spec.power_dbm,
+            )
+        case "lidar":
+            return LidarDevice(
+                name=name,
+                parent=parent,
+                position=position,
+                orientation=orientation,
+                beams=spec.beams,
+                azimuth_steps=spec.azimuth_steps,
+                elevation_min=math.radians(spec.elevation_deg[0]),
+                elevation_max=math.radians(spec.elevation_deg[1]),
+                min_range=spec.range_m[0],
+                max_range=spec.range_m[1],
+            )
+        case "camera":
+            return CameraDevice(
+                name=name,
+                parent=parent,
+                position=position,
+                orientation=orientation,
+                width=spec.size_px[0],
+                height=spec.size_px[1],
+                field_of_view=math.radians(spec.field_of_view_deg),
+            )
+
+
+def owned_by(patterns: Iterable[str], name: str) -> bool:
+    """Whether one of the patterns, with ``*`` and ``?``, matches a name (clause 17)."""
+    return any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)

@@ -1,0 +1,209 @@
+"""TOML from elsewhere in bounded time and memory, and the line of every key.
+
+`tomllib` recurses for every level, so that a few kilobytes of brackets end in a `RecursionError`, and takes
+time quadratic in the parts of a dotted key. What no scenario needs is refused before. It does not keep line
+numbers either: a scanner finds where the keys of an accepted document stand.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from typing import Any
+
+MAX_SIZE = 1 << 20
+"""Characters of a file."""
+MAX_DEPTH = 32
+"""Levels of arrays and tables, and parts of a dotted key."""
+
+_STRING_OR_COMMENT = re.compile(
+    r'"""(?:\\.|[^\\])*?"""|' + r"'''.*?'''|" + r'"(?:\\.|[^"\\\n])*"|' + r"'[^'\n]*'|#[^\n]*", re.DOTALL
+)
+_BRACKET = re.compile(r"[][{}]")
+_PART = r'(?:[\w-]++|"")'
+_LONG_WORD = re.compile(r"\w{1000}")
+"""A number of so many digits takes quadratic time to be read, and to be printed."""
+_LONG_KEY = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*\.[ \t]*{_PART}){{{MAX_DEPTH}}}")
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """The table that TOML text is.
+
+    Raises `tomllib.TOMLDecodeError`, whose text ends with the line where one is known, for what is no TOML,
+    larger than `MAX_SIZE`, deeper than `MAX_DEPTH`, or has a number of a thousand digits.
+    """
+    if len(text) > MAX_SIZE:
+        raise tomllib.TOMLDecodeError(f"{len(text)} characters, of which a file may have {MAX_SIZE}")
+    # Strings keep their lines, so that places stay right.
+    bare = _STRING_OR_COMMENT.sub(lambda found: '""' + "\n" * found[0].count("\n"), text)
+    depth = 0
+    for bracket in _BRACKET.finditer(bare):
+        depth += 1 if bracket[0] in "[{" else -1
+        if depth > MAX_DEPTH:
+            raise _refused(f"arrays and tables are nested in more than {MAX_DEPTH} levels", bare, bracket)
+    if (key := _LONG_KEY.search(bare)) is not None:
+        raise _refused(f"a key has more than {MAX_DEPTH} parts", bare, key)
+    if (word := _LONG_WORD.search(bare)) is not None:
+        raise _refused("a number or a key has more than 1000 characters", bare, word)
+    return tomllib.loads(text)
+
+
+def _refused(what: str, text: str, found: re.Match[str]) -> tomllib.TOMLDecodeError:
+    line = text.count("\n", 0, found.start()) + 1
+    column = found.start() - text.rfind("\n", 0, found.start())
+    return tomllib.TOMLDecodeError(f"{what} (at line {line}, column {column})")
+
+
+KeyPath = tuple[str | int, ...]
+"""Keys and array indices from the root of a document: ``("devices", 0, "array", "rows")``."""
+
+_BLANK = re.compile(r"(?:[ \t\r\n]|#[^\n]*)*")
+_SPACE = re.compile(r"[ \t]*")
+_BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
+_BARE_VALUE = re.compile(r"[^,\]}#\r\n]+")
+_STRING = re.compile(
+    r'"""(?:\\.|[^\\])*?"{3,5}(?!")'  # multi-line basic; may end in up to two quotes of its own
+    r"|'''.*?'{3,5}(?!')"
+    r'|"(?:\\.|[^"\\\n])*"'
+    r"|'[^'\n]*'",
+    re.DOTALL,
+)
+
+
+def dotted(path: KeyPath) -> str:
+    """A key path as people write it: ``devices[0].array.rows``."""
+    text = ""
+    for part in path:
+        if isinstance(part, int):
+            text += f"[{part}]"
+        else:
+            name = part if _BARE_KEY.fullmatch(part) else f'"{part}"'
+            text += f".{name}" if text else name
+    return text
+
+
+def key_lines(text: str) -> dict[KeyPath, int]:
+    """The 1-based line of every key, table and array element of a valid TOML document."""
+    return _Scanner(text).scan()
+
+
+class _Scanner:
+    """One pass over a document. ``at`` is the position of the next character to read."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+        self.at = 0
+        self.line = 1
+        self.counted = 0
+        self.lines: dict[KeyPath, int] = {}
+        self.elements: dict[KeyPath, int] = {}
+        """Index of the last table of each array of tables."""
+
+    def scan(self) -> dict[KeyPath, int]:
+        table: KeyPath = ()
+        while True:
+            self.skip(_BLANK)
+            if self.at == len(self.text):
+                return self.lines
+            if self.text[self.at] == "[":
+                table = self.header()
+            else:
+                self.key_value(table)
+
+    def skip(self, pattern: re.Pattern[str]) -> str:
+        match = pattern.match(self.text, self.at)
+        if match is None:
+            raise ValueError(f"not a TOML document: stopped at line {self.current_line()}")
+        self.at = match.end()
+        return match.group()
+
+    def current_line(self) -> int:
+        self.line += self.text.count("\n", self.counted, self.at)
+        self.counted = self.at
+        return self.line
+
+    def note(self, path: KeyPath) -> None:
+        """Record the line of a path, and of each of its parents not seen before."""
+        line = self.current_line()
+        for depth in range(1, len(path) + 1):
+            self.lines.setdefault(path[:depth], line)
+
+    def header(self) -> KeyPath:
+        is_array = self.text.startswith("[[", self.at)
+        self.at += 2 if is_array else 1
+        keys = self.key()
+        path: KeyPath = ()
+        for depth, key in enumerate(keys, 1):
+            path = (*path, key)
+            if is_array and depth == len(keys):
+                self.elements[path] = self.elements.get(path, -1) + 1
+            if path in self.elements:
+                path = (*path, self.elements[path])
+        self.note(path)
+        self.at += 2 if is_array else 1
+        return path
+
+    def key(self) -> tuple[str, ...]:
+        """A possibly dotted key, up to the ``=`` or ``]`` behind it."""
+        parts: list[str] = []
+        while True:
+            self.skip(_SPACE)
+            if self.text[self.at] in "\"'":
+                parts.append(_unquoted(self.skip(_STRING)))
+            else:
+                parts.append(self.skip(_BARE_KEY))
+            self.skip(_SPACE)
+            if self.text[self.at] != ".":
+                return tuple(parts)
+            self.at += 1
+
+    def key_value(self, table: KeyPath) -> None:
+        path: KeyPath = (*table, *self.key())
+        self.note(path)
+        self.at += 1  # the equals sign
+        self.skip(_SPACE)
+        self.value(path)
+
+    def value(self, path: KeyPath) -> None:
+        match self.text[self.at]:
+            case "[":
+                self.array(path)
+            case "{":
+                self.inline_table(path)
+            case '"' | "'":
+                self.skip(_STRING)
+            case _:
+                self.skip(_BARE_VALUE)
+
+    def array(self, path: KeyPath) -> None:
+        self.at += 1
+        index = 0
+        while True:
+            self.skip(_BLANK)
+            if self.text[self.at] == "]":
+                self.at += 1
+                return
+            element = (*path, index)
+            self.note(element)
+            self.value(element)
+            self.skip(_BLANK)
+            if self.text[self.at] == ",":
+                self.at += 1
+            index += 1
+
+    def inline_table(self, path: KeyPath) -> None:
+        self.at += 1
+        while True:
+            self.skip(_BLANK)
+            if self.text[self.at] == "}":
+                self.at += 1
+                return
+            self.key_value(path)
+            self.skip(_BLANK)
+            if self.text[self.at] == ",":
+                self.at += 1
+
+
+def _unquoted(raw: str) -> str:
+    parsed: dict[str, Any] = tomllib.loads(f"key = {raw}")
+    return str(parsed["key"])

@@ -1,0 +1,179 @@
+"""Which beam of a DFT codebook points where, for arrays of one or several panels and polarizations.
+
+`Link` defines the beams by their index. An array is a set of uniform subarrays: the elements of one panel and
+one polarization. Elements and beams are both in order of the subarrays, so whatever is known of uniform
+arrays holds for each of these blocks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import msgspec
+import numpy as np
+
+from caviar_protocol.arrays import Float64Array
+from caviar_protocol.space.coordinates import (
+    UnitQuaternion,
+    Vector,
+    quaternion_from_euler,
+    rotation_matrix,
+    unrotated,
+)
+from caviar_protocol.topics.scene import AntennaArray, Panel
+
+
+def straight_beams(
+    transmit: AntennaArray, towards_rx: Sequence[float], receive: AntennaArray, towards_tx: Sequence[float]
+) -> tuple[int, int]:
+    """Beams of two arrays along the straight line between them; directions in the axes of each device.
+
+    Of dual polarizations those that couple best between upright devices.
+    """
+    sent = taken = 0
+    if not (transmit.is_uniform and receive.is_uniform):
+        sent, taken = coupled_polarizations(transmit, receive)
+    return beam_towards(transmit, towards_rx, sent), beam_towards(receive, towards_tx, taken)
+
+
+def beam_towards(array: AntennaArray, direction: Sequence[float], polarization: int = 0) -> int:
+    """Beam with the greatest ``|c_k* a(k̂)|`` towards a direction, a unit vector in device axes.
+
+    Of several panels the one that faces the direction most is taken, of dual polarizations the one of index
+    ``polarization``.
+
+    Along one axis of N elements with a spacing of d wavelengths, and u the direction's cosine,
+    ``|c_k* a| = |sin(πNv)| / (sqrt(N)·|sin πv|)`` with ``v = d·u − k/N`` (Tse and Viswanath, section
+    7.3.4). The numerator is the same for all k, so the best k is the one nearest to N·d·u, modulo N:
+    wrapped beams, end-fire directions and grating lobes need no special cases. Of two beams with equal
+    gain the one of lower index is taken.
+    """
+    if array.is_uniform:
+        return _uniform_beam(array, direction)
+    mine = subarrays(array)[polarization :: len(array.polarizations)]
+    faced = max(mine, key=lambda part: part.towards(direction)[0])
+    return faced.first + _uniform_beam(faced.array, faced.towards(direction))
+
+
+def _uniform_beam(array: AntennaArray, direction: Sequence[float]) -> int:
+    _, y, z = direction
+    column = _nearest(array.columns, array.horizontal_spacing * y)
+    row = _nearest(array.rows, -array.vertical_spacing * z)  # rows count from +z to −z
+    return column * array.rows + row
+
+
+def _nearest(size: int, turns: float) -> int:
+    """The k of 0 … size − 1 with the least ``|turns − k/size|`` modulo 1."""
+    exact = size * turns
+    below = math.ceil(exact - 0.5)
+    is_tie = exact - below == 0.5
+    beam = below % size
+    return 0 if is_tie and beam == size - 1 else beam
+
+
+def beam_gain(array: AntennaArray, beam: int, directions: Float64Array) -> Float64Array:
+    """Amplitude of a beam towards unit vectors in device axes, 1 at its greatest; ``[..., 3]`` to ``[...]``.
+
+    The array factor ``|sin(πNv)| / (N·|sin πv|)`` of `beam_towards` over columns times that over rows, of
+    the beam's own subarray.
+    """
+    if not array.is_uniform:
+        part, beam = subarray_of(array, beam)
+        turned = rotation_matrix(part.orientation)
+        array, directions = part.array, directions @ turned
+    column, row = divmod(beam, array.rows)
+    gain: Float64Array = _factor(
+        array.columns, array.horizontal_spacing * directions[..., 1] - column / array.columns
+    ) * _factor(array.rows, -array.vertical_spacing * directions[..., 2] - row / array.rows)
+    return gain
+
+
+def subarray_of(array: AntennaArray, beam: int) -> tuple[Subarray, int]:
+    """The subarray that a beam is of, and the beam's index in its codebook."""
+    number, own = divmod(beam, array.rows * array.columns)
+    return subarrays(array)[number], own
+
+
+def _factor(size: int, v: Float64Array) -> Float64Array:
+    v = v - np.round(v)
+    sine = np.sin(np.pi * v)
+    peak = np.abs(sine) < 1e-9
+    factor: Float64Array = np.where(
+        peak, 1.0, np.abs(np.sin(np.pi * size * v)) / (size * np.abs(np.where(peak, 1.0, sine)))
+    )
+    return factor
+
+
+@dataclass(frozen=True)
+class Subarray:
+    """All elements of one panel and one polarization."""
+
+    array: AntennaArray
+    """A uniform array (`AntennaArray.is_uniform`)."""
+    first: int
+    """Index of its first element among those of the whole array, and of its first beam among all beams."""
+    position: Vector
+    """Of its centre in the device's axes [m]."""
+    orientation: UnitQuaternion
+    """Rotates its axes into the device's."""
+
+    @property
+    def elements(self) -> slice:
+        """Its elements, or its beams, among those of the whole array."""
+        return slice(self.first, self.first + self.array.size)
+
+    def towards(self, direction: Sequence[float]) -> Vector:
+        """A direction in the device's axes, in those of the subarray."""
+        x, y, z = direction
+        return unrotated(self.orientation, (x, y, z))
+
+
+@lru_cache(maxsize=256)
+def subarrays(array: AntennaArray) -> tuple[Subarray, ...]:
+    """The subarrays of an array: panels in their order, within each the polarizations."""
+    found = []
+    first = 0
+    for panel in array.panels or (Panel(),):
+        turned = (math.radians(panel.yaw_deg), math.radians(panel.pitch_deg), math.radians(panel.roll_deg))
+        for polarization in array.polarizations:
+            part = array
+            if not array.is_uniform:
+                part = msgspec.structs.replace(array, polarization=polarization, panels=())
+            found.append(Subarray(part, first, panel.position_m, quaternion_from_euler(*turned)))
+            first += part.size
+    return tuple(found)
+
+
+@lru_cache(maxsize=64)
+def coupled_polarizations(transmit: AntennaArray, receive: AntennaArray) -> tuple[int, int]:
+    """Polarizations, by their indices, that couple best between upright devices that face each other.
+
+    Of equal ones the first. A slant of +45° is one of −45° seen from the other side, so the first
+    elements of two ``cross`` arrays do not hear each other; those of two ``circular`` arrays do.
+    """
+    pairs = [(t, r) for t in range(len(transmit.polarizations)) for r in range(len(receive.polarizations))]
+
+    def coupling(pair: tuple[int, int]) -> float:
+        sent, taken = jones(transmit.polarizations[pair[0]]), jones(receive.polarizations[pair[1]])
+        return round(abs(sent[0] * taken[0] - sent[1] * taken[1]), 9)
+
+    return max(pairs, key=coupling)  # the first of equal ones
+
+
+def jones(polarization: str) -> tuple[complex, complex]:
+    """Field of an element along θ̂ and φ̂, as parts of the amplitude of its pattern.
+
+    Linear ones are those of model 2 of 3GPP TR 38.901, section 7.3.2, (cos ζ, sin ζ) at a slant of ζ.
+    Circular ones follow IEEE Std 145 for waves exp(+j2πft): looking along the wave, RHCP turns clockwise.
+    """
+    if polarization == "V":
+        return 1.0, 0.0
+    if polarization == "H":
+        return 0.0, 1.0
+    part = math.sqrt(0.5)
+    return {"-45": (part, -part), "+45": (part, part), "RHCP": (part, -1j * part), "LHCP": (part, 1j * part)}[
+        polarization
+    ]

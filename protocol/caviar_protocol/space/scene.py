@@ -1,0 +1,166 @@
+"""Scenes of several worlds as one, where things are in it, and who could talk to whom (contract, clause 3).
+
+A *pair* is a transmitting and a receiving device of the scene. A device that both transmits and receives is
+no pair with itself.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from caviar_protocol.arrays import Float64Array
+from caviar_protocol.errors import PayloadError
+from caviar_protocol.space.coordinates import Pose, Vector, compose, unrotated
+from caviar_protocol.topics.scene import AntennaDevice, Device, Scene
+
+
+def merge_scenes(scenes: Mapping[str, Scene]) -> Scene:
+    """The union of the scenes of all worlds, keyed by source, sorted by name.
+
+    Raises `PayloadError` naming the object and both worlds where a name occurs twice.
+    """
+    if len(scenes) == 1:
+        return next(iter(scenes.values()))
+    owner: dict[str, str] = {}
+    for source, scene in scenes.items():
+        for name in (*scene.names, *(device.name for device in scene.devices)):
+            if name in owner:
+                raise PayloadError(
+                    f"{name!r} comes from both world {owner[name]!r} and world {source!r}; "
+                    "give their objects different prefixes"
+                )
+            owner[name] = source
+    parts = list(scenes.values())
+    names = [name for scene in parts for name in scene.names]
+    order = sorted(range(len(names)), key=names.__getitem__)
+    classes = [item for scene in parts for item in scene.classes]
+    assets = [item for scene in parts for item in scene.assets]
+
+    def joined(field: str) -> Float64Array:
+        stacked: Float64Array = np.concatenate([getattr(scene, field) for scene in parts])
+        return stacked[order]
+
+    turning = None
+    if any(scene.angular_velocity is not None for scene in parts):
+        known = [(scene.angular_velocity, np.zeros_like(scene.velocity)) for scene in parts]
+        turning = np.concatenate([still if turns is None else turns for turns, still in known])[order]
+    return Scene(
+        names=tuple(names[i] for i in order),
+        classes=tuple(classes[i] for i in order),
+        assets=tuple(assets[i] for i in order),
+        position=joined("position"),
+        orientation=joined("orientation"),
+        velocity=joined("velocity"),
+        dimensions=joined("dimensions"),
+        devices=tuple(sorted((d for scene in parts for d in scene.devices), key=lambda device: device.name)),
+        angular_velocity=turning,
+    )
+
+
+def object_pose(scene: Scene, index: int) -> Pose:
+    """World pose of an object by index."""
+    x, y, z = scene.position[index].tolist()
+    w, qx, qy, qz = scene.orientation[index].tolist()
+    return Pose((x, y, z), (w, qx, qy, qz))
+
+
+def device_pose(scene: Scene, device: Device) -> Pose:
+    """World pose of a device: its mount pose on top of its parent's pose.
+
+    Raises `PayloadError` where the parent is not in the scene.
+    """
+    # Channel, link and agent ask for the same poses: what was composed is kept with the scene.
+    known: dict[str, tuple[Device, Pose]] = scene.__dict__.setdefault("_poses", {})
+    entry = known.get(device.name)
+    if entry is not None and entry[0] is device:
+        return entry[1]
+    pose = Pose(device.position, device.orientation)
+    if device.parent:
+        pose = compose(object_pose(scene, _parent_index(scene, device)), pose)
+    known[device.name] = device, pose
+    return pose
+
+
+def device_velocity(scene: Scene, device: Device) -> Float64Array:
+    """Velocity [m/s] of a device in world axes, Shape ``[3]``: that of its parent, at the device's place."""
+    if not device.parent:
+        return np.zeros(3)
+    index = _parent_index(scene, device)
+    velocity: Float64Array = scene.velocity[index]
+    if scene.angular_velocity is None:
+        return velocity
+    arm = np.array(device_pose(scene, device).position) - scene.position[index]
+    return velocity + np.cross(scene.angular_velocity[index], arm)
+
+
+_antennas: dict[str, tuple[tuple[Device, ...], list[AntennaDevice]]] = {}
+"""Of the last scene, by role: the devices of one frame mostly are those of the next."""
+
+
+def antennas(scene: Scene, role: str) -> Sequence[AntennaDevice]:
+    """Antenna devices that transmit (``"tx"``) or receive (``"rx"``), sorted by name."""
+    known = _antennas.get(role)
+    if known is None or known[0] is not scene.devices:
+        found = (d for d in scene.devices if isinstance(d, AntennaDevice) and d.role in (role, "both"))
+        known = scene.devices, sorted(found, key=lambda device: device.name)
+        _antennas[role] = known
+    return known[1]
+
+
+def _parent_index(scene: Scene, device: Device) -> int:
+    try:
+        return scene.names.index(device.parent)
+    except ValueError:
+        raise PayloadError(
+            f"device {device.name!r} is mounted on {device.parent!r}, which is not in the scene"
+        ) from None
+
+
+BORESIGHT: Vector = (1.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A transmitter and a receiver."""
+
+    tx: AntennaDevice
+    rx: AntennaDevice
+
+
+def pairs_of(scene: Scene) -> list[Pair]:
+    """All pairs of the scene, sorted by TX, then RX."""
+    receivers = antennas(scene, "rx")
+    return [Pair(tx, rx) for tx in antennas(scene, "tx") for rx in receivers if rx.name != tx.name]
+
+
+def directions(scene: Scene, pairs: Sequence[Pair]) -> tuple[list[Vector], list[Vector]]:
+    """Direction of RX from TX in the TX device's axes, and of TX from RX in the RX device's axes.
+
+    Unit vectors, one of each for every pair. Two devices at one point see each other at boresight.
+    """
+    # Link and agent ask for the same pairs: what was computed is kept with the scene.
+    known: dict[tuple[str, str], tuple[Pair, Vector, Vector]] = scene.__dict__.setdefault("_directions", {})
+    at_tx, at_rx = [], []
+    for pair in pairs:
+        names = pair.tx.name, pair.rx.name
+        entry = known.get(names)
+        if entry is None or entry[0].tx is not pair.tx or entry[0].rx is not pair.rx:
+            entry = known[names] = (pair, *_along(scene, pair))
+        at_tx.append(entry[1])
+        at_rx.append(entry[2])
+    return at_tx, at_rx
+
+
+def _along(scene: Scene, pair: Pair) -> tuple[Vector, Vector]:
+    tx, rx = device_pose(scene, pair.tx), device_pose(scene, pair.rx)
+    (x0, y0, z0), (x1, y1, z1) = tx.position, rx.position
+    dx, dy, dz = x1 - x0, y1 - y0, z1 - z0
+    length = math.hypot(dx, dy, dz)
+    if length == 0:
+        return BORESIGHT, BORESIGHT
+    dx, dy, dz = dx / length, dy / length, dz / length
+    return unrotated(tx.orientation, (dx, dy, dz)), unrotated(rx.orientation, (-dx, -dy, -dz))
