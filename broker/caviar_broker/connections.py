@@ -6,13 +6,13 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from caviar_broker.assets import AssetExchange
 from caviar_broker.core import events as ev
 from caviar_broker.core.clock import FrameClock
-from caviar_broker.grumbles import Grumbles
-from caviar_broker.loop import Loop
-from caviar_broker.port import Port, is_assigned
-from caviar_broker.scenery import SceneryDesk
-from caviar_broker.watchdog import Watchdog
+from caviar_broker.event_loop import EventLoop
+from caviar_broker.router import Router, is_assigned
+from caviar_broker.security.limits import NoticeThrottle
+from caviar_broker.supervision import Watchdog
 from caviar_protocol import messages as m
 from caviar_protocol.codec import encode_message, message_type
 from caviar_protocol.errors import ProtocolError, VersionError
@@ -58,10 +58,10 @@ class Connections:
 
     clock: FrameClock
     epoch: int
-    port: Port
-    loop: Loop
+    port: Router
+    loop: EventLoop
     watchdog: Watchdog
-    scenery: SceneryDesk
+    scenery: AssetExchange
     feed: Callable[[ev.Event], None]
     perform: Callable[[], None]
     note: Callable[[str, str, str], None]
@@ -72,7 +72,7 @@ class Connections:
 
     def __post_init__(self) -> None:
         self._guard = self.port.guard
-        self._grumbles = Grumbles()
+        self._grumbles = NoticeThrottle()
         self._host = host_identity()
         self._replying = b""
         """Whose HELLO the clock looks at."""

@@ -14,9 +14,9 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from caviar_broker.aside import call_aside
 from caviar_broker.core.events import Journal
-from caviar_broker.core.resumption import Snapshot
+from caviar_broker.core.run import Snapshot
+from caviar_broker.event_loop import call_with_timeout
 from caviar_broker.journal import JournalFile
 from caviar_protocol.errors import RunError
 from caviar_protocol.files import SYNC_PERIOD_S, Durability
@@ -110,7 +110,7 @@ class JournalWriter:
 
     def close(self) -> bool:
         """Put everything on the disk; False where it takes nothing for `END_S`."""
-        return call_aside(self._end, END_S)
+        return call_with_timeout(self._end, END_S)
 
     def _end(self) -> None:
         with self._clean:

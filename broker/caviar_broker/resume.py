@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from caviar_broker.checkpoints import CheckpointFiles
+from caviar_broker.core.decisions import Decision, Task
 from caviar_broker.core.events import Product
-from caviar_broker.core.resumption import Resumption
-from caviar_broker.core.tasks import Decision, Task
+from caviar_broker.core.run import Resumption
 from caviar_broker.core.transitions import TaskState
+from caviar_broker.journal import CheckpointFiles
 from caviar_broker.journal_format import JournalEntry, JournalReader
 from caviar_protocol.digest import RunDigest, payload_digest
 from caviar_protocol.errors import RecordingError
@@ -26,7 +26,7 @@ _STATES = {
 
 
 @dataclass(frozen=True)
-class Left:
+class ResumeState:
     """What another broker left of a run."""
 
     resumption: Resumption | None
@@ -41,7 +41,7 @@ class Left:
 
 def read_resumption(
     journal: Path, checkpoints: CheckpointFiles, recorded: tuple[int, int] | None = None
-) -> Left:
+) -> ResumeState:
     """The run up to the last frame that was finished and, where there is a recording, is in it.
 
     Parameters
@@ -67,7 +67,7 @@ def read_resumption(
         losses.append(f"{reader.problem}; {reader.lost} B behind it are lost, and the run goes on with {at}")
     if found.is_cut:
         losses.append(f"the recording ends before {at}: what the journal has from there on is run again")
-    return Left(resumption, end, tuple(losses), found.is_cut)
+    return ResumeState(resumption, end, tuple(losses), found.is_cut)
 
 
 class _Reader:

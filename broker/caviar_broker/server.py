@@ -14,22 +14,21 @@ from typing import Any, Protocol
 
 import zmq
 
+from caviar_broker.assets import AssetExchange, AssetTransfers
 from caviar_broker.connections import COMPLAINTS, Connections
 from caviar_broker.core import events as ev
 from caviar_broker.core.clock import FrameClock
 from caviar_broker.core.plan import RunPlan
-from caviar_broker.core.resumption import Resumption
+from caviar_broker.core.run import Resumption
 from caviar_broker.core.transitions import RunState
+from caviar_broker.event_loop import EventLoop, Standby
 from caviar_broker.journal import JournalFile
 from caviar_broker.journal_writer import JournalWriter
-from caviar_broker.loop import Loop
-from caviar_broker.port import Port
-from caviar_broker.scenery import SceneryDesk, SceneryExchange
+from caviar_broker.router import Router
 from caviar_broker.security.access import Access
-from caviar_broker.security.guard import PeerLimits
-from caviar_broker.standby import Standby
+from caviar_broker.security.limits import PeerLimits
 from caviar_broker.statistics import Statistics
-from caviar_broker.watchdog import CHECK_NS, Watchdog
+from caviar_broker.supervision import CHECK_NS, Watchdog
 from caviar_protocol import messages as m
 from caviar_protocol.assets import AssetStore
 from caviar_protocol.codec import check_parts, decode_message, encode_message
@@ -113,8 +112,8 @@ class BrokerServer:
         self._disk_told = 0.0
         """[s] for which the disk had taken nothing when that was told; 0: it takes what comes."""
         self._sign = SignOfLife()
-        self._scenery = SceneryDesk(
-            exchange=SceneryExchange(store or AssetStore()),
+        self._scenery = AssetExchange(
+            exchange=AssetTransfers(store or AssetStore()),
             clock=self.clock,
             feed=self.feed,
             reply=self._reply,
@@ -133,7 +132,7 @@ class BrokerServer:
         self._next_check = self._look_at = 0
         self._budgets_are_long = not plan.realtime and all(s.budget_ns >= LONG_NS for s in plan.services)
         self._unhurried = False
-        self._port = Port(endpoint, plan.limits.liveness, access, peer_limits)
+        self._port = Router(endpoint, plan.limits.liveness, access, peer_limits)
         self._guard = self._port.guard
         self.access = access
         """The keys of those who may take part; None: every process of this machine may."""
@@ -141,7 +140,7 @@ class BrokerServer:
         """Whether the disk took all of the journal by the end of the run."""
         self.endpoint = self._port.endpoint
         """Where services connect to."""
-        self.loop = Loop()
+        self.loop = EventLoop()
         """Others may have descriptors watched by it."""
         self.loop.watch(self._port.socket, self._receive_all)
         self._journal = JournalWriter(journal, durability, sync_recording)

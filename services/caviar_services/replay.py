@@ -41,7 +41,7 @@ class Replayer(Service[ReplaySettings]):
     """One recorded service: its products, decisions and counts, and where an agent, the ends of episodes.
 
     Frames are found by episode and number, so that a run which leaves some out gets the others as they
-    were. What was held or absent is told by the broker (`caviar_broker.replaying`), with the recorded cause.
+    were. What was held or absent is told by the broker (`caviar_broker.recordings`), with the recorded cause.
     """
 
     Settings = ReplaySettings

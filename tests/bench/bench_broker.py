@@ -34,8 +34,8 @@ from typing import Any
 
 import zmq
 
+from caviar_broker.bench.client import deliveries
 from caviar_broker.bench.run import WARM_UP
-from caviar_broker.bench.topology import deliveries
 
 HEADER = bytes(60)
 """Stands for what the broker tells with each product."""

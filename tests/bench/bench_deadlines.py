@@ -27,11 +27,11 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import zmq
 
-from caviar_broker.__main__ import tune_collector
 from caviar_broker.core import events as ev
 from caviar_broker.core.plan import SECOND, RunPlan, ServicePlan
+from caviar_broker.event_loop import prefer
 from caviar_broker.journal import JournalFile
-from caviar_broker.scheduling import prefer
+from caviar_broker.launch import tune_garbage_collector
 from caviar_broker.server import BrokerServer
 from caviar_broker.statistics import Statistics
 from caviar_protocol import messages as m
@@ -105,7 +105,7 @@ def measure(frames: int, budget_ms: float) -> np.ndarray:
     )
     with TemporaryDirectory() as folder, closing(JournalFile(Path(folder) / "journal", 1)) as journal:
         server = BrokerServer(plan, "tcp://127.0.0.1:0", journal, _Silent(), AssetStore(Path(folder) / "a"))
-        tune_collector()
+        tune_garbage_collector()
         started = [
             subprocess.Popen([sys.executable, __file__, "--client", name, str(delay), server.endpoint])
             for name, delay in {"world": 0.0, **dict.fromkeys(SENSORS, 1.5e-3 * budget_ms)}.items()

@@ -22,10 +22,9 @@ from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
-from caviar_broker.checkpoints import CheckpointFiles
 from caviar_broker.core.events import Journal, Product
-from caviar_broker.core.resumption import Snapshot
-from caviar_broker.journal import JournalFile
+from caviar_broker.core.run import Snapshot
+from caviar_broker.journal import CheckpointFiles, JournalFile
 from caviar_broker.journal_writer import JournalWriter
 from caviar_broker.resume import read_resumption
 from caviar_protocol.digest import RunDigest, payload_digest

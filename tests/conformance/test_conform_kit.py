@@ -205,7 +205,7 @@ def test_python_in_a_command_is_the_one_that_runs_where_no_environment_is_activa
 
 
 def test_what_the_gateway_says_of_a_client_is_shown_with_the_verdicts() -> None:
-    from caviar_broker.api.front import gateway_in_front
+    from caviar_broker.http.process import gateway_in_front
 
     script = (
         "import struct, sys; from websockets.sync.client import connect; "

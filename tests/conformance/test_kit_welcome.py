@@ -7,10 +7,9 @@ from typing import Any
 
 import pytest
 
-from caviar_broker.briefing import briefings, with_ownership
 from caviar_broker.core import events as ev
 from caviar_broker.core.clock import FrameClock
-from caviar_broker.core.plan import plan_run
+from caviar_broker.core.plan import briefings, plan_run, with_ownership
 from caviar_clients.conform import session as kit
 from caviar_clients.conform.packing import pack, unpack
 from caviar_clients.conform.session import Rules, Seen, Session

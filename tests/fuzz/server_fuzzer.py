@@ -30,7 +30,7 @@ from decoder_fuzzer import PROGRESS_S, Mutator, seeds
 from caviar_broker.core import events as ev
 from caviar_broker.core.plan import SECOND, RunPlan, ServicePlan
 from caviar_broker.journal import JournalFile
-from caviar_broker.security.guard import PeerLimits
+from caviar_broker.security.limits import PeerLimits
 from caviar_broker.server import BrokerServer
 from caviar_broker.statistics import Statistics
 from caviar_protocol import messages as m

@@ -31,7 +31,7 @@ from pathlib import Path
 
 from scenarios_support import SCENARIOS, Finished, caviar, marked, run, running
 
-from caviar_broker.deskplace import ask
+from caviar_broker.control.socket import ask
 from caviar_broker.journal_format import read_journal
 from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.files import SYNC_PERIOD_S

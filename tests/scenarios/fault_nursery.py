@@ -31,7 +31,7 @@ import msgspec
 IMPORTED = (
     "fault_kinds",
     "stateful",
-    "caviar_broker.__main__",
+    "caviar_broker.launch",
     "caviar_clients.cli.launch",
     "caviar_services.__main__",
     "caviar_services.agent.los_beam",
@@ -177,7 +177,7 @@ def _become(command: list[str], fds: list[int], session: bool, env: Mapping[str,
 def _run(module: str, arguments: list[str]) -> int:
     import fault_kinds
 
-    import caviar_broker.__main__ as broker
+    import caviar_broker.launch as broker
     import caviar_services.__main__ as services
 
     sys.argv = [module, *arguments]

@@ -30,7 +30,7 @@ from typing import Any
 
 from scenarios_support import SCENARIOS, caviar, environment
 
-from caviar_broker.deskplace import ask
+from caviar_broker.control.socket import ask
 from caviar_protocol.errors import RunError
 from caviar_protocol.scenario import load_scenario
 

@@ -16,7 +16,7 @@ import pytest
 from node_project import node_project
 from scenarios_support import ROOT, environment, eventually, recorded_below, running, scenario_file
 
-from caviar_broker.deskplace import ask
+from caviar_broker.control.socket import ask
 from caviar_protocol.errors import RunError
 
 HERE = Path(__file__).parent

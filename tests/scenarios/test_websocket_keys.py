@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from api_harness import Peer
+from http_harness import Peer
 from scenarios_support import SCENARIOS, caviar, running, scenario_file
 from test_websocket_agent import FRAMES, WITHIN_S, WebRun, over_zeromq, python_agent
 from websockets.exceptions import ConnectionClosed

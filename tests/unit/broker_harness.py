@@ -13,9 +13,9 @@ from typing import Any, TypeVar
 
 import zmq
 
+from caviar_broker.control.server import ControlServer
 from caviar_broker.core import events as ev
 from caviar_broker.core.plan import Limits, RunPlan, ServicePlan
-from caviar_broker.desk import Desk
 from caviar_broker.journal import JournalFile
 from caviar_broker.server import BrokerServer
 from caviar_broker.statistics import Statistics
@@ -101,15 +101,15 @@ def serving(
     file = make(tmp_path / "journal.msgpack")
     store = AssetStore(tmp_path / "broker-cache")
     endpoint = server_options.pop("endpoint", "tcp://127.0.0.1:0")
-    observer = witness if desk is None else Desk(desk, witness)
+    observer = witness if desk is None else ControlServer(desk, witness)
     server = BrokerServer(run, endpoint, file, observer, store, **server_options)
-    if isinstance(observer, Desk):
+    if isinstance(observer, ControlServer):
         observer.attach(server)
 
     def body() -> None:
         try:
             server.run()
-            if isinstance(observer, Desk):
+            if isinstance(observer, ControlServer):
                 observer.close()
         except BaseException as error:
             failures.append(error)

@@ -20,7 +20,7 @@ from core_history import History
 from caviar_broker.core import events as ev
 from caviar_broker.core.clock import FrameClock
 from caviar_broker.core.plan import Limits, RunPlan, ServicePlan
-from caviar_broker.core.resumption import Resumption
+from caviar_broker.core.run import Resumption
 from caviar_broker.core.transitions import RunState
 from caviar_broker.journal import JournalFile
 from caviar_protocol import messages as m

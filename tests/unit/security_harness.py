@@ -14,7 +14,7 @@ from broker_harness import INPUTS, MS, Client, Serving, eventually, plan, servin
 
 from caviar_broker.core.plan import RunPlan
 from caviar_broker.security.access import Access
-from caviar_broker.security.guard import PeerLimits
+from caviar_broker.security.limits import PeerLimits
 from caviar_protocol import keys as k
 from caviar_protocol import messages as m
 

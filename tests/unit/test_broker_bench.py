@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from caviar_broker.bench.client import Topology, deliveries, parts
 from caviar_broker.bench.run import measure
-from caviar_broker.bench.topology import Topology, deliveries, parts
 from caviar_broker.core.graph import build_graph
 from caviar_clients.cli.main import app
 from caviar_protocol import messages as m

@@ -10,11 +10,10 @@ from typing import Any
 import pytest
 from core_harness import MS, SECOND, Simulation, loop
 
-from caviar_broker.checkpoints import CheckpointFiles
 from caviar_broker.core import events as ev
 from caviar_broker.core.plan import Limits
-from caviar_broker.core.resumption import Resumption
-from caviar_broker.journal import JournalFile
+from caviar_broker.core.run import Resumption
+from caviar_broker.journal import CheckpointFiles, JournalFile
 from caviar_broker.journal_format import read_journal
 from caviar_broker.resume import read_resumption
 from caviar_protocol import messages as m

@@ -14,7 +14,7 @@ import zmq
 from broker_harness import Client, Serving, eventually, plan, play_to_the_end, playing, serving
 from security_harness import Background, eight_services
 
-from caviar_broker.security.guard import PeerLimits
+from caviar_broker.security.limits import PeerLimits
 from caviar_protocol import messages as m
 from caviar_protocol.codec import encode_message
 
@@ -222,7 +222,7 @@ def over_descriptors_used_before(
 ) -> Iterator[tuple[Serving, Client]]:
     """`beside_a_bad_member`, whose connections have descriptors of others that have just ended, as after a
     broker was killed and all come back: whose a message is, is not certain in all of the test."""
-    monkeypatch.setattr("caviar_broker.security.wire.UNCLEAR_NS", 60_000_000_000)
+    monkeypatch.setattr("caviar_broker.security.tcp.UNCLEAR_NS", 60_000_000_000)
     limits = PeerLimits(strangers=20)
     with (
         serving(plan("world", "sensors:bad", frames=1000), tmp_path, peer_limits=limits) as broker,

@@ -12,9 +12,8 @@ from broker_harness import MS, PATIENCE_S, Client, eventually, plan, play_to_the
 from security_harness import Ring, pair, ring
 from zmq.utils.monitor import recv_monitor_message
 
-from caviar_broker.port import Port
-from caviar_broker.security.access import Access, answer
-from caviar_broker.security.local import is_local
+from caviar_broker.router import Router
+from caviar_broker.security.access import Access, answer, is_local
 from caviar_protocol import keys as k
 from caviar_protocol import messages as m
 from caviar_protocol.errors import CaviarError, RunError, SetupError
@@ -245,8 +244,8 @@ def test_an_address_open_to_others_is_refused_without_keys_and_taken_with_them(
     keys: Ring, endpoint: str
 ) -> None:
     with pytest.raises(CaviarError, match=r"--keys keys; or listen on this machine alone"):
-        Port(endpoint, 1500 * MS)
-    port = Port(endpoint, 1500 * MS, keys.access())
+        Router(endpoint, 1500 * MS)
+    port = Router(endpoint, 1500 * MS, keys.access())
     port.close()
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import msgspec
 
-from caviar_broker.port import HANDSHAKE_MS
+from caviar_broker.router import HANDSHAKE_MS
 from caviar_broker.security.access import BAR_NS
-from caviar_broker.security.guard import PeerLimits
+from caviar_broker.security.limits import PeerLimits
 from caviar_protocol.scenario import Limits
 
 ROOT = Path(__file__).parents[2]

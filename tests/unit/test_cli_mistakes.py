@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from caviar_broker.beside import HttpBeside
+from caviar_broker.http.process import HttpProcess
 from caviar_clients.cli import main as command
 from caviar_clients.conform import conform
 from caviar_clients.conform.session import Rules
@@ -63,7 +63,7 @@ def test_a_token_without_a_role_is_one_that_may_look_on(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], keys: Path
 ) -> None:
     assert caviar(monkeypatch, "keys", "token", "ana") == 0
-    HttpBeside(keys, "127.0.0.1:0", keys)  # refuses tokens with roles that HTTP does not know
+    HttpProcess(keys, "127.0.0.1:0", keys)  # refuses tokens with roles that HTTP does not know
     assert caviar(monkeypatch, "keys", "list") == 0
     assert "ana  viewer  HTTP token" in capsys.readouterr().out
 
@@ -99,8 +99,8 @@ def test_an_http_address_that_is_taken_is_refused_before_the_run(tmp_path: Path)
         with pytest.raises(
             SetupError, match=f"cannot be served at {address}: Address already in use; choose"
         ):
-            HttpBeside(tmp_path, address, None)
-        HttpBeside(tmp_path, address, None, again=True)  # the process of the broker before may still end
+            HttpProcess(tmp_path, address, None)
+        HttpProcess(tmp_path, address, None, again=True)  # the process of the broker before may still end
 
 
 def test_an_embedded_run_is_not_gone_on_with_and_says_why(

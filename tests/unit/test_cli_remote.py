@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from caviar_broker import __main__ as broker_main
+from caviar_broker import launch as broker_main
 from caviar_broker.core.plan import SECOND, plan_run
 from caviar_clients.cli import remote
 from caviar_clients.cli.main import app

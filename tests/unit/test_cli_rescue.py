@@ -11,7 +11,7 @@ from recording_samples import frame, record, recorder
 from rich.console import Console
 
 from caviar_broker.journal_format import MAGIC
-from caviar_broker.record import RunRecord
+from caviar_broker.run_record import RunRecord
 from caviar_clients.cli.inspect import inspect_command
 from caviar_clients.cli.rescue import rescue_run
 from caviar_protocol.errors import RunError

@@ -9,7 +9,7 @@ import pytest
 from core_harness import MS, SECOND, Simulation, loop
 
 from caviar_broker.core import events as ev
-from caviar_broker.core.memory import MAX_WEIGHT
+from caviar_broker.core.checkpoints import MAX_HISTORY_BYTES
 from caviar_broker.core.plan import Limits
 from caviar_protocol import messages as m
 
@@ -60,7 +60,7 @@ def test_a_service_with_grants_queued_answers_them_all_before_it_saves() -> None
 
 def test_much_to_remember_is_reason_to_save_early() -> None:
     run = simulation(frames=4, checkpoint_frames=100)
-    run.clock._episodes.recall._weigh = lambda payload: MAX_WEIGHT  # type: ignore[attr-defined]
+    run.clock._episodes.recall._weigh = lambda payload: MAX_HISTORY_BYTES  # type: ignore[attr-defined]
     run.run()
     assert [c.frame for c in run.seen(m.Checkpoint, "channel")] == [1]
 

@@ -8,7 +8,7 @@ import pytest
 from core_harness import MS, SECOND, Simulation, agent, channel, link, loop, recorder, sensors, world
 
 from caviar_broker.core import events as ev
-from caviar_broker.core.ledger import Ledger
+from caviar_broker.core.decisions import Ledger
 from caviar_broker.core.plan import Limits
 from caviar_broker.core.transitions import RunState
 from caviar_protocol import messages as m

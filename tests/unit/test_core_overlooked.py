@@ -11,12 +11,12 @@ from typing import Any
 import pytest
 from test_core_stateful import play
 
-from caviar_broker.core.schedule import EpisodeSchedule
+from caviar_broker.core.dispatch import Dispatcher
 
-advance = EpisodeSchedule.advance
+advance = Dispatcher.advance
 
 
-def done_so_far(schedule: EpisodeSchedule) -> tuple[Any, ...]:
+def done_so_far(schedule: Dispatcher) -> tuple[Any, ...]:
     """What a look at somebody could change."""
     eligible = {
         (task.service, task.frame): task.eligible_at for task in schedule._book.tasks() if task.eligible_at
@@ -25,7 +25,7 @@ def done_so_far(schedule: EpisodeSchedule) -> tuple[Any, ...]:
     return told, entries, len(schedule.grants), dict(schedule._book.next), eligible
 
 
-def advance_twice(schedule: EpisodeSchedule, now: int) -> None:
+def advance_twice(schedule: Dispatcher, now: int) -> None:
     """Advance, look at everybody, and put back who waits for what."""
     advance(schedule, now)
     turns, before = schedule._turns, done_so_far(schedule)
@@ -55,5 +55,5 @@ def advance_twice(schedule: EpisodeSchedule, now: int) -> None:
 
 
 def test_a_look_at_everybody_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(EpisodeSchedule, "advance", advance_twice)
+    monkeypatch.setattr(Dispatcher, "advance", advance_twice)
     play(150)

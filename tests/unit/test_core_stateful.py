@@ -25,11 +25,10 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
-from caviar_broker.checkpoints import CheckpointFiles
 from caviar_broker.core import events as ev
 from caviar_broker.core.plan import Limits
 from caviar_broker.core.transitions import RunState
-from caviar_broker.journal import JournalFile
+from caviar_broker.journal import CheckpointFiles, JournalFile
 from caviar_broker.resume import read_resumption
 from caviar_protocol import messages as m
 

@@ -9,8 +9,10 @@ from typing import Any
 import pytest
 from core_harness import MS, SECOND, Simulation, agent, loop, sensors, world
 
+from caviar_broker.core import decisions as tasks
 from caviar_broker.core import events as ev
-from caviar_broker.core import peers, run, tasks, transitions
+from caviar_broker.core import run, transitions
+from caviar_broker.core import run as peers
 from caviar_broker.core.plan import Limits
 from caviar_broker.core.transitions import (
     DECIDED,

@@ -1,1 +1,1 @@
-"""HTTP and WebSocket beside a broker: a process of its own, which talks to the broker's desk only."""
+"""Earlier name of `caviar_broker.http`."""

@@ -13,11 +13,11 @@ from tempfile import TemporaryDirectory
 import msgspec
 import numpy as np
 
-from caviar_broker.__main__ import tune_collector
-from caviar_broker.bench.topology import Part, Topology, deliveries, parts
+from caviar_broker.bench.client import Part, Topology, deliveries, parts
 from caviar_broker.core import events as ev
 from caviar_broker.core.plan import SECOND, Limits, RunPlan, ServicePlan
 from caviar_broker.journal import JournalFile
+from caviar_broker.launch import tune_garbage_collector
 from caviar_broker.security.access import Access
 from caviar_broker.server import BrokerServer
 from caviar_broker.statistics import Statistics
@@ -100,7 +100,7 @@ def measure(topology: Topology, services: int, payload: int, frames: int, *, cur
         store = AssetStore(Path(folder) / "assets")
         access = _keys(Path(folder), declared) if curve else None
         server = BrokerServer(plan, "tcp://127.0.0.1:0", journal, _Silent(), store, access=access)
-        tune_collector()
+        tune_garbage_collector()
         steady_memory()
         keys = Path(folder) if curve else None
         with _clients(topology, services, payload, server.endpoint, keys):

@@ -18,17 +18,15 @@ from collections.abc import Callable
 from typing import Any
 
 from caviar_broker.core import events as ev
+from caviar_broker.core.checkpoints import PayloadSize
 from caviar_broker.core.episodes import Episodes
 from caviar_broker.core.graph import Graph
-from caviar_broker.core.joining import Joining
 from caviar_broker.core.liveness import Liveness
-from caviar_broker.core.memory import Weigh
-from caviar_broker.core.peers import Peer
 from caviar_broker.core.plan import RunPlan
-from caviar_broker.core.resumption import Resumption, Snapshot
-from caviar_broker.core.run import Run
+from caviar_broker.core.registration import Registration
+from caviar_broker.core.run import Peer, Resumption, Run, Snapshot
+from caviar_broker.core.status import RunStatus, look
 from caviar_broker.core.transitions import RunState, ServiceState
-from caviar_broker.core.view import RunView, look
 from caviar_protocol.digest import RunDigest
 
 
@@ -48,12 +46,16 @@ class FrameClock:
     """
 
     def __init__(
-        self, plan: RunPlan, now: int, weigh: Weigh = lambda payload: 0, resumption: Resumption | None = None
+        self,
+        plan: RunPlan,
+        now: int,
+        weigh: PayloadSize = lambda payload: 0,
+        resumption: Resumption | None = None,
     ) -> None:
         self.plan = plan
         self._run = Run(plan, now, resumption)
         self._episodes = Episodes(self._run, weigh)
-        self._joining = Joining(self._run, self._episodes)
+        self._joining = Registration(self._run, self._episodes)
         self._liveness = Liveness(self._run, self._episodes)
         self._deadline: int | None = None
         self._deadline_is_known = False
@@ -207,7 +209,7 @@ class FrameClock:
         """What is known of a service; None for a name that the run does not expect."""
         return self._run.peers.get(name)
 
-    def look(self, now: int) -> RunView:
+    def look(self, now: int) -> RunStatus:
         """Who does what, and who is waited for, at the time ``now`` [ns]."""
         return look(self._run, self._episodes, now)
 

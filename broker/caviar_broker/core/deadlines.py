@@ -3,15 +3,121 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from typing import TYPE_CHECKING
 
-from caviar_broker.core.decisions import DecisionBook
+from caviar_broker.core.decisions import DecisionTable, Task, milliseconds
 from caviar_broker.core.events import Action, Latency, Notice, Overdue
-from caviar_broker.core.gate import Gate
-from caviar_broker.core.pace import Pacer
 from caviar_broker.core.plan import RunPlan, ServicePlan
-from caviar_broker.core.tasks import Task, milliseconds
 from caviar_broker.core.transitions import TaskEvent, TaskState
-from caviar_broker.core.turns import Turns
+
+if TYPE_CHECKING:
+    from caviar_broker.core.dispatch import Turns
+
+
+class PauseGate:
+    """Lets frames begin, or holds them back until the user wants the next ones.
+
+    A frame begins when somebody first asks for it. Frames that have begun are finished by everybody,
+    so nobody is waited for, and nothing can stall, in a run that is paused.
+    """
+
+    def __init__(self) -> None:
+        self.closed = False
+        """Whether the run is paused."""
+        self.steps = 0
+        """Frames that may still begin although the run is paused."""
+        self.begun = -1
+        """The last frame of the episode that has begun, while the run is paused."""
+        self._held_since: int | None = None
+
+    def pause(self, begun: int) -> None:
+        """Let no frame behind ``begun`` begin."""
+        if not self.closed:
+            self.closed, self.steps, self.begun, self._held_since = True, 0, begun, None
+
+    def resume(self) -> None:
+        """Let all frames begin."""
+        self.closed, self.steps = False, 0
+
+    def step(self, frames: int) -> None:
+        """Let so many frames more begin; of a run that is not paused none is held back."""
+        if self.closed:
+            self.steps += frames
+
+    def next_episode(self) -> None:
+        """Frames count from 0 again."""
+        self.begun = -1
+
+    def admits(self, frame: int, now: int) -> bool:
+        """Whether a frame may begin, or has begun."""
+        if self.closed and frame > self.begun:
+            if not self.steps:
+                self._held_since = now if self._held_since is None else self._held_since
+                return False
+            self.steps -= 1
+            self.begun = frame
+        return True
+
+    def held_ns(self, now: int) -> int:
+        """For how long frames were held back that may begin now [ns]; counted once."""
+        since, self._held_since = self._held_since, None
+        return 0 if since is None else now - since
+
+
+class Pacer:
+    """Releases the frames of one episode (contract, clause 8).
+
+    Frame 0 is released when somebody first asks for it. A later one is due as long after the one
+    before as simulated time says, divided by the run's speed; when nobody is ready for it by then, all
+    frames behind it slip by as much. A timer that fires late delays its own frame, not those behind it. As
+    fast as possible, every frame is released at once.
+    """
+
+    def __init__(self, plan: RunPlan) -> None:
+        self._plan = plan
+        self._released_frame = -1
+        self._reference = 0
+        """When the frame released last should have been, slips included [ns]."""
+        self._awaited = False
+        self.lag_ns = 0
+        """Sum of all slips [ns]."""
+
+    def release(self, frame: int, now: int) -> int | None:
+        """Ask for a frame: by how much it slips [ns], or None while its time has not come."""
+        if not self._plan.realtime or frame <= self._released_frame:
+            return 0
+        due = now if self._released_frame < 0 else self._due()
+        if now < due:
+            self._awaited = True
+            return None
+        slip = 0 if self._awaited else now - due
+        self._released_frame, self._reference, self._awaited = frame, due + slip, False
+        self.lag_ns += slip
+        return slip
+
+    def tells(self, slip: int) -> bool:
+        """Whether a slip is worth a notice of its own: a tenth of a period, in real time."""
+        return slip > self._real_ns(self._plan.sampling_period_ns) // 10
+
+    def next_instant(self) -> int | None:
+        """When the frame that was asked for in vain will be due [ns]; None if there is none."""
+        return self._due() if self._awaited else None
+
+    def withdraw(self) -> None:
+        """The frame that was asked for in vain is not wanted for now."""
+        self._awaited = False
+
+    def shift(self, held_ns: int) -> None:
+        """The run was paused for so long [ns]: that is no slip."""
+        self._reference += held_ns
+
+    def _due(self) -> int:
+        frame = self._released_frame
+        return self._reference + self._real_ns(self._plan.t_ns(frame + 1) - self._plan.t_ns(frame))
+
+    def _real_ns(self, simulated_ns: int) -> int:
+        return simulated_ns if self._plan.speed == 1.0 else round(simulated_ns / self._plan.speed)
+
 
 # On the path of every frame: a member that is looked up in its class costs four times as much.
 _GRANTED = TaskState.GRANTED
@@ -43,9 +149,9 @@ class Deadlines:
         self,
         plan: RunPlan,
         episode: int,
-        book: DecisionBook,
+        book: DecisionTable,
         turns: Turns,
-        gate: Gate,
+        gate: PauseGate,
         outstanding: Mapping[str, Sequence[Task]],
         saving: Collection[str],
         actions: list[Action],

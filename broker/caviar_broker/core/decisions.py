@@ -2,24 +2,164 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 
+import msgspec
 from msgspec.structs import replace
 
 from caviar_broker.core.events import Action, FrameFinished, Journal, Product
 from caviar_broker.core.graph import Edge, Graph
-from caviar_broker.core.ledger import Ledger
 from caviar_broker.core.plan import RunPlan
-from caviar_broker.core.tasks import Decision, Task, provenance, validate_decision
-from caviar_broker.core.transitions import DECIDED, OUTSTANDING, TaskState
+from caviar_broker.core.transitions import DECIDED, OUTSTANDING, TASK, TaskEvent, TaskState, step
 from caviar_protocol.digest import RunDigest
-from caviar_protocol.messages import GrantInput, Status
+from caviar_protocol.messages import GrantInput, Report, Status
+
+
+class Ledger:
+    """Counts the entries of the run's journal.
+
+    Entries become safe in order, so one number says which are: all up to and including `written`.
+    """
+
+    def __init__(self, *, kept: bool = True) -> None:
+        self._kept = kept
+        """Whether there is a journal; without one every entry is as safe as it will be."""
+        self.last = 0
+        """Number of the last entry; 0: none yet."""
+        self.written = 0
+        """All entries up to this number are with the operating system."""
+        self.waiting_since: int | None = None
+        """Since when no entry was confirmed though some are outstanding [ns]; None: none is."""
+
+    def enter(self, now: int) -> int:
+        """Number of a new entry."""
+        self.last += 1
+        if not self._kept:
+            self.written = self.last
+        elif self.waiting_since is None:
+            self.waiting_since = now
+        return self.last
+
+    def confirm(self, number: int, now: int) -> bool:
+        """Entries up to ``number`` are written; whether that is news."""
+        if number <= self.written:
+            return False
+        self.written = number
+        self.waiting_since = now if number < self.last else None
+        return True
+
+
+class Decision(msgspec.Struct, frozen=True):
+    """What consumers of a frame get of one (topic, source)."""
+
+    status: Status
+    product: Product | None
+    cause: str = ""
+    journal: int = 0
+    """Journal entry that holds a held product; 0: the one of this decision, as for one that is replayed."""
+
+
+class GrantOrder(msgspec.Struct, frozen=True):
+    """A grant that the schedule wants sent."""
+
+    service: str
+    frame: int
+    previous: int
+    final: bool
+    inputs: tuple[GrantInput, ...]
+    products: tuple[Product, ...]
+    reports: tuple[Report, ...]
+
+
+class TaskInputs(msgspec.Struct, frozen=True):
+    """Inputs of a task, all of them decided."""
+
+    decisions: list[tuple[Edge, Decision]]
+    cause: str | None
+    """Why the first required input is absent (clause 10); frame 0 has no earlier one."""
+    entry: int
+    """Number of the last journal entry that a grant relies on from before its frame (clause 18): the
+    service's own, lag 1 inputs and held products."""
+
+    def provided(self, frame: int) -> tuple[list[GrantInput], list[Product]]:
+        """Provenance of every input, and the products of those that are not absent."""
+        inputs = [provenance(edge.topic, edge.source, decision, frame) for edge, decision in self.decisions]
+        return inputs, [decision.product for _, decision in self.decisions if decision.product is not None]
+
+
+@dataclass(slots=True, eq=False)
+class Task:
+    """One service's part of one frame."""
+
+    service: str
+    frame: int
+    state: TaskState = TaskState.PENDING
+    eligible_at: int | None = None
+    """When it could first have been granted, or skipped, had its service been there and not late [ns]."""
+    started_at: int = 0
+    """When it was granted or, where grants queue, when the one before it was answered [ns]."""
+    inputs: TaskInputs | None = None
+    """Kept while its grant waits for the journal."""
+    overran: bool = False
+    """Whether its budget is up."""
+    order: GrantOrder | None = None
+    """As granted, until it is answered: a service that rejoins gets it again."""
+    decisions: dict[str, Decision] = field(default_factory=dict)
+    """By topic, once decided."""
+    journal: int = 0
+    """Number of the journal entry of its decisions; 0: not decided."""
+    report: Report | None = None
+
+    def move(self, event: TaskEvent) -> None:
+        """Take a transition of the table."""
+        self.state = step(TASK, self.state, event)
+
+
+def provenance(topic: str, source: str, decision: Decision, frame: int) -> GrantInput:
+    """What a consumer in ``frame`` is told about where its input comes from."""
+    product = decision.product
+    if product is None:
+        return GrantInput(topic=topic, source=source, status=decision.status, cause=decision.cause)
+    return GrantInput(
+        topic=topic,
+        source=source,
+        status=decision.status,
+        frame=product.frame,
+        t_ns=product.t_ns,
+        age=frame - product.frame,
+        fidelity=product.fidelity,
+        digest=product.digest,
+        cause=decision.cause,
+    )
+
+
+def validate_decision(service: str, frame: int, topic: str, decision: Decision) -> None:
+    """Raise AssertionError where a decision contradicts itself (clauses 9 to 12)."""
+    what = f"{topic} of {service} in frame {frame}"
+    match decision.status:
+        case Status.FRESH:
+            assert decision.product is not None, f"{what} is fresh without a product"
+            assert decision.product.frame == frame, f"{what} is not fresh"
+        case Status.HELD:
+            assert decision.product is not None, f"{what} is held without a product"
+            assert decision.product.frame < frame, f"{what} is not an earlier one"
+            assert decision.cause, f"{what} is held without a cause"
+        case _:
+            assert decision.product is None, f"{what} is absent with a product"
+            assert decision.cause, f"{what} is absent without a cause"
+
+
+def milliseconds(ns: int) -> str:
+    """A duration for people."""
+    return f"{ns / 1e6:.1f} ms"
+
 
 _FRESH = Status.FRESH
 _FIRST = Decision(Status.ABSENT, None, "there is no earlier frame")
 
 
-class DecisionBook:
+class DecisionTable:
     """Decisions of one episode, by service and frame (contract, clauses 9 to 12, 18 and 20).
 
     A service decides its frames one after the other. A frame is finished once every service has
@@ -283,3 +423,57 @@ class DecisionBook:
         assert all(n <= window for n in self.next.values()), "too many frames overlap"
         kept = [task for task in self.tasks() if task.state not in OUTSTANDING]
         assert all(task.frame >= self.finished_frames - 1 for task in kept), "tasks are not released"
+
+
+class Inputs:
+    """Inputs of the tasks of one episode, as far as they are decided (clauses 6, 7, 10 and 18)."""
+
+    def __init__(self, graph: Graph, book: DecisionTable) -> None:
+        self._book = book
+        self._all, self._consumers = graph.inputs, graph.consumers
+        self._latest = graph.latest
+        self._lagged = {name: tuple(e for e in edges if e.lag) for name, edges in graph.inputs.items()}
+
+    def taken(self, task: Task) -> Sequence[Edge]:
+        """Edges that count in this frame: behind the last frame only those with lag 1 (clause 16)."""
+        edges = self._all if task.frame < self._book.frames else self._lagged
+        return edges[task.service]
+
+    def undecided(self, task: Task) -> str | None:
+        """A source that has not decided yet what this task gets of it; None: all have (clause 7)."""
+        frame, undecided = task.frame, self._book.next
+        # From behind: once the last one is decided, so are mostly the others, and nobody looks in vain.
+        edges = self._latest[task.service] if frame < self._book.frames else self._lagged[task.service]
+        for edge in edges:
+            if frame - edge.lag >= undecided[edge.source] and frame >= edge.lag:
+                return edge.source
+        return None
+
+    def gathered(self, task: Task) -> TaskInputs:
+        """What is decided about its inputs; all of them must be."""
+        # The service's own last decision is relied on too. What was decided in this very frame would be
+        # decided again. Entries become safe in order, so nothing is missing between them.
+        book, frame = self._book, task.frame
+        cause, entry = None, book.entry(task.service, frame - 1)
+        decisions = []
+        for edge in self.taken(task):
+            decision = book.decision(edge, frame)
+            decisions.append((edge, decision))
+            if decision.product is None and edge.required and frame >= edge.lag and cause is None:
+                cause = decision.cause
+            if edge.lag and (of_input := book.entry(edge.source, frame - edge.lag)) > entry:
+                entry = of_input
+            if decision.journal > entry:
+                entry = decision.journal
+        return TaskInputs(decisions, cause, entry)
+
+    def lacking(self, source: str) -> str:
+        """Who waits for which input of a source now; empty if nobody does."""
+        found = []
+        for name in self._consumers[source]:
+            frame = self._book.next[name]
+            for edge in self._all[name]:
+                lacks = frame <= self._book.frames and not self._book.decided(edge, frame)
+                if lacks and edge.source == source:
+                    found.append(f"{name} waits for {edge.topic} of frame {frame - edge.lag}")
+        return ", ".join(found)

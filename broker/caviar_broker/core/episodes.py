@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from caviar_broker.core import events as ev
-from caviar_broker.core.memory import Weigh
-from caviar_broker.core.peers import Peer
-from caviar_broker.core.recall import Recall
-from caviar_broker.core.run import Run
-from caviar_broker.core.schedule import EpisodeSchedule
-from caviar_broker.core.tasks import GrantOrder
+from caviar_broker.core.checkpoints import Checkpoints, PayloadSize
+from caviar_broker.core.decisions import GrantOrder
+from caviar_broker.core.dispatch import Dispatcher
+from caviar_broker.core.run import Peer, Run
 from caviar_broker.core.transitions import RunEvent, RunState, ServiceEvent, ServiceState, TaskState
 from caviar_protocol.messages import RUN_COMPLETE, Cancel, Done, EpisodeEnd, Fault, Grant, Report, Reset
 from caviar_protocol.scenario.conversion import located
@@ -21,13 +19,13 @@ _ACTIVE, _RUNNING = ServiceState.ACTIVE, RunState.RUNNING
 class Episodes:
     """Drives the schedule of one episode after the other (clauses 1, 6, 16 and 18)."""
 
-    def __init__(self, run: Run, weigh: Weigh = lambda payload: 0) -> None:
+    def __init__(self, run: Run, weigh: PayloadSize = lambda payload: 0) -> None:
         self._run = run
-        self.recall = Recall(run, self._grant, self._returned, weigh)
+        self.recall = Checkpoints(run, self._grant, self._returned, weigh)
         """What is kept for services that may come back."""
-        self.schedule: EpisodeSchedule | None = None
+        self.schedule: Dispatcher | None = None
         """Of the episode that is under way; None between episodes."""
-        self._ended: EpisodeSchedule | None = None
+        self._ended: Dispatcher | None = None
         """Of the episode that was under way before."""
 
     # --- from one episode to the next ----------------------------------------------------------------
@@ -84,7 +82,7 @@ class Episodes:
         run, memories = self._run, self.recall.memories
         assert run.graph is not None
         capacity = {p.name: _capacity(p) for p in self._members()}
-        self.schedule = EpisodeSchedule(
+        self.schedule = Dispatcher(
             run.graph,
             run.plan,
             capacity,
@@ -106,7 +104,7 @@ class Episodes:
         for name in memories:
             run.enter_journal("checkpoint", name, -1, now)
 
-    def _over(self, schedule: EpisodeSchedule, now: int) -> None:
+    def _over(self, schedule: Dispatcher, now: int) -> None:
         run = self._run
         self.close(now)
         run.actions.append(ev.EpisodeFinished(run.episode, schedule.frames))
@@ -195,7 +193,7 @@ class Episodes:
     def _remember(
         self,
         peer: Peer,
-        schedule: EpisodeSchedule,
+        schedule: Dispatcher,
         digests: Mapping[str, str] | None,
         chosen: Mapping[str, str],
     ) -> None:
@@ -203,7 +201,7 @@ class Episodes:
         if order is not None:
             self.recall.answered(peer, order, digests, chosen)
 
-    def _save_if_due(self, peer: Peer, schedule: EpisodeSchedule, now: int) -> None:
+    def _save_if_due(self, peer: Peer, schedule: Dispatcher, now: int) -> None:
         if self.recall.is_due(peer) and not schedule.is_through(peer.name):
             schedule.save(peer.name)
             if not schedule.outstanding(peer.name):
@@ -214,7 +212,7 @@ class Episodes:
         if self.recall.saved(event, now) and self.schedule is not None:
             self.schedule.saved(event.service, now)
 
-    def _seed_chosen(self, peer: Peer, message: Done, schedule: EpisodeSchedule, now: int) -> None:
+    def _seed_chosen(self, peer: Peer, message: Done, schedule: Dispatcher, now: int) -> None:
         ends = message.end_episode or message.frame >= schedule.frames
         if ends and peer.role == "agent":
             self._run.wish(message.seed, peer, now)
@@ -257,7 +255,7 @@ class Episodes:
             schedule.fault(peer.name, message.frame, text, now)
             self._save_if_due(peer, schedule, now)
 
-    def _owing(self, peer: Peer, answer: Done | Fault, kind: str, now: int) -> EpisodeSchedule | None:
+    def _owing(self, peer: Peer, answer: Done | Fault, kind: str, now: int) -> Dispatcher | None:
         """The schedule, if this answers the oldest outstanding grant (clause 1), in time or late."""
         run, schedule = self._run, self.schedule
         owed = schedule.outstanding(peer.name) if schedule and run.takes_part(peer) else []

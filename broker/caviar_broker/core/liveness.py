@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from caviar_broker.core import events as ev
 from caviar_broker.core.episodes import Episodes
-from caviar_broker.core.peers import Peer
-from caviar_broker.core.run import Run
+from caviar_broker.core.run import Peer, Run
 from caviar_broker.core.transitions import RunState, ServiceEvent, ServiceState
 
 MAX_LOSSES = 5

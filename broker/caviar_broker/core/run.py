@@ -1,19 +1,195 @@
-"""What the parts of the frame clock share: the peers, the state of the run, and what shall be done."""
+"""The state of one run: its services as the broker knows them, its seeds, and the actions to carry out."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
+from caviar_broker.core.deadlines import PauseGate
+from caviar_broker.core.decisions import Ledger, Task
 from caviar_broker.core.events import Action, Finished, Journal, Notice, Product, Send
-from caviar_broker.core.gate import Gate
 from caviar_broker.core.graph import Graph
-from caviar_broker.core.ledger import Ledger
-from caviar_broker.core.peers import Peer
-from caviar_broker.core.plan import RunPlan
-from caviar_broker.core.resumption import Resumption
-from caviar_broker.core.transitions import RUN, RunEvent, RunState, step
+from caviar_broker.core.plan import Limits, RunPlan, ServicePlan
+from caviar_broker.core.transitions import (
+    PRESENT,
+    RUN,
+    SERVICE,
+    RunEvent,
+    RunState,
+    ServiceEvent,
+    ServiceState,
+    step,
+)
 from caviar_protocol.digest import RunDigest
-from caviar_protocol.messages import Error, Message, Shutdown, Stale
+from caviar_protocol.messages import Asset, Error, Hello, Message, Ready, Shutdown, Stale
+
+_DOING = {
+    ServiceState.EXPECTED: "being awaited",
+    ServiceState.JOINED: "waiting for the others",
+    ServiceState.PREPARING: "preparing",
+    ServiceState.READY: "waiting for the others",
+    ServiceState.RESETTING: "resetting",
+    ServiceState.RESTORING: "being restored",
+    ServiceState.ACTIVE: "idle in an episode",
+    ServiceState.LOST: "lost",
+    ServiceState.LEFT: "gone",
+}
+
+
+@dataclass(slots=True)
+class Peer:
+    """A service that the run expects, and what has been heard of it."""
+
+    plan: ServicePlan
+    state: ServiceState = ServiceState.EXPECTED
+    since: int = 0
+    """When its state began [ns]."""
+    hello: Hello | None = None
+    outputs: frozenset[str] = frozenset()
+    """Topics that it declared."""
+    ready: Ready | None = None
+    """Its last READY; kept when it is lost."""
+    assets: tuple[Asset, ...] = ()
+    attempt: int = 0
+    heard_at: int | None = None
+    """When the last heartbeat came [ns]."""
+    advanced_at: int = 0
+    """When it last showed progress: an offer of scenery, or a heartbeat that counted on [ns]."""
+    progress: int = 0
+    phase: str = ""
+    grace_ns: int = 0
+    verdict: str = ""
+    """How its loss is known."""
+    losses: int = 0
+    """How often it was lost since it last answered a grant."""
+    restored: bool = False
+    """Whether it has the state that it was saved with, and is sent what it was granted since."""
+    name: str = field(init=False)
+    """Name in the run."""
+    role: str = field(init=False)
+    """Role in the run."""
+
+    def __post_init__(self) -> None:
+        self.name, self.role = self.plan.name, self.plan.role
+
+    @property
+    def present(self) -> bool:
+        """Whether messages can reach it."""
+        return self.state in PRESENT
+
+    def __str__(self) -> str:
+        return f"{self.plan.role} {self.plan.name!r}"
+
+    def move(self, event: ServiceEvent, now: int) -> None:
+        """Take a transition of the table."""
+        self.state, self.since = step(SERVICE, self.state, event), now
+
+    def join(self, hello: Hello, now: int) -> None:
+        """A new incarnation: what was heard of the one before does not count for it."""
+        self.move(ServiceEvent.HELLO, now)
+        self.hello, self.attempt = hello, self.attempt + 1
+        self.outputs = frozenset(hello.outputs)
+        self.heard_at, self.progress, self.phase, self.grace_ns = None, 0, "", 0
+        self.restored = False
+
+    def heartbeat(self, progress: int, phase: str, grace_ns: int, now: int) -> None:
+        """A heartbeat came."""
+        self.heard_at = now
+        if progress != self.progress or phase != self.phase:
+            self.advanced_at = now
+        self.progress, self.phase, self.grace_ns = progress, phase, grace_ns
+
+    def silent_until(self, since: int, limit: int) -> int:
+        """When a silence that began at ``since`` or at its last progress becomes a stall [ns].
+
+        A phase that declared a longer grace, such as compilation, has that (clause 14).
+        """
+        return max(since, self.advanced_at) + max(limit, self.grace_ns)
+
+    def rejoin(self, limits: Limits) -> int:
+        """How long its return is waited for once it is lost [ns]; 0: not at all."""
+        return limits.rejoin if self.plan.rejoin is None else self.plan.rejoin
+
+    @property
+    def doing(self) -> str:
+        """What its state means, for people."""
+        return _DOING[self.state]
+
+    def last_words(self, now: int) -> str:
+        """What its heartbeats told last."""
+        if self.heard_at is None:
+            return "no heartbeat ever came"
+        phase = f"phase {self.phase!r}" if self.phase else "no phase told"
+        return f"last heartbeat {_seconds(now - self.heard_at)} ago: {phase}, progress {self.progress}"
+
+    def blame_task(self, task: Task, problem: str, now: int, waiting: str = "") -> str:
+        """Clause 14: service, frame, who lacks what, elapsed and budget, last heartbeat, phase, progress."""
+        return (
+            f"{self} {problem} in frame {task.frame}: {_seconds(now - task.started_at)} since its grant, "
+            f"budget {_seconds(self.plan.budget_ns)}; {self.last_words(now)}"
+        ) + (f"; {waiting}" if waiting else "")
+
+    def blame(self, problem: str, now: int) -> str:
+        """The same outside a frame."""
+        return f"{self} {problem} for {_seconds(now - self.since)}; {self.last_words(now)}"
+
+
+def _seconds(ns: int) -> str:
+    return f"{ns / 1e9:.3g} s" if ns >= 1_000_000_000 else f"{ns / 1e6:.3g} ms"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Snapshot:
+    """A run up to a finished frame, as a compacted journal opens with it."""
+
+    episode: int
+    finished: int
+    """Frames of the episode that are finished."""
+    finished_before: int
+    """Frames of the episodes before."""
+    digest: str
+    """Of all finished frames."""
+    seed: int
+    """Of the episode."""
+    seed_episode: int
+    frames: int
+    """Of the episode."""
+    members: tuple[str, ...]
+    """Services of the run."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Resumption:
+    """A run up to a frame."""
+
+    episode: int
+    seed: int
+    """Of the episode."""
+    seed_episode: int
+    frames: int
+    """Of the episode."""
+    finished: int
+    """Frames of the episode that are finished."""
+    finished_before: int = 0
+    """Frames of the episodes before."""
+    digest: RunDigest
+    """Of all finished frames."""
+    entries: int
+    """Number of the last journal entry."""
+    wish: tuple[int, str] | None = None
+    """Seed that an agent chose for the next episode, and the agent."""
+    tasks: Mapping[str, Mapping[int, Task]] = field(default_factory=dict)
+    """Decided tasks by service and frame: those of the last finished frame, and all from which the
+    grants since the last checkpoints can be made."""
+    newest: Mapping[tuple[str, str], tuple[Product, int]] = field(default_factory=dict)
+    """Newest product and its journal entry by (service, topic)."""
+    answered: Mapping[str, Mapping[int, Mapping[str, str] | None]] = field(default_factory=dict)
+    """What services answered: digests by topic, None for FAULT, by service and frame."""
+    chosen: Mapping[str, Mapping[int, Mapping[str, str]]] = field(default_factory=dict)
+    """Decisions that services took, by service and frame."""
+    states: Mapping[str, tuple[int, Any]] = field(default_factory=dict)
+    """Last checkpoint: frame and state, by service; frame −1 where there is none."""
 
 
 class Run:
@@ -39,7 +215,7 @@ class Run:
         self.digest = RunDigest()
         self.finished_before = 0
         """Frames of the episodes that are over."""
-        self.gate = Gate()
+        self.gate = PauseGate()
         self.ledger = Ledger(kept=not plan.ephemeral)
         self.over = False
         """Whether the run has ended, if perhaps not everybody has left."""

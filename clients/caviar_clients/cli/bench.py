@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from caviar_broker.bench.topology import Topology
+from caviar_broker.bench.client import Topology
 from caviar_clients.files import write_file
 
 app = typer.Typer(no_args_is_help=True, help="Measure what the parts of a run cost on this machine.")

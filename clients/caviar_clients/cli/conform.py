@@ -70,7 +70,7 @@ def conform_client(
 
 def _gateway(listen: str, tell: Callable[[str], None]) -> Callable[[str], AbstractContextManager[str]]:
     """What serves WebSockets at ``listen``, an address of this machine, for the kit."""
-    from caviar_broker.api.front import gateway_in_front
+    from caviar_broker.http.process import gateway_in_front
 
     address = listen.partition("://")[2].partition("/")[0] or listen
     return lambda endpoint: gateway_in_front(endpoint, address, tell)

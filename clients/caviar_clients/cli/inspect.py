@@ -17,7 +17,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from caviar_broker.record import NAME as RECORD
+from caviar_broker.run_record import NAME as RECORD
 from caviar_clients.cli.decided import Decided, Decisions, decided_lines
 from caviar_clients.cli.outages import Outages, OutageSummary, outage_lines
 from caviar_clients.cli.unserved import Unserved

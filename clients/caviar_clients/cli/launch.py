@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from caviar_broker.processes import describe_exit, describe_stop, is_stopped
+from caviar_broker.supervision import describe_exit, describe_stop, is_stopped
 from caviar_clients.cli.borrowed import BorrowedKey
 from caviar_clients.cli.children import Child, end, wait
 from caviar_clients.sessions.checking import module_folders

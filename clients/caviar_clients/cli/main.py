@@ -143,8 +143,8 @@ def broker(
     restarted: Restarted = False,
 ) -> None:
     """Run only the broker; start the services with `caviar service`, here or on other machines."""
-    from caviar_broker.__main__ import DEFAULT_BIND, parser, serve
-    from caviar_broker.security.local import check_bind
+    from caviar_broker.launch import DEFAULT_BIND, parser, serve
+    from caviar_broker.security.access import check_bind
     from caviar_clients.cli.remote import service_commands
     from caviar_clients.cli.restarted import RunInProgress
     from caviar_clients.cli.run import run_directory

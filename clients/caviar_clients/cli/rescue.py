@@ -18,10 +18,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from caviar_broker.checkpoints import FOLDER as CHECKPOINTS
+from caviar_broker.journal import FOLDER as CHECKPOINTS
 from caviar_broker.journal_format import JournalReader, run_of_journal
-from caviar_broker.record import NAME as RECORD
-from caviar_broker.record import RunRecord, read_record
+from caviar_broker.run_record import NAME as RECORD
+from caviar_broker.run_record import RunRecord, read_record
 from caviar_clients.cli.inspect import resume_hint
 from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.messages import Status

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from caviar_broker.record import NAME as RECORD
+from caviar_broker.run_record import NAME as RECORD
 from caviar_protocol.errors import RunError
 from caviar_protocol.files import replace_file
 

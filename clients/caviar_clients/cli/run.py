@@ -17,9 +17,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-from caviar_broker.api.tokens import http_address
-from caviar_broker.record import read_record
-from caviar_broker.security.local import check_bind
+from caviar_broker.http.auth import http_address
+from caviar_broker.run_record import read_record
+from caviar_broker.security.access import check_bind
 from caviar_clients.cli.inside import EmbeddedLauncher
 from caviar_clients.cli.launch import Launcher
 from caviar_clients.cli.recording_check import with_recording_checked

@@ -8,7 +8,7 @@ from typing import Any
 
 from rich.console import Console
 
-from caviar_broker.deskplace import NOTE, ask
+from caviar_broker.control.socket import NOTE, ask
 from caviar_protocol.errors import RunError
 
 RUNS = Path("runs")

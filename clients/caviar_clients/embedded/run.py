@@ -16,12 +16,11 @@ from typing import Any
 
 from msgspec.structs import replace as replace_field
 
-from caviar_broker.briefing import briefings, with_ownership
 from caviar_broker.core import events as ev
 from caviar_broker.core.clock import FrameClock
-from caviar_broker.core.plan import plan_run
+from caviar_broker.core.plan import briefings, plan_run, with_ownership
 from caviar_broker.journal import JournalFile
-from caviar_broker.replaying import with_replay
+from caviar_broker.recordings import with_replay
 from caviar_broker.statistics import Statistics
 from caviar_clients.embedded.place import Place, Seat
 from caviar_protocol import messages as m

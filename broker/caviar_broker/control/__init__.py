@@ -1,0 +1,1 @@
+"""The control channel of a running broker: its socket, its requests, and its launcher."""

@@ -1,0 +1,335 @@
+"""The desk of a running broker: who runs it asks there what goes on, and has it pause, step or stop.
+
+A Unix socket in the run's directory, served by the broker's own loop. A request is one line of JSON,
+``{"do": "why"}``; so is its answer, ``{"ok": true, …}`` or ``{"ok": false, "error": TEXT}``. After
+``subscribe`` come lines with ``event`` too. See docs/howto/control-a-run.md.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import zmq
+
+from caviar_broker.control.socket import ControlSocket
+from caviar_broker.core import events as ev
+from caviar_broker.server import BrokerServer, Observer
+from caviar_broker.statistics import Statistics
+
+MAX_REQUEST = 1 << 12
+"""[B] of a request."""
+MAX_WAITING = 1 << 18
+"""[B] that may wait for somebody who does not read; behind that the connection is cut."""
+MAX_CONNECTIONS = 32
+FRAME_EVENT_NS = 50_000_000
+"""[ns] between ``frame`` events at least."""
+MAX_STEPS = 1_000_000_000
+NOTED = ("note", "refused")
+"""Kinds of notices that can be given at the desk."""
+BLAMES = frozenset({"miss", "lost", "away", "fault", "skipped"})
+"""Kinds of notices that name a culprit."""
+
+Answer = dict[str, Any]
+
+
+class ControlServer:
+    """Answers questions about one broker.
+
+    It is the server's observer, in front of the one that it is given, so it knows what was told last.
+
+    Parameters
+    ----------
+    directory
+        Of the run; the socket is made there.
+    observer
+        Who is told everything too.
+
+    Raises `RunError` where another broker serves that directory, or no socket can be made.
+    """
+
+    def __init__(self, directory: Path, observer: Observer) -> None:
+        self._place = ControlSocket(directory)
+        self._observer = observer
+        self._server: BrokerServer | None = None
+        self._callers: dict[int, _Caller] = {}
+        self._last_blame: Answer | None = None
+        self._next_frame_event = 0
+        self._serving: dict[str, str] = {}
+        self._orders: dict[str, Callable[[Mapping[str, Any]], Answer]] = {
+            "status": self._status,
+            "why": self._why,
+            "latencies": self._latencies,
+            "pause": self._pause,
+            "resume": self._resume,
+            "step": self._step,
+            "stop": self._stop,
+            "gateway": self._gateway,
+            "serving": self._note_serving,
+            "note": self._note,
+        }
+
+    def attach(self, server: BrokerServer) -> None:
+        """Begin to answer, in the server's loop."""
+        self._server = server
+        self._place.announce(run=server.clock.plan.run, pid=os.getpid(), broker=server.endpoint)
+        server.loop.watch(self._place.socket.fileno(), self._accept)
+
+    def close(self) -> None:
+        """Tell subscribers that this was it, and leave nothing behind."""
+        outcome = self.server.outcome if self._server is not None else None
+        if outcome is not None:
+            line = {"error": outcome.error, "culprit": outcome.culprit, "digest": outcome.digest}
+            self._tell({"event": "finished", **line})
+        for caller in tuple(self._callers.values()):
+            caller.close()
+        if self._server is not None:
+            self._server.loop.unwatch(self._place.socket.fileno())
+        self._place.close()
+
+    @property
+    def server(self) -> BrokerServer:
+        """Whose desk this is."""
+        assert self._server is not None  # noqa: S101  # nobody calls before `attach`
+        return self._server
+
+    # --- what the server tells ------------------------------------------------------------------------
+
+    def notice(self, notice: ev.Notice) -> None:
+        """Remember the last blame, and pass it on."""
+        fields: Answer = {"kind": notice.kind, "service": notice.service, "text": notice.text}
+        fields |= {"episode": notice.episode, "frame": notice.frame}
+        if notice.kind in BLAMES:
+            self._last_blame = {**fields, "at": time.time()}
+        self._tell({"event": "notice", **fields})
+        self._observer.notice(notice)
+
+    def frame(self, frame: ev.FrameFinished, statistics: Statistics) -> None:
+        """Pass it on; subscribers hear of it not more often than somebody could read it."""
+        self._observer.frame(frame, statistics)
+        if not self._callers:
+            return
+        now = time.monotonic_ns()
+        if now >= self._next_frame_event:
+            self._next_frame_event = now + FRAME_EVENT_NS
+            line = {"episode": frame.episode, "frame": frame.frame, "t_ns": frame.t_ns}
+            line |= {"frames": statistics.frames, "misses": statistics.misses, "lag_ns": frame.lag_ns}
+            self._tell({"event": "frame", **line})
+
+    def _tell(self, line: Answer) -> None:
+        for caller in tuple(self._callers.values()):
+            if caller.subscribed:
+                caller.say(line)
+
+    # --- connections ----------------------------------------------------------------------------------
+
+    def _accept(self) -> None:
+        try:
+            connection, _ = self._place.socket.accept()
+        except OSError:
+            return  # who called has hung up already
+        if len(self._callers) >= MAX_CONNECTIONS:
+            connection.close()
+            return
+        connection.setblocking(False)
+        caller = _Caller(connection, self)
+        self._callers[connection.fileno()] = caller
+
+    def forget(self, fd: int) -> None:
+        """A connection is closed."""
+        self._callers.pop(fd, None)
+
+    def answer(self, line: bytes) -> tuple[Answer, bool]:
+        """The answer to one request, and whether events are wanted from now on."""
+        try:
+            request = json.loads(line)
+        except (ValueError, RecursionError):  # what is nested too deep is no request
+            request = None
+        if not isinstance(request, dict):
+            return _refusal('a request is one JSON object a line, such as {"do": "status"}'), False
+        tag = {"id": request["id"]} if "id" in request else {}
+        name = request.get("do")
+        if name == "subscribe":
+            return {"ok": True, **tag}, True
+        order = self._orders.get(name) if isinstance(name, str) else None
+        if order is None:
+            known = ", ".join([*self._orders, "subscribe"])
+            return {**_refusal(f"there is no request {name!r:.80}; choose one of {known}"), **tag}, False
+        return {**order(request), **tag}, False
+
+    # --- questions ------------------------------------------------------------------------------------
+
+    def _status(self, _: Mapping[str, Any]) -> Answer:
+        view = msgspec.to_builtins(self.server.clock.look(time.monotonic_ns()))
+        statistics = self.server.statistics
+        figures = self._figures()
+        for service in view["services"]:
+            service.update(figures[service["name"]])
+        counts = {"frames_finished": statistics.frames, "misses": statistics.misses}
+        rate = {"frames_per_second": round(statistics.recent_rate(time.monotonic_ns()), 3)}
+        where = {"endpoint": self.server.endpoint, **self._serving}
+        return {"ok": True, "status": {**view, **counts, **rate, **where, "last_blame": self._last_blame}}
+
+    def _why(self, _: Mapping[str, Any]) -> Answer:
+        view = self.server.clock.look(time.monotonic_ns())
+        found = {
+            "run": view.run,
+            "state": view.state,
+            "paused": view.paused,
+            "episode": view.episode,
+            "frame": view.frame,
+            "late": any(wait.late for wait in view.waits),
+            "waits": msgspec.to_builtins(view.waits),
+            "last_blame": self._last_blame,
+            "error": view.error,
+        }
+        return {"ok": True, "why": found}
+
+    def _latencies(self, _: Mapping[str, Any]) -> Answer:
+        return {"ok": True, "latencies": self._figures()}
+
+    def _figures(self) -> dict[str, Answer]:
+        return {
+            name: msgspec.to_builtins(figures)
+            for name, figures in self.server.statistics.recent_services().items()
+        }
+
+    # --- orders ---------------------------------------------------------------------------------------
+
+    def _pause(self, _: Mapping[str, Any]) -> Answer:
+        return self._ordered(ev.PauseRequested(), "the run is paused: no new frame begins")
+
+    def _resume(self, _: Mapping[str, Any]) -> Answer:
+        return self._ordered(ev.ResumeRequested(), "the run goes on")
+
+    def _step(self, request: Mapping[str, Any]) -> Answer:
+        frames = request.get("frames", 1)
+        if type(frames) is not int or not 1 <= frames <= MAX_STEPS:
+            return _refusal(f"frames is {frames!r:.80}, it is a whole number from 1 to {MAX_STEPS}")
+        if not self.server.clock.look(time.monotonic_ns()).paused:
+            return _refusal("the run is not paused; pause it first")
+        return self._ordered(ev.StepRequested(frames), f"{frames} more frames begin")
+
+    def _stop(self, request: Mapping[str, Any]) -> Answer:
+        reason = request.get("reason") or "stopped at the broker's desk"
+        if not isinstance(reason, str) or len(reason) > 500:
+            return _refusal("reason is a text of at most 500 characters")
+        return self._ordered(ev.StopRequested(reason), "")
+
+    def _ordered(self, event: ev.Event, text: str) -> Answer:
+        if self.server.outcome is not None or self.server.clock.over:
+            return _refusal("the run is over")
+        if text:
+            self.server.note("", text)
+        self.server.feed(event)
+        view = self.server.clock.look(time.monotonic_ns())
+        return {"ok": True, "state": view.state, "paused": view.paused, "frame": view.frame}
+
+    def _gateway(self, _: Mapping[str, Any]) -> Answer:
+        """What the gateway needs to connect: whoever may ask here may read the keys directory as well."""
+        access = self.server.access
+        if access is None:
+            return {"ok": True, "keys": None}
+        pair = msgspec.to_builtins(access.gateway)
+        return {"ok": True, "keys": str(access.directory.resolve()), **pair, "broker": access.pair.public}
+
+    def _note_serving(self, request: Mapping[str, Any]) -> Answer:
+        url = request.get("http")
+        if not isinstance(url, str) or len(url) > 300:
+            return _refusal("http is the address that is served")
+        self._serving = {"http": url}
+        self._place.announce(http=url)
+        self.server.note("", f"HTTP is served at {url}")
+        return {"ok": True}
+
+    def _note(self, request: Mapping[str, Any]) -> Answer:
+        service, text, kind = (
+            request.get(k, d) for k, d in (("service", ""), ("text", ""), ("kind", "note"))
+        )
+        known = isinstance(service, str) and (not service or self.server.clock.peer(service) is not None)
+        if not known or not isinstance(text, str) or not 0 < len(text) <= 1000:
+            return _refusal("a note has a text of 1 to 1000 characters, and a service of the run or none")
+        if kind not in NOTED:
+            return _refusal(f"a note is of one of the kinds {', '.join(NOTED)}")
+        self.server.note(service, text, kind)
+        return {"ok": True}
+
+
+class _Caller:
+    """One connection. One request is answered a turn, so that frames are never held up by many."""
+
+    def __init__(self, connection: socket.socket, desk: ControlServer) -> None:
+        self.subscribed = False
+        self._socket, self._desk, self._fd = connection, desk, connection.fileno()
+        self._received, self._waiting = b"", bytearray()
+        self._watched = 0
+        self._watch()
+
+    def _watch(self) -> None:
+        """Wait for what is due: room for what waits, the turn of the next request, or a request."""
+        events = zmq.POLLOUT if self._waiting or b"\n" in self._received else zmq.POLLIN
+        if events != self._watched:
+            loop, self._watched = self._desk.server.loop, events
+            loop.unwatch(self._fd)
+            loop.watch(self._fd, self._turn, events)
+
+    def _turn(self) -> None:
+        if self._waiting:
+            self._flush()
+        elif b"\n" in self._received or self._receive():
+            line, _, self._received = self._received.partition(b"\n")
+            answer, events = self._desk.answer(line)
+            self.subscribed |= events
+            self.say(answer)
+        if self._watched:
+            self._watch()
+
+    def _receive(self) -> bool:
+        """Take in what came; whether that makes a request."""
+        try:
+            data = self._socket.recv(MAX_REQUEST)
+        except BlockingIOError:
+            return False
+        except OSError:
+            data = b""
+        self._received += data
+        if not data or (len(self._received) > MAX_REQUEST and b"\n" not in self._received):
+            self.close()
+        return b"\n" in self._received and bool(self._watched)
+
+    def say(self, line: Answer) -> None:
+        """Send one line, as far as it goes now."""
+        self._waiting += json.dumps(line, ensure_ascii=False).encode() + b"\n"
+        self._flush()
+        if len(self._waiting) > MAX_WAITING:
+            self.close()
+        if self._watched:
+            self._watch()
+
+    def _flush(self) -> None:
+        try:
+            sent = self._socket.send(self._waiting)
+        except BlockingIOError:
+            return
+        except OSError:
+            self.close()
+            return
+        del self._waiting[:sent]
+
+    def close(self) -> None:
+        """Hang up."""
+        if self._watched:
+            self._watched = 0
+            self._desk.server.loop.unwatch(self._fd)
+            self._desk.forget(self._fd)
+            self._socket.close()
+
+
+def _refusal(text: str) -> Answer:
+    return {"ok": False, "error": text}

@@ -1,0 +1,232 @@
+"""How services get into a run: HELLO, the graph, preparing, READY; and how they come back."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+from caviar_broker.core import events as ev
+from caviar_broker.core.episodes import Episodes
+from caviar_broker.core.graph import build_graph, check_actuators, check_prefixes
+from caviar_broker.core.run import Peer, Run
+from caviar_broker.core.transitions import RunEvent, RunState, ServiceEvent, ServiceState
+from caviar_protocol.codec import check_version
+from caviar_protocol.digest import geometry_digest
+from caviar_protocol.errors import DeclarationError, VersionError
+from caviar_protocol.messages import (
+    CAPABILITIES,
+    PROTOCOL_VERSION,
+    Asset,
+    Hello,
+    Prepare,
+    Ready,
+    Refuse,
+    Welcome,
+)
+
+
+class Registration:
+    """Clauses 1 and 3 to 5: who takes part, with which declaration and which scenery."""
+
+    def __init__(self, run: Run, episodes: Episodes) -> None:
+        self._run = run
+        self._episodes = episodes
+
+    # --- HELLO -------------------------------------------------------------------------------------
+
+    def joined(self, event: ev.Joined, now: int) -> None:
+        """HELLO: welcome it, or turn it away."""
+        run, hello = self._run, event.hello
+        refusal = self._refusal(hello)
+        if refusal is not None:
+            run.actions.append(ev.TurnAway(hello.name, refusal))
+            if refusal.code in ("version", "declaration"):  # waiting would not mend it
+                run.fail(f"{hello.role} {hello.name!r} was refused: {refusal.message}", hello.name, now)
+            return
+        peer = run.peers[hello.name]
+        if peer.state is ServiceState.LOST:
+            run.notice("back", peer.name, f"{peer} came back after {(now - peer.since) / 1e9:.3g} s")
+        peer.join(hello, now)
+        run.send(
+            peer,
+            Welcome(
+                version=PROTOCOL_VERSION,
+                run=run.plan.run,
+                epoch=run.plan.epoch,
+                attempt=peer.attempt,
+                capabilities=tuple(c for c in hello.capabilities if c in CAPABILITIES),
+                heartbeat_ns=run.plan.limits.heartbeat,
+                liveness_ns=run.plan.limits.liveness,
+                seed=run.plan.seed,
+                settings=dict(peer.plan.settings),
+                scenario=dict(peer.plan.scenario),
+                rejoin_ns=self._held_open(peer, event.local),
+            ),
+        )
+        if run.state is RunState.JOINING:
+            if all(p.state is ServiceState.JOINED for p in run.peers.values()):
+                self._all_joined(now)
+        else:
+            self._prepare_whoever_can(now)
+
+    def _held_open(self, peer: Peer, local: bool) -> int:
+        """How long a service may try to come back by itself once its connections are lost [ns].
+
+        A connection within one machine is lost with the broker alone. Whoever started that starts the local
+        services again too, and one that tried to come back would take the place of its successor.
+        """
+        return peer.rejoin(self._run.plan.limits) if peer.plan.remote or not local else 0
+
+    def _refusal(self, hello: Hello) -> Refuse | None:
+        peer = self._run.peers.get(hello.name)
+        if peer is None:
+            near = difflib.get_close_matches(hello.name, self._run.peers, n=1)
+            hint = f"did you mean {near[0]!r}? " if near else ""
+            expected = ", ".join(sorted(self._run.peers))
+            return Refuse(
+                code="unknown-name",
+                message=f"the run has no service {hello.name!r}; {hint}it expects: {expected}",
+            )
+        if self._run.over:
+            return Refuse(code="late", message="the run is over")
+        if peer.state not in (ServiceState.EXPECTED, ServiceState.LOST):
+            return Refuse(
+                code="name-taken",
+                message=f"a service named {hello.name!r} takes part already; end it or use another name",
+            )
+        try:
+            check_version(hello.version)
+        except VersionError as error:
+            return Refuse(code="version", message=str(error))
+        contradiction = _contradiction(peer, hello)
+        return Refuse(code="declaration", message=contradiction) if contradiction else None
+
+    def _all_joined(self, now: int) -> None:
+        run = self._run
+        hellos = {name: peer.hello for name, peer in run.peers.items() if peer.hello}
+        try:
+            run.graph = build_graph(hellos, run.plan.record)
+        except DeclarationError as error:
+            run.fail(str(error), "", now)
+            return
+        run.enter(RunEvent.ALL_JOINED, now)
+        for name in run.graph.idle:
+            outputs = hellos[name].outputs
+            add = " or ".join(f'"{topic}"' for topic in outputs)
+            text = f"no service takes its {', '.join(outputs)}, so it is not run; add {add} to run.record"
+            run.notice("idle", name, text)
+        self._prepare_whoever_can(now)
+
+    # --- PREPARE and READY ---------------------------------------------------------------------------
+
+    def _prepare_whoever_can(self, now: int) -> None:
+        """Worlds load first; their scenery is known once they are ready, and all others load with it."""
+        run = self._run
+        assert run.graph is not None
+        worlds = [p for p in run.peers.values() if p.role == "world" and run.takes_part(p)]
+        scenery_is_known = all(p.ready for p in worlds)
+        for peer in run.peers.values():
+            if peer.state is ServiceState.JOINED and (peer.role == "world" or scenery_is_known):
+                peer.move(ServiceEvent.PREPARE, now)
+                prepare = Prepare(
+                    epoch=run.plan.epoch,
+                    attempt=peer.attempt,
+                    demand=run.graph.demand[peer.name],
+                    assets=() if peer.role == "world" else self._scenery(),
+                    producers=dict(run.graph.producers),
+                    prefixes={} if peer.role == "world" else _prefixes(worlds),
+                )
+                run.send(peer, prepare)
+
+    def _scenery(self) -> tuple[Asset, ...]:
+        """The scenery of all worlds, each file once."""
+        found = {asset.name: asset for peer in self._run.peers.values() for asset in peer.assets}
+        return tuple(found[name] for name in sorted(found))
+
+    def assets_offered(self, event: ev.AssetsOffered, now: int) -> None:
+        """A world's scenery: one name stands for one file in the run (clause 4)."""
+        run, peer = self._run, self._run.peers[event.service]
+        if peer.state is not ServiceState.PREPARING or peer.role != "world":
+            run.unexpected(peer, "ASSET_OFFER", "only of a world, between PREPARE and READY")
+            return
+        digests = {asset.name: asset.digest for asset in event.assets}
+        if peer.ready and digests != {asset.name: asset.digest for asset in peer.assets}:
+            self._refuse(peer, "geometry", f"{peer} came back with other scenery than it had before", now)
+            return
+        for other in run.peers.values():
+            clashing = [a.name for a in other.assets if digests.get(a.name, a.digest) != a.digest]
+            if other is not peer and clashing:
+                text = f"{other} and {peer} bring different files named {clashing[0]!r}; rename one of them"
+                self._refuse(peer, "clash", text, now)
+                return
+        peer.assets, peer.advanced_at = event.assets, now
+
+    def ready(self, event: ev.ReadyReceived, now: int) -> None:
+        """READY: check what it claims, and go on when everybody is."""
+        run, peer, message = self._run, self._run.peers[event.service], event.message
+        if not run.current(peer, message.epoch, message.attempt, "READY"):
+            return
+        if peer.state is ServiceState.RESTORING:
+            self._episodes.recall.restored(peer, now)
+            return
+        if peer.state is not ServiceState.PREPARING:
+            run.unexpected(peer, "READY", "once, after PREPARE")
+            return
+        peer.move(ServiceEvent.READY, now)
+        for note in message.notes:
+            run.notice("note", peer.name, note)
+        if not self._accepted(peer, message, now):
+            return
+        peer.ready = message
+        if message.seed >= 0 and run.state is RunState.PREPARING and run.resumption is None:
+            run.wish(message.seed, peer, now)
+        self._prepare_whoever_can(now)
+        if run.state is not RunState.PREPARING:
+            self._episodes.reset(peer, now)
+        elif all(p.state is ServiceState.READY for p in run.peers.values() if run.takes_part(p)):
+            run.enter(RunEvent.ALL_READY, now)
+            self._episodes.begin(now)
+
+    def _accepted(self, peer: Peer, message: Ready, now: int) -> bool:
+        """Whether a READY agrees with what others hold and own; else the run ends (clauses 3 and 4)."""
+        expected = geometry_digest(self._scenery())
+        if peer.role != "world" and message.geometry and message.geometry != expected:
+            text = (
+                f"{peer} holds scenery {message.geometry[:12]}…, the worlds announced "
+                f"{expected[:12] or 'none'}…; clear its asset cache and start it again"
+            )
+            self._refuse(peer, "geometry", text, now)
+            return False
+        claims = {p.name: p.ready for p in self._run.peers.values() if p.ready} | {peer.name: message}
+        try:
+            worlds = {n: r.prefixes for n, r in claims.items() if self._run.peers[n].role == "world"}
+            check_prefixes(worlds)
+            check_actuators({n: r.actuators for n, r in claims.items()})
+        except DeclarationError as error:
+            self._refuse(peer, "clash", str(error), now)
+            return False
+        return True
+
+    def _refuse(self, peer: Peer, code: str, text: str, now: int) -> None:
+        self._run.send(peer, Refuse(code=code, message=text))
+        self._run.fail(text, peer.name, now)
+
+
+def _prefixes(worlds: Iterable[Peer]) -> dict[str, tuple[str, ...]]:
+    """What each world that is ready declared of the names of its objects."""
+    return {world.name: world.ready.prefixes for world in worlds if world.ready}
+
+
+def _contradiction(peer: Peer, hello: Hello) -> str:
+    """How a HELLO contradicts the scenario or what the service said before; empty if it does not."""
+    if hello.role != peer.role:
+        return f"{hello.name!r} is the run's {peer.role}, this one says that its role is {hello.role}"
+    if peer.plan.use and hello.implementation and hello.implementation != peer.plan.use:
+        return (
+            f"{hello.name!r} is {hello.implementation!r}, the scenario says use = {peer.plan.use!r}; "
+            "start that one, or change the scenario, which is recorded with the run"
+        )
+    before = peer.hello
+    if before is not None and (hello.inputs, hello.outputs) != (before.inputs, before.outputs):
+        return f"{hello.name!r} came back with other inputs or outputs than it had before"
+    return ""

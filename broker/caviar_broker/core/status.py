@@ -1,0 +1,206 @@
+"""A run as somebody sees who asks: who does what, and who is waited for (contract, clause 14)."""
+
+from __future__ import annotations
+
+import msgspec
+
+from caviar_broker.core.decisions import Task
+from caviar_broker.core.episodes import Episodes
+from caviar_broker.core.run import Peer, Run
+from caviar_broker.core.transitions import RunState, ServiceState, TaskState
+
+_UNDER_WAY = {
+    ServiceState.EXPECTED: "has not connected",
+    ServiceState.PREPARING: "is preparing",
+    ServiceState.RESETTING: "is resetting",
+    ServiceState.LOST: "is away",
+}
+
+
+class GrantStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """A grant that a service has not answered."""
+
+    frame: int
+    state: str
+    """``granted``; ``overdue`` where its frame has gone on without it, ``abandoned`` behind the end."""
+    elapsed_s: float
+    budget_s: float
+
+
+class ServiceStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """One service of the run."""
+
+    name: str
+    role: str
+    use: str
+    policy: str
+    state: str
+    since_s: float
+    """How long it has been in that state [s]."""
+    attempt: int
+    phase: str
+    progress: int
+    heartbeat_age_s: float | None
+    """Since its last heartbeat [s]; None: none ever came."""
+    grants: tuple[GrantStatus, ...]
+    """Oldest first."""
+
+
+class Wait(msgspec.Struct, frozen=True, kw_only=True):
+    """One service that the run waits for now."""
+
+    service: str
+    role: str
+    frame: int
+    """-1 where it is not a frame that it works on."""
+    phase: str
+    progress: int
+    heartbeat_age_s: float | None
+    elapsed_s: float
+    limit_s: float
+    """Its budget in a frame, otherwise how long the run waits at most [s]."""
+    late: bool
+    """Whether that is up."""
+    missing: str
+    """Who waits for which input of it; empty if nobody does."""
+    text: str
+
+
+class RunStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """The run as a whole."""
+
+    run: str
+    epoch: int
+    state: str
+    since_s: float
+    paused: bool
+    steps: int
+    """Frames that will still begin although it is paused."""
+    episode: int
+    episodes: int
+    frame: int
+    """The last frame of the episode that has begun; -1: none."""
+    frames: int
+    pace: str
+    services: tuple[ServiceStatus, ...]
+    waits: tuple[Wait, ...]
+    """Who is waited for, longest first."""
+    error: str
+    culprit: str
+
+
+def look(run: Run, episodes: Episodes, now: int) -> RunStatus:
+    """The view of a run at the time ``now`` [ns]."""
+    schedule = episodes.schedule
+    waits = [wait for peer in run.peers.values() if (wait := _wait(run, episodes, peer, now)) is not None]
+    return RunStatus(
+        run=run.plan.run,
+        epoch=run.plan.epoch,
+        state=run.state.name.lower(),
+        since_s=_s(now - run.since),
+        paused=run.gate.closed,
+        steps=run.gate.steps,
+        episode=run.episode,
+        episodes=run.plan.episodes,
+        frame=schedule.begun if schedule is not None else -1,
+        frames=schedule.frames if schedule is not None else run.plan.frames,
+        pace="realtime" if run.plan.realtime else "free",
+        services=tuple(_service(peer, episodes, now) for peer in run.peers.values()),
+        waits=tuple(sorted(waits, key=lambda wait: (not wait.late, -wait.elapsed_s))),
+        error=run.error,
+        culprit=run.culprit,
+    )
+
+
+def _service(peer: Peer, episodes: Episodes, now: int) -> ServiceStatus:
+    return ServiceStatus(
+        name=peer.name,
+        role=peer.role,
+        use=peer.plan.use,
+        policy=peer.plan.policy,
+        state=peer.state.name.lower(),
+        since_s=_s(now - peer.since),
+        attempt=peer.attempt,
+        phase=peer.phase,
+        progress=peer.progress,
+        heartbeat_age_s=_age(peer, now),
+        grants=tuple(
+            GrantStatus(
+                frame=task.frame,
+                state=task.state.name.lower(),
+                elapsed_s=_s(now - task.started_at),
+                budget_s=_s(peer.plan.budget_ns),
+            )
+            for task in _owed(peer, episodes)
+        ),
+    )
+
+
+def _wait(run: Run, episodes: Episodes, peer: Peer, now: int) -> Wait | None:
+    """Whether the run waits for a service, and how that is told."""
+    if not run.takes_part(peer):
+        return None
+    if run.state is RunState.STOPPING:
+        if not peer.present:
+            return None
+        limit = run.plan.limits.shutdown
+        text = f"{peer} has not said BYE for {_told(now - run.since)}; {peer.last_words(now)}"
+        return _of(peer, -1, now - run.since, limit, "", text, now)
+    owed = [task for task in _owed(peer, episodes) if task.state is not TaskState.ABANDONED]
+    schedule = episodes.schedule
+    lacking = schedule.waiting_for(peer.name) if schedule is not None else ""
+    if peer.state in _UNDER_WAY:
+        limits = run.plan.limits
+        limit = {
+            ServiceState.EXPECTED: limits.connect,
+            ServiceState.PREPARING: limits.ready,
+            ServiceState.RESETTING: limits.reset,
+            ServiceState.LOST: peer.rejoin(limits),
+        }[peer.state]
+        text = f"{peer} {_UNDER_WAY[peer.state]}, for {_told(now - peer.since)} now, "
+        text += f"at most {_told(limit)}; {peer.last_words(now)}"
+        text += f"; {peer.verdict}" if peer.state is ServiceState.LOST else ""
+        text += f"; {lacking}" if lacking and owed else ""
+        return _of(peer, owed[0].frame if owed else -1, now - peer.since, limit, lacking, text, now)
+    if not owed:
+        return None
+    task = owed[0]
+    late = now - task.started_at > peer.plan.budget_ns
+    problem = "is late" if late else "is at work"
+    text = peer.blame_task(task, problem, now, lacking)
+    return _of(peer, task.frame, now - task.started_at, peer.plan.budget_ns, lacking, text, now)
+
+
+def _of(peer: Peer, frame: int, elapsed: int, limit: int, lacking: str, text: str, now: int) -> Wait:
+    return Wait(
+        service=peer.name,
+        role=peer.role,
+        frame=frame,
+        phase=peer.phase,
+        progress=peer.progress,
+        heartbeat_age_s=_age(peer, now),
+        elapsed_s=_s(elapsed),
+        limit_s=_s(limit),
+        late=elapsed > limit,
+        missing=lacking,
+        text=text,
+    )
+
+
+def _owed(peer: Peer, episodes: Episodes) -> list[Task]:
+    schedule = episodes.schedule
+    if schedule is None or peer.name not in schedule.graph.inputs:
+        return []
+    return schedule.outstanding(peer.name)
+
+
+def _age(peer: Peer, now: int) -> float | None:
+    return None if peer.heard_at is None else _s(now - peer.heard_at)
+
+
+def _s(ns: int) -> float:
+    return round(ns / 1e9, 6)
+
+
+def _told(ns: int) -> str:
+    return f"{ns / 1e9:.3g} s" if ns >= 1_000_000_000 else f"{ns / 1e6:.3g} ms"

@@ -1,0 +1,323 @@
+"""The HTTP interface: what a broker's desk says and does, as JSON, and the gateway at ``/ws``."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from typing import Annotated, Any
+
+from fastapi import Depends, FastAPI, HTTPException, Query, Request, WebSocket
+from fastapi.responses import JSONResponse, PlainTextResponse
+from fastapi.security import HTTPBearer
+from starlette.datastructures import Headers
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from caviar_broker.control.server import MAX_STEPS
+from caviar_broker.control.socket import ControlClient, RequestRefusedError
+from caviar_broker.http.auth import Tokens, foreign, token_of
+from caviar_broker.http.gateway import Gateway
+from caviar_protocol.errors import RunError
+from caviar_protocol.keys import OPERATOR, VIEWER
+from caviar_protocol.messages import PROTOCOL_VERSION
+
+CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+STATES = ("joining", "preparing", "resetting", "running", "stopping", "finished")
+
+
+def metrics(status: Mapping[str, Any], peers: int) -> str:
+    """The text, from a desk's status and the number of open WebSockets."""
+    return "\n".join(_lines(status, peers)) + "\n"
+
+
+def _lines(status: Mapping[str, Any], peers: int) -> Iterator[str]:
+    services, waits = status["services"], {wait["service"]: wait for wait in status["waits"]}
+    yield from _family("caviar_run_info", "gauge", "Run and incarnation of the broker; always 1.")
+    yield _sample("caviar_run_info", 1, run=status["run"], epoch=status["epoch"])
+    yield from _family("caviar_run_state", "gauge", "1 for the state that the run is in.")
+    for state in STATES:
+        yield _sample("caviar_run_state", int(state == status["state"]), state=state)
+    single = (
+        ("caviar_paused", "gauge", "Whether the run is paused.", int(status["paused"])),
+        ("caviar_episode", "gauge", "Present episode, from 0.", status["episode"]),
+        (
+            "caviar_frames_finished_total",
+            "counter",
+            "Frames finished.",
+            status["frames_finished"],
+        ),
+        ("caviar_frames_per_second", "gauge", "Newest frames a second.", status["frames_per_second"]),
+        ("caviar_websocket_connections", "gauge", "Open connections of the gateway.", peers),
+    )
+    for name, kind, about, value in single:
+        yield from _family(name, kind, about)
+        yield _sample(name, value)
+    yield from _family("caviar_service_present", "gauge", "Whether a service is connected.")
+    for service in services:
+        present = service["state"] not in ("expected", "lost", "left")
+        yield _sample("caviar_service_present", int(present), service=service["name"], role=service["role"])
+    yield from _family("caviar_service_waited_seconds", "gauge", "How long the run has waited for it now.")
+    for service in services:
+        waited = waits[service["name"]]["elapsed_s"] if service["name"] in waits else 0
+        yield _sample("caviar_service_waited_seconds", waited, service=service["name"])
+    yield from _family("caviar_heartbeat_age_seconds", "gauge", "Since its last heartbeat.")
+    for service in services:
+        if service["heartbeat_age_s"] is not None:
+            yield _sample("caviar_heartbeat_age_seconds", service["heartbeat_age_s"], service=service["name"])
+    yield from _family("caviar_budget_seconds", "gauge", "Its budget of a frame.")
+    for service in services:
+        yield _sample("caviar_budget_seconds", service["budget_ms"] / 1e3, service=service["name"])
+    yield from _family("caviar_misses_total", "counter", "Frames in which it overran its budget.")
+    for service in services:
+        yield _sample("caviar_misses_total", service["misses"], service=service["name"])
+    yield from _family("caviar_latency_seconds", "summary", "From grant to answer; quantiles: newest 512.")
+    for service in services:
+        name = service["name"]
+        for quantile, key in (("0.5", "p50_ms"), ("0.99", "p99_ms")):
+            if service[key] is not None:
+                yield _sample("caviar_latency_seconds", service[key] / 1e3, service=name, quantile=quantile)
+        yield _sample("caviar_latency_seconds_sum", service["total_ms"] / 1e3, service=name)
+        yield _sample("caviar_latency_seconds_count", service["grants_answered"], service=name)
+
+
+def _family(name: str, kind: str, about: str) -> Iterator[str]:
+    yield f"# HELP {name} {about}"
+    yield f"# TYPE {name} {kind}"
+
+
+def _sample(name: str, value: float, **labels: str | int) -> str:
+    told = ",".join(f'{key}="{_escaped(str(text))}"' for key, text in labels.items())
+    return f"{name}{{{told}}} {value}" if told else f"{name} {value}"
+
+
+def _escaped(text: str) -> str:
+    return text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
+
+
+_WAIT: dict[str, Any] = {
+    "service": "channel",
+    "role": "channel",
+    "frame": 41,
+    "phase": "tracing",
+    "progress": 3107,
+    "heartbeat_age_s": 0.121,
+    "elapsed_s": 0.734,
+    "limit_s": 0.5,
+    "late": True,
+    "missing": "link waits for channel of frame 41",
+    "text": "channel 'channel' is late in frame 41: 734 ms since its grant, budget 500 ms; last heartbeat "
+    "121 ms ago: phase 'tracing', progress 3107; link waits for channel of frame 41",
+}
+_BLAME: dict[str, Any] = {
+    "kind": "miss",
+    "service": "channel",
+    "text": "channel 'channel' overran its budget in frame 41: 500 ms since its grant, budget 500 ms; "
+    "last heartbeat 86.4 ms ago: phase 'tracing', progress 3101; the frame waits",
+    "episode": 0,
+    "frame": 41,
+    "at": 1767225600.25,
+}
+_FIGURES: dict[str, Any] = {
+    "p50_ms": 212.4,
+    "p99_ms": 480.2,
+    "total_ms": 9012.7,
+    "grants_answered": 41,
+    "misses": 1,
+    "budget_ms": 500.0,
+}
+
+WHY: dict[str, Any] = {
+    "run": "street-canyon-20260101-120000",
+    "state": "running",
+    "paused": False,
+    "episode": 0,
+    "frame": 42,
+    "late": True,
+    "waits": [_WAIT],
+    "last_blame": _BLAME,
+    "error": "",
+}
+LATENCIES: dict[str, Any] = {"channel": _FIGURES}
+ORDERED: dict[str, Any] = {"state": "running", "paused": True, "frame": 42}
+STATUS: dict[str, Any] = {
+    "run": "street-canyon-20260101-120000",
+    "epoch": 1,
+    "state": "running",
+    "since_s": 12.81,
+    "paused": False,
+    "steps": 0,
+    "episode": 0,
+    "episodes": 1,
+    "frame": 42,
+    "frames": 120,
+    "pace": "free",
+    "services": [
+        {
+            "name": "channel",
+            "role": "channel",
+            "use": "sionna-rt",
+            "policy": "wait",
+            "state": "active",
+            "since_s": 12.81,
+            "attempt": 1,
+            "phase": "tracing",
+            "progress": 3107,
+            "heartbeat_age_s": 0.121,
+            "grants": [{"frame": 41, "state": "granted", "elapsed_s": 0.734, "budget_s": 0.5}],
+            **_FIGURES,
+        }
+    ],
+    "waits": [_WAIT],
+    "error": "",
+    "culprit": "",
+    "frames_finished": 40,
+    "misses": 1,
+    "frames_per_second": 3.2,
+    "endpoint": "tcp://127.0.0.1:5570",
+    "http": "http://127.0.0.1:8080",
+    "last_blame": _BLAME,
+}
+
+
+ABOUT = """Look at a running CAVIAR broker, and have it pause, step or stop.
+
+Where there are tokens, `Authorization: Bearer TOKEN` is asked for: a *viewer* may read, an *operator* may
+give orders too. `/ws` is the WebSocket gateway (protocol/SPEC.md, section WebSocket)."""
+READY = ("resetting", "running", "stopping")
+_bearer = HTTPBearer(auto_error=False, description="token of caviar keys token")
+
+
+class LocalOnly:
+    """Refuses what a page from elsewhere has a browser send here, where no token protects from that.
+
+    WebSockets pass: the gateway refuses those itself, in a way that a page can read.
+    """
+
+    def __init__(self, app: ASGIApp, tokens: Tokens) -> None:
+        self._app, self._tokens = app, tokens
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on, or answer it."""
+        reason = foreign(Headers(scope=scope), self._tokens) if scope["type"] == "http" else ""
+        if reason:
+            await JSONResponse({"detail": reason}, 403)(scope, receive, send)
+        else:
+            await self._app(scope, receive, send)
+
+
+def make_app(desk: ControlClient, tokens: Tokens, gateway: Gateway) -> FastAPI:
+    """The application."""
+    version = ".".join(map(str, PROTOCOL_VERSION))
+    app = FastAPI(title="CAVIAR broker", version=version, description=ABOUT, docs_url=None, redoc_url=None)
+    app.add_middleware(LocalOnly, tokens=tokens)
+    app.add_exception_handler(RequestRefusedError, _refused)
+    app.add_exception_handler(RunError, _no_broker)
+    viewer = [Depends(_bearer), Depends(_may(VIEWER, tokens))]
+    operator = [Depends(_bearer), Depends(_may(OPERATOR, tokens))]
+    _questions(app, desk, gateway, viewer)
+    _orders(app, desk, operator)
+    _probes(app, desk)
+
+    @app.websocket("/ws")
+    async def ws(socket: WebSocket) -> None:
+        await gateway.serve(socket)
+
+    return app
+
+
+def _questions(app: FastAPI, desk: ControlClient, gateway: Gateway, viewer: list[Any]) -> None:
+    @app.get("/status", dependencies=viewer, responses=_example(STATUS))
+    async def status() -> Any:
+        """The run, its services, and what each of them does now."""
+        return (await desk.ask("status"))["status"]
+
+    @app.get("/why", dependencies=viewer, responses=_example(WHY))
+    async def why() -> Any:
+        """Whom the run waits for now, and why; the last blame."""
+        return (await desk.ask("why"))["why"]
+
+    @app.get("/latencies", dependencies=viewer, responses=_example(LATENCIES))
+    async def latencies() -> Any:
+        """How each service keeps its budget; quantiles of its newest 512 answers."""
+        return (await desk.ask("latencies"))["latencies"]
+
+    @app.get("/metrics", dependencies=viewer, response_class=PlainTextResponse)
+    async def prometheus() -> Any:
+        """The same as figures for Prometheus."""
+        found = (await desk.ask("status"))["status"]
+        return PlainTextResponse(metrics(found, gateway.connections), media_type=CONTENT_TYPE)
+
+
+def _orders(app: FastAPI, desk: ControlClient, operator: list[Any]) -> None:
+    done = _example(ORDERED) | {409: {"description": "not possible in this state of the run"}}
+
+    @app.post("/pause", dependencies=operator, responses=done)
+    async def pause() -> Any:
+        """Let no new frame begin; those that have begun are finished."""
+        return _state(await desk.ask("pause"))
+
+    @app.post("/resume", dependencies=operator, responses=done)
+    async def resume() -> Any:
+        """Let frames begin again."""
+        return _state(await desk.ask("resume"))
+
+    @app.post("/step", dependencies=operator, responses=done)
+    async def step(
+        frames: Annotated[int, Query(ge=1, le=MAX_STEPS, description="how many frames")] = 1,
+    ) -> Any:
+        """Let so many frames more of a paused run begin."""
+        return _state(await desk.ask("step", frames=frames))
+
+    @app.post("/stop", dependencies=operator, responses=done)
+    async def stop(
+        reason: Annotated[str, Query(min_length=1, max_length=500)] = "stopped over HTTP",
+    ) -> Any:
+        """End the run in order: every service is told to leave."""
+        return _state(await desk.ask("stop", reason=reason))
+
+
+def _probes(app: FastAPI, desk: ControlClient) -> None:
+    @app.get("/healthz", responses=_example({"ok": True}) | _unready("the broker does not answer"))
+    async def healthz() -> Any:
+        """Whether the broker answers. Needs no token."""
+        await desk.ask("why")
+        return {"ok": True}
+
+    @app.get("/readyz", responses=_example({"ready": True}) | _unready("services are missing or prepare"))
+    async def readyz() -> Any:
+        """Whether all services are there and ready. Needs no token."""
+        state = (await desk.ask("why"))["why"]["state"]
+        return JSONResponse({"ready": state in READY}, 200 if state in READY else 503)
+
+
+def _may(role: str, tokens: Tokens) -> Callable[[Request], Awaitable[None]]:
+    """What checks that a request's token has a role."""
+
+    async def check(request: Request) -> None:
+        if not tokens.exist:
+            return
+        token = token_of(request.headers, tokens)
+        if token is None:
+            raise HTTPException(401, "this asks for a token", {"WWW-Authenticate": "Bearer"})
+        if not token.may(role):
+            raise HTTPException(403, f"this asks for a token with the role {role}")
+
+    return check
+
+
+def _state(answer: dict[str, Any]) -> dict[str, Any]:
+    return {key: answer[key] for key in ("state", "paused", "frame")}
+
+
+async def _refused(_: Request, error: Exception) -> JSONResponse:
+    return JSONResponse({"detail": str(error)}, 409)
+
+
+async def _no_broker(_: Request, error: Exception) -> JSONResponse:
+    return JSONResponse({"detail": str(error)}, 503)
+
+
+def _example(value: Any) -> dict[int | str, dict[str, Any]]:
+    return {200: {"content": {"application/json": {"example": value}}}}
+
+
+def _unready(text: str) -> dict[int | str, dict[str, Any]]:
+    return {503: {"description": text}}

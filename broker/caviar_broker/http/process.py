@@ -1,0 +1,248 @@
+"""Serving HTTP in a process of its own: started by a broker, by hand beside one, or in front of any ROUTER.
+
+``python -m caviar_broker.http RUN --http HOST:PORT`` serves beside the broker that runs in a directory, and
+ends when that broker does. Libraries of HTTP are imported by the functions that serve: the broker's own
+process, which imports this module to start the other one, does without them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import os
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from caviar_broker.control.socket import ControlClient
+from caviar_broker.http.auth import Tokens, http_address
+from caviar_broker.supervision import describe_exit
+from caviar_protocol.errors import CaviarError, RunError, SetupError
+from caviar_protocol.keys import Credentials, Pair
+
+if TYPE_CHECKING:
+    from caviar_broker.server import BrokerServer
+
+END_S = 3.0
+"""[s] that the process gets to end behind the broker's last frame, which it sees by itself."""
+LOG = Path("logs", "http.log")
+
+
+class HttpProcess:
+    """The process that serves HTTP for a broker; without an address, nothing.
+
+    Parameters
+    ----------
+    directory
+        Of the run.
+    address
+        ``HOST:PORT``; "" for none.
+    keys
+        Keys directory with the tokens.
+    again
+        Whether the run goes on: then the process of the broker before may hold the address a moment longer.
+
+    Raises `SetupError` where the address is none, taken, or open to others without tokens.
+    """
+
+    def __init__(self, directory: Path, address: str, keys: Path | None, again: bool = False) -> None:
+        self._directory, self._address, self._keys = directory, address, keys
+        self._process: subprocess.Popen[bytes] | None = None
+        self._fd = -1
+        if address:
+            place = http_address(address, keys)
+            if not again:
+                _refuse_taken(*place)
+
+    def start(self, server: BrokerServer) -> None:
+        """Start the process; the server's loop notes when it ends."""
+        if not self._address:
+            return
+        command = [sys.executable, "-m", "caviar_broker.http", str(self._directory), "--http", self._address]
+        command += ["--keys", str(self._keys)] if self._keys is not None else []
+        log = self._directory / LOG
+        log.parent.mkdir(exist_ok=True)
+        with log.open("wb") as file:
+            self._process = subprocess.Popen(  # noqa: S603  # our own module with checked arguments
+                command, stdin=subprocess.DEVNULL, stdout=file, stderr=file, start_new_session=True
+            )
+        self._fd = os.pidfd_open(self._process.pid)
+        server.loop.watch(self._fd, lambda: self._ended(server))
+
+    def _ended(self, server: BrokerServer) -> None:
+        server.loop.unwatch(self._fd)
+        if self._process is not None:
+            lines = (self._directory / LOG).read_text(errors="replace").strip().splitlines()
+            said = f": {lines[-1]}" if lines else ""
+            server.note("", f"HTTP is not served any more, {describe_exit(self._process.wait())}{said}")
+
+    def close(self) -> None:
+        """Wait for the end of the process, and kill it after `END_S`."""
+        if self._process is None:
+            return
+        try:
+            self._process.wait(END_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        os.close(self._fd)
+
+
+def _refuse_taken(host: str, port: int) -> None:
+    """`SetupError` where nothing can listen: the process itself would end beside a run that goes on."""
+    try:
+        family, kind, number, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, number) as trial:
+            trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            trial.bind(place)
+            trial.listen()
+    except OSError as error:
+        raise SetupError(
+            f"HTTP cannot be served at {host}:{port}: {error.strerror}; "
+            "choose another address, or port 0 for any"
+        ) from None
+
+
+async def serve(run: Path, address: str, keys: Path | None) -> None:
+    """Serve until the broker ends. Raises `RunError` where none runs there, or the address is taken."""
+    from caviar_broker.http.app import make_app
+    from caviar_broker.http.gateway import NOTE, REMEDY, Gateway
+    from caviar_broker.http.server import http_server, listening_socket
+
+    desk = ControlClient(run)
+    keys, credentials = await _of_the_broker(desk, keys)
+    host, port = http_address(address, keys)
+    tokens = Tokens(keys)
+    status = (await desk.ask("status"))["status"]
+    known = {entry["name"] for entry in status["services"]}
+
+    async def tell(service: str, text: str, kind: str) -> None:
+        with contextlib.suppress(RunError):
+            await desk.ask("note", service=service if service in known else "", text=text[:1000], kind=kind)
+
+    remedy = f"{REMEDY} --directory {keys}" if keys is not None else REMEDY
+    gateway = Gateway(_reachable(status["endpoint"]), tokens, tell, credentials, remedy)
+    listening = listening_socket(host, port)
+    told: set[asyncio.Task[None]] = set()
+
+    def tell_soon(text: str) -> None:
+        task = asyncio.create_task(tell("", text, NOTE))
+        told.add(task)
+        task.add_done_callback(told.discard)
+
+    server = http_server(make_app(desk, tokens, gateway), tell_soon, own_process=True)
+
+    async def end_with_the_broker() -> None:
+        async for _ in desk.events():
+            continue
+        server.should_exit = True
+
+    follower = asyncio.create_task(end_with_the_broker())
+    await desk.ask("serving", http=f"http://{_place(host, listening)}")
+    try:
+        await server.serve(sockets=[listening])
+    finally:
+        follower.cancel()
+        desk.close()
+        gateway.close()
+
+
+async def _of_the_broker(desk: ControlClient, keys: Path | None) -> tuple[Path | None, Credentials | None]:
+    """Keys directory, and the gateway's own key where the broker has keys, whose directory it then is.
+
+    The key comes over the control socket, where only the broker's user can ask; it is written nowhere.
+    """
+    told = await desk.ask("gateway")
+    if told["keys"] is None:
+        return keys, None
+    directory = Path(told["keys"])
+    if keys is not None and keys.resolve() != directory:
+        raise RunError(f"the broker has its keys and tokens in {directory}, not in {keys}; leave out --keys")
+    pair = Pair(public=told["public"], secret=told["secret"])
+    return directory, Credentials(pair, told["broker"])
+
+
+def _reachable(endpoint: str) -> str:
+    """Where this machine reaches a broker that listens at all of its addresses."""
+    return endpoint.replace("//0.0.0.0:", "//127.0.0.1:").replace("//[::]:", "//[::1]:")
+
+
+def _place(host: str, listening: socket.socket) -> str:
+    """``HOST:PORT`` of a listening socket, as it stands in a URL."""
+    shown = f"[{host}]" if ":" in host else host
+    return f"{shown}:{listening.getsockname()[1]}"
+
+
+@contextlib.contextmanager
+def gateway_in_front(endpoint: str, address: str, tell: Callable[[str], None]) -> Iterator[str]:
+    """Serve WebSockets for a ROUTER that is no broker's, such as that of the conformance kit, without tokens.
+
+    Parameters
+    ----------
+    endpoint
+        Where the ROUTER listens.
+    address
+        ``HOST:PORT`` of this machine to serve at; port 0: any.
+    tell
+        Is told of each connection that is refused or cut off, from another thread.
+
+    Yields the URL, and serves until the context is left.
+    Raises `SetupError` for an address that is none, `RunError` where it is taken.
+    """
+    from starlette.applications import Starlette
+    from starlette.routing import WebSocketRoute
+    from uvicorn import Server
+
+    from caviar_broker.http.gateway import Gateway
+    from caviar_broker.http.server import http_server, listening_socket
+
+    host, port = http_address(address, None)
+    listening = listening_socket(host, port)
+    servers: list[Server] = []
+
+    async def serve() -> None:
+        async def note(_service: str, text: str, _kind: str) -> None:
+            tell(text)
+
+        gateway = Gateway(endpoint, Tokens(None), note)
+        servers.append(http_server(Starlette(routes=[WebSocketRoute("/ws", gateway.serve)]), tell))
+        try:
+            await servers[0].serve(sockets=[listening])
+        finally:
+            gateway.close()
+
+    thread = threading.Thread(target=asyncio.run, args=(serve(),), name="gateway", daemon=True)
+    thread.start()
+    try:
+        yield f"ws://{_place(host, listening)}/ws"
+    finally:
+        for server in servers:
+            server.should_exit = True
+        thread.join()
+
+
+def parser() -> argparse.ArgumentParser:
+    """Command line."""
+    found = argparse.ArgumentParser(prog="python -m caviar_broker.http", description=__doc__)
+    found.add_argument("run", type=Path, help="directory of the run")
+    found.add_argument("--http", default="127.0.0.1:8080", help="address to serve at; port 0: any free one")
+    found.add_argument("--keys", type=Path, default=None, help="keys directory, with tokens.toml")
+    return found
+
+
+def main() -> int:
+    """Parse the command line and serve; the exit status."""
+    arguments = parser().parse_args()
+    try:
+        asyncio.run(serve(arguments.run, arguments.http, arguments.keys))
+    except CaviarError as error:
+        sys.stderr.write(f"caviar http: {error}\n")
+        return 1
+    except KeyboardInterrupt:
+        return 130
+    return 0

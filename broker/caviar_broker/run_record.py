@@ -1,0 +1,173 @@
+"""What a run directory says about its run, so that another broker can go on with it."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+import re
+from collections.abc import Iterator, Mapping
+from importlib import metadata
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from caviar_protocol.errors import RecordingError, RunError
+from caviar_protocol.files import read_regular, replace_file
+from caviar_protocol.messages import PROTOCOL_VERSION
+from caviar_protocol.scenario import Scenario
+from caviar_protocol.scenario.conversion import Source
+
+PACKAGES = ("caviar_protocol", "caviar_broker", "caviar_services")
+"""Code that takes part in every run."""
+LIBRARIES = ("numpy", "msgspec", "pyzmq", "mcap")
+TRACING = ("sionna-rt", "mitsuba", "drjit")
+TRAFFIC = ("libsumo", "eclipse-sumo")
+ENTRY_POINTS = "caviar.services"
+"""Group through which other distributions add services."""
+
+
+def versions_of(scenario: Scenario) -> dict[str, str]:
+    """Version of each part that the results of a scenario may depend on; of code and files a hash.
+
+    Libraries for ray tracing and traffic count where a service that `caviar run` starts may use them.
+    """
+    read = msgspec.structs.replace(scenario, source=Source())  # a run goes on with what was read
+    used = {spec.use for spec in scenario.services.values()}
+    libraries = [*LIBRARIES]
+    libraries += TRAFFIC if "sumo" in used else ()
+    libraries += TRACING if used & _tracers() else ()
+    found = {
+        "python": platform.python_version(),
+        "protocol": ".".join(map(str, PROTOCOL_VERSION)),
+        "code": _hash_of(path for package in PACKAGES for path in _sources(package)),
+    }
+    found |= {name: _version(name) for name in libraries}
+    for package in sorted({use.partition(".")[0].partition(":")[0] for use in used if ":" in use}):
+        found[f"code of {package}"] = _hash_of(_sources(package))
+    for point in metadata.entry_points(group=ENTRY_POINTS):
+        if point.name.partition(":")[2] in used and point.dist is not None:
+            found[point.dist.name] = point.dist.version
+    for path in sorted(set(_files_in(msgspec.to_builtins(read)))):
+        found[f"file {path}"] = _hash_of([path])
+    return found
+
+
+def changes(before: Mapping[str, str], now: Mapping[str, str]) -> str:
+    """What is of another version than before; empty where nothing is."""
+    return "; ".join(
+        f"{name} {now.get(name, 'not used')} (was {before.get(name, 'not used')})"
+        for name in sorted({*before, *now})
+        if before.get(name) != now.get(name)
+    )
+
+
+def _tracers() -> frozenset[str]:
+    """Implementations that import the ray tracer."""
+    return frozenset({"sionna-rt", "adaptive", "lidar", "camera"})
+
+
+def _version(name: str) -> str:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def _sources(package: str) -> Iterator[Path]:
+    spec = find_spec(package)
+    if spec is None:
+        return  # a service that is not installed here does not start here
+    for folder in spec.submodule_search_locations or ():
+        yield from sorted(Path(folder).rglob("*.py"))
+    if not spec.submodule_search_locations and spec.origin:
+        yield Path(spec.origin)
+
+
+def _hash_of(paths: Any) -> str:
+    """A short hash of the contents of files."""
+    h = hashlib.sha256()
+    for path in paths:
+        data = path.read_bytes()
+        h.update(f"{path.name}\0{len(data)}\0".encode())
+        h.update(data)
+    return h.hexdigest()[:16]
+
+
+def _files_in(value: Any) -> Iterator[Path]:
+    """Files that a scenario names, with their absolute paths."""
+    if isinstance(value, Mapping):
+        value = list(value.values())
+    if isinstance(value, list | tuple):
+        for item in value:
+            yield from _files_in(item)
+    elif isinstance(value, str) and len(value) < 4096:
+        path = Path(value.removeprefix("file:"))
+        if path.is_absolute() and path.is_file():
+            yield path
+
+
+NAME = "run.json"
+_UNSET = "0" * 64
+_CHECK = re.compile(rb'\n "check": "([0-9a-f]{64})"\n}\n$')
+"""The last line of the file."""
+
+
+class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """``run.json``: who runs what, where, and with which code."""
+
+    run: str
+    epoch: int
+    """Of the broker that wrote this."""
+    endpoint: str
+    """Where that broker listened."""
+    scenario: Scenario
+    """As resolved, with the command line's values and absolute paths."""
+    versions: dict[str, str] = {}
+    """Of all that the results depend on, as `caviar_broker.versions.versions_of` finds them."""
+    check: str = _UNSET
+    """SHA-256 of the file with zeros in this place."""
+
+    def save(self, directory: Path) -> None:
+        """Write it, in one step and to the disk. `RunError` naming the file where that fails."""
+        path = directory / NAME
+        file = self.scenario.source.file  # whose folder may have modules of services
+        source = Source(file=str(Path(file).resolve()) if file else "")
+        without_lines = msgspec.structs.replace(self.scenario, source=source)
+        plain = msgspec.structs.replace(self, scenario=without_lines, check=_UNSET)
+        data = msgspec.json.format(msgspec.json.encode(plain), indent=1) + b"\n"
+        check = hashlib.sha256(data).hexdigest()
+        try:
+            replace_file(path, data.replace(_UNSET.encode(), check.encode()))
+        except OSError as error:
+            raise RunError(f"cannot write {path}: {error.strerror}") from error
+
+
+def read_record(directory: Path) -> RunRecord:
+    """The record of a run. `RecordingError` naming the file where it is none, or not as it was written."""
+    path = directory / NAME
+    try:
+        data = read_regular(path)
+    except OSError as error:
+        if isinstance(error, FileNotFoundError) and (directory / "journal.msgpack").exists():
+            raise RecordingError(
+                f"cannot go on with {directory}: it has no {NAME}, and an embedded run cannot be "
+                "gone on with; run its scenario again"
+            ) from error
+        remedy = "; give the directory of a run" if isinstance(error, FileNotFoundError) else ""
+        raise RecordingError(f"cannot go on with {directory}: {path}: {error.strerror}{remedy}") from error
+    found = _CHECK.search(data)
+    if found is None or hashlib.sha256(_blanked(data, found)).hexdigest() != found[1].decode():
+        why = "it is empty" if not data.strip(b"\0") else "its content is not that of its SHA-256"
+        if found is None and b'"scenario"' in data and b'"check"' not in data:
+            why = "it has no check value; a run that another version began is gone on with by that version"
+        raise RecordingError(f"cannot go on with {directory}: {path} is damaged: {why}")
+    try:
+        return msgspec.json.decode(data, type=RunRecord)
+    except msgspec.MsgspecError as error:
+        raise RecordingError(f"cannot go on with {directory}: {path} is damaged: {error}") from error
+
+
+def _blanked(data: bytes, found: re.Match[bytes]) -> bytes:
+    return data[: found.start(1)] + _UNSET.encode() + data[found.end(1) :]

@@ -1,0 +1,202 @@
+"""The TCP connections under a ZeroMQ socket: whose they are, what waits in them, and ending one of them.
+
+libzmq has no call that ends one connection of a socket, and none that says how much memory one takes. But
+its messages carry the descriptor that they came from (``__fd``), a monitor tells when connections begin and
+end, Linux counts the bytes of each (``TCP_INFO``), and `shutdown` of a descriptor ends that one alone.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import stat
+import struct
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import zmq
+
+_EVENT = struct.Struct("=HI")
+_BYTES = struct.Struct("=QQ")
+_BYTES_AT = 120
+"""Where ``tcpi_bytes_acked`` and ``tcpi_bytes_received`` stand in struct tcp_info (linux/tcp.h)."""
+_WATCHED = int(zmq.EVENT_ACCEPTED) | int(zmq.EVENT_DISCONNECTED) | int(zmq.EVENT_CLOSED)
+UNKNOWN = "somewhere"
+"""Address of a connection that ended before anybody could ask for it."""
+UNCLEAR_NS = 2_000_000_000
+"""[ns] for which messages of a closed connection may still come, while its descriptor is another's."""
+
+
+@dataclass(eq=False, slots=True)
+class TcpConnection:
+    """One accepted connection."""
+
+    fd: int
+    inode: int
+    """Of the socket: tells it from a later one with the same descriptor."""
+    address: str
+    since: int
+    """When it was accepted [ns]."""
+    unclear_until: int = 0
+    """Until then a message with this descriptor may be of the connection before [ns]."""
+    claimed: bool = False
+    """Whether a routing id is known to be this connection."""
+    open: bool = True
+    dismissed: bool = False
+    """Whether the broker ended it."""
+
+    def end(self) -> None:
+        """End the connection; nothing where it has ended."""
+        self.dismissed = True
+        with self._socket() as found:
+            if found is not None:
+                try:
+                    found.shutdown(socket.SHUT_RDWR)
+                except OSError:
+                    return  # it ended by itself
+
+    def transferred(self) -> tuple[int, int]:
+        """Bytes that the peer has acknowledged, and that came from it [B]; (0, 0) if it is no TCP."""
+        with self._socket() as found:
+            if found is None or found.family not in (socket.AF_INET, socket.AF_INET6):
+                return 0, 0
+            info = found.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _BYTES_AT + _BYTES.size)
+        return _BYTES.unpack_from(info, _BYTES_AT) if len(info) >= _BYTES_AT + _BYTES.size else (0, 0)
+
+    @contextmanager
+    def _socket(self) -> Iterator[socket.socket | None]:
+        duplicate = _duplicate(self.fd)
+        if duplicate is None:
+            yield None
+            return
+        with duplicate:
+            same = os.fstat(duplicate.fileno()).st_ino == self.inode
+            yield duplicate if same else None
+
+
+class TcpConnections:
+    """The open connections of a bound socket."""
+
+    def __init__(self, context: zmq.Context[Any], watched: zmq.Socket[Any]) -> None:
+        address = f"inproc://monitor-{id(self)}"
+        watched.monitor(address, _WATCHED)
+        self._watched = watched
+        self.monitor = context.socket(zmq.PAIR)
+        """Readable when `update` has something to do."""
+        self.monitor.rcvhwm = 0  # a full one would hold up libzmq's thread, and with it every peer
+        self.monitor.connect(address)
+        self._open: dict[int, TcpConnection] = {}
+        self._closed: dict[int, int] = {}
+        """Descriptor to when a connection ended that no routing id was known of [ns]."""
+
+    def __iter__(self) -> Iterator[TcpConnection]:
+        return iter(tuple(self._open.values()))
+
+    def __len__(self) -> int:
+        return len(self._open)
+
+    def update(self) -> tuple[list[TcpConnection], list[TcpConnection]]:
+        """Take note of what began and ended: the new connections, and those that ended by themselves before
+        it was known whose they were, as those do that are not ZeroMQ's or have no key."""
+        fresh: dict[int, TcpConnection] = {}
+        failures: list[TcpConnection] = []
+        while (event := self._next()) is not None:
+            kind, fd = event
+            if kind == zmq.EVENT_ACCEPTED:
+                self._ended(fd)
+                fresh.pop(fd, None)
+                wire = self._begun(fd)
+                if wire.open:
+                    fresh[fd] = wire
+                else:
+                    failures.append(wire)
+                    self._closed[fd] = time.monotonic_ns()
+            else:
+                ended = self._ended(fd)
+                fresh.pop(fd, None)
+                if ended is not None and not ended.claimed and not ended.dismissed:
+                    failures.append(ended)
+        return list(fresh.values()), failures
+
+    def at(self, fd: int) -> TcpConnection | None:
+        """The open connection with this descriptor."""
+        return self._open.get(fd)
+
+    def claim(self, wire: TcpConnection, address: str) -> bool:
+        """Whether a connection certainly is that of a routing id with such an address, which had a message
+        with its descriptor; it is nobody else's from then on."""
+        if not wire.open or wire.claimed or time.monotonic_ns() < wire.unclear_until:
+            return False
+        if address and wire.address and address != wire.address:
+            return False
+        wire.claimed = True
+        return True
+
+    def close(self) -> None:
+        """Stop watching."""
+        self._watched.disable_monitor()
+        self.monitor.close(0)
+
+    def _next(self) -> tuple[int, int] | None:
+        try:
+            header, _ = self.monitor.recv_multipart(zmq.NOBLOCK)
+        except zmq.Again:
+            return None
+        kind, value = _EVENT.unpack(header)
+        return kind, value
+
+    def _begun(self, fd: int) -> TcpConnection:
+        """A new connection; not an open one where it has ended already."""
+        now = time.monotonic_ns()
+        found = _identity(fd)
+        if found is None:
+            return TcpConnection(fd, 0, UNKNOWN, now, open=False)
+        inode, address = found
+        until = self._closed.pop(fd, -UNCLEAR_NS) + UNCLEAR_NS
+        wire = self._open[fd] = TcpConnection(fd, inode, address, now, until)
+        return wire
+
+    def _ended(self, fd: int) -> TcpConnection | None:
+        wire = self._open.pop(fd, None)
+        if wire is not None:
+            wire.open = False
+            if not wire.claimed:
+                self._closed[fd] = time.monotonic_ns()
+        return wire
+
+
+def plain(address: str) -> str:
+    """An address as it is compared: of an IPv4 peer at an IPv6 port that of IPv4, and without a scope."""
+    return address.removeprefix("::ffff:").partition("%")[0]
+
+
+def _identity(fd: int) -> tuple[int, str] | None:
+    """Inode and peer address of somebody else's socket, also where no descriptor is left for one of our own;
+    None where it is no socket."""
+    try:
+        found = os.fstat(fd)
+        if not stat.S_ISSOCK(found.st_mode):
+            return None
+        borrowed = socket.socket(fileno=fd)
+    except OSError:
+        return None
+    try:
+        name = borrowed.getpeername()
+    except OSError:
+        name = ""
+    finally:
+        borrowed.detach()
+    return found.st_ino, plain(str(name[0])) if isinstance(name, tuple) else ""
+
+
+def _duplicate(fd: int) -> socket.socket | None:
+    """A socket of our own on somebody else's descriptor; None where that is none."""
+    try:
+        if not stat.S_ISSOCK(os.fstat(fd).st_mode):
+            return None
+        return socket.socket(fileno=os.dup(fd))
+    except OSError:
+        return None

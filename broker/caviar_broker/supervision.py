@@ -1,0 +1,237 @@
+"""Which services live: the operating system is asked about local ones, connections about remote ones."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from caviar_broker.core.clock import FrameClock
+
+
+class LocalProcess:
+    """A process of this kernel and PID namespace, watched through a pidfd.
+
+    The descriptor becomes readable the moment the process dies, whoever its parent is, and never
+    means another process that was given the same number later.
+    """
+
+    def __init__(self, pid: int) -> None:
+        self.pid = pid
+        self.fd = os.pidfd_open(pid)
+
+    def verdict(self) -> str:
+        """How the process ended, as far as can be told."""
+        fields = _stat(self.pid)
+        if fields is not None and fields[0] == "Z":
+            return describe_exit(os.waitstatus_to_exitcode(int(fields[-1])))
+        return "its process is gone"
+
+    @property
+    def stopped(self) -> bool:
+        """Whether it is stopped by a signal (SIGSTOP, SIGTSTP), so that it cannot answer."""
+        return is_stopped(self.pid)
+
+    def close(self) -> None:
+        """Stop watching."""
+        os.close(self.fd)
+
+
+def watch(pid: int) -> LocalProcess | None:
+    """Watch a process; None where the system does not let us.
+
+    Raises `ProcessLookupError` where there is no such process.
+    """
+    try:
+        return LocalProcess(pid)
+    except ProcessLookupError:
+        raise
+    except OverflowError:
+        raise ProcessLookupError(pid) from None
+    except OSError:
+        return None
+
+
+def is_stopped(pid: int) -> bool:
+    """Whether a process is stopped by a signal (SIGSTOP, SIGTSTP), so that it cannot answer."""
+    fields = _stat(pid)
+    return fields is not None and fields[0] == "T"
+
+
+def describe_stop(pid: int) -> str:
+    """A stopped process for people."""
+    return f"its process {pid} is stopped (SIGSTOP or SIGTSTP)"
+
+
+def describe_exit(code: int) -> str:
+    """An exit status for people: negative for a signal, as `subprocess` has it."""
+    if code >= 0:
+        return f"it exited with status {code}"
+    try:
+        name = signal.Signals(-code).name
+    except ValueError:
+        name = f"signal {-code}"
+    return f"it was killed by {name}"
+
+
+def _stat(pid: int) -> list[str] | None:
+    """Fields of /proc/PID/stat behind the command name, state first; None where it is gone."""
+    try:
+        with open(f"/proc/{pid}/stat", "rb", buffering=0) as file:  # noqa: PTH123 - read 100 times a second
+            text = file.read()
+    except OSError:
+        return None
+    return text.rpartition(b")")[2].decode().split()
+
+
+CHECK_NS = 50_000_000
+"""[ns] between looks at whether a local process is stopped; its death shows at once."""
+SUPERVISOR_NS = 1_000_000_000
+"""[ns] that a launcher has to report the death of its child, with exit status and last words."""
+
+
+@dataclass
+class _Watched:
+    """What the watchdog knows of one incarnation of a service."""
+
+    since: int
+    process: LocalProcess | None = None
+    pulse: bytes | None = None
+    """Routing id of its heartbeat connection."""
+    heard_at: int = 0
+    died_at: int | None = None
+    """When the process of a supervised service died [ns]."""
+    cut_off_at: int | None = None
+    """When a message to a local process first found no connection [ns]."""
+    warned: bool = False
+
+
+@dataclass
+class Watchdog:
+    """Tells of services that are gone (contract, clause 15).
+
+    Parameters
+    ----------
+    clock
+        Who is present in the run.
+    heartbeat_ns, liveness_ns
+        Of the run [ns].
+    probe
+        Sends a harmless message to a heartbeat connection; why that did not go, or an empty text.
+    lost
+        Is told service and verdict.
+    warn
+        Is told service and text.
+    gone_words
+        What is said of a service without a connection.
+    """
+
+    clock: FrameClock
+    heartbeat_ns: int
+    liveness_ns: int
+    probe: Callable[[bytes], str]
+    lost: Callable[[str, str], None]
+    warn: Callable[[str, str], None]
+    gone_words: str
+    supervised: set[str] = field(default_factory=set)
+    """Services whose death a launcher reports, who knows their exit status and last words."""
+    _watched: dict[str, _Watched] = field(default_factory=dict)
+
+    def welcome(self, service: str, pid: int | None) -> int | None:
+        """A new incarnation of a service; ``pid`` on this machine, None if it is elsewhere.
+
+        Returns a descriptor that is readable once its process is dead, if it can be watched.
+        """
+        watched = self._watched[service] = _Watched(since=time.monotonic_ns())
+        if pid is None:
+            return None
+        try:
+            watched.process = watch(pid)
+        except ProcessLookupError:
+            self.lost(service, f"there is no process {pid}, which it says it is")
+        return watched.process.fd if watched.process else None
+
+    def forget(self, service: str) -> int | None:
+        """An incarnation is of no interest any more; the descriptor that `welcome` returned, now closed."""
+        watched = self._watched.pop(service, None)
+        if watched is None or watched.process is None:
+            return None
+        watched.process.close()
+        return watched.process.fd
+
+    def attach(self, service: str, pulse: bytes) -> bytes | None:
+        """A service has a heartbeat connection; returns the one that it had before."""
+        watched = self._watched[service]
+        before, watched.pulse = watched.pulse, pulse
+        self.heard(service)
+        return before
+
+    def heard(self, service: str) -> None:
+        """A heartbeat came."""
+        watched = self._watched.get(service)
+        if watched is not None:
+            watched.heard_at = time.monotonic_ns()
+
+    def died(self, service: str) -> None:
+        """The descriptor of a local process says that it is dead."""
+        watched = self._watched[service]
+        watched.died_at = time.monotonic_ns()
+        if service not in self.supervised and watched.process is not None:
+            self.lost(service, watched.process.verdict())
+
+    def cut_off(self, service: str) -> bool:
+        """A message found no connection. Whether the verdict is left to the operating system, which
+        tells a moment later how a local process ended."""
+        watched = self._watched.get(service)
+        if watched is None or watched.process is None:
+            return False
+        watched.cut_off_at = watched.cut_off_at or time.monotonic_ns()
+        return True
+
+    def check(self, now: int) -> None:
+        """Look for local processes that are stopped, and probe remote ones."""
+        for service, watched in list(self._watched.items()):
+            peer = self.clock.peer(service)
+            if peer is None or not peer.present:
+                continue
+            if watched.process is not None:
+                self._check_local(service, watched, watched.process, now)
+            else:
+                self._check_remote(service, watched, now)
+
+    def recheck(self, service: str) -> None:
+        """Somebody else claims the name of a service: whether a remote one still is there, asked now."""
+        watched = self._watched.get(service)
+        if watched is not None and watched.process is None and watched.pulse is not None:
+            self._probe(service, watched.pulse)
+
+    def close(self) -> None:
+        """Stop watching."""
+        for service in tuple(self._watched):
+            self.forget(service)
+
+    def _check_local(self, service: str, watched: _Watched, process: LocalProcess, now: int) -> None:
+        if watched.died_at is not None:
+            if now - watched.died_at > SUPERVISOR_NS:
+                self.lost(service, process.verdict())
+        elif process.stopped:
+            self.lost(service, describe_stop(process.pid))
+        elif watched.cut_off_at is not None and now - watched.cut_off_at > SUPERVISOR_NS:
+            self.lost(service, f"its process {process.pid} lives, but {self.gone_words}")
+
+    def _check_remote(self, service: str, watched: _Watched, now: int) -> None:
+        if watched.pulse is None:
+            if not watched.warned and now - watched.since > self.liveness_ns:
+                watched.warned = True
+                self.warn(
+                    service, "has no heartbeat connection: its death shows only when it is due to answer"
+                )
+        elif now - watched.heard_at > 2 * self.heartbeat_ns:
+            self._probe(service, watched.pulse)
+
+    def _probe(self, service: str, pulse: bytes) -> None:
+        reason = self.probe(pulse)
+        if reason:
+            self.lost(service, f"it is unreachable or stopped: {reason}")
