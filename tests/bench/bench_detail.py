@@ -28,8 +28,8 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Channel, Scene
-from caviar_services.channel.sionna_rt import SionnaChannel
-from caviar_services.channel.sionna_settings import SionnaSettings
+from caviar_services.channel.sionna.model import SionnaChannel
+from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 from caviar_services.world.assets import scenery_assets
 

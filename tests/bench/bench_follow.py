@@ -27,8 +27,8 @@ from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.space.coordinates import Pose
 from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Channel, Scene
-from caviar_services.channel.sionna_rt import SionnaChannel
-from caviar_services.channel.sionna_settings import SionnaSettings
+from caviar_services.channel.sionna.model import SionnaChannel
+from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 from caviar_services.world.assets import object_assets, scenery_assets
 

@@ -33,10 +33,10 @@ from caviar_clients.embedded.run import EmbeddedRun
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.scenario import Scenario, load_scenario
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Channel, Scene
+from caviar_services.channel.arrays.mimo_rt import ElementTracer
 from caviar_services.channel.base import ChannelModel, ChannelSettings, Modelled
-from caviar_services.channel.mimo_rt import ElementTracer
-from caviar_services.channel.sionna_rt import SionnaChannel
-from caviar_services.channel.sionna_settings import SionnaSettings
+from caviar_services.channel.sionna.model import SionnaChannel
+from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 
 SCENARIO = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "street-canyon.toml"

@@ -22,10 +22,10 @@ import numpy as np
 
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.topics import AntennaDevice, Carrier, Channel, Scene
-from caviar_services.channel import sionna_rt
-from caviar_services.channel.contributing import UsedSurfaces
-from caviar_services.channel.sionna_launch import LaunchOptions
-from caviar_services.channel.sionna_settings import SionnaSettings
+from caviar_services.channel.sionna import model as sionna_model
+from caviar_services.channel.sionna.contributing import UsedSurfaces
+from caviar_services.channel.sionna.ray_launcher import LaunchOptions
+from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 from caviar_services.world.assets import scenery_assets
 
@@ -54,12 +54,12 @@ def left_on(
     return options, ()
 
 
-def prepared(scenery: str, settings: dict[str, Any]) -> tuple[sionna_rt.SionnaChannel, tuple[str, ...]]:
+def prepared(scenery: str, settings: dict[str, Any]) -> tuple[sionna_model.SionnaChannel, tuple[str, ...]]:
     """A model, and the notes on what was switched off."""
     named = scenery_assets(f"sionna:{scenery}") if scenery else {}
     assets = {name: file for name, file in named.items() if isinstance(file, Path)}
     run = RunInfo(name="channel", seed=1, carriers=(Carrier(name="c", frequency_hz=28e9),))
-    model = sionna_rt.SionnaChannel(msgspec.convert({"bodies": 0, **settings}, SionnaSettings), run)
+    model = sionna_model.SionnaChannel(msgspec.convert({"bodies": 0, **settings}, SionnaSettings), run)
     notes = model.prepare(Preparation(demand={"channel": frozenset()}, assets=assets)).notes
     return model, tuple(note for note in notes if "switched off" in note)
 
@@ -85,7 +85,7 @@ def standing() -> Frame:
     return Frame(episode=0, number=0, t_ns=0, inputs=(source,))
 
 
-def timed(model: sionna_rt.SionnaChannel, frame: Frame) -> tuple[float, Channel]:
+def timed(model: sionna_model.SionnaChannel, frame: Frame) -> tuple[float, Channel]:
     """Time [ms] and product of a frame."""
     begin = time.perf_counter()
     channel = model.step(frame).products["channel"]
@@ -103,7 +103,7 @@ def main() -> None:
     rows = []
     for case, (scenery, settings) in CASES.items():
         without, notes = prepared(scenery, settings)
-        with mock.patch.object(sionna_rt, "contributing", left_on):
+        with mock.patch.object(sionna_model, "contributing", left_on):
             full, _ = prepared(scenery, settings)
         times = np.zeros((options.frames, 2))
         for number in range(options.frames):  # in turn: what else the machine does slows both

@@ -14,8 +14,8 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.topics import Interaction
-from caviar_services.channel.sionna_scene import SionnaScene
-from caviar_services.channel.specular import image_points
+from caviar_services.channel.propagation.image_method import image_points
+from caviar_services.channel.sionna.scene import SionnaScene
 
 NEAR = 1e-3
 """[m] from an edge: what is decided there, files and float32 decide."""

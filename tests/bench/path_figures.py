@@ -12,7 +12,7 @@ from path_reference import absent
 from caviar_protocol.arrays import Complex128Array
 from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import Scene
-from caviar_services.channel.sionna_scene import SionnaScene
+from caviar_services.channel.sionna.scene import SionnaScene
 
 
 def compared(

@@ -21,8 +21,8 @@ from caviar_protocol.space.scene import antennas, device_pose
 from caviar_protocol.topics import Channel, Interaction, Scene
 from caviar_services.antenna import steering_vector
 from caviar_services.channel.paths import Antenna
-from caviar_services.channel.sionna_rt import SionnaChannel
-from caviar_services.channel.specular import image_points, path_lengths
+from caviar_services.channel.propagation.image_method import image_points, path_lengths
+from caviar_services.channel.sionna.model import SionnaChannel
 
 SAME_POINT = 1e-3
 """[m]; paths whose points are all nearer are one."""

@@ -17,7 +17,7 @@ import numpy as np
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Channel, Scene
 from caviar_services.channel.base import ChannelModel
-from caviar_services.channel.free_space import FreeSpaceChannel, FreeSpaceSettings
+from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 
 C = 299_792_458.0
@@ -188,8 +188,8 @@ def free_space(*frequencies: float) -> ChannelModel[Any]:
 
 
 def geometric(*frequencies: float, seed: int = 1, **settings: Any) -> ChannelModel[Any]:
-    from caviar_services.channel.geometric import GeometricChannel
-    from caviar_services.channel.geometric_settings import GeometricSettings
+    from caviar_services.channel.statistical.geometric import GeometricChannel
+    from caviar_services.channel.statistical.geometric_settings import GeometricSettings
 
     run = RunInfo(name="channel", seed=seed, carriers=carriers(*frequencies))
     model = GeometricChannel(msgspec.convert(settings, GeometricSettings), run)
@@ -200,8 +200,8 @@ def geometric(*frequencies: float, seed: int = 1, **settings: Any) -> ChannelMod
 def sionna(
     frequency: float | Sequence[float], assets: Mapping[str, Path] | None = None, **settings: Any
 ) -> ChannelModel[Any]:
-    from caviar_services.channel.sionna_rt import SionnaChannel
-    from caviar_services.channel.sionna_settings import SionnaSettings
+    from caviar_services.channel.sionna.model import SionnaChannel
+    from caviar_services.channel.sionna.settings import SionnaSettings
 
     settings = {"samples": 20_000, "bodies": 2, "receivers_at_once": 8, **settings}
     frequencies = [frequency] if isinstance(frequency, int | float) else frequency

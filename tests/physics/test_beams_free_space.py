@@ -17,7 +17,7 @@ from caviar_services.agent.base import Agent, AgentSettings
 from caviar_services.agent.los_beam import LosBeamAgent
 from caviar_services.agent.oracle import OracleAgent
 from caviar_services.antenna import element_positions, steering_vector
-from caviar_services.channel.free_space import FreeSpaceChannel, FreeSpaceSettings
+from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.link.beams import BeamLink, BeamLinkSettings
 from caviar_services.link.codebook import dft_codebook
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo

@@ -15,8 +15,8 @@ from caviar_protocol.multipath import subcarrier_offsets
 from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import AntennaArray, Carrier, Channel, Panel
 from caviar_services.channel.base import ChannelModel
-from caviar_services.channel.free_space import FreeSpaceChannel, FreeSpaceSettings
-from caviar_services.channel.patterns import Patterns, element_amplitude
+from caviar_services.channel.propagation.patterns import Patterns, element_amplitude
+from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.pattern_files import read_pattern
 from caviar_services.service import Preparation, RunInfo
 from caviar_services.world.assets import scenery_assets
@@ -328,8 +328,8 @@ def test_responses_over_the_band_have_all_subarrays(rung: str) -> None:
     run = RunInfo(name="channel", seed=1, carriers=(carrier,))
     model: ChannelModel[Any] = FreeSpaceChannel(FreeSpaceSettings(), run)
     if rung == "spherical":
-        from caviar_services.channel.sionna_rt import SionnaChannel
-        from caviar_services.channel.sionna_settings import SionnaSettings
+        from caviar_services.channel.sionna.model import SionnaChannel
+        from caviar_services.channel.sionna.settings import SionnaSettings
 
         model = SionnaChannel(SionnaSettings(rung=rung, bodies=0, max_depth=1, samples=1000), run)
     model.prepare(Preparation(demand={"channel": frozenset({"h", "hf"})}))

@@ -24,9 +24,9 @@ from channel_lab import (
 
 from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import Interaction
-from caviar_services.channel import edge_fields as module
-from caviar_services.channel import sionna_table
-from caviar_services.channel.edge_fields import Media, edge_fields, faces_of
+from caviar_services.channel.propagation import utd as module
+from caviar_services.channel.propagation.utd import Media, edge_fields, faces_of
+from caviar_services.channel.sionna import path_table
 
 pytestmark = pytest.mark.channel
 
@@ -121,7 +121,7 @@ def test_levels_do_not_depend_on_how_deep_is_traced(tmp_path: Path) -> None:
 def both_fields(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Array, Array]]:
     """The ray tracer's dyads of diffracted paths of full depth, and what they are replaced by."""
     seen: list[tuple[Array, Array]] = []
-    replaced = sionna_table._diffract_anew
+    replaced = path_table._diffract_anew
 
     def keep(scene_: Any, edges: Any, met: Any, traced: Any, ends: Any, transfer: Any) -> Any:
         before = transfer.copy()
@@ -130,7 +130,7 @@ def both_fields(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Array, Array]]:
         seen.append((before[:, rows], transfer[:, rows]))
         return found
 
-    monkeypatch.setattr(sionna_table, "_diffract_anew", keep)
+    monkeypatch.setattr(path_table, "_diffract_anew", keep)
     monkeypatch.setattr(module, "_SIGN", 1.0)  # the ray tracer's, which is wrong
     return seen
 

@@ -16,10 +16,10 @@ from caviar_protocol.codec import encode_payload
 from caviar_protocol.digest import payload_digest
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.topics import Channel, Scene
-from caviar_services.channel import scenery_chains
 from caviar_services.channel.base import ChannelModel
-from caviar_services.channel.sionna_rt import SionnaChannel
-from caviar_services.channel.sionna_settings import SionnaSettings
+from caviar_services.channel.enumeration import scenery_chains
+from caviar_services.channel.sionna.model import SionnaChannel
+from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.service import Preparation, RunInfo
 
 STATION = (-3.0, -8.3, 5.0)

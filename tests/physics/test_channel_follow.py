@@ -15,7 +15,7 @@ from caviar_protocol.errors import PayloadError
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.topics import AntennaArray, Channel, Scene
 from caviar_services.channel.base import ChannelModel
-from caviar_services.channel.sionna_settings import SionnaSettings
+from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.service import Frame, FrameInput
 
 CANYON = "simple_street_canyon_with_cars"

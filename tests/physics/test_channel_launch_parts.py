@@ -11,7 +11,7 @@ from same_paths import model
 from test_channel_follow import stepped
 
 from caviar_protocol.topics import AntennaArray, Channel, Interaction, Scene
-from caviar_services.channel.sionna_launch import RAYS_AT_ONCE, rays_within
+from caviar_services.channel.sionna.ray_launcher import RAYS_AT_ONCE, rays_within
 
 pytestmark = pytest.mark.channel
 

@@ -29,9 +29,9 @@ from caviar_protocol.codec import encode_payload
 from caviar_protocol.errors import AssetError, ScenarioError
 from caviar_protocol.topics import Channel, Scene
 from caviar_services.channel.base import ChannelModel
-from caviar_services.channel.sionna_materials import ItuMaterial, MaterialPolicy, itu_material
-from caviar_services.channel.sionna_rt import SionnaChannel
-from caviar_services.channel.sionna_settings import SionnaSettings
+from caviar_services.channel.sionna.materials import ItuMaterial, MaterialPolicy, itu_material
+from caviar_services.channel.sionna.model import SionnaChannel
+from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.service import Preparation, RunInfo
 from caviar_services.world.assets import scenery_assets
 

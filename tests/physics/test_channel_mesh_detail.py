@@ -13,8 +13,8 @@ from same_paths import digest
 
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.topics import Channel
-from caviar_services.channel.sionna_rt import SionnaChannel
-from caviar_services.channel.sionna_settings import SionnaSettings
+from caviar_services.channel.sionna.model import SionnaChannel
+from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.service import Preparation, RunInfo
 
 pytestmark = pytest.mark.channel

@@ -29,7 +29,7 @@ from channel_lab import (
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.topics import Channel, Interaction, Scene
 from caviar_services.channel.base import ChannelModel
-from caviar_services.channel.object_materials import OTHER_MATERIALS, ObjectMaterials, body_kind
+from caviar_services.channel.sionna.object_materials import OTHER_MATERIALS, ObjectMaterials, body_kind
 
 pytestmark = pytest.mark.channel
 
@@ -176,8 +176,8 @@ def test_what_is_wrong_with_a_material_names_its_key(settings: dict[str, Any], k
 def test_keys_that_nothing_is_called_are_noted() -> None:
     from channel_lab import carriers
 
-    from caviar_services.channel.sionna_rt import SionnaChannel
-    from caviar_services.channel.sionna_settings import SionnaSettings
+    from caviar_services.channel.sionna.model import SionnaChannel
+    from caviar_services.channel.sionna.settings import SionnaSettings
     from caviar_services.service import Preparation, RunInfo
 
     settings = SionnaSettings(object_materials={"pedestrian": "skin"}, samples=1000, max_depth=1, bodies=1)

@@ -20,7 +20,7 @@ from caviar_services.channel.radio_map.measurement_surface import (
     draped_surface,
     level_surface,
 )
-from caviar_services.channel.sionna_rt import SionnaChannel
+from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.link.codebook import dft_codebook
 
 pytestmark = pytest.mark.channel

@@ -16,8 +16,8 @@ import pytest
 from same_paths import EVERYTHING, POSITIONS, SCENES, SPECULAR, asked, digest, model, of_receiver, places
 
 from caviar_services.channel.base import ChannelModel
-from caviar_services.channel.sionna_candidates import Planes
-from caviar_services.channel.sionna_chains import Chains
+from caviar_services.channel.sionna.candidates import Planes
+from caviar_services.channel.sionna.chains import Chains
 
 pytestmark = pytest.mark.channel
 

@@ -8,7 +8,7 @@ import pytest
 from same_paths import asked, model, of_receiver, places
 
 from caviar_protocol.topics import Channel, Interaction
-from caviar_services.channel.sionna_settings import SionnaSettings
+from caviar_services.channel.sionna.settings import SionnaSettings
 
 TEN = [f"r{i}" for i in range(10)]
 CANYON = "simple_street_canyon_with_cars"

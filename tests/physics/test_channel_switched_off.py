@@ -11,10 +11,10 @@ import pytest
 from channel_lab import Plate, Thing, antenna, carriers, measure, scene, sionna, turn, write_scenery
 
 from caviar_protocol.topics import Channel, Interaction
-from caviar_services.channel import sionna_rt
-from caviar_services.channel.contributing import SurfaceMaterial, UsedSurfaces, contributing
-from caviar_services.channel.sionna_launch import LaunchOptions
-from caviar_services.channel.sionna_settings import SionnaSettings
+from caviar_services.channel.sionna import model as sionna_model
+from caviar_services.channel.sionna.contributing import SurfaceMaterial, UsedSurfaces, contributing
+from caviar_services.channel.sionna.ray_launcher import LaunchOptions
+from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.service import Preparation, RunInfo
 
 pytestmark = pytest.mark.channel
@@ -63,7 +63,7 @@ def both(
     things = [Thing("car", (4.0, 2.0, 1.5)), Thing("van", (-8.0, -1.0, 1.9), (6.0, 2.0, 2.6))]
     at = scene(devices, things if settings.get("bodies", 2) else ())
     off = measure(sionna(frequencies, assets, **settings), at)
-    monkeypatch.setattr(sionna_rt, "contributing", left_on)
+    monkeypatch.setattr(sionna_model, "contributing", left_on)
     return off, measure(sionna(frequencies, assets, **settings), at)
 
 
@@ -168,7 +168,7 @@ def test_what_finds_paths_is_left_on(
 
 def test_each_switch_is_a_note(tmp_path: Path) -> None:
     settings = SionnaSettings(samples=500, bodies=1, refraction=True, scattering=True, diffraction=True)
-    model = sionna_rt.SionnaChannel(settings, RunInfo(name="channel", carriers=carriers(28e9)))
+    model = sionna_model.SionnaChannel(settings, RunInfo(name="channel", carriers=carriers(28e9)))
     assets = write_scenery(tmp_path, slanted("concrete", 0.3))
     notes = [
         note for note in model.prepare(Preparation(demand={}, assets=assets)).notes if "switched off" in note

@@ -13,7 +13,7 @@ import pytest
 from channel_lab import Plate, antenna, measure, scene, sionna, write_scenery
 
 from caviar_protocol.topics import AntennaArray, Channel
-from caviar_services.channel import spherical
+from caviar_services.channel.arrays import spherical
 
 pytestmark = pytest.mark.channel
 

@@ -35,7 +35,7 @@ IMPORTED = (
     "caviar_clients.cli.launch",
     "caviar_services.__main__",
     "caviar_services.agent.los_beam",
-    "caviar_services.channel.free_space",
+    "caviar_services.channel.statistical.free_space",
     "caviar_services.link.beams",
     "caviar_services.recorder.mcap",
     "caviar_services.world.trajectory",

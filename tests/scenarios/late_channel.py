@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 
-from caviar_services.channel.free_space import FreeSpaceChannel
+from caviar_services.channel.statistical.free_space import FreeSpaceChannel
 from caviar_services.service import Frame, StepResult
 
 LATE = {3: 0.25, 8: 0.6, 15: 0.25}

@@ -26,7 +26,7 @@ from caviar_protocol.topics import Channel, Scene
 from caviar_services.channel.adaptive.channel import TIMINGS, AdaptiveChannel
 from caviar_services.channel.adaptive.cost_model import Workload
 from caviar_services.channel.adaptive.rehearsal import rehearsal_scene
-from caviar_services.channel.sionna_rt import SionnaChannel
+from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 
 pytestmark = pytest.mark.channel

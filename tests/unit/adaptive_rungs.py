@@ -14,7 +14,7 @@ from caviar_protocol.scenario.conversion import convert_settings
 from caviar_protocol.topics import AntennaDevice, Carrier, Channel, Scene
 from caviar_services.channel.adaptive.channel import AdaptiveChannel
 from caviar_services.channel.base import Modelled
-from caviar_services.channel.free_space import FreeSpaceChannel, FreeSpaceSettings
+from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo, StepResult
 
 MS = 1_000_000

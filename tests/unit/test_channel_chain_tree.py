@@ -7,9 +7,9 @@ import itertools
 import numpy as np
 import pytest
 
-from caviar_services.channel import chain_tree
-from caviar_services.channel.chain_tree import ChainTree
-from caviar_services.channel.face_rectangles import FaceRectangles, narrowest_sides
+from caviar_services.channel.enumeration import chain_tree
+from caviar_services.channel.enumeration.chain_tree import ChainTree
+from caviar_services.channel.enumeration.face_rectangles import FaceRectangles, narrowest_sides
 
 SIGHTS = np.array([[2, 5], [2, 7], [5, 2], [7, 2]])
 

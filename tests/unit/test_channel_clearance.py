@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from caviar_protocol.topics import AntennaArray
-from caviar_services.channel.clearance import CLEARANCE, Surfaces, spread_anew, with_near_pairs
 from caviar_services.channel.paths import Antenna, PathTable
+from caviar_services.channel.propagation.clearance import CLEARANCE, Surfaces, spread_anew, with_near_pairs
 from caviar_services.meshes import box
 
 BOX = box((0.0, 2.0), (0.0, 3.0), (0.0, 1.0))

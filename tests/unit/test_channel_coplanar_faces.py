@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from caviar_services.channel.coplanar_faces import CoplanarFaces, JoinedFaces
-from caviar_services.channel.sionna_planes import PlaneTable, plane_numbers
+from caviar_services.channel.sionna.coplanar_faces import CoplanarFaces, JoinedFaces
+from caviar_services.channel.sionna.planes import PlaneTable, plane_numbers
 from caviar_services.meshes import Mesh, box
 
 FACES = 6

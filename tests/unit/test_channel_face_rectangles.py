@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array
-from caviar_services.channel.face_rectangles import RIM, FaceRectangles, narrowest_sides, ranges
-from caviar_services.channel.sionna_planes import plane_numbers, two_sided_planes
+from caviar_services.channel.enumeration.face_rectangles import RIM, FaceRectangles, narrowest_sides, ranges
+from caviar_services.channel.sionna.planes import plane_numbers, two_sided_planes
 from caviar_services.meshes import Mesh, unit_box
 
 L_SHAPE = np.array(

@@ -9,7 +9,7 @@ from caviar_protocol.codec import encode_payload
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Channel, Scene
-from caviar_services.channel.free_space import FreeSpaceChannel, FreeSpaceSettings
+from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.registry import load
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo, StepResult
 

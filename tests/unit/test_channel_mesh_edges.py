@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from caviar_services.channel.mesh_edges import MeshEdges, mesh_edges
-from caviar_services.channel.sionna_planes import plane_numbers
+from caviar_services.channel.sionna.mesh_edges import MeshEdges, mesh_edges
+from caviar_services.channel.sionna.planes import plane_numbers
 from caviar_services.meshes import Mesh, box, unit_box
 
 Array = np.ndarray[tuple[int, ...], np.dtype[Any]]

@@ -12,10 +12,10 @@ from caviar_protocol.arrays import Float64Array
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.topics import AntennaDevice, Carrier, Channel, Scene
-from caviar_services.channel.clearance import RISING_RAYS, Surfaces
 from caviar_services.channel.outage import outage_counts
-from caviar_services.channel.sionna_rt import SionnaChannel
-from caviar_services.channel.sionna_settings import SionnaSettings
+from caviar_services.channel.propagation.clearance import RISING_RAYS, Surfaces
+from caviar_services.channel.sionna.model import SionnaChannel
+from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.meshes import box
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 

@@ -7,7 +7,7 @@ import pytest
 
 from caviar_protocol.space.coordinates import direction, quaternion_from_euler, rotation_matrix
 from caviar_protocol.topics import AntennaArray
-from caviar_services.channel.patterns import radiated_field, spherical_basis
+from caviar_services.channel.propagation.patterns import radiated_field, spherical_basis
 
 UPRIGHT = np.eye(3)
 PATTERNS = ("iso", "dipole", "hw_dipole", "tr38901")

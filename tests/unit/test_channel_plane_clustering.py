@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from caviar_services.channel import plane_clustering
-from caviar_services.channel.sionna_planes import plane_numbers, plane_numbers_of
+from caviar_services.channel.sionna import plane_clustering
+from caviar_services.channel.sionna.planes import plane_numbers, plane_numbers_of
 from caviar_services.meshes import Mesh, unit_box
 
 Array = NDArray[np.float64]

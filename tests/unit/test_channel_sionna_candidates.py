@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from caviar_services.channel.sionna_candidates import first_of_each
+from caviar_services.channel.sionna.candidates import first_of_each
 
 
 @given(st.lists(st.integers(0, 5), max_size=40), st.integers(1, 6))

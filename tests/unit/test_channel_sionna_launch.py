@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from caviar_services.channel.sionna_launch import morton_order
+from caviar_services.channel.sionna.ray_launcher import morton_order
 
 
 def test_the_curve_visits_the_quarters_of_a_square_one_after_the_other() -> None:

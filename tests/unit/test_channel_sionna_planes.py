@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from caviar_services.channel.sionna_planes import PlaneTable, plane_numbers, shared_planes
+from caviar_services.channel.sionna.planes import PlaneTable, plane_numbers, shared_planes
 from caviar_services.meshes import Mesh, box, unit_box
 
 Array = NDArray[np.float64]

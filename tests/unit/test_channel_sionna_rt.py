@@ -13,8 +13,8 @@ from caviar_protocol.errors import AssetError, PayloadError, ScenarioError
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.topics import AntennaDevice, Carrier, Channel, Scene
-from caviar_services.channel.sionna_rt import SionnaChannel
-from caviar_services.channel.sionna_settings import SionnaSettings
+from caviar_services.channel.sionna.model import SionnaChannel
+from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.registry import load
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo, StepResult
 

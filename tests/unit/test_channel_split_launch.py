@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from caviar_services.channel.sionna_chains import MANY_RAYS, Chains, chains_of
-from caviar_services.channel.sionna_launch import REFLECTED, Bounce, Launch
+from caviar_services.channel.sionna.chains import MANY_RAYS, Chains, chains_of
+from caviar_services.channel.sionna.ray_launcher import REFLECTED, Bounce, Launch
 
 
 class Column:

@@ -57,7 +57,7 @@ def _keyframes() -> dict[str, Any]:
 
 
 def _channel_model() -> dict[str, Any]:
-    from caviar_services.channel.free_space import FreeSpaceChannel
+    from caviar_services.channel.statistical.free_space import FreeSpaceChannel
 
     return {"MyModel": FreeSpaceChannel, "MyChannel": FreeSpaceChannel}
 

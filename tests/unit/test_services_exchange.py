@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from caviar_protocol.messages import Grant, Reset
 from caviar_protocol.topics import Carrier
-from caviar_services.channel.free_space import FreeSpaceChannel, FreeSpaceSettings
+from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.exchange import frame_of
 from caviar_services.service import RunInfo
 

@@ -13,7 +13,7 @@ import pytest
 from caviar_protocol.errors import DeclarationError
 from caviar_services import registry
 from caviar_services.agent.base import AgentSettings
-from caviar_services.channel.free_space import FreeSpaceChannel
+from caviar_services.channel.statistical.free_space import FreeSpaceChannel
 from caviar_services.registry import BUILT_IN, load, registered
 
 
@@ -44,7 +44,9 @@ def test_an_unknown_role_is_answered_with_the_roles() -> None:
 
 
 def test_an_implementation_is_found_by_its_place() -> None:
-    assert load("channel", "caviar_services.channel.free_space:FreeSpaceChannel") is FreeSpaceChannel
+    assert (
+        load("channel", "caviar_services.channel.statistical.free_space:FreeSpaceChannel") is FreeSpaceChannel
+    )
 
 
 def test_other_distributions_add_theirs(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -65,7 +67,7 @@ def test_an_unknown_name_comes_with_the_nearest_and_all_known() -> None:
 
 BROKEN = {
     "no module": ("nowhere_at_all:Channel", "No module named 'nowhere_at_all'"),
-    "no class": ("caviar_services.channel.free_space:Chanel", "has no attribute 'Chanel'"),
+    "no class": ("caviar_services.channel.statistical.free_space:Chanel", "has no attribute 'Chanel'"),
     "no place": (":Channel", "cannot be loaded from :Channel"),
     "no service": ("pathlib:Path", "which is not a Service"),
     "another role": ("caviar_services.agent.random:RandomAgent", "whose role is 'agent'"),

@@ -15,7 +15,7 @@ from caviar_protocol.errors import PayloadError, RunError
 from caviar_protocol.messages import Input
 from caviar_protocol.topics import Channel
 from caviar_services.agent.base import Agent, AgentSettings
-from caviar_services.channel.free_space import FreeSpaceChannel
+from caviar_services.channel.statistical.free_space import FreeSpaceChannel
 from caviar_services.service import Frame, Service, StepResult
 from caviar_services.testing import CONFORMANCE, ChannelConformance, ServiceConformance, samples
 

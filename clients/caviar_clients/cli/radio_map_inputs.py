@@ -19,7 +19,6 @@ from caviar_protocol.space.ply import read_ply
 from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import Carrier, Scene
 from caviar_services.channel.adaptive.settings import AdaptiveSettings, models
-from caviar_services.channel.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.channel.radio_map.measurement_surface import (
     Area,
     MeasurementSurface,
@@ -27,8 +26,9 @@ from caviar_services.channel.radio_map.measurement_surface import (
     draped_surface,
     level_surface,
 )
-from caviar_services.channel.sionna_rt import SionnaChannel
-from caviar_services.channel.sionna_settings import SionnaSettings
+from caviar_services.channel.sionna.model import SionnaChannel
+from caviar_services.channel.sionna.settings import SionnaSettings
+from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.link.beams import BeamLink, BeamLinkSettings, noise_power
 from caviar_services.registry import load
 from caviar_services.scenery import SceneryShape, read_scenery

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from caviar_protocol.space.coordinates import Vector
-from caviar_services.channel.clearance import Surfaces
+from caviar_services.channel.propagation.clearance import Surfaces
 from caviar_services.world.obstacles import Obstacles, scenery_triangles
 
 TRIES = 10_000

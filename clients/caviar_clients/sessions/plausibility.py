@@ -15,7 +15,7 @@ from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario.conversion import convert_settings
 from caviar_protocol.scenario.rules import scenario_error, settings_place
 from caviar_protocol.space.coordinates import Vector
-from caviar_services.channel.clearance import Surfaces
+from caviar_services.channel.propagation.clearance import Surfaces
 from caviar_services.registry import load
 from caviar_services.world.assets import scenery_assets
 from caviar_services.world.base import World

@@ -20,9 +20,7 @@ from caviar_protocol.topics import (
     ChannelMatrix,
     ChannelOptions,
 )
-from caviar_services.channel.atmosphere import amplitude_factor
-from caviar_services.channel.geometry import PathGeometry, path_geometry
-from caviar_services.channel.matrices import (
+from caviar_services.channel.arrays.channel_matrices import (
     Located,
     Matrices,
     PlaneWaves,
@@ -31,6 +29,8 @@ from caviar_services.channel.matrices import (
 )
 from caviar_services.channel.path_ids import stable_ids
 from caviar_services.channel.paths import Antenna, PathTable, antenna_fields
+from caviar_services.channel.propagation.atmosphere import amplitude_factor
+from caviar_services.channel.propagation.geometry import PathGeometry, path_geometry
 from caviar_services.channel.wideband import Wideband, bins_of, wideband_parts
 
 

@@ -24,12 +24,12 @@ from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import AntennaDevice, Channel, ChannelOptions, Scene
 from caviar_protocol.topics.scene import Device, Panel
 from caviar_protocol.validation import too_fast
+from caviar_services.channel.arrays.channel_matrices import Matrices
 from caviar_services.channel.assemble import Product, assemble
-from caviar_services.channel.atmosphere import Atmosphere, specific_attenuation
-from caviar_services.channel.matrices import Matrices
 from caviar_services.channel.outage import outage_counts
 from caviar_services.channel.paths import Antenna, PathTable
-from caviar_services.channel.patterns import Patterns
+from caviar_services.channel.propagation.atmosphere import Atmosphere, specific_attenuation
+from caviar_services.channel.propagation.patterns import Patterns
 from caviar_services.channel.wideband import required_parts
 from caviar_services.pattern_files import read_pattern
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult

@@ -20,8 +20,8 @@ from caviar_protocol.space.beams import subarrays
 from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.space.scene import device_pose, device_velocity
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Scene
-from caviar_services.channel.patterns import ElementPattern, Field, Patterns, radiated_field
-from caviar_services.channel.vectors import cross
+from caviar_services.channel.propagation.patterns import ElementPattern, Field, Patterns, radiated_field
+from caviar_services.channel.propagation.vectors import cross
 
 
 @dataclass(frozen=True, eq=False)

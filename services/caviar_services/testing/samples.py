@@ -40,7 +40,7 @@ from caviar_protocol.topics import (
 )
 from caviar_services.agent.base import AgentSettings
 from caviar_services.agent.random import RandomAgent
-from caviar_services.channel.free_space import FreeSpaceChannel, FreeSpaceSettings
+from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.link.beams import BeamLink, BeamLinkSettings
 from caviar_services.meshes import Mesh, box
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo

@@ -30,7 +30,7 @@ from caviar_services.channel.adaptive.rehearsal import rehearsal_scene
 from caviar_services.channel.adaptive.settings import AdaptiveSettings, Rung, built, models, rung_of
 from caviar_services.channel.base import Modelled
 from caviar_services.channel.outage import outage_counts
-from caviar_services.channel.sionna_sharing import shared_scenes
+from caviar_services.channel.sionna.scene_sharing import shared_scenes
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
 from caviar_services.state import restored, saved
 

@@ -20,11 +20,11 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_services.channel.paths import Antenna
-from caviar_services.channel.patterns import spherical_basis
+from caviar_services.channel.propagation.patterns import spherical_basis
 from caviar_services.channel.radio_map.measurement_surface import MeasurementSurface
-from caviar_services.channel.sionna_launch import spread_directions
-from caviar_services.channel.sionna_meshes import Shape, mi_mesh
-from caviar_services.channel.sionna_scene import SionnaScene
+from caviar_services.channel.sionna.meshes import Shape, mi_mesh
+from caviar_services.channel.sionna.ray_launcher import spread_directions
+from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.columns import aligned_columns, aligned_indices
 
 PART = 1_000_000

@@ -23,7 +23,7 @@ from caviar_services.channel.radio_map.cell_gains import (
 )
 from caviar_services.channel.radio_map.coverage import Coverage
 from caviar_services.channel.radio_map.measurement_surface import MeasurementSurface
-from caviar_services.channel.sionna_rt import SionnaChannel
+from caviar_services.channel.sionna.model import SionnaChannel
 
 BeamChoice = Literal["best", "wide"] | int
 """``best``: in each cell the beam of the transmitter's codebook that brings most. ``wide``: one element, no

@@ -14,9 +14,9 @@ from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.scenario.conversion import convert_settings
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Channel, Scene
 from caviar_services.channel.base import ChannelModel
-from caviar_services.channel.free_space import FreeSpaceChannel, FreeSpaceSettings
-from caviar_services.channel.geometric import GeometricChannel
-from caviar_services.channel.geometric_settings import GeometricSettings
+from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
+from caviar_services.channel.statistical.geometric import GeometricChannel
+from caviar_services.channel.statistical.geometric_settings import GeometricSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 
 Point = Sequence[float]
@@ -84,8 +84,8 @@ class Bench:
         **settings: Any,
     ) -> Model:
         """Rung ``siso-rt`` in a scenery of plates, whose materials are made here."""
-        from caviar_services.channel.sionna_rt import SionnaChannel
-        from caviar_services.channel.sionna_settings import SionnaSettings
+        from caviar_services.channel.sionna.model import SionnaChannel
+        from caviar_services.channel.sionna.settings import SionnaSettings
 
         carriers = (frequencies,) if isinstance(frequencies, int | float) else tuple(frequencies)
         given: dict[str, Any] = {"samples": 20_000, "bodies": 1, "receivers_at_once": 4, "max_depth": 1}

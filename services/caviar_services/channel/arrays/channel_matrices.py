@@ -1,0 +1,219 @@
+"""From the paths of a product to its channel matrices H."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Protocol, TypeVar
+
+import numpy as np
+
+from caviar_protocol.arrays import Complex64Array, Complex128Array, Float64Array, Int64Array
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
+from caviar_protocol.topics import Carrier, ChannelMatrix
+from caviar_services.antenna import steering_vector
+from caviar_services.channel.arrays.stacked import summed
+from caviar_services.channel.paths import Antenna
+from caviar_services.channel.propagation.geometry import PathGeometry
+from caviar_services.channel.propagation.patterns import radiated_field
+from caviar_services.channel.wideband import Bins, superposed
+
+
+@dataclass(frozen=True, eq=False)
+class Located:
+    """P paths in the order of the product, as matrices are made of them."""
+
+    row: Int64Array
+    """Row of each in the model's `PathTable`, Shape ``[P]``."""
+    pair: Int64Array
+    offsets: Int64Array
+    """As in `Channel`: paths of a pair are ``offsets[pair]`` to ``offsets[pair + 1]``."""
+    geometry: PathGeometry
+    a: Complex128Array
+    """As in `Channel`, Shape ``[C, P]``."""
+    transfer: Complex128Array
+    """As in `PathTable`, Shape ``[C, P, 3, 3]``, with absorption by the air."""
+    absorption_db_per_km: Float64Array | None
+    """As in `Product`."""
+
+
+class Matrices(Protocol):
+    """Makes the matrices of a product from its paths, at the carriers and over the band."""
+
+    def __call__(
+        self,
+        carriers: Sequence[Carrier],
+        transmitters: Sequence[Antenna],
+        receivers: Sequence[Antenna],
+        located: Located,
+    ) -> tuple[ChannelMatrix, ...]:
+        """H of every carrier and pair, carriers slowest."""
+
+    def responses(
+        self,
+        bins: Sequence[Bins],
+        transmitters: Sequence[Antenna],
+        receivers: Sequence[Antenna],
+        located: Located,
+    ) -> Iterator[Complex64Array]:
+        """What `Bins` ask for, of each of them and each pair, pairs fastest; Shape ``[J, Nr, Nt]`` each."""
+
+
+class PlaneWaves:
+    """H[m, n] = Σ_p a[p] · receive[p, m] · transmit[p, n]: delays and phases within an array are those at
+    the carrier, so that its beams point where they do there on every subcarrier (no beam squint).
+
+    With several subarrays the sum holds for each block of H, with the amplitudes between these two and the
+    phases of their centres.
+    """
+
+    def __call__(
+        self,
+        carriers: Sequence[Carrier],
+        transmitters: Sequence[Antenna],
+        receivers: Sequence[Antenna],
+        located: Located,
+    ) -> tuple[ChannelMatrix, ...]:
+        steered = _steered(transmitters, receivers, located)
+        return tuple(
+            ChannelMatrix(carrier=index, tx=pair // len(receivers), rx=pair % len(receivers), h=h)
+            for index, carrier in enumerate(carriers)
+            for pair, h in enumerate(of.h(index, carrier) for of in steered)
+        )
+
+    def responses(
+        self,
+        bins: Sequence[Bins],
+        transmitters: Sequence[Antenna],
+        receivers: Sequence[Antenna],
+        located: Located,
+    ) -> Iterator[Complex64Array]:
+        geometry = located.geometry
+        steered = _steered(transmitters, receivers, located)
+        for asked in bins:
+            doppler = geometry.doppler_ratio * asked.carrier.frequency_hz
+            for pair, of in enumerate(steered):
+                weights = asked.weights(pair, geometry.tau[of.mine], doppler[of.mine])
+                yield of.response(asked.index, asked.carrier, weights)
+
+
+@dataclass(frozen=True, eq=False)
+class _Steered:
+    """The p paths of a pair of devices, and the phases of the elements of their subarrays on each."""
+
+    antennas: tuple[Antenna, Antenna]
+    """Transmitter and receiver."""
+    mine: slice
+    located: Located
+    transmit: list[Complex128Array]
+    """Of each subarray of the transmitter, Shape ``[p, N]`` each; ``receive`` likewise."""
+    receive: list[Complex128Array]
+
+    def h(self, index: int, carrier: Carrier) -> Complex128Array:
+        """H on a carrier, which is the ``index``-th."""
+        a = self._amplitudes(index, carrier)
+        return joined(
+            [
+                [summed(receive * a[r, t, :, None], transmit) for t, transmit in enumerate(self.transmit)]
+                for r, receive in enumerate(self.receive)
+            ]
+        )
+
+    def response(self, index: int, carrier: Carrier, weights: Complex128Array) -> Complex64Array:
+        """Σ_p weights[j, p] · (what path p adds to H), Shape ``[J, Nr, Nt]``."""
+        a = self._amplitudes(index, carrier)
+        return joined(
+            [
+                [
+                    superposed(weights * a[r, t], receive[:, :, None] * transmit[:, None, :])
+                    for t, transmit in enumerate(self.transmit)
+                ]
+                for r, receive in enumerate(self.receive)
+            ]
+        )
+
+    def _amplitudes(self, index: int, carrier: Carrier) -> Complex128Array:
+        """Of the paths between each subarray of the receiver and each of the transmitter, ``[R, T, p]``."""
+        located, mine = self.located, self.mine
+        if len(self.transmit) * len(self.receive) == 1:
+            return located.a[None, None, index, mine]
+        geometry = located.geometry
+        towards = geometry.departure[mine], geometry.arrival[mine]
+        phase = carrier_phase([carrier], geometry.tau[mine])
+        a = subarray_amplitudes(self.antennas, towards, located.transfer[index : index + 1, mine], phase)
+        return a[:, :, 0] * _centre_phases(carrier, self.antennas, towards)
+
+
+def _steered(
+    transmitters: Sequence[Antenna], receivers: Sequence[Antenna], located: Located
+) -> list[_Steered]:
+    """The paths of each pair."""
+    geometry, found = located.geometry, []
+    for pair, (begin, end) in enumerate(pairwise(located.offsets.tolist())):
+        antennas = transmitters[pair // len(receivers)], receivers[pair % len(receivers)]
+        mine = slice(begin, end)
+        transmit = [_steering(part, geometry.departure[mine]) for part in antennas[0].subarrays]
+        receive = [_steering(part, geometry.arrival[mine]) for part in antennas[1].subarrays]
+        found.append(_Steered(antennas, mine, located, transmit, receive))
+    return found
+
+
+Blocks = TypeVar("Blocks", Complex64Array, Complex128Array)
+
+
+def joined(rows: list[list[Blocks]]) -> Blocks:
+    """One array of blocks between subarrays, in a row those of one receiving subarray; ``[..., M, N]``."""
+    return rows[0][0] if len(rows) * len(rows[0]) == 1 else np.block(rows)
+
+
+def carrier_phase(carriers: Sequence[Carrier], tau: Float64Array) -> Complex128Array:
+    """exp(−j2πfτ), Shape ``[C, P]``."""
+    frequency = np.array([carrier.frequency_hz for carrier in carriers])
+    # The whole turns of f·τ go first: they are millions, and only the rest is a phase.
+    turns = frequency[:, None] * tau
+    phase: Complex128Array = np.exp(-2j * np.pi * (turns - np.round(turns)))
+    return phase
+
+
+def subarray_amplitudes(
+    antennas: tuple[Antenna, Antenna],
+    towards: tuple[Float64Array, Float64Array],
+    transfer: Complex128Array,
+    phase: Complex128Array,
+) -> Complex128Array:
+    """Amplitudes of paths between elements at the devices' positions, of each subarray of a receiver and each
+    of a transmitter, Shape ``[R, T, C, P]``.
+
+    Parameters
+    ----------
+    antennas
+        Transmitter and receiver.
+    towards
+        Directions of departure and of arrival in world axes, Shape ``[P, 3]`` each.
+    transfer, phase
+        As in `PathTable` and from `carrier_phase`, of these paths.
+    """
+    sent, taken = (
+        np.array([radiated_field(part.array, part.rotation, along, part.pattern) for part in end.subarrays])
+        for end, along in zip(antennas, towards, strict=True)
+    )
+    amplitudes: Complex128Array = np.einsum("rpi,cpij,tpj->rtcp", taken, transfer, sent) * phase
+    return amplitudes
+
+
+def _centre_phases(
+    carrier: Carrier, antennas: tuple[Antenna, Antenna], towards: tuple[Float64Array, Float64Array]
+) -> Complex128Array:
+    """What the phase at subarrays' centres is against those of their devices, Shape ``[R, T, P]``."""
+    nearer = [
+        np.array([along @ (part.position - end.position) for part in end.subarrays])
+        for end, along in zip(antennas, towards, strict=True)
+    ]
+    metres = nearer[1][:, None] + nearer[0][None]
+    phases: Complex128Array = np.exp(2j * np.pi * carrier.frequency_hz / SPEED_OF_LIGHT * metres)
+    return phases
+
+
+def _steering(antenna: Antenna, directions: Float64Array) -> Complex128Array:
+    return steering_vector(antenna.array, directions @ antenna.rotation)

@@ -1,0 +1,263 @@
+"""Rung ``mimo-rt``: every antenna pair traced.
+
+Each transmitting element is a source, each receiving element a target of the same tracer that finds the
+paths between the arrays' centres. So every pair has reflection coefficients, element patterns and visibility
+of its own: the reference for the rungs below, at the price of one trace for each transmitting element.
+
+Sionna RT moves images by up to a millimetre before it asks whether a face is met, so at the edge of a face
+its answer is that of a neighbouring element. Paths of reflections alone are asked for once more, without.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from caviar_protocol.arrays import Complex64Array, Complex128Array, Float64Array, Int64Array
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
+from caviar_protocol.topics import Carrier, ChannelMatrix, Interaction
+from caviar_services.channel.arrays.channel_matrices import Located
+from caviar_services.channel.arrays.element_visibility import elements
+from caviar_services.channel.paths import Antenna, PathTable, antenna_fields
+from caviar_services.channel.propagation.atmosphere import amplitude_factor
+from caviar_services.channel.propagation.clearance import with_near_pairs
+from caviar_services.channel.propagation.geometry import PathGeometry, path_geometry
+from caviar_services.channel.sionna.candidate_visibility import Corners
+from caviar_services.channel.sionna.path_solver import Tracer
+from caviar_services.channel.sionna.path_table import path_table
+from caviar_services.channel.sionna.scene import SionnaScene
+from caviar_services.channel.wideband import Bins
+
+
+class ElementTracer:
+    """Makes the matrices of a frame, by traces between elements.
+
+    Parameters
+    ----------
+    tracer
+        Set up for the options of the scenario.
+    scene
+        Of the frame.
+    velocity
+        Of each object of the scene [m/s], Shape ``[len(scene.names), 3]``.
+    wavelengths
+        Of the carriers [m].
+    lanes
+        Candidates looked at together at most.
+    los
+        Whether straight paths count.
+    """
+
+    def __init__(
+        self,
+        tracer: Tracer,
+        scene: SionnaScene,
+        velocity: Float64Array,
+        wavelengths: Float64Array,
+        lanes: int,
+        los: bool,
+    ) -> None:
+        self._tracer = tracer
+        self._scene = scene
+        self._velocity = velocity
+        self._wavelengths = wavelengths
+        self._lanes = lanes
+        self._los = los
+        self.counts: list[Int64Array] = []
+        """Paths between elements in this frame, of each carrier and transmitter: Shape ``[M, N]``, M elements
+        of all receivers."""
+        self._traced: dict[tuple[int, int], list[_ElementPaths]] = {}
+        """Of each transmitting element, by carrier and transmitter: the parts of a product share them."""
+
+    def __call__(
+        self,
+        carriers: Sequence[Carrier],
+        transmitters: Sequence[Antenna],
+        receivers: Sequence[Antenna],
+        located: Located,
+    ) -> tuple[ChannelMatrix, ...]:
+        made: list[ChannelMatrix] = []
+        ends = np.cumsum([antenna.array.size for antenna in receivers]).tolist()
+        for carrier in range(len(carriers)):
+            for t in range(len(transmitters)):
+                columns = self._paths_of(carrier, t, carriers, transmitters, receivers, located)
+                h = np.stack([column.summed(column.a) for column in columns], axis=1)
+                self.counts.append(np.stack([column.counts for column in columns], axis=1))
+                made += [
+                    ChannelMatrix(carrier=carrier, tx=t, rx=r, h=h[end - receiver.array.size : end])
+                    for r, (receiver, end) in enumerate(zip(receivers, ends, strict=True))
+                ]
+        return tuple(made)
+
+    def responses(
+        self,
+        bins: Sequence[Bins],
+        transmitters: Sequence[Antenna],
+        receivers: Sequence[Antenna],
+        located: Located,
+    ) -> Iterator[Complex64Array]:
+        sizes = [antenna.array.size for antenna in receivers]
+        ends = np.cumsum(sizes).tolist()
+        for asked in bins:
+            carriers = {asked.index: asked.carrier}
+            for t in range(len(transmitters)):
+                columns = self._paths_of(asked.index, t, carriers, transmitters, receivers, located)
+                for r, (end, size) in enumerate(zip(ends, sizes, strict=True)):
+                    pair = t * len(receivers) + r
+                    of_elements = [
+                        column.weighted(asked, pair, end - size, end).astype(np.complex64)
+                        for column in columns
+                    ]
+                    yield np.stack(of_elements, axis=-1)
+
+    def _paths_of(
+        self,
+        carrier: int,
+        t: int,
+        carriers: Sequence[Carrier] | Mapping[int, Carrier],
+        transmitters: Sequence[Antenna],
+        receivers: Sequence[Antenna],
+        located: Located,
+    ) -> list[_ElementPaths]:
+        """Paths from each element of a transmitter to those of all receivers, traced once."""
+        if (carrier, t) not in self._traced:
+            wavelength = SPEED_OF_LIGHT / carriers[carrier].frequency_hz
+            targets = self._ends(receivers, wavelength)
+            self._traced[carrier, t] = [
+                self._column(carrier, wavelength, source, targets, located)
+                for source in self._ends([transmitters[t]], wavelength)
+            ]
+        return self._traced[carrier, t]
+
+    def _ends(self, antennas: Sequence[Antenna], wavelength: float) -> list[_Element]:
+        """All elements of these antennas, in order."""
+        parts = [part for antenna in antennas for part in antenna.subarrays]
+        placed = elements(parts, wavelength)
+        return [
+            _Element(replace(part, position=at), replace(part, position=self._scene.surfaces.cleared(at)))
+            for index, part in enumerate(parts)
+            for at in placed.of(index)
+        ]
+
+    def _column(
+        self,
+        carrier: int,
+        wavelength: float,
+        source: _Element,
+        targets: Sequence[_Element],
+        located: Located,
+    ) -> _ElementPaths:
+        """What arrives from one transmitting element at M receiving ones."""
+        others = np.flatnonzero([target.place.name != source.place.name for target in targets])
+        ends = [targets[index] for index in others.tolist()]
+        table = self._paths(source, ends)
+        a, geometry = self._amplitudes(carrier, wavelength, table, source.place, [end.place for end in ends])
+        target = others[table.pair]
+        if located.absorption_db_per_km is not None:
+            per_km = located.absorption_db_per_km[carrier : carrier + 1]
+            a = a * amplitude_factor(per_km, geometry.tau)[0]
+        # The tracer's order may change with threads, and a sum with its order.
+        order = np.lexsort([a.imag, a.real, target])
+        finite = order[np.isfinite(a[order])]
+        doppler_hz = geometry.doppler_ratio[finite] * SPEED_OF_LIGHT / wavelength
+        return _ElementPaths(len(targets), target[finite], a[finite], geometry.tau[finite], doppler_hz)
+
+    def _paths(self, source: _Element, ends: Sequence[_Element]) -> PathTable:
+        """Between one element and others, as between antennas."""
+        from_, to = source.traced.position, np.array([end.traced.position for end in ends]).reshape(-1, 3)
+        corners = Corners(from_[None], to[:, None])
+        traced = self._tracer.trace(from_, to, lanes=self._lanes, corners=corners)
+        mirrored = ((traced.types == 0) | (traced.types == Interaction.REFLECTION)).all(1)
+        traced = traced.take(~mirrored | traced.hidden | traced.settled)
+        # Its own corner is all that an element has: what that sees, the element sees.
+        traced = replace(traced, hidden=np.zeros(len(traced.hidden), np.bool_))
+        names = self._scene.names
+        places = [source.place], [end.place for end in ends]
+        table = path_table(
+            self._scene,
+            [(traced.receiver, traced)],
+            names,
+            self._velocity,
+            places,
+            ([source.traced], [end.traced for end in ends]),
+        )
+        los = np.zeros(len(ends), np.bool_)
+        table, _ = with_near_pairs(table, los, *places, self._wavelengths, self._scene.surfaces)
+        return table if self._los else table.take((table.types != 0).any(1))
+
+    def _amplitudes(
+        self,
+        carrier: int,
+        wavelength: float,
+        table: PathTable,
+        source: Antenna,
+        targets: Sequence[Antenna],
+    ) -> tuple[Complex128Array, PathGeometry]:
+        """With the phase of lengths in float64, Shape ``[P]``, and what follows from the paths' points."""
+        ends = np.array([target.position for target in targets]).reshape(-1, 3)[table.pair]
+        start = np.broadcast_to(source.position, ends.shape)
+        with np.errstate(invalid="ignore"):  # what is not finite is left out
+            geometry = path_geometry(
+                start,
+                table.points,
+                ends,
+                (table.types != 0).sum(1),
+                np.broadcast_to(source.velocity, ends.shape),
+                table.point_velocity,
+                np.array([target.velocity for target in targets]).reshape(-1, 3)[table.pair],
+            )
+            sent = source.radiated(geometry.departure)
+            parts = {(target.name, target.part): target for target in targets}
+            number = {key: index for index, key in enumerate(parts)}
+            which = np.array([number[target.name, target.part] for target in targets], np.int64)[table.pair]
+            taken = antenna_fields(list(parts.values()), which, geometry.arrival)
+            turns = geometry.tau * SPEED_OF_LIGHT / wavelength
+            phase = np.exp(-2j * np.pi * (turns - np.round(turns)))
+            a: Complex128Array = np.einsum("pi,pij,pj->p", taken, table.transfer[carrier], sent) * phase
+        return a, geometry
+
+
+@dataclass(frozen=True, eq=False)
+class _ElementPaths:
+    """Paths from one transmitting element, sorted by the receiving one, Shape ``[P]`` each."""
+
+    targets: int
+    """Receiving elements M, of all receivers."""
+    target: Int64Array
+    a: Complex128Array
+    tau: Float64Array
+    """[s]."""
+    doppler: Float64Array
+    """[Hz]."""
+
+    @property
+    def counts(self) -> Int64Array:
+        """Paths to each receiving element, Shape ``[M]``."""
+        return np.bincount(self.target, minlength=self.targets)
+
+    def summed(self, amplitudes: Complex128Array) -> Complex128Array:
+        """What arrives at each receiving element, Shape ``[M]``."""
+        column = np.zeros(self.targets, np.complex128)
+        np.add.at(column, self.target, amplitudes)
+        return column
+
+    def weighted(self, asked: Bins, pair: int, begin: int, end: int) -> Complex128Array:
+        """What arrives at the receiving elements ``begin`` to ``end``, Shape ``[J, end − begin]``."""
+        mine = slice(*np.searchsorted(self.target, [begin, end]).tolist())
+        weights = asked.weights(pair, self.tau[mine], self.doppler[mine]) * self.a[mine]
+        response = np.zeros((len(weights), end - begin), np.complex128)
+        elements, first = np.unique(self.target[mine], return_index=True)
+        if len(elements):
+            response[:, elements - begin] = np.add.reduceat(weights, first, axis=1)
+        return response
+
+
+@dataclass(frozen=True, eq=False)
+class _Element:
+    """One element, as an antenna of its own."""
+
+    place: Antenna
+    traced: Antenna
+    """Off the surface that it is at."""

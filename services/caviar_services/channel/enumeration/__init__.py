@@ -1,0 +1,1 @@
+"""Candidate paths at moving bodies, enumerated face by face: no launch of rays meets each small face."""

@@ -1,0 +1,369 @@
+"""Beams of images: where waves can go that were reflected at given faces, culled in the ray tracer's arrays.
+
+Mirrored in a face, a transmitter is an image, and what it lights by way of that face is the pyramid from the
+image through the face's rectangle. The next face mirrors the image and the last rectangle with it: a beam is
+an image, the pyramids through its last two rectangles, and the side of the last plane that it lights (M. F.
+Catedra et al., "Efficient ray-tracing techniques for three-dimensional analyses of propagation in mobile
+communications", IEEE Antennas Propag. Mag. 40(2), 1998, cull by such beams). Nothing that a beam lights is
+left out, and some that it does not light is kept: the image method decides, in float64, which is a path.
+
+Everything here counts in float32, with a slack that is more than its rounding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
+from caviar_services.channel.enumeration.face_rectangles import FaceRectangles
+from caviar_services.channel.enumeration.lane_pairs import filtered, gathered, numbers, opaque, pairs
+from caviar_services.channel.sionna.candidates import positions
+from caviar_services.columns import aligned_columns, aligned_indices, several
+
+_SLACK = 5e-3
+"""[m] around everything that is looked for."""
+
+_RELATIVE_SLACK = 2e-6
+"""The same as a part of the largest coordinate."""
+
+_WIDE = 0.01
+"""Cosine of the half angle of the widest cone that is held against anything."""
+
+
+class Targets:
+    """What beams are held against in a frame: faces, the spheres around bodies, and points.
+
+    Parameters
+    ----------
+    faces
+        Of scenery, and behind them of bodies, body after body.
+    sizes
+        How many of the last ones each body has, Shape ``[V]``.
+    """
+
+    def __init__(self, faces: FaceRectangles, sizes: Int64Array) -> None:
+        import drjit as dr
+        import mitsuba as mi
+
+        self.faces = faces
+        self.first_body = len(faces) - int(sizes.sum())
+        """Number of the first face of a body."""
+        self.most = int(sizes.max(initial=0))
+        """Faces of a body, at most."""
+        self.bodies = len(sizes)
+        centre, reach = _spheres(faces, self.first_body, sizes)
+        rows = np.concatenate(
+            [
+                faces.normal,
+                faces.centre,
+                faces.axes[:, 0] * faces.half[:, :1],
+                faces.axes[:, 1] * faces.half[:, 1:],
+                faces.offset[:, None],
+                faces.radius[:, None],
+            ],
+            axis=1,
+        ).T
+        columns = [mi.Float(column) for column in aligned_columns(rows[:, several(len(faces))])]
+        self.normal, self.centre, self.u, self.v = (mi.Vector3f(*columns[i : i + 3]) for i in (0, 3, 6, 9))
+        self.offset, self.radius = columns[12:]
+        self.two_sided = mi.UInt(aligned_indices(faces.two_sided[several(len(faces))])) != 0
+        some = several(self.bodies)
+        self.body_centre = positions(centre[some])
+        self.body_radius = mi.Float(aligned_columns(reach[None, some])[0])
+        begin = self.first_body + np.cumsum(sizes) - sizes
+        self.body_begin, self.body_size = (mi.UInt(aligned_indices(part[some])) for part in (begin, sizes))
+        slack = _SLACK + _RELATIVE_SLACK * float(np.abs(faces.centre).max(initial=0.0))
+        self.slack = dr.opaque(mi.Float, slack)
+        """Around everything that is looked for [m]; a number in a kernel would be another kernel."""
+
+    def body_of(self, faces: Int64Array) -> Int64Array:
+        """Number of the body of these faces of bodies."""
+        begin = self.body_begin.numpy()[: self.bodies].astype(np.int64)
+        return np.searchsorted(begin, faces, side="right") - 1
+
+    def corners(self, face: Any) -> list[Any]:
+        """Those of rectangles, in turn."""
+        centre, u, v = (gathered(column, face) for column in (self.centre, self.u, self.v))
+        return [centre - u - v, centre + u - v, centre + u + v, centre - u + v]
+
+    def height(self, point: Any, face: Any) -> Any:
+        """How far points are in front of planes."""
+        import drjit as dr
+
+        return dr.dot(point, gathered(self.normal, face)) - gathered(self.offset, face)
+
+
+def _spheres(faces: FaceRectangles, first: int, sizes: Int64Array) -> tuple[Float64Array, Float64Array]:
+    """Centre [m], Shape ``[V, 3]``, and radius [m] of a sphere around all rectangles of each body."""
+    if not len(sizes):
+        return np.zeros((0, 3)), np.zeros(0)
+    u, v = (faces.axes[first:, i] * faces.half[first:, i, None] for i in (0, 1))
+    corners = faces.centre[first:, None] + np.stack([u + v, u - v, v - u, -u - v], axis=1)
+    begin = np.cumsum(sizes) - sizes
+    low = np.minimum.reduceat(corners.min(1), begin)
+    high = np.maximum.reduceat(corners.max(1), begin)
+    centre = (low + high) / 2
+    away = np.sqrt(((corners - np.repeat(centre, sizes, axis=0)[:, None]) ** 2).sum(-1)).max(1)
+    return centre, np.maximum.reduceat(away, begin)
+
+
+@dataclass(frozen=True, eq=False)
+class Beams:
+    """B beams behind the same number of reflections, in the ray tracer's arrays and in NumPy's."""
+
+    chain: Int64Array
+    """Faces that they were reflected at, Shape ``[B, n]``."""
+    by_body: BoolArray
+    """Whether one of these is of a body, Shape ``[B]``."""
+    image: Any
+    sides: Sequence[Any]
+    """Unit normals, inwards, of the pyramids' sides: four for each rectangle."""
+    axis: Any
+    cosine: Any
+    """Of the half angle of the narrowest cone around a pyramid."""
+    last: Any
+    """The last face."""
+    lit: Any
+    """Unit normal of its plane towards the side that is lit."""
+    lit_from: Any
+    """Offset of that plane along it."""
+
+    def __len__(self) -> int:
+        return len(self.chain)
+
+    @property
+    def first_by_body(self) -> int:
+        """Number of the first beam by way of a body: those of scenery alone stand before."""
+        return int(np.argmax(self.by_body)) if self.by_body.any() else len(self)
+
+    def light_cone(self, beam: Any, centre: Any, radius: Any, slack: Any) -> Any:
+        """Whether spheres reach into the cones of beams, and before their last planes."""
+        import drjit as dr
+
+        axis, cosine = gathered(self.axis, beam), gathered(self.cosine, beam)
+        towards = centre - gathered(self.image, beam)
+        along = dr.dot(axis, towards)
+        across = dr.sqrt(dr.maximum(dr.squared_norm(towards) - along * along, 0.0))
+        sine = dr.sqrt(dr.maximum(1.0 - cosine * cosine, 0.0))
+        before = dr.dot(gathered(self.lit, beam), centre) - gathered(self.lit_from, beam)
+        reach = radius + 2.0 * slack
+        return (across * cosine - along * sine <= reach) & (before > -reach)
+
+    def light(self, beam: Any, centre: Any, reach: Any) -> Any:
+        """Whether spheres reach into the pyramids of beams."""
+        import drjit as dr
+        import mitsuba as mi
+
+        towards = centre - gathered(self.image, beam)
+        lit = mi.Bool(True)
+        for side in self.sides:
+            lit &= dr.dot(gathered(side, beam), towards) > -reach
+        return lit
+
+
+def first_beams(targets: Targets, source: Float64Array, scenery: Int64Array) -> Beams:
+    """Beams of a transmitter [m], Shape ``[3]``, by faces of scenery, then by all that bodies show it."""
+    faces = targets.faces
+    bodies = np.arange(targets.first_body, len(faces))
+    shown = faces.height(np.broadcast_to(source, (len(bodies), 3)), bodies) > 0
+    first = np.concatenate([scenery, bodies[shown | faces.two_sided[bodies]]])
+    image = positions(np.broadcast_to(source, (len(several(len(first))), 3)))
+    return reflected_beams(targets, first[:, None], image, None)
+
+
+def next_beams(targets: Targets, beams: Beams, scenery: Int64Array, known: Int64Array) -> Beams:
+    """Beams behind one more reflection.
+
+    Parameters
+    ----------
+    scenery
+        Faces of scenery that reflect what bodies reflected.
+    known
+        Chains of scenery alone that are one longer than those of ``beams``, Shape ``[K, n + 1]``, each
+        beginning with one of these: of scenery alone these are gone on with.
+    """
+
+    beam, face = by_scenery(targets, beams, scenery)
+    of_body = filtered(partial(lights_corner, targets, beams), lit_bodies(targets, beams))
+    chain = np.concatenate(
+        [
+            known,
+            np.concatenate([beams.chain[numbers(beam)], numbers(face)[:, None]], axis=1),
+            np.concatenate([beams.chain[numbers(of_body[0])], numbers(of_body[1])[:, None]], axis=1),
+        ]
+    )
+    before = _rows_of(beams.chain[: beams.first_by_body], known[:, :-1])
+    parent = np.concatenate([before, numbers(beam), numbers(of_body[0])])
+    return _longer(targets, beams, parent, chain)
+
+
+def scenery_beams(targets: Targets, beams: Beams, known: Int64Array) -> Beams:
+    """Of `next_beams`, those of chains of scenery alone."""
+    return _longer(targets, beams, _rows_of(beams.chain[: beams.first_by_body], known[:, :-1]), known)
+
+
+def _longer(targets: Targets, beams: Beams, parent: Int64Array, chain: Int64Array) -> Beams:
+    """Beams of chains, each of which is longer by one than that of its parent."""
+    import mitsuba as mi
+
+    index = mi.UInt(aligned_indices(parent[several(len(parent))]))
+    return reflected_beams(targets, chain, gathered(beams.image, index), gathered(beams.last, index))
+
+
+def by_scenery(targets: Targets, beams: Beams, scenery: Int64Array) -> tuple[Any, Any]:
+    """Beams by way of bodies and faces of scenery that they light, as `mitsuba.UInt`."""
+    import drjit as dr
+    import mitsuba as mi
+
+    faces = mi.UInt(aligned_indices(scenery[several(len(scenery))]))
+    begin = beams.first_by_body
+    first = opaque(begin)
+
+    def near(beam: Any, place: Any) -> Any:
+        beam, face = beam + first, gathered(faces, place)
+        centre, radius = gathered(targets.centre, face), gathered(targets.radius, face)
+        lit = beams.light_cone(beam, centre, radius, targets.slack)
+        return lit & (face != gathered(beams.last, beam))
+
+    def lights(beam: Any, place: Any) -> Any:
+        return lights_corner(targets, beams, beam + first, gathered(faces, place))
+
+    beam, place = filtered(lights, pairs(len(beams) - begin, len(scenery), near))
+    if not dr.width(beam):
+        return beam, place
+    beam, face = beam + first, gathered(faces, place)
+    dr.eval(beam, face)
+    return beam, face
+
+
+def lit_bodies(targets: Targets, beams: Beams) -> tuple[Any, Any]:
+    """Beams and faces of bodies whose spheres they light, as `mitsuba.UInt`."""
+    import drjit as dr
+
+    slack = targets.slack
+    beam, body = near_bodies(targets, beams)
+
+    def face_of(pair: Any, number: Any) -> Any:
+        return gathered(targets.body_begin, gathered(body, pair)) + number
+
+    def shows(pair: Any, number: Any) -> Any:
+        there = number < gathered(targets.body_size, gathered(body, pair))
+        of, face = gathered(beam, pair), dr.select(there, face_of(pair, number), 0)
+        height = targets.height(gathered(beams.image, of), face)
+        there &= (height > -slack) | gathered(targets.two_sided, face)
+        there &= face != gathered(beams.last, of)
+        centre, radius = gathered(targets.centre, face), gathered(targets.radius, face)
+        return there & beams.light_cone(of, centre, radius, slack)
+
+    def shows_within(pair: Any, number: Any) -> Any:
+        face = face_of(pair, number)
+        reach = gathered(targets.radius, face) + slack
+        return beams.light(gathered(beam, pair), gathered(targets.centre, face), reach)
+
+    pair, number = filtered(shows_within, pairs(dr.width(beam), targets.most, shows))
+    beam, face = gathered(beam, pair), face_of(pair, number)
+    dr.eval(beam, face)
+    return beam, face
+
+
+def reflected_beams(targets: Targets, chain: Int64Array, image: Any, before: Any | None) -> Beams:
+    """Beams by way of the last faces of chains, from images before these and by way of faces ``before``."""
+    import drjit as dr
+    import mitsuba as mi
+
+    if not len(chain):  # kernels of no lanes do not exist
+        return Beams(chain, np.zeros(0, np.bool_), None, (), None, None, None, None, None)
+    last = mi.UInt(aligned_indices(chain[several(len(chain)), -1]))
+    normal, offset = gathered(targets.normal, last), gathered(targets.offset, last)
+
+    def mirrored(point: Any) -> Any:
+        return point - 2.0 * (dr.dot(point, normal) - offset) * normal
+
+    image = mirrored(image)
+    corners = targets.corners(last)
+    axis, cosine = _cone(image, corners)
+    sides = _sides(image, corners)
+    if before is not None:
+        mirrored_corners = [mirrored(corner) for corner in targets.corners(before)]
+        other_axis, other_cosine = _cone(image, mirrored_corners)
+        narrower = other_cosine > cosine
+        axis, cosine = dr.select(narrower, other_axis, axis), dr.maximum(cosine, other_cosine)
+        sides += _sides(image, mirrored_corners)
+    away = dr.select(dr.dot(image, normal) > offset, -1.0, 1.0)
+    lit, lit_from = normal * away, offset * away
+    dr.eval(image, axis, cosine, sides, lit, lit_from, last)
+    by_body = chain >= targets.first_body
+    return Beams(
+        chain, np.logical_or.reduce(by_body, axis=1), image, sides, axis, cosine, last, lit, lit_from
+    )
+
+
+def near_bodies(targets: Targets, beams: Beams) -> tuple[Any, Any]:
+    """Beams and bodies whose spheres they light, as `mitsuba.UInt`."""
+
+    def near(beam: Any, body: Any) -> Any:
+        centre, radius = gathered(targets.body_centre, body), gathered(targets.body_radius, body)
+        return beams.light_cone(beam, centre, radius, targets.slack)
+
+    def lit(beam: Any, body: Any) -> Any:
+        centre, radius = gathered(targets.body_centre, body), gathered(targets.body_radius, body)
+        return beams.light(beam, centre, radius + targets.slack)
+
+    return filtered(lit, pairs(len(beams), targets.bodies, near))
+
+
+def lights_corner(targets: Targets, beams: Beams, beam: Any, face: Any) -> Any:
+    """Whether no side of beams has all corners of rectangles beyond it."""
+    import drjit as dr
+
+    corners, image = targets.corners(face), gathered(beams.image, beam)
+    lit = _some(corners, gathered(beams.lit, beam), gathered(beams.lit_from, beam) + targets.slack)
+    for side in beams.sides:
+        normal = gathered(side, beam)
+        lit &= _some(corners, normal, dr.dot(normal, image) - targets.slack)
+    return lit
+
+
+def _some(corners: list[Any], normal: Any, offset: Any) -> Any:
+    """Whether one of the corners at least is beyond a plane."""
+    import drjit as dr
+
+    a, b, c, d = (dr.dot(normal, corner) for corner in corners)
+    return dr.maximum(dr.maximum(a, b), dr.maximum(c, d)) > offset
+
+
+def _sides(image: Any, corners: list[Any]) -> list[Any]:
+    """Unit normals, inwards, of the sides of the pyramid from a point around corners in turn."""
+    import drjit as dr
+
+    edges = [corner - image for corner in corners]
+    middle = edges[0] + edges[2]
+    sides = []
+    for one, other in zip(edges, [*edges[1:], edges[0]], strict=True):
+        normal = dr.cross(one, other)
+        normal *= dr.rsqrt(dr.maximum(dr.squared_norm(normal), 1e-20))
+        sides.append(dr.select(dr.dot(normal, middle) < 0.0, -normal, normal))
+    return sides
+
+
+def _cone(image: Any, corners: list[Any]) -> tuple[Any, Any]:
+    """Axis of a cone from a point around corners, and the cosine of its half angle."""
+    import drjit as dr
+
+    edges = [dr.normalize(corner - image) for corner in corners]
+    axis = dr.normalize(edges[0] + edges[1] + edges[2] + edges[3])
+    a, b, c, d = (dr.dot(edge, axis) for edge in edges)
+    cosine = dr.minimum(dr.minimum(a, b), dr.minimum(c, d))
+    # A cone that is wider than a half-space does not hold all that its directions span.
+    return axis, dr.select(cosine > _WIDE, cosine, -1.0)
+
+
+def _rows_of(rows: Int64Array, wanted: Int64Array) -> Int64Array:
+    """Number of the row that each of the wanted ones is."""
+    known = {tuple(row): number for number, row in enumerate(rows.tolist())}
+    return np.array([known[tuple(row)] for row in wanted.tolist()], np.int64)

@@ -1,0 +1,1 @@
+"""Fields along paths in float64: image method, diffraction (UTD), atmosphere, antenna patterns."""

@@ -1,0 +1,407 @@
+"""Fields of diffracted paths, in float64 from the meshes' own corners.
+
+Those of the ray tracer change by 10 dB and more with where a scene stands, for the first two reasons:
+
+- Of a path with fewer interactions than the solver's depth, it counts the way from the last point to the
+  origin of coordinates, and from there to the receiver, as the length behind the edge.
+- A ray in the plane of a face is neither before nor behind it, and rounding in float32 says one or the other:
+  the wedge is then taken for its mirror image, the angle 0 for 2π, or a face for one in the shadow.
+- The terms that make up for the reflected wave where it ends have its opposite sign.
+
+Here legs are those of the path, faces those of the mesh, angles those of the exterior, and what lies in a
+plane to within `IN_PLANE` counts as lying in it. The two faces may be of different materials.
+
+The coefficient is that of the uniform theory of diffraction (R. G. Kouyoumjian and P. H. Pathak, "A
+uniform geometrical theory of diffraction for an edge in a perfectly conducting surface", Proc. IEEE 62(11),
+1974) for a wedge of reflection matrices R0 and Rn, in the ray tracer's heuristic form: exact for a conductor
+and a field along the edge, else where light and reflection end,
+
+D = R0·(D1 − D4) + Rn·(D2 − D3), Di = −exp(−jπ/4) / (2n·sqrt(2πk)·sin β0) · cot(ψi)·F(kL·ai),
+
+with Rn = −1 for a face in the shadow.
+
+Each Di changes its sign at one boundary: D1 and D2 where the wave that passes the edge ends, D4 and D3 where
+the waves end that the first and the second face reflect. `Bends.margins` says how far off these are. Where
+it is known otherwise which of these waves there are, ``lit`` says so, and the sum of all waves is continuous.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int64Array, UInt8Array
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
+from caviar_protocol.topics import Interaction
+from caviar_services.channel.propagation.vectors import cross
+from caviar_services.channel.sionna.contributing import slab
+
+IN_PLANE = 1e-8
+"""[rad]; a ray this near the plane of a face is in it, and this near a shadow boundary on its lit side."""
+
+_FLAT = 1e-6
+"""Sine of the angle between faces below which they are one plane, or lie upon one another."""
+
+_SIGN = -1.0
+"""Of reflection matrices in the bases of diffraction, which turn round from the incoming to the outgoing ray:
+with it the field is continuous where reflection ends, without it, as in the ray tracer, it is not."""
+
+_ALONG = 1e-9
+"""Sine of the angle between two directions below which they are one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Media:
+    """What surfaces at the interactions of P paths are made of, on C carriers."""
+
+    permittivity: Float64Array
+    """Relative, Shape ``[C, P, D]``."""
+    conductivity: Float64Array
+    """[S/m], Shape ``[C, P, D]``."""
+    thickness: Float64Array
+    """[m], Shape ``[P, D]``."""
+    scattering: Float64Array
+    """Scattering coefficients, Shape ``[P, D]``."""
+
+
+@dataclass(frozen=True, eq=False)
+class Faces:
+    """The two faces of P wedges; the first of them is counted from."""
+
+    normals: Float64Array
+    """Unit, outward, Shape ``[P, 2, 3]``."""
+    edge: Float64Array
+    """Unit, along the edge, such that normal × edge leads into the first face, Shape ``[P, 3]``."""
+
+    @property
+    def exterior(self) -> Float64Array:
+        """Angle between the faces outside of the wedge [rad], Shape ``[P]``: n·π in the coefficients."""
+        first, second = np.moveaxis(self.normals, 1, 0)
+        cosine, sine = -(first * second).sum(-1), _sine(first, second)
+        exterior: Float64Array = 2 * np.pi - np.arctan2(sine, cosine)
+        return exterior
+
+    def take(self, which: Int64Array | BoolArray) -> Faces:
+        """Those of these wedges."""
+        return Faces(self.normals[which], self.edge[which])
+
+    def turned(self, swap: BoolArray) -> Faces:
+        """The same, counted from the other face where ``swap`` is true."""
+        return Faces(
+            np.where(swap[:, None, None], self.normals[:, ::-1], self.normals),
+            np.where(swap[:, None], -self.edge, self.edge),
+        )
+
+
+def faces_of(ends: Float64Array, apexes: Float64Array) -> tuple[Faces, BoolArray]:
+    """Faces of wedges, and where there are any: not where an edge has no length or a face no width.
+
+    Parameters
+    ----------
+    ends
+        Of the edges [m], Shape ``[P, 2, 3]``.
+    apexes
+        A point of each face that is not on the edge [m], Shape ``[P, 2, 3]``; of a single face, twice.
+    """
+    begin, end = ends[:, 0], ends[:, 1]
+    with np.errstate(invalid="ignore", divide="ignore"):  # of what is no wedge
+        edge = _unit(end - begin)
+        inward = [_unit(_across(apexes[:, face] - begin, edge)) for face in (0, 1)]
+        normals = [np.cross(edge, part) for part in inward]
+        for normal, other in zip(normals, inward[::-1], strict=True):
+            normal *= np.where((normal * other).sum(-1, keepdims=True) > 0, -1.0, 1.0)
+        # One plane is seen from one side, two faces that lie upon one another from both.
+        level = (_sine(*inward) < _FLAT)[:, None]
+        turned = np.where((inward[0] * inward[1]).sum(-1, keepdims=True) > 0, -normals[0], normals[0])
+        normals[1] = np.where(level, turned, normals[1])
+        leads_in = (np.cross(normals[0], edge) * inward[0]).sum(-1, keepdims=True) >= 0
+    is_edge: BoolArray = np.asarray(np.isfinite(normals).all((0, 2)))
+    return Faces(np.stack(normals, axis=1), np.where(leads_in, edge, -edge)), is_edge
+
+
+@dataclass(frozen=True, eq=False)
+class Bends:
+    """How P paths go over their edges."""
+
+    at: Int64Array
+    """Which interaction that is, Shape ``[P]``."""
+    k: Float64Array
+    """Unit vectors along which waves come in, Shape ``[P, 3]``."""
+    out: Float64Array
+    """Along which they go on, Shape ``[P, 3]``."""
+    legs: tuple[Float64Array, Float64Array]
+    """Lengths before and behind the edge [m], each of Shape ``[P]``."""
+    faces: Faces
+    """Counted from that which waves meet more steeply."""
+    swapped: BoolArray
+    """Whether that is the second one of those that were given, Shape ``[P]``."""
+
+    @classmethod
+    def of(cls, corners: Float64Array, types: UInt8Array, faces: Faces) -> Bends:
+        """Those of paths; the parameters are those of `edge_fields`."""
+        steps = np.diff(corners, axis=1)
+        lengths = np.sqrt((steps**2).sum(-1))
+        bent = types == Interaction.DIFFRACTION
+        at, rows = np.argmax(bent, axis=1), np.arange(len(types))
+        behind = np.cumsum(bent, axis=1) > 0
+        legs = lengths[:, 0] + (lengths[:, 1:] * ~behind).sum(1), (lengths[:, 1:] * behind).sum(1)
+        k, out = _unit(steps[rows, at]), _unit(steps[rows, at + 1])
+        met = -(faces.normals * k[:, None]).sum(-1)
+        swap = met[:, 1] > met[:, 0] + IN_PLANE
+        return cls(at, k, out, legs, faces.turned(swap), swap)
+
+    @property
+    def angles(self) -> tuple[Float64Array, Float64Array]:
+        """Of the ray that comes in and of that which goes on, from the first face [rad], each ``[P]``."""
+        exterior = self.faces.exterior
+        return _angle(-self.k, self.faces, exterior), _angle(self.out, self.faces, exterior)
+
+    @property
+    def margins(self) -> Float64Array:
+        """How far [rad] the outgoing ray is within the wave that passes the edge, and within those that the
+        faces reflect, first and second as they were given; negative where these have ended; ``[P, 3]``."""
+        angle_in, angle_out = self.angles
+        both = angle_in + angle_out
+        first, second = np.pi - both, both - (2 * self.faces.exterior - np.pi)
+        first, second = np.where(self.swapped, (second, first), (first, second))
+        return np.stack([np.pi - np.abs(angle_out - angle_in), first, second], axis=-1)
+
+    @property
+    def spread(self) -> Float64Array:
+        """The length L = s'·s/(s' + s) [m] of the coefficients, Shape ``[P]``."""
+        spread: Float64Array = self.legs[0] * self.legs[1] / (self.legs[0] + self.legs[1])
+        return spread
+
+    def take(self, rows: Int64Array) -> Bends:
+        """Those of these paths."""
+        return Bends(
+            self.at[rows],
+            self.k[rows],
+            self.out[rows],
+            (self.legs[0][rows], self.legs[1][rows]),
+            self.faces.take(rows),
+            self.swapped[rows],
+        )
+
+
+def edge_fields(
+    corners: Float64Array,
+    types: UInt8Array,
+    normals: Float64Array,
+    faces: Faces,
+    media: Media,
+    second: Media,
+    wavelengths: Sequence[float],
+    lit: Int64Array | None = None,
+) -> Complex128Array:
+    """Dyads of `PathTable` of paths that are diffracted once, Shape ``[C, P, 3, 3]``; not finite where the
+    geometry leaves none.
+
+    Parameters
+    ----------
+    corners
+        TX, interaction points, and RX in all places behind the last one [m], Shape ``[P, D + 2, 3]``.
+    types
+        `Interaction` at each point, Shape ``[P, D]``: reflections, transmissions, and one diffraction.
+    normals
+        Of the triangle at each point, of any length, Shape ``[P, D, 3]``.
+    faces
+        Of the wedge.
+    media
+        At each point; at the edge, that of the first face.
+    second
+        Of the second face, Shape ``[C, P, 1]`` or ``[P, 1]``.
+    wavelengths
+        Of the carriers [m].
+    lit
+        Which of the waves of `Bends.margins` there are: 1, −1 for none, 0 where angles tell; ``[P, 3]``.
+    """
+    steps = np.diff(corners, axis=1)
+    bends = Bends.of(corners, types, faces)
+    lit = np.zeros((len(types), 3), np.int64) if lit is None else lit
+    s_in, s_out = bends.legs
+    fields = []
+    for carrier, wavelength in enumerate(wavelengths):
+        k = _unit(steps[:, 0])
+        field = np.eye(3) - k[:, :, None] * k[:, None] + 0j
+        other = Wall.of(second, carrier, 0, wavelength)
+        for d in range(types.shape[1]):
+            going = types[:, d] != 0
+            out = np.where(going[:, None], _unit(steps[:, d + 1]), k)
+            wall = Wall.of(media, carrier, d, wavelength)
+            flat = wall.dyad(k, _unit(normals[:, d]), types[:, d] == Interaction.TRANSMISSION)
+            rows = np.flatnonzero(bends.at == d)
+            if len(rows):
+                walls = wall.take(rows), other.take(rows)
+                flat[rows] = _diffracted(bends.take(rows), walls, lit[rows])
+            field = np.where(going[:, None, None], flat @ field, field)
+            k = out
+        spreading = 1 / np.sqrt(s_in * s_out * (s_in + s_out))
+        fields.append(field * (wavelength / (4 * np.pi) * spreading)[:, None, None])
+    return np.stack(fields)
+
+
+@dataclass(frozen=True, eq=False)
+class Wall:
+    """Slabs that P rays meet, at one wavelength [m]."""
+
+    permittivity: Float64Array
+    conductivity: Float64Array
+    thickness: Float64Array
+    scattering: Float64Array
+    wavelength: float
+
+    @classmethod
+    def of(cls, media: Media, carrier: int, d: int, wavelength: float) -> Wall:
+        """What is at interaction ``d`` of paths."""
+        constants = media.permittivity[carrier, :, d], media.conductivity[carrier, :, d]
+        return cls(*constants, media.thickness[:, d], media.scattering[:, d], wavelength)
+
+    def where(self, which: BoolArray, other: Wall) -> Wall:
+        """These where ``which`` is true, and elsewhere those of another."""
+        return Wall(
+            np.where(which, self.permittivity, other.permittivity),
+            np.where(which, self.conductivity, other.conductivity),
+            np.where(which, self.thickness, other.thickness),
+            np.where(which, self.scattering, other.scattering),
+            self.wavelength,
+        )
+
+    def take(self, rows: Int64Array) -> Wall:
+        """Those of these rays."""
+        return Wall(
+            self.permittivity[rows],
+            self.conductivity[rows],
+            self.thickness[rows],
+            self.scattering[rows],
+            self.wavelength,
+        )
+
+    def dyad(self, k: Float64Array, normal: Float64Array, through: BoolArray) -> Complex128Array:
+        """From the field that comes in along ``k`` to what is reflected, or goes through."""
+        across = (k * normal).sum(-1)
+        frequency = SPEED_OF_LIGHT / self.wavelength
+        back, passed = slab(np.abs(across), (self.permittivity, self.conductivity), self.thickness, frequency)
+        te, tm = np.where(through, passed, back * np.sqrt(1 - self.scattering**2))
+        s = _unit(_perpendicular(k, normal))
+        out = np.where(through[:, None], k, k - 2 * across[:, None] * normal)
+        return _outer(te[:, None] * s, s) + _outer(tm[:, None] * cross(out, s), cross(k, s))
+
+
+def _diffracted(bends: Bends, walls: tuple[Wall, Wall], lit: Int64Array) -> Complex128Array:
+    """Dyads of diffraction, without spreading; ``walls`` and ``lit`` are those of the faces as given."""
+    k, out, edge = bends.k, bends.out, bends.faces.edge
+    exterior, (angle_in, angle_out) = bends.faces.exterior, bends.angles
+    swap = bends.swapped
+    lit = np.where(swap[:, None], lit[:, [0, 2, 1]], lit)
+    walls = walls[1].where(swap, walls[0]), walls[0].where(swap, walls[1])
+    legs = bends.spread * _sine(k, edge) ** 2
+    wavelength = walls[0].wavelength
+    d14, d23 = _coefficients(angle_in, angle_out, exterior, _sine(k, edge), legs, wavelength, lit)
+    s_in, s_out = _unit(np.cross(k, edge)), -_unit(np.cross(out, edge))
+    incoming = np.stack([s_in, np.cross(k, s_in)], axis=1)
+    outgoing = np.stack([s_out, np.cross(out, s_out)], axis=1)
+    no = np.zeros(len(k), np.bool_)
+    parts = []
+    for normal, wall in zip(np.moveaxis(bends.faces.normals, 1, 0), walls, strict=True):
+        sent_back = k - 2 * (k * normal).sum(-1, keepdims=True) * normal
+        s_back = -_unit(np.cross(sent_back, edge))
+        back = np.stack([s_back, np.cross(sent_back, s_back)], axis=1)
+        parts.append(_SIGN * back @ wall.dyad(k, normal, no) @ incoming.transpose(0, 2, 1))
+    shadowed = exterior >= np.pi + angle_in - IN_PLANE
+    r_n = np.where(shadowed[:, None, None], -np.eye(2), parts[1])
+    jones = parts[0] * d14[:, None, None] + r_n * d23[:, None, None]
+    dyad: Complex128Array = outgoing.transpose(0, 2, 1) @ jones @ incoming
+    return dyad
+
+
+def _angle(direction: Float64Array, faces: Faces, exterior: Float64Array) -> Float64Array:
+    """Angle about the edge from the first face [rad], within the exterior: what rounding puts inside the
+    wedge is at the nearer face."""
+    normal = faces.normals[:, 0]
+    into = np.cross(normal, faces.edge)
+    angle = np.arctan2((direction * normal).sum(-1), (direction * into).sum(-1)) % (2 * np.pi)
+    inside = angle > exterior
+    nearer = np.where(angle - exterior < 2 * np.pi - angle, exterior, 0.0)
+    angle = np.where(inside, nearer, angle)
+    angle = np.where(angle < IN_PLANE, 0.0, angle)
+    clamped: Float64Array = np.where(exterior - angle < IN_PLANE, exterior, angle)
+    return clamped
+
+
+def _coefficients(
+    angle_in: Float64Array,
+    angle_out: Float64Array,
+    exterior: Float64Array,
+    sine: Float64Array,
+    length: Float64Array,
+    wavelength: float,
+    lit: Int64Array,
+) -> tuple[Complex128Array, Complex128Array]:
+    """D1 − D4 and D2 − D3; ``length`` is L [m], and ``lit`` that of the faces in their order."""
+    k, n = 2 * np.pi / wavelength, exterior / np.pi
+    factor = -np.exp(-0.25j * np.pi) / (2 * n * np.sqrt(2 * np.pi * k) * sine)
+    apart, both = angle_out - angle_in, angle_out + angle_in
+    passes = lit[:, 0]
+    terms = (
+        (apart, np.where(apart < 0, passes, 0)),
+        (-apart, np.where(apart < 0, 0, passes)),
+        (both, lit[:, 2]),
+        (-both, lit[:, 1]),
+    )
+    d1, d2, d3, d4 = (factor * _cot_f(beta, exterior, k * length, wave) for beta, wave in terms)
+    return d1 - d4, d2 - d3
+
+
+def _cot_f(beta: Float64Array, exterior: Float64Array, kl: Float64Array, lit: Int64Array) -> Complex128Array:
+    """cot(ψ)·F(kL·a) with ψ = (π + β)/2n and a = 2·cos²(nπN − β/2), N the nearest integer to (π + β)/2nπ.
+
+    ψ is off a multiple of π by a 2n-th of the angle to the shadow boundary, which is positive where the
+    boundary's wave is there; where ``lit`` is ±1 that says it instead. At the boundary cot is infinite and
+    F is 0: with F(x) = 2·sqrt(πx)·exp(jπ/4)·K(sqrt(x)), K the modified Fresnel integral, what remains is
+    sqrt(a)·cot(ψ), which is ±sqrt(2)·n there.
+    """
+    from scipy.special import modfresnelm  # type: ignore[import-untyped]
+
+    n = exterior / np.pi
+    off = np.pi + beta - 2 * exterior * np.round((np.pi + beta) / (2 * exterior))
+    on = np.abs(off) < IN_PLANE
+    side = np.where(lit != 0, lit, np.where(on | (off > 0), 1, -1))
+    root = np.sqrt(2.0) * np.abs(np.sin(off / 2))
+    tangent = np.abs(np.tan(off / (2 * n)))
+    ratio = side * np.where(on, np.sqrt(2.0) * n, root / np.where(on, 1.0, tangent))
+    _, k_minus = modfresnelm(np.sqrt(kl) * root)
+    product: Complex128Array = 2 * np.sqrt(np.pi * kl) * np.exp(0.25j * np.pi) * ratio * k_minus
+    return product
+
+
+def _sine(one: Float64Array, other: Float64Array) -> Float64Array:
+    sine: Float64Array = np.sqrt((np.cross(one, other) ** 2).sum(-1))
+    return sine
+
+
+def _perpendicular(k: Float64Array, normal: Float64Array) -> Float64Array:
+    """A direction across both; any across ``k`` where both are one."""
+    across = cross(k, normal)
+    axis = np.eye(3)[np.argmin(np.abs(k), axis=-1)]
+    lost = (across**2).sum(-1, keepdims=True) < _ALONG**2
+    perpendicular: Float64Array = np.where(lost, cross(k, axis), across)
+    return perpendicular
+
+
+def _across(vectors: Float64Array, axis: Float64Array) -> Float64Array:
+    """What of vectors is across unit vectors."""
+    across: Float64Array = vectors - (vectors * axis).sum(-1, keepdims=True) * axis
+    return across
+
+
+def _outer(one: Complex128Array | Float64Array, other: Float64Array) -> Complex128Array:
+    outer: Complex128Array = one.astype(np.complex128)[:, :, None] * other[:, None]
+    return outer
+
+
+def _unit(vectors: Float64Array) -> Float64Array:
+    unit: Float64Array = vectors / np.sqrt((vectors**2).sum(-1, keepdims=True))
+    return unit

@@ -1,0 +1,206 @@
+"""Which candidates are paths between the outermost elements of arrays, in one kernel.
+
+A path that the arrays' centres have may be hidden from some elements, and one that they do not have may
+exist for others. Both are seen at the corners of the arrays, with the chains of planes that are
+known from the launch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
+from caviar_services.channel.sionna.candidates import Candidates, Planes, positions
+from caviar_services.channel.sionna.scene import SionnaScene
+from caviar_services.columns import aligned_indices, several
+
+_OFF_SURFACE = 2e-4
+"""[m]; rays from face to face start this far from the first, whose points are known to some 1e-5 m. From and
+to antennas rays start at the antenna, so that nothing is off."""
+
+_AT_END = 1e-2
+"""[m]; a surface this near a segment's end is what stands there."""
+
+
+class Faces:
+    """What rays meet first in a scene: how far away, and which of the surfaces of its objects' faces."""
+
+    def __init__(self, scene: SionnaScene) -> None:
+        import mitsuba as mi
+
+        self._scene = scene
+        self._offset = mi.UInt(aligned_indices(scene.offset_by_shape))
+        self._surface_of = scene.surface_of
+        self._surface = mi.UInt(aligned_indices(scene.surface_of))
+
+    def _follow_scene(self) -> None:
+        """Know which faces are one surface now."""
+        import mitsuba as mi
+
+        if self._surface_of is not self._scene.surface_of:
+            self._surface_of = self._scene.surface_of
+            self._surface = mi.UInt(aligned_indices(self._surface_of))
+
+    def along(self, start: Any, end: Any, active: Any) -> tuple[Any, Any]:
+        """How much farther than a segment's end [m] the first surface along it is, and its number."""
+        import drjit as dr
+        import mitsuba as mi
+
+        self._follow_scene()
+
+        line = end - start
+        length = dr.norm(line)
+        active &= length > 0.0
+        ray = mi.Ray3f(start, line / dr.select(length > 0.0, length, 1.0))
+        met = self._scene.mi_scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+        hit = active & met.is_valid()
+        offset = dr.gather(mi.UInt, self._offset, mi.UInt(dr.reinterpret_array(mi.UInt, met.shape)), hit)
+        return met.t - length, dr.gather(mi.UInt, self._surface, offset + met.prim_index, hit)
+
+    def nearest(self, start: Float64Array, end: Float64Array) -> tuple[Float64Array, Int64Array]:
+        """The same of segments ``[Q, 3]`` → ``[Q, 3]``; infinite where there is none, its number anything."""
+        import drjit as dr
+        import mitsuba as mi
+
+        lanes = several(len(start))
+        behind, plane = self.along(
+            positions(start[lanes]), positions(end[lanes]), dr.full(mi.Bool, True, len(lanes))
+        )
+        dr.eval(behind, plane)
+        behind, plane = behind.numpy()[: len(start)], plane.numpy()[: len(start)]
+        return behind.astype(np.float64), plane.astype(np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class Corners:
+    """Outermost elements of arrays around a transmitter and its receivers [m]."""
+
+    transmitter: Float64Array
+    """Shape ``[K, 3]``."""
+    receivers: Float64Array
+    """Shape ``[R, L, 3]``."""
+
+    def relative_to(self, centre: Float64Array) -> Corners:
+        """The same, counted from there."""
+        return Corners(self.transmitter - centre, self.receivers - centre)
+
+    def take(self, which: slice) -> Corners:
+        """Those of some receivers."""
+        return Corners(self.transmitter, self.receivers[which])
+
+
+def at_corners(
+    faces: Faces, planes: Planes, candidates: Candidates, at_centres: BoolArray, corners: Corners | None
+) -> tuple[BoolArray, BoolArray]:
+    """Of all candidates, which only other elements than the centres have, and which all corners have."""
+    hidden, settled = np.zeros((2, len(at_centres)), np.bool_)
+    if corners is not None:
+        place = np.arange(candidates.planes.shape[1])
+        mirrors = (candidates.planes >= 0) == (place < candidates.depth[:, None])
+        some = np.flatnonzero(mirrors.all(1))
+        exist = reached(
+            faces,
+            planes,
+            candidates.planes[some],
+            candidates.receiver[some],
+            corners.transmitter,
+            corners.receivers,
+        )
+        hidden[some] = exist.any((1, 2))
+        settled[some] = exist.all((1, 2))
+    return hidden & ~at_centres, settled & at_centres
+
+
+def reached(
+    faces: Faces,
+    planes: Planes,
+    chains: Int32Array,
+    receiver: Int64Array,
+    sources: Float64Array,
+    targets: Float64Array,
+) -> BoolArray:
+    """Whether chains of reflections are paths, Shape ``[P, L, K]``.
+
+    Parameters
+    ----------
+    chains
+        Plane at each interaction, −1 behind the last, Shape ``[P, D]``.
+    receiver
+        Of each chain, Shape ``[P]``.
+    sources
+        Corners of the transmitter's array [m], Shape ``[K, 3]``.
+    targets
+        Corners of the receivers' arrays [m], Shape ``[R, L, 3]``.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    lanes = several(len(chains))
+    shape = (len(chains), targets.shape[1], len(sources))
+    chains, receiver = chains[lanes], receiver[lanes]
+    count, corners = len(chains), targets.shape[1]
+    lane = dr.arange(mi.UInt, count * corners * len(sources))
+    per_chain, per_corner = (dr.opaque(mi.UInt, n) for n in (corners * len(sources), len(sources)))
+    chain, rest = lane // per_chain, lane % per_chain
+    corner, source = rest // per_corner, rest % per_corner
+    number = [
+        dr.gather(mi.UInt, mi.UInt(aligned_indices(column + 1)), chain)
+        for column in chains.T.astype(np.int64)
+    ]
+    first = dr.gather(mi.UInt, mi.UInt(aligned_indices(receiver * corners)), chain)
+    start, here = (
+        dr.gather(mi.Point3f, positions(places[several(len(places))]), index)
+        for places, index in ((sources, source), (targets.reshape(-1, 3), first + corner))
+    )
+    found: BoolArray = _exists(faces, planes, number, start, here).numpy()
+    return found.reshape(-1, *shape[1:])[: shape[0]]
+
+
+def reflected(
+    faces: Faces, planes: Planes, chains: Int64Array, start: Float64Array, end: Float64Array
+) -> BoolArray:
+    """Whether chains of reflections ``[Q, D]`` are paths between positions ``[Q, 3]`` [m], Shape ``[Q]``."""
+    import mitsuba as mi
+
+    lanes = several(len(chains))
+    number = [mi.UInt(aligned_indices(column + 1)) for column in chains[lanes].T]
+    found: BoolArray = _exists(faces, planes, number, positions(start[lanes]), positions(end[lanes])).numpy()
+    return found[: len(chains)]
+
+
+def _exists(faces: Faces, planes: Planes, number: list[Any], start: Any, end: Any) -> Any:
+    """The same on the ray tracer's side; planes are numbered from 1, 0 is none."""
+    import drjit as dr
+    import mitsuba as mi
+
+    here = end
+    images = [start]
+    surfaces = []
+    for plane in number:
+        origin, normal = planes.plane(plane)
+        surfaces.append((origin, normal))
+        mirrored = images[-1] - 2 * dr.dot(images[-1] - origin, normal) * normal
+        images.append(dr.select(plane > 0, mirrored, images[-1]))
+    exists, lifted = mi.Bool(True), here
+    for plane, (origin, normal), image in zip(number[::-1], surfaces[::-1], images[:0:-1], strict=True):
+        used = exists & (plane > 0)
+        line = image - here
+        along = dr.dot(origin - here, normal) / dr.dot(line, normal)
+        met = here + along * line
+        exists &= ~used | ((along > 0) & (along < 1))
+        used &= exists
+        exists &= ~used | (faces.along(lifted, met, used)[1] == plane - 1)
+        here = dr.select(used, met, here)
+        lifted = dr.select(
+            used, met - _OFF_SURFACE * dr.select(dr.dot(line, normal) > 0, normal, -normal), lifted
+        )
+    behind, met_plane = faces.along(start, here, exists)
+    exists &= (
+        dr.select(number[0] > 0, met_plane == number[0] - 1, behind > -_AT_END)
+        if number
+        else behind > -_AT_END
+    )
+    return exists

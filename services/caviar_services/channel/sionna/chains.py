@@ -1,0 +1,249 @@
+"""The chains of planes that the rays of a launch went along, and the points at which they were scattered.
+
+A chain is a sequence of planes that some ray went along. Chains come from the transmitter's launch alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array, UInt64Array
+from caviar_services.channel.sionna.ray_launcher import DIFFRACTED, REFLECTED, REFRACTED, SCATTERED, Launch
+from caviar_services.channel.sionna.scene import SionnaScene
+
+MANY_RAYS = 1000
+"""Of a chain that no half of a launch would miss."""
+
+
+@dataclass(frozen=True, eq=False)
+class Chains:
+    """C specular chains, or specular ends behind a scattering point."""
+
+    ray: Int64Array
+    """The first ray that went along each, Shape ``[C]``."""
+    depth: Int64Array
+    """Interactions of each, Shape ``[C]``."""
+    planes: Int32Array
+    """Plane at each interaction that is a reflection, −1 elsewhere, Shape ``[C, D]``."""
+    straight: BoolArray
+    """Whether a chain has but reflections and transmissions, Shape ``[C]``."""
+    rays: Int64Array
+    """How many rays went along each, Shape ``[C]``."""
+
+    def take(self, which: BoolArray | Int64Array) -> Chains:
+        """These chains."""
+        return Chains(
+            self.ray[which], self.depth[which], self.planes[which], self.straight[which], self.rays[which]
+        )
+
+    def rays_of(self, planes: Int64Array, depth: Int64Array) -> Int64Array:
+        """Rays that went along the chains of paths with these planes, Shape ``[P, D]``, and depths, Shape
+        ``[P]``; chains that differ in other things than planes count together. ``MANY_RAYS`` for a path of
+        none of these chains.
+        """
+        known, which = np.unique(_chain_keys(self.planes, self.depth), return_inverse=True)
+        if not len(known):
+            return np.full(len(depth), MANY_RAYS)
+        rays = np.bincount(which.reshape(-1), weights=self.rays).astype(np.int64)
+        keys = _chain_keys(planes, depth)
+        place = np.minimum(np.searchsorted(known, keys), len(known) - 1)
+        return np.where(known[place] == keys, rays[place], MANY_RAYS)
+
+
+def _chain_keys(planes: Int32Array | Int64Array, depth: Int64Array) -> UInt64Array:
+    """A hash of each chain: planes are too many for a key that counts all sequences of them."""
+    key = depth.astype(np.uint64)
+    for column in planes.T:
+        key = key * np.uint64(1_000_003) + (column + 2).astype(np.uint64)
+    return key
+
+
+@dataclass(frozen=True, eq=False)
+class Scattered:
+    """P points of a launch from which waves go on diffusely, in the order of depth and ray."""
+
+    ray: Int64Array
+    """Shape ``[P]``."""
+    depth: Int64Array
+    """Which interaction of the ray, from 1, Shape ``[P]``."""
+    rows: Float64Array
+    """What a choice among them goes by (`Thinning.points`), Shape ``[K, P]``; K = 0 where all are taken."""
+
+
+@dataclass(frozen=True, eq=False)
+class Met:
+    """What rays met, as far as paths may come of it."""
+
+    launch: Launch
+    """The rays that went along a chain first, or were scattered; of a launch in one part all of them."""
+    chains: Chains
+    """By rays of ``launch``."""
+    scattered: Scattered
+
+
+def met_by(
+    launch: Launch, scene: SionnaScene, max_depth: int, scattered: Scattered | None = None, part: bool = False
+) -> Met:
+    """What a launch met; ``scattered`` where points of diffuse paths are not those that were drawn.
+
+    Of a ``part`` of a larger launch only the rays that matter are kept."""
+    chains = chains_of(launch, scene, max_depth)
+    scattered = scattered or scattered_of(launch)
+    if not part:
+        return Met(launch, chains, scattered)
+    # One at least: Dr.Jit gathers nothing from arrays without elements, not even with no lane active.
+    rays = np.union1d(np.append(chains.ray, 0), scattered.ray)
+    return Met(
+        launch.take(rays),
+        replace(chains, ray=np.searchsorted(rays, chains.ray)),
+        replace(scattered, ray=np.searchsorted(rays, scattered.ray)),
+    )
+
+
+def united(parts: Sequence[Met], scene: SionnaScene) -> Met:
+    """What the parts of a launch, one at least, met together; each chain once, as `chains_of` sorts."""
+    if len(parts) == 1:
+        return parts[0]
+    launch = Launch.joined([part.launch for part in parts])
+    widths = np.array([part.launch.rays for part in parts])
+    first = np.cumsum(widths) - widths
+    chains = Chains(
+        np.concatenate([part.chains.ray + begin for part, begin in zip(parts, first, strict=True)]),
+        np.concatenate([part.chains.depth for part in parts]),
+        np.concatenate([part.chains.planes for part in parts]),
+        np.concatenate([part.chains.straight for part in parts]),
+        np.concatenate([part.chains.rays for part in parts]),
+    )
+    signature = np.column_stack([chains.depth, _signature(launch, chains, scene)])
+    _, kept, which = np.unique(signature, axis=0, return_index=True, return_inverse=True)
+    rays = np.bincount(which.reshape(-1), weights=chains.rays).astype(np.int64)
+    ray = np.concatenate([part.scattered.ray + begin for part, begin in zip(parts, first, strict=True)])
+    depth = np.concatenate([part.scattered.depth for part in parts])
+    order = np.argsort(depth, kind="stable")
+    rows = np.concatenate([part.scattered.rows for part in parts], axis=1)
+    return Met(
+        launch, replace(chains.take(kept), rays=rays), Scattered(ray[order], depth[order], rows[:, order])
+    )
+
+
+def chains_of(launch: Launch, scene: SionnaScene, max_depth: int) -> Chains:
+    """All chains that rays of a launch went along, shortest first, then in a stable order."""
+    ray = np.zeros(0, np.int64)
+    chain = np.zeros(0, np.int64)
+    planes, straight = np.full((1, max_depth), -1, np.int32), np.ones(1, np.bool_)
+    found: list[Chains] = []
+    for d, bounce in enumerate(launch.bounces):
+        kinds = bounce.kind.numpy()
+        if d == 0:
+            ray = np.flatnonzero(kinds)
+            chain = np.zeros(len(ray), np.int64)
+        else:
+            going = kinds[ray] != 0
+            ray, chain = ray[going], chain[going]
+        if not len(ray):
+            break
+        # Neighbouring rays mostly meet the same: only the first of each run is looked at.
+        begins = _begins(launch, d, ray, chain)
+        heads = np.flatnonzero(begins)
+        kind, plane, token, tokens = _tokens(launch, d, ray[heads], scene)
+        key = chain[heads] * tokens + token
+        _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
+        kind, plane, first = kind[first], plane[first], heads[first]
+        before = chain[first]
+        planes, straight = planes[before], straight[before] & ((kind == REFLECTED) | (kind == REFRACTED))
+        planes[:, d] = np.where(kind == REFLECTED, plane, -1)
+        run_lengths = np.diff(np.append(heads, len(ray)))
+        rays = np.bincount(inverse.reshape(-1), weights=run_lengths).astype(np.int64)
+        chain = inverse.reshape(-1)[np.cumsum(begins) - 1]
+        specular = kind != SCATTERED
+        found.append(
+            Chains(
+                ray[first][specular],
+                np.full(int(specular.sum()), d + 1, np.int64),
+                planes[specular],
+                straight[specular],
+                rays[specular],
+            )
+        )
+    return Chains(
+        _stacked([part.ray for part in found], (0,)),
+        _stacked([part.depth for part in found], (0,)),
+        np.concatenate([np.zeros((0, max_depth), np.int32), *(part.planes for part in found)]),
+        np.concatenate([np.zeros(0, np.bool_), *(part.straight for part in found)]),
+        _stacked([part.rays for part in found], (0,)),
+    )
+
+
+def _begins(launch: Launch, d: int, ray: Int64Array, chain: Int64Array) -> BoolArray:
+    """Which rays differ from those before them, in what they met or the chain that they come from."""
+    bounce = launch.bounces[d]
+    told_apart = [chain, *(column.numpy()[ray] for column in (bounce.kind, bounce.shape, bounce.primitive))]
+    if launch.wedges is not None:
+        told_apart.append(launch.wedges.local_edge.numpy()[ray])
+    begins = np.ones(len(ray), np.bool_)
+    begins[1:] = False
+    for column in told_apart:
+        begins[1:] |= column[1:] != column[:-1]
+    return begins
+
+
+def _tokens(
+    launch: Launch, d: int, ray: Int64Array, scene: SionnaScene
+) -> tuple[Int64Array, Int64Array, Int64Array, int]:
+    """Kind, plane, and what tells interactions of these rays apart: the plane of a reflection, the edge of a
+    diffraction, else the kind alone; and how many of these there can be."""
+    kind, plane, token = _met_at(launch, d, ray, scene)
+    first_edge = _first_edge(scene)
+    bent = np.flatnonzero(token >= first_edge)
+    edges = 0
+    if len(bent):
+        _, edge = np.unique(token[bent], return_inverse=True)
+        edges = int(edge.max()) + 1
+        token[bent] = first_edge + edge.reshape(-1)
+    return kind, plane, token, first_edge + edges
+
+
+def _signature(launch: Launch, chains: Chains, scene: SionnaScene) -> Int64Array:
+    """What tells each interaction of chains apart, −1 behind the last, Shape ``[C, D]``."""
+    signature = np.full(chains.planes.shape, -1, np.int64)
+    for d in range(len(launch.bounces)):
+        used = chains.depth > d
+        signature[used, d] = _met_at(launch, d, chains.ray[used], scene)[2]
+    return signature
+
+
+def _met_at(
+    launch: Launch, d: int, ray: Int64Array, scene: SionnaScene
+) -> tuple[Int64Array, Int64Array, Int64Array]:
+    """Kind and plane of an interaction of rays, and a number that tells it apart in all launches: the
+    plane, or one for each kind, or one for each edge."""
+    bounce = launch.bounces[d]
+    kind = bounce.kind.numpy()[ray].astype(np.int64)
+    shape = bounce.shape.numpy()[ray].astype(np.int64)
+    plane = scene.surface_of[scene.triangle_numbers(shape, bounce.primitive.numpy()[ray].astype(np.int64))]
+    token = np.where(kind == REFLECTED, plane, _first_edge(scene) - 16 + kind)
+    bent = kind == DIFFRACTED
+    if bent.any():
+        edge = launch.wedges.local_edge.numpy()[ray[bent]].astype(np.int64)
+        token[bent] = _first_edge(scene) + edge
+    return kind, plane, token
+
+
+def _first_edge(scene: SionnaScene) -> int:
+    """The first number of an edge: behind those of planes and kinds."""
+    return len(scene.plane_table.triangle) + 16
+
+
+def _stacked(parts: list[Int64Array], empty: tuple[int, ...]) -> Int64Array:
+    return np.concatenate([np.zeros(empty, np.int64), *parts])
+
+
+def scattered_of(launch: Launch) -> Scattered:
+    """Every interaction of a launch that is a diffuse reflection."""
+    rays = [np.flatnonzero(bounce.kind.numpy() == SCATTERED) for bounce in launch.bounces]
+    depths = [np.full(len(ray), d + 1, np.int64) for d, ray in enumerate(rays)]
+    ray = _stacked(rays, (0,))
+    return Scattered(ray, _stacked(depths, (0,)), np.zeros((0, len(ray))))

@@ -1,0 +1,304 @@
+"""Radio materials: ITU-R P.2040 evaluated in double precision, and what a scenario changes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import msgspec
+
+from caviar_protocol.errors import ScenarioError, suggestion
+from caviar_protocol.scenario.conversion import Place
+from caviar_services.channel.sionna.object_materials import OTHER_MATERIALS, Constants, ObjectMaterials
+
+OBJECT_MATERIAL = "caviar-object-"
+"""What the ray tracer's names of materials begin with that objects are given."""
+
+_BODY_THICKNESS = 0.1
+"""[m]; of walls of bodies, where a scenario does not say."""
+
+OutsideRange = Literal["error", "nearest", "extrapolate"]
+"""Where a carrier lies in none of the ranges that ITU-R P.2040 defines a material in: refuse it; take the
+constants of the nearest end of a range; or follow the power law of that range beyond its end."""
+
+
+class MaterialSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What to change about a material of the scenery; what is not given stays."""
+
+    relative_permittivity: float | None = None
+    conductivity_s_per_m: float | None = None
+    scattering_coefficient: float | None = None
+    xpd_coefficient: float | None = None
+    thickness_m: float | None = None
+
+    @property
+    def is_electric(self) -> bool:
+        """Whether both electric constants are given, so that no ITU material is needed."""
+        return self.relative_permittivity is not None and self.conductivity_s_per_m is not None
+
+    def applied(self, constants: Constants) -> Constants:
+        """These constants with the changes."""
+        permittivity, conductivity = constants
+        if self.relative_permittivity is not None:
+            permittivity = self.relative_permittivity
+        if self.conductivity_s_per_m is not None:
+            conductivity = self.conductivity_s_per_m
+        return permittivity, conductivity
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaterialPolicy:
+    """What a scenario says about materials."""
+
+    changes: Mapping[str, MaterialSettings] = field(default_factory=dict)
+    """By name of the material in the scenery."""
+    outside: OutsideRange = "error"
+    key: str = "settings"
+    """Of the settings in the scenario, for messages."""
+
+    def of(self, name: str) -> MaterialSettings:
+        return self.changes.get(name, MaterialSettings())
+
+
+@dataclass(frozen=True, kw_only=True)
+class ItuMaterial:
+    """A material of ITU-R P.2040 at one frequency."""
+
+    itu_type: str
+    frequency_hz: float
+    ranges_ghz: tuple[tuple[float, float], ...]
+    """Where the material is defined."""
+    taken_ghz: tuple[float, float]
+    """The range whose parameters were taken."""
+    policy: OutsideRange
+    constants: Constants
+
+    @property
+    def label(self) -> str:
+        """Name of the material, with ITU where the Recommendation has it."""
+        return self.itu_type if self.itu_type in OTHER_MATERIALS else f"ITU {self.itu_type}"
+
+    @property
+    def is_outside(self) -> bool:
+        """Whether the frequency lies outside all ranges."""
+        return not self.taken_ghz[0] <= self.frequency_hz / 1e9 <= self.taken_ghz[1]
+
+    @property
+    def source(self) -> str:
+        """What was taken in place of constants that are not defined, in short."""
+        low, high = self.taken_ghz
+        if self.policy == "extrapolate":
+            return f"extrapolate {low:g}–{high:g} GHz"
+        return f"nearest {_clamped(self.frequency_hz / 1e9, self.taken_ghz):g} GHz"
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutsideUse:
+    """That a material is used where ITU-R P.2040 does not define it."""
+
+    name: str
+    carrier: int
+    """Index of the carrier."""
+    itu: ItuMaterial
+    constants: Constants
+    """As used, with what the scenario changes."""
+
+    def brief(self, carrier: str) -> str:
+        """For the provenance: ``brick@mmwave: nearest 40 GHz``."""
+        return f"{self.name}@{carrier}: {self.itu.source}"
+
+    def note(self, carrier: str) -> str:
+        """For the user, with the constants."""
+        permittivity, conductivity = self.constants
+        return (
+            f"material {self.name!r} ({self.itu.label}) is defined for {_spans(self.itu.ranges_ghz)}; "
+            f"on carrier {carrier!r} at {self.itu.frequency_hz / 1e9:g} GHz it has ({self.itu.source}) "
+            f"relative permittivity {permittivity:.4g}, conductivity {conductivity:.4g} S/m"
+        )
+
+
+def itu_material(
+    name: str, itu_type: str, frequency_hz: float, policy: MaterialPolicy, remedy: str = ""
+) -> ItuMaterial:
+    """A material by its ITU-R P.2040 type: a·f^b and c·f^d with f in GHz (P.2040-3, eqs. 28 and 29, table 3);
+    or one of `OTHER_MATERIALS` by its name.
+
+    Outside of all ranges the nearest one counts, by the distance [Hz] of its nearest end; of two equally
+    near, the first of the table. Raises `ScenarioError` naming material, ranges and remedies under the policy
+    ``error``; ``remedy`` stands in place of constants of the user's own.
+    """
+    from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
+
+    other = OTHER_MATERIALS.get(itu_type)
+    table: Mapping[tuple[float, float], tuple[float, ...]] | None = ITU_MATERIALS_PROPERTIES.get(itu_type)
+    if other is not None:
+        table = {other.range_ghz: ()}
+    if table is None:
+        known = sorted({*ITU_MATERIALS_PROPERTIES, *OTHER_MATERIALS})
+        raise ScenarioError(
+            f"there is no ITU material {itu_type!r}; {suggestion(itu_type, known)}",
+            key=f"{policy.key}.{name}" if remedy else f"{policy.key}.materials.{name}",
+        )
+    gigahertz, label = frequency_hz / 1e9, itu_type if other else f"ITU {itu_type}"
+    taken = next((r for r in table if r[0] <= gigahertz <= r[1]), None)
+    evaluated = gigahertz
+    if taken is None:
+        if policy.outside == "error":
+            own = f"give it relative_permittivity and conductivity_s_per_m in {policy.key}.materials.{name}"
+            raise ScenarioError(
+                f"material {name!r} ({label}) is defined for {_spans(tuple(table))}, the carrier is "
+                f"at {gigahertz:g} GHz; choose a carrier within, {remedy or own}, or set outside_itu_range = "
+                '"nearest" (constants of the nearest end) or "extrapolate" (power law of the nearest range)',
+                key=f"{policy.key}.outside_itu_range",
+            )
+        taken = min(table, key=lambda r: abs(gigahertz - _clamped(gigahertz, r)))
+        if policy.outside == "nearest":
+            evaluated = _clamped(gigahertz, taken)
+    if other is not None:
+        constants = other.constants(evaluated)
+    else:
+        a, b, c, d = table[taken]
+        constants = a * evaluated**b, c * evaluated**d
+    return ItuMaterial(
+        itu_type=itu_type,
+        frequency_hz=frequency_hz,
+        ranges_ghz=tuple(table),
+        taken_ghz=taken,
+        policy=policy.outside,
+        constants=constants,
+    )
+
+
+@contextmanager
+def any_frequency() -> Iterator[None]:
+    """While a scene is loaded, which Sionna RT does at 3.5 GHz, no material is outside its range.
+
+    The materials then have constants that mean nothing: `freeze` and `set_materials` are to follow.
+    """
+    from sionna.rt.radio_materials import itu_material as module
+
+    evaluate = module.itu_material
+    module.itu_material = lambda name, frequency: (1.0, 0.0)
+    try:
+        yield
+    finally:
+        module.itu_material = evaluate
+
+
+def freeze(scene: Any) -> None:
+    """Let no change of the scene's frequency change a material."""
+    for material in scene.radio_materials.values():
+        if hasattr(material, "itu_type"):
+            material.frequency_update_callback = None
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectMaterial:
+    """A material that objects are given, in the ray tracer."""
+
+    name: str
+    radio: Any
+    """The `sionna.rt.RadioMaterial`."""
+    itu: tuple[ItuMaterial, ...]
+    """On each carrier; empty where its constants are the scenario's."""
+    constants: tuple[Constants, ...]
+    """On each carrier, as used."""
+
+
+def object_materials(
+    objects: ObjectMaterials, frequencies_hz: tuple[float, ...], policy: MaterialPolicy
+) -> dict[str, ObjectMaterial]:
+    """The materials that objects are given, by name.
+
+    Raises `ScenarioError` naming the key for one that neither ITU-R P.2040 nor `OTHER_MATERIALS` has, without
+    constants of the scenario's own.
+    """
+    from sionna.rt import RadioMaterial
+
+    made = {}
+    for name in objects.names:
+        change, key = policy.of(name), Place("object_materials").at(objects.key_of(name)).key
+        remedy = f"choose another material, give {policy.key}.materials.{name} constants of its own"
+        itu: tuple[ItuMaterial, ...] = ()
+        if not change.is_electric:
+            itu = tuple(itu_material(key, name, f, policy, remedy) for f in frequencies_hz)
+        defined = [of.constants for of in itu] or [(1.0, 0.0)] * len(frequencies_hz)
+        constants = tuple(change.applied(of_carrier) for of_carrier in defined)
+        radio = RadioMaterial(f"{OBJECT_MATERIAL}{name}", _BODY_THICKNESS)
+        _checked_change(radio, name, change, policy)
+        radio.relative_permittivity, radio.conductivity = constants[0]
+        made[name] = ObjectMaterial(name, radio, itu, constants)
+    return made
+
+
+def set_materials(
+    scene: Any, frequency_hz: float, policy: MaterialPolicy, others: Iterable[str] = ()
+) -> None:
+    """Give all materials of a `sionna.rt.Scene` their constants at the carrier.
+
+    Constants are set here rather than by Sionna RT, whose float32 frequency puts 60 GHz outside of
+    a range that ends at 60 GHz; the scene's own materials are frozen. ``others`` are those that objects are
+    given. Raises `ScenarioError` for an unknown name or a bad value.
+    """
+    materials = scene.radio_materials
+    unknown = sorted(policy.changes.keys() - materials.keys() - set(others))
+    if unknown:
+        raise ScenarioError(
+            f"the scenery has no material {unknown[0]!r}; it has: {', '.join(sorted(materials))}",
+            key=f"{policy.key}.materials.{unknown[0]}",
+        )
+    for name, material in materials.items():
+        itu = _itu_of(name, material, frequency_hz, policy)
+        if itu is not None:
+            material.relative_permittivity, material.conductivity = itu.constants
+        _checked_change(material, name, policy.of(name), policy)
+    scene.frequency = frequency_hz
+
+
+def itu_materials(
+    scene: Any, frequency_hz: float, policy: MaterialPolicy
+) -> list[tuple[Any, ItuMaterial, Constants]]:
+    """Materials of a `sionna.rt.Scene` that may differ between carriers, with their constants at one, as ITU
+    defines them and as changed."""
+    found = []
+    for name, material in scene.radio_materials.items():
+        itu = _itu_of(name, material, frequency_hz, policy)
+        if itu is not None:
+            found.append((material, itu, policy.of(name).applied(itu.constants)))
+    return found
+
+
+def _itu_of(name: str, material: Any, frequency_hz: float, policy: MaterialPolicy) -> ItuMaterial | None:
+    """The ITU material that a material of the scene is; None for others, and for those that nothing needs."""
+    if not hasattr(material, "itu_type") or policy.of(name).is_electric or not material.is_used:
+        return None
+    return itu_material(name, material.itu_type, frequency_hz, policy)
+
+
+def _checked_change(material: Any, name: str, change: MaterialSettings, policy: MaterialPolicy) -> None:
+    """Give a material what a scenario changes about it. Raises `ScenarioError` for a bad value."""
+    try:
+        for attribute, value in (
+            ("relative_permittivity", change.relative_permittivity),
+            ("conductivity", change.conductivity_s_per_m),
+            ("scattering_coefficient", change.scattering_coefficient),
+            ("xpd_coefficient", change.xpd_coefficient),
+            ("thickness", change.thickness_m),
+        ):
+            if value is not None:
+                setattr(material, attribute, value)
+    except ValueError as error:
+        raise ScenarioError(
+            f"material {name!r}: {error}; correct it", key=f"{policy.key}.materials.{name}"
+        ) from error
+
+
+def _clamped(gigahertz: float, span: tuple[float, float]) -> float:
+    """The frequency of a range that is nearest to this one."""
+    return min(max(gigahertz, span[0]), span[1])
+
+
+def _spans(ranges: tuple[tuple[float, float], ...]) -> str:
+    return ", ".join(f"{low:g}–{high:g} GHz" for low, high in ranges)

@@ -1,0 +1,400 @@
+"""Scenery and moving bodies in Sionna RT: loaded once, moved in one update a frame.
+
+Every further shape makes each trace a millisecond longer, whatever its size. So there is one
+shape for each material, and a table that says which triangles belong to what (`NumberedTriangles`); paths
+still name the single building and vehicle.
+
+The ray tracer counts in float32, whose step is 1 mm at 10 km. So it is given the scene relative to
+`SionnaScene.centre`, and what its paths meet is told to callers in float64 and in world coordinates: the
+scenery's corners as they stand in the files, and those of moving bodies from their poses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
+from caviar_protocol.errors import PayloadError
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
+from caviar_protocol.space.scene import object_pose
+from caviar_protocol.topics import Scene
+from caviar_services.channel.mesh_detail.detail import DetailSettings
+from caviar_services.channel.paths import Turning
+from caviar_services.channel.propagation.utd import Media
+from caviar_services.channel.sionna.contributing import SurfaceMaterial, UsedSurfaces
+from caviar_services.channel.sionna.diffracting_edges import SceneEdges
+from caviar_services.channel.sionna.materials import (
+    OBJECT_MATERIAL,
+    MaterialPolicy,
+    OutsideUse,
+    itu_material,
+    itu_materials,
+    object_materials,
+    set_materials,
+)
+from caviar_services.channel.sionna.meshes import (
+    Shape,
+    file_meshes,
+    file_vertices,
+    floats,
+    mi_mesh,
+    unit_mesh,
+)
+from caviar_services.channel.sionna.object_materials import Constants, ObjectMaterials, body_kind
+from caviar_services.channel.sionna.scene_loading import by_material, loaded, with_detail
+from caviar_services.channel.sionna.triangle_numbering import Body, NumberedTriangles
+from caviar_services.meshes import BodyPool, Mesh, box, placed
+from caviar_services.scenery import find_scenery
+
+_Tuning = tuple[float, list[tuple[Any, Constants]]]
+"""Frequency [Hz] of a carrier, and what is to be set at materials."""
+
+PARKING_DEPTH = 2000.0
+"""Unused receivers stand this far [m] below the scenery, in a closed metal box of their own."""
+
+_HALF_BOX = 4.0
+"""[m]; more than the part of a shadow ray near its end that is not tested (9e-4 of its length)."""
+
+_CENTRE_STEP = 128.0
+"""[m]; the centre is a multiple of it, so that a scene about the origin stays as it is."""
+
+_PARKING = "caviar-parking"
+_SKIN = "caviar-body"
+
+_SKIN_NAME = "body_material"
+_OTHER_SKIN = "choose another body_material"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneSettings:
+    """What the scene is made with."""
+
+    frequencies_hz: tuple[float, ...]
+    """Of the carriers. The scene is at the first one, unless it is tuned to another."""
+    body_material: str
+    materials: MaterialPolicy
+    edges: bool
+    """Look for the edges between faces (diffraction)."""
+    free_edges: bool = False
+    """Whether the rims of open surfaces are edges too."""
+    detail: DetailSettings = field(default_factory=DetailSettings)
+    """What of the scenery is left out."""
+    objects: ObjectMaterials = field(default_factory=ObjectMaterials)
+    """Of what objects and pieces of scenery are made that differ from the others."""
+
+
+class SionnaScene(NumberedTriangles):
+    """The triangles of a `sionna.rt.Scene` with a pool of bodies for moving objects.
+
+    Bodies that stand for no object are shrunk to a point: a triangle without area is never hit.
+    """
+
+    def __init__(self, assets: Mapping[str, Path], pool: Mapping[str, int], settings: SceneSettings) -> None:
+        bodied = any(pool.values())
+        skins = [
+            itu_material(_SKIN_NAME, settings.body_material, frequency, settings.materials, _OTHER_SKIN)
+            for frequency in settings.frequencies_hz
+            if bodied
+        ]
+        description = find_scenery(assets)
+        files = {} if description is None else file_vertices(description)  # says what is wrong with a file
+        self._scene = loaded(description)
+        self._scenery = frozenset(self._scene.objects)
+        self._objects = settings.objects
+        made = object_materials(self._objects, settings.frequencies_hz, settings.materials)
+        changed = {name: made[m].radio for name in self._scenery if (m := self._objects.of(name))}
+        full = by_material(self._scene, file_meshes(self._scene, files), changed)
+        key = f"{settings.materials.key}.detail"
+        shapes, self.detail_effect = with_detail(full, settings.detail, key)
+        self.low, self.high = _bounds(shapes)
+        meshes = {asset: unit_mesh(asset, assets) for asset in pool}
+        # Each material of bodies is a shape of its own, with a pool of its own.
+        kinds = {(asset, m): body_kind(asset, m) for m in ("", *made) for asset in sorted(pool)}
+        self._pool = {kind: pool[asset] for (asset, _), kind in kinds.items()}
+        self._meshes = {kind: meshes[asset] for (asset, _), kind in kinds.items()}
+        of_material = {
+            m: [(kind, slot) for (asset, of), kind in kinds.items() if of == m for slot in range(pool[asset])]
+            for m in ("", *made)
+        }
+        bodies = [body for of in of_material.values() for body in of]
+        self._standing: frozenset[Body] = frozenset()
+        self.turning: Turning | None = None
+        """How the objects turn that bodies stand for, by the names that `place` returned; None: none does."""
+        is_metal = settings.body_material == "metal"
+        moving = self._moving_shapes(of_material[""], skins[0].constants if skins else None, is_metal)
+        self._moving = [moving[-1]]
+        if bodied:
+            self._moving += [self._body_shape(of_material[m], m, of.radio) for m, of in made.items()]
+        self._shapes = [*shapes, *moving[:-1], *self._moving]
+        centre = _near_middle(self.low, self.high)
+        super().__init__(
+            self._shapes, self._replace_shapes(centre), bodies, self._meshes, centre, len(self._moving)
+        )
+        self.edges: SceneEdges | None = None
+        """None where nothing is diffracted."""
+        if settings.edges:
+            parking = self.names.index(_PARKING)
+            self.edges = SceneEdges(self, self.unit_meshes, parking, settings.free_edges)
+        set_materials(self._scene, settings.frequencies_hz[0], settings.materials, made)
+        self._carriers: list[_Tuning] = []
+        outside: list[OutsideUse] = []
+        for carrier, frequency in enumerate(settings.frequencies_hz):
+            found = itu_materials(self._scene, frequency, settings.materials)
+            used = [(material.name, itu, constants) for material, itu, constants in found]
+            tuning = [(material, constants) for material, _, constants in found]
+            if skins:
+                used.append((_SKIN_NAME, skins[carrier], skins[carrier].constants))
+                tuning.append((moving[-1].material, skins[carrier].constants))
+            used += [(name, of.itu[carrier], of.constants[carrier]) for name, of in made.items() if of.itu]
+            tuning += [(of.radio, of.constants[carrier]) for of in made.values()]
+            self._carriers.append((frequency, tuning))
+            outside += [
+                OutsideUse(name=name, carrier=carrier, itu=itu, constants=constants)
+                for name, itu, constants in used
+                if itu.is_outside
+            ]
+        self.outside = tuple(outside)
+        """Materials used where they are not defined, by carrier."""
+
+    @property
+    def mi_scene(self) -> Any:
+        """The Mitsuba scene, in metres relative to `centre`."""
+        return self._scene.mi_scene
+
+    @property
+    def rt_scene(self) -> Any:
+        """The `sionna.rt.Scene`, in metres relative to `centre`."""
+        return self._scene
+
+    @property
+    def wavelengths(self) -> tuple[float, ...]:
+        """Of the carriers [m]."""
+        return tuple(SPEED_OF_LIGHT / frequency for frequency, _ in self._carriers)
+
+    def tune(self, carrier: int) -> None:
+        """Set frequency and materials to those of a carrier."""
+        frequency, constants = self._carriers[carrier]
+        for material, (permittivity, conductivity) in constants:
+            material.relative_permittivity, material.conductivity = permittivity, conductivity
+        self._scene.frequency = frequency
+
+    def used_surfaces(self) -> UsedSurfaces:
+        """What waves can meet, at rest and moving."""
+        constants, slabs = self._surface_materials
+        used = [(i, shape) for i, shape in enumerate(self._shapes) if shape.id != _PARKING]
+        return UsedSurfaces(
+            materials=tuple(
+                SurfaceMaterial(
+                    name=_material_name(shape),
+                    constants=tuple((float(p), float(c)) for p, c in constants[:, :, i].T),
+                    thickness_m=float(slabs[0, i]),
+                    scattering_coefficient=float(slabs[1, i]),
+                )
+                for i, shape in used
+            ),
+            has_edges=self.edges is not None and len(self.edges) > 0,
+        )
+
+    @cached_property
+    def _surface_materials(self) -> tuple[Float64Array, Float64Array]:
+        """Of each shape, permittivity and conductivity [S/m] on each carrier, Shape ``[2, C, S]``, and
+        thickness [m] and scattering coefficient, Shape ``[2, S]``."""
+        constants = []
+        for carrier in range(len(self._carriers)):
+            self.tune(carrier)
+            constants.append([_constants(shape.material) for shape in self._shapes])
+        self.tune(0)
+        slabs = [
+            (float(material.thickness[0]), float(material.scattering_coefficient[0]))
+            for material in (shape.material for shape in self._shapes)
+        ]
+        return np.moveaxis(np.array(constants), -1, 0), np.array(slabs).T
+
+    def media(self, shapes: Int64Array) -> Media:
+        """What process-local shapes are made of; anything for no shape."""
+        of = self._shape_order[self._where(shapes)]
+        constants, slabs = self._surface_materials
+        return Media(*constants[..., of], *slabs[:, of])
+
+    @property
+    def unit_meshes(self) -> Mapping[str, Mesh]:
+        """Of the kinds of bodies that there are (`body_kind`)."""
+        return {kind: mesh for kind, mesh in self._meshes.items() if self._pool[kind]}
+
+    @property
+    def standing_bodies(self) -> tuple[int, ...]:
+        """Numbers of the bodies that stand for an object, in ascending order."""
+        return tuple(number for number, body in enumerate(self._bodies) if body in self._standing)
+
+    def is_parking_piece(self, pieces: Int64Array) -> BoolArray:
+        """Which pieces are the box around parked receivers, which is not in the world."""
+        parking: BoolArray = pieces == self.names.index(_PARKING)
+        return parking
+
+    @property
+    def parking(self) -> Float64Array:
+        """Where unused receivers stand [m], Shape ``[3]``."""
+        middle = (self.low + self.high) / 2
+        return np.array([middle[0], middle[1], self.low[2] - PARKING_DEPTH])
+
+    def place(self, scene: Scene, without_body: frozenset[str]) -> tuple[tuple[str, ...], Float64Array]:
+        """Move the bodies to the objects of a scene, in one update.
+
+        Returns the names that the indices of `object_index` stand for, and their velocities [m/s],
+        Shape ``[len(names), 3]``.
+
+        Raises `PayloadError` where the pool is too small, or an object has the name of a piece of scenery.
+        """
+        solid = [i for i, cls in enumerate(scene.classes) if cls not in without_body]
+        index = {scene.names[i]: i for i in solid}
+        clash = self._scenery & index.keys()
+        if clash:
+            raise PayloadError(f"object {min(clash)!r} has the name of a piece of scenery; rename one")
+        if not self.has_scenery and solid:
+            self._count_from_objects(scene.position[solid])
+        # A new assignment each frame: the product follows from this frame alone, also after a restart.
+        kinds = ((scene.names[i], self._kind(scene, i)) for i in solid)
+        taken = BodyPool(self._pool).assign(kinds)
+        standing = {body: index[name] for name, body in taken.items()}
+        names, velocity = list(self.names), np.zeros((len(self.names), 3))
+        turning = None
+        if scene.angular_velocity is not None and scene.angular_velocity.any():
+            turning = Turning(np.zeros_like(velocity), np.zeros_like(velocity))
+        first = len(names) - len(self._bodies)
+        vertices = self.moving_vertices
+        begin = len(vertices) - sum(len(self._meshes[asset].vertices) for asset, _ in self._bodies)
+        for number, body in enumerate(self._bodies, start=first):
+            mesh = self._meshes[body[0]]
+            rows = slice(begin, begin + len(mesh.vertices))
+            begin = rows.stop
+            i = standing.get(body)
+            if i is not None:
+                vertices[rows] = placed(mesh, scene.dimensions[i], object_pose(scene, i))
+                names[number], velocity[number] = scene.names[i], scene.velocity[i]
+                if turning is not None and scene.angular_velocity is not None:
+                    turning.centre[number] = scene.position[i]
+                    turning.angular_velocity[number] = scene.angular_velocity[i]
+            elif body in self._standing:
+                vertices[rows] = self._middle
+        before = self._vertices.copy() if len(self._moving) > 1 else None
+        if self.move(vertices):
+            params = self._scene.mi_scene_params
+            for shape, rows in self._moving_rows():
+                if before is None or not np.array_equal(before[rows], vertices[rows]):
+                    params[f"{shape.id}.vertex_positions"] = floats(vertices[rows] - self.centre)
+            params.update()
+        self._standing, self.turning = frozenset(standing), turning
+        return tuple(names), velocity
+
+    def _count_from_objects(self, positions: Float64Array) -> None:
+        """Let the ray tracer count from the middle of the objects [m], Shape ``[N, 3]``: nothing else says
+        where a world without scenery is, and far from the origin its float32 is coarse."""
+        centre = _near_middle(positions.min(0), positions.max(0))
+        if (centre != self.centre).any():
+            self.low, self.high = self.low + (centre - self.centre), self.high + (centre - self.centre)
+            self.count_from(centre)
+
+    @property
+    def has_scenery(self) -> bool:
+        """Whether anything stands still; `low` and `high` are its corners."""
+        return bool(self._scenery)
+
+    def enclosing(self, position: Float64Array) -> int:
+        """See `NumberedTriangles.enclosing`; below its lowest point, no scenery is around anything."""
+        piece = super().enclosing(position)
+        is_body = piece >= len(self.names) - len(self._bodies)
+        return piece if is_body or position[2] >= self.low[2] else -1
+
+    def is_parking(self, names: tuple[str, ...], objects: Int32Array) -> BoolArray:
+        """Which of the objects of paths, Shape ``[P, D]``, are the box around parked receivers.
+
+        Paths by way of it are none: it is not in the world.
+        """
+        parking: BoolArray = objects == names.index(_PARKING)
+        return parking
+
+    @property
+    def _middle(self) -> Float64Array:
+        return (self.low + self.high) / 2
+
+    def _moving_shapes(self, bodies: Sequence[Body], constants: Constants | None, metal: bool) -> list[Shape]:
+        """The box around the parked receivers, and last the moving bodies; one shape where both are metal."""
+        from sionna.rt import RadioMaterial
+
+        x, y, z = self.parking
+        h = _HALF_BOX
+        walls = box((x - h, x + h), (y - h, y + h), (z - h, z + h))
+        names = [f"{_SKIN}-{asset or 'box'}-{slot}" for asset, slot in bodies]
+        points = [self._parked(kind) for kind, _ in bodies]
+        if constants is not None and metal:
+            skin = RadioMaterial(f"{_SKIN}-skin", 0.1, *constants)
+            return [Shape(_SKIN, skin, [_PARKING, *names], [walls, *points])]
+        closed = Shape(_PARKING, RadioMaterial(f"{_PARKING}-walls", conductivity=1e7), [_PARKING], [walls])
+        if constants is None:
+            return [closed]
+        skin = RadioMaterial(f"{_SKIN}-skin", 0.1, *constants)
+        return [closed, Shape(_SKIN, skin, names, points)]
+
+    def _body_shape(self, bodies: Sequence[Body], material: str, radio: Any) -> Shape:
+        """Moving bodies of one material, none of which stands for anything yet."""
+        name = f"{_SKIN}-of-{material}"
+        names = [f"{_SKIN}-{kind or 'box'}-{slot}" for kind, slot in bodies]
+        return Shape(name, radio, names, [self._parked(kind) for kind, _ in bodies])
+
+    def _parked(self, kind: str) -> Mesh:
+        """A body that stands for nothing: a point."""
+        mesh = self._meshes[kind]
+        return Mesh(np.tile(self._middle, (len(mesh.vertices), 1)), mesh.faces)
+
+    def _moving_rows(self) -> Iterator[tuple[Shape, slice]]:
+        """The shapes that may move, and which of all moving vertices are theirs."""
+        begin = 0
+        for shape in self._moving:
+            end = begin + sum(len(mesh.vertices) for mesh in shape.meshes)
+            yield shape, slice(begin, end)
+            begin = end
+
+    def _kind(self, scene: Scene, i: int) -> str:
+        """Which bodies may stand for an object of a scene."""
+        return body_kind(scene.assets[i], self._objects.of(scene.names[i], scene.classes[i]))
+
+    def _replace_shapes(self, centre: Float64Array) -> Int64Array:
+        """Put the shapes in place of what was loaded. Returns their process-local numbers."""
+        from sionna.rt import SceneObject
+
+        added = [
+            SceneObject(mi_mesh=mi_mesh(shape, centre), radio_material=shape.material)
+            for shape in self._shapes
+        ]
+        self._scene.edit(add=added, remove=list(self._scene.objects))
+        return np.array([item.object_id for item in added], np.int64)
+
+
+def _material_name(shape: Shape) -> str:
+    """Of a shape, as a scenario has it."""
+    name: str = shape.material.name
+    return _SKIN_NAME if shape.id == _SKIN else name.removeprefix(OBJECT_MATERIAL)
+
+
+def _near_middle(low: Float64Array, high: Float64Array) -> Float64Array:
+    """Multiples of `_CENTRE_STEP` next to the middle of a box [m], Shape ``[3]``; no negative zeros."""
+    middle: Float64Array = np.round((low + high) / (2 * _CENTRE_STEP)) * _CENTRE_STEP + 0.0
+    return middle
+
+
+def _bounds(shapes: Sequence[Shape]) -> tuple[Float64Array, Float64Array]:
+    """Lowest and highest corner [m] of all shapes; the origin where there are none."""
+    if not shapes:
+        return np.zeros(3), np.zeros(3)
+    corners = np.concatenate([mesh.vertices for shape in shapes for mesh in shape.meshes])
+    return corners.min(0), corners.max(0)
+
+
+def _constants(material: Any) -> Constants:
+    return float(material.relative_permittivity[0]), float(material.conductivity[0])

@@ -1,0 +1,181 @@
+"""Settings of the channel ``sionna-rt``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from pathlib import PurePosixPath
+from typing import Annotated, Literal
+
+import msgspec
+
+from caviar_protocol.arrays import quantity
+from caviar_protocol.errors import ScenarioError
+from caviar_services.channel.base import ChannelSettings
+from caviar_services.channel.mesh_detail.detail import DetailSettings
+from caviar_services.channel.sionna.materials import MaterialSettings, OutsideRange
+
+_SAMPLES = 100_000
+"""Of a launch in each frame."""
+
+_SCENERY_SAMPLES = 10_000_000
+"""Of a launch before the first one."""
+
+
+class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
+    """What is modelled, and how finely."""
+
+    max_depth: Annotated[int, quantity("1", "interactions of a path at most", ge=0, le=16)] = 3
+    rung: Literal["siso-rt", "spherical", "mimo-rt"] = "siso-rt"
+    """How arrays are treated: plane waves, spherical waves, or every antenna pair traced."""
+    candidates: Literal["enumerated", "launched"] | None = None
+    """How reflected paths are looked for: ``enumerated``, chains of scenery by launches from where
+    transmitters stand, before the first frame, and chains by way of moving objects face by face in each
+    frame; ``launched``, all of them by rays in each frame. Absent: enumerated where objects move in the run,
+    which is where devices are mounted on them or a world has meshes of them."""
+    samples: (
+        Annotated[int, quantity("1", "rays of a launch from each transmitter", ge=1, le=100_000_000)] | None
+    ) = None
+    """Of the scenery's launches where candidates are enumerated, of those in each frame elsewhere. Absent:
+    10,000,000 and 100,000."""
+    scenery_launches: Annotated[int, quantity("1", "launches of scenery that are united", ge=1, le=100)] = 4
+    """Each has its rays turned against the others: what one passes by, another meets."""
+    samples_per_frame: Annotated[
+        int, quantity("1", "rays launched in each frame where some are needed", ge=1, le=100_000_000)
+    ] = 100_000
+    """Where candidates are enumerated: from transmitters that move, and for refraction, diffraction,
+    scattering and paths longer than ``enumerated_depth``."""
+    enumerated_depth: Annotated[int, quantity("1", "reflections of enumerated paths at most", ge=1, le=5)] = 3
+    cache_chains: bool = True
+    """Keep the scenery's chains in the user's cache, ``$XDG_CACHE_HOME/caviar/chains``, for the next run."""
+    ray_spacing_deg: (
+        Annotated[float, quantity("°", "mean angle between rays, in place of samples", ge=0.03, le=90)] | None
+    ) = None
+    """N rays that share the sphere's 4π sr have a mean spacing Δ [rad] with N = 4π/Δ²."""
+    los: bool = True
+    reflection: bool = True
+    refraction: bool = False
+    diffraction: bool = False
+    free_edges: bool = False
+    """Whether the rims of open surfaces diffract, too, that of the ground or of a screen without thickness:
+    edges at which one face ends and no other begins."""
+    edges_within_m: (
+        Annotated[float, quantity("m", "from an edge that diffracts to the nearer end of a path", gt=0)]
+        | None
+    ) = None
+    """Edges farther from both ends diffract nothing; where there is none in range of a transmitter and all
+    receivers, its rays are launched without diffraction. Absent: all edges count."""
+    scattering: bool = False
+    """Diffuse reflection; needs a scattering_coefficient above 0 in ``materials``."""
+    scattering_samples: (
+        Annotated[int, quantity("1", "rays of a launch of its own for diffuse paths", ge=1, le=100_000_000)]
+        | None
+    ) = None
+    """Every point that a ray meets is a path to whoever sees it, so diffuse paths take far longer than
+    others, and their power converges far sooner. Absent: the rays of ``samples`` scatter too."""
+    scattering_paths: (
+        Annotated[int, quantity("1", "diffuse paths of a receiver, about", ge=1, le=1_000_000)] | None
+    ) = None
+    """Of all points at which the rays of ``scattering_samples`` meet something rough, about so many are
+    chosen for each receiver, the stronger the likelier, and stand for the others: power is right in the mean.
+    Absent: every point at which a ray was drawn to be scattered."""
+    launch_seed: Annotated[int | None, quantity("1", "of the ray launch; absent: from the run's seed")] = None
+    max_paths: Annotated[
+        int, quantity("1", "candidates of a TX/RX pair; more are lost and counted", ge=1)
+    ] = 200_000
+    follow: (
+        Annotated[int, quantity("1", "frames in which all rays are launched, a part in each", ge=2, le=1000)]
+        | None
+    ) = None
+    """Reflections and transmissions are followed from frame to frame, not looked for with all rays in each:
+    new ones are found within this many frames, and a channel that is started again in the middle of an
+    episode cannot go on unless states are saved. Absent: each frame stands on its own."""
+    receivers_at_once: Annotated[
+        int | None, quantity("1", "receivers looked at together; absent: as many as fit")
+    ] = None
+    memory_gib: Annotated[
+        float, quantity("GiB", "for rays, and element pairs, looked at or traced together", gt=0, le=1024)
+    ] = 4.0
+    """Rays are launched in parts of a million at most, and of fewer where this asks for it."""
+    bodies: Annotated[int, quantity("1", "moving objects of one mesh at most", ge=0, le=4096)] = 32
+    pool: dict[str, int] = msgspec.field(default_factory=dict)
+    """Bodies of single meshes where ``bodies`` does not fit, by file name without ending: ``car = 64``;
+    ``box`` for objects without a mesh."""
+    without_body: tuple[str, ...] = ()
+    """Classes of objects that the waves pass through."""
+    body_material: str = "metal"
+    """ITU-R P.2040 material of moving objects."""
+    object_materials: dict[str, str] = msgspec.field(default_factory=dict)
+    """Materials of moving objects by class, ``pedestrian = "skin"``, and of objects and pieces of scenery by
+    name or a pattern of names with ``*``: those of ITU-R P.2040, ``skin``, ``plastic``, and those that
+    ``materials`` gives both electric constants. The first of name, pattern and class that fits counts."""
+    materials: dict[str, MaterialSettings] = msgspec.field(default_factory=dict)
+    """Changes to materials of the scenery, and of ``object_materials``, by name."""
+    detail: DetailSettings = msgspec.field(default_factory=DetailSettings)
+    """What of the scenery is left out; absent, nothing is."""
+    outside_itu_range: OutsideRange = "error"
+    """Where ITU-R P.2040 does not define a material at a carrier: ``error``; ``nearest``, the constants of
+    the nearest end of a range; ``extrapolate``, the power law of that range."""
+
+    def __post_init__(self) -> None:
+        if self.scattering_samples is not None and not self.scattering:
+            raise ValueError("scattering_samples needs scattering = true; write both or neither")
+        if self.scattering_paths is not None and self.scattering_samples is None:
+            raise ValueError(
+                "scattering_paths chooses among the points of a launch of its own; give scattering_samples"
+            )
+        if self.scattering_samples is not None and self.rung == "mimo-rt":
+            raise ValueError(
+                'rung = "mimo-rt" traces all paths of an antenna pair at once; leave out scattering_samples'
+            )
+        if self.free_edges and not self.diffraction:
+            raise ValueError("free_edges needs diffraction = true; write both or neither")
+        if self.edges_within_m is not None and (not self.diffraction or self.rung == "mimo-rt"):
+            raise ValueError(
+                'edges_within_m needs diffraction = true and a rung other than "mimo-rt"; leave it out'
+            )
+        if self.candidates == "enumerated" and (self.follow is not None or self.rung == "mimo-rt"):
+            raise ValueError(
+                'candidates = "enumerated" goes with neither follow nor rung = "mimo-rt", which launch their '
+                "own; leave one out"
+            )
+        mixed = self.scattering and self.scattering_samples is None
+        if self.follow is not None and (self.diffraction or mixed):
+            raise ValueError(
+                "follow knows reflections and transmissions only; leave it out, or set diffraction to "
+                "false and give diffuse paths a launch of their own with scattering_samples"
+            )
+
+    def enumerates(self, moving: bool) -> bool:
+        """Whether reflected paths are enumerated, in a run in which objects move or none do."""
+        if self.candidates is not None:
+            return self.candidates == "enumerated"
+        return moving and self.reflection and self.rung == "siso-rt" and self.follow is None
+
+    def launched_samples(self, service: str, enumerated: bool = False) -> int:
+        """Rays of a launch, however they were given. Raises `ScenarioError` where they were given twice."""
+        if self.ray_spacing_deg is None:
+            absent = _SCENERY_SAMPLES if enumerated else _SAMPLES
+            return absent if self.samples is None else self.samples
+        if self.samples is not None:
+            raise ScenarioError(
+                f"samples = {self.samples} and ray_spacing_deg = {self.ray_spacing_deg} both say "
+                "how many rays are launched; leave one out",
+                key=f"services.{service}.settings.ray_spacing_deg",
+            )
+        return round(4 * math.pi / math.radians(self.ray_spacing_deg) ** 2)
+
+    def pool_sizes(self, assets: Iterable[str], service: str) -> dict[str, int]:
+        """Bodies of each mesh: those among the assets, and the box.
+
+        Raises `ScenarioError` where ``pool`` names another.
+        """
+        by_stem = {PurePosixPath(name).stem: name for name in assets if name.startswith("objects/")}
+        by_stem["box"] = ""
+        unknown = sorted(self.pool.keys() - by_stem.keys())
+        if unknown:
+            raise ScenarioError(
+                f"there is no object mesh {unknown[0]!r}; the run has: {', '.join(sorted(by_stem))}",
+                key=f"services.{service}.settings.pool",
+            )
+        return {name: self.pool.get(stem, self.bodies) for stem, name in by_stem.items()}

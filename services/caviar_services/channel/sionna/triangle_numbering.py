@@ -1,0 +1,351 @@
+"""Which triangle of the ray tracer's shapes is whose: numbers, pieces and planes of triangles, in float64.
+
+A shape holds many pieces of scenery or many bodies. Ray tracers tell a shape and a triangle within it; here
+triangles are numbered through all shapes, in the order of the shapes, and each belongs to a piece and lies
+in a plane of it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
+from caviar_services.channel.propagation.clearance import Surfaces
+from caviar_services.channel.sionna.coplanar_faces import CoplanarFaces, JoinedFaces
+from caviar_services.channel.sionna.meshes import Shape
+from caviar_services.channel.sionna.planes import (
+    PlaneTable,
+    plane_numbers,
+    plane_numbers_of,
+    shared_planes,
+    two_sided_planes,
+)
+from caviar_services.meshes import Mesh
+
+Body = tuple[str, int]
+"""Asset and slot of a body in the pool."""
+
+SurfaceNames = tuple[tuple[str, int], ...]
+"""Objects, and planes of each, that surfaces of several objects are known by."""
+
+_LYING = 0.5
+"""Vertical part of the normal of grounds and roofs, at least."""
+
+
+class NumberedTriangles:
+    """The triangles of shapes, of which the last ones may move; bodies are their last pieces.
+
+    Parameters
+    ----------
+    shapes
+        In world coordinates.
+    ids
+        Process-local number of each shape.
+    bodies
+        What may move, in the order of the pieces.
+    unit_meshes
+        Of the bodies, by asset.
+    centre
+        What the ray tracer's coordinates are relative to [m], Shape ``[3]``.
+    moving
+        How many shapes may move, one of each material of bodies.
+    """
+
+    def __init__(
+        self,
+        shapes: Sequence[Shape],
+        ids: Int64Array,
+        bodies: Sequence[Body],
+        unit_meshes: Mapping[str, Mesh],
+        centre: Float64Array,
+        moving: int = 1,
+    ) -> None:
+        self.centre = centre
+        """What the ray tracer's coordinates are relative to [m], Shape ``[3]``."""
+        self.version = 0
+        """Counts how often anything has moved."""
+        self._bodies = tuple(bodies)
+        meshes = [mesh for shape in shapes for mesh in shape.meshes]
+        self._number_shapes(shapes, ids, moving)
+        corners = np.array([len(mesh.vertices) for mesh in meshes])
+        before = self._first_vertices = np.cumsum(corners) - corners
+        self._corners = np.concatenate([mesh.vertices for mesh in meshes])
+        self._faces = np.concatenate([mesh.faces + b for mesh, b in zip(meshes, before, strict=True)])
+        self.names = tuple(name for shape in shapes for name in shape.names)
+        """What the indices of `object_index` stand for while no body stands for an object."""
+        self._relative = self._corners - centre
+        self.joined: JoinedFaces
+        """Which faces are one surface."""
+        self._number_planes(meshes, unit_meshes)
+        last = [mesh for shape in shapes[-moving:] for mesh in shape.meshes]
+        self._vertices = self._corners[len(self._corners) - sum(len(mesh.vertices) for mesh in last) :]
+        self._first_moving = len(self._faces) - sum(len(mesh.faces) for mesh in last)
+        self.surfaces = Surfaces(self._corners[self._faces], self._points_outside)
+        """All triangles, in world coordinates."""
+
+    @property
+    def moving_vertices(self) -> Float64Array:
+        """Vertices of the shapes that may move [m], Shape ``[V, 3]``; a copy."""
+        return self._vertices.copy()
+
+    def count_from(self, centre: Float64Array) -> None:
+        """Move everything to stand about another centre [m], Shape ``[3]``, as it stood about the last."""
+        self._corners += centre - self.centre
+        self.centre = centre
+        self.version += 1
+        self.surfaces.move(np.arange(len(self._faces)), self._corners[self._faces])
+
+    def move(self, vertices: Float64Array) -> bool:
+        """Put the vertices that may move there [m], Shape ``[V, 3]``. Returns whether any has moved."""
+        changed = (vertices != self._vertices).any(1)
+        if not changed.any():
+            return False
+        self._vertices[:] = vertices
+        self.version += 1
+        first = len(self._corners) - len(vertices)
+        self._relative[first:][changed] = vertices[changed] - self.centre
+        # Most bodies of the pool stand for nothing: only what has moved is looked at.
+        moved = changed[self._faces[self._first_moving :] - first].any(1)
+        triangles = self._first_moving + np.flatnonzero(moved)
+        joined = np.array([group[0] for group in self.joined.groups], np.int64)
+        self.plane_table.update(self._relative, np.union1d(self.plane_of[triangles], joined))
+        self._join()
+        self.surfaces.move(triangles, self._corners[self._faces[triangles]])
+        return True
+
+    def _join(self) -> None:
+        """Find the faces that are one surface now."""
+        before, now = self.joined, self._coplanar.find()
+        self.joined = now
+        self.plane_table.join(now.groups)
+        if before.groups or now.groups:
+            self.surface_of = self.joined.label[self.plane_of]
+
+    def surface_names(self, triangles: Int64Array, names: Sequence[str]) -> tuple[Int32Array, SurfaceNames]:
+        """By what name paths by way of triangles are known: the number of the plane within its object, or
+        where a body's face is one surface with others, −1 minus the place of that surface's object and plane.
+
+        A surface has the name of the first scenery that its bodies touch, else the least of its names.
+        ``names`` are those of all pieces, as `SionnaScene.place` returned them.
+        """
+        numbers = self._face_of[triangles].astype(np.int32)
+        of, known = self.plane_of[triangles], []
+        for group in self.joined.groups:
+            its = np.isin(of, group[group >= self.first_moving_plane])
+            if not its.any():
+                continue
+            touched = self.joined.scenery.get(int(group[0]))
+            members = self.plane_table.triangle[group] if touched is None else np.array([touched])
+            pieces = self.piece_of(members).tolist()
+            known.append(
+                min((names[piece], int(self._face_of[t])) for piece, t in zip(pieces, members, strict=True))
+            )
+            numbers[its] = -len(known)
+        return numbers, tuple(known)
+
+    @property
+    def vertices(self) -> Float64Array:
+        """All vertices as they stand [m], Shape ``[V, 3]``."""
+        return self._corners
+
+    @property
+    def triangle_vertices(self) -> Int32Array:
+        """Vertices of each triangle, Shape ``[F, 3]``."""
+        return self._faces
+
+    def begin_of(self, piece: int) -> tuple[int, int]:
+        """Numbers of the first vertex and of the first triangle of a piece."""
+        return int(self._first_vertices[piece]), int(self._first_triangles[piece])
+
+    @property
+    def first_moving_plane(self) -> int:
+        """Number of the first plane of a body; those of scenery come before."""
+        return int(self._moving_plane)
+
+    @property
+    def first_body_piece(self) -> int:
+        """Number of the piece that is the first body; those of scenery come before."""
+        return len(self.names) - len(self._bodies)
+
+    @property
+    def scenery_digest(self) -> bytes:
+        """Of all triangles at rest and of their planes."""
+        digest = hashlib.blake2b(digest_size=20)
+        faces = self._faces[: self._first_moving]
+        still = self._corners[: len(self._corners) - len(self._vertices)]
+        for part in (still - self.centre, faces, self.plane_of[: self._first_moving]):
+            digest.update(np.ascontiguousarray(part).tobytes())
+        return digest.digest()
+
+    def bodies_of(self, asset: str) -> Int64Array:
+        """Numbers of the bodies of an asset, counted through all bodies."""
+        return np.flatnonzero([of == asset for of, _ in self._bodies])
+
+    def face_numbers(self, asset: str) -> Int32Array:
+        """Number of the plane of each triangle of a body of an asset, within it; it has one body at least."""
+        piece = self.first_body_piece + int(self.bodies_of(asset)[0])
+        ends = np.append(self._first_triangles, len(self._faces))
+        return self._face_of[ends[piece] : ends[piece + 1]]
+
+    def piece_of(self, triangles: Int64Array) -> Int64Array:
+        """Number of the piece that each of these triangles is of."""
+        return np.searchsorted(self._first_triangles, triangles, side="right") - 1
+
+    def enclosing(self, position: Float64Array) -> int:
+        """Piece that a point [m], Shape ``[3]``, is inside; −1: none.
+
+        A ray from inside of a closed surface crosses it an odd number of times. Walls and roof of one
+        building may be pieces of their own, and houses mostly have no floor: so all pieces at rest count as
+        one surface, and rays go upwards, from shallow to steep. All but one have to agree, so that a roof
+        without walls, a screen or a slit does not count.
+        """
+        found: Counter[int] = Counter()
+        for met in self.surfaces.above(position):
+            found[self._left(met)] += 1
+            if found[-1] > 1:
+                return -1
+        del found[-1]
+        return found.most_common(1)[0][0]
+
+    def _left(self, met: Int64Array) -> int:
+        """Piece that a ray leaves for good which meets these triangles, nearest first; −1: none."""
+        pieces = np.searchsorted(self._first_triangles, met, side="right") - 1
+        is_body = pieces >= len(self._first_triangles) - len(self._bodies)
+        bodies, crossings = np.unique(pieces[is_body], return_counts=True)
+        odd = bodies[crossings % 2 == 1]
+        if len(odd):
+            return int(odd[0])
+        scenery = pieces[~is_body]
+        return int(scenery[0]) if len(scenery) % 2 else -1
+
+    def planes(self, shapes: Int64Array, primitives: Int64Array) -> tuple[Float64Array, Float64Array]:
+        """A corner [m] and the normal (of any length) of triangles, each of Shape ``[..., 3]``, in float64.
+
+        Anything for no shape.
+        """
+        a, b, c = np.moveaxis(self.triangles(shapes, primitives), -2, 0)
+        return a, np.cross(b - a, c - a)
+
+    def triangles(self, shapes: Int64Array, primitives: Int64Array) -> Float64Array:
+        """The corners [m] of triangles, Shape ``[..., 3, 3]``, in float64: those of scenery as they stand in
+        its files, those of moving bodies where `place` put them last. Anything for no shape."""
+        corners: Float64Array = self._corners[self._faces[self.triangle_numbers(shapes, primitives)]]
+        return corners
+
+    def triangle_numbers(self, shapes: Int64Array, primitives: Int64Array) -> Int64Array:
+        """Number, through all shapes, of triangles of process-local shapes; anything for no shape."""
+        number = self._offsets[self._where(shapes)] + primitives
+        clipped: Int64Array = np.clip(number, 0, len(self._faces) - 1)
+        return clipped
+
+    def corners(self, triangles: Int64Array) -> Float64Array:
+        """Corners of triangles by number [m], Shape ``[..., 3, 3]``; float64."""
+        corners: Float64Array = self._corners[self._faces[triangles]]
+        return corners
+
+    def shapes_of(self, triangles: Int64Array) -> tuple[Int64Array, Int64Array]:
+        """Process-local shape of triangles by number, and their numbers within it."""
+        order = np.argsort(self._offsets)
+        where = order[np.searchsorted(self._offsets[order], triangles, side="right") - 1]
+        return self._ids[where], triangles - self._offsets[where]
+
+    def face_number(self, shapes: Int64Array, primitives: Int64Array) -> Int32Array:
+        """Number of the plane of triangles within their object, the same in every frame; anything for no
+        shape."""
+        return self._face_of[self.triangle_numbers(shapes, primitives)]
+
+    def moved_triangles(
+        self, triangles: Int64Array, before: tuple[str, ...], now: tuple[str, ...]
+    ) -> Int64Array:
+        """Numbers of the same triangles of the same objects, where `place` has given bodies to others since.
+
+        ``before`` and ``now`` are what it returned; −1 where an object has left or has another mesh.
+        """
+        if before == now:
+            return triangles
+        first = len(now) - len(self._bodies)
+        place = {name: number for number, name in enumerate(now[first:], start=first)}
+        piece = np.searchsorted(self._first_triangles, triangles, side="right") - 1
+        moved = np.arange(len(now))
+        for number, name in enumerate(before[first:], start=first):
+            there = place.get(name, -1)
+            is_same = there >= 0 and self._bodies[there - first][0] == self._bodies[number - first][0]
+            moved[number] = there if is_same else -1
+        start = self._first_triangles[moved[piece]] + triangles - self._first_triangles[piece]
+        return np.where(moved[piece] >= 0, start, -1)
+
+    def is_body(self, shapes: NDArray[np.uint32]) -> BoolArray:
+        """Whether process-local shapes are of moving bodies."""
+        return np.isin(shapes, self._body_ids)
+
+    def object_index(self, shapes: Int64Array, primitives: Int64Array) -> Int32Array:
+        """Index into the names of `place` of triangles of process-local shapes; −1 for no shape."""
+        where = self._where(shapes)
+        piece = np.searchsorted(self._first_triangles, self._offsets[where] + primitives, side="right") - 1
+        return np.where(self._ids[where] == shapes, piece, -1).astype(np.int32)
+
+    def _number_shapes(self, shapes: Sequence[Shape], ids: Int64Array, moving: int) -> None:
+        """Number the triangles of shapes and of their pieces."""
+        counts = [[len(mesh.faces) for mesh in shape.meshes] for shape in shapes]
+        totals = np.array([sum(count) for count in counts], np.int64)
+        self.offset_by_shape = np.zeros(int(ids.max(initial=0)) + 1, np.int64)
+        """Number of the first triangle of each process-local shape."""
+        self.offset_by_shape[ids] = np.cumsum(totals) - totals
+        self._body_ids = ids[-moving:] if self._bodies else ids[:0]
+        order = np.argsort(ids)
+        self._ids, self._shape_order = ids[order], order
+        self._offsets = (np.cumsum(totals) - totals)[order]
+        faces = np.concatenate([np.array(count, np.int64) for count in counts])
+        self._first_triangles = np.cumsum(faces) - faces
+
+    def _number_planes(self, meshes: Sequence[Mesh], unit_meshes: Mapping[str, Mesh]) -> None:
+        """Number the planes of these pieces; bodies, each of which is a point yet, by their unit meshes."""
+        still = len(meshes) - len(self._bodies)
+        of_asset = {asset: plane_numbers(mesh) for asset, mesh in unit_meshes.items()}
+        numbers = plane_numbers_of(meshes[:still])
+        numbers += [of_asset[asset] for asset, _ in self._bodies]
+        self._face_of = np.concatenate(numbers)
+        counts = np.array([int(number.max(initial=-1)) + 1 for number in numbers], np.int64)
+        before = np.cumsum(counts) - counts
+        parts = np.concatenate([number + first for number, first in zip(numbers, before, strict=True)])
+        faces = self._faces.astype(np.int64)
+        apart = PlaneTable(parts.astype(np.int64), faces)
+        apart.update(self._relative)
+        self.part_of = parts.astype(np.int64)
+        """Plane face of each triangle, numbered through all objects, of which none share any."""
+        shared = shared_planes(apart, int(counts[:still].sum()))
+        self.plane_of = shared[parts]
+        """Infinite plane of each triangle, numbered through all objects."""
+        self._moving_plane = len(apart.normal) and int(shared.max()) + 1 - int(counts[still:].sum())
+        self.plane_table = PlaneTable(self.plane_of, faces)
+        self.plane_table.update(self._relative)
+        two_sided = {asset: two_sided_planes(mesh, of_asset[asset]) for asset, mesh in unit_meshes.items()}
+        sides = [np.zeros(0, np.bool_), *(two_sided[asset] for asset, _ in self._bodies)]
+        self._coplanar = CoplanarFaces(
+            self.plane_table, int(self._moving_plane), counts[still:], np.concatenate(sides)
+        )
+        self.joined = self._coplanar.none
+        self.surface_of = self.plane_of
+        """Number of the surface that each triangle is of: that of its plane, or of the first of the planes
+        that are one surface with it."""
+
+    def _points_outside(self, triangle: int, normal: Float64Array) -> bool:
+        """Whether a triangle's normal points away from its piece, or up from one that lies.
+
+        Scenery has faces of either sense, so their order of corners says nothing.
+        """
+        piece = int(np.searchsorted(self._first_triangles, triangle, side="right")) - 1
+        if triangle < self._first_moving and abs(normal[2]) > _LYING:
+            return bool(normal[2] > 0)
+        ends = [*self._first_triangles.tolist(), len(self._faces)]
+        corners = self._corners[self._faces[ends[piece] : ends[piece + 1]]].reshape(-1, 3)
+        middle = (corners.min(0) + corners.max(0)) / 2
+        return bool((self._corners[self._faces[triangle, 0]] - middle) @ normal >= 0)
+
+    def _where(self, shapes: Int64Array) -> Int64Array:
+        return np.minimum(np.searchsorted(self._ids, shapes), len(self._ids) - 1)
