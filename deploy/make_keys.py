@@ -5,11 +5,11 @@ These are volumes of their own, so that no service can read another's. What is t
 that is made anew, since the volume of the one before is gone, takes its place among the authorized.
 """
 
-import shutil
 import sys
 from pathlib import Path
 
 from caviar_clients.cli.keys import authorize, new, revoke
+from caviar_protocol.files import replace_file
 from caviar_protocol.keys import BROKER, read_authorized, read_public
 
 ROOT = Path("/keys")
@@ -38,9 +38,7 @@ def main() -> None:
                 revoke(name, directory=ours)
             authorize(public, name=name, role=role, directory=ours)
         # Its service waits for this file, so it comes last, and in one step.
-        partial = public.with_name("broker.partial")
-        shutil.copyfile(broker, partial)
-        partial.replace(public.with_name(broker.name))
+        replace_file(public.with_name(broker.name), broker.read_bytes())
 
 
 if __name__ == "__main__":

@@ -31,8 +31,7 @@ from caviar_broker.journal_format import (
 )
 from caviar_protocol.errors import RunError
 from caviar_protocol.files import read_regular, replace_file, sync_file
-
-FOLDER = "checkpoints"
+from caviar_protocol.run_directory import RunDirectory
 
 
 class CheckpointFiles:
@@ -50,7 +49,7 @@ class CheckpointFiles:
     """
 
     def __init__(self, directory: Path, *, durable: bool = False) -> None:
-        self._folder, self._durable = directory / FOLDER, durable
+        self._folder, self._durable = RunDirectory(directory).checkpoints, durable
         self.finished = (0, -1)
         """(episode, frame) that was finished last, and will be so for a broker that resumes."""
         self._kept: dict[str, dict[tuple[int, int], Path]] = {}

@@ -45,11 +45,10 @@ from caviar_broker.server import BrokerServer
 from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.files import file_system_of
 from caviar_protocol.host import steady_memory
+from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import load_scenario
 from caviar_protocol.scenario.rules import with_overrides
 
-JOURNAL = "journal.msgpack"
-LATENCIES = "latency.npz"
 SAVE_S = 5.0
 """[s] that is waited for the disk to take the latencies."""
 OWN_DESCRIPTORS = 40
@@ -110,7 +109,8 @@ def _serve(arguments: argparse.Namespace, record: RunRecord, directory: Path, fo
     durability = record.scenario.run.durability
     checkpoints = CheckpointFiles(directory, durable=durability != "none")
     # A launcher that starts its broker again has not summed the run up yet.
-    last = "summary.json" if arguments.control else LATENCIES
+    files = RunDirectory(directory)
+    last = files.summary if arguments.control else files.latencies
     left = _left(directory, record, checkpoints, last) if arguments.resume else _NOTHING
     if left.is_cut and not has_recording(directory) and not arguments.force:
         raise RunError(
@@ -118,9 +118,9 @@ def _serve(arguments: argparse.Namespace, record: RunRecord, directory: Path, fo
         )
     resumption = left.resumption
     scheduling = prefer()  # before the threads of the port are started, which inherit it
-    reporter = Reporter(sys.stdout.fileno(), directory / "events.jsonl", arguments.control)
+    reporter = Reporter(sys.stdout.fileno(), files.events, arguments.control)
     journal_file = JournalFile(
-        directory / JOURNAL, plan.epoch, checkpoints, left.end, run=plan.run, durable=durability != "none"
+        files.journal, plan.epoch, checkpoints, left.end, run=plan.run, durable=durability != "none"
     )
     with closing(journal_file) as journal:
         supervised = arguments.supervised if arguments.control else ()
@@ -155,9 +155,7 @@ def _serve(arguments: argparse.Namespace, record: RunRecord, directory: Path, fo
             tune_garbage_collector()
             outcome = server.run(prefer)
     statistics = server.statistics
-    takes_files = server.disk_answers and call_with_timeout(
-        lambda: statistics.save(directory / LATENCIES), SAVE_S
-    )
+    takes_files = server.disk_answers and call_with_timeout(lambda: statistics.save(files.latencies), SAVE_S)
     reporter.finished(
         disk="" if takes_files else f"the disk does not answer: {file_system_of(directory)}",
         error=outcome.error,
@@ -222,13 +220,13 @@ def _resumed(arguments: argparse.Namespace) -> tuple[RunRecord, Path, tuple[str,
 _NOTHING = ResumeState(None, None, ())
 
 
-def _left(directory: Path, record: RunRecord, checkpoints: CheckpointFiles, last: str) -> ResumeState:
+def _left(directory: Path, record: RunRecord, checkpoints: CheckpointFiles, last: Path) -> ResumeState:
     """What journal and recording say.
 
     Raises `RunError` where they are no files, or those of another run, or where every frame is finished and
-    there is the file that is written ``last``.
+    there is ``last``, the file that is written last.
     """
-    journal = directory / JOURNAL
+    journal = RunDirectory(directory).journal
     if not journal.exists():
         return _NOTHING
     scenario = record.scenario
@@ -237,7 +235,7 @@ def _left(directory: Path, record: RunRecord, checkpoints: CheckpointFiles, last
     left = read_resumption(journal, checkpoints, recorded)
     found = left.resumption
     over = found is not None and found.finished >= found.frames and found.episode + 1 >= scenario.run.episodes
-    if over and (directory / last).exists() and (directory / last).stat().st_size:
+    if over and last.exists() and last.stat().st_size:
         raise RunError(
             f"cannot go on with {directory}: all its frames are finished, and so is it; "
             "to run its scenario again leave out --resume"

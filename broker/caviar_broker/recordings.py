@@ -14,15 +14,16 @@ from caviar_protocol.files import PUT_BACK, refuse_other_kinds, sync_file
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.recording import Recording
 from caviar_protocol.recording.integrity import metadata_of, recorded_until
-from caviar_protocol.recording.layout import MANIFEST_NAME, SEGMENT_PATTERN, read_manifest
+from caviar_protocol.recording.layout import read_manifest
 from caviar_protocol.recording.reader import recorded_decisions
 from caviar_protocol.recording.segment import Segment
+from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import ReplaySpec, Scenario
 
 
 def has_recording(directory: Path) -> bool:
     """Whether there is a file of a recording."""
-    return any(directory.glob(SEGMENT_PATTERN))
+    return bool(RunDirectory(directory).segments())
 
 
 def recorded_frames(directory: Path, scenario: Scenario) -> tuple[tuple[int, int] | None, tuple[str, ...]]:
@@ -44,7 +45,7 @@ def sync_recording(directory: Path) -> None:
     last time. `RunError` naming the directory where that fails.
     """
     try:
-        for path in [*sorted(directory.glob(SEGMENT_PATTERN))[-2:], directory]:
+        for path in [*RunDirectory(directory).segments()[-2:], directory]:
             with suppress(FileNotFoundError):
                 sync_file(path)
     except OSError as error:
@@ -66,8 +67,9 @@ def check_run_files(directory: Path, journal: Path, run: str) -> None:
     Raises `RunError` naming what is another run's, or no file; `RecordingError` where the journal is none.
     What is damaged is not looked at here.
     """
-    segments = sorted(directory.glob(SEGMENT_PATTERN))
-    for path in (journal, directory / MANIFEST_NAME, *segments):
+    files = RunDirectory(directory)
+    segments = files.segments()
+    for path in (journal, files.manifest, *segments):
         try:
             refuse_other_kinds(path, PUT_BACK)
         except OSError as error:
@@ -75,7 +77,7 @@ def check_run_files(directory: Path, journal: Path, run: str) -> None:
     runs = {journal.name: run_of_journal(journal)}
     with suppress(RecordingError):
         manifest = read_manifest(directory)
-        runs[MANIFEST_NAME] = manifest.run if manifest else ""
+        runs[files.manifest.name] = manifest.run if manifest else ""
     with suppress(RecordingError):
         runs |= {path.name: metadata_of(Segment(path)).run for path in segments[:1]}
     strange = [f"{name} is of run {other!r}" for name, other in runs.items() if other not in ("", run)]

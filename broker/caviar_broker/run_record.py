@@ -16,6 +16,7 @@ import msgspec
 from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.files import read_regular, replace_file
 from caviar_protocol.messages import PROTOCOL_VERSION
+from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario.conversion import Source
 
@@ -108,7 +109,6 @@ def _files_in(value: Any) -> Iterator[Path]:
             yield path
 
 
-NAME = "run.json"
 _UNSET = "0" * 64
 _CHECK = re.compile(rb'\n "check": "([0-9a-f]{64})"\n}\n$')
 """The last line of the file."""
@@ -131,7 +131,7 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
 
     def save(self, directory: Path) -> None:
         """Write it, in one step and to the disk. `RunError` naming the file where that fails."""
-        path = directory / NAME
+        path = RunDirectory(directory).record
         file = self.scenario.source.file  # whose folder may have modules of services
         source = Source(file=str(Path(file).resolve()) if file else "")
         without_lines = msgspec.structs.replace(self.scenario, source=source)
@@ -146,13 +146,13 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 def read_record(directory: Path) -> RunRecord:
     """The record of a run. `RecordingError` naming the file where it is none, or not as it was written."""
-    path = directory / NAME
+    path = RunDirectory(directory).record
     try:
         data = read_regular(path)
     except OSError as error:
-        if isinstance(error, FileNotFoundError) and (directory / "journal.msgpack").exists():
+        if isinstance(error, FileNotFoundError) and RunDirectory(directory).journal.exists():
             raise RecordingError(
-                f"cannot go on with {directory}: it has no {NAME}, and an embedded run cannot be "
+                f"cannot go on with {directory}: it has no {path.name}, and an embedded run cannot be "
                 "gone on with; run its scenario again"
             ) from error
         remedy = "; give the directory of a run" if isinstance(error, FileNotFoundError) else ""

@@ -8,6 +8,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from caviar_protocol.errors import RunError
+from caviar_protocol.files import replace_file
 
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
 
@@ -43,13 +44,7 @@ def write_file(path: Path, text: str = "") -> None:
         elif path.exists() and not path.is_file():  # a device, a pipe
             path.write_text(text, encoding="utf-8")
         else:
-            target = path.resolve()
-            part = target.with_name(f".{target.name}.part")
-            try:
-                part.write_text(text, encoding="utf-8")
-                part.replace(target)
-            finally:
-                part.unlink(missing_ok=True)
+            replace_file(path.resolve(), text.encode(), durable=False)
 
 
 @contextmanager

@@ -5,15 +5,16 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-import tempfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from uuid import uuid4
 
 import msgspec
 
 from caviar_protocol.digest import geometry_digest
 from caviar_protocol.errors import AssetError, SetupError
 from caviar_protocol.fields import AssetName
+from caviar_protocol.files import replace_file
 from caviar_protocol.limits import MAX_ASSET_CHUNK, MAX_BODY
 from caviar_protocol.messages import Asset
 
@@ -124,7 +125,7 @@ class AssetStore:
         if target.is_file() and (target.samefile(source) or _file_digest(target) == asset.digest):
             return
         target.parent.mkdir(parents=True, exist_ok=True)
-        staged = Path(tempfile.mkdtemp(dir=target.parent, prefix=".staged-")) / "file"
+        staged = target.with_name(f".staged-{uuid4().hex}")
         try:
             try:
                 os.link(source, staged)
@@ -132,13 +133,11 @@ class AssetStore:
                 shutil.copyfile(source, staged)
             staged.replace(target)
         finally:
-            shutil.rmtree(staged.parent)
+            staged.unlink(missing_ok=True)  # a link to the file that target is already stays after a rename
 
     def _place(self, asset: Asset, data: bytes) -> None:
         try:
-            with tempfile.NamedTemporaryFile(dir=self._files, prefix="part-", delete=False) as file:
-                file.write(data)
-            Path(file.name).replace(self.path(asset.digest))
+            replace_file(self.path(asset.digest), data, durable=False, mode=0o600, concurrent=True)
         except OSError as error:
             raise AssetError(
                 f"cannot keep asset {asset.name!r} in {self._files}: {error.strerror}"

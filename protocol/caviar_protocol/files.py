@@ -1,4 +1,4 @@
-"""Files of a run: written in one step, put on the disk, and opened only where they are files.
+"""Files of a run: written in one step, put on the disk, and opened only where they are regular files.
 
 A process that dies loses nothing that it handed to the operating system. A machine that dies loses what
 was not synchronised yet, so ``run.durability`` says when that happens:
@@ -16,6 +16,7 @@ import stat
 from io import BufferedReader, FileIO
 from pathlib import Path
 from typing import Literal
+from uuid import uuid4
 
 from caviar_protocol.errors import RunError
 
@@ -23,12 +24,58 @@ Durability = Literal["none", "periodic", "frame"]
 
 SYNC_PERIOD_S = 1.0
 """[s] of a run that a loss of power costs at most under ``periodic``, beside one frame."""
+PUT_BACK = "move it away, and put the file of the run back"
+_KINDS = {
+    stat.S_IFDIR: "directory",
+    stat.S_IFIFO: "named pipe",
+    stat.S_IFSOCK: "socket",
+    stat.S_IFCHR: "device",
+    stat.S_IFBLK: "device",
+}
+
+
+def replace_file(
+    path: Path,
+    data: bytes | memoryview,
+    *,
+    durable: bool = True,
+    mode: int = 0o666,
+    concurrent: bool = False,
+) -> None:
+    """Write a file in one step: a reader, and a machine that died, have the whole of it or what was before.
+
+    Args:
+        path: The file; its folder exists.
+        data: The whole content.
+        durable: Whether the content and its name are on the disk when this returns.
+        mode: Permission bits of the file, of which the process's umask takes some away.
+        concurrent: Whether several processes may write the file at the same time. Their drafts then have
+            names of their own, and a process that is killed leaves its draft behind.
+
+    Raises:
+        OSError: The file cannot be written; the earlier one is as it was.
+    """
+    draft = path.with_name(f"{path.name}.{uuid4().hex}.partial" if concurrent else f"{path.name}.partial")
+    try:
+        descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, mode)
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(data)
+            if durable:
+                file.flush()
+                os.fsync(file.fileno())
+        draft.replace(path)
+    except BaseException:
+        draft.unlink(missing_ok=True)
+        raise
+    if durable:
+        sync_file(path.parent)
 
 
 def sync_file(path: Path) -> None:
     """Have the disk hold what the operating system holds of a file or a directory.
 
-    Raises `OSError` with the path as its filename.
+    Raises:
+        OSError: The disk refuses; the error has the path as its ``filename``.
     """
     fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
@@ -40,63 +87,16 @@ def sync_file(path: Path) -> None:
         os.close(fd)
 
 
-def replace_file(path: Path, data: bytes | memoryview, *, durable: bool = True) -> None:
-    """Write a file in one step: readers, and a machine that died, have the whole of it or what was before.
-
-    ``durable`` says whether it is on the disk when this returns. Raises `OSError`.
-    """
-    partial = path.with_name(path.name + ".partial")
-    with partial.open("wb") as file:
-        file.write(data)
-        if durable:
-            file.flush()
-            os.fsync(file.fileno())
-    partial.replace(path)
-    if durable:
-        sync_file(path.parent)
-
-
-def file_system_of(path: Path) -> str:
-    """The file system that holds a path, for people: ``ext4 on /dev/sda1, mounted at /data``.
-
-    It reads what the kernel lists and asks no disk, so it answers for one that does not.
-    """
-    found, best = "its file system is unknown", ""
-    try:
-        lines = Path("/proc/self/mountinfo").read_text().splitlines()
-    except OSError:
-        return found
-    place = f"{os.path.abspath(path)}/"  # noqa: PTH100  # Path.resolve would ask the disk
-    for line in lines:
-        fields, _, rest = line.partition(" - ")
-        mount, kind = fields.split()[4], rest.split()
-        if place.startswith(mount.rstrip("/") + "/") and len(mount) >= len(best):
-            found, best = f"{kind[0]} on {kind[1]}, mounted at {mount}", mount
-    return found
-
-
-PUT_BACK = "move it away, and put the file of the run back"
-_KINDS = {
-    stat.S_IFDIR: "directory",
-    stat.S_IFIFO: "named pipe",
-    stat.S_IFSOCK: "socket",
-    stat.S_IFCHR: "device",
-    stat.S_IFBLK: "device",
-}
-
-
 def open_regular(path: Path) -> BufferedReader:
     """Open a regular file, or a link to one, to be read.
 
-    Raises
-    ------
-    OSError
-        Its ``strerror`` says what the path is, where that is no file, and what mends it.
+    Raises:
+        OSError: ``strerror`` says what the path is where that is no file, and what mends it.
     """
-    fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # else a pipe is waited for here
+    # Opening a pipe without O_NONBLOCK waits for a writer, which may never come.
+    fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
-        kind = stat.S_IFMT(os.fstat(fd).st_mode)
-        _refuse_other_kinds(kind, path, PUT_BACK)
+        _refuse_kind(os.fstat(fd), path, PUT_BACK)
         return os.fdopen(fd, "rb")
     except BaseException:
         os.close(fd)
@@ -110,9 +110,10 @@ def read_regular(path: Path) -> bytes:
 
 
 def open_to_append(path: Path) -> FileIO:
-    """Open a file of a run behind its end, to be written and read; it and its folder are made where missing.
+    """Open a file of a run behind its end, to be written and read; make it and its folder where missing.
 
-    Raises `RunError` naming the file, why it cannot be written, and what mends that.
+    Raises:
+        RunError: The file cannot be written; the text names it, says why and what mends that.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -130,16 +131,38 @@ def open_to_append(path: Path) -> FileIO:
 
 
 def refuse_other_kinds(path: Path, remedy: str = "move it away") -> None:
-    """Check that a path is a regular file, or free. Raises `OSError` as `open_regular` does."""
+    """Check that a path is a regular file, or free.
+
+    Raises:
+        OSError: It is a directory, a pipe, a socket or a device; ``strerror`` says which, and ``remedy``.
+    """
     try:
-        kind = stat.S_IFMT(path.stat().st_mode)
+        status = path.stat()
     except OSError:
         return  # the call that opens it says why
-    _refuse_other_kinds(kind, path, remedy)
+    _refuse_kind(status, path, remedy)
 
 
-def _refuse_other_kinds(kind: int, path: Path, remedy: str) -> None:
+def _refuse_kind(status: os.stat_result, path: Path, remedy: str) -> None:
+    kind = stat.S_IFMT(status.st_mode)
     if kind != stat.S_IFREG:
         code = errno.EISDIR if kind == stat.S_IFDIR else errno.EINVAL
         what = _KINDS.get(kind, "special file")
         raise OSError(code, f"it is a {what}, not a file; {remedy}", str(path))
+
+
+def file_system_of(path: Path) -> str:
+    """Describe the file system that holds a path, for an error: ``ext4 on /dev/sda1, mounted at /data``."""
+    found, best = "its file system is unknown", ""
+    try:
+        lines = Path("/proc/self/mountinfo").read_text().splitlines()
+    except OSError:
+        return found
+    # Only the kernel's list is read: Path.resolve would ask the disk, which may be the one that hangs.
+    place = f"{os.path.abspath(path)}/"  # noqa: PTH100
+    for line in lines:
+        fields, _, rest = line.partition(" - ")
+        mount, kind = fields.split()[4], rest.split()
+        if place.startswith(mount.rstrip("/") + "/") and len(mount) >= len(best):
+            found, best = f"{kind[0]} on {kind[1]}, mounted at {mount}", mount
+    return found

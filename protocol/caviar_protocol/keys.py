@@ -21,7 +21,6 @@ from __future__ import annotations
 import os
 import re
 import stat
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args
@@ -31,6 +30,7 @@ import zmq
 from msgspec import Meta
 
 from caviar_protocol.errors import SetupError
+from caviar_protocol.files import replace_file
 from caviar_protocol.messages import Role
 
 BROKER = "broker"
@@ -305,12 +305,7 @@ def _replace(path: Path, heading: str, table: str, entries: Sequence[msgspec.Str
             text += _table(key, shown) if shown is not None else f"{key} = [{_listed(value)}]\n"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}-")
-        with os.fdopen(descriptor, "w") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        Path(name).replace(path)
+        replace_file(path, text.encode(), mode=0o600, concurrent=True)
     except OSError as error:
         raise SetupError(f"cannot write {path}: {error.strerror}; choose another --directory") from error
 

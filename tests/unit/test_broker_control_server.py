@@ -30,10 +30,12 @@ from broker_harness import (
 from rich.console import Console
 
 from caviar_broker.control.server import MAX_CONNECTIONS, MAX_REQUEST, MAX_WAITING
-from caviar_broker.control.socket import NOTE, SOCKET, ask, connect, held
+from caviar_broker.control.socket import ask, connect, held
 from caviar_clients.cli.why import newest_run, why_command
 from caviar_protocol import messages as m
 from caviar_protocol.errors import RunError
+
+SOCKET, NOTE = "control.sock", "control.json"
 
 
 @contextmanager

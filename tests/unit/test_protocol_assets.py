@@ -95,7 +95,7 @@ def test_files_lie_at_their_relative_names_in_one_folder(store: AssetStore) -> N
     assert paths["scenery/meshes/a.ply"] == paths["scenery/town.xml"].parent / "meshes" / "a.ply"
     other = store.folder_of(manifest[:1])
     assert other["scenery/town.xml"] != paths["scenery/town.xml"]
-    assert [p.name for p in store.folder.rglob("*") if "staged" in p.name or "part-" in p.name] == []
+    assert [p.name for p in store.folder.rglob("*") if "staged" in p.name or p.suffix == ".partial"] == []
 
 
 def test_one_folder_laid_out_by_many_threads_at_once_is_whole(store: AssetStore) -> None:

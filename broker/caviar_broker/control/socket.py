@@ -17,9 +17,9 @@ from typing import Any
 
 from caviar_broker.event_loop import call_with_timeout
 from caviar_protocol.errors import RunError
-from caviar_protocol.files import read_regular, refuse_other_kinds
+from caviar_protocol.files import read_regular, refuse_other_kinds, replace_file
+from caviar_protocol.run_directory import RunDirectory
 
-SOCKET, NOTE = "control.sock", "control.json"
 BACKLOG = 16
 REMOVE_S = 1.0
 """[s] that is waited for the disk to remove them."""
@@ -35,18 +35,18 @@ class ControlSocket:
     """
 
     def __init__(self, directory: Path) -> None:
-        self._directory, self._elsewhere = directory, ""
+        self._files, self._elsewhere = RunDirectory(directory), ""
         self._told: dict[str, str | int] = {}
         refuse_second_broker(directory)
         self.socket = _listening()
-        path = directory / SOCKET
+        path = self._files.control_socket
         try:
             path.unlink(missing_ok=True)
             with _short(directory) as folder:
-                self.socket.bind(f"{folder}/{SOCKET}")
+                self.socket.bind(f"{folder}/{path.name}")
         except OSError:
             self._elsewhere = tempfile.mkdtemp(prefix="caviar-")
-            path = Path(self._elsewhere, SOCKET)
+            path = Path(self._elsewhere, path.name)
             self.socket.close()
             self.socket = _listening()
             self.socket.bind(str(path))
@@ -56,12 +56,10 @@ class ControlSocket:
     def announce(self, **told: str | int) -> None:
         """Write more into the note."""
         self._told |= told
-        note = self._directory / NOTE
-        draft = note.with_suffix(".new")
+        note = self._files.control_note
         try:
             refuse_other_kinds(note)
-            draft.write_text(json.dumps(self._told, indent=2) + "\n")
-            draft.replace(note)
+            replace_file(note, json.dumps(self._told, indent=2).encode() + b"\n", durable=False)
         except OSError as error:
             raise RunError(f"cannot write {note}: {error.strerror}") from error
 
@@ -71,9 +69,9 @@ class ControlSocket:
         call_with_timeout(self._remove, REMOVE_S)
 
     def _remove(self) -> None:
-        for name in (SOCKET, NOTE):
+        for file in (self._files.control_socket, self._files.control_note):
             with suppress(OSError):  # what was there before and is no file stays
-                (self._directory / name).unlink(missing_ok=True)
+                file.unlink(missing_ok=True)
         if self._elsewhere:
             shutil.rmtree(self._elsewhere, ignore_errors=True)
 
@@ -113,18 +111,18 @@ def connect(directory: Path) -> socket.socket:
 
     Raises `RunError` where none does.
     """
-    note = directory / NOTE
+    files = RunDirectory(directory)
     try:
-        path = Path(json.loads(read_regular(note))["socket"])
+        path = Path(json.loads(read_regular(files.control_note))["socket"])
     except (OSError, ValueError, KeyError, TypeError):
-        path = directory / SOCKET
+        path = files.control_socket
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     # With a timeout of Python's, a full backlog would be an error at once.
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("ll", round(REACH_S), 0))
-    if path.parent.is_dir() and path.name == SOCKET:
+    if path.parent.is_dir() and path.name == files.control_socket.name:
         with _short(path.parent) as folder:
             try:
-                connection.connect(f"{folder}/{SOCKET}")
+                connection.connect(f"{folder}/{path.name}")
             except BlockingIOError:
                 connection.close()
                 raise _no_answer(directory) from None

@@ -41,7 +41,7 @@ class ServicePlan:
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """How long the core waits for what [ns]; see `caviar_protocol.scenario.Timeouts`."""
+    """How long the core waits for what [ns]; see `caviar_protocol.scenario.schema.Timeouts`."""
 
     connect: int = 30 * SECOND
     ready: int = 120 * SECOND

@@ -24,13 +24,13 @@ from caviar_broker.http.auth import Tokens, http_address
 from caviar_broker.supervision import describe_exit
 from caviar_protocol.errors import CaviarError, RunError, SetupError
 from caviar_protocol.keys import Credentials, Pair
+from caviar_protocol.run_directory import RunDirectory
 
 if TYPE_CHECKING:
     from caviar_broker.server import BrokerServer
 
 END_S = 3.0
 """[s] that the process gets to end behind the broker's last frame, which it sees by itself."""
-LOG = Path("logs", "http.log")
 
 
 class HttpProcess:
@@ -65,7 +65,7 @@ class HttpProcess:
             return
         command = [sys.executable, "-m", "caviar_broker.http", str(self._directory), "--http", self._address]
         command += ["--keys", str(self._keys)] if self._keys is not None else []
-        log = self._directory / LOG
+        log = RunDirectory(self._directory).log("http")
         log.parent.mkdir(exist_ok=True)
         with log.open("wb") as file:
             self._process = subprocess.Popen(  # noqa: S603  # our own module with checked arguments
@@ -77,7 +77,7 @@ class HttpProcess:
     def _ended(self, server: BrokerServer) -> None:
         server.loop.unwatch(self._fd)
         if self._process is not None:
-            lines = (self._directory / LOG).read_text(errors="replace").strip().splitlines()
+            lines = RunDirectory(self._directory).log("http").read_text(errors="replace").strip().splitlines()
             said = f": {lines[-1]}" if lines else ""
             server.note("", f"HTTP is not served any more, {describe_exit(self._process.wait())}{said}")
 

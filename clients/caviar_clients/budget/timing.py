@@ -5,7 +5,6 @@ from __future__ import annotations
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -16,8 +15,8 @@ from caviar_protocol.errors import RecordingError
 from caviar_protocol.files import open_regular
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.recording.layout import FrameEntry
+from caviar_protocol.run_directory import RunDirectory
 
-LATENCIES = "latency.npz"
 At: TypeAlias = tuple[int, int]
 """(episode, frame); an agent's final grant stands behind the last frame."""
 Outcome: TypeAlias = Literal["answered", "late", "busy", "skipped"]
@@ -122,7 +121,7 @@ def _latencies(run: RecordedRun) -> dict[str, npt.NDArray[np.int64]]:
 
 
 def _archive(run: RecordedRun) -> dict[str, npt.NDArray[np.int64]]:
-    path: Path = run.recording.directory / LATENCIES
+    path = RunDirectory(run.recording.directory).latencies
     try:
         with open_regular(path) as file, np.load(file) as archive:
             return {key: archive[key] for key in archive.files}

@@ -15,6 +15,7 @@ import msgspec
 from caviar_broker.core import events as ev
 from caviar_clients.embedded.run import EmbeddedRun
 from caviar_protocol.errors import RunError
+from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario
 
 REPORT_S = 0.1
@@ -77,7 +78,7 @@ class EmbeddedLauncher:
     def _log(self, event: Mapping[str, Any]) -> None:
         """Keep a notice; a disk that is full costs the log, not the run."""
         try:
-            with (self._directory / "events.jsonl").open("a", encoding="utf-8") as log:
+            with RunDirectory(self._directory).events.open("a", encoding="utf-8") as log:
                 log.write(json.dumps(event, ensure_ascii=False) + "\n")
         except OSError as error:
             self._log_error = self._log_error or str(error)

@@ -17,7 +17,6 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from caviar_broker.run_record import NAME as RECORD
 from caviar_clients.cli.decided import Decided, Decisions, decided_lines
 from caviar_clients.cli.outages import Outages, OutageSummary, outage_lines
 from caviar_clients.cli.unserved import Unserved
@@ -25,6 +24,7 @@ from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import RecordedFrame, Recording, RecordingWarning
+from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.topics import Link
 
 SHOWN_DAMAGE = 20
@@ -95,8 +95,9 @@ def resume_hint(recording: Recording) -> str:
     """
     directory, metadata = recording.directory, recording.metadata
     planned = metadata.frames * _episodes_planned(metadata.scenario)
-    ended = (directory / "summary.json").is_file() or len(recording) >= planned
-    if not (directory / RECORD).is_file() or (recording.complete and ended):
+    files = RunDirectory(directory)
+    ended = files.summary.is_file() or len(recording) >= planned
+    if not files.record.is_file() or (recording.complete and ended):
         return ""
     return (
         f"unless the run still goes on, continue it with: caviar run --resume {shlex.quote(str(directory))}"

@@ -19,6 +19,7 @@ from caviar_clients.cli.children import Child, end, wait
 from caviar_clients.sessions.checking import module_folders
 from caviar_protocol.errors import RunError
 from caviar_protocol.files import file_system_of, open_to_append
+from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario, ServiceSpec
 from caviar_services.ray_tracing_threads import ENVIRONMENT, share_of_each
 
@@ -149,7 +150,7 @@ class Launcher:
     @property
     def _log(self) -> Path:
         """Where the broker prints."""
-        return self.directory / "logs" / "broker.log"
+        return RunDirectory(self.directory).log("broker")
 
     def _broker_arguments(self) -> list[str]:
         if self.resume:
@@ -190,7 +191,7 @@ class Launcher:
             self._start(name)
 
     def _start(self, name: str) -> None:
-        spec, path = self._local[name], self.directory / "logs" / f"{name}.log"
+        spec, path = self._local[name], RunDirectory(self.directory).log(name)
         command = [sys.executable, "-m", "caviar_services", name]
         command += ["--use", f"{spec.role}:{spec.use}", "--broker", self.endpoint]
         for folder in module_folders(self.scenario):

@@ -18,23 +18,21 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from caviar_broker.journal import FOLDER as CHECKPOINTS
 from caviar_broker.journal_format import JournalReader, run_of_journal
-from caviar_broker.run_record import NAME as RECORD
 from caviar_broker.run_record import RunRecord, read_record
 from caviar_clients.cli.inspect import resume_hint
 from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import Recording, RecordingWarning
-from caviar_protocol.recording.layout import ASSET_FOLDER, frame_name, segment_name
+from caviar_protocol.recording.layout import frame_name
 from caviar_protocol.recording.segment import Segment
+from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario
 from caviar_services.recorder.base import failure
 from caviar_services.recorder.continuing import stored_products
 from caviar_services.recorder.persistence import Persistence
 from caviar_services.recorder.segment_writer import SegmentWriter
 
-JOURNAL = "journal.msgpack"
 SHOWN = 10
 """Lines about a part that are printed; how many there are more is said."""
 
@@ -132,12 +130,12 @@ def _examine_recording(run: Path) -> tuple[Recording | None, Part]:
 
 def _examine_journal(run: Path) -> tuple[JournalReader | None, Part]:
     part = Part(name="journal", state="whole", lines=[])
-    if not (run / JOURNAL).exists():
+    if not RunDirectory(run).journal.exists():
         part.state, part.lines = "none", ["there is none: an embedded run has no journal"]
         return None, part
     try:
-        part.run = run_of_journal(run / JOURNAL)
-        reader = JournalReader(run / JOURNAL)
+        part.run = run_of_journal(RunDirectory(run).journal)
+        reader = JournalReader(RunDirectory(run).journal)
         entries = sum(1 for _ in reader)
     except RecordingError as error:
         part.state, part.lines = "lost", [str(error)]
@@ -152,8 +150,8 @@ def _examine_journal(run: Path) -> tuple[JournalReader | None, Part]:
 def _examine_record(
     run: Path, recording: Recording | None, journal: JournalReader | None
 ) -> tuple[RunRecord | None, Part]:
-    part = Part(name=RECORD, state="whole", lines=[])
-    if journal is None and not (run / RECORD).exists() and not (run / JOURNAL).exists():
+    part = Part(name=RunDirectory(run).record.name, state="whole", lines=[])
+    if journal is None and not RunDirectory(run).record.exists() and not RunDirectory(run).journal.exists():
         part.state, part.lines = "none", ["there is none: an embedded run has no record"]
         return None, part
     try:
@@ -209,10 +207,10 @@ def _save(
         record.save(target)
     if journal is not None:
         with journal.path.open("rb") as source:
-            (target / JOURNAL).write_bytes(source.read(journal.end))
-    for folder in (ASSET_FOLDER, CHECKPOINTS):
-        if (run / folder).is_dir():
-            shutil.copytree(run / folder, target / folder)
+            RunDirectory(target).journal.write_bytes(source.read(journal.end))
+    for folder in (RunDirectory(run).assets, RunDirectory(run).checkpoints):
+        if folder.is_dir():
+            shutil.copytree(folder, target / folder.name)
 
 
 def _save_recording(recording: Recording, target: Path) -> None:
@@ -227,7 +225,8 @@ def _save_recording(recording: Recording, target: Path) -> None:
         if segment is not source:
             if writer is not None:
                 kept.finished(writer)
-            writer, source = SegmentWriter(target / segment_name(number), segment.metadata, "none"), segment
+            file, source = RunDirectory(target).segment(number), segment
+            writer = SegmentWriter(file, segment.metadata, "none")
             number += 1
         if writer is not None:
             entry = segment.entries[place]

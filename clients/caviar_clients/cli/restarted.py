@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from caviar_broker.run_record import NAME as RECORD
 from caviar_protocol.errors import RunError
 from caviar_protocol.files import replace_file
+from caviar_protocol.run_directory import RunDirectory
 
 
 class RunInProgress:
@@ -26,7 +26,7 @@ class RunInProgress:
             left = self._root / self._file.read_text().strip()
         except OSError:
             return None
-        return left if (left / RECORD).is_file() else None
+        return left if RunDirectory(left).record.is_file() else None
 
     def serve(self, directory: Path, serve: Callable[[], int]) -> int:
         """Serve a run to its end, whatever that is; the exit status of ``serve``."""

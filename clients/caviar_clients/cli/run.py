@@ -34,6 +34,7 @@ from caviar_clients.files import printable, reason, write_file
 from caviar_clients.sessions.checking import checked_scenario
 from caviar_clients.sessions.plausibility import implausible_values
 from caviar_protocol.errors import RunError, SetupError
+from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario, find_scenario
 from caviar_protocol.scenario.rules import refuse_remote
 
@@ -172,7 +173,7 @@ def _write_summary(summary: Mapping[str, Any], directory: Path, json_file: Path 
     text = json.dumps(summary, indent=2, ensure_ascii=False) + "\n"
     if json_file is not None:
         write_file(json_file, text)
-    write_file(directory / "summary.json", text)
+    write_file(RunDirectory(directory).summary, text)
     if summary["frames"]:
         table = StringIO()
         _show(Console(file=table, width=100), summary)

@@ -8,8 +8,9 @@ from typing import Any
 
 from rich.console import Console
 
-from caviar_broker.control.socket import NOTE, ask
+from caviar_broker.control.socket import ask
 from caviar_protocol.errors import RunError
+from caviar_protocol.run_directory import RunDirectory
 
 RUNS = Path("runs")
 
@@ -26,7 +27,7 @@ def why_command(run: Path | None, console: Console) -> None:
 
 def newest_run(root: Path) -> Path:
     """The directory of the run below ``root`` whose broker was started last and is still noted there."""
-    notes = [note for note in root.glob(f"*/{NOTE}") if note.is_file()]
+    notes = [note for run in root.glob("*") if (note := RunDirectory(run).control_note).is_file()]
     if not notes:
         raise RunError(f"no broker runs below {root.resolve()}; name the directory of a run: caviar why RUN")
     return max(notes, key=lambda note: note.stat().st_mtime_ns).parent

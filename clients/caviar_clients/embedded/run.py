@@ -27,6 +27,7 @@ from caviar_protocol import messages as m
 from caviar_protocol.assets import AssetStore
 from caviar_protocol.errors import RunError
 from caviar_protocol.recording.reader import Imposed
+from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.validation import ContentCheck
 from caviar_services.registry import load
@@ -81,7 +82,7 @@ class EmbeddedRun:
         self._now = 0
         self._clock = FrameClock(plan, self._now)
         self._journal = (
-            JournalFile(folder / "journal.msgpack", plan.epoch, run=plan.run) if directory else None
+            JournalFile(RunDirectory(folder).journal, plan.epoch, run=plan.run) if directory else None
         )
         self._on_notice, self._on_frame = on_notice, on_frame
         self.outcome: ev.Finished | None = None

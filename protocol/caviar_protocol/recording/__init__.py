@@ -11,5 +11,5 @@
 `Recording.frames` the products frame by frame; docs/reading-recordings.md has more.
 """
 
-from caviar_protocol.recording.integrity import newest_run
 from caviar_protocol.recording.reader import RecordedFrame, RecordedProduct, Recording, RecordingWarning
+from caviar_protocol.run_directory import newest_run

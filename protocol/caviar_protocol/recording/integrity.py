@@ -16,19 +16,16 @@ from caviar_protocol.errors import RecordingError
 from caviar_protocol.files import open_regular
 from caviar_protocol.messages import Status
 from caviar_protocol.recording.layout import (
-    ASSET_FOLDER,
     FORMAT,
-    MANIFEST_NAME,
-    SEGMENT_PATTERN,
     FrameEntry,
     Manifest,
     RecordingMetadata,
     SegmentRecord,
     frame_name,
     read_manifest,
-    segment_name,
 )
 from caviar_protocol.recording.segment import Channel, Chunk, Segment
+from caviar_protocol.run_directory import SEGMENT_PATTERN, RunDirectory
 
 _READINGS = 8
 """A recorder replaces the manifest a few times while it goes on with a recording, then once a segment."""
@@ -194,7 +191,7 @@ class RecordedSegments:
         if own != run:
             return f"{segment.path} is of run {run!r}, and what is before it of run {own!r}"
         if listed not in ("", own):
-            other = f"{segment.path.parent / MANIFEST_NAME} is of run {listed!r}"
+            other = f"{RunDirectory(segment.path.parent).manifest} is of run {listed!r}"
             self.damage.append(f"{other}, and {segment.path.name} of run {own!r}: it is left aside")
             self.manifest, self._listed = None, {}
         return ""
@@ -265,7 +262,7 @@ def _files(folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise RecordingError(f"{folder} does not exist: give a run directory or a {SEGMENT_PATTERN} file")
     try:
-        files = sorted(folder.glob(SEGMENT_PATTERN), key=lambda file: (len(file.name), file.name))
+        files = RunDirectory(folder).segments()
     except OSError as error:
         raise RecordingError(
             f"cannot read the folder {folder}: {error.strerror}; check its file system (fsck)"
@@ -278,34 +275,13 @@ def _files(folder: Path) -> list[Path]:
 def _expected(folder: Path, files: list[Path], known: dict[str, SegmentRecord]) -> list[Path]:
     """The segments by number, up to the last one that is there or that the manifest lists."""
     names = {file.name for file in files} | set(known)
-    numbered = [number for number in range(2 * len(names) + 1) if segment_name(number) in names]
-    return [folder / segment_name(number) for number in range(max(numbered, default=-1) + 1)]
+    numbered = [RunDirectory(folder).segment(number) for number in range(2 * len(names) + 1)]
+    last = max((number for number, file in enumerate(numbered) if file.name in names), default=-1)
+    return numbered[: last + 1]
 
 
 def _first_there(files: list[Path]) -> str:
     return next((file.name for file in files if file.exists()), "another one")
-
-
-def newest_run(root: str | Path = "runs", name: str = "*") -> Path:
-    """The run directory below ``root`` whose recording was written last.
-
-    Parameters
-    ----------
-    root
-        Directory in which `caviar run` makes the directories of runs (its ``--out``).
-    name
-        Glob pattern of the run directory's name, such as ``"smoke-*"``.
-
-    A directory without a recording, as a run leaves that failed while starting, is passed over.
-    Raises `RecordingError` where there is no other.
-    """
-    written = {
-        file.parent: file.stat().st_mtime_ns for file in sorted(Path(root).glob(f"{name}/{SEGMENT_PATTERN}"))
-    }
-    if not written:
-        where = Path(root).resolve() / name
-        raise RecordingError(f"no run with a recording is at {where}; make one with: caviar run SCENARIO")
-    return max(written, key=lambda directory: (written[directory], directory.name))
 
 
 class RunDigestReport(msgspec.Struct, frozen=True, kw_only=True):
@@ -358,7 +334,7 @@ def damaged_assets(recorded: RecordedSegments) -> list[str]:
         return []
     found = []
     for asset in metadata_of(recorded.segments[0]).assets:
-        file = recorded.path / ASSET_FOLDER / asset.name
+        file = RunDirectory(recorded.path).assets / asset.name
         try:
             with open_regular(file) as stream:
                 digest = hashlib.file_digest(stream, "sha256").hexdigest()

@@ -20,20 +20,10 @@ from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.files import read_regular, replace_file
 from caviar_protocol.messages import Asset, GrantInput, Report
+from caviar_protocol.run_directory import RunDirectory
 
 FORMAT = 1
 """Version of the layout of a recording; a reader refuses any other."""
-
-ASSET_FOLDER = "assets"
-"""Folder of the run directory that holds the scenery, files at their asset names."""
-
-SEGMENT_PATTERN = "recording-*.mcap"
-
-
-def segment_name(index: int) -> str:
-    """File name of a segment."""
-    return f"recording-{index:04d}.mcap"
-
 
 PROFILE = "caviar"
 """MCAP profile of a segment."""
@@ -88,9 +78,6 @@ class FrameEntry(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     was dropped, and wall times, which no digest covers."""
 
 
-MANIFEST_NAME = "recording.json"
-
-
 class SegmentRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One segment in the manifest."""
 
@@ -129,7 +116,7 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     def save(self, folder: Path, *, sync: bool) -> None:
         """Write it to a run directory, in one step. Raises `OSError` where that fails."""
         content = msgspec.json.encode(self)
-        replace_file(folder / MANIFEST_NAME, _sealed(content), durable=sync)
+        replace_file(RunDirectory(folder).manifest, _sealed(content), durable=sync)
 
 
 class _Envelope(msgspec.Struct):
@@ -143,7 +130,7 @@ def read_manifest(folder: Path) -> Manifest | None:
 
     Raises `RecordingError` naming the file where a byte of it differs from what was written.
     """
-    path = folder / MANIFEST_NAME
+    path = RunDirectory(folder).manifest
     try:
         data = read_regular(path)
     except FileNotFoundError:

@@ -40,11 +40,11 @@ from caviar_protocol.recording.integrity import (
     metadata_of,
     recorded_digest,
 )
-from caviar_protocol.recording.integrity import newest_run as newest_run
-from caviar_protocol.recording.layout import ASSET_FOLDER, FrameEntry, RecordingMetadata
+from caviar_protocol.recording.layout import FrameEntry, RecordingMetadata
 from caviar_protocol.recording.segment import Channel, Chunk, Segment
 from caviar_protocol.recording.sensors import CameraArrays, DepthArrays, LidarArrays, SegmentationArrays
 from caviar_protocol.recording.topics import ActionArrays, ChannelArrays, LinkArrays, SceneArrays
+from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.space.scene import merge_scenes
 from caviar_protocol.topics import PAYLOADS, Scene
 
@@ -234,7 +234,7 @@ class Recording:
     @property
     def assets(self) -> dict[str, Path]:
         """Files of scenery that were recorded, by asset name."""
-        folder = self.directory / ASSET_FOLDER
+        folder = RunDirectory(self.directory).assets
         found = {asset.name: folder / asset.name for asset in self.metadata.assets}
         return {name: file for name, file in found.items() if file.is_file()}
 

@@ -1,109 +1,201 @@
-"""PLY meshes as arrays, without a renderer."""
+"""PLY meshes as arrays, in the precision of the file; a renderer keeps single precision only.
+
+Text and binary files of either byte order are read, with any elements beside vertices and faces.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_protocol.errors import AssetError
 
-_PLY_TYPES = {
+_TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
     "ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
     "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
 }  # fmt: skip
+_BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
 def read_ply(file: Path) -> tuple[Float64Array, Int64Array]:
-    """Vertices [m], Shape ``[V, 3]``, and triangles, Shape ``[F, 3]``, of a PLY mesh, text or binary.
+    """Read the vertices and triangles of a PLY mesh.
 
-    Polygons are cut into triangles. Raises `AssetError` naming the file where it is not a mesh.
+    Args:
+        file: A PLY file with elements ``vertex`` and ``face``; polygons are cut into triangles.
+
+    Returns:
+        Vertices [m], Shape ``[V, 3]``, and indices of the corners of each triangle, Shape ``[F, 3]``.
+
+    Raises:
+        AssetError: The file cannot be read, is no mesh, breaks off, has a vertex that is not finite, or a
+            face that refers to a vertex that is not there.
     """
+    elements = _read(file, "face")
+    return elements["vertex"], elements["face"]
+
+
+def read_ply_vertices(file: Path) -> Float64Array:
+    """Read the vertices of a PLY file; what follows them is not parsed.
+
+    Args:
+        file: A PLY file with an element ``vertex``. Numbers of a text file are read as they are written, also
+            where its header calls them ``float``.
+
+    Returns:
+        Vertices [m] in the file's order, Shape ``[V, 3]``.
+
+    Raises:
+        AssetError: The file cannot be read, is no mesh, breaks off, or has a vertex that is not finite.
+    """
+    vertices: Float64Array = _read(file, "vertex")["vertex"]
+    return vertices
+
+
+def _read(file: Path, last: str) -> dict[str, NDArray[Any]]:
+    """Elements of a file up to ``last``, by name: vertices as coordinates, elements of lists as triangles."""
     try:
-        data = file.read_bytes()
-        head, mark, rest = data.partition(b"end_header")
-        if not head.startswith(b"ply") or not mark:
-            raise AssetError(f"{file} is not a PLY mesh; its first bytes are {data[:8]!r}")
-        return _checked(*_parse(_header(head.decode("ascii")), rest[rest.index(b"\n") + 1 :]))
+        found = _parse(file.read_bytes(), last)
     except OSError as error:
         raise AssetError(f"{file} cannot be read: {error.strerror}") from error
-    except (ValueError, KeyError, IndexError, StopIteration) as error:
-        raise AssetError(f"{file} is a PLY mesh that cannot be read: {error!r}") from error
+    except (ValueError, KeyError, IndexError) as error:
+        raise AssetError(f"{file}: not a PLY file that can be read ({error!r}); export it again") from error
+    vertices = found["vertex"]
+    bad = np.flatnonzero(~np.isfinite(vertices).all(1))
+    if len(bad):
+        where = vertices[bad[0]].tolist()
+        raise AssetError(f"{file}: vertex {bad[0]} is at {where}; give every vertex finite coordinates")
+    return found
 
 
-@dataclass(frozen=True)
-class _Header:
-    order: str
-    """``<`` or ``>`` of a binary file, empty for text."""
-    counts: dict[str, int]
-    properties: dict[str, list[tuple[str, ...]]]
+@dataclass
+class _Element:
+    """An element of the header: so many rows, each of numbers or of lists."""
+
+    name: str
+    count: int
+    numbers: list[tuple[str, str]] = field(default_factory=list)
+    """(name, type) of each property that is one number."""
+    lists: list[tuple[str, str]] = field(default_factory=list)
+    """(type of the length, type of the items) of each property that is a list."""
+
+    @property
+    def axes(self) -> list[str]:
+        return list("xyz") if self.name == "vertex" else []
 
 
-def _header(text: str) -> _Header:
-    order, counts = "", {}
-    properties: dict[str, list[tuple[str, ...]]] = {}
-    for words in (line.split() for line in text.splitlines()):
+def _parse(data: bytes, last: str) -> dict[str, NDArray[Any]]:
+    order, elements, begin = _header(data)
+    body = _Binary(data, begin, order) if order else _Text(data[begin:])
+    found: dict[str, NDArray[Any]] = {}
+    for element in elements:
+        if element.numbers and element.lists:
+            raise ValueError(f"element {element.name} mixes lists and numbers")
+        found[element.name] = body.triangles(element) if element.lists else body.columns(element)
+        if element.name == last:
+            break
+    if missing := {"vertex", last} - set(found):
+        raise ValueError(f"no element {missing.pop()} up to {last}")
+    faces, count = found.get("face", np.empty(0)), len(found["vertex"])
+    if len(faces) and not 0 <= faces.min() <= faces.max() < count:
+        raise ValueError(f"faces refer to vertices {faces.min()} to {faces.max()} of {count}")
+    return found
+
+
+def _header(data: bytes) -> tuple[str, list[_Element], int]:
+    """Byte order, elements, and where the data begin."""
+    end = data.index(b"end_header")
+    order, elements = None, list[_Element]()
+    for words in (line.split() for line in data[:end].decode("latin-1").splitlines()):
         match words:
-            case ["format", "binary_little_endian", _]:
-                order = "<"
-            case ["format", "binary_big_endian", _]:
-                order = ">"
+            case ["format", name, _]:
+                order = _BYTE_ORDERS[name]
             case ["element", name, count]:
-                counts[name], properties[name] = int(count), []
-            case ["property", *rest]:
-                properties[next(reversed(properties))].append(tuple(rest))
-    if list(counts)[:2] != ["vertex", "face"]:
-        raise ValueError(f"elements {list(counts)}, expected vertex, then face")
-    return _Header(order, counts, properties)
+                elements.append(_Element(name, int(count)))
+            case ["property", "list", length, item, _]:
+                elements[-1].lists.append((_TYPES[length], _TYPES[item]))
+            case ["property", kind, name]:
+                elements[-1].numbers.append((name, _TYPES[kind]))
+    if order is None:
+        raise ValueError(f"no format; the file begins with {data[:8]!r}")
+    return order, elements, data.index(b"\n", end) + 1
 
 
-def _parse(header: _Header, data: bytes) -> tuple[Float64Array, Int64Array]:
-    fields = [words[-1] for words in header.properties["vertex"]]
-    columns = [fields.index(axis) for axis in "xyz"]
-    count, faces = header.counts["vertex"], header.counts["face"]
-    if not header.order:
-        words = data.split()
-        numbers = np.array(words[: count * len(fields)], dtype=np.float64).reshape(count, len(fields))
-        return numbers[:, columns], _fan(iter(map(int, words[count * len(fields) :])), faces)
-    record = np.dtype([(w[-1], header.order + _PLY_TYPES[w[0]]) for w in header.properties["vertex"]])
-    table = np.frombuffer(data, record, count)
-    vertices = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=-1)
-    return vertices, _binary_faces(header, data[count * record.itemsize :], faces)
+class _Text:
+    """The data of a text file, of which elements are taken one after the other."""
+
+    def __init__(self, data: bytes) -> None:
+        self._words = data.split()
+        self._at = 0
+
+    def columns(self, element: _Element) -> Float64Array:
+        width = len(element.numbers)
+        rows = self._take(element.count * width)
+        names = [name for name, _ in element.numbers]
+        table = np.array(rows, dtype=np.float64).reshape(element.count, width)
+        return table[:, [names.index(axis) for axis in element.axes]]
+
+    def triangles(self, element: _Element) -> Int64Array:
+        polygons = []
+        for _ in range(element.count):
+            row = [self._take(int(self._take(1)[0])) for _ in element.lists]
+            polygons.append([int(word) for word in row[0]])
+        return _fans(polygons)
+
+    def _take(self, count: int) -> list[bytes]:
+        words = self._words[self._at : self._at + count]
+        if len(words) < count:
+            raise ValueError("it breaks off")
+        self._at += count
+        return words
 
 
-def _checked(vertices: Float64Array, faces: Int64Array) -> tuple[Float64Array, Int64Array]:
-    if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
-        raise ValueError(f"faces refer to vertices {faces.min()} to {faces.max()} of {len(vertices)}")
-    return vertices, faces
+class _Binary:
+    """The data of a binary file, of which elements are taken one after the other."""
+
+    def __init__(self, data: bytes, begin: int, order: str) -> None:
+        self._data, self._at, self._order = data, begin, order
+
+    def columns(self, element: _Element) -> Float64Array:
+        row = np.dtype([(name, self._order + kind) for name, kind in element.numbers])
+        table = self._take(row, element.count)
+        if not element.axes:
+            return np.empty((element.count, 0))
+        return np.stack([table[axis].astype(np.float64) for axis in element.axes], axis=-1)
+
+    def triangles(self, element: _Element) -> Int64Array:
+        kinds = [tuple(np.dtype(self._order + kind) for kind in kinds) for kinds in element.lists]
+        length, item = kinds[0]
+        triangle: Any = np.dtype([("length", length), ("corners", item, 3)])
+        # Most meshes have triangles only: one look at all of them instead of a step for each.
+        if len(kinds) == 1 and len(self._data) >= self._at + element.count * triangle.itemsize:
+            table = np.frombuffer(self._data, triangle, element.count, self._at)
+            if (table["length"] == 3).all():
+                self._at += table.nbytes
+                corners: Int64Array = table["corners"].astype(np.int64)
+                return corners
+        polygons = []
+        for _ in range(element.count):
+            row = [self._take(item, int(self._take(length, 1)[0])).tolist() for length, item in kinds]
+            polygons.append(row[0])
+        return _fans(polygons)
+
+    def _take(self, kind: np.dtype[Any], count: int) -> NDArray[Any]:
+        values = (
+            np.frombuffer(self._data, kind, count, self._at)
+            if count * kind.itemsize
+            else np.empty(count, kind)
+        )
+        self._at += values.nbytes
+        return values
 
 
-def _binary_faces(header: _Header, data: bytes, count: int) -> Int64Array:
-    (words,) = header.properties["face"]  # one list, as every exporter writes it
-    sizes, indices = (np.dtype(header.order + _PLY_TYPES[word]) for word in words[1:3])
-    triangle: Any = np.dtype([("size", sizes), ("index", indices, 3)])
-    if len(data) >= count * triangle.itemsize:
-        table = np.frombuffer(data, triangle, count)
-        if (table["size"] == 3).all():
-            found: Int64Array = table["index"].astype(np.int64)
-            return found
-    numbers: list[int] = []
-    position = 0
-    for _ in range(count):
-        size = int(np.frombuffer(data, sizes, 1, position)[0])
-        position += sizes.itemsize
-        numbers += [size, *np.frombuffer(data, indices, size, position).tolist()]
-        position += size * indices.itemsize
-    return _fan(iter(numbers), count)
-
-
-def _fan(numbers: Any, count: int) -> Int64Array:
-    """Triangles of polygons that are given as size, index, index, …"""
-    triangles = []
-    for _ in range(count):
-        polygon = [next(numbers) for _ in range(next(numbers))]
-        triangles += [(polygon[0], *polygon[i : i + 2]) for i in range(1, len(polygon) - 1)]
-    return np.array(triangles, dtype=np.int64).reshape(-1, 3)
+def _fans(polygons: list[list[int]]) -> Int64Array:
+    """Triangles around the first corner of each polygon."""
+    corners = [(p[0], *p[i : i + 2]) for p in polygons for i in range(1, len(p) - 1)]
+    return np.array(corners, dtype=np.int64).reshape(-1, 3)

@@ -14,8 +14,9 @@ from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.files import sync_file
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.recording.integrity import RecordedSegments, follows
-from caviar_protocol.recording.layout import SEGMENT_PATTERN, Manifest, SegmentRecord, frame_name
+from caviar_protocol.recording.layout import Manifest, SegmentRecord, frame_name
 from caviar_protocol.recording.segment import Channel, Segment
+from caviar_protocol.run_directory import RunDirectory
 from caviar_services.recorder.segment_writer import SegmentWriter
 from caviar_services.service import FrameInput
 
@@ -96,7 +97,7 @@ class Continuation:
 
         Raises `RunError` where frames before ``until`` are missing; then nothing is changed.
         """
-        files, damage = list(self.folder.glob(SEGMENT_PATTERN)), list[str]()
+        files, damage = RunDirectory(self.folder).segments(), list[str]()
         try:
             found = RecordedSegments(self.folder, trusted_before=until or _END) if files else None
         except RecordingError as error:

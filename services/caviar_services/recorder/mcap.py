@@ -40,14 +40,12 @@ from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.files import Durability, sync_file
 from caviar_protocol.messages import GrantInput
 from caviar_protocol.recording.layout import (
-    ASSET_FOLDER,
-    SEGMENT_PATTERN,
     FrameEntry,
     RecordingMetadata,
     SegmentRecord,
-    segment_name,
 )
 from caviar_protocol.recording.segment import Segment
+from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.validation import check_digest
 from caviar_services.recorder.base import Recorder, copy_assets, failure, machine, versions
 from caviar_services.recorder.continuing import Continuation, RunTime, Stored
@@ -95,7 +93,7 @@ class McapRecorder(Recorder[McapSettings]):
     def prepare(self, preparation: Preparation) -> Prepared:
         """Open the first segment. `RunError` where the directory is not writable or holds a run."""
         folder = self.run.directory
-        existing = sorted(folder.glob(SEGMENT_PATTERN))
+        existing = RunDirectory(folder).segments()
         self._goes_on = self.run.again
         if existing and not self.run.again:
             raise RunError(
@@ -105,7 +103,7 @@ class McapRecorder(Recorder[McapSettings]):
         assets = preparation.assets if self.settings.copy_assets else {}
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            copied = copy_assets(assets, folder / ASSET_FOLDER, sync=self._durability != "none")
+            copied = copy_assets(assets, RunDirectory(folder).assets, sync=self._durability != "none")
         except OSError as error:
             raise failure(Path(error.filename or folder), error) from error
         self._metadata = RecordingMetadata(
@@ -210,7 +208,7 @@ class McapRecorder(Recorder[McapSettings]):
         self._persistence = self._persisted(before.records)
 
     def _open_segment(self) -> SegmentWriter:
-        path = self.run.directory / segment_name(self._segments)
+        path = RunDirectory(self.run.directory).segment(self._segments)
         metadata = msgspec.structs.replace(self._metadata, segment=self._segments)
         try:
             self._segment = SegmentWriter(path, _as_text(metadata), self.settings.compression)

@@ -11,9 +11,9 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import AssetError
+from caviar_protocol.space.ply import read_ply_vertices
 from caviar_services.columns import aligned_columns
 from caviar_services.meshes import Mesh, unit_box
-from caviar_services.ply import ply_vertices
 from caviar_services.scenery import SceneryShape, asset_name, read_scenery
 
 _SAME_VERTEX = 1e-5
@@ -39,7 +39,7 @@ def file_vertices(description: Path) -> dict[str, Float64Array]:
     for shape in read_scenery(description, asset_name(description)).shapes:
         _check_material(shape)
         turned, moved = shape.to_world[:3, :3], shape.to_world[:3, 3]
-        vertices[shape.name] = ply_vertices(shape.file) @ turned.T + moved
+        vertices[shape.name] = read_ply_vertices(shape.file) @ turned.T + moved
     return vertices
 
 
@@ -84,7 +84,7 @@ def unit_mesh(asset: str, assets: Mapping[str, Path]) -> Mesh:
         loaded = _mesh_of(mi.load_dict({"type": "ply", "filename": str(path), "face_normals": True}))
     except RuntimeError as error:
         raise AssetError(f"mesh {asset!r} ({path}) cannot be read: {error}") from error
-    return _as_in_file(loaded, ply_vertices(path))
+    return _as_in_file(loaded, read_ply_vertices(path))
 
 
 def _mesh_of(shape: Any) -> Mesh:
