@@ -491,10 +491,21 @@ def _difference(right: Device, device: Device) -> str:
     if abs(cosine) < 1 - SAME_ROTATION:
         return _not_as(device, "orientation", device.orientation, right.orientation)
     for field in right.__struct_fields__:
-        expected, got = getattr(right, field), getattr(device, field)
-        if field != "orientation" and not _close(expected, got):
-            return _not_as(device, field, got, expected)
+        if field != "orientation" and (
+            found := _first_difference(field, getattr(right, field), getattr(device, field))
+        ):
+            return _not_as(device, *found)
     return ""
+
+
+def _first_difference(key: str, expected: object, got: object) -> tuple[str, object, object] | None:
+    """Dotted key of the first value that differs, the value, and the scenario's; None: all are equal, but for
+    how a client rounds numbers."""
+    if isinstance(expected, msgspec.Struct) and type(got) is type(expected):
+        fields = expected.__struct_fields__
+        found = (_first_difference(f"{key}.{f}", getattr(expected, f), getattr(got, f)) for f in fields)
+        return next(filter(None, found), None)
+    return None if _close(expected, got) else (key, got, expected)
 
 
 def _close(expected: object, got: object) -> bool:
@@ -502,12 +513,16 @@ def _close(expected: object, got: object) -> bool:
     if isinstance(expected, float) and isinstance(got, float):
         return math.isclose(expected, got, **MOUNT_TOLERANCE)
     if isinstance(expected, tuple) and isinstance(got, tuple):
-        return all(_close(a, b) for a, b in zip(expected, got, strict=True))
+        return len(expected) == len(got) and all(map(_close, expected, got))
     if isinstance(expected, msgspec.Struct) and isinstance(got, msgspec.Struct):
         return _close(msgspec.structs.astuple(expected), msgspec.structs.astuple(got))
     return expected == got
 
 
 def _not_as(device: Device, field: str, got: object, expected: object) -> str:
-    shown = [_numbers(v) if isinstance(v, tuple) else repr(v) for v in (got, expected)]
-    return f"device {device.name!r}: {field} {shown[0]}, by the scenario it is {shown[1]}"
+    return f"device {device.name!r}: {field} {_shown(got)}, by the scenario it is {_shown(expected)}"
+
+
+def _shown(value: object) -> str:
+    is_numbers = isinstance(value, tuple) and value and all(isinstance(v, float | int) for v in value)
+    return _numbers(cast(tuple[float, ...], value)) if is_numbers else repr(value)

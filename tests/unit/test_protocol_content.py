@@ -30,7 +30,7 @@ from caviar_protocol.topics import (
     VelocityCommand,
     WaypointCommand,
 )
-from caviar_protocol.topics.scene import Device
+from caviar_protocol.topics.scene import Device, Panel
 from caviar_protocol.validation import (
     FIRST_LOOKS,
     ContentCheck,
@@ -198,6 +198,21 @@ def test_what_the_run_does_not_say_is_not_checked() -> None:
         field: getattr(scene(), field)[:0] for field in ("position", "orientation", "velocity", "dimensions")
     })  # fmt: skip
     ContentCheck()(entry(), nothing)
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_an_array_with_fewer_or_more_panels_than_the_scenario_says_is_refused(count: int) -> None:
+    array = AntennaArray(columns=4, panels=(Panel(), Panel(yaw_deg=180.0)))
+    specs = (SPECS[0], replace(SPECS[1], array=array), SPECS[2])
+    check = ContentCheck(replace(RULES, devices={"world": specs}))
+    wrong = replace(array, panels=(Panel(),) * count)
+    devices = (BS, EYE, replace(A, array=wrong), replace(B, array=array))
+    with pytest.raises(
+        ProductError, match=r"'car.04/rx': array.panels \(.*\), by the scenario it is \(Panel\("
+    ):
+        check(entry(), scene(devices=devices))
+    right = (BS, EYE, replace(A, array=array), replace(B, array=array))
+    check(entry(), scene(devices=right))
 
 
 def test_a_device_that_changes_under_equal_names_is_noticed() -> None:
