@@ -172,10 +172,10 @@ class _Reader:
 
     def _decision(self, service: str, told: GrantInput) -> Decision:
         if told.status is Status.ABSENT:
-            return Decision(told.status, None, told.cause)
+            return Decision(told)
         known = self._products.get((service, told.topic), {}).get(told.frame)
         product, number = known or (_product(service, told, None), 0)
-        return Decision(told.status, product, told.cause, number if told.status is Status.HELD else 0)
+        return Decision(told, product, number if told.status is Status.HELD else 0)
 
     def _finish(self) -> None:
         begin = self._begin

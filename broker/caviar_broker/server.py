@@ -103,7 +103,7 @@ class BrokerServer:
         durability: Durability = "none",
         sync_recording: Callable[[], None] = lambda: None,
     ) -> None:
-        self.clock = FrameClock(plan, time.monotonic_ns(), weigh=_weight, resumption=resumption)
+        self.clock = FrameClock(plan, time.monotonic_ns(), payload_size=_payload_size, resumption=resumption)
         self.statistics = Statistics({s.name: s.budget_ns for s in plan.services})
         self.outcome: ev.Finished | None = None
         self._plan, self._observer = plan, observer
@@ -309,7 +309,7 @@ class BrokerServer:
 
     def _done(self, service: str, message: m.Done, parts: Sequence[zmq.Frame]) -> None:
         payloads = tuple(zip(parts[::2], parts[1::2], strict=True))
-        self.clock.take(ev.DoneReceived(service, message, payloads), time.monotonic_ns())
+        self.clock.handle(ev.DoneReceived(service, message, payloads), time.monotonic_ns())
         self._taken = True
 
     def _reset_done(self, service: str, message: m.ResetDone, _: Sequence[zmq.Frame]) -> None:
@@ -369,10 +369,10 @@ class BrokerServer:
         self._standby.call(lambda: self._journal.write(entries, finished, snapshot))
         confirmed, error = self._journal.confirmed, self._journal.error
         if error is not None:
-            self.clock.take(ev.StopRequested(str(error)), time.monotonic_ns())
+            self.clock.handle(ev.StopRequested(str(error)), time.monotonic_ns())
         elif confirmed > self._confirmed:
             self._confirmed = confirmed
-            self.clock.take(ev.Journaled(confirmed), time.monotonic_ns())
+            self.clock.handle(ev.Journaled(confirmed), time.monotonic_ns())
 
     def _look_at_disk(self) -> None:
         """Tell of a disk that takes nothing, and that it does again."""
@@ -429,5 +429,5 @@ class BrokerServer:
         self._observer.notice(ev.Notice(kind, service, text, self.clock.episode))
 
 
-def _weight(payload: Sequence[zmq.Frame]) -> int:
+def _payload_size(payload: Sequence[zmq.Frame]) -> int:
     return sum(map(len, payload))

@@ -167,7 +167,7 @@ def test_a_disk_that_does_not_answer_is_told_of_and_holds_up_only_what_relies_on
         told = "the disk does not answer: write of"
         eventually(lambda: told in broker.witness.texts(), "the disk is told of")
         assert "mounted at" in broker.witness.texts()
-        assert broker.server.clock.look(time.monotonic_ns()).frame == 1  # it can be asked
+        assert broker.server.clock.status(time.monotonic_ns()).frame == 1  # it can be asked
         if thaws:
             made[0].thawed.set()
             play_to_the_end([world, sensors], 1)

@@ -60,7 +60,7 @@ def test_a_service_with_grants_queued_answers_them_all_before_it_saves() -> None
 
 def test_much_to_remember_is_reason_to_save_early() -> None:
     run = simulation(frames=4, checkpoint_frames=100)
-    run.clock._episodes.recall._weigh = lambda payload: MAX_HISTORY_BYTES  # type: ignore[attr-defined]
+    run.clock._episodes.checkpoints._payload_size = lambda payload: MAX_HISTORY_BYTES  # type: ignore[attr-defined]
     run.run()
     assert [c.frame for c in run.seen(m.Checkpoint, "channel")] == [1]
 

@@ -1,7 +1,8 @@
-"""Nobody who could go on is overlooked: in random runs everybody is looked at again after every step.
+"""No service that could go on is overlooked: in random runs every one is looked at again after every step.
 
-`Turns` looks only at services for which something may have changed. Whatever a look at all of them, without
-anything remembered, would grant or skip in addition is a service that would have waited for ever.
+`Dispatcher.advance` looks only at services for which something may have changed. Whatever a look at all of
+them, without anything remembered, would grant or skip in addition is a service that would have waited for
+ever.
 """
 
 from __future__ import annotations
@@ -16,42 +17,36 @@ from caviar_broker.core.dispatch import Dispatcher
 advance = Dispatcher.advance
 
 
-def done_so_far(schedule: Dispatcher) -> tuple[Any, ...]:
-    """What a look at somebody could change."""
-    eligible = {
-        (task.service, task.frame): task.eligible_at for task in schedule._book.tasks() if task.eligible_at
-    }
-    told, entries = len(schedule._actions), schedule._ledger.last
-    return told, entries, len(schedule.grants), dict(schedule._book.next), eligible
+def done_so_far(dispatcher: Dispatcher) -> tuple[Any, ...]:
+    """What a look at a service could change."""
+    table = dispatcher.table
+    eligible = {(task.service, task.frame): task.eligible_at for task in table.tasks() if task.eligible_at}
+    notices, entries = len(dispatcher._actions), dispatcher._ledger.last
+    reached = [participant.next_frame for participant in table.participants.values()]
+    return notices, entries, len(dispatcher.grants), reached, eligible
 
 
-def advance_twice(schedule: Dispatcher, now: int) -> None:
-    """Advance, look at everybody, and put back who waits for what."""
-    advance(schedule, now)
-    turns, before = schedule._turns, done_so_far(schedule)
-    remembered = (
-        turns.concerned,
-        turns.waiting_for_journal,
-        turns.waiting_for_pace,
-        turns._waiting_for_frames,
-        *turns._awaiting.values(),
-    )
-    kept = [set(names) for names in remembered]
-    gathered = {task: task.inputs for task in schedule._book.tasks()}
+def advance_twice(dispatcher: Dispatcher, now: int) -> None:
+    """Advance, look at every service, and put back what each waits for."""
+    advance(dispatcher, now)
+    before = done_so_far(dispatcher)
+    remembered = [dispatcher.ready, *dispatcher.waiting()]
+    kept = [set(waiting) for waiting in remembered]
+    gathered = {task: task.inputs for task in dispatcher.table.tasks()}
     for task in gathered:
         task.inputs = None
     # A frame whose time has come meanwhile is begun by the timer, not by a look.
     for_the_timer = kept[2].difference(*kept[:2], *kept[3:])
-    turns.wake_all()
-    turns.concerned -= for_the_timer
-    advance(schedule, now)
-    assert done_so_far(schedule) == before
+    dispatcher.wake_all()
+    dispatcher.ready -= for_the_timer
+    advance(dispatcher, now)
+    assert done_so_far(dispatcher) == before
     for task, inputs in gathered.items():
         assert inputs is None or task.inputs == inputs, f"{task} would be granted what is not so any more"
         task.inputs = inputs
-    for names, known in zip(remembered, kept, strict=True):
-        names.clear()
-        names |= known
+    for waiting, known in zip(remembered, kept, strict=True):
+        waiting.clear()
+        waiting |= known
 
 
 def test_a_look_at_everybody_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -41,7 +41,7 @@ def test_a_paused_run_finishes_what_has_begun_and_then_rests_without_stalling() 
 
 
 def look_at(run: Simulation) -> tuple[int, int, bool]:
-    view = run.clock.look(run.now)
+    view = run.clock.status(run.now)
     assert view.waits == ()
     return view.frame, len(finished_frames(run)), view.paused
 
@@ -93,7 +93,7 @@ def test_the_view_tells_who_is_late_in_which_frame_and_who_lacks_what() -> None:
     slow = {"latency": lambda episode, frame: 500 * MS if frame == 2 else MS}
     run = Simulation(loop(channel=slow), frames=4)
     views = []
-    run.after(250 * MS, lambda: views.append(run.clock.look(run.now)))
+    run.after(250 * MS, lambda: views.append(run.clock.status(run.now)))
     run.join().run()
     wait = views[0].waits[0]
     assert (wait.service, wait.role, wait.frame, wait.late) == ("channel", "channel", 2, True)
@@ -108,7 +108,7 @@ def test_the_view_tells_who_is_late_in_which_frame_and_who_lacks_what() -> None:
 def test_the_view_tells_who_has_not_come_yet() -> None:
     run = Simulation([world(ready_after=None), recorder()], record=("scene",), limits=Limits(ready=SECOND))
     views = []
-    run.after(500 * MS, lambda: views.append(run.clock.look(run.now)))
+    run.after(500 * MS, lambda: views.append(run.clock.status(run.now)))
     run.join().run()
     assert [(wait.service, wait.late) for wait in views[0].waits] == [("world", False)]
     assert "is preparing" in views[0].waits[0].text

@@ -166,7 +166,7 @@ class ControlServer:
     # --- questions ------------------------------------------------------------------------------------
 
     def _status(self, _: Mapping[str, Any]) -> Answer:
-        view = msgspec.to_builtins(self.server.clock.look(time.monotonic_ns()))
+        view = msgspec.to_builtins(self.server.clock.status(time.monotonic_ns()))
         statistics = self.server.statistics
         figures = self._figures()
         for service in view["services"]:
@@ -177,7 +177,7 @@ class ControlServer:
         return {"ok": True, "status": {**view, **counts, **rate, **where, "last_blame": self._last_blame}}
 
     def _why(self, _: Mapping[str, Any]) -> Answer:
-        view = self.server.clock.look(time.monotonic_ns())
+        view = self.server.clock.status(time.monotonic_ns())
         found = {
             "run": view.run,
             "state": view.state,
@@ -212,7 +212,7 @@ class ControlServer:
         frames = request.get("frames", 1)
         if type(frames) is not int or not 1 <= frames <= MAX_STEPS:
             return _refusal(f"frames is {frames!r:.80}, it is a whole number from 1 to {MAX_STEPS}")
-        if not self.server.clock.look(time.monotonic_ns()).paused:
+        if not self.server.clock.status(time.monotonic_ns()).paused:
             return _refusal("the run is not paused; pause it first")
         return self._ordered(ev.StepRequested(frames), f"{frames} more frames begin")
 
@@ -228,7 +228,7 @@ class ControlServer:
         if text:
             self.server.note("", text)
         self.server.feed(event)
-        view = self.server.clock.look(time.monotonic_ns())
+        view = self.server.clock.status(time.monotonic_ns())
         return {"ok": True, "state": view.state, "paused": view.paused, "frame": view.frame}
 
     def _gateway(self, _: Mapping[str, Any]) -> Answer:

@@ -1,4 +1,8 @@
-"""CHECKPOINT and RESTORE: services with state get back to where they were (contract, clause 18)."""
+"""Checkpoints: CHECKPOINT and RESTORE bring a service with state back to where it was (contract, clause 18).
+
+A service that loses its state gets its last checkpoint and, one after the other, the grants that it answered
+since. `CheckpointHistory` is what is kept for that; `Checkpoints` asks for states and restores services.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from caviar_broker.core import events as ev
-from caviar_broker.core.decisions import DecisionTable, GrantOrder, Inputs, Ledger, Task
+from caviar_broker.core.decisions import DecisionTable, GrantOrder, Ledger
 from caviar_broker.core.graph import Graph
 from caviar_broker.core.plan import RunPlan
 from caviar_broker.core.run import Peer, Resumption, Run
@@ -15,6 +19,7 @@ from caviar_broker.core.transitions import ServiceEvent, ServiceState
 from caviar_protocol.digest import RunDigest
 from caviar_protocol.messages import Checkpoint, Done, Fault, Restore
 
+CAPABILITY = "checkpoint"
 MAX_HISTORY_BYTES = 64 * 2**20
 """[B] of products kept for a service, behind which its state is saved before its turn."""
 
@@ -35,17 +40,14 @@ class AnsweredGrant:
 
 @dataclass(slots=True)
 class CheckpointHistory:
-    """The last checkpoint of one service in one episode, and the grants that it answered since.
-
-    They are sent again one after the other to an incarnation that has been reset.
-    """
+    """The last checkpoint of one service in one episode, and the grants that it answered since."""
 
     frame: int = -1
     """Of the checkpoint; −1: there is none."""
     state: Any = None
     """As the service sent it, opaque."""
     grants: list[AnsweredGrant] = field(default_factory=list)
-    weight: int = 0
+    size: int = 0
     """Of their products [B]."""
     asked: int | None = None
     """Frame of the CHECKPOINT that is not answered yet."""
@@ -54,31 +56,25 @@ class CheckpointHistory:
     position: int = 0
     """The grant that is sent again next, or was and is not answered yet."""
 
-    def remember(
-        self,
-        order: GrantOrder,
-        digests: Mapping[str, str] | None,
-        weigh: PayloadSize,
-        chosen: Mapping[str, str] | None = None,
-    ) -> None:
-        """A grant was answered."""
-        self.grants.append(AnsweredGrant(order, digests, chosen or {}))
-        self.weight += sum(weigh(product.payload) for product in order.products)
+    def add(self, grant: AnsweredGrant, payload_size: PayloadSize) -> None:
+        """Keep a grant that was answered."""
+        self.grants.append(grant)
+        self.size += sum(payload_size(product.payload) for product in grant.order.products)
 
-    def due(self, period: int) -> bool:
-        """Whether it is time to save the state."""
-        return len(self.grants) >= period or self.weight > MAX_HISTORY_BYTES
+    def is_due(self, period: int) -> bool:
+        """Whether it is time to save the state, at the latest after ``period`` frames."""
+        return len(self.grants) >= period or self.size > MAX_HISTORY_BYTES
 
-    def saved(self, state: Any) -> None:
-        """CHECKPOINT was answered; nothing had been granted meanwhile."""
-        assert self.asked is not None, "a state that nobody asked for"
+    def save(self, state: Any) -> None:
+        """Keep the answer to CHECKPOINT; nothing had been granted meanwhile."""
+        assert self.asked is not None, "a state that was not asked for"
         assert self.asked == self.last, f"state after frame {self.asked}, not {self.last}"
         self.frame, self.state, self.asked = self.asked, state, None
         self.grants.clear()
-        self.weight = 0
+        self.size = 0
 
     def rewind(self) -> None:
-        """The service lost its state."""
+        """Begin again with the first grant: the service lost its state."""
         self.asked, self.position = None, 0
 
     @property
@@ -92,180 +88,160 @@ class CheckpointHistory:
         return self.grants[-1].order.frame if self.grants else self.frame
 
 
-CAPABILITY = "checkpoint"
-
-
 class Checkpoints:
-    """The memories of one episode, and what is done with them.
+    """The checkpoint histories of one episode, and what is done with them.
 
-    Parameters
-    ----------
-    run
-        The run.
-    grant
-        Sends a grant, with decisions imposed.
-    returned
-        Called with a service that is where it was.
-    weigh
-        Size of a payload [B].
+    Args:
+        run: The run.
+        grant: Sends a grant, with decisions imposed.
+        return_service: Called with a service that is where it was.
+        payload_size: Size of a payload [B].
     """
 
     def __init__(
         self,
         run: Run,
         grant: Callable[[GrantOrder, Mapping[str, str]], None],
-        returned: Callable[[Peer, int], None],
-        weigh: PayloadSize,
+        return_service: Callable[[Peer, int], None],
+        payload_size: PayloadSize,
     ) -> None:
-        self._run, self._grant, self._returned, self._weigh = run, grant, returned, weigh
-        self._memories: dict[str, CheckpointHistory] = {}
+        self._run, self._grant, self._return_service = run, grant, return_service
+        self._payload_size = payload_size
+        self.histories: dict[str, CheckpointHistory] = {}
+        """Of each service that is asked to save its state."""
 
-    # --- keeping -------------------------------------------------------------------------------------
-
-    def begin(self) -> None:
-        """An episode begins, or is gone on with."""
+    def begin_episode(self) -> None:
+        """Start with nothing, or with what another broker left of the episode."""
         run, before = self._run, self._run.resumption
-        self._memories = {}
+        self.histories = {}
         if before is not None and run.graph is not None:
-            self._memories = memories_of(before, run.graph, run.plan, self._weigh)
+            self.histories = histories_of(before, run.graph, run.plan, self._payload_size)
 
-    @property
-    def memories(self) -> Mapping[str, CheckpointHistory]:
-        """What is kept, by service."""
-        return self._memories
+    def reset(self, peer: Peer, *, begins: bool) -> None:
+        """Note that a service is reset, as an episode ``begins`` or within one."""
+        able = peer.hello is not None and CAPABILITY in peer.hello.capabilities
+        if not (able and peer.role != "recorder" and self._run.plan.remembers):
+            self.histories.pop(peer.name, None)
+        elif peer.name in self.histories:
+            self.histories[peer.name].rewind()
+        elif begins:
+            self.histories[peer.name] = CheckpointHistory()
 
-    def digests(self, peer: Peer, answer: Done) -> dict[str, str]:
-        """Digests by topic of what an answer holds and somebody asked for."""
+    def add(self, peer: Peer, order: GrantOrder, answer: Done | Fault) -> None:
+        """Keep a grant and its answer, for a service that saves its state."""
+        history = self.histories.get(peer.name)
+        if history is not None:
+            chosen = answer.decisions if isinstance(answer, Done) else {}
+            history.add(AnsweredGrant(order, self._digests(peer, answer), chosen), self._payload_size)
+
+    def _digests(self, peer: Peer, answer: Done | Fault) -> dict[str, str] | None:
+        """Digests by topic of what an answer holds and a service takes; None for FAULT."""
+        if isinstance(answer, Fault):
+            return None
         graph = self._run.graph
         wanted = graph.outputs[peer.name] if graph else ()
         return {header.topic: header.digest for header in answer.products if header.topic in wanted}
-
-    def of(self, service: str) -> CheckpointHistory | None:
-        """The memory that is kept for a service; None: it is not told to save its state."""
-        return self._memories.get(service)
-
-    def is_kept_for(self, peer: Peer) -> bool:
-        """Whether a service can save its state, and the scenario wants it to."""
-        able = peer.hello is not None and CAPABILITY in peer.hello.capabilities
-        return able and peer.role != "recorder" and self._run.plan.remembers
-
-    def reset(self, peer: Peer, *, begins: bool) -> None:
-        """A service is reset: from here on it remembers, or has to be reminded."""
-        if not self.is_kept_for(peer):
-            self._memories.pop(peer.name, None)
-        elif peer.name in self._memories:
-            self._memories[peer.name].rewind()
-        elif begins:
-            self._memories[peer.name] = CheckpointHistory()
-
-    def answered(
-        self, peer: Peer, order: GrantOrder, digests: Mapping[str, str] | None, chosen: Mapping[str, str]
-    ) -> None:
-        """A grant was answered with these products, or with FAULT (None), after these decisions."""
-        memory = self._memories.get(peer.name)
-        if memory is not None:
-            memory.remember(order, digests, self._weigh, chosen)
 
     # --- saving --------------------------------------------------------------------------------------
 
     def is_due(self, peer: Peer) -> bool:
         """Whether a service shall save its state before it is granted anything more."""
-        memory = self._memories.get(peer.name)
-        return memory is not None and memory.due(self._run.plan.checkpoint_frames)
+        history = self.histories.get(peer.name)
+        return history is not None and history.is_due(self._run.plan.checkpoint_frames)
 
-    def ask(self, peer: Peer, now: int) -> None:
-        """CHECKPOINT for a service that owes nothing, once."""
-        run, memory = self._run, self._memories[peer.name]
-        if memory.asked is None:
-            memory.asked, memory.asked_at = memory.last, now
-            run.send(peer, Checkpoint(**self._ids(peer), frame=memory.last))
+    def request(self, peer: Peer, now: int) -> None:
+        """Send CHECKPOINT to a service that owes nothing, once."""
+        history = self.histories[peer.name]
+        if history.asked is None:
+            history.asked, history.asked_at = history.last, now
+            self._run.send(peer, Checkpoint(**self._run.ids(peer), frame=history.last))
 
     def saving_since(self, peer: Peer) -> int | None:
-        """When a service that saves its state was told to [ns]; None: it does not."""
-        memory = self._memories.get(peer.name)
-        return memory.asked_at if memory is not None and memory.asked is not None else None
+        """When a service that saves its state was asked to [ns]; None: it does not."""
+        history = self.histories.get(peer.name)
+        return history.asked_at if history is not None and history.asked is not None else None
 
-    def saved(self, event: ev.CheckpointReceived, now: int) -> bool:
-        """CHECKPOINT_DONE: whether it was waited for."""
+    def handle_checkpoint_done(self, event: ev.CheckpointReceived, now: int) -> bool:
+        """Take CHECKPOINT_DONE: whether it was waited for."""
         run, peer, message = self._run, self._run.peers[event.service], event.message
         if not run.current(peer, message.epoch, message.attempt, "CHECKPOINT_DONE"):
             return False
-        memory = self._memories.get(peer.name)
-        asked = None if memory is None else memory.asked
-        if memory is None or asked is None or (message.episode, message.frame) != (run.episode, asked):
+        history = self.histories.get(peer.name)
+        asked = None if history is None else history.asked
+        if history is None or asked is None or (message.episode, message.frame) != (run.episode, asked):
             what = f"CHECKPOINT_DONE for episode {message.episode} frame {message.frame}"
             run.stale(peer, "CHECKPOINT_DONE", what)
             return False
-        memory.saved(event.state)
+        history.save(event.state)
         run.enter_journal("checkpoint", peer.name, message.frame, now, state=event.state)
         return True
 
-    def is_concerned(self, peer: Peer, fault: Fault) -> bool:
+    def concerns(self, peer: Peer, fault: Fault) -> bool:
         """Whether a FAULT answers CHECKPOINT or RESTORE, and not a grant."""
-        memory = self._memories.get(peer.name)
-        if memory is None or fault.episode != self._run.episode:
+        history = self.histories.get(peer.name)
+        if history is None or fault.episode != self._run.episode:
             return False
         restoring = peer.state is ServiceState.RESTORING and not peer.restored
-        return fault.frame == (memory.frame if restoring else memory.asked)
+        return fault.frame == (history.frame if restoring else history.asked)
 
     # --- restoring -----------------------------------------------------------------------------------
 
-    def bring_back(self, peer: Peer, now: int) -> bool:
-        """RESTORE and the grants since, for a service that has been reset; False where there are none."""
-        memory = self._memories.get(peer.name)
-        if memory is None or memory.last < 0:
+    def restore(self, peer: Peer, now: int) -> bool:
+        """Send RESTORE, or the first grant again, to a service that was reset; False where there is none."""
+        history = self.histories.get(peer.name)
+        if history is None or history.last < 0:
             return False
         peer.move(ServiceEvent.RESTORE, now)
         peer.restored = False
-        if memory.frame >= 0:
-            restore = Restore(**self._ids(peer), frame=memory.frame)
-            self._run.send(peer, restore, attachment=memory.state)
+        if history.frame >= 0:
+            message = Restore(**self._run.ids(peer), frame=history.frame)
+            self._run.send(peer, message, attachment=history.state)
         else:
-            self._next(peer, memory, now)
+            self._grant_next(peer, history, now)
         return True
 
-    def restored(self, peer: Peer, now: int) -> None:
-        """READY, to RESTORE."""
-        memory = self._memories.get(peer.name)
-        if memory is None or memory.frame < 0 or memory.position or peer.restored:
+    def handle_ready(self, peer: Peer, now: int) -> None:
+        """Take READY, the answer to RESTORE."""
+        history = self.histories.get(peer.name)
+        if history is None or history.frame < 0 or history.position or peer.restored:
             self._run.unexpected(peer, "READY", "once, after PREPARE, and once after RESTORE")
             return
         peer.restored = True
-        self._next(peer, memory, now)
+        self._grant_next(peer, history, now)
 
-    def _next(self, peer: Peer, memory: CheckpointHistory, now: int) -> None:
+    def _grant_next(self, peer: Peer, history: CheckpointHistory, now: int) -> None:
         peer.since = now
-        pending = memory.pending
+        pending = history.pending
         if pending is not None:
             peer.restored = True
             self._grant(pending.order, pending.chosen)
         else:
             peer.move(ServiceEvent.RESTORED, now)
-            self._returned(peer, now)
+            self._return_service(peer, now)
 
-    def repeated(self, peer: Peer, answer: Done | Fault, now: int) -> None:
-        """DONE or FAULT of a service that is being brought back: was it the same as before?"""
-        run, memory = self._run, self._memories.get(peer.name)
+    def handle_repeated_answer(self, peer: Peer, answer: Done | Fault, now: int) -> None:
+        """Take DONE or FAULT of a service that is being restored, and compare it with the one before."""
+        run, history = self._run, self.histories.get(peer.name)
         kind = "DONE" if isinstance(answer, Done) else "FAULT"
         if not run.current(peer, answer.epoch, answer.attempt, kind):
             return
-        pending = memory.pending if memory is not None and peer.restored else None
+        pending = history.pending if history is not None and peer.restored else None
         expected = (run.episode, pending.order.frame) if pending else None
-        if memory is None or pending is None or (answer.episode, answer.frame) != expected:
+        if history is None or pending is None or (answer.episode, answer.frame) != expected:
             what = f"{kind} for episode {answer.episode} frame {answer.frame}"
             run.stale(peer, kind, what, pending.order.frame if pending else -1)
             return
-        if isinstance(answer, Fault):
-            if pending.digests is not None and peer.plan.policy in ("wait", "abort"):
-                text = f"failed in frame {answer.frame}, {answer.phase}: {answer.message}"
-                run.fail(f"{peer} was restored and {text}", peer.name, now)
-                return
-            now_digests = None
-        else:
-            now_digests = self.digests(peer, answer)
-        self._compare(peer, answer.frame, pending.digests, now_digests)
-        memory.position += 1
-        self._next(peer, memory, now)
+        if (
+            isinstance(answer, Fault)
+            and pending.digests is not None
+            and peer.plan.policy in ("wait", "abort")
+        ):
+            text = f"failed in frame {answer.frame}, {answer.phase}: {answer.message}"
+            run.fail(f"{peer} was restored and {text}", peer.name, now)
+            return
+        self._compare(peer, answer.frame, pending.digests, self._digests(peer, answer))
+        history.position += 1
+        self._grant_next(peer, history, now)
 
     def _compare(
         self, peer: Peer, frame: int, before: Mapping[str, str] | None, again: Mapping[str, str] | None
@@ -277,38 +253,28 @@ class Checkpoints:
         else:
             topics = sorted(t for t in {*before, *again} if before.get(t) != again.get(t))
             what = f"another {', '.join(topics)}"
-        self._run.notice(
-            "differs",
-            peer.name,
+        text = (
             f"{peer} answered frame {frame} again after its restart, with {what}: it is not "
-            "reproducible; the run goes on with what was decided",
-            frame,
+            "reproducible; the run goes on with what was decided"
         )
-
-    def _ids(self, peer: Peer) -> dict[str, Any]:
-        run = self._run
-        return {"epoch": run.plan.epoch, "attempt": peer.attempt, "episode": run.episode}
+        self._run.notice("differs", peer.name, text, frame)
 
 
-def memories_of(
-    left: Resumption, graph: Graph, plan: RunPlan, weigh: PayloadSize
+def histories_of(
+    before: Resumption, graph: Graph, plan: RunPlan, payload_size: PayloadSize
 ) -> dict[str, CheckpointHistory]:
-    """What is kept for the services that can save their state, as it was."""
-    book = DecisionTable(graph, plan, left.episode, RunDigest(), Ledger(), [])
-    book.go_on(left.finished, left.frames, left.tasks, left.newest)
-    inputs, found = Inputs(graph, book), {}
-    for name, (frame, state) in left.states.items():
-        memory = found[name] = CheckpointHistory(frame=frame, state=state)
-        for number, digests in sorted(left.answered.get(name, {}).items()):
-            if frame < number < left.finished:
-                order = _order(name, number, memory.last, inputs)
-                memory.remember(order, digests, weigh, left.chosen.get(name, {}).get(number))
+    """The histories of the services of a run that goes on, as they were under the broker before."""
+    table = DecisionTable(graph, plan, before.episode, RunDigest(), Ledger(), [])
+    table.resume(before.finished, before.frames, before.tasks, before.newest)
+    found = {}
+    for name, (frame, state) in before.states.items():
+        history = found[name] = CheckpointHistory(frame=frame, state=state)
+        chosen, participant = before.chosen.get(name, {}), table.participants[name]
+        for number, digests in sorted(before.answered.get(name, {}).items()):
+            if frame < number < before.finished:
+                lacked = table.undecided_source(participant, number)
+                assert lacked is None, f"frame {number} is finished, and {name} lacks an input"
+                inputs = table.gather_inputs(participant, number)
+                order = GrantOrder(name, number, history.last, False, inputs.inputs, inputs.products)
+                history.add(AnsweredGrant(order, digests, chosen.get(number, {})), payload_size)
     return found
-
-
-def _order(service: str, frame: int, previous: int, inputs: Inputs) -> GrantOrder:
-    task = Task(service, frame)
-    lacked = inputs.undecided(task)
-    assert lacked is None, f"frame {frame} is finished, and {service} lacks an input from {lacked}"
-    provenances, products = inputs.gathered(task).provided(frame)
-    return GrantOrder(service, frame, previous, False, tuple(provenances), tuple(products), ())

@@ -25,7 +25,7 @@ from caviar_broker.core.liveness import Liveness
 from caviar_broker.core.plan import RunPlan
 from caviar_broker.core.registration import Registration
 from caviar_broker.core.run import Peer, Resumption, Run, Snapshot
-from caviar_broker.core.status import RunStatus, look
+from caviar_broker.core.status import RunStatus, status_of
 from caviar_broker.core.transitions import RunState, ServiceState
 from caviar_protocol.digest import RunDigest
 
@@ -39,7 +39,7 @@ class FrameClock:
         The run.
     now
         The time [ns], of the same monotonic clock as every later ``now``.
-    weigh
+    payload_size
         Size of a payload [B], for what is kept of a service that may come back.
     resumption
         What another broker left of the run.
@@ -49,51 +49,51 @@ class FrameClock:
         self,
         plan: RunPlan,
         now: int,
-        weigh: PayloadSize = lambda payload: 0,
+        payload_size: PayloadSize = lambda payload: 0,
         resumption: Resumption | None = None,
     ) -> None:
         self.plan = plan
         self._run = Run(plan, now, resumption)
-        self._episodes = Episodes(self._run, weigh)
-        self._joining = Registration(self._run, self._episodes)
+        self._episodes = Episodes(self._run, payload_size)
+        self._registration = Registration(self._run, self._episodes)
         self._liveness = Liveness(self._run, self._episodes)
         self._deadline: int | None = None
         self._deadline_is_known = False
         self._handlers: dict[type, Callable[[Any, int], None]] = {
-            ev.Joined: self._joining.joined,
-            ev.AssetsOffered: self._joining.assets_offered,
-            ev.ReadyReceived: self._joining.ready,
-            ev.ResetDoneReceived: self._episodes.reset_done,
-            ev.DoneReceived: self._episodes.done,
-            ev.FaultReceived: self._episodes.fault,
-            ev.CheckpointReceived: self._episodes.checkpointed,
-            ev.Journaled: self._episodes.journaled,
-            ev.Violated: self._liveness.violated,
-            ev.Progressed: self._liveness.progressed,
-            ev.Lost: self._liveness.lost,
-            ev.ByeReceived: self._liveness.bye,
+            ev.Joined: self._registration.handle_hello,
+            ev.AssetsOffered: self._registration.handle_asset_offer,
+            ev.ReadyReceived: self._registration.handle_ready,
+            ev.ResetDoneReceived: self._episodes.handle_reset_done,
+            ev.DoneReceived: self._episodes.handle_done,
+            ev.FaultReceived: self._episodes.handle_fault,
+            ev.CheckpointReceived: self._episodes.handle_checkpoint_done,
+            ev.Journaled: self._episodes.handle_journaled,
+            ev.Violated: self._liveness.handle_violation,
+            ev.Progressed: self._liveness.handle_heartbeat,
+            ev.Lost: self._liveness.handle_loss,
+            ev.ByeReceived: self._liveness.handle_bye,
             ev.StopRequested: self._stop_requested,
-            ev.PauseRequested: self._episodes.paused,
-            ev.ResumeRequested: self._episodes.paused,
-            ev.StepRequested: self._episodes.paused,
+            ev.PauseRequested: self._episodes.handle_pause,
+            ev.ResumeRequested: self._episodes.handle_pause,
+            ev.StepRequested: self._episodes.handle_pause,
         }
 
     # --- the interface of a shell ----------------------------------------------------------------
 
     def receive(self, event: ev.Event, now: int) -> None:
         """Take in one event at the time ``now`` [ns]."""
-        self.take(event, now)
+        self.handle(event, now)
         self.settle(now)
 
-    def take(self, event: ev.Event, now: int) -> None:
+    def handle(self, event: ev.Event, now: int) -> None:
         """The first half of `receive`, for several events that came together: `settle` follows the last."""
         handler = self._late if self._run.over else self._handlers[type(event)]
         handler(event, now)
 
     def expire(self, now: int) -> None:
         """Act on every deadline that has passed."""
-        if self._episodes.schedule is not None:
-            self._episodes.schedule.deadlines.expire(now)
+        if self._episodes.dispatcher is not None:
+            self._episodes.dispatcher.expire(now)
             self._episodes.pump(now)
         self._liveness.expire(now)
         self.settle(now)
@@ -101,8 +101,8 @@ class FrameClock:
     def next_deadline(self) -> int | None:
         """When `expire` has to be called at the latest [ns]; None if nothing is awaited."""
         if not self._deadline_is_known:
-            schedule = self._episodes.schedule
-            of_frames = schedule.deadlines.next() if schedule is not None else None
+            dispatcher = self._episodes.dispatcher
+            of_frames = dispatcher.next_deadline() if dispatcher is not None else None
             instants = (self._liveness.next_deadline(), of_frames)
             self._deadline = min((instant for instant in instants if instant is not None), default=None)
             self._deadline_is_known = True
@@ -115,7 +115,7 @@ class FrameClock:
         return actions
 
     def settle(self, now: int) -> None:
-        """What follows from any event: the schedule acts, and a run that is over gets done."""
+        """What follows from any event: the dispatcher acts, and a run that is over gets done."""
         self._deadline_is_known = False
         self._episodes.pump(now)
         if self._run.over:
@@ -128,7 +128,7 @@ class FrameClock:
             case ev.Joined() | ev.Lost() | ev.ByeReceived() | ev.Progressed():
                 self._handlers[type(event)](event, now)
             case ev.DoneReceived(service=name, message=message):
-                if self._episodes.recorded(event, now):
+                if self._episodes.handle_last_recording(event, now):
                     return
                 text = f"answered frame {message.frame} after the end of the run; not used"
                 self._run.notice("note", name, text, message.frame)
@@ -165,30 +165,30 @@ class FrameClock:
     @property
     def finished_frames(self) -> int:
         """Frames of the present episode that are finished; 0 between episodes."""
-        schedule = self._episodes.schedule
-        return 0 if schedule is None else schedule.finished_frames
+        dispatcher = self._episodes.dispatcher
+        return 0 if dispatcher is None else dispatcher.table.finished_frames
 
     def snapshot(self) -> Snapshot | None:
         """The run up to its last finished frame; None where the episode has none."""
-        run, schedule = self._run, self._episodes.schedule
-        if schedule is None or not schedule.finished_frames:
+        run, dispatcher = self._run, self._episodes.dispatcher
+        if dispatcher is None or not dispatcher.table.finished_frames:
             return None
         return Snapshot(
             episode=run.episode,
-            finished=schedule.finished_frames,
+            finished=dispatcher.table.finished_frames,
             finished_before=run.finished_before,
             digest=run.digest.hexdigest(),
             seed=run.seed,
             seed_episode=run.seed_episode,
-            frames=schedule.frames,
-            members=schedule.graph.order,
+            frames=dispatcher.table.frames,
+            members=dispatcher.graph.order,
         )
 
     @property
     def waits_for_journal(self) -> bool:
         """Whether somebody waits for the journal to be written; nobody does where no frames are granted."""
-        schedule = self._episodes.schedule
-        return schedule is not None and schedule.waits_for_journal
+        dispatcher = self._episodes.dispatcher
+        return dispatcher is not None and dispatcher.waits_for_journal
 
     @property
     def digest(self) -> RunDigest:
@@ -209,19 +209,19 @@ class FrameClock:
         """What is known of a service; None for a name that the run does not expect."""
         return self._run.peers.get(name)
 
-    def look(self, now: int) -> RunStatus:
+    def status(self, now: int) -> RunStatus:
         """Who does what, and who is waited for, at the time ``now`` [ns]."""
-        return look(self._run, self._episodes, now)
+        return status_of(self._run, self._episodes, now)
 
     def validate(self) -> None:
         """Cross-field invariants; raises AssertionError naming the one that is broken."""
-        run, schedule = self._run, self._episodes.schedule
+        run, dispatcher = self._run, self._episodes.dispatcher
         peers = run.peers.values()
-        assert (schedule is not None) == (run.state is RunState.RUNNING), "schedule outside an episode"
+        assert (dispatcher is not None) == (run.state is RunState.RUNNING), "dispatcher outside an episode"
         assert not run.culprit or run.error, "a culprit without an error"
         assert (run.graph is None) == (run.state is RunState.JOINING) or run.over, "a graph too early"
-        if schedule is not None:
-            schedule.validate()
+        if dispatcher is not None:
+            dispatcher.validate()
             away = [p for p in peers if p.state is not ServiceState.ACTIVE and run.takes_part(p)]
             absent = [p.name for p in away if not p.rejoin(self.plan.limits)]
             assert not absent, f"{absent} are not in the episode"

@@ -1,8 +1,12 @@
-"""What becomes of every product of an episode: decided once, in order, and entered in the journal."""
+"""Tasks of an episode and what is decided about their products: once, in order, entered in the journal.
+
+A *task* is one service's part of one frame. Once it is decided, each of its topics has a `Decision`: what
+consumers get. `DecisionTable` holds both; `Ledger` says which decisions are safe in the journal.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 
 import msgspec
@@ -10,21 +14,26 @@ from msgspec.structs import replace
 
 from caviar_broker.core.events import Action, FrameFinished, Journal, Product
 from caviar_broker.core.graph import Edge, Graph
-from caviar_broker.core.plan import RunPlan
+from caviar_broker.core.plan import RunPlan, ServicePlan
 from caviar_broker.core.transitions import DECIDED, OUTSTANDING, TASK, TaskEvent, TaskState, step
 from caviar_protocol.digest import RunDigest
 from caviar_protocol.messages import GrantInput, Report, Status
 
+_ABSENT, _FRESH = Status.ABSENT, Status.FRESH
+_NO_EARLIER_FRAME = "there is no earlier frame"
+
 
 class Ledger:
-    """Counts the entries of the run's journal.
+    """Counts the entries of the run's journal (contract, clause 18).
 
     Entries become safe in order, so one number says which are: all up to and including `written`.
+
+    Args:
+        kept: Whether there is a journal; without one every entry is as safe as it will be.
     """
 
     def __init__(self, *, kept: bool = True) -> None:
         self._kept = kept
-        """Whether there is a journal; without one every entry is as safe as it will be."""
         self.last = 0
         """Number of the last entry; 0: none yet."""
         self.written = 0
@@ -33,7 +42,7 @@ class Ledger:
         """Since when no entry was confirmed though some are outstanding [ns]; None: none is."""
 
     def enter(self, now: int) -> int:
-        """Number of a new entry."""
+        """Number of a new entry, made at the time ``now`` [ns]."""
         self.last += 1
         if not self._kept:
             self.written = self.last
@@ -42,7 +51,7 @@ class Ledger:
         return self.last
 
     def confirm(self, number: int, now: int) -> bool:
-        """Entries up to ``number`` are written; whether that is news."""
+        """Note that entries up to ``number`` are written; whether that is news."""
         if number <= self.written:
             return False
         self.written = number
@@ -53,39 +62,42 @@ class Ledger:
 class Decision(msgspec.Struct, frozen=True):
     """What consumers of a frame get of one (topic, source)."""
 
-    status: Status
-    product: Product | None
-    cause: str = ""
+    provenance: GrantInput
+    """As a consumer in the same frame is granted it, and as the journal has it."""
+    product: Product | None = None
     journal: int = 0
     """Journal entry that holds a held product; 0: the one of this decision, as for one that is replayed."""
 
+    @property
+    def status(self) -> Status:
+        """Fresh, held, absent or late."""
+        return self.provenance.status
+
 
 class GrantOrder(msgspec.Struct, frozen=True):
-    """A grant that the schedule wants sent."""
+    """A grant that the dispatcher wants sent."""
 
     service: str
     frame: int
     previous: int
+    """Frame that the service completed before; −1: none."""
     final: bool
     inputs: tuple[GrantInput, ...]
     products: tuple[Product, ...]
-    reports: tuple[Report, ...]
+    reports: tuple[Report, ...] = ()
 
 
 class TaskInputs(msgspec.Struct, frozen=True):
     """Inputs of a task, all of them decided."""
 
-    decisions: list[tuple[Edge, Decision]]
+    inputs: tuple[GrantInput, ...]
+    products: tuple[Product, ...]
+    """Those of the inputs that are not absent, in the same order."""
     cause: str | None
     """Why the first required input is absent (clause 10); frame 0 has no earlier one."""
     entry: int
     """Number of the last journal entry that a grant relies on from before its frame (clause 18): the
     service's own, lag 1 inputs and held products."""
-
-    def provided(self, frame: int) -> tuple[list[GrantInput], list[Product]]:
-        """Provenance of every input, and the products of those that are not absent."""
-        inputs = [provenance(edge.topic, edge.source, decision, frame) for edge, decision in self.decisions]
-        return inputs, [decision.product for _, decision in self.decisions if decision.product is not None]
 
 
 @dataclass(slots=True, eq=False)
@@ -112,73 +124,89 @@ class Task:
     report: Report | None = None
 
     def move(self, event: TaskEvent) -> None:
-        """Take a transition of the table."""
+        """Take a transition of the table in `caviar_broker.core.transitions`."""
         self.state = step(TASK, self.state, event)
 
 
-def provenance(topic: str, source: str, decision: Decision, frame: int) -> GrantInput:
-    """What a consumer in ``frame`` is told about where its input comes from."""
-    product = decision.product
-    if product is None:
-        return GrantInput(topic=topic, source=source, status=decision.status, cause=decision.cause)
+@dataclass(slots=True, eq=False)
+class Participant:
+    """One service in an episode."""
+
+    plan: ServicePlan
+    rank: int
+    """Place in the graph's order: producers come before the consumers of their frame."""
+    outputs: tuple[str, ...]
+    """Topics in demand."""
+    wanted: frozenset[str] = field(init=False)
+    """The same, as a set."""
+    capacity: int = 1
+    """Grants that may be outstanding (clause 7)."""
+    tasks: dict[int, Task] = field(default_factory=dict)
+    """By frame, as far as anything still needs them."""
+    next_frame: int = 0
+    """First frame that is not decided."""
+    completed: int = -1
+    """Last frame that the service answered."""
+    outstanding: list[Task] = field(default_factory=list)
+    """Tasks for which DONE or FAULT is due, oldest first."""
+    suspended: bool = False
+    """Whether the service is gone: its outstanding grants stay owed, no new ones are made."""
+    saving: bool = False
+    """Whether the service saves its state, and is granted nothing until it has."""
+    inputs: tuple[tuple[Edge, Participant], ...] = ()
+    """Its edges with their sources, sorted by (topic, source)."""
+    lagged: tuple[tuple[Edge, Participant], ...] = ()
+    """Those of lag 1, which alone count behind the last frame (clause 16)."""
+    latest: tuple[tuple[Edge, Participant], ...] = ()
+    """All of them, those first that are decided last in a frame."""
+    waiting: set[Participant] = field(default_factory=set)
+    """Services that can be granted nothing before this one's next decision."""
+
+    def __post_init__(self) -> None:
+        self.wanted = frozenset(self.outputs)
+
+    def task(self, frame: int) -> Task:
+        """Its task in a frame; a new one where there is none."""
+        found = self.tasks.get(frame)
+        if found is None:
+            found = self.tasks[frame] = Task(self.plan.name, frame)
+        return found
+
+
+def provenance_of(product: Product, status: Status, frame: int, cause: str = "") -> GrantInput:
+    """What a consumer in ``frame`` is told about where a product comes from."""
     return GrantInput(
-        topic=topic,
-        source=source,
-        status=decision.status,
+        topic=product.topic,
+        source=product.source,
+        status=status,
         frame=product.frame,
         t_ns=product.t_ns,
         age=frame - product.frame,
         fidelity=product.fidelity,
         digest=product.digest,
-        cause=decision.cause,
+        cause=cause,
     )
 
 
-def validate_decision(service: str, frame: int, topic: str, decision: Decision) -> None:
-    """Raise AssertionError where a decision contradicts itself (clauses 9 to 12)."""
-    what = f"{topic} of {service} in frame {frame}"
-    match decision.status:
-        case Status.FRESH:
-            assert decision.product is not None, f"{what} is fresh without a product"
-            assert decision.product.frame == frame, f"{what} is not fresh"
-        case Status.HELD:
-            assert decision.product is not None, f"{what} is held without a product"
-            assert decision.product.frame < frame, f"{what} is not an earlier one"
-            assert decision.cause, f"{what} is held without a cause"
-        case _:
-            assert decision.product is None, f"{what} is absent with a product"
-            assert decision.cause, f"{what} is absent without a cause"
-
-
 def milliseconds(ns: int) -> str:
-    """A duration for people."""
+    """A duration as notices have it."""
     return f"{ns / 1e6:.1f} ms"
 
 
-_FRESH = Status.FRESH
-_FIRST = Decision(Status.ABSENT, None, "there is no earlier frame")
-
-
 class DecisionTable:
-    """Decisions of one episode, by service and frame (contract, clauses 9 to 12, 18 and 20).
+    """Decisions of one episode, by service and frame (contract, clauses 6, 7, 9 to 12, 18 and 20).
 
     A service decides its frames one after the other. A frame is finished once every service has
     decided it; the fresh products of finished frames make the digest of the run.
 
-    Parameters
-    ----------
-    graph, plan
-        The run.
-    episode
-        Number of the episode.
-    digest
-        The run's chain; finished frames are added to it.
-    ledger
-        The run's journal.
-    actions
-        Where journal entries and finished frames are put.
-    sources
-        Services whose products stand in the journal because those that take them remember them.
+    Args:
+        graph: Who takes what from whom.
+        plan: The run.
+        episode: Number of the episode.
+        digest: The run's chain; finished frames are added to it.
+        ledger: The run's journal.
+        actions: Where journal entries and finished frames are put.
+        sources: Services whose products stand in the journal because those that take them save their state.
     """
 
     def __init__(
@@ -194,180 +222,224 @@ class DecisionTable:
         self.frames = plan.frames
         """Frames of the episode; becomes less when an agent ends it early."""
         self.finished_frames = 0
-        self.next = dict.fromkeys(graph.order, 0)
-        """First frame of each service that is not decided yet."""
         self.lag_ns: Callable[[], int] = lambda: 0
         """How far real time has slipped, for the report on a frame."""
+        self.on_decision: Callable[[Participant], None] = lambda participant: None
+        """Called with each service that has decided one more frame."""
+        plans = {service.name: service for service in plan.services}
+        self.participants = {
+            name: Participant(plans[name], rank, graph.outputs[name]) for rank, name in enumerate(graph.order)
+        }
+        for name, participant in self.participants.items():
+            participant.inputs = self._with_sources(graph.inputs[name])
+            participant.lagged = tuple(pair for pair in participant.inputs if pair[0].lag)
+            participant.latest = self._with_sources(graph.latest[name])
         self._graph, self._plan, self._episode = graph, plan, episode
         self._digest, self._ledger, self._actions = digest, ledger, actions
         self._holding = frozenset(p.name for p in plan.services if p.policy == "hold")
         self._kept = self._holding | graph.retained | frozenset(sources)
-        self._tasks: dict[str, dict[int, Task]] = {name: {} for name in graph.order}
-        self._last = graph.order[-1]
+        self._last = self.participants[graph.order[-1]]
         """A service that has not decided the first frame yet that is not finished."""
         self._newest: dict[tuple[str, str], tuple[Product, int]] = {}
         """Newest product and its journal entry by (service, topic), late ones included (clause 12)."""
 
-    def go_on(
+    def _with_sources(self, edges: Iterable[Edge]) -> tuple[tuple[Edge, Participant], ...]:
+        return tuple((edge, self.participants[edge.source]) for edge in edges)
+
+    def resume(
         self,
         finished: int,
         frames: int,
         tasks: Mapping[str, Mapping[int, Task]],
         newest: Mapping[tuple[str, str], tuple[Product, int]],
     ) -> None:
-        """Go on with an episode of which so many frames are finished; the book must be new."""
-        assert not self.finished_frames, "only a new book can go on"
+        """Go on behind the last finished frame of an episode; the table must be new.
+
+        Args:
+            finished: How many frames are finished.
+            frames: Of the episode.
+            tasks: Decided tasks by service and frame.
+            newest: Newest product and its journal entry by (service, topic).
+        """
+        assert not self.finished_frames, "only a new table can go on"
         self.finished_frames, self.frames = finished, frames
-        for name in self.next:
-            self.next[name] = finished
-            self._tasks[name] = dict(tasks.get(name, {}))
+        for name, participant in self.participants.items():
+            participant.next_frame = finished
+            participant.tasks = dict(tasks.get(name, {}))
         self._newest = {key: known for key, known in newest.items() if key[0] in self._holding}
 
     def forget_before(self, frame: int) -> None:
-        """Nothing needs tasks of earlier frames any more."""
-        for tasks in self._tasks.values():
-            for old in [number for number in tasks if number < frame]:
-                del tasks[old]
-
-    # --- tasks -----------------------------------------------------------------------------------
-
-    def task(self, service: str, frame: int) -> Task:
-        """The task of a service in a frame; a new one where there is none."""
-        tasks = self._tasks[service]
-        found = tasks.get(frame)
-        if found is None:
-            found = tasks[frame] = Task(service, frame)
-        return found
-
-    def find(self, service: str, frame: int) -> Task | None:
-        """The task of a service in a frame, if there is one."""
-        return self._tasks[service].get(frame)
+        """Drop the tasks of earlier frames."""
+        for participant in self.participants.values():
+            participant.tasks = {n: task for n, task in participant.tasks.items() if n >= frame}
 
     def release(self, task: Task) -> None:
         """Forget a task that was answered when its frame had been over already."""
         if not self.finished_frames - 1 <= task.frame < self.frames:
-            del self._tasks[task.service][task.frame]
+            del self.participants[task.service].tasks[task.frame]
 
     def tasks(self) -> Iterable[Task]:
         """All tasks that are not forgotten."""
-        return (task for tasks in self._tasks.values() for task in tasks.values())
+        return (task for participant in self.participants.values() for task in participant.tasks.values())
 
     # --- what consumers get ------------------------------------------------------------------------
 
-    def decided(self, edge: Edge, frame: int) -> bool:
-        """Whether it is known what a consumer gets over an edge in a frame."""
-        return frame - edge.lag < self.next[edge.source] or frame < edge.lag
+    def undecided_source(self, participant: Participant, frame: int) -> Participant | None:
+        """A source that has not decided what a service gets of it in a frame; None: all have (clause 7)."""
+        # From behind: once the last one is decided, so are mostly the others, and few looks are in vain.
+        for edge, source in participant.latest if frame < self.frames else participant.lagged:
+            if frame - edge.lag >= source.next_frame and frame >= edge.lag:
+                return source
+        return None
 
-    def decision(self, edge: Edge, frame: int) -> Decision:
-        """What a consumer gets over an edge in a frame."""
-        if frame < edge.lag:
-            return _FIRST
-        return self._tasks[edge.source][frame - edge.lag].decisions[edge.topic]
+    def gather_inputs(self, participant: Participant, frame: int) -> TaskInputs:
+        """What is decided about the inputs of a service in a frame; all of them must be."""
+        # The service's own last decision is relied on too. What was decided in this very frame would be
+        # decided again. Entries become safe in order, so nothing is missing between them.
+        before = participant.tasks.get(frame - 1)
+        entry = 0 if before is None else before.journal
+        cause = None
+        inputs: list[GrantInput] = []
+        products: list[Product] = []
+        for edge, source in participant.inputs if frame < self.frames else participant.lagged:
+            if frame < edge.lag:
+                first = GrantInput(
+                    topic=edge.topic, source=edge.source, status=_ABSENT, cause=_NO_EARLIER_FRAME
+                )
+                inputs.append(first)
+                continue
+            origin = source.tasks[frame - edge.lag]
+            decision = origin.decisions[edge.topic]
+            told, product = decision.provenance, decision.product
+            if product is not None:
+                products.append(product)
+                if edge.lag:
+                    told = provenance_of(product, told.status, frame, told.cause)
+            elif edge.required and cause is None:
+                cause = told.cause
+            inputs.append(told)
+            if edge.lag and origin.journal > entry:
+                entry = origin.journal
+            if decision.journal > entry:
+                entry = decision.journal
+        return TaskInputs(tuple(inputs), tuple(products), cause, entry)
 
-    def entry(self, service: str, frame: int) -> int:
-        """Journal entry of a service's decisions about a frame; 0 where there is none."""
-        task = self._tasks[service].get(frame)
-        return 0 if task is None else task.journal
+    def describe_waiting(self, source: str) -> str:
+        """Which services wait for which input of a source now, for its blame; empty if none does."""
+        found = []
+        for name in self._graph.consumers[source]:
+            consumer = self.participants[name]
+            frame = consumer.next_frame
+            for edge, origin in consumer.inputs:
+                lacks = frame <= self.frames and not is_decided(edge, origin, frame)
+                if lacks and edge.source == source:
+                    found.append(f"{name} waits for {edge.topic} of frame {frame - edge.lag}")
+        return ", ".join(found)
 
     # --- deciding ----------------------------------------------------------------------------------
 
-    def fresh(self, task: Task, products: Mapping[str, Product], now: int) -> None:
-        """The task was answered in time; a declared product that is missing is absent."""
+    def decide_fresh(self, task: Task, products: Mapping[str, Product], now: int) -> None:
+        """Decide a task that was answered in time; a declared product that is missing is absent."""
         decisions = {}
         for topic in self._due_topics(task):
             product = products.get(topic)
             if product is not None:
-                decisions[topic] = Decision(_FRESH, product)
+                decisions[topic] = Decision(provenance_of(product, _FRESH, task.frame), product)
             else:
-                cause = f"{task.service} produced no {topic} in frame {task.frame}"
-                decisions[topic] = Decision(Status.ABSENT, None, cause)
+                decisions[topic] = _absent(task, topic, _not_produced(task, topic))
         self._decide(task, decisions, "done", now)
         if task.service in self._holding:
             self._renew(products.values(), task.journal)
 
-    def as_recorded(
+    def decide_as_recorded(
         self, task: Task, entries: Iterable[GrantInput], products: Mapping[str, Product], now: int
     ) -> None:
-        """A replayed service: its products are held or absent where they were, with the recorded cause."""
+        """Decide a task of a replayed service: held or absent as it was, with the recorded cause."""
         recorded, decisions = {entry.topic: entry for entry in entries}, {}
         for topic in self._due_topics(task):
             entry, product = recorded.get(topic), products.get(topic)
             status = entry.status if entry is not None else _FRESH
             cause = entry.cause if entry is not None else ""
-            if product is None or status is Status.ABSENT:
-                cause = cause or f"{task.service} produced no {topic} in frame {task.frame}"
-                decisions[topic] = Decision(Status.ABSENT, None, cause)
+            if product is None or status is _ABSENT:
+                decisions[topic] = _absent(task, topic, cause or _not_produced(task, topic))
             elif entry is not None and status is Status.HELD:
                 product = replace(product, frame=entry.frame, t_ns=entry.t_ns)
-                decisions[topic] = Decision(Status.HELD, product, cause)
+                decisions[topic] = Decision(provenance_of(product, status, task.frame, cause), product)
             else:
-                decisions[topic] = Decision(_FRESH, product)
+                decisions[topic] = Decision(provenance_of(product, _FRESH, task.frame), product)
         self._decide(task, decisions, "done", now)
 
-    def substitute(self, task: Task, cause: str, outcome: str, now: int) -> None:
-        """Clause 9: under hold consumers get the newest earlier product; else, or without one, nothing."""
+    def decide_without_answer(self, task: Task, cause: str, outcome: str, now: int) -> None:
+        """Decide for a service (clause 9): under hold its newest earlier product, where there is one."""
         decisions = {}
         for topic in self._due_topics(task):
             held = self._newest.get((task.service, topic))
             if held is None:
-                decisions[topic] = Decision(Status.ABSENT, None, cause)
+                decisions[topic] = _absent(task, topic, cause)
             else:
-                decisions[topic] = Decision(Status.HELD, held[0], cause, held[1])
+                product, number = held
+                told = provenance_of(product, Status.HELD, task.frame, cause)
+                decisions[topic] = Decision(told, product, number)
         self._decide(task, decisions, outcome, now)
 
-    def consequence(self, task: Task, cause: str, now: int) -> None:
-        """Clause 10: a required input is absent, so its products are; the blame stays at the origin."""
-        absent = {topic: Decision(Status.ABSENT, None, cause) for topic in self._due_topics(task)}
+    def decide_consequence(self, task: Task, cause: str, now: int) -> None:
+        """Decide that products are absent as a required input is (clause 10); its source keeps the blame."""
+        absent = {topic: _absent(task, topic, cause) for topic in self._due_topics(task)}
         self._decide(task, absent, "skipped", now)
 
-    def late(self, task: Task, products: Mapping[str, Product], now: int) -> None:
-        """Clause 11: products whose frame went on without them; later frames may hold them."""
+    def record_late(self, task: Task, products: Mapping[str, Product], now: int) -> None:
+        """Enter products whose frame went on without them (clause 11); later frames may hold them."""
         number = self._ledger.enter(now)
-        decisions = {topic: Decision(Status.LATE, product) for topic, product in products.items()}
+        decisions = [
+            Decision(provenance_of(product, Status.LATE, task.frame), product)
+            for product in products.values()
+        ]
         self._journal(task, decisions, "late", number)
         if task.service in self._holding:
             self._renew(products.values(), number)
 
     def end_after(self, frame: int) -> list[Task]:
-        """The episode ends with ``frame`` (clause 16); the tasks behind it, forgotten unless outstanding."""
+        """End the episode with ``frame`` (clause 16); the tasks behind it, forgotten unless outstanding."""
         if frame + 1 >= self.frames:
             return []
         self.frames = frame + 1
         cut = [task for task in self.tasks() if task.frame >= self.frames]
         for task in cut:
             if task.state not in OUTSTANDING:
-                del self._tasks[task.service][task.frame]
-        for name in self.next:
-            self.next[name] = min(self.next[name], self.frames)
+                del self.participants[task.service].tasks[task.frame]
+        for participant in self.participants.values():
+            participant.next_frame = min(participant.next_frame, self.frames)
         return cut
 
     def _due_topics(self, task: Task) -> tuple[str, ...]:
         """Topics that consumers expect of a task; none of a final one."""
-        return self._graph.outputs[task.service] if task.frame < self.frames else ()
+        return self.participants[task.service].outputs if task.frame < self.frames else ()
 
     def _renew(self, products: Iterable[Product], number: int) -> None:
         for product in products:
             key = (product.source, product.topic)
             known = self._newest.get(key)
-            # Nobody is granted a frame before an earlier one is answered, so products come in order.
+            # No service is granted a frame before it has answered an earlier one, so products come in order.
             assert known is None or known[0].frame < product.frame, f"{product} is not newer (clause 12)"
             self._newest[key] = product, number
 
     def _decide(self, task: Task, decisions: dict[str, Decision], outcome: str, now: int) -> None:
         task.decisions = decisions
         task.journal = self._ledger.enter(now)
-        self._journal(task, decisions, outcome, task.journal)
-        self.next[task.service] = task.frame + 1
-        self._finish_frames()
+        self._journal(task, decisions.values(), outcome, task.journal)
+        participant = self.participants[task.service]
+        participant.next_frame = task.frame + 1
+        if self._last.next_frame > self.finished_frames:
+            self._finish_frames()
+        self.on_decision(participant)
 
-    def _journal(self, task: Task, decisions: Mapping[str, Decision], outcome: str, number: int) -> None:
+    def _journal(self, task: Task, decisions: Collection[Decision], outcome: str, number: int) -> None:
         """Products of earlier frames stand in entries of their own; others only if they may be used later."""
         if self._plan.ephemeral:
             return
         products: tuple[Product, ...] = ()
         if task.service in self._kept:
-            products = tuple([d.product for d in decisions.values() if d.product and not d.journal])
-        told = [provenance(topic, task.service, d, task.frame) for topic, d in decisions.items()]
+            products = tuple([d.product for d in decisions if d.product and not d.journal])
         self._actions.append(
             Journal(
                 number=number,
@@ -375,105 +447,81 @@ class DecisionTable:
                 frame=task.frame,
                 service=task.service,
                 outcome=outcome,
-                decisions=tuple(told),
+                decisions=tuple([decision.provenance for decision in decisions]),
                 products=products,
                 chosen=task.report.decisions if task.report else None,
             )
         )
 
     def _finish_frames(self) -> None:
-        if self.next[self._last] <= self.finished_frames:
-            return
-        for frame in range(self.finished_frames, min(self.frames, *self.next.values())):
+        participants = self.participants.values()
+        reached = min(self.frames, *[participant.next_frame for participant in participants])
+        for frame in range(self.finished_frames, reached):
             if not self._plan.ephemeral:
                 self._digest.add_frame(self._episode, frame, self._fresh(frame))
             t_ns = self._plan.t_ns(frame)
             self._actions.append(FrameFinished(self._episode, frame, t_ns, self.lag_ns()))
             self.finished_frames += 1
-            for tasks in self._tasks.values():  # lag 1 still needs this frame, nothing needs the one before
-                old = tasks.get(frame - 1)
+            for participant in participants:  # lag 1 still needs this frame, nothing needs the one before
+                old = participant.tasks.get(frame - 1)
                 if old is not None and old.state not in OUTSTANDING:
-                    del tasks[frame - 1]
-        self._last = min(reversed(self.next), key=self.next.__getitem__)
+                    del participant.tasks[frame - 1]
+        self._last = min(reversed(participants), key=lambda participant: participant.next_frame)
 
     def _fresh(self, frame: int) -> Iterable[tuple[str, str, str]]:
-        """(topic, source, digest) of the fresh products of a frame that everybody has decided."""
-        decided = [self._tasks[name][frame] for name in self._graph.order]
-        return (
-            (topic, task.service, decision.product.digest)
-            for task in decided
-            for topic, decision in task.decisions.items()
-            if decision.status is Status.FRESH and decision.product is not None
-        )
+        """(topic, source, digest) of the fresh products of a frame that every service has decided."""
+        return [
+            (topic, participant.plan.name, decision.product.digest)
+            for participant in self.participants.values()
+            for topic, decision in participant.tasks[frame].decisions.items()
+            if decision.status is _FRESH and decision.product is not None
+        ]
 
     # --- invariants ----------------------------------------------------------------------------------
 
     def validate(self) -> None:
-        """Cross-field invariants; raises AssertionError naming the one that is broken."""
+        """Check cross-field invariants; raises AssertionError naming the one that is broken."""
         for task in self.tasks():
             decided = task.state in DECIDED
             beyond = task.state in (TaskState.ABANDONED, TaskState.DISCARDED)
-            assert beyond or decided == (task.frame < self.next[task.service]), f"{task} decided out of order"
+            known = task.frame < self.participants[task.service].next_frame
+            assert beyond or decided == known, f"{task} decided out of order"
             assert decided == bool(task.journal) or beyond, f"{task} is not in the journal"
             for topic, decision in task.decisions.items():
-                validate_decision(task.service, task.frame, topic, decision)
+                _validate_decision(f"{topic} of {task.service} in frame {task.frame}", task.frame, decision)
         assert self.finished_frames <= self.frames
-        assert all(n >= self.finished_frames for n in self.next.values()), "finished, but not decided"
+        reached = [participant.next_frame for participant in self.participants.values()]
+        assert all(n >= self.finished_frames for n in reached), "finished, but not decided"
         window = self.finished_frames + self._plan.frames_in_flight + 1
-        assert all(n <= window for n in self.next.values()), "too many frames overlap"
+        assert all(n <= window for n in reached), "too many frames overlap"
         kept = [task for task in self.tasks() if task.state not in OUTSTANDING]
         assert all(task.frame >= self.finished_frames - 1 for task in kept), "tasks are not released"
 
 
-class Inputs:
-    """Inputs of the tasks of one episode, as far as they are decided (clauses 6, 7, 10 and 18)."""
+def is_decided(edge: Edge, source: Participant, frame: int) -> bool:
+    """Whether it is known what a consumer gets over an edge in a frame."""
+    return frame - edge.lag < source.next_frame or frame < edge.lag
 
-    def __init__(self, graph: Graph, book: DecisionTable) -> None:
-        self._book = book
-        self._all, self._consumers = graph.inputs, graph.consumers
-        self._latest = graph.latest
-        self._lagged = {name: tuple(e for e in edges if e.lag) for name, edges in graph.inputs.items()}
 
-    def taken(self, task: Task) -> Sequence[Edge]:
-        """Edges that count in this frame: behind the last frame only those with lag 1 (clause 16)."""
-        edges = self._all if task.frame < self._book.frames else self._lagged
-        return edges[task.service]
+def _not_produced(task: Task, topic: str) -> str:
+    return f"{task.service} produced no {topic} in frame {task.frame}"
 
-    def undecided(self, task: Task) -> str | None:
-        """A source that has not decided yet what this task gets of it; None: all have (clause 7)."""
-        frame, undecided = task.frame, self._book.next
-        # From behind: once the last one is decided, so are mostly the others, and nobody looks in vain.
-        edges = self._latest[task.service] if frame < self._book.frames else self._lagged[task.service]
-        for edge in edges:
-            if frame - edge.lag >= undecided[edge.source] and frame >= edge.lag:
-                return edge.source
-        return None
 
-    def gathered(self, task: Task) -> TaskInputs:
-        """What is decided about its inputs; all of them must be."""
-        # The service's own last decision is relied on too. What was decided in this very frame would be
-        # decided again. Entries become safe in order, so nothing is missing between them.
-        book, frame = self._book, task.frame
-        cause, entry = None, book.entry(task.service, frame - 1)
-        decisions = []
-        for edge in self.taken(task):
-            decision = book.decision(edge, frame)
-            decisions.append((edge, decision))
-            if decision.product is None and edge.required and frame >= edge.lag and cause is None:
-                cause = decision.cause
-            if edge.lag and (of_input := book.entry(edge.source, frame - edge.lag)) > entry:
-                entry = of_input
-            if decision.journal > entry:
-                entry = decision.journal
-        return TaskInputs(decisions, cause, entry)
+def _absent(task: Task, topic: str, cause: str) -> Decision:
+    return Decision(GrantInput(topic=topic, source=task.service, status=_ABSENT, cause=cause))
 
-    def lacking(self, source: str) -> str:
-        """Who waits for which input of a source now; empty if nobody does."""
-        found = []
-        for name in self._consumers[source]:
-            frame = self._book.next[name]
-            for edge in self._all[name]:
-                lacks = frame <= self._book.frames and not self._book.decided(edge, frame)
-                if lacks and edge.source == source:
-                    found.append(f"{name} waits for {edge.topic} of frame {frame - edge.lag}")
-        return ", ".join(found)
+
+def _validate_decision(what: str, frame: int, decision: Decision) -> None:
+    """Raise AssertionError where a decision contradicts itself (clauses 9 to 12)."""
+    product, cause = decision.product, decision.provenance.cause
+    match decision.status:
+        case Status.FRESH:
+            assert product is not None, f"{what} is fresh without a product"
+            assert product.frame == frame, f"{what} is not fresh"
+        case Status.HELD:
+            assert product is not None, f"{what} is held without a product"
+            assert product.frame < frame, f"{what} is not an earlier one"
+            assert cause, f"{what} is held without a cause"
+        case _:
+            assert product is None, f"{what} is absent with a product"
+            assert cause, f"{what} is absent without a cause"

@@ -20,33 +20,33 @@ class Liveness:
 
     # --- life and death ------------------------------------------------------------------------------
 
-    def progressed(self, event: ev.Progressed, now: int) -> None:
+    def handle_heartbeat(self, event: ev.Progressed, now: int) -> None:
         """A heartbeat."""
         self._run.peers[event.service].heartbeat(event.progress, event.phase, event.grace_ns, now)
 
-    def violated(self, event: ev.Violated, now: int) -> None:
+    def handle_violation(self, event: ev.Violated, now: int) -> None:
         """A service broke the protocol beyond repair."""
         self._run.fail(f"{self._run.peers[event.service]} {event.text}", event.service, now)
 
-    def bye(self, event: ev.ByeReceived, now: int) -> None:
+    def handle_bye(self, event: ev.ByeReceived, now: int) -> None:
         """A service leaves: as it was told to, or on its own account."""
         peer = self._run.peers[event.service]
         if peer.present and self._run.over:
             peer.move(ServiceEvent.BYE, now)
         elif peer.present:
-            self.lost(ev.Lost(event.service, f"it left: {event.reason or 'no reason given'}"), now)
+            self.handle_loss(ev.Lost(event.service, f"it left: {event.reason or 'no reason given'}"), now)
 
-    def lost(self, event: ev.Lost, now: int) -> None:
+    def handle_loss(self, event: ev.Lost, now: int) -> None:
         """A service died; the run ends, unless it can do without it or wait for its return."""
         run, peer = self._run, self._run.peers[event.service]
         if peer.state in (ServiceState.LOST, ServiceState.LEFT):
             return
-        schedule = self._episodes.schedule if run.takes_part(peer) else None
-        owed = schedule.outstanding(peer.name) if schedule else []
+        dispatcher = self._episodes.dispatcher if run.takes_part(peer) else None
+        owed = dispatcher.outstanding(peer.name) if dispatcher else []
         text = f"{peer} died while {peer.doing}: {event.verdict}; {peer.last_words(now)}"
-        if owed and schedule:
+        if owed and dispatcher:
             died = f"died ({event.verdict})"
-            text = peer.blame_task(owed[0], died, now, schedule.waiting_for(peer.name))
+            text = peer.blame_task(owed[0], died, now, dispatcher.table.describe_waiting(peer.name))
         peer.verdict = event.verdict
         peer.losses += 1
         peer.move(ServiceEvent.LOST, now)
@@ -61,8 +61,8 @@ class Liveness:
         limit = peer.rejoin(run.plan.limits) / 1e9
         told = f"{peer} is away; the run waits for it for at most {limit:g} s (timeouts.rejoin_s)"
         run.notice("away", peer.name, told, owed[0].frame if owed else -1)
-        if schedule:
-            schedule.pause(peer.name)
+        if dispatcher:
+            dispatcher.suspend_service(peer.name)
 
     def _may_return(self, peer: Peer) -> bool:
         """Whether the loss of a service is survived for a while: it was ready once, perhaps under a
@@ -119,8 +119,8 @@ class Liveness:
             case ServiceState.LOST:
                 return peer.since + peer.rejoin(limits)
             case ServiceState.ACTIVE:
-                schedule = self._episodes.schedule
-                task = schedule.awaited(peer.name) if schedule else None
+                dispatcher = self._episodes.dispatcher
+                task = dispatcher.awaited(peer.name) if dispatcher else None
                 since = task.started_at if task else self._saving_since(peer)
                 return None if since is None else peer.silent_until(since, limits.stall)
             case _:
@@ -128,13 +128,15 @@ class Liveness:
 
     def _saving_since(self, peer: Peer) -> int | None:
         """Since when a service without which the run cannot go on saves its state [ns]."""
-        return self._episodes.recall.saving_since(peer) if peer.plan.policy in ("wait", "abort") else None
+        return (
+            self._episodes.checkpoints.saving_since(peer) if peer.plan.policy in ("wait", "abort") else None
+        )
 
     def _blame(self, peer: Peer, now: int) -> str:
-        limits, schedule = self._run.plan.limits, self._episodes.schedule
-        task = schedule.awaited(peer.name) if schedule and peer.state is ServiceState.ACTIVE else None
-        if schedule and task:
-            waiting = schedule.waiting_for(peer.name)
+        limits, dispatcher = self._run.plan.limits, self._episodes.dispatcher
+        task = dispatcher.awaited(peer.name) if dispatcher and peer.state is ServiceState.ACTIVE else None
+        if dispatcher and task:
+            waiting = dispatcher.table.describe_waiting(peer.name)
             return peer.blame_task(task, "makes no progress (timeouts.stall_s)", now, waiting)
         match peer.state:
             case ServiceState.ACTIVE:

@@ -34,7 +34,7 @@ class Registration:
 
     # --- HELLO -------------------------------------------------------------------------------------
 
-    def joined(self, event: ev.Joined, now: int) -> None:
+    def handle_hello(self, event: ev.Joined, now: int) -> None:
         """HELLO: welcome it, or turn it away."""
         run, hello = self._run, event.hello
         refusal = self._refusal(hello)
@@ -143,7 +143,7 @@ class Registration:
         found = {asset.name: asset for peer in self._run.peers.values() for asset in peer.assets}
         return tuple(found[name] for name in sorted(found))
 
-    def assets_offered(self, event: ev.AssetsOffered, now: int) -> None:
+    def handle_asset_offer(self, event: ev.AssetsOffered, now: int) -> None:
         """A world's scenery: one name stands for one file in the run (clause 4)."""
         run, peer = self._run, self._run.peers[event.service]
         if peer.state is not ServiceState.PREPARING or peer.role != "world":
@@ -161,13 +161,13 @@ class Registration:
                 return
         peer.assets, peer.advanced_at = event.assets, now
 
-    def ready(self, event: ev.ReadyReceived, now: int) -> None:
+    def handle_ready(self, event: ev.ReadyReceived, now: int) -> None:
         """READY: check what it claims, and go on when everybody is."""
         run, peer, message = self._run, self._run.peers[event.service], event.message
         if not run.current(peer, message.epoch, message.attempt, "READY"):
             return
         if peer.state is ServiceState.RESTORING:
-            self._episodes.recall.restored(peer, now)
+            self._episodes.checkpoints.handle_ready(peer, now)
             return
         if peer.state is not ServiceState.PREPARING:
             run.unexpected(peer, "READY", "once, after PREPARE")

@@ -289,6 +289,10 @@ class Run:
         """Have a message sent."""
         self.actions.append(Send(peer.name, message, products, attachment))
 
+    def ids(self, peer: Peer) -> dict[str, int]:
+        """What every message of an episode to a service carries (clause 1)."""
+        return {"epoch": self.plan.epoch, "attempt": peer.attempt, "episode": self.episode}
+
     def enter_journal(self, outcome: str, service: str, frame: int, now: int, **facts: Any) -> None:
         """Have something written down that is no decision about a task."""
         if not self.plan.ephemeral:
@@ -312,14 +316,7 @@ class Run:
         """Answer a message that matches nothing outstanding (clause 1)."""
         self.notice("stale", peer.name, f"{what} matches nothing that is outstanding; not used")
         if peer.present:
-            answer = Stale(
-                of=kind,
-                epoch=self.plan.epoch,
-                attempt=peer.attempt,
-                episode=self.episode,
-                frame=outstanding,
-            )
-            self.send(peer, answer)
+            self.send(peer, Stale(of=kind, **self.ids(peer), frame=outstanding))
 
     def unexpected(self, peer: Peer, kind: str, when: str) -> None:
         """Answer a message that came out of turn."""

@@ -89,9 +89,9 @@ class RunStatus(msgspec.Struct, frozen=True, kw_only=True):
     culprit: str
 
 
-def look(run: Run, episodes: Episodes, now: int) -> RunStatus:
+def status_of(run: Run, episodes: Episodes, now: int) -> RunStatus:
     """The view of a run at the time ``now`` [ns]."""
-    schedule = episodes.schedule
+    dispatcher = episodes.dispatcher
     waits = [wait for peer in run.peers.values() if (wait := _wait(run, episodes, peer, now)) is not None]
     return RunStatus(
         run=run.plan.run,
@@ -102,8 +102,8 @@ def look(run: Run, episodes: Episodes, now: int) -> RunStatus:
         steps=run.gate.steps,
         episode=run.episode,
         episodes=run.plan.episodes,
-        frame=schedule.begun if schedule is not None else -1,
-        frames=schedule.frames if schedule is not None else run.plan.frames,
+        frame=dispatcher.begun if dispatcher is not None else -1,
+        frames=dispatcher.table.frames if dispatcher is not None else run.plan.frames,
         pace="realtime" if run.plan.realtime else "free",
         services=tuple(_service(peer, episodes, now) for peer in run.peers.values()),
         waits=tuple(sorted(waits, key=lambda wait: (not wait.late, -wait.elapsed_s))),
@@ -147,8 +147,8 @@ def _wait(run: Run, episodes: Episodes, peer: Peer, now: int) -> Wait | None:
         text = f"{peer} has not said BYE for {_told(now - run.since)}; {peer.last_words(now)}"
         return _of(peer, -1, now - run.since, limit, "", text, now)
     owed = [task for task in _owed(peer, episodes) if task.state is not TaskState.ABANDONED]
-    schedule = episodes.schedule
-    lacking = schedule.waiting_for(peer.name) if schedule is not None else ""
+    dispatcher = episodes.dispatcher
+    lacking = dispatcher.table.describe_waiting(peer.name) if dispatcher is not None else ""
     if peer.state in _UNDER_WAY:
         limits = run.plan.limits
         limit = {
@@ -188,10 +188,10 @@ def _of(peer: Peer, frame: int, elapsed: int, limit: int, lacking: str, text: st
 
 
 def _owed(peer: Peer, episodes: Episodes) -> list[Task]:
-    schedule = episodes.schedule
-    if schedule is None or peer.name not in schedule.graph.inputs:
+    dispatcher = episodes.dispatcher
+    if dispatcher is None or peer.name not in dispatcher.table.participants:
         return []
-    return schedule.outstanding(peer.name)
+    return dispatcher.outstanding(peer.name)
 
 
 def _age(peer: Peer, now: int) -> float | None:
