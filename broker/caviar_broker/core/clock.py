@@ -110,8 +110,11 @@ class FrameClock:
 
     def actions(self) -> list[ev.Action]:
         """What the shell has to do, in order; each is handed out once."""
-        actions = self._run.actions.copy()
-        self._run.actions.clear()
+        waiting = self._run.actions
+        if not waiting:
+            return []
+        actions = waiting.copy()
+        waiting.clear()
         return actions
 
     def settle(self, now: int) -> None:

@@ -272,8 +272,7 @@ class Dispatcher:
             latest[0][1].waiting.add(participant)
         else:
             self.ready.add(participant)
-        if participant.waiting:
-            self._wake(participant.waiting)
+        self._wake(participant.waiting)
         if table.finished_frames != self._seen_finished:
             self._seen_finished = table.finished_frames
             self._wake(self._waiting_for_frames)

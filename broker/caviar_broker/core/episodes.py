@@ -299,8 +299,9 @@ class Episodes:
         deadlines = dispatcher.deadlines
         if deadlines.overruns or deadlines.skips or dispatcher.cut or deadlines.aborted:
             self._blame_overruns(dispatcher, now)
-        if not run.over and dispatcher.finished:
-            self._end(dispatcher.table.frames, now)
+        table = dispatcher.table
+        if table.finished_frames >= table.frames and not run.over and dispatcher.finished:
+            self._end(table.frames, now)
 
     def _blame_overruns(self, dispatcher: Dispatcher, now: int) -> None:
         """Say which budgets are up, cancel what is cut, and end the run where the policy is abort."""
