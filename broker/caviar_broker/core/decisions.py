@@ -125,8 +125,7 @@ class Task:
 
     def move(self, event: TaskEvent) -> None:
         """Take a transition of the table in `caviar_broker.core.transitions`."""
-        # Twice in every service's part of a frame: `step`, which names what is wrong, only where there is none.
-        self.state = TASK.get((self.state, event)) or step(TASK, self.state, event)
+        self.state = step(TASK, self.state, event)
 
 
 @dataclass(slots=True, eq=False)
