@@ -32,6 +32,7 @@ SINCE: dict[str, str] = {
     "ChannelOptions.materials_outside": "1.1",
     "ChannelOptions.absorption_db_per_km": "1.1",
     "ChannelOptions.detail": "1.1",
+    "ChannelOptions.foliage": "1.4",
     "Welcome.rejoin_ns": "1.3",
     "Prepare.prefixes": "1.3",
     "Fault.culprit": "1.3",

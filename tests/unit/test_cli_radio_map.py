@@ -20,7 +20,7 @@ from caviar_clients.cli.radio_map_file import ARRAYS
 from caviar_clients.cli.radio_map_inputs import Wanted, channel_of, in_hertz, noise_of
 from caviar_clients.plots.radio_map import RadioMapView, colour_limits, draw_servers, draw_values
 from caviar_clients.tradeoff.scenes import scene_at
-from caviar_protocol.errors import RecordingError, RunError
+from caviar_protocol.errors import RecordingError, RunError, ScenarioError
 from caviar_protocol.scenario import ServiceSpec
 from caviar_protocol.topics import Carrier
 from caviar_services.channel.radio_map.mapping import transmitters_of
@@ -116,6 +116,18 @@ def test_a_channel_that_traces_no_rays_is_refused_and_leaves_nothing_behind(tmp_
             tmp_path / "mine.toml", tmp_path / "map.png", options_of(None, Wanted(), "best"), Console()
         )
     assert [file.name for file in tmp_path.iterdir()] == ["mine.toml"]
+
+
+def test_a_channel_with_foliage_is_refused(tmp_path: Path) -> None:
+    """The map would show the places behind it as if it were not there."""
+    shipped = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
+    traced = shipped.read_text().replace('use = "free-space"', 'use = "sionna-rt"')
+    file = tmp_path / "mine.toml"
+    file.write_text(f"{traced}\n[services.channel.settings.foliage.hedge]\n")
+    scenes = scene_at(file)
+    with pytest.raises(ScenarioError, match="no volumes that attenuate; map a scenario without") as refused:
+        channel_of(scenes, scenes.instants[0].scene)
+    assert refused.value.key == "services.channel.settings.foliage"
 
 
 def test_a_recorded_instant_is_found_and_a_missing_one_is_named(tmp_path: Path) -> None:

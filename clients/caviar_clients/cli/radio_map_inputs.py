@@ -89,6 +89,11 @@ def channel_of(scenes: Scenes, scene: Scene) -> tuple[SionnaChannel, Mapping[str
             traced = [model for model in models(settings, place) if issubclass(model[0], SionnaChannel)]
             cls, settings = traced[-1] if traced else (cls, settings)
         if issubclass(cls, SionnaChannel) and isinstance(settings, SionnaSettings):
+            if settings.foliage:
+                raise place.at("foliage").error(
+                    "radio maps have no volumes that attenuate; map a scenario without foliage, and without "
+                    "the pieces of scenery and objects that are"
+                )
             return cls(settings, run), scenes.assets
         if issubclass(cls, FreeSpaceChannel) and isinstance(settings, FreeSpaceSettings):
             nothing = SionnaSettings(

@@ -87,6 +87,9 @@ class ChannelOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=Tr
     """By the air (ITU-R P.676), for each carrier; empty: none."""
     detail: str = ""
     """What is left of the scenery, as ``312 of 1240 triangles, 91.2% of the area``; empty: all of it."""
+    foliage: tuple[str, ...] = ()
+    """What attenuates as foliage (ITU-R P.833), by kind and carrier, as ``tree*@v: 2.1 dB/m, at most 40 dB
+    (measured)``; empty: nothing."""
 
 
 class ChannelMatrix(Payload, frozen=True, kw_only=True, omit_defaults=True):

@@ -23,10 +23,11 @@ from caviar_services.channel.arrays.element_visibility import elements
 from caviar_services.channel.paths import Antenna, PathTable, antenna_fields
 from caviar_services.channel.propagation.atmosphere import amplitude_factor
 from caviar_services.channel.propagation.clearance import with_near_pairs
+from caviar_services.channel.propagation.foliage import Foliage
 from caviar_services.channel.propagation.geometry import PathGeometry, path_geometry
 from caviar_services.channel.sionna.candidate_visibility import Corners
 from caviar_services.channel.sionna.path_solver import Tracer
-from caviar_services.channel.sionna.path_table import path_table
+from caviar_services.channel.sionna.path_table import path_ends, path_table
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.channel.wideband import Bins
 
@@ -48,6 +49,8 @@ class ElementTracer:
         Candidates looked at together at most.
     los
         Whether straight paths count.
+    foliage
+        Of the frame; None: there is none.
     """
 
     def __init__(
@@ -58,7 +61,9 @@ class ElementTracer:
         wavelengths: Float64Array,
         lanes: int,
         los: bool,
+        foliage: Foliage | None = None,
     ) -> None:
+        self._foliage = foliage
         self._tracer = tracer
         self._scene = scene
         self._velocity = velocity
@@ -185,6 +190,8 @@ class ElementTracer:
         )
         los = np.zeros(len(ends), np.bool_)
         table, _ = with_near_pairs(table, los, *places, self._wavelengths, self._scene.surfaces)
+        if self._foliage is not None:
+            table = self._foliage.attenuated(table, *path_ends(table.pair, *places))
         return table if self._los else table.take((table.types != 0).any(1))
 
     def _amplitudes(

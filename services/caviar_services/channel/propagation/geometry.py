@@ -50,15 +50,11 @@ def path_geometry(
     Doppler shift to first order in v/c, with unit vector k_i of the segment behind corner i:
     f_D / f = Σ_i (v_i − v_{i+1})·k_i / c (a source that approaches raises the frequency).
     """
-    paths, depth = points.shape[:2]
-    if not depth:
+    paths = len(points)
+    if not points.shape[1]:
         return _straight(end - start, end_velocity - start_velocity)
-    corners = np.concatenate([start[:, None], points, end[:, None]], axis=1)
-    velocity = np.concatenate([start_velocity[:, None], point_velocity, end_velocity[:, None]], axis=1)
-    # Unused corners move onto the receiver, so that their segments have length zero.
-    unused = np.arange(depth + 2) > count[:, None]
-    corners = np.where(unused[..., None], end[:, None], corners)
-    velocity = np.where(unused[..., None], end_velocity[:, None], velocity)
+    corners = path_corners(start, points, end, count)
+    velocity = path_corners(start_velocity, point_velocity, end_velocity, count)
 
     segment = np.diff(corners, axis=1)
     length = np.sqrt((segment**2).sum(-1))
@@ -70,6 +66,18 @@ def path_geometry(
         arrival=-along[rows, count],
         doppler_ratio=-(np.diff(velocity, axis=1) * along).sum((1, 2)) / SPEED_OF_LIGHT,
     )
+
+
+def path_corners(
+    start: Float64Array, points: Float64Array, end: Float64Array, count: Int64Array
+) -> Float64Array:
+    """Corners of paths start → points → end, Shape ``[P, D + 2, 3]``; arguments are those of `path_geometry`.
+
+    Unused corners are at the receiver, so that their segments have length zero.
+    """
+    corners = np.concatenate([start[:, None], points, end[:, None]], axis=1)
+    unused = np.arange(corners.shape[1]) > count[:, None]
+    return np.where(unused[..., None], end[:, None], corners)
 
 
 def _straight(line: Float64Array, separation: Float64Array) -> PathGeometry:

@@ -20,6 +20,7 @@ from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_protocol.assets import default_folder
 from caviar_protocol.errors import PayloadError, SetupError
 from caviar_protocol.host import install_command
+from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.seeding import derive_seed
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import AntennaDevice, ChannelOptions, Scene
@@ -33,6 +34,7 @@ from caviar_services.channel.enumeration.path_solver import EnumeratedTracer, un
 from caviar_services.channel.enumeration.scenery_chains import SceneryChains, SceneryLaunch
 from caviar_services.channel.paths import Antenna, PathTable
 from caviar_services.channel.propagation.clearance import with_near_pairs
+from caviar_services.channel.propagation.foliage import Foliage
 from caviar_services.channel.sionna.candidate_visibility import Corners
 from caviar_services.channel.sionna.contributing import contributing
 from caviar_services.channel.sionna.diffuse_paths import Element
@@ -94,6 +96,15 @@ class SionnaChannel(PathModel[SionnaSettings]):
         """Whether rays are launched in each frame for the paths of all kinds."""
         self._following: Following | None = None
         self._outside: tuple[OutsideUse, ...] = ()
+        self.foliage: Foliage | None = None
+        """What paths lose in; None: no foliage in the scenario."""
+        if settings.foliage:
+            self.foliage = Foliage(
+                settings.foliage,
+                run.carriers,
+                Place("services").at(run.name).at("settings"),
+                {"without_body": settings.without_body, "object_materials": settings.object_materials},
+            )
         self._detail = ""
         self._room: dict[str, int] = {}
         self._names: tuple[str, ...] = ()
@@ -127,6 +138,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
             samples=self._samples,
             materials_outside=tuple(use.brief(self.run.carriers[use.carrier].name) for use in self._outside),
             detail=self._detail,
+            foliage=() if self.foliage is None else self.foliage.briefs,
         )
 
     @property
@@ -177,11 +189,17 @@ class SionnaChannel(PathModel[SionnaSettings]):
                 free_edges=s.free_edges,
                 detail=s.detail,
                 objects=ObjectMaterials(s.object_materials),
+                foliage=ObjectMaterials() if self.foliage is None else self.foliage.keys,
             ),
         )
+        if self.foliage is not None:
+            self.foliage.stand(self._scene.foliage_meshes)
+            notes += tuple(f"foliage {brief}" for brief in self.foliage.briefs)
         self._names = self._scene.names
         self._outside = self._scene.outside
-        notes += self._unmatched(preparation)
+        notes += self._unmatched("object_materials", ObjectMaterials(s.object_materials), preparation)
+        if self.foliage is not None:
+            notes += self._unmatched("foliage", self.foliage.keys, preparation)
         notes += tuple(use.note(self.run.carriers[use.carrier].name) for use in self._outside)
         if self._scene.detail_effect is not None:
             notes += (self._scene.detail_effect.note,)
@@ -266,7 +284,9 @@ class SionnaChannel(PathModel[SionnaSettings]):
 
     def paths(self, scene: Scene, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]) -> Found:
         self._activate()
-        _refuse_buried(scene, self.settings.without_body)
+        _refuse_buried(scene, self.settings.without_body, self.foliage)
+        if self.foliage is not None:
+            self.foliage.move(scene)
         if self._following is not None:
             names, velocity = self._following.place(scene)
         else:
@@ -286,6 +306,8 @@ class SionnaChannel(PathModel[SionnaSettings]):
         straight = (table.types == 0).all(1)
         los[table.pair[straight if table.hidden is None else straight & ~table.hidden]] = True
         table, too_close = with_near_pairs(table, los, *antennas, self._wavelengths, self._scene.surfaces)
+        if self.foliage is not None:
+            table = self.foliage.attenuated(table, *path_ends(table.pair, *antennas))
         if not self.settings.los:
             table = table.take((table.types != 0).any(1))
         return Found(
@@ -297,20 +319,28 @@ class SionnaChannel(PathModel[SionnaSettings]):
                 **({} if self._edge_range is None else {"no_edge_in_range": self._without_edge}),
             },
             matrices=self._matrices([part for _, part in parts], table, (sources, targets)),
-            split_nmse=self._split_nmse(parts),
+            split_nmse=self._split_nmse(parts, antennas),
         )
 
-    def _split_nmse(self, parts: Sequence[tuple[Int64Array, Traced]]) -> Float64Array | None:
+    def _split_nmse(self, parts: Sequence[tuple[Int64Array, Traced]], antennas: Ends) -> Float64Array | None:
         """See `Found.split_nmse`; antennas count as isotropic."""
         if not (self.with_split and self._launches):
             return None
         power = np.zeros(self._missed.size)
         for pair, traced in parts:
-            power += _power(pair, traced, self._missed.size)
+            dimmed = self._dimmed(traced, *path_ends(pair, *antennas))
+            power += _power(pair, dimmed, self._missed.size)
         split: Float64Array = self._missed / np.maximum(power, np.finfo(np.float64).tiny).reshape(
             self._missed.shape
         )
         return split
+
+    def _dimmed(self, traced: Traced, start: Float64Array, end: Float64Array) -> Traced:
+        """Traced paths between these positions [m], Shape ``[P, 3]``, with what foliage leaves of them."""
+        if self.foliage is None:
+            return traced
+        factor = self.foliage.amplitude_factor(start, traced.points, end, traced.types)
+        return replace(traced, transfer=traced.transfer * factor[..., None, None])
 
     def _activate(self) -> None:
         """The variant of Mitsuba is the process's, and others may have set theirs."""
@@ -336,6 +366,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
                 self._wavelengths,
                 max(1, lanes),
                 self.settings.los,
+                self.foliage,
             )
         return None
 
@@ -373,8 +404,11 @@ class SionnaChannel(PathModel[SionnaSettings]):
             )
             found.append(launched if not found else unknown_paths(launched, found[0], self._scene))
             if self.with_split:
-                missed = tracer.missed_by_half(transmitter.position, found[-1])
-                self._missed[t, others] = _power(found[-1].receiver, found[-1], len(others), missed)
+                last = found[-1]
+                missed = tracer.missed_by_half(transmitter.position, last)
+                ends = targets[last.receiver]
+                dimmed = self._dimmed(last, np.broadcast_to(transmitter.position, ends.shape), ends)
+                self._missed[t, others] = _power(last.receiver, dimmed, len(others), missed)
         if self._diffuse is not None:
             element = Element(transmitter)
             found.append(
@@ -383,13 +417,14 @@ class SionnaChannel(PathModel[SionnaSettings]):
         first, index = t * len(receivers), np.array(others, np.int64)
         return [(first + index[traced.receiver], traced) for traced in found]
 
-    def _unmatched(self, preparation: Preparation) -> tuple[str, ...]:
-        """Keys of ``object_materials`` that neither a mesh nor a piece of scenery is called."""
-        known = {*self._scene.names, *(PurePosixPath(name).stem for name in preparation.assets)}
+    def _unmatched(self, setting: str, keys: ObjectMaterials, preparation: Preparation) -> tuple[str, ...]:
+        """Keys of a setting that neither a mesh nor a piece of scenery is called."""
+        pieces = {*self._scene.names, *self._scene.foliage_meshes}
+        known = pieces | {PurePosixPath(name).stem for name in preparation.assets}
         return tuple(
-            f"object_materials: no mesh and no piece of scenery is called {key!r}; it counts for objects of "
+            f"{setting}: no mesh and no piece of scenery is called {key!r}; it counts for objects of "
             "this name, and for those of this class without a mesh"
-            for key in ObjectMaterials(self.settings.object_materials).unmatched(known)
+            for key in keys.unmatched(known)
         )
 
     def _moving(self, preparation: Preparation) -> bool:
@@ -471,12 +506,13 @@ def _power(where: Int64Array, traced: Traced, count: int, weight: Float64Array |
     return np.bincount(where, weights=weight * power, minlength=count).astype(np.float64)
 
 
-def _refuse_buried(scene: Scene, without_body: Sequence[str]) -> None:
+def _refuse_buried(scene: Scene, without_body: Sequence[str], foliage: Foliage | None) -> None:
     """Raise `PayloadError` for an antenna in the very middle of a body, which no wave can reach."""
     for device in scene.devices:
         if isinstance(device, AntennaDevice) and device.parent and device.position == (0.0, 0.0, 0.0):
             cls = scene.classes[scene.names.index(device.parent)]
-            if cls not in without_body:
+            is_foliage = foliage is not None and foliage.keys.of(device.parent, cls)
+            if cls not in without_body and not is_foliage:
                 raise PayloadError(
                     f"antenna {device.name!r} stands in the middle of the body of {device.parent!r}, where "
                     f"no wave reaches it; mount it on the roof or floor, or list {cls!r} in without_body"

@@ -87,6 +87,8 @@ class SceneSettings:
     """What of the scenery is left out."""
     objects: ObjectMaterials = field(default_factory=ObjectMaterials)
     """Of what objects and pieces of scenery are made that differ from the others."""
+    foliage: ObjectMaterials = field(default_factory=ObjectMaterials)
+    """Which objects and pieces of scenery are foliage: waves do not meet them."""
 
 
 class SionnaScene(NumberedTriangles):
@@ -105,19 +107,22 @@ class SionnaScene(NumberedTriangles):
         description = find_scenery(assets)
         files = {} if description is None else file_vertices(description)  # says what is wrong with a file
         self._scene = loaded(description)
-        self._scenery = frozenset(self._scene.objects)
-        self._objects = settings.objects
+        self._objects, self._foliage = settings.objects, settings.foliage
+        meshes = file_meshes(self._scene, files)
+        self.foliage_meshes = {name: meshes.pop(name) for name in list(meshes) if self._foliage.of(name)}
+        """Pieces of scenery that are foliage, by name; no shape has them."""
+        self._scenery = frozenset(meshes)
         made = object_materials(self._objects, settings.frequencies_hz, settings.materials)
         changed = {name: made[m].radio for name in self._scenery if (m := self._objects.of(name))}
-        full = by_material(self._scene, file_meshes(self._scene, files), changed)
+        full = by_material(self._scene, meshes, changed)
         key = f"{settings.materials.key}.detail"
         shapes, self.detail_effect = with_detail(full, settings.detail, key)
         self.low, self.high = _bounds(shapes)
-        meshes = {asset: unit_mesh(asset, assets) for asset in pool}
+        units = {asset: unit_mesh(asset, assets) for asset in pool}
         # Each material of bodies is a shape of its own, with a pool of its own.
         kinds = {(asset, m): body_kind(asset, m) for m in ("", *made) for asset in sorted(pool)}
         self._pool = {kind: pool[asset] for (asset, _), kind in kinds.items()}
-        self._meshes = {kind: meshes[asset] for (asset, _), kind in kinds.items()}
+        self._meshes = {kind: units[asset] for (asset, _), kind in kinds.items()}
         of_material = {
             m: [(kind, slot) for (asset, of), kind in kinds.items() if of == m for slot in range(pool[asset])]
             for m in ("", *made)
@@ -244,14 +249,18 @@ class SionnaScene(NumberedTriangles):
         return np.array([middle[0], middle[1], self.low[2] - PARKING_DEPTH])
 
     def place(self, scene: Scene, without_body: frozenset[str]) -> tuple[tuple[str, ...], Float64Array]:
-        """Move the bodies to the objects of a scene, in one update.
+        """Move the bodies to the objects of a scene, in one update; foliage has none.
 
         Returns the names that the indices of `object_index` stand for, and their velocities [m/s],
         Shape ``[len(names), 3]``.
 
         Raises `PayloadError` where the pool is too small, or an object has the name of a piece of scenery.
         """
-        solid = [i for i, cls in enumerate(scene.classes) if cls not in without_body]
+        solid = [
+            i
+            for i, cls in enumerate(scene.classes)
+            if cls not in without_body and not self._foliage.of(scene.names[i], cls)
+        ]
         index = {scene.names[i]: i for i in solid}
         clash = self._scenery & index.keys()
         if clash:

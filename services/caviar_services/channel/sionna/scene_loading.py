@@ -35,14 +35,14 @@ def loaded(description: Path | None) -> Any:
 
 
 def by_material(scene: Any, meshes: Mapping[str, Mesh], changed: Mapping[str, Any]) -> list[Shape]:
-    """What was loaded, joined to one shape a material; ``changed`` has the materials of pieces that are given
-    another one than the scenery's."""
+    """Meshes of what was loaded, by name, joined to one shape a material; ``changed`` has the materials of
+    pieces that are given another one than the scenery's."""
     groups: dict[str, Shape] = {}
-    for name, item in scene.objects.items():
-        material = changed.get(name, item.radio_material)
+    for name, mesh in meshes.items():
+        material = changed.get(name, scene.objects[name].radio_material)
         group = groups.setdefault(material.name, Shape(f"caviar-scenery-{material.name}", material, [], []))
         group.names.append(name)
-        group.meshes.append(meshes[name])
+        group.meshes.append(mesh)
     return list(groups.values())
 
 

@@ -13,6 +13,7 @@ from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import ScenarioError
 from caviar_services.channel.base import ChannelSettings
 from caviar_services.channel.mesh_detail.detail import DetailSettings
+from caviar_services.channel.propagation.foliage import FoliageSettings
 from caviar_services.channel.sionna.materials import MaterialSettings, OutsideRange
 
 _SAMPLES = 100_000
@@ -111,6 +112,10 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     ``materials`` gives both electric constants. The first of name, pattern and class that fits counts."""
     materials: dict[str, MaterialSettings] = msgspec.field(default_factory=dict)
     """Changes to materials of the scenery, and of ``object_materials``, by name."""
+    foliage: dict[str, FoliageSettings] = msgspec.field(default_factory=dict)
+    """What is foliage, through which waves pass with a loss: classes of moving objects, and names or patterns
+    of names of objects and pieces of scenery, as in ``object_materials``. The volume of a piece of scenery is
+    within its mesh, which is to be closed; that of an object is its bounding box."""
     detail: DetailSettings = msgspec.field(default_factory=DetailSettings)
     """What of the scenery is left out; absent, nothing is."""
     outside_itu_range: OutsideRange = "error"

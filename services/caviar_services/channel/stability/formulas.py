@@ -30,6 +30,12 @@ def doppler(closing_speed: float, frequency: float) -> float:
     return frequency * closing_speed / C
 
 
+def vegetation(length: float, gamma: float, most: float = math.inf) -> float:
+    """Attenuation [dB] of a path of some length [m] in vegetation of γ [dB/m], at most ``most`` (ITU-R
+    P.833-10, eq. 1)."""
+    return gamma * length if math.isinf(most) else most * (1 - math.exp(-gamma * length / most))
+
+
 def permittivity(relative: float, conductivity: float, frequency: float) -> complex:
     """Complex relative permittivity ε_r − jσ/(2πfε₀)."""
     return complex(relative, -conductivity / (2 * math.pi * frequency * EPSILON_0))

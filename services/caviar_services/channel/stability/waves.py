@@ -1,4 +1,4 @@
-"""Frequencies, distances, grazing incidence and materials: one ray, and two over flat ground."""
+"""Frequencies, distances, grazing incidence, materials and foliage: one ray, and two over flat ground."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from caviar_services.channel.stability.bench import (
     Material,
     Plate,
     Point,
+    Thing,
     answer,
     antenna,
     link,
@@ -219,3 +220,43 @@ def _(bench: Bench) -> Outcome:
     channel = link(model, tx, back)
     mirrored = abs(channel.a[0, (channel.interactions == 1).any(1)].sum()) / free
     return close("(|T|² + |R|²)", 1.0, float(passed**2 + mirrored**2), absolute=2e-3)
+
+
+# --- foliage ---------------------------------------------------------------------------------
+
+
+@case("foliage", "10 m of 1.5 dB/m on the line of sight, without a maximum and with one of 12 dB")
+def _(bench: Bench) -> Outcome:
+    frequency, distance = 28e9, 100.0
+    hedge = {
+        "attenuation_db_per_m": {"c0": 1.5, "c1": 1.5},
+        "maximum_db": {"c1": 12.0},
+        "source": "made up",
+    }
+    model = bench.traced((frequency, frequency), foliage={"hedge": hedge})
+    channel = link(model, (0, 0, 2), (distance, 0, 2), Thing("hedge", (50, 0, 2), (10, 8, 6)))
+    free = formulas.friis(distance, frequency) * formulas.phase(distance, frequency)
+    lost = formulas.vegetation(10.0, 1.5), formulas.vegetation(10.0, 1.5, 12.0)
+    return all_of(
+        *(
+            close("(H)", free * 10 ** (-db / 20), total(channel, c), relative=1e-5)
+            for c, db in enumerate(lost)
+        ),
+        equal(True, bool(channel.los.all()), "line of sight"),
+    )
+
+
+@case("foliage", "two crowns that overlap, on the way to the ground and back")
+def _(bench: Bench) -> Outcome:
+    """From (0, 20) over (50, 0) to (100, 20): each crown is 6 m wide, and 8 m are in one of them or both."""
+    crowns = {"attenuation_db_per_m": {"c0": 0.5, "c1": 0.0}, "source": "made up"}
+    model = bench.traced((3.5e9, 3.5e9), [ground(300.0)], {"surface": LOSSY}, foliage={"crown.*": crowns})
+    boxes = [Thing(f"crown.{i}", (x, 0, 10.5), (6, 8, 19)) for i, x in enumerate((23, 25))]
+    channel = link(model, (0, 0, 20), (100, 0, 20), *boxes)
+    direct, bounced = (
+        20 * np.log10(np.abs(channel.a[1, path] / channel.a[0, path])) for path in range(len(channel.tau))
+    )
+    return all_of(
+        close("dB straight", 0.0, float(direct), absolute=1e-6),
+        close("dB by the ground", 0.5 * 8 * math.hypot(50, 20) / 50, float(bounced), absolute=1e-6),
+    )
