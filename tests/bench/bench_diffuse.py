@@ -26,10 +26,10 @@ from typing import Any
 import numpy as np
 
 from caviar_clients.tradeoff.ladder import Setting
-from caviar_clients.tradeoff.measure import Rung
 from caviar_clients.tradeoff.rows import error_fields
 from caviar_clients.tradeoff.scenes import Scenes, scenes_of
 from caviar_clients.tradeoff.users import Key, Noise, UserChannel, differences
+from caviar_clients.tradeoff.worker import Rung
 
 SCENARIO = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "street-canyon.toml"
 WITHOUT, ONE, OTHER, RAYS = "without", "seed 1", "seed 2", "other rays"

@@ -29,7 +29,7 @@ from typing import Any, ClassVar
 import msgspec
 import numpy as np
 
-from caviar_clients.embedded.run import EmbeddedRun
+from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.scenario import Scenario, load_scenario
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Channel, Scene

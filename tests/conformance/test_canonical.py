@@ -8,10 +8,15 @@ import msgpack
 import pytest
 
 from caviar_clients.conform import street
-from caviar_clients.conform.canonical import first_difference
+from caviar_clients.conform.canonical import (
+    check_products,
+    first_difference,
+    not_canonical,
+    pack,
+    product_digest,
+    unpack,
+)
 from caviar_clients.conform.case import Failed
-from caviar_clients.conform.forms import check_products, not_canonical, product_digest
-from caviar_clients.conform.packing import pack, unpack
 from caviar_clients.conform.wire import Received
 
 HEADER, BODY = street.product("scene", "traffic", 3)

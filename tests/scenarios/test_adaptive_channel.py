@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 from scenarios_support import SCENARIOS
 
-from caviar_clients.cli.decided import Decided
-from caviar_clients.cli.inspect import summarise
-from caviar_clients.embedded.run import EmbeddedRun
+from caviar_clients.cli.recording_summary import Decided, summarise
+from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.recording import Recording

@@ -20,7 +20,7 @@ from scenarios_support import SCENARIOS, caviar, pid_of, running, scenario_file
 from caviar_clients.envs.beam_selection import BeamSelectionEnv
 from caviar_clients.envs.uav_path import UavPathEnv
 from caviar_clients.envs.uav_path_v1 import UavPathV1Env
-from caviar_clients.sessions.connected import ConnectedSession
+from caviar_clients.session.connected import ConnectedSession
 from caviar_protocol.errors import PayloadError, RunError
 from caviar_protocol.messages import Input
 from caviar_protocol.recording import Recording

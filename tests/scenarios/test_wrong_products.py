@@ -8,7 +8,7 @@ import pytest
 import wrong_worlds
 from scenarios_support import SCENARIOS, run, scenario_file
 
-from caviar_clients.embedded.run import EmbeddedRun
+from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.scenario import Scenario, parse_scenario
 
 OBJECTS = "[[services.world.settings.objects]]"

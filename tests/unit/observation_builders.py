@@ -9,8 +9,7 @@ import numpy as np
 from link_builders import antenna, frame_of, scene_of
 from msgspec.structs import replace
 
-from caviar_clients.envs.observations import Moment, part
-from caviar_clients.envs.users import Users
+from caviar_clients.envs.observations import Moment, Users, part
 from caviar_protocol.scenario import DeviceSpec, Scenario, load_scenario
 from caviar_protocol.topics import (
     Link,

@@ -31,7 +31,7 @@ from rich.console import Console
 
 from caviar_broker.control.server import MAX_CONNECTIONS, MAX_REQUEST, MAX_WAITING
 from caviar_broker.control.socket import ask, connect, held
-from caviar_clients.cli.why import newest_run, why_command
+from caviar_clients.cli.remote import newest_run, why_command
 from caviar_protocol import messages as m
 from caviar_protocol.errors import RunError
 

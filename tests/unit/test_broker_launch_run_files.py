@@ -14,7 +14,7 @@ from caviar_broker.control.socket import ControlSocket
 from caviar_broker.journal_format import read_journal, run_of_journal
 from caviar_broker.launch import parser, serve
 from caviar_broker.run_record import RunRecord, versions_of
-from caviar_clients.embedded.run import EmbeddedRun
+from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.recording.layout import read_manifest
 from caviar_protocol.scenario import load_scenario

@@ -9,7 +9,7 @@ import msgspec
 import pytest
 from adaptive_rungs import LADDER, MS, Time, adaptive, channel_of, frame, labels, rung
 
-from caviar_clients.sessions.checking import checked_scenario
+from caviar_clients.session.checks import checked_scenario
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.errors import ScenarioError
 from caviar_services.channel.adaptive.channel import AdaptiveChannel

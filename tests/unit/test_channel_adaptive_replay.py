@@ -8,7 +8,7 @@ import pytest
 from adaptive_rungs import LADDER, Time
 from msgspec.structs import replace
 
-from caviar_clients.embedded.run import EmbeddedRun
+from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.recording import Recording
 from caviar_protocol.recording.reader import Imposed, recorded_decisions
 from caviar_protocol.scenario import load_scenario

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from caviar_clients.cli.decided import Decisions, decided_lines
+from caviar_clients.cli.recording_summary import Decisions, decided_lines
 from caviar_protocol.messages import Report
 
 

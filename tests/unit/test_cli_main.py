@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from caviar_clients.cli import main as command
-from caviar_clients.embedded.run import EmbeddedRun
+from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.scenario import load_scenario
 
 SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"

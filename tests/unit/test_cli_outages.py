@@ -6,8 +6,7 @@ from pathlib import Path
 
 from recording_samples import frame, link, product, recorder, scene
 
-from caviar_clients.cli.inspect import summarise
-from caviar_clients.cli.outages import SHOWN_INSIDE, Outages, outage_lines
+from caviar_clients.cli.recording_summary import SHOWN_INSIDE, Outages, outage_lines, summarise
 from caviar_protocol.messages import Report
 from caviar_protocol.recording import Recording
 

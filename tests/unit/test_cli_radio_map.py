@@ -15,8 +15,7 @@ from recording_samples import record, scene
 from rich.console import Console
 
 from caviar_clients.cli import main as command
-from caviar_clients.cli.radio_map import draw_radio_map, options_of
-from caviar_clients.cli.radio_map_file import ARRAYS
+from caviar_clients.cli.radio_map import ARRAYS, draw_radio_map, options_of
 from caviar_clients.cli.radio_map_inputs import Wanted, channel_of, in_hertz, noise_of
 from caviar_clients.plots.radio_map import RadioMapView, colour_limits, draw_servers, draw_values
 from caviar_clients.tradeoff.scenes import scene_at

@@ -13,7 +13,7 @@ from caviar_broker import launch as broker_main
 from caviar_broker.core.plan import SECOND, plan_run
 from caviar_clients.cli import remote
 from caviar_clients.cli.main import app
-from caviar_clients.sessions.checking import TOPICS_OF, checked_scenario
+from caviar_clients.session.checks import TOPICS_OF, checked_scenario
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.keys import credentials, read_authorized, read_public
 from caviar_protocol.messages import Role

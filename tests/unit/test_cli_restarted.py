@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from caviar_clients.cli.restarted import RunInProgress
+from caviar_clients.cli.remote import RunInProgress
 from caviar_protocol.host import VARIABLE, SignOfLife
 from caviar_services.restarts import restart_status
 from caviar_services.termination import TERMINATED

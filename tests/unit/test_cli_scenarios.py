@@ -15,8 +15,8 @@ from typer.testing import CliRunner
 
 from caviar_clients.cli import scenarios
 from caviar_clients.cli.main import app
-from caviar_clients.embedded.run import EmbeddedRun
-from caviar_clients.sessions.checking import check_implementations, checked_scenario
+from caviar_clients.session.checks import check_implementations, checked_scenario
+from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol import host
 from caviar_protocol.errors import RunError, SetupError
 from caviar_protocol.scenario import load_scenario, parse_scenario, shipped_scenarios

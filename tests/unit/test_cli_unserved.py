@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from caviar_clients.cli.unserved import Unserved
+from caviar_clients.cli.recording_summary import Unserved
 from caviar_protocol.messages import Report
 
 

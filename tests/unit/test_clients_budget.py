@@ -12,11 +12,10 @@ import pytest
 from rich.console import Console
 
 from caviar_clients.budget.forecast import forecast, rounded_up
-from caviar_clients.budget.timing import Timing, measured_rate, outcomes_of, timings_of
 from caviar_clients.cli import budget as cli_budget
 from caviar_clients.cli.budget import budget_run, lines
-from caviar_clients.embedded.run import EmbeddedRun
-from caviar_clients.replay.recorded import RecordedRun
+from caviar_clients.replay.recorded import RecordedRun, Timing, measured_rate, outcomes_of, timings_of
+from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.recording import Recording

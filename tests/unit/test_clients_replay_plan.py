@@ -8,11 +8,11 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from caviar_clients.embedded.run import EmbeddedRun
 from caviar_clients.replay.plan import ReplayPlan, plan_replay
 from caviar_clients.replay.recorded import RecordedRun
 from caviar_clients.replay.request import request_of
 from caviar_clients.replay.toml import scenario_text
+from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.errors import CaviarError, RecordingError, RunError
 from caviar_protocol.recording import Recording, RecordingWarning
 from caviar_protocol.scenario import Scenario, load_scenario, parse_scenario

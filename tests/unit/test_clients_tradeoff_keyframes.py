@@ -11,12 +11,11 @@ import pytest
 from link_builders import CARRIER, antenna, scene_of
 from msgspec.structs import replace
 
-from caviar_clients.tradeoff.errors import FLOOR_DB
 from caviar_clients.tradeoff.keyframes import Traced, keyframe_rows, spaced
 from caviar_clients.tradeoff.ladder import Setting
-from caviar_clients.tradeoff.measure import Rung
 from caviar_clients.tradeoff.scenes import CONSECUTIVE, Instant, Scenes, scenes_of
-from caviar_clients.tradeoff.users import Noise
+from caviar_clients.tradeoff.users import FLOOR_DB, Noise
+from caviar_clients.tradeoff.worker import Rung
 from caviar_protocol.errors import RunError
 from caviar_protocol.topics import Channel
 

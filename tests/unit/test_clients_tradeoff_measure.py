@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from link_builders import CARRIER, antenna, scene_of
 
-from caviar_clients.tradeoff.errors import FLOOR_DB
 from caviar_clients.tradeoff.ladder import SCATTERING, Setting
-from caviar_clients.tradeoff.measure import Rung, peak_mib, reset_peak, scattering_materials, seen
 from caviar_clients.tradeoff.rows import error_fields
 from caviar_clients.tradeoff.scenes import Instant, Scenes
-from caviar_clients.tradeoff.users import Noise, UserChannel, difference, differences
+from caviar_clients.tradeoff.users import FLOOR_DB, Noise, UserChannel, difference, differences
+from caviar_clients.tradeoff.worker import Rung, peak_mib, reset_peak, scattering_materials, seen
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.space.scene import antennas
 

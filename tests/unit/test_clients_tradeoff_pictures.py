@@ -8,12 +8,10 @@ from typing import Any
 import pytest
 
 from caviar_clients.tradeoff.campaign import Skipped
-from caviar_clients.tradeoff.convergence import Point
-from caviar_clients.tradeoff.labels import Box, place, spots
-from caviar_clients.tradeoff.plot import draw_convergence, draw_pareto, pareto_front
+from caviar_clients.tradeoff.plot import Box, draw_convergence, draw_pareto, pareto_front, place, spots
 from caviar_clients.tradeoff.report import Report
 from caviar_clients.tradeoff.rows import Row, error_fields
-from caviar_clients.tradeoff.tables import level, markdown, significant
+from caviar_clients.tradeoff.tables import Point, level, markdown, significant
 
 
 def row(setting: str, time_ms: float, nmse_db: float, **more: Any) -> Row:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from caviar_clients.tradeoff.campaign import Cost, predicted_s, shares, spread_order
 from caviar_clients.tradeoff.ladder import (
     BASELINES,
     LADDER,
@@ -14,7 +15,6 @@ from caviar_clients.tradeoff.ladder import (
     samples_of,
     spacing_settings,
 )
-from caviar_clients.tradeoff.schedule import Cost, predicted_s, shares, spread_order
 
 
 def test_what_the_cheap_leave_goes_to_the_dear() -> None:

@@ -16,8 +16,7 @@ from observation_builders import (
     read,
 )
 
-from caviar_clients.envs.observations import PARTS, Part, part
-from caviar_clients.envs.users import Users
+from caviar_clients.envs.observations import PARTS, Part, Users, part
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.space.coordinates import quaternion_from_euler

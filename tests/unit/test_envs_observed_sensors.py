@@ -19,8 +19,7 @@ from observation_builders import (
 )
 
 from caviar_clients.envs.beam_selection import BeamSelectionEnv
-from caviar_clients.envs.observations import part
-from caviar_clients.envs.users import Users
+from caviar_clients.envs.observations import Users, part
 from caviar_protocol.errors import RunError, ScenarioError
 from caviar_protocol.scenario import DeviceSpec, Scenario
 from caviar_protocol.scenario.conversion import convert_settings

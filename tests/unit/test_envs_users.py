@@ -15,8 +15,7 @@ from observation_builders import (
     scenario_of,
 )
 
-from caviar_clients.envs.observations import part
-from caviar_clients.envs.users import Users
+from caviar_clients.envs.observations import Users, part
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.scenario import Scenario
 

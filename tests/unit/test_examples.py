@@ -18,7 +18,7 @@ from typing import Any
 
 import pytest
 
-from caviar_clients.embedded.run import EmbeddedRun
+from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.recording import Recording
 from caviar_protocol.scenario import find_scenario, load_scenario, parse_scenario
 from caviar_services.link.users import users_of

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from caviar_clients.plots.footprints import footprints, with_boxes
+from caviar_clients.plots.rays import footprints, with_boxes
 from caviar_protocol.errors import AssetError
 from caviar_protocol.space.ply import read_ply
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from caviar_clients.cli.scenarios import new_scenario
-from caviar_clients.sessions.checking import checked_scenario
+from caviar_clients.session.checks import checked_scenario
 from caviar_protocol.errors import ScenarioError
 
 

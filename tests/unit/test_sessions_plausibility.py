@@ -12,8 +12,7 @@ from rich.console import Console
 
 from caviar_clients.cli.run import run_scenario
 from caviar_clients.envs.beam_selection import BeamSelectionEnv
-from caviar_clients.sessions.checking import checked_scenario
-from caviar_clients.sessions.plausibility import implausible_values
+from caviar_clients.session.checks import checked_scenario, implausible_values
 from caviar_protocol.scenario import shipped_scenarios
 from caviar_services.meshes import Mesh
 from caviar_services.world.shapes import ply

@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from caviar_clients.conform import Verdict, cases, conform
-from caviar_clients.conform.report import as_json, as_markdown, repeated, summary
+from caviar_clients.conform.case import as_json, as_markdown, repeated, summary
 from caviar_clients.conform.session import Rules
 from caviar_clients.files import write_file
 from caviar_protocol.errors import SetupError

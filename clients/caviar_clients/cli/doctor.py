@@ -27,8 +27,8 @@ from rich.table import Table
 
 from caviar_broker.core.events import Finished
 from caviar_clients.cli.summary import recorded_figures
-from caviar_clients.embedded.run import EmbeddedRun
-from caviar_clients.sessions.checking import checked_scenario
+from caviar_clients.session.checks import checked_scenario
+from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.errors import CaviarError, SetupError
 from caviar_protocol.host import DISTRIBUTION, install_command
 from caviar_services import llvm

@@ -14,9 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from caviar_broker.supervision import describe_exit, describe_stop, is_stopped
-from caviar_clients.cli.borrowed import BorrowedKey
-from caviar_clients.cli.children import Child, end, wait
-from caviar_clients.sessions.checking import module_folders
+from caviar_clients.cli.children import BorrowedKey, Child, end, wait
+from caviar_clients.session.checks import module_folders
 from caviar_protocol.errors import RunError
 from caviar_protocol.files import file_system_of, open_to_append
 from caviar_protocol.run_directory import RunDirectory

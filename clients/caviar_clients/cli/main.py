@@ -14,7 +14,7 @@ from rich.text import Text
 
 from caviar_clients.cli import bench
 from caviar_clients.cli.keys import app as keys
-from caviar_clients.cli.options import (
+from caviar_clients.cli.scenarios import (
     Force,
     Frames,
     Http,
@@ -25,8 +25,8 @@ from caviar_clients.cli.options import (
     RunDirectory,
     ScenarioOrNone,
     Seed,
+    complete_scenario,
 )
-from caviar_clients.cli.scenarios import complete_scenario
 from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.host import DISTRIBUTION
 
@@ -145,11 +145,9 @@ def broker(
     """Run only the broker; start the services with `caviar service`, here or on other machines."""
     from caviar_broker.launch import DEFAULT_BIND, parser, serve
     from caviar_broker.security.access import check_bind
-    from caviar_clients.cli.remote import service_commands
-    from caviar_clients.cli.restarted import RunInProgress
+    from caviar_clients.cli.remote import RunInProgress, service_commands
     from caviar_clients.cli.run import run_directory
-    from caviar_clients.sessions.checking import checked_scenario
-    from caviar_clients.sessions.plausibility import implausible_values
+    from caviar_clients.session.checks import checked_scenario, implausible_values
 
     options = ["--bind", bind] + (["--keys", str(keys)] if keys else []) + ["--restarted"] * restarted
     options += ["--http", http] if http else []
@@ -213,7 +211,7 @@ def why(
     ] = None,
 ) -> None:
     """Ask a running broker whom it waits for now, and why."""
-    from caviar_clients.cli.why import why_command
+    from caviar_clients.cli.remote import why_command
 
     why_command(run, _console)
 

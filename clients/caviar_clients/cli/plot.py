@@ -12,9 +12,9 @@ import numpy as np
 from caviar_clients.files import make_folder_of
 from caviar_clients.plots.camera import CameraView, draw_view
 from caviar_clients.plots.fig8 import choose_user, draw_over_angle, draw_over_time, series
-from caviar_clients.plots.footprints import Box, Footprints, footprints, with_boxes
 from caviar_clients.plots.lidar import draw_scan
 from caviar_clients.plots.map import MapData, draw_map
+from caviar_clients.plots.rays import Box, Footprints, footprints, with_boxes
 from caviar_clients.plots.wideband import draw_dispersion, draw_frequency_response, user_paths
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import RecordingError

@@ -1,11 +1,13 @@
-"""``caviar map``: best server, gain, received power and SINR over a surface."""
+"""``caviar map``: best server, gain, received power and SINR over a surface, as PNG and NumPy archive."""
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from importlib import metadata as distribution
 from pathlib import Path
 from typing import Any
 
@@ -13,21 +15,13 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from caviar_clients.cli.radio_map_file import save
-from caviar_clients.cli.radio_map_inputs import (
-    Wanted,
-    carrier_of,
-    channel_of,
-    in_hertz,
-    noise_of,
-    surface_of,
-)
-from caviar_clients.files import reserved
-from caviar_clients.plots.footprints import footprints
+from caviar_clients.cli.radio_map_inputs import Wanted, carrier_of, channel_of, in_hertz, noise_of, surface_of
+from caviar_clients.files import reserved, writing
 from caviar_clients.plots.radio_map import RadioMapView, draw_servers, draw_values
+from caviar_clients.plots.rays import footprints
 from caviar_clients.tradeoff.scenes import is_recording, scene_at
 from caviar_protocol.errors import RunError, SetupError, suggestion
-from caviar_protocol.host import has_extra, install_command
+from caviar_protocol.host import DISTRIBUTION, has_extra, install_command
 from caviar_protocol.topics import Scene
 from caviar_services.channel.radio_map.coverage import Coverage, decibels
 from caviar_services.channel.radio_map.mapping import (
@@ -39,6 +33,61 @@ from caviar_services.channel.radio_map.mapping import (
 )
 from caviar_services.scenery import find_scenery, read_scenery
 from caviar_services.service import Preparation
+
+FORMAT = "caviar-radio-map-1"
+
+ARRAYS: Mapping[str, tuple[tuple[str, ...], str, str]] = {
+    "x": (("x",), "m", "middle of each column, east"),
+    "y": (("y",), "m", "middle of each row, north"),
+    "z": (("y", "x"), "m", "height of the middle of each cell; NaN where there is no ground"),
+    "transmitter": (("transmitter",), "", "names"),
+    "position": (("transmitter", "xyz"), "m", "of the transmitters"),
+    "power": (("transmitter",), "dBm", "of the transmitters"),
+    "gain": (("transmitter", "y", "x"), "dB", "mean path gain, serving beam; NaN: no signal"),
+    "interference_gain": (
+        ("transmitter", "y", "x"), "dB", "the same while a transmitter serves other cells",
+    ),
+    "rss": (("transmitter", "y", "x"), "dBm", "received power with the serving beam"),
+    "sinr": (("transmitter", "y", "x"), "dB", "of each transmitter, all others interfering"),
+    "best_server": (("y", "x"), "index", "transmitter of the greatest received power; -1: no signal"),
+    "beam": (("transmitter", "y", "x"), "index", "serving beam of the codebook; -1: none"),
+    "rays": (("transmitter", "y", "x"), "count", "that passed through a cell"),
+}  # fmt: skip
+"""Axes, unit and meaning of each array of a file."""
+
+
+def save(found: RadioMap, about: Mapping[str, Any], file: Path) -> None:
+    """Write a map; ``about`` becomes part of its metadata. Raises `RunError` where that fails."""
+    surface, coverage = found.surface, found.coverage
+    centres = surface.centres
+    arrays = {
+        "x": centres[0, :, 0],
+        "y": centres[:, 0, 1],
+        "z": centres[..., 2],
+        "transmitter": np.array(found.names),
+        "position": found.positions,
+        "power": found.power_dbm,
+        "gain": decibels(coverage.gain).astype(np.float32),
+        "interference_gain": decibels(coverage.interference_gain).astype(np.float32),
+        "rss": decibels(coverage.rss, 1e-3).astype(np.float32),
+        "sinr": decibels(coverage.sinr).astype(np.float32),
+        "best_server": coverage.best_server,
+        "beam": found.beam,
+        "rays": found.rays,
+    }
+    metadata = {
+        "format": FORMAT,
+        "caviar": distribution.version(DISTRIBUTION),
+        **about,
+        "shooting": asdict(found.shooting),
+        "arrays": {
+            name: {"axes": axes, "unit": unit, "meaning": meaning}
+            for name, (axes, unit, meaning) in ARRAYS.items()
+        },
+    }
+    with writing(file), file.open("wb") as stream:
+        np.savez_compressed(stream, allow_pickle=False, metadata=np.array(json.dumps(metadata)), **arrays)
+
 
 METRICS = {
     "gain": "Path gain of the best server [dB]",

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from caviar_clients.plots.footprints import ground
+from caviar_clients.plots.rays import ground
 from caviar_clients.tradeoff.scenes import Scenes
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import RunError, ScenarioError, suggestion

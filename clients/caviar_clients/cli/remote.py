@@ -1,16 +1,99 @@
-"""What a user types to start a service that `caviar run` does not start."""
+"""Runs with services or brokers of other machines: commands to type, restarts, and ``caviar why``.
+
+The file ``NAME.current`` in the folder of runs names the run in progress. It exists exactly while a broker
+serves that run, or after a broker died while it did: a broker that starts again resumes the run.
+"""
 
 from __future__ import annotations
 
 import shlex
 import socket
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
+
+from rich.console import Console
 
 import caviar_clients
+from caviar_broker.control.socket import ask
+from caviar_protocol.errors import RunError
+from caviar_protocol.files import replace_file
 from caviar_protocol.keys import BROKER, BROKER_KEY_VARIABLE, KEY_VARIABLE, read_authorized
+from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import ServiceSpec
 from caviar_services.registry import registered
+
+
+class RunInProgress:
+    """The run of a scenario's name that goes on in the folder ``root``."""
+
+    def __init__(self, root: Path, name: str) -> None:
+        self._root, self._file = root, root / f"{name}.current"
+
+    def directory(self) -> Path | None:
+        """Of the run whose broker died; None where there is none to go on with."""
+        try:
+            left = self._root / self._file.read_text().strip()
+        except OSError:
+            return None
+        return left if RunDirectory(left).record.is_file() else None
+
+    def serve(self, directory: Path, serve: Callable[[], int]) -> int:
+        """Serve a run to its end, whatever that is; the exit status of ``serve``."""
+        try:
+            replace_file(self._file, f"{directory.name}\n".encode())
+        except OSError as error:
+            raise RunError(f"cannot write {self._file}: {error.strerror}; choose another --out") from error
+        try:
+            return serve()
+        finally:
+            self._file.unlink(missing_ok=True)
+
+
+RUNS = Path("runs")
+
+
+def why_command(run: Path | None, console: Console) -> None:
+    """Print what the broker of a run says; of the newest one that runs below ``./runs`` where none is named.
+
+    Raises `RunError` where no broker runs there.
+    """
+    directory = run if run is not None else newest_run(RUNS)
+    for line in why_lines(ask(directory, do="why")["why"]):
+        console.print(line, highlight=False, soft_wrap=True, markup=False)
+
+
+def newest_run(root: Path) -> Path:
+    """The directory of the run below ``root`` whose broker was started last and is still noted there."""
+    notes = [note for run in root.glob("*") if (note := RunDirectory(run).control_note).is_file()]
+    if not notes:
+        raise RunError(f"no broker runs below {root.resolve()}; name the directory of a run: caviar why RUN")
+    return max(notes, key=lambda note: note.stat().st_mtime_ns).parent
+
+
+def why_lines(why: Mapping[str, Any]) -> Iterator[str]:
+    """The answer of a desk, in words."""
+    waits, last = why["waits"], why["last_blame"]
+    late = [wait for wait in waits if wait["late"]]
+    where = f", episode {why['episode']}, frame {why['frame']}" if why["frame"] >= 0 else ""
+    paused = ", paused" if why["paused"] else ""
+    yield f"run {why['run']}: {why['state']}{where}{paused}"
+    if why["error"]:
+        yield f"it ends early: {why['error']}"
+    if not late:
+        yield _nobody_late(why)
+    for wait in waits:
+        yield f"{'late' if wait['late'] else 'waited for'}: {wait['text']}"
+    if last is not None:
+        frame = f" in frame {last['frame']}" if last["frame"] >= 0 else ""
+        yield f"last blame: {last['kind']}: {last['service']}{frame}: {last['text']}"
+
+
+def _nobody_late(why: Mapping[str, Any]) -> str:
+    if why["paused"] and not why["waits"]:
+        return "nobody is late: the run is paused, and every frame that has begun is finished"
+    return "nobody is late"
+
 
 MINIMAL = Path(caviar_clients.__file__).parents[1] / "minimal"
 """The example clients; they come with the sources and not with an installed package."""

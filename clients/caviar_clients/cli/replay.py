@@ -16,7 +16,7 @@ from caviar_clients.replay.plan import ReplayPlan, plan_replay
 from caviar_clients.replay.recorded import RecordedRun
 from caviar_clients.replay.request import request_of
 from caviar_clients.replay.toml import scenario_text
-from caviar_clients.sessions.checking import check_implementations
+from caviar_clients.session.checks import check_implementations
 from caviar_protocol.recording import Recording
 
 PARTS = {

@@ -20,7 +20,7 @@ from rich.text import Text
 
 from caviar_broker.journal_format import JournalReader, run_of_journal
 from caviar_broker.run_record import RunRecord, read_record
-from caviar_clients.cli.inspect import resume_hint
+from caviar_clients.cli.recording_summary import resume_hint
 from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import Recording, RecordingWarning

@@ -1,4 +1,4 @@
-"""`caviar run`: a scenario from beginning to end, with progress and a summary."""
+"""``caviar run``: a scenario from beginning to end, in one process or many, with progress and a summary."""
 
 from __future__ import annotations
 
@@ -6,37 +6,140 @@ import json
 import shutil
 import signal
 import time
-from collections.abc import Mapping, Sequence
+import warnings
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from datetime import datetime
 from io import StringIO
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import msgspec
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
+from caviar_broker.core import events as ev
 from caviar_broker.http.auth import http_address
 from caviar_broker.run_record import read_record
 from caviar_broker.security.access import check_bind
-from caviar_clients.cli.inside import EmbeddedLauncher
 from caviar_clients.cli.launch import Launcher
-from caviar_clients.cli.recording_check import with_recording_checked
 from caviar_clients.cli.remote import key_text, reachable, start_command, waiting_text
 from caviar_clients.cli.scenarios import require_extras
-from caviar_clients.cli.summary import (
-    recorded_figures,
-    summary_of,
-    summary_table,
-)
+from caviar_clients.cli.summary import recorded_figures, summary_of, summary_table
 from caviar_clients.files import printable, reason, write_file
-from caviar_clients.sessions.checking import checked_scenario
-from caviar_clients.sessions.plausibility import implausible_values
-from caviar_protocol.errors import RunError, SetupError
+from caviar_clients.session.checks import checked_scenario, implausible_values
+from caviar_clients.session.embedded import EmbeddedRun
+from caviar_protocol.errors import RecordingError, RunError, SetupError
+from caviar_protocol.recording import Recording
+from caviar_protocol.recording.integrity import declared_digest
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario, find_scenario
 from caviar_protocol.scenario.rules import refuse_remote
+
+REPORT_S = 0.1
+"""[s] between ``frame`` events at least."""
+
+
+class EmbeddedLauncher:
+    """Has the interface of `caviar_clients.cli.launch.Launcher`, without processes."""
+
+    def __init__(self, scenario: Scenario, directory: Path) -> None:
+        self._directory = directory
+        self._told: deque[dict[str, Any]] = deque()
+        self._told_frame = 0.0
+        self._log_error = ""
+        self._run = EmbeddedRun(scenario, directory, self._notice, self._frame)
+
+    def __enter__(self) -> EmbeddedLauncher:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Nothing is left: whoever leaves the loop over `events` ends the run."""
+
+    def events(self) -> Iterator[Mapping[str, Any]]:
+        """What happens, until the run is over."""
+        with closing(self._run.steps()) as steps:
+            for _ in steps:
+                while self._told:
+                    event = self._told.popleft()
+                    if event["event"] == "notice":
+                        self._log(event)
+                    yield event
+        outcome, statistics = self._run.outcome, self._run.statistics
+        if outcome is None:
+            raise RunError("the run ended without an outcome")
+        statistics.save(self._directory / "latency.npz")
+        if self._log_error:
+            text = f"the log of notices is incomplete: {self._log_error}"
+            yield {"event": "notice", "kind": "note", "service": "", "frame": -1, "text": text}
+        yield {
+            "event": "finished",
+            "error": outcome.error,
+            "culprit": outcome.culprit,
+            "digest": outcome.digest,
+            "frames": statistics.frames,
+            "frames_per_second": statistics.frames_per_second(),
+            "warm_up_frames": statistics.warm_up_frames,
+            "deadlines": msgspec.structs.asdict(statistics.deadlines()),
+            "pace": msgspec.structs.asdict(statistics.pace()),
+            "services": {n: msgspec.structs.asdict(s) for n, s in statistics.services().items()},
+        }
+
+    def stop(self, reason: str) -> None:
+        """Ask for an orderly end."""
+        self._run.stop(reason)
+
+    def log_of(self, service: str) -> Path | None:
+        """Services have no logs of their own here."""
+        return None
+
+    def _log(self, event: Mapping[str, Any]) -> None:
+        """Keep a notice; a disk that is full costs the log, not the run."""
+        try:
+            with RunDirectory(self._directory).events.open("a", encoding="utf-8") as log:
+                log.write(json.dumps(event, ensure_ascii=False) + "\n")
+        except OSError as error:
+            self._log_error = self._log_error or str(error)
+
+    def _notice(self, notice: ev.Notice) -> None:
+        fields = ("kind", "service", "episode", "frame", "text")
+        self._told.append({"event": "notice", **{field: getattr(notice, field) for field in fields}})
+
+    def _frame(self, frame: ev.FrameFinished) -> None:
+        now = time.monotonic()
+        if now - self._told_frame >= REPORT_S:
+            self._told_frame = now
+            frames = self._run.statistics.frames
+            self._told.append({"event": "frame", "episode": frame.episode, "frames": frames, "misses": 0})
+
+
+def with_recording_checked(
+    directory: Path, scenario: Scenario, outcome: Mapping[str, Any]
+) -> Mapping[str, Any]:
+    """How a run ended; with an error where it came to its end and its recording is another run's.
+
+    The digests that the recording has of its products are compared, and no product is read.
+    """
+    recorders = [spec for spec in scenario.services.values() if spec.role == "recorder" and not spec.remote]
+    if outcome["error"] or not outcome["frames"] or not recorders:
+        return outcome
+    try:
+        with warnings.catch_warnings(action="ignore"):  # what is missing shows in the digest
+            recording = Recording(directory)
+        digest = declared_digest(recording.entry(index) for index in range(len(recording)))
+    except RecordingError as error:
+        return {**outcome, "error": f"the run came to its end, and its recording cannot be read: {error}"}
+    if digest == outcome["digest"]:
+        return outcome
+    differs = f"the run came to its end, and its recording in {directory} is not that of the run"
+    figures = (
+        f"{len(recording)} frames, digest {digest}; the run has {outcome['frames']}, {outcome['digest']}"
+    )
+    return {**outcome, "error": f"{differs}: {figures}"}
+
 
 QUIET = frozenset({"stale", "note", "lag"})
 """Kinds of notices that are logged, and only counted on the screen."""

@@ -1,4 +1,4 @@
-"""What a run comes to: the figures of `caviar run --json` and the table on the screen."""
+"""Figures of a finished run: `caviar run --json`, and the table on the screen."""
 
 from __future__ import annotations
 
@@ -11,9 +11,16 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from caviar_clients.cli.decided import Decided, counted, decided_lines
-from caviar_clients.cli.inspect import RunSummary, link_quality, summarise
-from caviar_clients.cli.outages import OutageSummary, outage_lines
+from caviar_clients.cli.recording_summary import (
+    Decided,
+    OutageSummary,
+    RunSummary,
+    counted,
+    decided_lines,
+    link_quality,
+    outage_lines,
+    summarise,
+)
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.recording import Recording
 

@@ -13,7 +13,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from caviar_clients.cli.scenarios import extras_of
 from caviar_clients.files import reserved, write_file
-from caviar_clients.sessions.checking import checked_scenario
+from caviar_clients.session.checks import checked_scenario
 from caviar_clients.tradeoff import ladder
 from caviar_clients.tradeoff.campaign import Told, candidates
 from caviar_clients.tradeoff.plot import draw_convergence, draw_pareto

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from caviar_clients.conform import forms
+from caviar_clients.conform import canonical
 from caviar_clients.conform.case import Failed, NotApplicable, case
 from caviar_clients.conform.session import ACTIVE, Answer, Session
 from caviar_clients.conform.wrong import right_end
@@ -112,7 +112,7 @@ def _restore(session: Session, state: bytes, frame: int) -> None:
 
 
 def _products(session: Session, answer: Answer) -> dict[str, bytes]:
-    return forms.check_products(answer.fields, answer.parts, session.hello.get("outputs", []))
+    return canonical.check_products(answer.fields, answer.parts, session.hello.get("outputs", []))
 
 
 CASES = (checkpoint, restore, wrong_state)

@@ -1,7 +1,8 @@
-"""One life of a client, from HELLO to its end, as a broker that follows a script sees it."""
+"""One life of a client, from HELLO to BYE, as a broker that follows a script sees it; scenery included."""
 
 from __future__ import annotations
 
+import hashlib
 import math
 import tempfile
 import time
@@ -9,12 +10,74 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
-from caviar_clients.conform import forms, scenery, street
+from caviar_clients.conform import canonical, street
 from caviar_clients.conform.case import Failed
 from caviar_clients.conform.client import BY_HAND_S, Client, End
-from caviar_clients.conform.grants import Inputs
-from caviar_clients.conform.packing import in_order
-from caviar_clients.conform.wire import Fields, Received, Wire
+from caviar_clients.conform.street import Inputs
+from caviar_clients.conform.wire import Fields, Received, Wire, in_order
+from caviar_protocol.topics import PARTS
+
+CHUNK = 700
+"""[B] of an ASSET_DATA from the kit, so that even small files take several."""
+
+
+def _preparation(session: Session, topics: list[str], inputs: Inputs) -> Fields:
+    """What PREPARE holds beside epoch and attempt."""
+    order: Fields = {}
+    if topics:
+        order["demand"] = [
+            {"topic": topic, **({"parts": list(PARTS[topic])} if PARTS.get(topic) else {})}
+            for topic in topics
+        ]
+    if session.hello["role"] != "world":
+        files = street.scenery(session.rules.mark)
+        session.served = {hashlib.sha256(data).hexdigest(): data for data in files.values()}
+        session.assets = [
+            {"name": name, "digest": hashlib.sha256(data).hexdigest(), "size": len(data)}
+            for name, data in files.items()
+        ]
+        order["assets"] = session.assets
+    order["producers"] = {topic: list(names) for topic, names in sorted(inputs.sources.items())}
+    if session.hello["role"] != "world":
+        order["prefixes"] = {world: street.PREFIXES[world] for world in inputs.sources["scene"]}
+    return order
+
+
+def _serve_asset(session: Session, get: Fields) -> None:
+    """Answer an ASSET_GET of the client."""
+    digest, offset = get["digest"], get.get("offset", 0)
+    data = session.served.get(digest)
+    if data is None or offset > len(data):
+        raise Failed("ASSET_GET of an asset of PREPARE", f"one of {digest[:12]}… from byte {offset}")
+    chunk = data[offset : offset + CHUNK]
+    session.fetched[digest] = session.fetched.get(digest, 0) + len(chunk)
+    session.send("ASSET_DATA", {"digest": digest, "offset": offset, "size": len(data)}, chunk)
+
+
+def _fetch_scenery(session: Session, offer: Fields) -> None:
+    """Take a world's scenery, each file in as many parts as the world makes of it."""
+    if session.hello["role"] != "world":
+        raise Failed("READY", "ASSET_OFFER, which only worlds send")
+    for asset in offer["assets"]:
+        data = b""
+        while True:
+            session.send("ASSET_GET", {"digest": asset["digest"], "offset": len(data)})
+            answer = session.receive("ASSET_DATA")
+            if answer.kind == "READY":
+                session.early.append(answer)
+                answer = session.receive("ASSET_DATA")
+            if answer.kind != "ASSET_DATA" or answer.fields["offset"] != len(data):
+                raise Failed(f"ASSET_DATA from byte {len(data)}", str(answer))
+            data += answer.parts[1]
+            if len(data) >= asset["size"]:
+                break
+            if not answer.parts[1]:
+                raise Failed("at least one byte of an ASSET_DATA before the end", "none")
+        if hashlib.sha256(data).hexdigest() != asset["digest"]:
+            raise Failed(f"bytes of {asset['name']} with the digest of its offer", "others")
+        session.offered[asset["name"]] = data
+    session.assets = list(offer["assets"])
+
 
 EPOCH, ATTEMPT = 3, 2
 """Not 1, so that a client which does not repeat what it is told shows."""
@@ -141,9 +204,9 @@ class Session:
             if time.monotonic() > until:
                 return None
         received = self._inbox.popleft()
-        fields = forms.checked(received)
+        fields = canonical.checked(received)
         self._seen.headers += 1
-        odd = forms.not_canonical(received)
+        odd = canonical.not_canonical(received)
         if odd and odd not in self._seen.odd:
             self._seen.odd.append(odd)
         return Answer(fields["type"], fields, received.parts)
@@ -176,7 +239,7 @@ class Session:
     def _heard(self, received: Received) -> None:
         self.pulse.route = received.route
         try:
-            fields = forms.checked(received)
+            fields = canonical.checked(received)
         except Failed as wrong:
             self.pulse.wrong.append(wrong.got)
             return
@@ -248,14 +311,14 @@ class Session:
         """PREPARE, and the exchange of scenery, up to READY."""
         hello = self.hello
         topics = [topic for topic in hello.get("outputs", []) if demand]
-        self.send("PREPARE", {**self.who, **scenery.order(self, topics, inputs or Inputs()), **more})
+        self.send("PREPARE", {**self.who, **_preparation(self, topics, inputs or Inputs()), **more})
         while True:
             answer = self.early.popleft() if self.early else self.receive("READY")
             match answer.kind:
                 case "ASSET_GET":
-                    scenery.serve(self, answer.fields)
+                    _serve_asset(self, answer.fields)
                 case "ASSET_OFFER":
-                    scenery.fetch(self, answer.fields)
+                    _fetch_scenery(self, answer.fields)
                 case "READY":
                     self.check_identity(answer)
                     self.ready, self.stage = answer.fields, READY
@@ -309,7 +372,7 @@ class Session:
             raise Failed(
                 f"DONE of episode {self.episode}, frame {frame}", f"one of episode {got[0]}, frame {got[1]}"
             )
-        forms.check_products(answer.fields, answer.parts, self.hello.get("outputs", []))
+        canonical.check_products(answer.fields, answer.parts, self.hello.get("outputs", []))
         self.completed, self.frame = max(frame, self.completed), max(self.frame, frame + 1)
         return answer
 

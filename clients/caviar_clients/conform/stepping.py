@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from caviar_clients.conform import forms, street
+from caviar_clients.conform import canonical, street
 from caviar_clients.conform.case import Failed, NotApplicable, case
-from caviar_clients.conform.grants import HELD_FOR, Inputs
 from caviar_clients.conform.joining import BEATS, _check_beats
 from caviar_clients.conform.session import ACTIVE, Answer, Session
+from caviar_clients.conform.street import HELD_FOR, Inputs
 
 if TYPE_CHECKING:
     from caviar_clients.conform.kit import Kit
@@ -240,7 +240,7 @@ def episodes(kit: Kit) -> str:
         session.reset(session.episode + 1, seed_episode=1)
         answers = [session.step() for _ in range(FRAMES)]
         outputs = session.hello.get("outputs", [])
-        played.append([forms.check_products(a.fields, a.parts, outputs) for a in answers])
+        played.append([canonical.check_products(a.fields, a.parts, outputs) for a in answers])
     for frame, (first, second) in enumerate(zip(*played, strict=True)):
         if first != second:
             raise Failed("equal products in two episodes with equal seeds", f"others in frame {frame}")

@@ -5,11 +5,33 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import msgpack  # type: ignore[import-untyped]
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
-from caviar_clients.conform.packing import BROKEN, pack, unpack
 from caviar_protocol.errors import RunError
+
+BROKEN = (ValueError, TypeError, RecursionError, msgpack.exceptions.UnpackException)
+"""What `unpack` raises for bytes that are no MessagePack."""
+
+
+def pack(value: Any) -> bytes:
+    """The bytes of a value, everything in its shortest form, floats in nine bytes."""
+    packed: bytes = msgpack.packb(value)
+    return packed
+
+
+def unpack(data: bytes) -> Any:
+    """The value of all these bytes; raises one of `BROKEN`."""
+    return msgpack.unpackb(data, raw=False)
+
+
+def in_order(value: Any) -> Any:
+    """A plain value whose maps have their keys in the order of the canonical form."""
+    if isinstance(value, dict):
+        return {key: in_order(value[key]) for key in sorted(value, key=str.encode)}
+    return [in_order(item) for item in value] if isinstance(value, list) else value
+
 
 MAX_PART = 1 << 30
 """[B] of a part; a client that sends more is disconnected."""

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING
 
 from caviar_clients.conform.case import Failed, NotApplicable, case
 from caviar_clients.conform.client import End
-from caviar_clients.conform.grants import Inputs
 from caviar_clients.conform.joining import BEATS, attached_heart
-from caviar_clients.conform.packing import pack
 from caviar_clients.conform.session import ACTIVE, ATTEMPT, EPOCH, Answer, Session
-from caviar_clients.conform.wire import Fields
+from caviar_clients.conform.street import Inputs
+from caviar_clients.conform.wire import Fields, pack
 
 if TYPE_CHECKING:
     from caviar_clients.conform.kit import Kit

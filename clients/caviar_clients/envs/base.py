@@ -1,31 +1,135 @@
-"""What the environments share: a scenario, a session, what is observed and what is rewarded."""
+"""Base class of the environments: scenario, session, observation, reward, rendering."""
 
 from __future__ import annotations
 
 import warnings
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, Literal, TypeAlias, TypeVar, get_args
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
 from msgspec.structs import replace
 
-from caviar_clients.envs.observations import Moment, Part, part
-from caviar_clients.envs.render import MapRenderer
-from caviar_clients.envs.rewards import KINDS, Reward, RewardKind
-from caviar_clients.envs.users import Users
-from caviar_clients.sessions.base import Frame, Session
-from caviar_clients.sessions.checking import checked_scenario
-from caviar_clients.sessions.opening import agent_of, open_session
-from caviar_clients.sessions.plausibility import implausible_values
-from caviar_protocol.errors import RunError, ScenarioError
+from caviar_clients.envs.observations import Moment, Part, Users, part
+from caviar_clients.plots.map import MapData, chosen_beam, draw_antennas, draw_beam, draw_objects
+from caviar_clients.plots.style import GREY
+from caviar_clients.session.base import Frame, Session
+from caviar_clients.session.checks import checked_scenario, implausible_values
+from caviar_clients.session.opening import agent_of, open_session
+from caviar_protocol.arrays import BoolArray, Float64Array, UInt8Array
+from caviar_protocol.errors import RunError, ScenarioError, SetupError
+from caviar_protocol.host import install_command
 from caviar_protocol.keys import credentials
 from caviar_protocol.messages import Input
-from caviar_protocol.topics import Action, Link
+from caviar_protocol.space.beams import beam_gain
+from caviar_protocol.space.scene import Pair, device_pose
+from caviar_protocol.topics import Action, Link, Scene
 from caviar_protocol.topics.action import Command
+
+SIZE_IN, DPI = (6.4, 4.8), 100
+"""640×480 pixels."""
+MARGIN_M = 15.0
+"""Around what was seen so far."""
+
+
+class MapRenderer:
+    """Draws scenes; the view only grows, so that what stands still does so in the pictures too."""
+
+    def __init__(self) -> None:
+        try:
+            from matplotlib.backends.backend_agg import FigureCanvasAgg
+            from matplotlib.figure import Figure
+        except ImportError as error:
+            raise SetupError(f"pictures need Matplotlib; run: {install_command('plot')}") from error
+        self._figure = Figure(SIZE_IN, dpi=DPI, layout="compressed")
+        self._canvas = FigureCanvasAgg(self._figure)
+        self._axes: Any = self._figure.subplots()
+        self._low, self._high = np.full(2, np.inf), np.full(2, -np.inf)
+
+    def draw(self, scene: Scene, link: Link | None, pair: Pair | None, title: str) -> UInt8Array:
+        """A picture, Shape ``[480, 640, 3]``; ``pair`` is the one whose beam is drawn."""
+        user = None
+        if pair is not None and link is not None:
+            users = zip(link.tx, link.rx, link.carrier, strict=True)
+            user = next((u for u in users if u[:2] == (pair.tx.name, pair.rx.name)), None)
+        data = MapData(scene, None, link, None, beam_gain, user, title)
+        axes = self._axes
+        axes.clear()
+        self._widen(scene)
+        axes.set_xlim(self._low[0], self._high[0])
+        axes.set_ylim(self._low[1], self._high[1])
+        axes.set_aspect("equal")
+        axes.grid(color=GREY, alpha=0.2)
+        beam = chosen_beam(data)
+        if beam is not None:
+            draw_beam(axes, beam)
+        draw_objects(axes, data)
+        draw_antennas(axes, data)
+        axes.set_xlabel("x, east [m]")
+        axes.set_ylabel("y, north [m]")
+        axes.set_title(title)
+        self._canvas.draw()
+        return np.array(self._canvas.buffer_rgba())[..., :3].copy()
+
+    def _widen(self, scene: Scene) -> None:
+        devices = [device_pose(scene, device).position[:2] for device in scene.devices]
+        seen = np.concatenate([scene.position[:, :2], np.array(devices).reshape(-1, 2)])
+        if len(seen):
+            self._low = np.minimum(self._low, seen.min(0) - MARGIN_M)
+            self._high = np.maximum(self._high, seen.max(0) + MARGIN_M)
+
+
+RewardKind: TypeAlias = Literal["abs_y", "normalised", "snr", "spectral_efficiency"]
+KINDS: tuple[RewardKind, ...] = get_args(RewardKind)
+
+
+class Reward:
+    """Mean over the users served of one of their figures; users without a path are left out.
+
+    ``abs_y``: |y| of the chosen pair (the paper, section 4); ``normalised``: |y| over that of the best
+    pair; ``snr``: linear; ``spectral_efficiency`` [bit/s/Hz]. 0 where no user has a path.
+    """
+
+    def __init__(self, kind: RewardKind) -> None:
+        self.kind = kind
+        self._known: tuple[tuple[str, ...], tuple[str, ...], Collection[tuple[str, str]]] | None = None
+        self._served: BoolArray | None = None
+
+    def served(self, link: Link, pairs: Collection[tuple[str, str]]) -> BoolArray | None:
+        """Which users of the link are among these (TX, RX); None: all of them."""
+        known = (link.tx, link.rx, pairs)
+        if known != self._known:
+            inside = np.array([pair in pairs for pair in zip(link.tx, link.rx, strict=True)], np.bool_)
+            self._known, self._served = known, None if inside.all() else inside
+        return self._served
+
+    def of(self, link: Link, pairs: Collection[tuple[str, str]]) -> float:
+        """The reward for a frame."""
+        values = self._values(link)
+        counted, served = link.has_path, self.served(link, pairs)
+        if served is not None:
+            counted = counted & served
+        if len(values) == 1:
+            return float(values[0]) if counted[0] else 0.0
+        chosen = values[counted]
+        return float(chosen.mean()) if len(chosen) else 0.0
+
+    def _values(self, link: Link) -> Float64Array:
+        match self.kind:
+            case "abs_y":
+                return link.abs_y
+            case "snr":
+                return link.snr
+            case "spectral_efficiency":
+                return link.spectral_efficiency
+            case "normalised":
+                best = link.top_abs_y.max(axis=1, initial=0.0)
+                share: Float64Array = np.divide(link.abs_y, best, out=np.zeros(len(best)), where=best > 0)
+                return share
+
 
 A = TypeVar("A")
 Observation = dict[str, np.ndarray[Any, np.dtype[Any]]]
@@ -52,7 +156,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
     observe
         Names of the parts of the observation: `caviar_clients.envs.observations.PARTS`.
     reward
-        What the reward is: `caviar_clients.envs.rewards.Reward`.
+        What the reward is: `caviar_clients.envs.base.Reward`.
     directory
         Where an embedded run records; None: it does not, which is faster.
     render_mode

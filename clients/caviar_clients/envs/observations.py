@@ -1,4 +1,4 @@
-"""What an agent may observe, by name.
+"""Observation parts by name, and the users that observations are about.
 
 To add a part: one subclass of `Part`, one line in `PARTS`.
 """
@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any, ClassVar
 
@@ -16,13 +17,104 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from caviar_clients.envs.users import Users
-from caviar_clients.sessions.base import Frame
+from caviar_clients.session.base import Frame
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.messages import Input
-from caviar_protocol.scenario import Scenario
-from caviar_protocol.space.scene import Pair, device_pose, device_velocity, directions
-from caviar_protocol.topics import Camera, Depth, Lidar, Link, Scene
+from caviar_protocol.scenario import DeviceSpec, Scenario
+from caviar_protocol.scenario.rules import patterns_overlap
+from caviar_protocol.scenario.schema import owned_by
+from caviar_protocol.space.scene import Pair, device_pose, device_velocity, directions, pairs_of
+from caviar_protocol.topics import AntennaArray, Camera, Depth, Lidar, Link, Scene
+
+
+@dataclass(frozen=True)
+class Place:
+    """What one place of the observation and of the action stands for."""
+
+    tx: AntennaArray
+    rx: AntennaArray
+
+    @property
+    def beam_pairs(self) -> int:
+        """Number of pairs of the two codebooks."""
+        return self.tx.size * self.rx.size
+
+
+class Users:
+    """Places for all pairs that a scenario can have, by transmitter, then receiver.
+
+    A device on a pattern (``on = "car.*"``, ``count = 10``) has ``count`` places; the pairs that are there
+    fill them in the order of their names, and what is left stays empty.
+
+    Parameters
+    ----------
+    scenario
+        Names the devices.
+    patterns
+        Receivers that are served, as names with ``*`` and ``?``.
+    """
+
+    def __init__(self, scenario: Scenario, patterns: Sequence[str]) -> None:
+        self._patterns = tuple(patterns)
+        antennas = [d for d in scenario.devices if d.kind == "antenna"]
+        self._groups: list[tuple[DeviceSpec, DeviceSpec]] = [
+            (tx, rx)
+            for tx in sorted((d for d in antennas if d.role in ("tx", "both")), key=_name)
+            for rx in sorted((d for d in antennas if d.role in ("rx", "both")), key=_name)
+            if rx is not tx and self._may_serve(rx)
+        ]
+        if not self._groups:
+            receivers = (d for d in antennas if d.role in ("rx", "both"))
+            names = ", ".join(_full_name(d) for d in receivers) or "none"
+            raise ScenarioError(f"no receiver of the scenario is {' or '.join(patterns)}; there are: {names}")
+        self._first: dict[tuple[str, str], int] = {}
+        self.places: list[Place] = []
+        """One for each pair there may be."""
+        for tx, rx in self._groups:
+            self._first[tx.name, rx.name] = len(self.places)
+            self.places += [Place(_array(tx), _array(rx))] * (tx.count * rx.count)
+        self._devices: object = None
+        self._found: tuple[tuple[int, Pair], ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def present(self, scene: Scene) -> tuple[tuple[int, Pair], ...]:
+        """(place, pair) of the pairs of a scene that are served."""
+        if scene.devices is not self._devices:
+            self._devices, self._found = scene.devices, tuple(self._seated(scene))
+        return self._found
+
+    def _seated(self, scene: Scene) -> Iterator[tuple[int, Pair]]:
+        taken: dict[tuple[str, str], int] = {}
+        for pair in pairs_of(scene):
+            group = _spec_name(pair.tx.name), _spec_name(pair.rx.name)
+            if group in self._first and owned_by(self._patterns, pair.rx.name):
+                place = self._first[group] + taken.get(group, 0)
+                taken[group] = taken.get(group, 0) + 1
+                yield place, pair
+
+    def _may_serve(self, rx: DeviceSpec) -> bool:
+        """Whether a receiver of this device may match; names of objects are only known later."""
+        return any(patterns_overlap(_full_name(rx), pattern) for pattern in self._patterns)
+
+
+def _name(device: DeviceSpec) -> str:
+    return device.name
+
+
+def _full_name(device: DeviceSpec) -> str:
+    """Name of a device in the run; a pattern where it is on one."""
+    return f"{device.on}/{device.name}" if device.on else device.name
+
+
+def _spec_name(device: str) -> str:
+    """Name in the scenario of a device that may be mounted on an object."""
+    return device.rpartition("/")[2]
+
+
+def _array(device: DeviceSpec) -> AntennaArray:
+    return device.array or AntennaArray()
 
 
 class Moment(msgspec.Struct, frozen=True):

@@ -14,9 +14,9 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from caviar_clients.envs.base import Observation
-from caviar_clients.envs.flight import FlightEnv, point
 from caviar_clients.envs.observations import Moment
-from caviar_clients.sessions.airspace import Airspace
+from caviar_clients.envs.uav_path import FlightEnv, point
+from caviar_clients.session.checks import Airspace
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import RunError, ScenarioError
 from caviar_protocol.seeding import generator

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from caviar_clients.plots.footprints import Footprints
-from caviar_clients.plots.rays import Rays, rays, scale
+from caviar_clients.plots.rays import Footprints, Rays, rays, scale
 from caviar_clients.plots.style import BLACK, GREY, LIGHT_GREY, ORANGE, SKY, VERMILION, figure, legend_below
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.space.coordinates import rotation_matrix

@@ -11,7 +11,6 @@ import numpy as np
 
 from caviar_clients.plots.camera import SKY_GREY
 from caviar_clients.plots.fig8 import UserSeries, curves, shade
-from caviar_clients.plots.footprints import Footprints
 from caviar_clients.plots.map import (
     BEAM_ALPHA,
     RECEIVERS,
@@ -30,7 +29,7 @@ from caviar_clients.plots.map import (
     draw_rays,
     draw_scenery,
 )
-from caviar_clients.plots.rays import rays
+from caviar_clients.plots.rays import Footprints, rays
 from caviar_clients.plots.style import BLACK, BLUE, GREY, LIGHT_GREY, ORANGE, SKY, VERMILION, styled
 from caviar_protocol.arrays import UInt8Array
 

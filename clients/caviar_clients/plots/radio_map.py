@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from caviar_clients.plots.footprints import Footprints
 from caviar_clients.plots.map import OUTLINE, TRANSMITTER, from_above
+from caviar_clients.plots.rays import Footprints
 from caviar_clients.plots.style import BLACK, GREY, LIGHT_GREY, figure, legend_below
 from caviar_protocol.arrays import Float64Array, Int32Array
 from caviar_protocol.topics import Scene

@@ -13,13 +13,20 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from caviar_clients.tradeoff.errors import FLOOR_DB, decibel, nmse
 from caviar_clients.tradeoff.ladder import Setting
-from caviar_clients.tradeoff.measure import seen
 from caviar_clients.tradeoff.rows import Row, error_fields
 from caviar_clients.tradeoff.scenes import Instant, Scenes
-from caviar_clients.tradeoff.users import Key, Noise, UserChannel, differences, user_channels
-from caviar_clients.tradeoff.worker import Sample, Worker
+from caviar_clients.tradeoff.users import (
+    FLOOR_DB,
+    Key,
+    Noise,
+    UserChannel,
+    decibel,
+    differences,
+    nmse,
+    user_channels,
+)
+from caviar_clients.tradeoff.worker import Sample, Worker, seen
 from caviar_protocol.errors import RunError
 from caviar_protocol.topics import Channel
 from caviar_protocol.topics.channel import PLANE_WAVES

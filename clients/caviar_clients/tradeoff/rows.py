@@ -9,8 +9,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from caviar_clients.tradeoff.errors import decibel
-from caviar_clients.tradeoff.users import ANGLES, Difference
+from caviar_clients.tradeoff.users import ANGLES, Difference, decibel
 from caviar_protocol.arrays import quantity
 
 

@@ -12,8 +12,8 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from caviar_clients.embedded.run import EmbeddedRun
-from caviar_clients.sessions.checking import checked_scenario
+from caviar_clients.session.checks import checked_scenario
+from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.errors import RecordingError, RunError, ScenarioError
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.recording import RecordedFrame, Recording

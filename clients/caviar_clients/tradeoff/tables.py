@@ -1,4 +1,4 @@
-"""The tables of a comparison: on the screen, and as Markdown beside the paper's."""
+"""Tables of a comparison, on the screen and as Markdown beside the paper's."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from rich.table import Table
 from rich.text import Text
 
 from caviar_clients.tradeoff.campaign import Skipped
-from caviar_clients.tradeoff.errors import FLOOR_DB
 from caviar_clients.tradeoff.ladder import (
     CHOSEN_PATHS,
     CHOSEN_SAMPLES,
@@ -23,6 +22,7 @@ from caviar_clients.tradeoff.ladder import (
 )
 from caviar_clients.tradeoff.report import Report
 from caviar_clients.tradeoff.rows import Row
+from caviar_clients.tradeoff.users import FLOOR_DB
 
 PAPER_SPACING = {
     "1": (1.0, 0.7),

@@ -1,7 +1,7 @@
-"""A run in one process, without sockets: the same frame clock, the same services, the same digest.
+"""A run in one process, without sockets, and the session that steps it: same clock, services and digest.
 
-Time stands still here: whoever is granted a frame is waited for, and nothing is ever late. Under
-``pace = "realtime"`` the clock jumps to its next deadline once nobody has anything to do.
+Time stands still here: the run waits for each service it grants a frame, and nothing is ever late. Under
+``pace = "realtime"`` the clock jumps to its next deadline when no service has work left.
 """
 
 from __future__ import annotations
@@ -22,16 +22,18 @@ from caviar_broker.core.plan import briefings, plan_run, with_ownership
 from caviar_broker.journal import JournalFile
 from caviar_broker.recordings import with_replay
 from caviar_broker.statistics import Statistics
-from caviar_clients.embedded.place import Place, Seat
+from caviar_clients.session.base import Frame, Session, declared
+from caviar_clients.session.place import Place, Seat
 from caviar_protocol import messages as m
 from caviar_protocol.assets import AssetStore
 from caviar_protocol.errors import RunError
+from caviar_protocol.messages import Input
 from caviar_protocol.recording.reader import Imposed
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.validation import ContentCheck
 from caviar_services.registry import load
-from caviar_services.service import Service
+from caviar_services.service import Service, StepResult
 
 
 class EmbeddedRun:
@@ -209,3 +211,77 @@ def _without_recorders(scenario: Scenario) -> Scenario:
     services = {name: spec for name, spec in scenario.services.items() if spec.role != "recorder"}
     run = replace_field(scenario.run, record=())
     return replace_field(scenario, services=services, run=run)
+
+
+ENDLESS = 2**53
+"""Episodes of a run that goes on until it is closed."""
+TOLD = 100
+"""Notices that are kept."""
+
+
+class EmbeddedSession(Session):
+    """A run in this process that plays as many episodes as are asked for.
+
+    Parameters
+    ----------
+    scenario
+        Checked, as `caviar_protocol.scenario.loader.load_scenario` returns it.
+    agent
+        Name of the agent whose place is taken.
+    inputs
+        What it consumes.
+    directory
+        Where recorder and journal write; None: nothing is written, which is a lot faster.
+    with_scenery
+        Whether `Session.scenery` is looked up.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        agent: str,
+        inputs: tuple[Input, ...],
+        directory: Path | None = None,
+        with_scenery: bool = False,
+    ) -> None:
+        super().__init__()
+        self.notices: deque[str] = deque(maxlen=TOLD)
+        """What the run told last."""
+        if directory is not None:
+            directory.mkdir(parents=True, exist_ok=True)
+        endless = replace_field(scenario, run=replace_field(scenario.run, episodes=ENDLESS))
+        self._seed = -1
+        scenery_here = self._take_scenery if with_scenery else None
+        cls = declared(inputs, lambda: self._seed, _decided_outside, scenery_here)
+        self._run = EmbeddedRun(endless, directory, self._notice, seats={agent: cls})
+        self._seat = self._run.seats[agent]
+        self._steps = self._run.steps()
+
+    def close(self) -> None:
+        """End the run and close its services."""
+        self._steps.close()
+
+    def _begin(self, seed: int) -> None:
+        self._seed = seed
+
+    def _answer(self, result: StepResult) -> None:
+        if self._run.outcome is not None:
+            raise self._over()
+        self._seat.answer(result)
+
+    def _granted(self) -> Frame:
+        for _ in self._steps:
+            if self._seat.frame is not None:
+                return self._seat.frame
+        raise self._over()
+
+    def _over(self) -> RunError:
+        outcome = self._run.outcome
+        return RunError(outcome.error if outcome and outcome.error else "the run is over; begin a new one")
+
+    def _notice(self, notice: ev.Notice) -> None:
+        self.notices.append(f"{notice.kind}: {notice.service}: {notice.text}")
+
+
+def _decided_outside(_: Frame) -> StepResult:
+    raise RunError("an embedded session answers through its seat")

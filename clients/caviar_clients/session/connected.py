@@ -7,8 +7,7 @@ from collections import OrderedDict
 from contextlib import suppress
 from queue import Empty, SimpleQueue
 
-from caviar_clients.sessions.agent import declared
-from caviar_clients.sessions.base import Frame, Session
+from caviar_clients.session.base import Frame, Session, declared
 from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.keys import Credentials
 from caviar_protocol.limits import MAX_IN_FLIGHT

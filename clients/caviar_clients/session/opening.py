@@ -1,12 +1,12 @@
-"""From a scenario to a session of one of its agents."""
+"""`open_session`: from a scenario to a session of one of its agents, here or at a broker elsewhere."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from caviar_clients.sessions.base import Session
-from caviar_clients.sessions.connected import ConnectedSession
-from caviar_clients.sessions.embedded import EmbeddedSession
+from caviar_clients.session.base import Session
+from caviar_clients.session.connected import ConnectedSession
+from caviar_clients.session.embedded import EmbeddedSession
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.keys import Credentials
 from caviar_protocol.messages import Input

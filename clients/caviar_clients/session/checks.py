@@ -1,25 +1,175 @@
-"""Values of a scenario that are allowed and yet hardly meant: a frequency of 28 Hz, a base station below
-the ground. They are warned of, and the run goes on."""
+"""Checks of a scenario before its run: implementations and their settings, plausible values, free airspace.
+
+Values that are allowed and yet hardly meant (a frequency of 28 Hz, a base station below the ground) are
+warned of, and the run goes on.
+"""
 
 from __future__ import annotations
 
+import copy
 import math
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array
-from caviar_protocol.errors import AssetError, ScenarioError, SetupError
-from caviar_protocol.scenario import Scenario
-from caviar_protocol.scenario.conversion import convert_settings
-from caviar_protocol.scenario.rules import scenario_error, settings_place
+from caviar_protocol.errors import AssetError, DeclarationError, ScenarioError, SetupError, suggestion
+from caviar_protocol.scenario import Scenario, ServiceSpec, load_scenario
+from caviar_protocol.scenario.conversion import Place, convert_settings
+from caviar_protocol.scenario.rules import scenario_error, settings_place, with_overrides
 from caviar_protocol.space.coordinates import Vector
 from caviar_services.channel.propagation.clearance import Surfaces
-from caviar_services.registry import load
+from caviar_services.registry import find_modules_in, load, registered_names
+from caviar_services.service import Service
 from caviar_services.world.assets import scenery_assets
 from caviar_services.world.base import World
-from caviar_services.world.obstacles import scenery_triangles
+from caviar_services.world.obstacles import Obstacles, scenery_triangles
+
+TOPICS_OF: Mapping[str, tuple[str, ...]] = {
+    "world": ("scene",),
+    "channel": ("channel",),
+    "sensors": ("lidar", "camera", "depth", "segmentation"),
+    "link": ("link",),
+    "agent": ("action",),
+    "recorder": (),
+}
+"""What a remote service may produce, by its role; what it does produce it says when it joins."""
+
+
+def checked_scenario(
+    path: Path, frames: int | None = None, seed: int | None = None, pace: str | None = None
+) -> Scenario:
+    """Load a scenario and check it against the implementations it uses.
+
+    Raises `ScenarioError` naming file, key and line for an implementation or a setting that does
+    not exist, and for a topic to record that no implementation produces.
+    """
+    return check_implementations(with_overrides(load_scenario(path), frames, seed, pace))
+
+
+def module_folders(scenario: Scenario) -> tuple[Path, ...]:
+    """Where modules of services that are named ``module:Class`` may lie: beside the scenario, and here.
+
+    Empty where no service is named so.
+    """
+    if not any(":" in spec.use for spec in scenario.services.values()):
+        return ()
+    beside = (Path(scenario.source.file).resolve().parent,) if scenario.source.file else ()
+    return (*beside, Path.cwd())
+
+
+def _check_keys(spec: ServiceSpec, implementation: type[Service[Any]], place: Place) -> None:
+    """Raise `ScenarioError` for a setting that the implementation lacks, naming those that have it."""
+    known = _settings_of(implementation)
+    for key in spec.settings:
+        if key in known:
+            continue
+        owners = [name for name in registered_names(spec.role) if key in _settings_named(spec.role, name)]
+        has = f"{spec.use!r} has: {', '.join(known)}" if known else f"{spec.use!r} has no settings"
+        if owners:
+            hint = f"it is a setting of {' and '.join(map(repr, owners))}; "
+        else:
+            near = suggestion(key, known)
+            hint = f"{near} " if near.startswith("did") else ""
+        raise place.at(key).error(f"unknown key {key!r}; {hint}{has}")
+
+
+def _settings_named(role: str, name: str) -> tuple[str, ...]:
+    """Settings of a registered implementation; none of one that cannot be loaded here."""
+    try:
+        return _settings_of(load(role, name))
+    except DeclarationError:
+        return ()
+
+
+def _settings_of(implementation: type[Service[Any]]) -> tuple[str, ...]:
+    return tuple(field.encode_name for field in msgspec.structs.fields(implementation.Settings))
+
+
+def check_implementations(scenario: Scenario) -> Scenario:
+    """The scenario, checked as `checked_scenario` does."""
+    for folder in module_folders(scenario):
+        find_modules_in(folder)
+    produced: set[str] = set()
+    for name, spec in scenario.services.items():
+        if spec.remote:
+            produced.update(TOPICS_OF[spec.role])
+            continue
+        try:
+            implementation = load(spec.role, spec.use)
+        except DeclarationError as error:
+            raise scenario_error(scenario, f"services.{name}.use", str(error)) from error
+        place = settings_place(scenario, name)
+        _check_keys(spec, implementation, place)
+        implementation.check_settings(convert_settings(implementation.Settings, spec.settings, place), place)
+        produced.update(implementation.outputs)
+    for index, entry in enumerate(scenario.run.record):
+        topic = entry.partition(".")[0]
+        if topic not in produced:
+            raise scenario_error(
+                scenario,
+                f"run.record[{index}]",
+                f"no service of the run produces {topic!r}; remove it, or add a service that does",
+            )
+    return scenario
+
+
+TRIES = 10_000
+"""Points that are drawn at most, until one is free."""
+
+
+class Airspace:
+    """Points that are free for an object.
+
+    Parameters
+    ----------
+    low, high
+        Corners [m] of the box that it keeps within.
+    clearance
+        Least distance [m] of its centre from scenery.
+    scenery
+        Files of the run's scenery, by asset name.
+    """
+
+    def __init__(self, low: Vector, high: Vector, clearance: float, scenery: Mapping[str, Path]) -> None:
+        self.low, self.high = low, high
+        self._clearance = clearance
+        triangles = scenery_triangles(scenery)
+        self._obstacles = Obstacles(triangles[triangles[..., 2].max(axis=1) > low[2]])
+        self._surfaces = Surfaces(triangles, lambda triangle, normal: True)
+
+    def within(self, low: Vector, high: Vector) -> Airspace:
+        """The same scenery, and another box [m]."""
+        other = copy.copy(self)
+        other.low, other.high = low, high
+        return other
+
+    def is_free(self, point: Vector) -> bool:
+        """Whether the object can be at a point [m]."""
+        if not all(a <= x <= b for a, x, b in zip(self.low, point, self.high, strict=True)):
+            return False
+        if self._obstacles.distance(point, self._clearance) < self._clearance:
+            return False
+        return not self._surfaces.encloses(np.array(point))
+
+    def draw(
+        self,
+        random: np.random.Generator,
+        near: Vector | None = None,
+        distance: tuple[float, float] = (0.0, np.inf),
+    ) -> Vector | None:
+        """A free point [m], uniform in the box, and, where ``near`` is given, as far from it [m] as
+        ``distance`` says; None where none was found."""
+        for _ in range(TRIES):
+            x, y, z = random.uniform(self.low, self.high).tolist()
+            far = 0.0 if near is None else float(np.linalg.norm(np.subtract((x, y, z), near)))
+            if distance[0] <= far <= distance[1] and self.is_free((x, y, z)):
+                return x, y, z
+        return None
+
 
 FREQUENCY_HZ = (100e6, 1e12)
 """The lower end of mobile radio; the upper end of Recommendation ITU-R P.676."""

@@ -1,0 +1,1 @@
+"""Runs that a program steps: in its own process (`embedded`), or of a broker elsewhere (`connected`)."""
