@@ -102,7 +102,7 @@ def newest_run(root: str | Path = "runs", name: str = "*") -> Path:
         RecordingError: No directory below ``root`` with this name has a recording.
 
     Example:
-        >>> newest_run(name="smoke-*").name
+        >>> newest_run(name="smoke-*").name  # doctest: +SKIP
         'smoke-20261122-101500'
     """
     written = {

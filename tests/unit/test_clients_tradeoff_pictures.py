@@ -9,9 +9,9 @@ import pytest
 
 from caviar_clients.tradeoff.campaign import Skipped
 from caviar_clients.tradeoff.plot import Box, draw_convergence, draw_pareto, pareto_front, place, spots
-from caviar_clients.tradeoff.report import Report
+from caviar_clients.tradeoff.report import Point, Report
 from caviar_clients.tradeoff.rows import Row, error_fields
-from caviar_clients.tradeoff.tables import Point, level, markdown, significant
+from caviar_clients.tradeoff.tables import level, markdown, significant
 
 
 def row(setting: str, time_ms: float, nmse_db: float, **more: Any) -> Row:
