@@ -1,7 +1,7 @@
 """A whole agent, written from protocol/SPEC.md alone: python agent.py tcp://HOST:PORT NAME"""
 import hashlib, itertools, os, pathlib, signal, struct, sys, threading, time, tomllib, msgpack, zmq
 ENDPOINT, NAME, INPUTS = *sys.argv[1:3], [{"topic": "scene"}, {"topic": "link", "lag": 1, "required": False}]
-message = {"version": [1, 0], "name": NAME, "role": "agent", "inputs": INPUTS, "outputs": ["action"]}
+message = {"version": [1, 4], "name": NAME, "role": "agent", "inputs": INPUTS, "outputs": ["action"]}
 
 def dealer(context):  # a broker with keys wants the files that two environment variables name
     socket, variables = context.socket(zmq.DEALER), ("CAVIAR_KEY", "CAVIAR_BROKER_KEY")

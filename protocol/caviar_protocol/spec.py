@@ -24,36 +24,7 @@ import numpy as np
 from caviar_protocol import arrays, fields, limits, messages, topics
 from caviar_protocol.arrays import WIRE_DTYPES, ArrayField
 from caviar_protocol.topics import PARTS
-
-SINCE: dict[str, str] = {
-    "Ready.seed": "1.1",
-    "Done.seed": "1.1",
-    "Reset.seed_episode": "1.1",
-    "ChannelOptions.materials_outside": "1.1",
-    "ChannelOptions.absorption_db_per_km": "1.1",
-    "ChannelOptions.detail": "1.1",
-    "ChannelOptions.foliage": "1.4",
-    "Welcome.rejoin_ns": "1.3",
-    "Prepare.prefixes": "1.3",
-    "Fault.culprit": "1.3",
-    "WaypointCommand.at_once": "1.3",
-    "Scene.angular_velocity": "1.4",
-    "Carrier.subcarriers": "1.4",
-    "Carrier.subcarrier_spacing_hz": "1.4",
-    "Carrier.taps": "1.4",
-    "Carrier.slots": "1.4",
-    "Carrier.slot_duration_s": "1.4",
-    "ChannelResponse": "1.4",
-    "ChannelTaps": "1.4",
-    "Channel.hf": "1.4",
-    "Channel.taps": "1.4",
-    "AntennaArray.pattern_file": "1.4",
-    "AntennaArray.panels": "1.4",
-    "Panel": "1.4",
-    "Channel.error_bound_db": "1.4",
-    "Channel.error_reference": "1.4",
-}
-"""Minor version that brought a field (``Grant.reports``) or a class (``Grant``); 1.0 unless said here."""
+from caviar_protocol.versions import PARTS_SINCE, SINCE, VALUES_SINCE
 
 _MARKER = re.compile(r"(<!-- (\w+)(?:: ([\w ]+))? -->\n).*?(<!-- end -->)", re.DOTALL)
 
@@ -92,7 +63,7 @@ def rows(cls: type[msgspec.Struct]) -> list[tuple[str, str, str, str, str, str]]
         found.append(
             (
                 field.name,
-                type_text(hint),
+                type_text(hint) + _later_values(f"{cls.__name__}.{field.name}"),
                 unit_of(hint),
                 _default_text(field),
                 SINCE.get(f"{cls.__name__}.{field.name}", since),
@@ -100,6 +71,16 @@ def rows(cls: type[msgspec.Struct]) -> list[tuple[str, str, str, str, str, str]]
             )
         )
     return found
+
+
+def _later_values(field: str) -> str:
+    """Which values of a closed field a later minor version brought."""
+    later = VALUES_SINCE.get(field, {})
+    found = [
+        ", ".join(f"`{value}`" for value, of in later.items() if of == since) + f" since {since}"
+        for since in sorted(set(later.values()))
+    ]
+    return f" ({'; '.join(found)})" if found else ""
 
 
 def type_text(hint: Any) -> str:
@@ -227,8 +208,12 @@ def _elements_block(_: str) -> str:
 
 
 def _parts_block(_: str) -> str:
-    found = [(topic, ", ".join(f"`{part}`" for part in parts) or "none") for topic, parts in PARTS.items()]
-    return _table(("topic", "parts"), found)
+    found = [
+        (topic, f"`{part}`", PARTS_SINCE.get(f"{topic}.{part}", "1.0"))
+        for topic, parts in PARTS.items()
+        for part in parts
+    ]
+    return _table(("topic", "part", "since"), found)
 
 
 def _bytes_block(name: str, vectors: Path) -> str:

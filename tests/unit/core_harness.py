@@ -19,7 +19,7 @@ from core_history import History
 
 from caviar_broker.core import events as ev
 from caviar_broker.core.clock import FrameClock
-from caviar_broker.core.plan import Limits, RunPlan, ServicePlan
+from caviar_broker.core.plan import Feature, Limits, RunPlan, ServicePlan
 from caviar_broker.core.run import Resumption
 from caviar_broker.core.transitions import RunState
 from caviar_broker.journal import JournalFile
@@ -75,6 +75,8 @@ class Sim:
     """Whether its products depend on all that it was granted in the episode, and it can save that."""
     saving: int | None = MS
     """How long CHECKPOINT and RESTORE take [ns]; None: they are never answered."""
+    features: tuple[Feature, ...] = ()
+    """What the scenario needs it to know."""
     forgets: bool = False
     """Whether a restored state is another than that which was saved."""
 
@@ -88,6 +90,7 @@ class Sim:
             budget_ns=self.budget,
             policy=self.policy,
             max_in_flight=self.max_in_flight,
+            features=self.features,
         )
 
     def takes(self, episode: int, frame: int) -> int | None:

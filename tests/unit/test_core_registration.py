@@ -6,10 +6,11 @@ import pytest
 from core_harness import MS, SECOND, Sim, Simulation, agent, channel, link, loop, recorder, sensors, world
 
 from caviar_broker.core import events as ev
-from caviar_broker.core.plan import Limits
+from caviar_broker.core.plan import Feature, Limits, plan_run
 from caviar_broker.core.transitions import RunState
 from caviar_protocol import messages as m
 from caviar_protocol.digest import geometry_digest
+from caviar_protocol.scenario import parse_scenario
 
 
 def refusals(run: Simulation) -> list[m.Refuse]:
@@ -74,6 +75,73 @@ def test_an_unknown_minor_version_is_accepted() -> None:
     major, _ = m.PROTOCOL_VERSION
     run = Simulation(loop(channel={"hello": {"version": (major, 99)}})).join().run()
     assert run.outcome.error == ""
+
+
+@pytest.mark.parametrize("role", ["world", "channel", "link", "agent"])
+def test_a_service_that_cannot_know_what_the_scenario_has_is_refused_with_its_version_and_the_key(
+    role: str,
+) -> None:
+    feature = Feature("devices[0].array.panels", "panels (2 of them) of device 'bs'", (1, 4))
+    run = Simulation(loop(**{role: {"hello": {"version": (1, 3)}, "features": (feature,)}})).join().run()
+    assert refusals(run)[0].code == "version"
+    assert run.outcome.culprit == role
+    assert (
+        f"devices[0].array.panels: {role} '{role}' speaks protocol 1.3, which does not" in run.outcome.error
+    )
+    assert "panels (2 of them) of device 'bs': protocol 1.4 brought it; update" in run.outcome.error
+    assert not run.seen(m.Grant)
+    later = Simulation(loop(**{role: {"hello": {"version": (1, 4)}, "features": (feature,)}})).join().run()
+    assert later.outcome.error == ""
+
+
+@pytest.mark.parametrize(
+    ("array", "key"),
+    [
+        ('polarization = "cross"', "polarization ('cross')"),
+        ('polarization = "+45"', "polarization ('+45')"),
+        ("panels = [{}, {yaw_deg = 180}]", "panels (2 of them)"),
+    ],
+)
+def test_what_the_devices_of_a_scenario_need_their_readers_to_know(array: str, key: str) -> None:
+    services = "".join(
+        f'[services.{name}]\nrole = "{role}"\nuse = "remote"\nbudget_ms = 9\n'
+        for name, role in {"a": "world", "b": "world", "c": "channel"}.items()
+    )
+    text = (
+        f'{services}[run]\nname = "old"\nframes = 1\n'
+        '[[devices]]\nname = "bs"\nworld = "a"\nkind = "antenna"\nrole = "tx"\narray = { columns = 4 }\n'
+        f'[[devices]]\nname = "rx"\nworld = "b"\nkind = "antenna"\nrole = "rx"\narray = {{ {array} }}\n'
+        '[[carriers]]\nname = "mmwave"\nfrequency_hz = 28e9\nsubcarriers = 4\nsubcarrier_spacing_hz = 1e5\n'
+    )
+    plan = plan_run(parse_scenario(text), "run", {})
+    features = {service.name: service.features for service in plan.services}
+    needed = Feature(f"devices[1].array.{array.split()[0]}", f"{key} of device 'rx'", (1, 4))
+    assert features == {"a": (), "b": (needed,), "c": (needed,)}
+
+
+def test_a_part_is_not_asked_of_a_service_of_a_version_without_it() -> None:
+    hears = (m.Input(topic="channel", parts=("h", "hf")),)
+    old = {"hello": {"version": (1, 3)}}
+    run = Simulation(loop(channel=old, link={"inputs": hears})).join().run()
+    assert run.outcome.error.startswith(
+        "channel 'channel' speaks protocol 1.3, which has no part 'hf' of topic 'channel': protocol 1.4"
+    )
+    assert "have link 'link' do without" in run.outcome.error
+    recorded = Simulation([*loop(channel=old), recorder()], record=("channel.taps",)).join().run()
+    assert "no part 'taps'" in recorded.outcome.error
+    assert "have run.record do without" in recorded.outcome.error
+    assert Simulation(loop(channel=old)).join().run().outcome.error == ""
+
+
+def test_a_part_that_no_topic_has_is_refused_with_the_one_that_was_probably_meant() -> None:
+    hears = (m.Input(topic="channel", parts=("hff",)),)
+    run = Simulation(loop(link={"inputs": hears})).join().run()
+    assert refusals(run)[0].code == "declaration"
+    assert run.outcome.culprit == "link"
+    assert "'link' asks for the part 'hff' of topic 'channel', which has no such part; " in run.outcome.error
+    assert "did you mean 'hf'" in run.outcome.error
+    later = {"inputs": hears, "hello": {"version": (1, 99)}}
+    assert Simulation(loop(link=later)).join().run().outcome.error == ""
 
 
 def test_a_service_of_another_role_than_the_scenario_says_is_refused_and_ends_the_run() -> None:

@@ -187,7 +187,7 @@ def scene() -> tuple[bytes, bytes]:
 
 def test_the_minimal_client_lives_through_a_run(script: Script, client: subprocess.Popen[bytes]) -> None:
     hello, _ = script.receive(m.Hello)
-    assert (hello.version, hello.name, hello.role) == ((1, 0), "mine", "agent")
+    assert (hello.version, hello.name, hello.role) == ((1, 4), "mine", "agent")
     script.send(
         m.Welcome(version=(1, 0), run="r", epoch=3, attempt=2, heartbeat_ns=20_000_000, liveness_ns=10**9)
     )

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
 
 from caviar_protocol.host import host_identity
@@ -15,6 +16,8 @@ from caviar_protocol.keys import Pair, read_pair
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.space.coordinates import rotated, rotation_matrix
 from caviar_protocol.space.ply import read_ply
+from caviar_protocol.topics import Interaction
+from caviar_protocol.versions import CHANGES_OTHERS, PARTS_SINCE, VALUES_SINCE
 from caviar_services.scenery import find_scenery, read_scenery
 
 SPEC = (Path(__file__).parents[2] / "protocol" / "SPEC.md").read_text("utf-8")
@@ -41,7 +44,9 @@ def test_the_example_of_scenery_and_its_mesh_are_read(tmp_path: Path) -> None:
 
 def of_engine(row: str, name: str, values: dict[str, float]) -> list[float]:
     """Numbers of a cell of the table of engines, by the axes and components that it names."""
-    cells = dict(zip(("engine", "position", "quaternion", "dimensions"), row.split(" | "), strict=True))
+    cells = dict(
+        zip(("engine", "position", "quaternion", "turning", "dimensions"), row.split(" | "), strict=True)
+    )
     terms = re.findall(r"(−?)([wxyz])(?:/(100))?", cells[name])
     return [(-1 if sign else 1) * values[key] / float(scale or 1) for sign, key, scale in terms]
 
@@ -58,6 +63,9 @@ def test_the_table_of_engines_turns_and_then_maps_as_it_maps_and_then_turns(engi
 
     expected = mapped(turn @ body)
     assert rotated(of_engine(row, "quaternion", parts), mapped(body)) == pytest.approx(expected)
+    velocity = {"x": 0.3, "y": -0.7, "z": 1.1}
+    turning = of_engine(row, "turning", velocity)
+    assert np.cross(turning, mapped(body)) == pytest.approx(mapped(np.cross([*velocity.values()], body)))
     sides = of_engine(row, "dimensions", {"x": 1.0, "y": 2.0, "z": 3.0})
     assert sides == pytest.approx([abs(side) for side in mapped(body)])
 
@@ -66,6 +74,25 @@ def test_every_key_of_a_device_is_in_the_table() -> None:
     section = SPEC[SPEC.index("### Which devices") : SPEC.index("### Geometry of several worlds")]
     rows = "".join(re.findall(r"^\| (`.*?) \|", section, re.MULTILINE))
     assert set(re.findall(r"`(\w+)`", rows)) == set(DeviceSpec.__struct_fields__)
+
+
+def test_the_section_on_versions_names_what_a_reader_has_to_know() -> None:
+    section = SPEC[SPEC.index("## Versions") : SPEC.index("## Transport")]
+    words = set(re.findall(r"`([^`]+)`", section))
+    assert words >= {value for values in VALUES_SINCE.values() for value in values}
+    assert words >= {field.partition(".")[2] for field in CHANGES_OTHERS}
+    for part, since in PARTS_SINCE.items():
+        topic, _, name = part.partition(".")
+        assert f"| {topic} | `{name}` | {since} |" in SPEC
+
+
+def test_what_interactions_are_stands_in_the_table_of_a_channel() -> None:
+    (row,) = re.findall(r"^\| interactions \|.*", SPEC, re.MULTILINE)
+    codes = dict(re.findall(r"(\d) (\w+)", row))
+    assert codes.pop("0") == "nothing"
+    assert {name.upper(): int(code) for code, name in codes.items()} == {
+        kind.name: kind.value for kind in Interaction if kind
+    }
 
 
 def test_the_key_file_is_one(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from caviar_protocol.errors import DeclarationError
 from caviar_protocol.messages import Demand, Hello
 from caviar_protocol.scenario.rules import patterns_overlap
+from caviar_protocol.versions import PARTS_SINCE, parsed
 
 WILDCARD = "*"
 """Topic of an input that takes every topic (recorders)."""
@@ -70,6 +71,14 @@ def build_graph(hellos: Mapping[str, Hello], record: Iterable[str] = ()) -> Grap
         name: tuple(edge for edge in found if edge.topic in outputs[edge.source])
         for name, found in inputs.items()
     }
+    demand = {
+        name: tuple(
+            Demand(topic=topic, parts=_parts(topic, hellos, active - recorders, wanted))
+            for topic in outputs.get(name, ())
+        )
+        for name in hellos
+    }
+    _check_parts(hellos, active - recorders, wanted, demand)
     rank = {name: place for place, name in enumerate(order)}
     return Graph(
         order=tuple(name for name in order if name in active),
@@ -83,13 +92,7 @@ def build_graph(hellos: Mapping[str, Hello], record: Iterable[str] = ()) -> Grap
             for name in active
         },
         outputs=outputs,
-        demand={
-            name: tuple(
-                Demand(topic=topic, parts=_parts(topic, hellos, active - recorders, wanted))
-                for topic in outputs.get(name, ())
-            )
-            for name in hellos
-        },
+        demand=demand,
         producers=producers,
         retained=frozenset(e.source for found in inputs.values() for e in found if e.lag == 1),
         idle=tuple(sorted(hellos.keys() - active)),
@@ -222,3 +225,29 @@ def _parts(
     for name in consumers:
         parts.update(part for entry in hellos[name].inputs if entry.topic == topic for part in entry.parts)
     return tuple(sorted(parts))
+
+
+def _check_parts(
+    hellos: Mapping[str, Hello],
+    consumers: Iterable[str],
+    wanted: Mapping[str, set[str]],
+    demand: Mapping[str, tuple[Demand, ...]],
+) -> None:
+    """Raise `DeclarationError` where a service is asked for a part that its version does not have."""
+    for name, entries in demand.items():
+        for topic, part in [(entry.topic, part) for entry in entries for part in entry.parts]:
+            since = PARTS_SINCE.get(f"{topic}.{part}", "1.0")
+            if hellos[name].version >= parsed(since):
+                continue
+            askers = [
+                f"{hellos[consumer].role} {consumer!r}"
+                for consumer in sorted(consumers)
+                if any(i.topic == topic and part in i.parts for i in hellos[consumer].inputs)
+            ]
+            askers += ["run.record"] * (part in wanted.get(topic, ()))
+            spoken = ".".join(map(str, hellos[name].version))
+            raise DeclarationError(
+                f"{hellos[name].role} {name!r} speaks protocol {spoken}, which has no part {part!r} of topic "
+                f"{topic!r}: protocol {since} brought it; update the service, or have {' and '.join(askers)} "
+                "do without"
+            )

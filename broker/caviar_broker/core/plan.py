@@ -9,14 +9,27 @@ from typing import Any
 
 import msgspec
 
+from caviar_protocol.fields import Version
 from caviar_protocol.messages import GrantInput, Policy, Role
 from caviar_protocol.scenario import REMOTE_REJOIN_S, Scenario, ServiceSpec
 from caviar_protocol.scenario.conversion import Source
 from caviar_protocol.scenario.loader import instants_ns
 from caviar_protocol.scenario.rules import resolved, world_of
+from caviar_protocol.versions import required_knowledge
 
 SECOND = 1_000_000_000
 """[ns]"""
+
+
+@dataclass(frozen=True)
+class Feature:
+    """Something in the scenario that services of earlier protocol versions do not know."""
+
+    key: str
+    """Where it stands: ``devices[0].array.panels``."""
+    text: str
+    """What it is, for people."""
+    since: Version
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +50,8 @@ class ServicePlan:
     """What WELCOME tells it about the scenario."""
     rejoin: int | None = None
     """How long its return is waited for [ns]; None: as `Limits` says."""
+    features: tuple[Feature, ...] = ()
+    """Of its devices: what the service has to know of later minor versions than 1.0."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,6 +131,7 @@ def plan_run(scenario: Scenario, run: str, told: Mapping[str, Mapping[str, Any]]
                 settings=spec.settings,
                 scenario=told.get(name, {}),
                 rejoin=round(REMOTE_REJOIN_S * SECOND) if spec.remote and t.rejoin_s is None else None,
+                features=_features(scenario, name if spec.role == "world" else ""),
             )
             for name, spec in scenario.services.items()
         ),
@@ -141,6 +157,18 @@ def plan_run(scenario: Scenario, run: str, told: Mapping[str, Mapping[str, Any]]
             rejoin=round((t.rejoin_s or 0.0) * SECOND),
         ),
     )
+
+
+def _features(scenario: Scenario, world: str) -> tuple[Feature, ...]:
+    """What the devices of a world, or of all for the empty name, need a service to know."""
+    found = []
+    for index, device in enumerate(scenario.devices):
+        if device.array is not None and (not world or world_of(scenario, index) == world):
+            for field, value, since in required_knowledge(device.array):
+                shown = repr(value) if isinstance(value, str) else f"{len(value)} of them"
+                text = f"{field} ({shown}) of device {device.name!r}"
+                found.append(Feature(f"devices[{index}].array.{field}", text, since))
+    return tuple(found)
 
 
 def briefings(scenario: Scenario, directory: Path) -> dict[str, dict[str, Any]]:

@@ -12,7 +12,7 @@ from caviar_broker.core.run import Peer, Run
 from caviar_broker.core.transitions import RunEvent, RunState, ServiceEvent, ServiceState
 from caviar_protocol.codec import check_version
 from caviar_protocol.digest import geometry_digest
-from caviar_protocol.errors import DeclarationError, VersionError
+from caviar_protocol.errors import DeclarationError, VersionError, suggestion
 from caviar_protocol.messages import (
     CAPABILITIES,
     PROTOCOL_VERSION,
@@ -23,6 +23,8 @@ from caviar_protocol.messages import (
     Refuse,
     Welcome,
 )
+from caviar_protocol.scenario.conversion import located
+from caviar_protocol.topics import PARTS, PAYLOADS
 
 
 class Registration:
@@ -98,6 +100,14 @@ class Registration:
             check_version(hello.version)
         except VersionError as error:
             return Refuse(code="version", message=str(error))
+        for feature in peer.plan.features:
+            if hello.version < feature.since:
+                text = (
+                    f"{feature.key}: {peer} speaks protocol {_dotted(hello.version)}, which does not know "
+                    f"{feature.text}: protocol {_dotted(feature.since)} brought it; update the service, or "
+                    "do without the key"
+                )
+                return Refuse(code="version", message=located(text, peer.name, self._run.plan.source))
         contradiction = _contradiction(peer, hello)
         return Refuse(code="declaration", message=contradiction) if contradiction else None
 
@@ -217,6 +227,10 @@ def _prefixes(worlds: Iterable[Peer]) -> dict[str, tuple[str, ...]]:
     return {world.name: world.ready.prefixes for world in worlds if world.ready}
 
 
+def _dotted(version: tuple[int, int]) -> str:
+    return ".".join(map(str, version))
+
+
 def _contradiction(peer: Peer, hello: Hello) -> str:
     """How a HELLO contradicts the scenario or what the service said before; empty if it does not."""
     if hello.role != peer.role:
@@ -226,7 +240,26 @@ def _contradiction(peer: Peer, hello: Hello) -> str:
             f"{hello.name!r} is {hello.implementation!r}, the scenario says use = {peer.plan.use!r}; "
             "start that one, or change the scenario, which is recorded with the run"
         )
+    if unknown := _unknown_part(hello):
+        return unknown
     before = peer.hello
     if before is not None and (hello.inputs, hello.outputs) != (before.inputs, before.outputs):
         return f"{hello.name!r} came back with other inputs or outputs than it had before"
+    return ""
+
+
+def _unknown_part(hello: Hello) -> str:
+    """The first part that a HELLO asks for and its topic does not have; empty: none.
+
+    A service of a later minor version than the broker's may know further ones.
+    """
+    if hello.version > PROTOCOL_VERSION:
+        return ""
+    for entry in hello.inputs:
+        known = PARTS.get(entry.topic, ())
+        for part in entry.parts:
+            if entry.topic in PAYLOADS and part not in known:
+                hint = suggestion(part, known) if known else "it has none"
+                asked = f"{hello.name!r} asks for the part {part!r} of topic {entry.topic!r}"
+                return f"{asked}, which has no such part; {hint}"
     return ""

@@ -50,7 +50,7 @@ function done(grant, parts) {
 }
 const say = (message) => broker.send(encode(message));
 const inputs = [{ topic: "scene" }, { topic: "link", lag: 1, required: false }];
-await say({ type: "HELLO", version: [1, 0], name, role: "agent", inputs, outputs: ["action"] });
+await say({ type: "HELLO", version: [1, 4], name, role: "agent", inputs, outputs: ["action"] });
 while (kind !== "SHUTDOWN") {
   const [head, ...parts] = await broker.receive(), message = decode(head.subarray(0, 1 << 20)), { episode, frame } = message;
   kind = message.type;

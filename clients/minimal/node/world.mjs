@@ -251,7 +251,7 @@ const ON = {
 
 broker.connect(endpoint);
 await send({
-  type: "HELLO", version: [1, 2], name, role: "world", outputs: ["scene"], capabilities: ["assets", "episodes"],
+  type: "HELLO", version: [1, 4], name, role: "world", outputs: ["scene"], capabilities: ["assets", "episodes"],
   implementation: "minimal-world", max_in_flight: 4,
   ...(link("/proc/self/ns/pid") && { host: `${read("/proc/sys/kernel/random/boot_id").trim()}:${link("/proc/self/ns/pid")}`, pid: process.pid }),
 });

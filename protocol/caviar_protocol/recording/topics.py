@@ -323,7 +323,13 @@ class ChannelArrays(UserArrays[Channel]):
         np.float64, "P", 2, unit="rad", doc="direction the wave comes from, likewise", rows=_arrivals
     )
     path_id = Column(np.uint64, "P", doc="stable id of each path in its pair", rows=_ids)
-    interactions = Column(np.uint8, "P", "D", doc="`Interaction` at each point, TX to RX", rows=_interactions)
+    interactions = Column(
+        np.uint8,
+        "P",
+        "D",
+        doc="at each point, TX to RX: 0 nothing, 1 reflection, 2 diffraction, 3 scattering, 4 transmission",
+        rows=_interactions,
+    )
     points = Column(np.float64, "P", "D", 3, unit="m", doc="interaction points; 0 where none", rows=_points)
     error_bound_db = Column(
         np.float64,

@@ -93,7 +93,18 @@ class ChannelOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=Tr
 
 
 class ChannelMatrix(Payload, frozen=True, kw_only=True, omit_defaults=True):
-    """Narrowband MIMO channel of one carrier and one TX/RX pair, at the carrier frequency."""
+    """Narrowband MIMO channel of one carrier and one TX/RX pair, at the carrier frequency.
+
+    Nr and Nt are the elements of the receiver's and of the transmitter's array: rows·columns, since 1.4 times
+    the polarizations and the panels. Where arrays see plane waves (rungs ``free-space``, ``geometric``,
+    ``siso-rt``), h[m, n] = Σ a·exp(+j2π/λ·(u_rx·d_m + u_tx·d_n)) over the paths, with λ of the carrier; u_tx
+    the unit vector of ``aod`` and u_rx that of ``aoa``, both pointing away from their device; and d the place
+    of an element from the reference point of its device, in world axes. In the axes of its panel element i is
+    at (0, (⌊i/rows⌋ − (columns − 1)/2)·horizontal_spacing·λ, ((rows − 1)/2 − i mod rows)·vertical_spacing·λ);
+    the panel's own position_m is added, and its rotation applied. ``a`` and ``tau`` are those between the
+    devices' reference points, also where no panel stands there. Between other subarrays than those of
+    `Channel.a`, amplitudes differ by the elements' patterns and polarizations.
+    """
 
     carrier: Annotated[int, quantity("1", "index into `Channel.carriers`", ge=0)]
     tx: Annotated[int, quantity("1", "index into `Channel.tx`", ge=0)]
@@ -126,8 +137,8 @@ class ChannelTaps(Payload, frozen=True, kw_only=True, omit_defaults=True):
 
     Tap l is at the absolute delay (first + l)/W with the sampling rate W = ``bandwidth_hz``, behind an ideal
     low-pass filter: h = Σ a·sinc(first + l − W·(τ − Δt·ν/frequency_hz))·exp(j2πν·Δt), where
-    sinc(x) = sin(πx)/(πx). ``first`` is some samples before the earliest path; what arrives behind the last
-    tap is left out.
+    sinc(x) = sin(πx)/(πx). ``first`` is ⌊W·τ⌋ − 6 with the delay τ of the pair's earliest path, which may be
+    negative, and 0 without a path; what arrives behind the last tap is left out.
     """
 
     carrier: Annotated[int, quantity("1", "index into `Channel.carriers`", ge=0)]
@@ -189,7 +200,15 @@ class Channel(Payload, frozen=True, kw_only=True, omit_defaults=True):
     ]
     doppler: Annotated[Float64Array, array("<f8", "C", "P", unit="Hz", doc="Doppler shift")]
     interactions: Annotated[
-        UInt8Array, array("|u1", "P", "D", unit="1", doc="Interaction at each point, TX to RX")
+        UInt8Array,
+        array(
+            "|u1",
+            "P",
+            "D",
+            unit="1",
+            doc="what happens at each point, TX to RX: 0 nothing (behind the last), 1 reflection, "
+            "2 diffraction, 3 scattering, 4 transmission",
+        ),
     ]
     points: Annotated[
         Float64Array, array("<f8", "P", "D", 3, unit="m", doc="interaction points; 0 where none")

@@ -18,6 +18,17 @@ class Link(Payload, frozen=True, kw_only=True, omit_defaults=True):
     the same direction at both ends. With several panels or dual polarization, beam ``s·N + k`` is beam ``k``
     of the ``s``-th block of N elements and 0 at all others.
 
+    The pair along the straight line has, at each end, the beam of the greatest |c_k* a| for the unit vector u
+    towards the other end, in the panel's axes: p is the integer nearest to −rows·vertical_spacing·u_z, modulo
+    rows, and q that nearest to columns·horizontal_spacing·u_y, modulo columns; of two as near the lower
+    index. Of several panels it is the one with the greatest u_x. Of polarizations it is the two that couple
+    best between upright devices that face each other, of equal ones the first: V to V, RHCP to RHCP, but
+    −45° to +45°.
+
+    The SNR is P·|y|²/(k·T·B·F), with the transmit power P [W] of ``power_dbm``, B = ``bandwidth_hz`` of the
+    carrier, k = 1.380649e-23 J/K, and temperature T and noise factor F as the link is set: 290 K and 9 dB
+    unless its settings ``temperature_k`` and ``noise_figure_db`` say otherwise.
+
     A user without a path has ``has_path`` false and zeros; one that no agent served has beams −1
     and |y| 0. The lists of best pairs end with beams −1 and |y| 0 where a user has no path or
     fewer pairs. Of pairs with equal |y| the one of lower TX, then RX beam stands first. Means
