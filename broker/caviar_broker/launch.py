@@ -25,7 +25,7 @@ import msgspec
 
 from caviar_broker.control.launcher import LauncherPipe, Reporter, stop_on_signals
 from caviar_broker.control.server import ControlServer
-from caviar_broker.control.socket import held, refuse_second_broker
+from caviar_broker.control.socket import locked, refuse_second_broker
 from caviar_broker.core.plan import briefings, plan_run, with_ownership
 from caviar_broker.event_loop import call_with_timeout, prefer
 from caviar_broker.http.process import HttpProcess
@@ -93,7 +93,7 @@ def serve(arguments: argparse.Namespace) -> int:
     """Run the broker; the exit status: 0 exactly if the run came to its end."""
     steady_memory()
     record, directory, forced = _resumed(arguments) if arguments.resume else _begun(arguments)
-    with held(directory):  # before its journal is read, which is cut where it is damaged
+    with locked(directory):  # before its journal is read, which is cut where it is damaged
         return _serve(arguments, record, directory, forced)
 
 

@@ -30,7 +30,7 @@ from broker_harness import (
 from rich.console import Console
 
 from caviar_broker.control.server import MAX_CONNECTIONS, MAX_REQUEST, MAX_WAITING
-from caviar_broker.control.socket import ask, connect, held
+from caviar_broker.control.socket import ask, connect, locked
 from caviar_clients.cli.remote import newest_run, why_command
 from caviar_protocol import messages as m
 from caviar_protocol.errors import RunError
@@ -344,7 +344,7 @@ def test_a_broker_that_is_stopped_is_told_from_one_that_is_gone(
 
 
 def test_a_directory_is_held_by_one_broker_at_a_time(tmp_path: Path) -> None:
-    with held(tmp_path), pytest.raises(RunError, match="another broker runs in"), held(tmp_path):
+    with locked(tmp_path), pytest.raises(RunError, match="another broker runs in"), locked(tmp_path):
         pass
-    with held(tmp_path):
+    with locked(tmp_path):
         pass

@@ -1,4 +1,7 @@
-"""The broker's desk, asked from an event loop."""
+"""The socket of a running broker's control channel, and its clients: blocking, and for an event loop.
+
+``control.sock`` and ``control.json``, which says where the socket is, stand in the directory of a run.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ import shutil
 import socket
 import struct
 import tempfile
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -22,22 +25,39 @@ from caviar_protocol.run_directory import RunDirectory
 
 BACKLOG = 16
 REMOVE_S = 1.0
-"""[s] that is waited for the disk to remove them."""
+"""[s] that is waited for the disk to remove socket and note."""
 REACH_S = 2.0
 """[s] that a broker gets to accept a connection and to answer a request."""
 
 
+Ask = Callable[..., Awaitable[dict[str, Any]]]
+"""`ask_in_thread` of one run: ``await ask(do="why")``."""
+
+
+class RequestRefusedError(RunError):
+    """A broker refuses a request; ``reason`` says why, in the broker's words."""
+
+    def __init__(self, directory: Path, reason: str) -> None:
+        self.reason = reason
+        super().__init__(f"the broker in {directory} refuses: {reason}")
+
+
 class ControlSocket:
-    """The listening socket of a desk, and the note that says where it is.
+    """The listening socket of a broker, and the note that says where it is.
 
     Only the user that runs the broker may connect. Where the run's file system takes no sockets, it is
     in a directory of its own below that for temporary files, and the note says so.
+
+    Args:
+        directory: Of the run.
+
+    Raises:
+        RunError: Another broker serves that directory.
     """
 
     def __init__(self, directory: Path) -> None:
-        self._files, self._elsewhere = RunDirectory(directory), ""
-        self._told: dict[str, str | int] = {}
         refuse_second_broker(directory)
+        self._files, self._elsewhere = RunDirectory(directory), ""
         self.socket = _listening()
         path = self._files.control_socket
         try:
@@ -51,15 +71,15 @@ class ControlSocket:
             self.socket = _listening()
             self.socket.bind(str(path))
         self.socket.listen(BACKLOG)
-        self._told["socket"] = str(path)
+        self._announced: dict[str, str | int] = {"socket": str(path)}
 
-    def announce(self, **told: str | int) -> None:
-        """Write more into the note."""
-        self._told |= told
+    def announce(self, **facts: str | int) -> None:
+        """Add facts to the note. `RunError` naming it where it cannot be written."""
+        self._announced |= facts
         note = self._files.control_note
         try:
             refuse_other_kinds(note)
-            replace_file(note, json.dumps(self._told, indent=2).encode() + b"\n", durable=False)
+            replace_file(note, json.dumps(self._announced, indent=2).encode() + b"\n", durable=False)
         except OSError as error:
             raise RunError(f"cannot write {note}: {error.strerror}") from error
 
@@ -77,28 +97,30 @@ class ControlSocket:
 
 
 def refuse_second_broker(directory: Path) -> None:
-    """Raises `RunError` where a broker runs in a directory."""
-    if _answers(directory):
-        raise RunError(f"another broker runs in {directory} already; stop it, or choose another directory")
+    """Raise `RunError` where a broker runs in a directory."""
+    try:
+        connect(directory).close()
+    except RunError:
+        return
+    raise _second_broker(directory)
 
 
 @contextmanager
-def held(directory: Path) -> Iterator[None]:
-    """Have a run's directory to oneself within the block, or until this process ends.
+def locked(directory: Path) -> Iterator[None]:
+    """Lock a run's directory within the block, or until this process ends.
 
     Two brokers that go on with a run at the same instant both find that no other answers, and the second
-    would cut the journal of the first. A file system without locks (some network ones) holds nothing.
+    would cut the journal of the first. A file system without locks (some network ones) locks nothing.
 
-    Raises `RunError` where another broker has the directory.
+    Raises:
+        RunError: Another broker has the directory.
     """
     fd = os.open(directory, os.O_RDONLY | os.O_CLOEXEC)
     try:
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise RunError(
-                f"another broker runs in {directory} already; stop it, or choose another directory"
-            ) from None
+            raise _second_broker(directory) from None
         except OSError:
             pass
         yield
@@ -107,9 +129,10 @@ def held(directory: Path) -> Iterator[None]:
 
 
 def connect(directory: Path) -> socket.socket:
-    """A connection to the desk of the broker that runs in a directory.
+    """Connect to the broker that runs in a directory.
 
-    Raises `RunError` where none does.
+    Raises:
+        RunError: No broker runs there, or it does not answer within `REACH_S`.
     """
     files = RunDirectory(directory)
     try:
@@ -138,9 +161,18 @@ def connect(directory: Path) -> socket.socket:
 
 
 def ask(directory: Path, **request: Any) -> dict[str, Any]:
-    """The answer of a broker's desk to one request: ``ask(run, do="why")``.
+    """Ask the broker that runs in a directory.
 
-    Raises `RunError` where no broker runs there, where it does not answer, or with what it refuses.
+    Args:
+        directory: Of the run.
+        request: Its fields, ``do`` and what belongs to it.
+
+    Returns:
+        The answer, with ``ok`` and what was asked for: ``ask(run, do="why")["why"]``.
+
+    Raises:
+        RequestRefusedError: The broker refuses the request.
+        RunError: No broker runs there, or it does not answer within `REACH_S`.
     """
     line = b""
     with connect(directory) as connection:
@@ -156,8 +188,34 @@ def ask(directory: Path, **request: Any) -> dict[str, Any]:
         raise RunError(f"the broker in {directory} hung up: its run is over, or too many ask it at once")
     answer: dict[str, Any] = json.loads(line)
     if not answer["ok"]:
-        raise RunError(f"the broker in {directory} refuses: {answer['error']}")
+        raise RequestRefusedError(directory, answer["error"])
     return answer
+
+
+async def ask_in_thread(directory: Path, **request: Any) -> dict[str, Any]:
+    """Do the same as `ask` for a caller in an event loop, which goes on meanwhile."""
+    return await asyncio.to_thread(lambda: ask(directory, **request))
+
+
+def call_at_end(connection: socket.socket, callback: Callable[[], None]) -> None:
+    """Have the running event loop call back once the broker at the other end of an idle connection ends."""
+    loop = asyncio.get_running_loop()
+    connection.setblocking(False)
+
+    def read() -> None:
+        with suppress(BlockingIOError):
+            with suppress(ConnectionError):
+                if connection.recv(1 << 12):
+                    return
+            loop.remove_reader(connection)
+            connection.close()
+            callback()
+
+    loop.add_reader(connection, read)
+
+
+def _second_broker(directory: Path) -> RunError:
+    return RunError(f"another broker runs in {directory} already; stop it, or choose another directory")
 
 
 def _no_answer(directory: Path) -> RunError:
@@ -165,14 +223,6 @@ def _no_answer(directory: Path) -> RunError:
         f"the broker in {directory} did not answer within {REACH_S:g} s: "
         "its process is stopped, or its machine is overloaded"
     )
-
-
-def _answers(directory: Path) -> bool:
-    try:
-        connect(directory).close()
-    except RunError:
-        return False
-    return True
 
 
 def _listening() -> socket.socket:
@@ -189,73 +239,3 @@ def _short(directory: Path) -> Iterator[str]:
         yield f"/proc/self/fd/{fd}"
     finally:
         os.close(fd)
-
-
-MAX_LINE = 1 << 24
-"""[B] of an answer."""
-
-_Streams = tuple[asyncio.StreamReader, asyncio.StreamWriter]
-
-
-class RequestRefusedError(RunError):  # it is an answer, and named as the desk names it
-    """The desk was asked for what cannot be now."""
-
-
-class ControlClient:
-    """Asks the desk of the broker that runs in a directory; one question at a time."""
-
-    def __init__(self, run: Path) -> None:
-        self._run = run
-        self._streams: _Streams | None = None
-        self._turn = asyncio.Lock()
-
-    async def ask(self, do: str, **request: Any) -> dict[str, Any]:
-        """The answer; `RequestRefusedError`, or `RunError` where the broker does not answer or is gone."""
-        async with self._turn:
-            try:
-                async with asyncio.timeout(REACH_S):
-                    answer = await self._exchange({"do": do, **request})
-            except (TimeoutError, OSError, ValueError) as error:
-                self.close()
-                told = (
-                    f"does not answer within {REACH_S:g} s" if isinstance(error, TimeoutError) else "is gone"
-                )
-                raise RunError(f"the broker {told}") from error
-        if not answer["ok"]:
-            raise RequestRefusedError(answer["error"])
-        return answer
-
-    async def _exchange(self, request: dict[str, Any]) -> dict[str, Any]:
-        if self._streams is None:
-            self._streams = await _open(self._run)
-        reader, writer = self._streams
-        writer.write(json.dumps(request).encode() + b"\n")
-        await writer.drain()
-        answer: dict[str, Any] = json.loads(await reader.readline())
-        return answer
-
-    async def events(self) -> AsyncIterator[dict[str, Any]]:
-        """What happens in the run, until the broker ends."""
-        reader, writer = await _open(self._run)
-        try:
-            writer.write(b'{"do": "subscribe"}\n')
-            while line := await reader.readline():
-                event = json.loads(line)
-                if "event" in event:
-                    yield event
-        except OSError:
-            return
-        finally:
-            writer.close()
-
-    def close(self) -> None:
-        """Hang up."""
-        if self._streams is not None:
-            self._streams[1].close()
-            self._streams = None
-
-
-async def _open(run: Path) -> _Streams:
-    connection = connect(run)
-    connection.setblocking(False)
-    return await asyncio.open_unix_connection(sock=connection, limit=MAX_LINE)

@@ -1,4 +1,4 @@
-"""The HTTP interface: what a broker's desk says and does, as JSON, and the gateway at ``/ws``."""
+"""The HTTP interface: requests of the control channel as JSON, figures for Prometheus, and the gateway."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from caviar_broker.control.server import MAX_STEPS
-from caviar_broker.control.socket import ControlClient, RequestRefusedError
+from caviar_broker.control.socket import Ask, RequestRefusedError
 from caviar_broker.http.auth import Tokens, foreign, token_of
 from caviar_broker.http.gateway import Gateway
 from caviar_protocol.errors import RunError
@@ -24,7 +24,7 @@ STATES = ("joining", "preparing", "resetting", "running", "stopping", "finished"
 
 
 def metrics(status: Mapping[str, Any], peers: int) -> str:
-    """The text, from a desk's status and the number of open WebSockets."""
+    """The status of a run in Prometheus's text format, and the number of open WebSockets."""
     return "\n".join(_lines(status, peers)) + "\n"
 
 
@@ -203,7 +203,7 @@ class LocalOnly:
             await self._app(scope, receive, send)
 
 
-def make_app(desk: ControlClient, tokens: Tokens, gateway: Gateway) -> FastAPI:
+def make_app(ask: Ask, tokens: Tokens, gateway: Gateway) -> FastAPI:
     """The application."""
     version = ".".join(map(str, PROTOCOL_VERSION))
     app = FastAPI(title="CAVIAR broker", version=version, description=ABOUT, docs_url=None, redoc_url=None)
@@ -212,9 +212,9 @@ def make_app(desk: ControlClient, tokens: Tokens, gateway: Gateway) -> FastAPI:
     app.add_exception_handler(RunError, _no_broker)
     viewer = [Depends(_bearer), Depends(_may(VIEWER, tokens))]
     operator = [Depends(_bearer), Depends(_may(OPERATOR, tokens))]
-    _questions(app, desk, gateway, viewer)
-    _orders(app, desk, operator)
-    _probes(app, desk)
+    _questions(app, ask, gateway, viewer)
+    _orders(app, ask, operator)
+    _probes(app, ask)
 
     @app.websocket("/ws")
     async def ws(socket: WebSocket) -> None:
@@ -223,68 +223,68 @@ def make_app(desk: ControlClient, tokens: Tokens, gateway: Gateway) -> FastAPI:
     return app
 
 
-def _questions(app: FastAPI, desk: ControlClient, gateway: Gateway, viewer: list[Any]) -> None:
+def _questions(app: FastAPI, ask: Ask, gateway: Gateway, viewer: list[Any]) -> None:
     @app.get("/status", dependencies=viewer, responses=_example(STATUS))
     async def status() -> Any:
         """The run, its services, and what each of them does now."""
-        return (await desk.ask("status"))["status"]
+        return (await ask(do="status"))["status"]
 
     @app.get("/why", dependencies=viewer, responses=_example(WHY))
     async def why() -> Any:
         """Whom the run waits for now, and why; the last blame."""
-        return (await desk.ask("why"))["why"]
+        return (await ask(do="why"))["why"]
 
     @app.get("/latencies", dependencies=viewer, responses=_example(LATENCIES))
     async def latencies() -> Any:
         """How each service keeps its budget; quantiles of its newest 512 answers."""
-        return (await desk.ask("latencies"))["latencies"]
+        return (await ask(do="latencies"))["latencies"]
 
     @app.get("/metrics", dependencies=viewer, response_class=PlainTextResponse)
     async def prometheus() -> Any:
         """The same as figures for Prometheus."""
-        found = (await desk.ask("status"))["status"]
+        found = (await ask(do="status"))["status"]
         return PlainTextResponse(metrics(found, gateway.connections), media_type=CONTENT_TYPE)
 
 
-def _orders(app: FastAPI, desk: ControlClient, operator: list[Any]) -> None:
+def _orders(app: FastAPI, ask: Ask, operator: list[Any]) -> None:
     done = _example(ORDERED) | {409: {"description": "not possible in this state of the run"}}
 
     @app.post("/pause", dependencies=operator, responses=done)
     async def pause() -> Any:
         """Let no new frame begin; those that have begun are finished."""
-        return _state(await desk.ask("pause"))
+        return _state(await ask(do="pause"))
 
     @app.post("/resume", dependencies=operator, responses=done)
     async def resume() -> Any:
         """Let frames begin again."""
-        return _state(await desk.ask("resume"))
+        return _state(await ask(do="resume"))
 
     @app.post("/step", dependencies=operator, responses=done)
     async def step(
         frames: Annotated[int, Query(ge=1, le=MAX_STEPS, description="how many frames")] = 1,
     ) -> Any:
         """Let so many frames more of a paused run begin."""
-        return _state(await desk.ask("step", frames=frames))
+        return _state(await ask(do="step", frames=frames))
 
     @app.post("/stop", dependencies=operator, responses=done)
     async def stop(
         reason: Annotated[str, Query(min_length=1, max_length=500)] = "stopped over HTTP",
     ) -> Any:
         """End the run in order: every service is told to leave."""
-        return _state(await desk.ask("stop", reason=reason))
+        return _state(await ask(do="stop", reason=reason))
 
 
-def _probes(app: FastAPI, desk: ControlClient) -> None:
+def _probes(app: FastAPI, ask: Ask) -> None:
     @app.get("/healthz", responses=_example({"ok": True}) | _unready("the broker does not answer"))
     async def healthz() -> Any:
         """Whether the broker answers. Needs no token."""
-        await desk.ask("why")
+        await ask(do="why")
         return {"ok": True}
 
     @app.get("/readyz", responses=_example({"ready": True}) | _unready("services are missing or prepare"))
     async def readyz() -> Any:
         """Whether all services are there and ready. Needs no token."""
-        state = (await desk.ask("why"))["why"]["state"]
+        state = (await ask(do="why"))["why"]["state"]
         return JSONResponse({"ready": state in READY}, 200 if state in READY else 503)
 
 
@@ -308,7 +308,8 @@ def _state(answer: dict[str, Any]) -> dict[str, Any]:
 
 
 async def _refused(_: Request, error: Exception) -> JSONResponse:
-    return JSONResponse({"detail": str(error)}, 409)
+    reason = error.reason if isinstance(error, RequestRefusedError) else str(error)
+    return JSONResponse({"detail": reason}, 409)
 
 
 async def _no_broker(_: Request, error: Exception) -> JSONResponse:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import functools
 import os
 import socket
 import subprocess
@@ -19,7 +20,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from caviar_broker.control.socket import ControlClient
+from caviar_broker.control.socket import Ask, ask_in_thread, call_at_end, connect
 from caviar_broker.http.auth import Tokens, http_address
 from caviar_broker.supervision import describe_exit
 from caviar_protocol.errors import CaviarError, RunError, SetupError
@@ -114,16 +115,16 @@ async def serve(run: Path, address: str, keys: Path | None) -> None:
     from caviar_broker.http.gateway import NOTE, REMEDY, Gateway
     from caviar_broker.http.server import http_server, listening_socket
 
-    desk = ControlClient(run)
-    keys, credentials = await _of_the_broker(desk, keys)
+    ask = functools.partial(ask_in_thread, run)
+    keys, credentials = await _keys_of_broker(ask, keys)
     host, port = http_address(address, keys)
     tokens = Tokens(keys)
-    status = (await desk.ask("status"))["status"]
+    status = (await ask(do="status"))["status"]
     known = {entry["name"] for entry in status["services"]}
 
     async def tell(service: str, text: str, kind: str) -> None:
         with contextlib.suppress(RunError):
-            await desk.ask("note", service=service if service in known else "", text=text[:1000], kind=kind)
+            await ask(do="note", service=service if service in known else "", text=text[:1000], kind=kind)
 
     remedy = f"{REMEDY} --directory {keys}" if keys is not None else REMEDY
     gateway = Gateway(_reachable(status["endpoint"]), tokens, tell, credentials, remedy)
@@ -135,29 +136,25 @@ async def serve(run: Path, address: str, keys: Path | None) -> None:
         told.add(task)
         task.add_done_callback(told.discard)
 
-    server = http_server(make_app(desk, tokens, gateway), tell_soon, own_process=True)
+    server = http_server(make_app(ask, tokens, gateway), tell_soon, own_process=True)
 
-    async def end_with_the_broker() -> None:
-        async for _ in desk.events():
-            continue
+    def end() -> None:
         server.should_exit = True
 
-    follower = asyncio.create_task(end_with_the_broker())
-    await desk.ask("serving", http=f"http://{_place(host, listening)}")
+    call_at_end(connect(run), end)
+    await ask(do="serving", http=f"http://{_place(host, listening)}")
     try:
         await server.serve(sockets=[listening])
     finally:
-        follower.cancel()
-        desk.close()
         gateway.close()
 
 
-async def _of_the_broker(desk: ControlClient, keys: Path | None) -> tuple[Path | None, Credentials | None]:
+async def _keys_of_broker(ask: Ask, keys: Path | None) -> tuple[Path | None, Credentials | None]:
     """Keys directory, and the gateway's own key where the broker has keys, whose directory it then is.
 
     The key comes over the control socket, where only the broker's user can ask; it is written nowhere.
     """
-    told = await desk.ask("gateway")
+    told = await ask(do="gateway")
     if told["keys"] is None:
         return keys, None
     directory = Path(told["keys"])
