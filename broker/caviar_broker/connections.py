@@ -46,7 +46,7 @@ class Connections:
         Where messages come and go.
     loop
         Where processes are watched.
-    watchdog, scenery
+    watchdog, assets
         Are told of incarnations that come and go.
     feed
         Gives the clock an event, and does what it wants.
@@ -61,7 +61,7 @@ class Connections:
     port: Router
     loop: EventLoop
     watchdog: Watchdog
-    scenery: AssetExchange
+    assets: AssetExchange
     feed: Callable[[ev.Event], None]
     perform: Callable[[], None]
     note: Callable[[str, str, str], None]
@@ -149,7 +149,7 @@ class Connections:
     def _admit(self, route: bytes, hello: m.Hello, local: bool) -> None:
         """A new incarnation is in the run: nothing counts any more that comes from the one before."""
         name = hello.name
-        self.scenery.forget(name)
+        self.assets.forget(name)
         earlier = self.watchdog.forget(name)
         if earlier is not None:
             self.loop.unwatch(earlier)

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 import zmq
 
-from caviar_broker.assets import AssetExchange, AssetTransfers
+from caviar_broker.assets import AssetExchange
 from caviar_broker.connections import COMPLAINTS, Connections
 from caviar_broker.core import events as ev
 from caviar_broker.core.clock import FrameClock
@@ -112,8 +112,8 @@ class BrokerServer:
         self._disk_told = 0.0
         """[s] for which the disk had taken nothing when that was told; 0: it takes what comes."""
         self._sign = SignOfLife()
-        self._scenery = AssetExchange(
-            exchange=AssetTransfers(store or AssetStore()),
+        self._assets = AssetExchange(
+            store=store or AssetStore(),
             clock=self.clock,
             feed=self.feed,
             reply=self._reply,
@@ -162,7 +162,7 @@ class BrokerServer:
             port=self._port,
             loop=self.loop,
             watchdog=self._watchdog,
-            scenery=self._scenery,
+            assets=self._assets,
             feed=self.feed,
             perform=self._perform,
             note=self.note,
@@ -171,24 +171,26 @@ class BrokerServer:
         self._known, self._routes = self._connections.known, self._connections.routes
         self._handlers: dict[type, Callable[[str, Any, Sequence[zmq.Frame]], None]] = {
             m.Done: self._done,
-            m.Ready: self._scenery.ready,
-            m.ResetDone: self._reset_done,
-            m.Fault: self._fault,
-            m.Bye: self._bye,
-            m.CheckpointDone: self._checkpoint_done,
+            m.Ready: self._assets.handle_ready,
+            m.ResetDone: lambda name, message, _: self.feed(ev.ResetDoneReceived(name, message)),
+            m.Fault: lambda name, message, _: self.feed(ev.FaultReceived(name, message)),
+            m.Bye: lambda name, message, _: self.feed(ev.ByeReceived(name, message.reason)),
+            m.CheckpointDone: lambda name, message, parts: self.feed(
+                ev.CheckpointReceived(name, message, parts[0])
+            ),
             m.Error: self._error,
-            m.AssetOffer: self._scenery.offer,
-            m.AssetGet: self._scenery.get,
-            m.AssetData: self._scenery.data,
+            m.AssetOffer: self._assets.handle_offer,
+            m.AssetGet: self._assets.handle_get,
+            m.AssetData: self._assets.handle_data,
         }
         self._performers: dict[type, Callable[[Any], None]] = {
-            ev.Latency: self._latency,
-            ev.Overdue: self._overdue,
+            ev.Latency: lambda a: self.statistics.latency(a.service, a.elapsed_ns, a.missed),
+            ev.Overdue: lambda a: self.statistics.decision(time.monotonic_ns() - a.due_ns),
             ev.Notice: self._observer.notice,
             ev.FrameFinished: self._frame_finished,
-            ev.EpisodeFinished: self._episode_finished,
+            ev.EpisodeFinished: lambda _: None,  # its frames are told one by one
             ev.TurnAway: self._connections.turn_away,
-            ev.Finished: self._finished,
+            ev.Finished: lambda outcome: setattr(self, "outcome", outcome),
         }
 
     # --- the loop ------------------------------------------------------------------------------------
@@ -312,20 +314,8 @@ class BrokerServer:
         self.clock.handle(ev.DoneReceived(service, message, payloads), time.monotonic_ns())
         self._taken = True
 
-    def _reset_done(self, service: str, message: m.ResetDone, _: Sequence[zmq.Frame]) -> None:
-        self.feed(ev.ResetDoneReceived(service, message))
-
-    def _checkpoint_done(self, service: str, message: m.CheckpointDone, parts: Sequence[zmq.Frame]) -> None:
-        self.feed(ev.CheckpointReceived(service, message, parts[0]))
-
-    def _fault(self, service: str, message: m.Fault, _: Sequence[zmq.Frame]) -> None:
-        self.feed(ev.FaultReceived(service, message))
-
-    def _bye(self, service: str, message: m.Bye, _: Sequence[zmq.Frame]) -> None:
-        self.feed(ev.ByeReceived(service, message.reason))
-
     def _error(self, service: str, message: m.Error, _: Sequence[zmq.Frame]) -> None:
-        if self._scenery.undeliverable(service, message):
+        if self._assets.handle_error(service, message):
             return
         text = f"could not use {message.of or 'a message'}: {message.message}"
         self._connections.grumble(f"error {service}", text, service)
@@ -387,22 +377,10 @@ class BrokerServer:
             self.note("", f"the disk answers again, after some {self._disk_told:.1f} s", "disk")
         self._disk_told = waited if waited >= DISK_NOTE_S else 0.0
 
-    def _latency(self, action: ev.Latency) -> None:
-        self.statistics.latency(action.service, action.elapsed_ns, action.missed)
-
-    def _overdue(self, action: ev.Overdue) -> None:
-        self.statistics.decision(time.monotonic_ns() - action.due_ns)
-
     def _frame_finished(self, action: ev.FrameFinished) -> None:
         self.clock.digest.fold()
         self.statistics.frame(time.monotonic_ns(), action.episode, action.lag_ns)
         self._observer.frame(action, self.statistics)
-
-    def _episode_finished(self, action: ev.EpisodeFinished) -> None:
-        """Its frames are told one by one."""
-
-    def _finished(self, action: ev.Finished) -> None:
-        self.outcome = action
 
     def _send(self, action: ev.Send) -> None:
         parts: list[Any] = []

@@ -299,7 +299,7 @@ def test_a_member_that_never_reads_is_cut_off_before_it_fills_the_memory(tmp_pat
         serving(plan("world", "sensors:bad"), tmp_path, peer_limits=PeerLimits(queued=32 << 20)) as broker,
         raw(broker.endpoint) as bad,
     ):
-        store = broker.server._scenery.exchange._store
+        store = broker.server._assets.store
         asset = store.add("scenery/large.ply", bytes(4 << 20))
         hello = m.Hello(version=(1, 0), name="bad", role="sensors", outputs=("lidar",))
         for message in (hello, *[m.AssetGet(digest=asset.digest, offset=0)] * 40):
