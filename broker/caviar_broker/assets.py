@@ -30,10 +30,10 @@ class Reply(Protocol):
 class _Delivery:
     """What a world still owes of the scenery that it announced."""
 
+    # By digest: not asked for yet.
     waiting: dict[str, m.Asset]
-    """By digest: not asked for yet."""
+    # By digest: asked for.
     coming: dict[str, Incoming] = field(default_factory=dict)
-    """By digest: asked for."""
 
     @property
     def owed(self) -> tuple[m.Asset, ...]:
@@ -83,7 +83,7 @@ class AssetExchange:
         delivery = self._deliveries.get(service)
         incoming = delivery.coming.get(message.digest) if delivery is not None else None
         if delivery is None or incoming is None:
-            text = f"sent wrong scenery: asset {message.digest[:12]}… was not asked for"
+            text = f"sent wrong scenery: nobody asked for asset {message.digest[:12]}…"
             self.feed(ev.Violated(service, text))
             return
         try:

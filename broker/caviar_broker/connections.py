@@ -36,24 +36,15 @@ class Connections:
 
     The tables `known` and `routes` are for others to look things up in, and are changed only here.
 
-    Parameters
-    ----------
-    clock
-        Who is in the run.
-    epoch
-        Of the run.
-    port
-        Where messages come and go.
-    loop
-        Where processes are watched.
-    watchdog, assets
-        Are told of incarnations that come and go.
-    feed
-        Gives the clock an event, and does what it wants.
-    perform
-        Does what the clock wants.
-    note
-        Is told service, text and kind of something that the user should know.
+    Args:
+        clock: Who is in the run.
+        epoch: Of the run.
+        port: Where messages come and go.
+        loop: Where processes are watched.
+        watchdog, assets: Are told of incarnations that come and go.
+        feed: Gives the clock an event, and does what it wants.
+        perform: Does what the clock wants.
+        note: Is told service, text and kind of something that the user should know.
     """
 
     clock: FrameClock
@@ -74,8 +65,8 @@ class Connections:
         self._guard = self.port.guard
         self._grumbles = NoticeThrottle()
         self._host = host_identity()
+        # Whose HELLO the clock looks at.
         self._replying = b""
-        """Whose HELLO the clock looks at."""
         self._guard.start(self.loop, self._cut_off, self._gone, self._refused)
 
     # --- what comes ----------------------------------------------------------------------------------

@@ -169,13 +169,10 @@ class Standby:
     runs the turns. To hand each write to another thread and wait for it would cost two switches of threads,
     several times what the write takes; here a write that is quick costs a lock.
 
-    Parameters
-    ----------
-    turn
-        One turn of the loop. It returns soon once ``fd`` is readable. Behind a `call` it takes nothing for
-        granted that it looked up before, since other turns may have been run meanwhile.
-    over
-        Whether the loop is over.
+    Args:
+        turn: One turn of the loop. It returns soon once ``fd`` is readable. Behind a `call` it takes nothing
+            for granted that it looked up before, since other turns may have been run meanwhile.
+        over: Whether the loop is over.
     """
 
     def __init__(self, turn: Callable[[], None], over: Callable[[], bool]) -> None:
@@ -186,8 +183,8 @@ class Standby:
         """When the call that is under way began [s]; None: there is none."""
         self.cpu_s = 0.0
         """CPU time of the leader, once the loop is over [s]."""
+        # Held by the thread that runs turns.
         self._role = threading.Lock()
-        """Held by the thread that runs turns."""
         self._ended = threading.Event()
         self._failures: list[BaseException] = []
 
@@ -201,10 +198,8 @@ class Standby:
 
         The leader is a thread of its own, so that this returns, and signals are heard, whatever a disk does.
 
-        Parameters
-        ----------
-        begin
-            Called by the leader first.
+        Args:
+            begin: Called by the leader first.
         """
         self._role.acquire()
         for body, name in ((self._lead, "leader"), (self._stand_by, "standby")):

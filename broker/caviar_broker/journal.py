@@ -40,24 +40,21 @@ class CheckpointFiles:
     A file is there as a whole or not at all. Kept of each service are the newest one of a frame that
     is finished, since a broker that resumes goes on behind the last finished frame, and all later ones.
 
-    Parameters
-    ----------
-    directory
-        Of the run.
-    durable
-        Whether a state has to be on the disk before an older one may go.
+    Args:
+        directory: Of the run.
+        durable: Whether a state has to be on the disk before an older one may go.
     """
 
     def __init__(self, directory: Path, *, durable: bool = False) -> None:
         self._folder, self._durable = RunDirectory(directory).checkpoints, durable
         self.finished = (0, -1)
         """(episode, frame) that was finished last, and will be so for a broker that resumes."""
+        # Files of each service by (episode, frame), in that order.
         self._kept: dict[str, dict[tuple[int, int], Path]] = {}
-        """Files of each service by (episode, frame), in that order."""
+        # Files that are not named by an entry of the journal yet.
         self._saved: list[Path] = []
-        """Files that are not named by an entry of the journal yet."""
+        # Files that are, and may not be on the disk.
         self._unsynced: list[Path] = []
-        """Files that are, and may not be on the disk."""
         self._synced: set[Path] = set()
 
     def save(self, service: str, episode: int, frame: int, state: Any) -> tuple[str, str]:
@@ -121,14 +118,14 @@ COMPACT_BYTES = 8 << 20
 """[B] that a journal grows by before it is compacted."""
 CUT_SUFFIX = ".cut"
 """Of the file that keeps what was cut off a damaged journal."""
+# That one call of ``writev`` takes.
 _MOST_PIECES = 1024
-"""That one call of ``writev`` takes."""
+# An empty body, as msgpack writes it.
 _NO_BYTES = b"\xc4\x00"
-"""An empty body, as msgpack writes it."""
+# Errors of `os.fsync` for what no disk is behind: a pipe, a device, a file system in memory.
 _UNSYNCABLE = frozenset({errno.EINVAL, errno.EROFS, errno.ENOTSUP})
-"""Errors of `os.fsync` for what no disk is behind: a pipe, a device, a file system in memory."""
+# [B] from which a body is written without a copy; below, one more piece costs more.
 _UNCOPIED = 1 << 16
-"""[B] from which a body is written without a copy; below, one more piece costs more."""
 
 
 class JournalFile:
@@ -137,22 +134,18 @@ class JournalFile:
     When `write` returns the kernel has the bytes, so they outlive this process. `sync` puts them on the
     disk. Both and `compact` may be called from different threads, `write` and `compact` from one.
 
-    Parameters
-    ----------
-    path
-        The file; one that exists is gone on with behind its last whole entry.
-    epoch
-        Of the broker that writes.
-    checkpoints
-        Where the states of services go; by default beside the journal.
-    end
-        Where to go on [B]; what is behind it is kept in a file of its own. By default the end of the log.
-    run
-        Id of the run, by which a journal in the directory of another run is noticed.
-    durable
-        Whether what is compacted has to be on the disk before it takes the place of what was there.
+    Args:
+        path: The file; one that exists is gone on with behind its last whole entry.
+        epoch: Of the broker that writes.
+        checkpoints: Where the states of services go; by default beside the journal.
+        end: Where to go on [B]; what is behind it is kept in a file of its own. By default the end of the
+            log.
+        run: Id of the run, by which a journal in the directory of another run is noticed.
+        durable: Whether what is compacted has to be on the disk before it takes the place of what was there.
 
-    Raises `RunError` naming the file where it cannot be opened, `RecordingError` where it is no journal.
+    Raises:
+        RunError: The file cannot be opened.
+        RecordingError: The file is no journal.
     """
 
     def __init__(
@@ -169,8 +162,8 @@ class JournalFile:
         self.path, self._epoch, self._durable = path, epoch, durable
         self.checkpoints = checkpoints or CheckpointFiles(path.parent, durable=durable)
         self._encoder = msgspec.msgpack.Encoder()
+        # Held while the file is replaced, or its descriptor taken.
         self._lock = Lock()
-        """Held while the file is replaced, or its descriptor taken."""
         self._entries = EntryIndex()
         self._number, self._crc, self.size = 0, MAGIC_CRC, 0
         self._compacted_size = 0

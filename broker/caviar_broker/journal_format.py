@@ -65,7 +65,8 @@ class JournalReader:
 
     ``problem`` says why the log ends before the file does; it is empty where it does not.
 
-    Raises `RecordingError` where the file cannot be read or is a journal of another format.
+    Raises:
+        RecordingError: The file cannot be read or is a journal of another format.
     """
 
     def __init__(self, path: Path) -> None:
@@ -126,7 +127,8 @@ class JournalReader:
 def run_of_journal(path: Path) -> str:
     """Id of the run that a journal is of; empty where it does not say, as those of earlier versions.
 
-    Raises `RecordingError` like `JournalReader`.
+    Raises:
+        RecordingError: The file cannot be read or is a journal of another format.
     """
     return next((entry.run for entry in JournalReader(path)), "")
 
@@ -143,7 +145,8 @@ def framed(before: int, *pieces: bytes | memoryview) -> tuple[bytes, int]:
 def read_journal(path: Path) -> Iterator[JournalEntry]:
     """The entries of a journal up to its end, or to the first that is damaged.
 
-    Raises `RecordingError` like `JournalReader`.
+    Raises:
+        RecordingError: The file cannot be read or is a journal of another format.
     """
     return iter(JournalReader(path))
 
@@ -183,10 +186,10 @@ class EntryIndex:
     """The places of the entries of a journal, in 40 B each: they are kept until the next compaction."""
 
     def __init__(self) -> None:
+        # Episode, frame, offset and length of each.
         self._numbers = array("q")
-        """Episode, frame, offset and length of each."""
+        # Service, outcome and topics of each.
         self._kinds: list[tuple[str, str, tuple[str, ...]]] = []
-        """Service, outcome and topics of each."""
         self._known: dict[tuple[str, str, tuple[str, ...]], tuple[str, str, tuple[str, ...]]] = {}
 
     def extend(self, entries: Iterable[EntryLocation]) -> None:

@@ -28,15 +28,11 @@ END_S = 10.0
 class JournalWriter:
     """Writes a journal, and puts it on the disk as ``durability`` says. `write` may wait for the disk.
 
-    Parameters
-    ----------
-    file
-        The journal; its owner closes it behind `close`.
-    durability
-        When entries have to be on the disk.
-    sync_recording
-        Puts the recording on the disk, as far as it is handed over; under ``frame`` the recorder did so
-        before it answered.
+    Args:
+        file: The journal; its owner closes it behind `close`.
+        durability: When entries have to be on the disk.
+        sync_recording: Puts the recording on the disk, as far as it is handed over; under ``frame`` the
+            recorder did so before it answered.
     """
 
     def __init__(
@@ -52,13 +48,13 @@ class JournalWriter:
         """Why no more entries are confirmed."""
         self.doing = ""
         """What `write` last began to wait for."""
+        # (episode, frame) that was finished last by the entries in the file.
         self._finished = (0, -1)
-        """(episode, frame) that was finished last by the entries in the file."""
         self._clean = threading.Condition()
+        # When the first entry was written that the next sync will cover [s].
         self._dirty_since: float | None = None
-        """When the first entry was written that the next sync will cover [s]."""
+        # The same of the sync that is under way.
         self._syncing_since: float | None = None
-        """The same of the sync that is under way."""
         self._over = False
         self._syncing = threading.Thread(target=self._sync_all, name="journal sync", daemon=True)
         if durability == "periodic":
@@ -79,14 +75,10 @@ class JournalWriter:
     ) -> None:
         """Write entries, until they are confirmed or `error` says why not.
 
-        Parameters
-        ----------
-        entries
-            In order.
-        finished
-            (episode, frame) that is finished with these entries.
-        snapshot
-            Of the same instant, where one is wanted.
+        Args:
+            entries: In order.
+            finished: (episode, frame) that is finished with these entries.
+            snapshot: Of the same instant, where one is wanted.
         """
         if self.error is not None:
             return

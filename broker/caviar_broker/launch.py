@@ -71,8 +71,9 @@ def tune_garbage_collector() -> None:
 def reserve_descriptors(services: int) -> None:
     """Ask the system for as many open files as a broker of that many services may need.
 
-    Raises `RunError` naming the limit and the remedy where fewer are granted than a run takes: accepting a
-    connection without a free descriptor fails in silence, and the service that made it seems dead.
+    Raises:
+        RunError: Fewer are granted than a run takes; it names limit and remedy. Accepting a
+            connection without a free descriptor fails in silence, and the service that made it seems dead.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft == resource.RLIM_INFINITY:
@@ -223,8 +224,9 @@ _NOTHING = ResumeState(None, None, ())
 def _left(directory: Path, record: RunRecord, checkpoints: CheckpointFiles, last: Path) -> ResumeState:
     """What journal and recording say.
 
-    Raises `RunError` where they are no files, or those of another run, or where every frame is finished and
-    there is ``last``, the file that is written last.
+    Raises:
+        RunError: They are no files, or those of another run, or every frame is finished and there
+            is ``last``, the file that is written last.
     """
     journal = RunDirectory(directory).journal
     if not journal.exists():

@@ -55,17 +55,14 @@ def sync_recording(directory: Path) -> None:
 def check_run_files(directory: Path, journal: Path, run: str) -> None:
     """Check that journal and recording are files, and those of this run.
 
-    Parameters
-    ----------
-    directory
-        Of the run.
-    journal
-        In it.
-    run
-        Id of the run, as ``run.json`` has it.
+    Args:
+        directory: Of the run.
+        journal: In it.
+        run: Id of the run, as ``run.json`` has it.
 
-    Raises `RunError` naming what is another run's, or no file; `RecordingError` where the journal is none.
-    What is damaged is not looked at here.
+    Raises:
+        RunError: A file is another run's, or no regular file.
+        RecordingError: The journal is none. What is damaged is not looked at here.
     """
     files = RunDirectory(directory)
     segments = files.segments()
@@ -91,7 +88,8 @@ def check_run_files(directory: Path, journal: Path, run: str) -> None:
 def with_replay(plan: RunPlan, spec: ReplaySpec | None) -> RunPlan:
     """The plan with the recorded decisions and misses of a run that is repeated.
 
-    Raises `RecordingError` where there is no such recording.
+    Raises:
+        RecordingError: There is no such recording.
     """
     if spec is None:
         return plan

@@ -44,14 +44,13 @@ def read_resumption(
 ) -> ResumeState:
     """The run up to the last frame that was finished and, where there is a recording, is in it.
 
-    Parameters
-    ----------
-    journal, checkpoints
-        Files of the run.
-    recorded
-        Last episode in the recording, and how many of its frames are; None: nothing is known of one.
+    Args:
+        journal, checkpoints: Files of the run.
+        recorded: Last episode in the recording, and how many of its frames are; None: nothing is known of
+            one.
 
-    Raises `RecordingError` naming what cannot be read, or what would be needed and is gone.
+    Raises:
+        RecordingError: The journal cannot be read, or something that is needed is gone.
     """
     reader, found = JournalReader(journal), _Reader(checkpoints, recorded)
     end = reader.end
@@ -75,29 +74,29 @@ class _Reader:
 
     def __init__(self, checkpoints: CheckpointFiles, recorded: tuple[int, int] | None) -> None:
         self._checkpoints, self._recorded = checkpoints, recorded
+        # Whether the journal has finished frames that the recording lacks.
         self.is_cut = False
-        """Whether the journal has finished frames that the recording lacks."""
         self._digest = RunDigest()
         self._entries = 0
         self._finished_before = 0
+        # Frame from which the journal has all entries.
         self._complete_from = -1
-        """Frame from which the journal has all entries."""
         self._begin: JournalEntry | None = None
         self._clear()
 
     def _clear(self) -> None:
         self._finished = 0
         self._tasks: dict[str, dict[int, Task]] = {}
+        # By (service, topic) and frame: those in the journal, and their entries.
         self._products: dict[tuple[str, str], dict[int, tuple[Product, int]]] = {}
-        """By (service, topic) and frame: those in the journal, and their entries."""
         self._answered: dict[str, dict[int, Mapping[str, str] | None]] = {}
         self._chosen: dict[str, dict[int, Mapping[str, str]]] = {}
+        # Checkpoints of each service by frame.
         self._states: dict[str, dict[int, JournalEntry]] = {}
-        """Checkpoints of each service by frame."""
+        # Of the files of states that were looked at; None where one is gone, or damaged.
         self._contents: dict[str, bytes | None] = {}
-        """Of the files of states that were looked at; None where one is gone, or damaged."""
+        # Frames in which agents ended the episode, or chose the next one's seed.
         self._ends: list[JournalEntry] = []
-        """Frames in which agents ended the episode, or chose the next one's seed."""
 
     def take(self, entry: JournalEntry) -> None:
         """One more entry."""

@@ -61,20 +61,17 @@ def is_assigned(route: bytes) -> bool:
 class Router:
     """A bound ROUTER socket.
 
-    Parameters
-    ----------
-    endpoint
-        Address to bind, ``tcp://127.0.0.1:0`` for any free port.
-    liveness_ns
-        A peer that is stopped or unreachable loses its connection before this is over, and the next
-        `send` to it says so. libzmq's own thread answers for a peer that is merely busy, so a slow
-        service is never taken for a dead one (contract, clause 15).
-    access
-        The keys of those who may connect; None: none are asked for, and only this machine can connect.
-    peer_limits
-        What each peer may use.
+    Args:
+        endpoint: Address to bind, ``tcp://127.0.0.1:0`` for any free port.
+        liveness_ns: A peer that is stopped or unreachable loses its connection before this is over, and the
+            next `send` to it says so. libzmq's own thread answers for a peer that is merely busy, so a slow
+            service is never taken for a dead one (contract, clause 15).
+        access: The keys of those who may connect; None: none are asked for, and only this machine can
+            connect.
+        peer_limits: What each peer may use.
 
-    Raises `RunError` naming the remedy where the address cannot be bound, or may not without keys.
+    Raises:
+        RunError: The address cannot be bound, or may not without keys.
     """
 
     def __init__(

@@ -110,8 +110,8 @@ def _files_in(value: Any) -> Iterator[Path]:
 
 
 _UNSET = "0" * 64
+# The last line of the file.
 _CHECK = re.compile(rb'\n "check": "([0-9a-f]{64})"\n}\n$')
-"""The last line of the file."""
 
 
 class RunRecord(msgspec.Struct, frozen=True, kw_only=True):

@@ -46,8 +46,8 @@ DISK_NOTE_S = 2.0
 """[s] that the disk may take for an entry of the journal before that is told."""
 MESSAGES_A_TURN = 64
 """Messages taken before the clock is looked at again."""
+# Actions that no service waits for: carried out once whoever can be is at work.
 _CAN_WAIT = frozenset({ev.Notice, ev.Latency, ev.FrameFinished})
-"""Actions that no service waits for: carried out once whoever can be is at work."""
 
 
 class Observer(Protocol):
@@ -63,30 +63,18 @@ class Observer(Protocol):
 class BrokerServer:
     """Runs one plan on one port.
 
-    Parameters
-    ----------
-    plan
-        The run.
-    endpoint
-        Address to bind, ``tcp://127.0.0.1:0`` for any free port.
-    journal
-        Where decisions are written.
-    observer
-        Who is told.
-    store
-        Where scenery is kept.
-    supervised
-        Services whose death somebody else reports, who knows their exit status and last words.
-    access
-        The keys of those who may take part; None: every process of this machine may.
-    peer_limits
-        What each peer may use of the broker.
-    resumption
-        What another broker left of the run.
-    durability
-        When entries of the journal have to be on the disk.
-    sync_recording
-        Puts on the disk what is recorded here.
+    Args:
+        plan: The run.
+        endpoint: Address to bind, ``tcp://127.0.0.1:0`` for any free port.
+        journal: Where decisions are written.
+        observer: Who is told.
+        store: Where scenery is kept.
+        supervised: Services whose death somebody else reports, who knows their exit status and last words.
+        access: The keys of those who may take part; None: every process of this machine may.
+        peer_limits: What each peer may use of the broker.
+        resumption: What another broker left of the run.
+        durability: When entries of the journal have to be on the disk.
+        sync_recording: Puts on the disk what is recorded here.
     """
 
     def __init__(
@@ -107,10 +95,10 @@ class BrokerServer:
         self.statistics = Statistics({s.name: s.budget_ns for s in plan.services})
         self.outcome: ev.Finished | None = None
         self._plan, self._observer = plan, observer
+        # Number of the last journal entry that the clock knows to be handed over.
         self._confirmed = 0
-        """Number of the last journal entry that the clock knows to be handed over."""
+        # [s] for which the disk had taken nothing when that was told; 0: it takes what comes.
         self._disk_told = 0.0
-        """[s] for which the disk had taken nothing when that was told; 0: it takes what comes."""
         self._sign = SignOfLife()
         self._assets = AssetExchange(
             store=store or AssetStore(),
@@ -119,16 +107,16 @@ class BrokerServer:
             reply=self._reply,
             note=self.note,
         )
+        # Whether the clock took answers that it has not acted upon yet.
         self._taken = False
-        """Whether the clock took answers that it has not acted upon yet."""
+        # Frames of the episode that were finished when it last acted.
         self._finished_frames = 0
-        """Frames of the episode that were finished when it last acted."""
+        # Decisions that are not in the journal yet.
         self._entries: list[ev.Journal] = []
-        """Decisions that are not in the journal yet."""
+        # Notices, latencies and finished frames, in order: nobody waits for these.
         self._later: list[ev.Action] = []
-        """Notices, latencies and finished frames, in order: nobody waits for these."""
+        # Whether somebody was sent something in this turn.
         self._has_sent = False
-        """Whether somebody was sent something in this turn."""
         self._next_check = self._look_at = 0
         self._budgets_are_long = not plan.realtime and all(s.budget_ns >= LONG_NS for s in plan.services)
         self._unhurried = False

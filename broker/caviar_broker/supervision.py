@@ -42,7 +42,8 @@ class LocalProcess:
 def watch(pid: int) -> LocalProcess | None:
     """Watch a process; None where the system does not let us.
 
-    Raises `ProcessLookupError` where there is no such process.
+    Raises:
+        ProcessLookupError: There is no such process.
     """
     try:
         return LocalProcess(pid)
@@ -98,13 +99,13 @@ class _Watched:
 
     since: int
     process: LocalProcess | None = None
+    # Routing id of its heartbeat connection.
     pulse: bytes | None = None
-    """Routing id of its heartbeat connection."""
     heard_at: int = 0
+    # When the process of a supervised service died [ns].
     died_at: int | None = None
-    """When the process of a supervised service died [ns]."""
+    # When a message to a local process first found no connection [ns].
     cut_off_at: int | None = None
-    """When a message to a local process first found no connection [ns]."""
     warned: bool = False
 
 
@@ -112,20 +113,13 @@ class _Watched:
 class Watchdog:
     """Tells of services that are gone (contract, clause 15).
 
-    Parameters
-    ----------
-    clock
-        Who is present in the run.
-    heartbeat_ns, liveness_ns
-        Of the run [ns].
-    probe
-        Sends a harmless message to a heartbeat connection; why that did not go, or an empty text.
-    lost
-        Is told service and verdict.
-    warn
-        Is told service and text.
-    gone_words
-        What is said of a service without a connection.
+    Args:
+        clock: Who is present in the run.
+        heartbeat_ns, liveness_ns: Of the run [ns].
+        probe: Sends a harmless message to a heartbeat connection; why that did not go, or an empty text.
+        lost: Is told service and verdict.
+        warn: Is told service and text.
+        gone_words: What is said of a service without a connection.
     """
 
     clock: FrameClock

@@ -56,8 +56,8 @@ def deliveries(topology: Topology, services: int) -> int:
 
 # Plain integers, and no multipart calls: pyzmq's flags are enumerations, which cost more than a small send.
 _MORE = int(zmq.SNDMORE)
+# [B] from which a payload is sent without a copy.
 _COPIED = 1 << 16
-"""[B] from which a payload is sent without a copy."""
 
 
 def speak(part: Part, payload: int, endpoint: str) -> None:

@@ -33,8 +33,8 @@ BUDGET_NS = SECOND
 CLIENT = "caviar_broker.bench.client"
 CONNECT_NS = 30 * SECOND
 """Until all clients have to be there."""
+# What the pair is called that all of them have.
 _CLIENTS = "clients"
-"""What the pair is called that all of them have."""
 END_S = 10.0
 """[s] that a client gets to end after the run."""
 
@@ -82,7 +82,8 @@ def measure(topology: Topology, services: int, payload: int, frames: int, *, cur
 
     With ``curve`` each of them has a key, and what it says is encrypted, as in a run with keys.
 
-    Raises `RunError` where the run, or one of the clients, does not come to its end.
+    Raises:
+        RunError: The run, or one of the clients, does not come to its end.
     """
     declared = parts(topology, services)
     plan = RunPlan(

@@ -35,7 +35,8 @@ class LogFile:
     """A file that a thread appends to, so that a disk that does not answer holds up no caller.
 
     Once lines could not be written, it takes no more: offsets of later ones would be wrong.
-    Raises `RunError` naming the file where it cannot be opened.
+    Raises:
+        RunError: The file cannot be opened.
     """
 
     def __init__(self, path: Path) -> None:
@@ -112,21 +113,17 @@ class Outbox:
     `MAX_PENDING` are waiting, later notices go to the log alone and come from there, in their order,
     once there is room. So none is lost, and memory stays bounded.
 
-    Parameters
-    ----------
-    fd
-        Where lines go: a pipe, a terminal, a file.
-    log
-        The file for notices.
-    render
-        What a line looks like on ``fd``.
+    Args:
+        fd: Where lines go: a pipe, a terminal, a file.
+        log: The file for notices.
+        render: What a line looks like on ``fd``.
     """
 
     def __init__(self, fd: int, log: Path, render: Callable[[Line], str]) -> None:
         self._fd, self._render = fd, render
         self._log = LogFile(log)
+        # Where in the log the notices begin that did not fit into memory; None: all did.
         self._behind: int | None = None
-        """Where in the log the notices begin that did not fit into memory; None: all did."""
         self._pending = bytearray()
         self._poll = select.poll()
         self._poll.register(fd, select.POLLOUT)

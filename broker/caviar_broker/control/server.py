@@ -44,14 +44,12 @@ class ControlServer:
 
     It is the server's observer, in front of the one that it is given, so it knows what was told last.
 
-    Parameters
-    ----------
-    directory
-        Of the run; the socket is made there.
-    observer
-        Who is told everything too.
+    Args:
+        directory: Of the run; the socket is made there.
+        observer: Who is told everything too.
 
-    Raises `RunError` where another broker serves that directory, or no socket can be made.
+    Raises:
+        RunError: Another broker serves that directory, or no socket can be made.
     """
 
     def __init__(self, directory: Path, observer: Observer) -> None:

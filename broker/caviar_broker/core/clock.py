@@ -33,16 +33,11 @@ from caviar_protocol.digest import RunDigest
 class FrameClock:
     """The rules of a run. See `caviar_broker.core.events` for what goes in and out.
 
-    Parameters
-    ----------
-    plan
-        The run.
-    now
-        The time [ns], of the same monotonic clock as every later ``now``.
-    payload_size
-        Size of a payload [B], for what is kept of a service that may come back.
-    resumption
-        What another broker left of the run.
+    Args:
+        plan: The run.
+        now: The time [ns], of the same monotonic clock as every later ``now``.
+        payload_size: Size of a payload [B], for what is kept of a service that may come back.
+        resumption: What another broker left of the run.
     """
 
     def __init__(

@@ -80,8 +80,8 @@ class Pacer:
     def __init__(self, plan: RunPlan) -> None:
         self._plan = plan
         self._released_frame = -1
+        # When the frame released last should have been, slips included [ns].
         self._reference = 0
-        """When the frame released last should have been, slips included [ns]."""
         self._awaited = False
         self.lag_ns = 0
         """Sum of all slips [ns]."""

@@ -238,10 +238,10 @@ class DecisionTable:
         self._digest, self._ledger, self._actions = digest, ledger, actions
         self._holding = frozenset(p.name for p in plan.services if p.policy == "hold")
         self._kept = self._holding | graph.retained | frozenset(sources)
+        # A service that has not decided the first frame yet that is not finished.
         self._last = self.participants[graph.order[-1]]
-        """A service that has not decided the first frame yet that is not finished."""
+        # Newest product and its journal entry by (service, topic), late ones included (clause 12).
         self._newest: dict[tuple[str, str], tuple[Product, int]] = {}
-        """Newest product and its journal entry by (service, topic), late ones included (clause 12)."""
 
     def _with_sources(self, edges: Iterable[Edge]) -> tuple[tuple[Edge, Participant], ...]:
         return tuple((edge, self.participants[edge.source]) for edge in edges)

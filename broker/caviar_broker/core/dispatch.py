@@ -85,17 +85,17 @@ class Dispatcher:
         everyone = self._participants.values()
         self._agents = tuple(p for p in everyone if p.plan.role == "agent")
         self._recorders = tuple(p for p in everyone if p.plan.role == "recorder")
+        # All but the recorders, those behind others in the graph first.
         self._others = tuple(p for p in reversed(everyone) if p.plan.role != "recorder")
-        """All but the recorders, those behind others in the graph first."""
+        # Late products that no recorder has been granted (clause 11).
         self._late: list[Product] = []
-        """Late products that no recorder has been granted (clause 11)."""
         self.ready = set(everyone)
         """Services for which something may have changed."""
         self._waiting_for_journal: set[Participant] = set()
         self._waiting_for_pace: set[Participant] = set()
         self._waiting_for_frames: set[Participant] = set()
+        # Finished frames when services were last woken for them.
         self._seen_finished = 0
-        """Finished frames when services were last woken for them."""
 
     def resume(self, before: Resumption, completed: Mapping[str, int]) -> None:
         """Go on behind the last finished frame; ``completed`` says how far services got that have state."""

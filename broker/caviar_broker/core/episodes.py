@@ -31,8 +31,8 @@ class Episodes:
         """What is kept for services that may come back."""
         self.dispatcher: Dispatcher | None = None
         """Of the episode that is under way; None between episodes."""
+        # Of the episode that was under way before.
         self._ended: Dispatcher | None = None
-        """Of the episode that was under way before."""
 
     # --- from one episode to the next ----------------------------------------------------------------
 

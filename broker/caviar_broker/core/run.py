@@ -210,8 +210,8 @@ class Run:
         """Of the present episode."""
         self.seed_episode = 0
         """Episodes since the first one with this seed."""
+        # Seed of the next episode, and the agent that chose it.
         self._wished: tuple[int, Peer] | None = None
-        """Seed of the next episode, and the agent that chose it."""
         self.digest = RunDigest()
         self.finished_before = 0
         """Frames of the episodes that are over."""

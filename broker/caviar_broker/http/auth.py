@@ -16,10 +16,8 @@ from caviar_protocol.keys import TOKENS, Token, read_tokens
 class Tokens:
     """The tokens of a keys directory, as they are now: the file is read again when it changes.
 
-    Parameters
-    ----------
-    directory
-        Keys directory; None: there are no tokens, and everybody on this machine may do everything.
+    Args:
+        directory: Keys directory; None: there are no tokens, and everybody on this machine may do everything.
     """
 
     def __init__(self, directory: Path | None) -> None:
@@ -72,8 +70,9 @@ class Tokens:
 def http_address(text: str, keys: Path | None) -> tuple[str, int]:
     """Host and port of ``HOST:PORT``.
 
-    Raises `SetupError` where it is none, where other machines could reach it without a token, and where a
-    broker with keys has no tokens: a process of this machine without a key could then stop the run.
+    Raises:
+        SetupError: It is no address, other machines could reach it without a token, or a broker
+            with keys has no tokens: a process of this machine without a key could then stop the run.
     """
     host, _, port = text.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")

@@ -56,18 +56,14 @@ Tell = Callable[[str, str, str], Awaitable[None]]
 class Gateway:
     """Connects WebSockets with a broker.
 
-    Parameters
-    ----------
-    endpoint
-        Where the broker listens.
-    tokens
-        Who may take part.
-    tell
-        Called with a service, or "", what the run's user should know about it, and the kind of the notice.
-    credentials
-        Its key, which a broker with keys admits for the services that have a token, and that broker's.
-    remedy
-        What makes a token.
+    Args:
+        endpoint: Where the broker listens.
+        tokens: Who may take part.
+        tell: Called with a service, or "", what the run's user should know about it, and the kind of the
+            notice.
+        credentials: Its key, which a broker with keys admits for the services that have a token, and that
+            broker's.
+        remedy: What makes a token.
     """
 
     def __init__(
@@ -163,17 +159,17 @@ class _Bridge:
         self._socket, self._tell, self._refused = socket, tell, refused
         self._tokens, self._token = tokens, token
         self._connect = connect
+        # Made for a peer that says who it is: one that is silent costs the broker nothing.
         self._dealer: asyncio.Future[zmq.asyncio.Socket] = asyncio.get_running_loop().create_future()
-        """Made for a peer that says who it is: one that is silent costs the broker nothing."""
+        # Whether the broker has accepted the peer, and how many messages of it came before that.
         self._admitted, self._messages = False, 0
-        """Whether the broker has accepted the peer, and how many messages of it came before that."""
+        # What the peer is told on its ordered connection; None before, and once it has said BYE.
         self._welcome: m.Welcome | None = None
-        """What the peer is told on its ordered connection; None before, and once it has said BYE."""
         self._awaits_welcome = False
+        # What the peer is called, once it said so.
         self._name = ""
-        """What the peer is called, once it said so."""
+        # Bytes of the frame sent last, which may still be under way.
         self._sent = 0
-        """Bytes of the frame sent last, which may still be under way."""
 
     async def run(self) -> None:
         """Carry messages both ways until one side ends."""

@@ -37,18 +37,15 @@ END_S = 3.0
 class HttpProcess:
     """The process that serves HTTP for a broker; without an address, nothing.
 
-    Parameters
-    ----------
-    directory
-        Of the run.
-    address
-        ``HOST:PORT``; "" for none.
-    keys
-        Keys directory with the tokens.
-    again
-        Whether the run goes on: then the process of the broker before may hold the address a moment longer.
+    Args:
+        directory: Of the run.
+        address: ``HOST:PORT``; "" for none.
+        keys: Keys directory with the tokens.
+        again: Whether the run goes on: then the process of the broker before may hold the address a moment
+            longer.
 
-    Raises `SetupError` where the address is none, taken, or open to others without tokens.
+    Raises:
+        SetupError: The address is none, taken, or open to others without tokens.
     """
 
     def __init__(self, directory: Path, address: str, keys: Path | None, again: bool = False) -> None:
@@ -179,17 +176,15 @@ def _place(host: str, listening: socket.socket) -> str:
 def gateway_in_front(endpoint: str, address: str, tell: Callable[[str], None]) -> Iterator[str]:
     """Serve WebSockets for a ROUTER that is no broker's, such as that of the conformance kit, without tokens.
 
-    Parameters
-    ----------
-    endpoint
-        Where the ROUTER listens.
-    address
-        ``HOST:PORT`` of this machine to serve at; port 0: any.
-    tell
-        Is told of each connection that is refused or cut off, from another thread.
+    Args:
+        endpoint: Where the ROUTER listens.
+        address: ``HOST:PORT`` of this machine to serve at; port 0: any.
+        tell: Is told of each connection that is refused or cut off, from another thread.
 
     Yields the URL, and serves until the context is left.
-    Raises `SetupError` for an address that is none, `RunError` where it is taken.
+    Raises:
+        SetupError: The address is none.
+        RunError: The address is taken.
     """
     from starlette.applications import Starlette
     from starlette.routing import WebSocketRoute

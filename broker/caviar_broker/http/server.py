@@ -37,31 +37,28 @@ TOO_LARGE = 1009
 @dataclass(slots=True)
 class _Stranger:
     address: str
+    # When its time is over, on the clock of the event loop [s].
     until: float
-    """When its time is over, on the clock of the event loop [s]."""
 
 
 @dataclass
 class Strangers:
     """The strangers of one server, oldest first.
 
-    Parameters
-    ----------
-    tell
-        Is told, once in `LOOK_S` at most, how many were turned out to make room, and from where.
-    own_process
-        Whether the memory of connections that have ended goes back to the system, which takes a look at all
-        objects of the process.
+    Args:
+        tell: Is told, once in `LOOK_S` at most, how many were turned out to make room, and from where.
+        own_process: Whether the memory of connections that have ended goes back to the system, which takes a
+            look at all objects of the process.
     """
 
     tell: Callable[[str], None]
     own_process: bool = False
     _known: dict[asyncio.Transport, _Stranger] = field(default_factory=dict)
     _turned_out: Counter[str] = field(default_factory=Counter)
+    # Whether connections have ended since the last look.
     _freed: bool = False
-    """Whether connections have ended since the last look."""
+    # Whether another look is due.
     _looks: bool = False
-    """Whether another look is due."""
 
     def add(self, transport: asyncio.Transport) -> None:
         """A connection begins; the oldest one of the address that has most makes room where there are too
@@ -148,8 +145,8 @@ class _WebSocket(WebSocketsSansIOProtocol):
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
+        # [B] that may come yet; None: any number.
         self._room: int | None = HELLO_BYTES
-        """[B] that may come yet; None: any number."""
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
@@ -199,14 +196,11 @@ BACKLOG = 128
 def http_server(app: Any, tell: Callable[[str], None], *, own_process: bool = False) -> uvicorn.Server:
     """A server of an ASGI application, WebSockets included, that has not begun to serve.
 
-    Parameters
-    ----------
-    app
-        The application; ``scope["state"]["admit"]`` of a WebSocket is to be called once its peer is accepted.
-    tell
-        Is told of connections that were ended because there were too many.
-    own_process
-        Whether the process is this server's own, so that its memory may be tuned for it.
+    Args:
+        app: The application; ``scope["state"]["admit"]`` of a WebSocket is to be called once its peer is
+            accepted.
+        tell: Is told of connections that were ended because there were too many.
+        own_process: Whether the process is this server's own, so that its memory may be tuned for it.
     """
     if own_process:
         steady_memory()

@@ -82,17 +82,14 @@ _Stamp = tuple[int, int, int]
 class Access:
     """The keys of a broker.
 
-    Parameters
-    ----------
-    directory
-        Keys directory, with ``broker.key``, and ``authorized.toml`` and ``tokens.toml``, which may change at
-        any time.
-    local_key
-        Public key of the services that a launcher starts itself; "" for none.
-    local
-        Name to role of these.
+    Args:
+        directory: Keys directory, with ``broker.key``, and ``authorized.toml`` and ``tokens.toml``, which may
+            change at any time.
+        local_key: Public key of the services that a launcher starts itself; "" for none.
+        local: Name to role of these.
 
-    Raises `SetupError` naming the remedy where the directory lacks something.
+    Raises:
+        SetupError: The directory lacks something.
     """
 
     def __init__(self, directory: Path, local_key: str = "", local: Mapping[str, str] | None = None) -> None:
@@ -110,8 +107,8 @@ class Access:
         self._entries: dict[str, Authorization] = {}
         self._tokens: tuple[Token, ...] = ()
         self._read()
+        # Public key to the instant until which it is barred [ns].
         self._barred: dict[str, int] = {}
-        """Public key to the instant until which it is barred [ns]."""
 
     def name(self, key: str) -> str:
         """What a key is called; "" for one that is not authorized."""

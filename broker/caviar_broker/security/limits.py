@@ -97,39 +97,35 @@ class _Peer:
     """What is known of one routing id."""
 
     route: bytes
+    # The connection that had the descriptor of its first message then: its own, or a later one.
     maybe: TcpConnection | None
-    """The connection that had the descriptor of its first message then: its own, or a later one."""
     address: str
     key: str
     credit: float
+    # When `credit` was counted [ns].
     at: int
-    """When `credit` was counted [ns]."""
+    # [B] that may wait.
     limit: int
-    """[B] that may wait."""
+    # Its connection, once that is certain.
     wire: TcpConnection | None = None
-    """Its connection, once that is certain."""
     service: str = ""
+    # [B] taken from it, and an allowance for framing.
     taken: int = 0
-    """[B] taken from it, and an allowance for framing."""
+    # [B] handed to libzmq for it.
     sent: int = 0
-    """[B] handed to libzmq for it."""
     cut: bool = False
+    # When its connection ended [ns]; 0: it has not.
     ended: int = 0
-    """When its connection ended [ns]; 0: it has not."""
     missed: bool = False
 
 
 class PeerGuard:
     """Watches over one ROUTER socket.
 
-    Parameters
-    ----------
-    context, socket
-        The socket, not bound yet.
-    access
-        The keys; None where every process of this machine may take part.
-    limits
-        What each peer may use.
+    Args:
+        context, socket: The socket, not bound yet.
+        access: The keys; None where every process of this machine may take part.
+        limits: What each peer may use.
     """
 
     def __init__(
@@ -150,8 +146,8 @@ class PeerGuard:
         self._wires = TcpConnections(context, socket)
         self._peers: dict[bytes, _Peer] = {}
         self._by_wire: dict[TcpConnection, _Peer] = {}
+        # Address to the instant until which it is barred [ns].
         self._barred: dict[str, int] = {}
-        """Address to the instant until which it is barred [ns]."""
         self._scan_at = self._scan_from = 0
         self._lost: Callable[[bytes, str], bool] = lambda route, why: False
         self._gone: Callable[[bytes], None] = lambda route: None
@@ -175,16 +171,11 @@ class PeerGuard:
     ) -> None:
         """Begin to watch.
 
-        Parameters
-        ----------
-        loop
-            The broker's.
-        lost
-            Is told routing id and reason of a peer that is cut off; whether that was a service.
-        gone
-            Is told the routing id of a service whose connection has ended.
-        tell
-            Is told of what others than services did: its kind, and a text.
+        Args:
+            loop: The broker's.
+            lost: Is told routing id and reason of a peer that is cut off; whether that was a service.
+            gone: Is told the routing id of a service whose connection has ended.
+            tell: Is told of what others than services did: its kind, and a text.
         """
         self._lost, self._gone, self._tell = lost, gone, tell
         loop.watch(self._wires.monitor, self._connections_changed)

@@ -21,8 +21,8 @@ import zmq
 
 _EVENT = struct.Struct("=HI")
 _BYTES = struct.Struct("=QQ")
+# Where ``tcpi_bytes_acked`` and ``tcpi_bytes_received`` stand in struct tcp_info (linux/tcp.h).
 _BYTES_AT = 120
-"""Where ``tcpi_bytes_acked`` and ``tcpi_bytes_received`` stand in struct tcp_info (linux/tcp.h)."""
 _WATCHED = int(zmq.EVENT_ACCEPTED) | int(zmq.EVENT_DISCONNECTED) | int(zmq.EVENT_CLOSED)
 UNKNOWN = "somewhere"
 """Address of a connection that ended before anybody could ask for it."""
@@ -89,8 +89,8 @@ class TcpConnections:
         self.monitor.rcvhwm = 0  # a full one would hold up libzmq's thread, and with it every peer
         self.monitor.connect(address)
         self._open: dict[int, TcpConnection] = {}
+        # Descriptor to when a connection ended that no routing id was known of [ns].
         self._closed: dict[int, int] = {}
-        """Descriptor to when a connection ended that no routing id was known of [ns]."""
 
     def __iter__(self) -> Iterator[TcpConnection]:
         return iter(tuple(self._open.values()))
