@@ -60,12 +60,9 @@ class ProductError(ProtocolError):
     A service that raises it answers with a FAULT that names the producer, on which the run then lays the
     blame.
 
-    Parameters
-    ----------
-    topic, source, frame
-        Which product: its topic, the service that made it, and the frame it is for.
-    problem
-        What is wrong: object, field and value, and what would be right.
+    Args:
+        topic, source, frame: Which product: its topic, the service that made it, and the frame it is for.
+        problem: What is wrong: object, field and value, and what would be right.
     """
 
     code = "product"
@@ -86,16 +83,11 @@ class DeclarationError(CaviarError):
 class ScenarioError(CaviarError):
     """A scenario file is wrong.
 
-    Parameters
-    ----------
-    message
-        What is wrong, naming the value, and what to write instead.
-    file
-        Path of the scenario file.
-    key
-        Dotted key, for example ``services.channel.budget_ms``.
-    line
-        1-based line of that key, where known.
+    Args:
+        message: What is wrong, naming the value, and what to write instead.
+        file: Path of the scenario file.
+        key: Dotted key, for example ``services.channel.budget_ms``.
+        line: 1-based line of that key, where known.
     """
 
     def __init__(self, message: str, file: str = "", key: str = "", line: int | None = None) -> None:

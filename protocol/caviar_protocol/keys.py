@@ -32,6 +32,7 @@ from msgspec import Meta
 from caviar_protocol.errors import SetupError
 from caviar_protocol.files import replace_file
 from caviar_protocol.messages import Role
+from caviar_protocol.scenario.toml import toml_text
 
 BROKER = "broker"
 """Name of the broker's own pair."""
@@ -297,18 +298,9 @@ def _create(path: Path, text: str, mode: int) -> None:
 
 
 def _replace(path: Path, heading: str, table: str, entries: Sequence[msgspec.Struct]) -> None:
-    text = heading
-    for entry in entries:
-        text += f"\n[[{table}]]\n"
-        for key, value in msgspec.to_builtins(entry).items():
-            shown = value if isinstance(value, str) else None
-            text += _table(key, shown) if shown is not None else f"{key} = [{_listed(value)}]\n"
+    text = f"{heading}\n{toml_text({table: msgspec.to_builtins(entries)})}" if entries else heading
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         replace_file(path, text.encode(), mode=0o600, concurrent=True)
     except OSError as error:
         raise SetupError(f"cannot write {path}: {error.strerror}; choose another --directory") from error
-
-
-def _listed(values: Sequence[str]) -> str:
-    return ", ".join(f'"{value}"' for value in values)

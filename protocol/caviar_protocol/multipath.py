@@ -53,18 +53,12 @@ def first_tap(carrier: Carrier, tau: Float64Array) -> int:
 def subcarrier_weights(carrier: Carrier, tau: Float64Array, doppler: Float64Array) -> Complex128Array:
     """What each path's amplitude is multiplied with on each subcarrier.
 
-    Parameters
-    ----------
-    carrier
-        With its numerology.
-    tau
-        Delays [s], Shape ``[...]``.
-    doppler
-        Doppler shifts at the carrier frequency [Hz], of a shape that broadcasts to that of ``tau``.
+    Args:
+        carrier: With its numerology.
+        tau: Delays [s], Shape ``[...]``.
+        doppler: Doppler shifts at the carrier frequency [Hz], of a shape that broadcasts to that of ``tau``.
 
-    Returns
-    -------
-    Complex128Array
+    Returns:
         Shape ``[S, K, ...]``, each of magnitude 1.
     """
     count, ahead = carrier.subcarriers, carrier.subcarriers // 2

@@ -37,10 +37,8 @@ class ContentCheck:
     Names, meshes and devices of a scene are looked at where they differ from those of the scene before,
     numbers in every frame.
 
-    Parameters
-    ----------
-    rules
-        What the run says about scenes, once that is known.
+    Args:
+        rules: What the run says about scenes, once that is known.
     """
 
     def __init__(self, rules: SceneRules | None = None) -> None:

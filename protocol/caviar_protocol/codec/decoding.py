@@ -94,14 +94,10 @@ _STEP = re.compile(r"\.([A-Za-z0-9_]+)|\[(\d+)\]")
 def choices(kind: Any, encoded: bytes | bytearray | memoryview, complaint: str) -> tuple[str, ...]:
     """The words that may stand where a value of type ``kind`` has another one; empty where that is not known.
 
-    Parameters
-    ----------
-    kind
-        Type that was decoded: a struct, or a union of structs with tags.
-    encoded
-        The MessagePack bytes that could not be decoded.
-    complaint
-        What msgspec says about them: ``Invalid enum value 'worldd' - at `$.role```.
+    Args:
+        kind: Type that was decoded: a struct, or a union of structs with tags.
+        encoded: The MessagePack bytes that could not be decoded.
+        complaint: What msgspec says about them: ``Invalid enum value 'worldd' - at `$.role```.
     """
     found = _INVALID.fullmatch(complaint)
     if found is None:

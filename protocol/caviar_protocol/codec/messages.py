@@ -73,14 +73,10 @@ def encode_message(message: Message) -> bytes:
 def decode_message(header: Buffer) -> Message:
     """Typed message of a header part.
 
-    Raises
-    ------
-    LimitError
-        The header is larger than `limits.MAX_HEADER` or nested too deeply.
-    VersionError
-        It is a HELLO or WELCOME of another major version, which this one cannot read.
-    DecodeError
-        The bytes are not a message of this protocol.
+    Raises:
+        LimitError: The header is larger than `limits.MAX_HEADER` or nested too deeply.
+        VersionError: It is a HELLO or WELCOME of another major version, which this one cannot read.
+        DecodeError: The bytes are not a message of this protocol.
     """
     if not len(header):
         raise DecodeError(
@@ -118,12 +114,9 @@ def part_count(message: Message) -> int:
 def check_parts(message: Message, parts: Sequence[Any]) -> None:
     """Check the parts (header included) that came with ``message``, without decoding them.
 
-    Raises
-    ------
-    DecodeError
-        They are not as many as the message announces, or reach beyond the end of an asset.
-    LimitError
-        One of them is too large.
+    Raises:
+        DecodeError: They are not as many as the message announces, or reach beyond the end of an asset.
+        LimitError: One of them is too large.
     """
     expected = part_count(message)
     if len(parts) != expected:

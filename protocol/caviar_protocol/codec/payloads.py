@@ -165,12 +165,9 @@ def _payload_decoder(cls: type[Payload]) -> msgspec.msgpack.Decoder[Payload]:
 def decode_payload(topic: str, header: Buffer, body: Buffer) -> Payload:
     """Typed payload of a product; its arrays are read-only views into ``body``.
 
-    Raises
-    ------
-    DecodeError
-        The topic is unknown, or the bytes are not a payload of it.
-    LimitError
-        A size exceeds its limit.
+    Raises:
+        DecodeError: The topic is unknown, or the bytes are not a payload of it.
+        LimitError: A size exceeds its limit.
     """
     cls = PAYLOADS.get(topic)
     if cls is None:

@@ -20,6 +20,7 @@ from typing import (
     Self,
     TypeAlias,
     TypeVar,
+    get_args,
     get_type_hints,
     overload,
 )
@@ -54,15 +55,11 @@ is read."""
 class Column(Generic[S]):
     """An array attribute of a `TopicArrays`, read from the recording each time it is asked for.
 
-    Parameters
-    ----------
-    dtype
-        Element type.
-    shape
-        Of one row: fixed sizes, or the name of one that differs between rows. Such an axis is as long as the
-        longest row, and the others are padded with the missing value.
-    rows
-        Rows of one product; by default the payload's field of this attribute's name.
+    Args:
+        dtype: Element type.
+        shape: Of one row: fixed sizes, or the name of one that differs between rows. Such an axis is as long
+            as the longest row, and the others are padded with the missing value.
+        rows: Rows of one product; by default the payload's field of this attribute's name.
     """
 
     def __init__(
@@ -96,15 +93,31 @@ class Column(Generic[S]):
         return found
 
 
-def payload_column(dtype: type[S], cls: type[Payload], name: str) -> Column[S]:
-    """The column of an array field of a payload whose first axis counts its rows."""
-    spec = array_fields(cls)[name]
-    return Column(dtype, *spec.shape[1:], unit=spec.unit, doc=_description(cls, name))
+def payload_column(
+    dtype: type[S],
+    cls: type[Payload],
+    name: str,
+    axes: int = 1,
+    rows: Callable[[Any, Any], Rows] | None = None,
+) -> Column[S]:
+    """A column with the shape, the unit and the description of a payload's field.
 
-
-def _description(cls: type[Payload], name: str) -> str:
-    hint = get_type_hints(cls, include_extras=True)[name]
-    return next(str(meta.description) for meta in hint.__metadata__ if isinstance(meta, msgspec.Meta))
+    Args:
+        dtype: Element type, that of the field.
+        cls: Class of the payload, or of the object in it that is a row.
+        name: The field.
+        axes: Leading axes of the field that count rows.
+        rows: Rows of one product; by default those of the field along its first axis.
+    """
+    spec, hint = array_fields(cls)[name], get_type_hints(cls, include_extras=True)[name]
+    candidates = (hint, *get_args(hint))  # an optional field is a union with the annotated type
+    doc = next(
+        str(meta.description)
+        for candidate in candidates
+        for meta in getattr(candidate, "__metadata__", ())
+        if isinstance(meta, msgspec.Meta)
+    )
+    return Column(dtype, *spec.shape[axes:], unit=spec.unit, doc=doc, rows=rows)
 
 
 class TopicArrays(Generic[P, K]):
@@ -118,10 +131,9 @@ class TopicArrays(Generic[P, K]):
     integers, 0 for unsigned ones and false for booleans; `present` tells which rows are there, `status` why.
     Axis F counts the frames.
 
-    Raises
-    ------
-    RecordingError
-        On reading: the bytes of a product are damaged or not in this file; the message names frame and place.
+    Raises:
+        RecordingError: On reading: the bytes of a product are damaged or not in this file; the message names
+            frame and place.
     """
 
     axis: ClassVar[str] = ""

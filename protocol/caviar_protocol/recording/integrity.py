@@ -213,12 +213,9 @@ class RecordedSegments:
 def recorded_until(path: Path) -> tuple[tuple[int, int] | None, tuple[str, ...]]:
     """How far a recording goes without a gap.
 
-    Returns
-    -------
-    last
-        (episode, frame) of the last frame before anything is missing; None: there is no frame.
-    damage
-        What is missing or cannot be read: a line each.
+    Returns:
+        last: (episode, frame) of the last frame before anything is missing; None: there is no frame.
+        damage: What is missing or cannot be read: a line each.
     """
     try:
         found = RecordedSegments(path, trusted_before=(sys.maxsize, 0))

@@ -175,23 +175,16 @@ class RecordedFrame:
 class Recording:
     """A recorded run, or one segment of it.
 
-    Parameters
-    ----------
-    path
-        The run directory, or one ``.mcap`` file of it.
-    past_gaps
-        Whether what is behind a segment that is missing or broken is read too.
+    Args:
+        path: The run directory, or one ``.mcap`` file of it.
+        past_gaps: Whether what is behind a segment that is missing or broken is read too.
 
-    Raises
-    ------
-    RecordingError
-        It is not a recording, nothing of it can be read, or the content contradicts itself.
+    Raises:
+        RecordingError: It is not a recording, nothing of it can be read, or the content contradicts itself.
 
-    Warns
-    -----
-    RecordingWarning
-        It is damaged, or a segment is missing. What precedes can be read, and `damage` says what cannot.
-        A last segment that breaks off, as a killed recorder leaves it, is no damage.
+    Warns:
+        RecordingWarning: It is damaged, or a segment is missing. What precedes can be read, and `damage`
+            says what cannot. A last segment that breaks off, as a killed recorder leaves it, is no damage.
     """
 
     def __init__(self, path: str | Path, *, past_gaps: bool = False) -> None:
@@ -269,15 +262,13 @@ class Recording:
     def __getitem__(self, key: Key[str]) -> TopicArrays[Any, Any]:
         """A topic as arrays over all frames: ``recording["channel"].h``, ``recording["lidar", "l1"].range``.
 
-        Parameters
-        ----------
-        key
-            A topic; with the source where several services produce it. The scenes of several worlds are one.
+        Args:
+            key: A topic; with the source where several services produce it. The scenes of several worlds are
+                one.
 
-        Raises
-        ------
-        RecordingError
-            There is no such topic, none of its products is in the recording, or the source is not one of it.
+        Raises:
+            RecordingError: There is no such topic, none of its products is in the recording, or the source
+                is not one of it.
         """
         topic, source = (key, "") if isinstance(key, str) else key
         return TOPIC_ARRAYS[check_topic(topic)](

@@ -147,10 +147,8 @@ class Segment:
     def altered(self, expected: int | None = None) -> list[tuple[int, int]]:
         """Ranges of bytes of a finished segment that differ from what was written; reads all of it.
 
-        Parameters
-        ----------
-        expected
-            CRC-32 of the file, where the manifest says it.
+        Args:
+            expected: CRC-32 of the file, where the manifest says it.
         """
         found, start, crc = [], 0, 0
         for place, recorded in self._seals:
@@ -391,21 +389,14 @@ def may_expand(size: int, expanded: int) -> bool:
 def expand(compression: str, data: memoryview, size: int, limit: int = 0) -> bytes:
     """Decompress, without ever holding more than was declared.
 
-    Parameters
-    ----------
-    compression
-        ``zstd`` or ``lz4``, as MCAP names them.
-    data
-        The compressed bytes.
-    size
-        The size that they declare [B], to be checked with `may_expand` before.
-    limit
-        Only so many bytes from the beginning; 0: all.
+    Args:
+        compression: ``zstd`` or ``lz4``, as MCAP names them.
+        data: The compressed bytes.
+        size: The size that they declare [B], to be checked with `may_expand` before.
+        limit: Only so many bytes from the beginning; 0: all.
 
-    Raises
-    ------
-    ValueError
-        They cannot be decompressed, or not to the declared size.
+    Raises:
+        ValueError: They cannot be decompressed, or not to the declared size.
     """
     wanted = min(limit, size) if limit else size + 1  # one more shows that there are more
     if compression == "zstd":

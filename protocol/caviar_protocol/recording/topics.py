@@ -6,7 +6,7 @@ devices in ``scene.devices``. `caviar_protocol.recording.sensors` has the sensor
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, ClassVar, Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
@@ -43,7 +43,11 @@ class User(NamedTuple):
 def recorded_part(
     view: TopicArrays[Any, Any], part: str, rows: Sequence[NDArray[Any] | None]
 ) -> list[NDArray[Any]]:
-    """Rows of a part that is computed only where a consumer asks for it."""
+    """Rows of a part that is computed only where a consumer asks for it.
+
+    Raises:
+        RecordingError: A row is not there; the text says what to write into the scenario.
+    """
     found = [row for row in rows if row is not None]
     if len(found) < len(rows):
         raise RecordingError(
@@ -89,7 +93,21 @@ class UserArrays(TopicArrays[P, User], Generic[P]):
     ) -> Self:
         """These frames and these users only; each argument that is left out allows all.
 
-        Raises `RecordingError` for a frame, an episode or a name that is not there, with what is.
+        Args:
+            episode: Number of an episode.
+            frames: Numbers of frames in their episodes.
+            tx: Name of a transmitting device, or several.
+            rx: Name of a receiving device, or several.
+            carrier: Name of a carrier, or several.
+
+        Raises:
+            RecordingError: A frame, an episode or a name is not there; the text says what is.
+
+        Example:
+            >>> from caviar_protocol.recording import Recording, newest_run
+            >>> channel = Recording(newest_run(name="smoke-*"))["channel"]
+            >>> channel.select(frames=range(10), rx="uav/rx-uav").h.shape
+            (10, 1, 4, 32)
         """
         chosen = super().select(episode=episode, frames=frames)
         return chosen._narrowed([(0, "transmitter", tx), (1, "receiver", rx), (2, "carrier", carrier)])
@@ -111,15 +129,15 @@ class NamedArrays(TopicArrays[P, str], Generic[P]):
     def index(self, names: Iterable[str]) -> Int64Array:
         """Place of each name on the second axis, to align arrays: ``position[:, devices.index(channel.rx)]``.
 
-        Raises `RecordingError` for a name that is not there.
+        Raises:
+            RecordingError: A name is not there.
         """
-        found = []
+        names = list(names)
         for name in names:
             if name not in self._place_of:
                 hint = suggestion(name, self.keys)
                 raise RecordingError(f"{self.place} has no {name!r} in these frames; {hint}")
-            found.append(self._place_of[name])
-        return np.array(found, dtype=np.int64)
+        return np.array([self._place_of[name] for name in names], dtype=np.int64)
 
     def select(
         self,
@@ -130,12 +148,21 @@ class NamedArrays(TopicArrays[P, str], Generic[P]):
     ) -> Self:
         """These frames and these names only; each argument that is left out allows all.
 
-        Raises `RecordingError` for a frame, an episode or a name that is not there, with what is.
+        Args:
+            episode: Number of an episode.
+            frames: Numbers of frames in their episodes.
+            names: Name of a row, or several.
+
+        Raises:
+            RecordingError: A frame, an episode or a name is not there; the text says what is.
         """
         return super().select(episode=episode, frames=frames)._narrowed([(0, "row named", names)])
 
     def sorted_keys(self, keys: Iterable[str]) -> Iterable[str]:
         return sorted(keys)
+
+
+# --- scene ------------------------------------------------------------------------------------------
 
 
 class SceneArrays(NamedArrays[Scene]):
@@ -177,23 +204,29 @@ class SceneArrays(NamedArrays[Scene]):
         return merge_scenes(payloads)
 
 
+def _each_device(value: Callable[[Scene, Device], Any]) -> Callable[[Any, Scene], Rows]:
+    return lambda _, scene: [value(scene, device) for device in scene.devices]
+
+
 class DeviceArrays(NamedArrays[Scene]):
     """Devices of topic ``scene``, fixed ones and those mounted on objects, in world axes."""
 
     axis: ClassVar[str] = "D"
 
-    def _positions(self, scene: Scene) -> Rows:
-        return [device_pose(scene, device).position for device in scene.devices]
-
-    def _orientations(self, scene: Scene) -> Rows:
-        return [device_pose(scene, device).orientation for device in scene.devices]
-
-    def _velocities(self, scene: Scene) -> Rows:
-        return [device_velocity(scene, device) for device in scene.devices]
-
-    position = Column(np.float64, 3, unit="m", doc="reference point, in the world", rows=_positions)
-    orientation = Column(np.float64, 4, doc="(w, x, y, z), device axes into world axes", rows=_orientations)
-    velocity = Column(np.float64, 3, unit="m/s", doc="in world axes", rows=_velocities)
+    position = Column(
+        np.float64,
+        3,
+        unit="m",
+        doc="reference point, in the world",
+        rows=_each_device(lambda scene, device: device_pose(scene, device).position),
+    )
+    orientation = Column(
+        np.float64,
+        4,
+        doc="(w, x, y, z), device axes into world axes",
+        rows=_each_device(lambda scene, device: device_pose(scene, device).orientation),
+    )
+    velocity = Column(np.float64, 3, unit="m/s", doc="in world axes", rows=_each_device(device_velocity))
 
     @property
     def devices(self) -> dict[str, Device]:
@@ -219,6 +252,58 @@ class DeviceArrays(NamedArrays[Scene]):
         return merge_scenes(payloads)
 
 
+# --- channel and link -------------------------------------------------------------------------------
+
+
+def _pairs(channel: Channel) -> Iterator[tuple[int, int, int]]:
+    """Carrier, TX and RX of each user as indices; a device is no user of itself."""
+    for c in range(len(channel.carriers)):
+        for t, tx in enumerate(channel.tx):
+            for r, rx in enumerate(channel.rx):
+                if tx != rx:
+                    yield c, t, r
+
+
+def _each_pair(value: Callable[[Channel, int, int], Any]) -> Callable[[Any, Channel], Rows]:
+    """Rows of what a channel has for each TX and RX, by their indices."""
+    return lambda _, channel: [value(channel, t, r) for _, t, r in _pairs(channel)]
+
+
+def _cuts(channel: Channel) -> Iterator[tuple[int, slice]]:
+    """Carrier, and run on the path axis, of each user."""
+    for c, t, r in _pairs(channel):
+        pair = t * len(channel.rx) + r
+        yield c, slice(int(channel.offsets[pair]), int(channel.offsets[pair + 1]))
+
+
+def _paths(field: str) -> Callable[[Any, Channel], Rows]:
+    """Rows of a field with a path axis, before which ``a`` and ``doppler`` have one of carriers."""
+
+    def rows(_: Any, channel: Channel) -> Rows:
+        values = getattr(channel, field)
+        if field in ("a", "doppler"):
+            return [values[c, cut] for c, cut in _cuts(channel)]
+        return [values[cut] for _, cut in _cuts(channel)]
+
+    return rows
+
+
+def _wideband(field: str, carrier_field: str) -> Callable[[Any, Channel], Rows]:
+    """Rows of a part that only carriers with a numerology have; empty ones for the others."""
+
+    def rows(view: Any, channel: Channel) -> Rows:
+        stored = {(part.carrier, part.tx, part.rx): part.h for part in getattr(channel, field)}
+        has_bins = [getattr(carrier, carrier_field) for carrier in channel.carriers]
+        found = [stored.get(pair) if has_bins[pair[0]] else _NO_BINS for pair in _pairs(channel)]
+        return recorded_part(view, f"channel.{field}", found if stored else [None for _ in found[:1]])
+
+    return rows
+
+
+_NO_BINS = np.zeros((0, 0, 0, 0), np.complex64)
+"""Of a carrier without subcarriers or taps."""
+
+
 class ChannelArrays(UserArrays[Channel]):
     """Topic ``channel``: H, and the paths that it is the sum of, by user.
 
@@ -230,112 +315,53 @@ class ChannelArrays(UserArrays[Channel]):
         found = {(m.carrier, m.tx, m.rx): m.h for m in channel.h}
         return recorded_part(self, "channel.h", [found.get(pair) for pair in _pairs(channel)])
 
-    def _responses(self, channel: Channel) -> Rows:
-        return self._wideband("hf", channel)
-
-    def _impulses(self, channel: Channel) -> Rows:
-        return self._wideband("taps", channel)
-
     def _first_taps(self, channel: Channel) -> Rows:
         if not channel.taps:
-            return self._wideband("taps", channel)
+            return _wideband("taps", "taps")(self, channel)
         first = {(t.carrier, t.tx, t.rx): t.first for t in channel.taps}
         return [first.get(pair, 0) for pair in _pairs(channel)]
-
-    def _wideband(self, part: str, channel: Channel) -> Rows:
-        """Rows of a part that only carriers with a numerology have; empty ones for the others."""
-        found = {(r.carrier, r.tx, r.rx): r.h for r in getattr(channel, part)}
-        keys = {"hf": "subcarriers", "taps": "taps"}
-        rows = [
-            found.get(pair) if getattr(channel.carriers[pair[0]], keys[part]) else _NO_BINS
-            for pair in _pairs(channel)
-        ]
-        if not found and rows:
-            rows = [None]
-        return recorded_part(self, f"channel.{part}", rows)
-
-    def _sights(self, channel: Channel) -> Rows:
-        return [channel.los[t, r] for _, t, r in _pairs(channel)]
-
-    def _counts(self, channel: Channel) -> Rows:
-        counts = np.diff(channel.offsets)
-        return [counts[t * len(channel.rx) + r] for _, t, r in _pairs(channel)]
-
-    def _amplitudes(self, channel: Channel) -> Rows:
-        return [channel.a[c, cut] for c, cut in _cuts(channel)]
-
-    def _shifts(self, channel: Channel) -> Rows:
-        return [channel.doppler[c, cut] for c, cut in _cuts(channel)]
-
-    def _delays(self, channel: Channel) -> Rows:
-        return [channel.tau[cut] for _, cut in _cuts(channel)]
-
-    def _departures(self, channel: Channel) -> Rows:
-        return [channel.aod[cut] for _, cut in _cuts(channel)]
-
-    def _arrivals(self, channel: Channel) -> Rows:
-        return [channel.aoa[cut] for _, cut in _cuts(channel)]
-
-    def _ids(self, channel: Channel) -> Rows:
-        return [channel.id[cut] for _, cut in _cuts(channel)]
-
-    def _interactions(self, channel: Channel) -> Rows:
-        return [channel.interactions[cut] for _, cut in _cuts(channel)]
-
-    def _bounds(self, channel: Channel) -> Rows:
-        stated = channel.error_bound_db
-        return [np.float64(np.nan) if stated is None else stated[t, r] for _, t, r in _pairs(channel)]
-
-    def _points(self, channel: Channel) -> Rows:
-        return [channel.points[cut] for _, cut in _cuts(channel)]
 
     h = Column(
         np.complex128, "Nr", "Nt", doc="narrowband gain from TX element n to RX element m", rows=_matrices
     )
     hf = Column(
         np.complex64,
-        "S",
-        "K",
-        "Nr",
-        "Nt",
+        *("S", "K", "Nr", "Nt"),
         doc="gain on each subcarrier in each slot, from TX element n to RX element m",
-        rows=_responses,
+        rows=_wideband("hf", "subcarriers"),
     )
     taps = Column(
         np.complex64,
-        "S",
-        "L",
-        "Nr",
-        "Nt",
+        *("S", "L", "Nr", "Nt"),
         doc="gain in each tap and slot, from TX element n to RX element m",
-        rows=_impulses,
+        rows=_wideband("taps", "taps"),
     )
     first_tap = Column(np.int64, doc="sample of the first tap; 0 is the delay 0", rows=_first_taps)
-    los = Column(np.bool_, doc="line of sight is free", rows=_sights)
-    paths = Column(np.int64, doc="number of paths", rows=_counts)
-    a = Column(np.complex128, "P", doc="amplitude gain of each path, incl. exp(−j2πfτ)", rows=_amplitudes)
-    tau = Column(np.float64, "P", unit="s", doc="absolute delay", rows=_delays)
-    doppler = Column(np.float64, "P", unit="Hz", doc="Doppler shift", rows=_shifts)
+    los = payload_column(
+        np.bool_, Channel, "los", axes=2, rows=_each_pair(lambda channel, t, r: channel.los[t, r])
+    )
+    paths = Column(
+        np.int64, doc="number of paths", rows=lambda _, channel: [c.stop - c.start for _, c in _cuts(channel)]
+    )
+    a = payload_column(np.complex128, Channel, "a", axes=1, rows=_paths("a"))
+    tau = payload_column(np.float64, Channel, "tau", axes=0, rows=_paths("tau"))
+    doppler = payload_column(np.float64, Channel, "doppler", axes=1, rows=_paths("doppler"))
     aod = Column(
-        np.float64, "P", 2, unit="rad", doc="departure (zenith, azimuth) in world axes", rows=_departures
+        np.float64, "P", 2, unit="rad", doc="departure (zenith, azimuth) in world axes", rows=_paths("aod")
     )
     aoa = Column(
-        np.float64, "P", 2, unit="rad", doc="direction the wave comes from, likewise", rows=_arrivals
+        np.float64, "P", 2, unit="rad", doc="direction the wave comes from, likewise", rows=_paths("aoa")
     )
-    path_id = Column(np.uint64, "P", doc="stable id of each path in its pair", rows=_ids)
-    interactions = Column(
-        np.uint8,
-        "P",
-        "D",
-        doc="at each point, TX to RX: 0 nothing, 1 reflection, 2 diffraction, 3 scattering, 4 transmission",
-        rows=_interactions,
-    )
-    points = Column(np.float64, "P", "D", 3, unit="m", doc="interaction points; 0 where none", rows=_points)
+    path_id = Column(np.uint64, "P", doc="stable id of each path in its pair", rows=_paths("id"))
+    interactions = payload_column(np.uint8, Channel, "interactions", axes=0, rows=_paths("interactions"))
+    points = payload_column(np.float64, Channel, "points", axes=0, rows=_paths("points"))
     error_bound_db = Column(
         np.float64,
         unit="dB",
         doc="stated NMSE of H that nine of ten users are within; NaN where none is",
-        rows=_bounds,
+        rows=_each_pair(
+            lambda channel, t, r: np.nan if channel.error_bound_db is None else channel.error_bound_db[t, r]
+        ),
     )
 
     @property
@@ -364,26 +390,6 @@ class ChannelArrays(UserArrays[Channel]):
     def keys_of(self, payload: Channel) -> Sequence[User]:
         carriers, tx, rx = payload.carriers, payload.tx, payload.rx
         return [User(tx[t], rx[r], carriers[c].name) for c, t, r in _pairs(payload)]
-
-
-_NO_BINS = np.zeros((0, 0, 0, 0), np.complex64)
-"""Of a carrier without subcarriers or taps."""
-
-
-def _pairs(channel: Channel) -> Iterator[tuple[int, int, int]]:
-    """Carrier, TX and RX of each user as indices; a device is no user of itself."""
-    for c in range(len(channel.carriers)):
-        for t, tx in enumerate(channel.tx):
-            for r, rx in enumerate(channel.rx):
-                if tx != rx:
-                    yield c, t, r
-
-
-def _cuts(channel: Channel) -> Iterator[tuple[int, slice]]:
-    """Carrier, and run on the path axis, of each user."""
-    for c, t, r in _pairs(channel):
-        pair = t * len(channel.rx) + r
-        yield c, slice(int(channel.offsets[pair]), int(channel.offsets[pair + 1]))
 
 
 class LinkArrays(UserArrays[Link]):
@@ -420,17 +426,37 @@ class LinkArrays(UserArrays[Link]):
         return [User(*user) for user in zip(payload.tx, payload.rx, payload.carrier, strict=True)]
 
 
+# --- action -----------------------------------------------------------------------------------------
+
+_NO_VECTOR = (np.nan, np.nan, np.nan)
+
+
+def _beam_choices(action: Action) -> list[BeamChoice]:
+    return [command for command in action.commands if isinstance(command, BeamChoice)]
+
+
+def _motions(action: Action) -> list[WaypointCommand | VelocityCommand]:
+    return [c for c in action.commands if isinstance(c, WaypointCommand | VelocityCommand)]
+
+
+def _each_motion(field: str, missing: Any) -> Callable[[Any, Action], Rows]:
+    """Rows of a field that only some commands have."""
+    return lambda _, action: [getattr(command, field, missing) for command in _motions(action)]
+
+
 class ActionArrays(UserArrays[Action]):
     """Topic ``action``: the beams that an agent chose, by user; an empty carrier stands for all of them."""
 
-    def _tx_beams(self, action: Action) -> Rows:
-        return [choice.tx_beam for choice in _choices(action)]
-
-    def _rx_beams(self, action: Action) -> Rows:
-        return [choice.rx_beam for choice in _choices(action)]
-
-    tx_beam = Column(np.int32, doc="chosen TX beam; −1: none chosen", rows=_tx_beams)
-    rx_beam = Column(np.int32, doc="chosen RX beam; −1: none chosen", rows=_rx_beams)
+    tx_beam = Column(
+        np.int32,
+        doc="chosen TX beam; −1: none chosen",
+        rows=lambda _, action: [choice.tx_beam for choice in _beam_choices(action)],
+    )
+    rx_beam = Column(
+        np.int32,
+        doc="chosen RX beam; −1: none chosen",
+        rows=lambda _, action: [choice.rx_beam for choice in _beam_choices(action)],
+    )
 
     @property
     def motion(self) -> MotionArrays:
@@ -438,11 +464,7 @@ class ActionArrays(UserArrays[Action]):
         return MotionArrays(self._recording, self.topic, self.sources, self._indices)
 
     def keys_of(self, payload: Action) -> Sequence[User]:
-        return [User(choice.tx, choice.rx, choice.carrier) for choice in _choices(payload)]
-
-
-def _choices(action: Action) -> list[BeamChoice]:
-    return [command for command in action.commands if isinstance(command, BeamChoice)]
+        return [User(choice.tx, choice.rx, choice.carrier) for choice in _beam_choices(payload)]
 
 
 class MotionArrays(NamedArrays[Action]):
@@ -450,25 +472,19 @@ class MotionArrays(NamedArrays[Action]):
 
     axis: ClassVar[str] = "N"
 
-    def _waypoints(self, action: Action) -> Rows:
-        return [c.position if isinstance(c, WaypointCommand) else _NO_VECTOR for c in _motions(action)]
-
-    def _speeds(self, action: Action) -> Rows:
-        return [c.speed if isinstance(c, WaypointCommand) else np.nan for c in _motions(action)]
-
-    def _velocities(self, action: Action) -> Rows:
-        return [c.velocity if isinstance(c, VelocityCommand) else _NO_VECTOR for c in _motions(action)]
-
-    waypoint = Column(np.float64, 3, unit="m", doc="where to; NaN: not commanded", rows=_waypoints)
-    speed = Column(np.float64, unit="m/s", doc="at most, towards the waypoint", rows=_speeds)
-    velocity = Column(np.float64, 3, unit="m/s", doc="in world axes; NaN: not commanded", rows=_velocities)
+    waypoint = Column(
+        np.float64, 3, unit="m", doc="where to; NaN: not commanded", rows=_each_motion("position", _NO_VECTOR)
+    )
+    speed = Column(
+        np.float64, unit="m/s", doc="at most, towards the waypoint", rows=_each_motion("speed", np.nan)
+    )
+    velocity = Column(
+        np.float64,
+        3,
+        unit="m/s",
+        doc="in world axes; NaN: not commanded",
+        rows=_each_motion("velocity", _NO_VECTOR),
+    )
 
     def keys_of(self, payload: Action) -> Sequence[str]:
         return [command.object for command in _motions(payload)]
-
-
-_NO_VECTOR = (np.nan, np.nan, np.nan)
-
-
-def _motions(action: Action) -> list[WaypointCommand | VelocityCommand]:
-    return [c for c in action.commands if isinstance(c, WaypointCommand | VelocityCommand)]

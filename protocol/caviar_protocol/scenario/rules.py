@@ -145,11 +145,11 @@ def resolved(scenario: Scenario, settings: Mapping[str, msgspec.Struct] | None =
 
     ``settings`` are those of services by name after conversion, so that their defaults show too.
     """
-    plain = _plain(scenario)
-    del plain["source"]
+    table = plain(scenario)
+    del table["source"]
     for name, value in (settings or {}).items():
-        plain["services"][name]["settings"] = _plain(value)
-    return plain  # type: ignore[no-any-return]  # a struct becomes a dict
+        table["services"][name]["settings"] = plain(value)
+    return table  # type: ignore[no-any-return]  # a struct becomes a dict
 
 
 def patterns_overlap(a: str, b: str) -> bool:
@@ -180,16 +180,24 @@ def _number_or_word(text: str) -> float | str:
         return text
 
 
-def _plain(value: Any) -> Any:
-    """Built-in types, with every field of a struct; `msgspec.to_builtins` leaves out defaults."""
+def plain(value: Any, *, defaults: bool = True) -> Any:
+    """Structs as built-in types, with every field, or only those that differ from their default.
+
+    `msgspec.to_builtins` leaves out defaults as the class says, not as the caller does.
+    """
     if isinstance(value, msgspec.Struct):
-        tag = value.__struct_config__.tag_field
-        head = {tag: value.__struct_config__.tag} if tag else {}
-        return head | {name: _plain(getattr(value, name)) for name in value.__struct_fields__}
+        config = value.__struct_config__
+        found = {config.tag_field: config.tag} if config.tag_field else {}
+        for field in msgspec.structs.fields(value):
+            item = getattr(value, field.name)
+            default = field.default_factory() if callable(field.default_factory) else field.default
+            if defaults or (item is not None and (item != default or type(item) is not type(default))):
+                found[field.name] = plain(item, defaults=defaults)
+        return found
     if isinstance(value, Mapping):
-        return {str(name): _plain(item) for name, item in value.items()}
+        return {str(k): plain(v, defaults=defaults) for k, v in value.items() if defaults or v is not None}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain(item, defaults=defaults) for item in value]
     return msgspec.to_builtins(value)
 
 
@@ -358,19 +366,14 @@ def _check_ascending(
 def with_numerology(carrier: Carrier, sampling_period_ns: int | None, place: Place) -> Carrier:
     """The carrier with the spacing, number or slot duration that follows from its other keys.
 
-    Parameters
-    ----------
-    carrier
-        As the scenario has it.
-    sampling_period_ns
-        Between frames [ns]; None where it is not the same between all of them.
-    place
-        Where the carrier stands in the scenario.
+    Args:
+        carrier: As the scenario has it.
+        sampling_period_ns: Between frames [ns]; None where it is not the same between all of them.
+        place: Where the carrier stands in the scenario.
 
-    Raises
-    ------
-    ScenarioError
-        Naming the key, where subcarriers do not fit into the bandwidth, or slots have no duration.
+    Raises:
+        ScenarioError: Naming the key, where subcarriers do not fit into the bandwidth, or slots have no
+            duration.
     """
     count, spacing, bandwidth = carrier.subcarriers, carrier.subcarrier_spacing_hz, carrier.bandwidth_hz
     if spacing and not count:

@@ -1,4 +1,4 @@
-"""TOML from elsewhere in bounded time and memory, and the line of every key.
+"""TOML: reading it from elsewhere in bounded time and memory, the line of every key, and writing it.
 
 `tomllib` recurses for every level, so that a few kilobytes of brackets end in a `RecursionError`, and takes
 time quadratic in the parts of a dotted key. What no scenario needs is refused before. It does not keep line
@@ -7,8 +7,10 @@ numbers either: a scanner finds where the keys of an accepted document stand.
 
 from __future__ import annotations
 
+import json
 import re
 import tomllib
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 MAX_SIZE = 1 << 20
@@ -207,3 +209,46 @@ class _Scanner:
 def _unquoted(raw: str) -> str:
     parsed: dict[str, Any] = tomllib.loads(f"key = {raw}")
     return str(parsed["key"])
+
+
+def toml_text(document: Mapping[str, Any]) -> str:
+    """Write a document of tables and arrays of tables; tables within these are written in one line.
+
+    Args:
+        document: By name, a table or a list of tables of strings, numbers, flags, lists and tables.
+
+    Example:
+        >>> print(toml_text({"run": {"frames": 3}, "carriers": [{"name": "n257"}]}), end="")
+        [run]
+        frames = 3
+        <BLANKLINE>
+        [[carriers]]
+        name = "n257"
+    """
+    tables = []
+    for name, value in document.items():
+        is_array = not isinstance(value, Mapping)
+        for entry in value if is_array else [value]:
+            lines = [f"{_key_text(key)} = {_value_text(item)}\n" for key, item in entry.items()]
+            tables.append((f"[[{name}]]\n" if is_array else f"[{name}]\n") + "".join(lines))
+    return "\n".join(tables)
+
+
+def _value_text(value: Any) -> str:
+    match value:
+        case Mapping():
+            inside = ", ".join(f"{_key_text(key)} = {_value_text(item)}" for key, item in value.items())
+            return f"{{ {inside} }}" if inside else "{}"
+        case str():
+            # JSON's escapes are those of TOML but for DEL, and for characters beyond the basic plane.
+            return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007F")
+        case float():
+            return repr(value)  # shortest digits that read back as the same number; inf and nan are TOML too
+        case Sequence():
+            return f"[{', '.join(map(_value_text, value))}]"
+        case _:
+            return json.dumps(value)
+
+
+def _key_text(key: str) -> str:
+    return key if _BARE_KEY.fullmatch(key) else _value_text(key)
