@@ -56,19 +56,49 @@ class ArrayField(msgspec.Struct, frozen=True):
 
 
 def array(dtype: str, *shape: int | str, unit: str, doc: str) -> Any:
-    """Describe an array field: ``Annotated[Float64Array, array("<f8", "N", 3, unit="m", doc=…)]``."""
+    """Describe an array field of a payload.
+
+    Args:
+        dtype: Element type as it stands in a header, one of `WIRE_DTYPES`: ``"<f8"``.
+        shape: Fixed sizes and names; a name stands for one size throughout a payload object.
+        unit: Unit of the elements, ``"1"`` for pure numbers.
+        doc: What the array is.
+
+    Returns:
+        An annotation: ``Annotated[Float64Array, array("<f8", "N", 3, unit="m", doc="position")]``.
+
+    Raises:
+        ValueError: Elements of this type cannot travel.
+    """
     if dtype not in WIRE_DTYPES:
         raise ValueError(f"dtype {dtype!r} cannot travel; one of {', '.join(WIRE_DTYPES)}")
     return msgspec.Meta(description=doc, extra={"array": ArrayField(dtype, shape, unit), "unit": unit})
 
 
 def quantity(unit: str, doc: str, **constraints: Any) -> Any:
-    """Describe a scalar or tuple field with its unit (``"1"`` for a pure number)."""
+    """Describe a number, or a tuple of numbers, with its unit.
+
+    Args:
+        unit: Unit, ``"1"`` for a pure number.
+        doc: What the number is.
+        constraints: Bounds, as of `msgspec.Meta`: ``ge=0``.
+
+    Returns:
+        An annotation: ``Annotated[float, quantity("Hz", "centre frequency", gt=0)]``.
+    """
     return msgspec.Meta(description=doc, extra={"unit": unit}, **constraints)
 
 
 def described(doc: str, **constraints: Any) -> Any:
-    """Describe a field that has no unit: a name, a text, a flag."""
+    """Describe a field that has no unit: a name, a text, a flag.
+
+    Args:
+        doc: What the field is.
+        constraints: Bounds, as of `msgspec.Meta`: ``max_length=128``.
+
+    Returns:
+        An annotation, as of `quantity`.
+    """
     return msgspec.Meta(description=doc, extra={"unit": ""}, **constraints)
 
 
@@ -97,6 +127,19 @@ class Payload(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
     On construction, here and after decoding, each array is checked against its declared dtype
     and shape; sizes that share a name must agree. Equality compares arrays element by element.
+
+    Raises:
+        PayloadError: An array has another dtype or shape than its field declares, or sizes differ.
+
+    Example:
+        >>> from typing import Annotated
+        >>> class Rays(Payload, frozen=True, kw_only=True):
+        ...     length: Annotated[Float64Array, array("<f8", "N", unit="m", doc="length of each ray")]
+        ...     hit: Annotated[BoolArray, array("|b1", "N", unit="1", doc="whether it hits anything")]
+        >>> Rays(length=np.ones(3), hit=np.ones(2, bool))
+        Traceback (most recent call last):
+            ...
+        caviar_protocol.errors.PayloadError: Rays.hit has shape (2,), expected ('N',) with N = 3
     """
 
     sizes_from: ClassVar[dict[str, tuple[str, ...]]] = {}
@@ -220,7 +263,15 @@ def _check_array(owner: str, name: str, value: Any, spec: ArrayField, sizes: dic
 
 
 def require_finite(payload: msgspec.Struct, path: str = "") -> None:
-    """Raise `PayloadError` where ``payload`` holds a NaN or an infinity (contract, clause 21)."""
+    """Check that a payload has no number that is not finite (contract, clause 21).
+
+    Args:
+        payload: Payload, or an object in one.
+        path: What the error calls it; by default the name of its class.
+
+    Raises:
+        PayloadError: It holds a NaN or an infinity; the text names the field and the element.
+    """
     path = path or type(payload).__name__
     for name in payload.__struct_fields__:
         _require_finite(getattr(payload, name), f"{path}.{name}")

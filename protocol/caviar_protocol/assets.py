@@ -31,10 +31,14 @@ class AssetStore:
     """Content-addressed files below ``folder``. Safe for several processes at once: a file appears
     under its digest only when it is complete and verified.
 
-    What a process finds in the store it believes only after it has looked at size and digest itself,
-    once: disks fill up and machines crash while a cache is written.
+    A file that the process finds in the store is believed only after one look at its size and digest: disks
+    fill up and machines crash while a cache is written.
 
-    Raises `SetupError` where the folder cannot be made.
+    Args:
+        folder: Folder of the store; by default the cache of this user (`default_folder`).
+
+    Raises:
+        SetupError: The folder cannot be made.
     """
 
     def __init__(self, folder: Path | None = None) -> None:
@@ -60,8 +64,12 @@ class AssetStore:
     def add(self, name: str, content: Path | bytes) -> Asset:
         """Take in a file and describe it.
 
-        Raises `AssetError` where it cannot be read or stored, is too large, or ``name`` could lead
-        out of a folder.
+        Args:
+            name: Name of the asset: a relative path with forward slashes.
+            content: The file, or its bytes.
+
+        Raises:
+            AssetError: It cannot be read or stored, is too large, or ``name`` could lead out of a folder.
         """
         _check_name(name)
         try:
@@ -75,9 +83,17 @@ class AssetStore:
         return asset
 
     def read(self, digest: str, offset: int) -> tuple[bytes, int]:
-        """Up to a chunk of a file from ``offset``, and the file's size [B].
+        """Read a chunk of a file.
 
-        Raises `AssetError` where there is no such file, or it ends before ``offset``.
+        Args:
+            digest: Of the file.
+            offset: First byte wanted.
+
+        Returns:
+            Up to `limits.MAX_ASSET_CHUNK` bytes, and the file's size [B].
+
+        Raises:
+            AssetError: There is no such file, or it ends before ``offset``.
         """
         try:
             with self.path(digest).open("rb") as file:
@@ -90,10 +106,19 @@ class AssetStore:
             raise AssetError(f"asset {digest} is not here: {error.strerror}") from error
 
     def folder_of(self, assets: Iterable[Asset]) -> Mapping[str, Path]:
-        """Local files of a manifest, all in one folder at their names as relative paths.
+        """Lay out the files of a manifest in one folder, at their names as relative paths.
 
-        The folder is kept under the manifest's digest; what is in it already and intact is not laid
-        out again. Raises `AssetError` where a file of the manifest is not in the store.
+        The folder is kept under the manifest's digest; what is in it already and intact is not laid out
+        again.
+
+        Args:
+            assets: The manifest.
+
+        Returns:
+            Local file of each asset, by its name.
+
+        Raises:
+            AssetError: A file of the manifest is not in the store, or cannot be laid out.
         """
         manifest = list(assets)
         folder = self.folder / "geometry" / (geometry_digest(manifest) or "none")
@@ -148,7 +173,12 @@ class AssetStore:
 class Incoming:
     """One file on its way, chunk by chunk.
 
-    Raises `AssetError` where more is announced than a file may have.
+    Args:
+        store: Where it goes.
+        asset: Its description.
+
+    Raises:
+        AssetError: More is announced than a file may have.
     """
 
     def __init__(self, store: AssetStore, asset: Asset) -> None:
@@ -163,10 +193,18 @@ class Incoming:
         return len(self._data)
 
     def take(self, offset: int, size: int, chunk: bytes | memoryview) -> bool:
-        """Append a chunk; True when the file is complete and in the store.
+        """Append a chunk.
 
-        Raises `AssetError` where the chunk is not the next one, or the content has another digest
-        than announced.
+        Args:
+            offset: Of the chunk in the file [B].
+            size: Of the file, as the sender says [B].
+            chunk: The bytes.
+
+        Returns:
+            Whether the file is complete, and then in the store.
+
+        Raises:
+            AssetError: The chunk is not the next one, or the content has another digest than announced.
         """
         name, announced = self.asset.name, self.asset
         fits = offset == self.offset and size == announced.size and offset + len(chunk) <= size

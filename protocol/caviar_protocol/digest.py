@@ -12,7 +12,19 @@ MOST_WAITING = 64
 
 
 def payload_digest(header: bytes | memoryview, body: bytes | memoryview) -> str:
-    """SHA-256 of a product: header length (8 bytes, little-endian), header, body."""
+    """SHA-256 of a product: header length (8 bytes, little-endian), header, body.
+
+    Args:
+        header: The encoded fields of the payload.
+        body: Its arrays.
+
+    Returns:
+        64 lower-case hexadecimal digits.
+
+    Example:
+        >>> payload_digest(b"", b"")
+        'af5570f5a1810b7af78caf4bc70a660f0df51e42baf91d4de5b2328de0e83dfc'
+    """
     h = hashlib.sha256(len(header).to_bytes(8, "little"))
     h.update(header)
     h.update(body)
@@ -20,7 +32,14 @@ def payload_digest(header: bytes | memoryview, body: bytes | memoryview) -> str:
 
 
 def geometry_digest(assets: Iterable[Asset]) -> str:
-    """SHA-256 over the assets sorted by name: ``name NUL digest NUL`` each; empty without assets."""
+    """SHA-256 of the scenery of a run: of the text ``name NUL digest NUL`` for each asset, sorted by name.
+
+    Args:
+        assets: Files of scenery, in any order.
+
+    Returns:
+        64 lower-case hexadecimal digits; empty without assets.
+    """
     ordered = sorted(assets, key=lambda asset: asset.name)
     if not ordered:
         return ""
@@ -36,6 +55,9 @@ class RunDigest:
     Starts from SHA-256 of ``caviar-run-1``; each fresh product sets
     ``h ← SHA-256(h ‖ episode NUL frame NUL topic NUL source NUL ‖ payload digest)`` with decimal
     numbers and raw digests, frames in order, within a frame sorted by (topic, source).
+
+    Args:
+        begun: Digest of the frames before, to continue a chain; empty: begin one.
     """
 
     def __init__(self, begun: str = "") -> None:
@@ -44,16 +66,21 @@ class RunDigest:
         self._waiting: list[tuple[int, int, list[tuple[str, str, str]]]] = []
 
     def add_frame(self, episode: int, frame: int, products: Iterable[tuple[str, str, str]]) -> None:
-        """Add the fresh products of one frame, each (topic, source, payload digest).
+        """Add the fresh products of one frame.
 
         They are hashed by the next `fold`, or once `MOST_WAITING` frames wait for it.
+
+        Args:
+            episode: Number of the episode.
+            frame: Number of the frame in it.
+            products: (topic, source, payload digest) of each fresh product, in any order.
         """
         self._waiting.append((episode, frame, list(products)))
         if len(self._waiting) >= MOST_WAITING:
             self.fold()
 
     def fold(self) -> None:
-        """Hash what was added: at a time when nobody waits."""
+        """Hash the frames that wait. The broker calls it while no service waits for a grant."""
         state = self._state
         for episode, frame, products in self._waiting:
             for topic, source, digest in sorted(products):

@@ -114,7 +114,19 @@ class RunError(CaviarError):
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:
-    """``did you mean 'frames'?``, or the known names where none is near."""
+    """Say which known name was probably meant, for an error.
+
+    Args:
+        name: What was written.
+        known: The names that are possible there.
+
+    Returns:
+        ``did you mean 'frames'?``, or the known names where none is near.
+
+    Example:
+        >>> suggestion("frame", ["frames", "seed"])
+        "did you mean 'frames'?"
+    """
     names = sorted(known)
     near = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
     if near:

@@ -18,10 +18,14 @@ _SPARE = 64 << 20
 
 
 def host_identity() -> str:
-    """Equal in two processes exactly if one can watch the other by process id; empty if unknown.
+    """Identify the kernel and the process namespace that this process lives in.
 
     A process id means something only within one boot of one kernel and one PID namespace, so a
     container on the same machine is another host.
+
+    Returns:
+        A text that is equal in two processes exactly if one can watch the other by process id; empty if
+        unknown.
     """
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
@@ -73,7 +77,10 @@ INTERVAL_S = 1.0
 
 
 class SignOfLife:
-    """A file that is as old as the last sign of life."""
+    """A file that is as old as the last sign of life of this process, for the health check of a container.
+
+    The environment variable ``CAVIAR_ALIVE`` names the file; without it no sign is given.
+    """
 
     def __init__(self) -> None:
         name = os.environ.get(VARIABLE, "")
@@ -81,10 +88,7 @@ class SignOfLife:
         self._due = 0.0
 
     def give(self) -> None:
-        """Touch the file, unless that has just been done.
-
-        A file that cannot be written is no reason to end a run: the health check tells of it.
-        """
+        """Touch the file, unless that has just been done."""
         now = time.monotonic()
         if self._path is None or now < self._due:
             return
@@ -106,9 +110,15 @@ def has_extra(extra: str) -> bool:
 
 
 def install_command(*extras: str) -> str:
-    """Shell command that adds extras to this installation: ``/…/python -m pip install 'caviar-sim[plot]'``.
+    """Shell command that adds extras to this installation.
 
     It names the interpreter that runs, so that it works without an activated environment; pip takes the
     requirements of the extras from the metadata of what is installed, be that a wheel or a checkout.
+
+    Args:
+        extras: Names of extras, as in pyproject.toml.
+
+    Returns:
+        ``/…/python -m pip install 'caviar-sim[plot]'``
     """
     return f"{sys.executable} -m pip install '{DISTRIBUTION}[{','.join(extras)}]'"

@@ -119,7 +119,11 @@ T = TypeVar("T")
 
 
 def check_name(name: str) -> str:
-    """``name`` itself. Raises `SetupError` where a key cannot be called so."""
+    """Check that a key can have this name, and return it.
+
+    Raises:
+        SetupError: It has other characters than letters, digits, ``_``, ``.`` and ``-``, or more than 64.
+    """
     if not _NAME.fullmatch(name):
         raise SetupError(
             f"a key cannot be called {name!r}; write letters, digits, '_', '.', '-', at most 64 of them, "
@@ -129,9 +133,18 @@ def check_name(name: str) -> str:
 
 
 def write_pair(directory: Path, name: str, pair: Pair) -> tuple[Path, Path]:
-    """Write ``NAME.key``, readable by its owner alone, and ``NAME.pub``; their paths.
+    """Write ``NAME.key``, readable by its owner alone, and ``NAME.pub``.
 
-    Raises `SetupError` where one of them exists, which stays as it is.
+    Args:
+        directory: Keys directory, made where it is missing.
+        name: Of the service, or `BROKER`.
+        pair: The keys.
+
+    Returns:
+        The two files.
+
+    Raises:
+        SetupError: One of them exists, which stays as it is, or cannot be written.
     """
     check_name(name)
     key, pub = directory / f"{name}.key", directory / f"{name}.pub"
@@ -155,9 +168,10 @@ def write_pair(directory: Path, name: str, pair: Pair) -> tuple[Path, Path]:
 
 
 def read_pair(path: Path) -> Pair:
-    """The key pair in a ``.key`` file.
+    """Read the key pair in a ``.key`` file.
 
-    Raises `SetupError` where there is none, it is no key, or others on this machine can read it.
+    Raises:
+        SetupError: There is no such file, it is no key, or others on this machine can read it.
     """
     pair = _decoded(path, Pair, "make it with  caviar keys new NAME")
     mode = stat.S_IMODE(path.stat().st_mode)
@@ -170,7 +184,11 @@ def read_pair(path: Path) -> Pair:
 
 
 def read_public(path: Path) -> str:
-    """The public key in a ``.pub`` file."""
+    """Read the public key in a ``.pub`` file.
+
+    Raises:
+        SetupError: There is no such file, it is no key, or it is a file of a secret key.
+    """
     remedy = "it is the file NAME.pub that  caviar keys new NAME  writes"
     if path.suffix == ".key":
         raise SetupError(f"{path} holds a secret key, which stays where it is; give the .pub file beside it")
@@ -178,7 +196,11 @@ def read_public(path: Path) -> str:
 
 
 def read_authorized(directory: Path) -> tuple[Authorization, ...]:
-    """Who may take part; nobody where there is no such file yet."""
+    """Read which keys may take part; none where the directory has no such file yet.
+
+    Raises:
+        SetupError: The file breaks a rule, or has a name or a key twice.
+    """
     path = directory / AUTHORIZED
     if not path.exists():
         return ()
@@ -194,7 +216,11 @@ def read_authorized(directory: Path) -> tuple[Authorization, ...]:
 
 
 def write_authorized(directory: Path, entries: Sequence[Authorization]) -> None:
-    """Write who may take part; a reader sees the old file or the new one, never half of it."""
+    """Write which keys may take part; a reader sees the old file or the new one, never half of it.
+
+    Raises:
+        SetupError: The file cannot be written.
+    """
     heading = (
         "# Keys that may take part in runs of this broker.\n# caviar keys authorize and revoke write it.\n"
     )
@@ -202,9 +228,10 @@ def write_authorized(directory: Path, entries: Sequence[Authorization]) -> None:
 
 
 def read_tokens(directory: Path) -> tuple[Token, ...]:
-    """The tokens of the HTTP interface; none where there is no such file yet.
+    """Read the tokens of the HTTP interface; none where the directory has no such file yet.
 
-    Raises `SetupError` naming file and line, where one of them has a role that there is not.
+    Raises:
+        SetupError: The file breaks a rule; the text names file and line where a role is unknown.
     """
     path = directory / TOKENS
     if not path.exists():
@@ -231,7 +258,11 @@ def _line_of_role(path: Path, number: int) -> int:
 
 
 def write_tokens(directory: Path, entries: Sequence[Token]) -> None:
-    """Write the tokens' digests."""
+    """Write the tokens' digests.
+
+    Raises:
+        SetupError: The file cannot be written.
+    """
     heading = "# Digests of the tokens that open runs over HTTP. caviar keys token writes it.\n"
     _replace(directory / TOKENS, heading, "token", entries)
 
@@ -244,7 +275,11 @@ class Credentials(msgspec.Struct, frozen=True):
     """Public key of the broker."""
 
     def give(self, socket: zmq.Socket[Any]) -> None:
-        """Give a socket what it needs before it connects. Raises `zmq.ZMQError` for impossible keys."""
+        """Give a socket what it needs before it connects.
+
+        Raises:
+            zmq.ZMQError: The keys are none of CurveZMQ.
+        """
         socket.curve_publickey = self.pair.public.encode()
         socket.curve_secretkey = self.pair.secret.encode()
         socket.curve_serverkey = self.broker.encode()
@@ -253,9 +288,18 @@ class Credentials(msgspec.Struct, frozen=True):
 def credentials(
     key: Path | None = None, broker_key: Path | None = None, environment: Mapping[str, str] = os.environ
 ) -> Credentials | None:
-    """Credentials from files; where a file is not given, from that which the environment names.
+    """Read the credentials of a service.
 
-    None where neither says anything. Raises `SetupError` where there is only one of the two.
+    Args:
+        key: File of its secret key; None: the one that the environment names in ``CAVIAR_KEY``.
+        broker_key: File of its broker's public key; None: the one named in ``CAVIAR_BROKER_KEY``.
+        environment: Environment variables.
+
+    Returns:
+        The keys; None where neither argument nor environment names a file.
+
+    Raises:
+        SetupError: Only one of the two is given, or a file is no key.
     """
     own = key or _path(environment.get(KEY_VARIABLE))
     broker = broker_key or _path(environment.get(BROKER_KEY_VARIABLE))

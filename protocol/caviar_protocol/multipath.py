@@ -46,7 +46,12 @@ def slot_offsets(carrier: Carrier) -> Float64Array:
 
 
 def first_tap(carrier: Carrier, tau: Float64Array) -> int:
-    """Sample of the first tap of paths with these delays [s]: `TAPS_BEFORE` that of the earliest."""
+    """Sample of the first tap: `TAPS_BEFORE` samples before that of the earliest path.
+
+    Args:
+        carrier: With its bandwidth.
+        tau: Delays [s] of the paths.
+    """
     return math.floor(carrier.bandwidth_hz * float(tau.min())) - TAPS_BEFORE if tau.size else 0
 
 
@@ -77,10 +82,16 @@ def subcarrier_weights(carrier: Carrier, tau: Float64Array, doppler: Float64Arra
 def tap_weights(
     carrier: Carrier, tau: Float64Array, doppler: Float64Array, first: int | Int64Array
 ) -> Complex128Array:
-    """What each path's amplitude is multiplied with in each tap, Shape ``[S, L, ...]``.
+    """What each path's amplitude is multiplied with in each tap.
 
-    ``first`` is the sample of the first tap, one for all paths or of a shape that broadcasts to that of
-    ``tau``; the rest is as for `subcarrier_weights`.
+    Args:
+        carrier: With its numerology.
+        tau: Delays [s], Shape ``[...]``.
+        doppler: Doppler shifts at the carrier frequency [Hz], of a shape that broadcasts to that of ``tau``.
+        first: Sample of the first tap, one for all paths or of a shape that broadcasts to that of ``tau``.
+
+    Returns:
+        Shape ``[S, L, ...]``.
     """
     drifting, turning = _in_slots(carrier, tau, doppler)
     samples = np.arange(carrier.taps).reshape(-1, *(1,) * tau.ndim) + first
@@ -112,24 +123,47 @@ CORRELATION = 0.5
 
 
 def delay_spread(a: Complex128Array, tau: Float64Array) -> Float64Array:
-    """RMS delay spread σ_τ [s] of amplitudes and delays [s], Shape ``[..., P]`` to ``[...]``; or NaN.
+    """RMS delay spread σ_τ: square root of the second central moment of the power delay profile.
 
-    Square root of the second central moment of the power delay profile (Rappaport, Wireless Communications,
-    2nd ed., eq. 5.35).
+    Rappaport, Wireless Communications, 2nd ed., eq. 5.35.
+
+    Args:
+        a: Amplitudes of the paths, Shape ``[..., P]``; NaN: no path.
+        tau: Delays [s], likewise.
+
+    Returns:
+        σ_τ [s], Shape ``[...]``; NaN without a path.
+
+    Example:
+        >>> float(delay_spread(np.array([1.0, 1.0], complex), np.array([0.0, 2e-7])))  # two equal paths
+        1e-07
     """
     return _spread(a, tau)
 
 
 def doppler_spread(a: Complex128Array, doppler: Float64Array) -> Float64Array:
-    """RMS Doppler spread σ_ν [Hz] of amplitudes and Doppler shifts [Hz], likewise."""
+    """RMS Doppler spread σ_ν.
+
+    Args:
+        a: Amplitudes of the paths, Shape ``[..., P]``; NaN: no path.
+        doppler: Doppler shifts [Hz], likewise.
+
+    Returns:
+        σ_ν [Hz], Shape ``[...]``; NaN without a path.
+    """
     return _spread(a, doppler)
 
 
 def k_factor(a: Complex128Array, tau: Float64Array, los: BoolArray) -> Float64Array:
-    """Ratio of the direct path's power to that of all others, Shape ``[..., P]`` to ``[...]``.
+    """Ratio of the direct path's power to that of all others, which is linear.
 
-    The direct path is the earliest of a user with line of sight ``los``, Shape ``[...]``. NaN without line of
-    sight, infinite where there is no other path.
+    Args:
+        a: Amplitudes of the paths, Shape ``[..., P]``; NaN: no path.
+        tau: Delays [s], likewise; the direct path is the earliest.
+        los: Whether the user has line of sight, Shape ``[...]``.
+
+    Returns:
+        Shape ``[...]``; NaN without line of sight, infinite where there is no other path.
     """
     power = np.nan_to_num(np.abs(a) ** 2)
     has_path = np.isfinite(tau).any(-1) & los
@@ -145,11 +179,17 @@ def k_factor(a: Complex128Array, tau: Float64Array, los: BoolArray) -> Float64Ar
 
 
 def coherence(spread: Float64Array, correlation: float = CORRELATION) -> Float64Array:
-    """Distance over which the channel stays correlated at least: arccos(c)/(2πσ), infinite for a spread of 0.
+    """Distance over which the channel stays correlated at least: arccos(c)/(2πσ).
 
-    Of a delay spread [s] it is a bandwidth [Hz], of a Doppler spread [Hz] a time [s]. It is a bound for
-    uncorrelated paths of any profile (Fleury, "An uncertainty relation for WSS processes and its application
-    to WSSUS systems", IEEE Trans. Commun. 44, 1996): 1/(6σ) for a correlation of 0.5.
+    It is a bound for uncorrelated paths of any profile (Fleury, "An uncertainty relation for WSS processes
+    and its application to WSSUS systems", IEEE Trans. Commun. 44, 1996): 1/(6σ) for a correlation of 0.5.
+
+    Args:
+        spread: σ, a delay spread [s] or a Doppler spread [Hz].
+        correlation: c, what is left of the correlation.
+
+    Returns:
+        A bandwidth [Hz] of a delay spread, a time [s] of a Doppler spread; infinite for a spread of 0.
     """
     with np.errstate(divide="ignore"):
         bound: Float64Array = np.arccos(correlation) / (2 * np.pi * np.asarray(spread, np.float64))
@@ -191,6 +231,10 @@ def changes(before: Channel, after: Channel) -> Changes:
 
     A path is the same where TX, RX and ``id`` are; all paths of a pair that came or left are born or
     died with it.
+
+    Args:
+        before: The earlier product.
+        after: The later product, of the same source.
     """
     same = before.tx == after.tx and before.rx == after.rx
     if same and np.array_equal(before.offsets, after.offsets) and np.array_equal(before.id, after.id):

@@ -1,9 +1,10 @@
-"""The check of content on the consumer's side: whether a product says what its topic allows.
+"""Validation of products on the consumer's side: whether a product says what its topic allows.
 
 The broker never looks into a payload, and a decoder checks types and shapes only. What a service
 consumes therefore passes through one `ContentCheck` before the service sees it: a product with a
 quaternion of norm 2, a negative dimension, a name twice or a number that is none is refused in the first
-frame, and the error names the service that made it.
+frame, and the error names the service that made it. Each function that looks at one aspect returns what is
+wrong there, as a phrase for an error, or an empty string.
 """
 
 from __future__ import annotations
@@ -53,10 +54,11 @@ class ContentCheck:
         """By world, the last header, or scene, of which names and devices are right."""
 
     def begin(self, inputs: Iterable[GrantInput]) -> None:
-        """These are the inputs of the next grant: one that was made of a frame's scenes vouches for them.
+        """Take note of the inputs of the next grant, before they are checked.
 
-        A channel looks at every scene before it computes with it. Behind the `FIRST_LOOKS` of a source those
-        who get the channel too do not look again: it would cost as much as a small service's own work.
+        A channel looks at every scene before it computes with it, so a product that was made of a frame's
+        scenes vouches for them. Behind the `FIRST_LOOKS` of a source, consumers that get the channel too do
+        not look again: it would cost as much as a small service's own work.
         """
         self._derived = frozenset(
             [i.frame for i in inputs if i.topic in _MADE_OF_SCENES and i.status is Status.FRESH]
@@ -67,17 +69,27 @@ class ContentCheck:
         return not (entry.frame in self._derived and entry.topic == "scene" and self._is_familiar(entry))
 
     def digest(self, entry: GrantInput, header: bytes | memoryview, body: bytes | memoryview) -> None:
-        """Raise `ProductError` where one of the first products of a source has not the digest that it stated.
+        """Compare the digest of one of the first products of a source with the one it stated.
 
-        Who computes digests wrongly does so from the first frame on; the recorder compares all of them.
+        A service that computes digests wrongly does so from the first frame on; the recorder compares all of
+        them.
+
+        Raises:
+            ProductError: They differ.
         """
         if not self._is_familiar(entry):
             check_digest(entry, header, body)
 
     def __call__(self, entry: GrantInput, payload: Payload, header: bytes = b"") -> None:
-        """Raise `ProductError` where the payload cannot be.
+        """Check the content of a product.
 
-        ``header`` are the payload's encoded fields, where there are any.
+        Args:
+            entry: Its provenance.
+            payload: The typed payload.
+            header: Its encoded fields, where there are any: in one process products are not encoded.
+
+        Raises:
+            ProductError: The payload cannot be; the text names object, field and value.
         """
         key = entry.topic, entry.source
         if (not header and self._passed.get(key) is payload) or not self.is_due(entry):
@@ -127,7 +139,11 @@ def wrong_description(scene: Scene, world: str, rules: SceneRules) -> str:
 
 
 def check_digest(entry: GrantInput, header: bytes | memoryview, body: bytes | memoryview) -> None:
-    """Raise `ProductError` where the bytes are not those of the digest that their producer stated."""
+    """Check that bytes are those of the digest that their producer stated.
+
+    Raises:
+        ProductError: They are not; the text says how a digest is made.
+    """
     digest = payload_digest(header, body)
     if digest != entry.digest:
         raise ProductError(

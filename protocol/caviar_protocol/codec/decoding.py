@@ -42,10 +42,17 @@ _LENGTH_FIELD = {
 
 
 def check_nesting(header: bytes | bytearray | memoryview, what: str) -> None:
-    """Raise `LimitError` where ``header`` nests so deep that decoding it could exhaust a stack.
+    """Refuse a header that nests so deep that decoding it could exhaust a stack.
 
     Up to `HARMLESS` maps and arrays in all are let pass unseen; with more, a depth beyond
     `limits.MAX_NESTING` is refused. Bytes that are not msgpack are left to the decoder.
+
+    Args:
+        header: MessagePack bytes from a peer.
+        what: What the error calls them.
+
+    Raises:
+        LimitError: Maps and arrays are nested in more than `limits.MAX_NESTING` levels.
     """
     data = header if isinstance(header, bytes) else bytes(header)
     if len(data) <= HARMLESS or len(data.translate(None, _OTHERS)) <= HARMLESS:
@@ -173,6 +180,17 @@ _T = TypeVar("_T")
 
 
 def decode_bounded(decoder: msgspec.msgpack.Decoder[_T], header: Buffer, what: str) -> _T:
+    """Decode MessagePack from a peer, after a check of its size and depth.
+
+    Args:
+        decoder: Decoder of the expected type.
+        header: The bytes.
+        what: What an error calls them: ``"message header"``.
+
+    Raises:
+        LimitError: They are larger than `limits.MAX_HEADER`, or nest deeper than `limits.MAX_NESTING`.
+        DecodeError: They are not of the expected type; the text lists what is accepted where that is known.
+    """
     if len(header) > limits.MAX_HEADER:
         raise LimitError(f"{what} has {len(header)} B, at most {limits.MAX_HEADER} are accepted")
     check_nesting(header, what)

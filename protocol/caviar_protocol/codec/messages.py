@@ -52,10 +52,22 @@ _opening_decoder = msgspec.msgpack.Decoder(_Opening)
 
 
 def encode_message(message: Message) -> bytes:
-    """Header part of a message.
+    """Encode the header part of a message.
 
-    Raises `PayloadError` where a field holds what cannot travel, `LimitError` where the header
-    gets too large.
+    Args:
+        message: Any message of the protocol.
+
+    Returns:
+        MessagePack bytes, the same for equal messages.
+
+    Raises:
+        PayloadError: A field holds a value that cannot travel.
+        LimitError: The header is larger than `limits.MAX_HEADER`.
+
+    Example:
+        >>> from caviar_protocol.messages import HeartbeatAck
+        >>> decode_message(encode_message(HeartbeatAck(sequence=3)))
+        HeartbeatAck(sequence=3)
     """
     if isinstance(message, Welcome):
         _check_settings(message, PayloadError)
@@ -71,7 +83,10 @@ def encode_message(message: Message) -> bytes:
 
 
 def decode_message(header: Buffer) -> Message:
-    """Typed message of a header part.
+    """Decode the header part of a message from a peer.
+
+    Args:
+        header: First part of the message, without the routing part.
 
     Raises:
         LimitError: The header is larger than `limits.MAX_HEADER` or nested too deeply.
@@ -112,7 +127,11 @@ def part_count(message: Message) -> int:
 
 
 def check_parts(message: Message, parts: Sequence[Any]) -> None:
-    """Check the parts (header included) that came with ``message``, without decoding them.
+    """Check the parts that came with a message, without decoding them.
+
+    Args:
+        message: The decoded header.
+        parts: All parts, the header included.
 
     Raises:
         DecodeError: They are not as many as the message announces, or reach beyond the end of an asset.
@@ -134,9 +153,12 @@ def check_parts(message: Message, parts: Sequence[Any]) -> None:
 
 
 def check_version(version: tuple[int, int]) -> None:
-    """Raise `VersionError` unless a peer with this version can be talked to.
+    """Check that a peer with this version can be talked to.
 
     Any minor version of our major version will do: what one side does not know, it ignores.
+
+    Raises:
+        VersionError: The major versions differ.
     """
     if version[0] != PROTOCOL_VERSION[0]:
         raise VersionError(
@@ -203,15 +225,31 @@ _COUNT = struct.Struct("<I")
 
 
 def join_parts(parts: Sequence[Buffer]) -> bytes:
-    """The frame of a message."""
+    """Write a message of several parts as one WebSocket frame.
+
+    Args:
+        parts: Header, then payload headers and bodies, as on ZeroMQ.
+    """
     views = [memoryview(part) for part in parts]
     return struct.pack(f"<{len(views) + 1}I", len(views), *(view.nbytes for view in views)) + b"".join(views)
 
 
 def split_frame(frame: Buffer) -> list[memoryview]:
-    """The parts of the message in a frame, without a copy.
+    """Read the parts of the message in a WebSocket frame, without a copy.
 
-    Raises `DecodeError` or `LimitError` where the bytes are no such frame.
+    Args:
+        frame: The bytes of a binary frame.
+
+    Returns:
+        Read-only views into ``frame``.
+
+    Raises:
+        DecodeError: The lengths of the parts do not add up to the frame.
+        LimitError: The frame, or the number of its parts, is too large.
+
+    Example:
+        >>> [bytes(part) for part in split_frame(join_parts([b"header", b"", b"body"]))]
+        [b'header', b'', b'body']
     """
     view = memoryview(frame).toreadonly().cast("B")
     if len(view) > MAX_FRAME:

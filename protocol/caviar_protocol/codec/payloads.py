@@ -46,7 +46,14 @@ class BodyWriter:
         self.length = 0
 
     def place(self, value: NDArray[Any]) -> dict[str, Any]:
-        """Append an array; returns the reference that stands for it in the header."""
+        """Append an array.
+
+        Returns:
+            The reference that stands for the array in the header.
+
+        Raises:
+            PayloadError: Elements of this type, or so many dimensions, cannot travel.
+        """
         code = _CODES.get(value.dtype)
         if code is None:
             dtype = value.dtype.newbyteorder("<")
@@ -78,10 +85,14 @@ class BodyReader:
         self._end = 0
 
     def take(self, reference: Any) -> NDArray[Any]:
-        """The array that ``reference`` points to.
+        """The array that a reference points to.
 
-        Raises `DecodeError` or `LimitError` unless it is well-formed and lies in the body, behind
-        the arrays taken before.
+        Args:
+            reference: What stands in a header for an array: a map with dtype, shape and offset.
+
+        Raises:
+            DecodeError: It is not well-formed, reaches out of the body, or overlaps the arrays taken before.
+            LimitError: It has too many dimensions.
         """
         code, shape, offset = _reference(reference)
         dtype, count, room = WIRE_DTYPES[code], 1, 1
@@ -130,10 +141,23 @@ _payload_encoder = msgspec.msgpack.Encoder()
 
 
 def encode_payload(payload: Payload) -> tuple[bytes, bytes]:
-    """Header and body of a product.
+    """Encode a product.
 
-    Equal payloads give equal bytes. Raises `PayloadError` for a non-finite value (clause 21) and
-    `LimitError` for a product too large to travel.
+    Args:
+        payload: A payload of any topic.
+
+    Returns:
+        Header (the fields) and body (the arrays). Equal payloads give equal bytes.
+
+    Raises:
+        PayloadError: A value is not finite (contract, clause 21), or not of the type its field declares.
+        LimitError: The product is too large to travel.
+
+    Example:
+        >>> from caviar_protocol.topics import Action, BeamChoice
+        >>> header, body = encode_payload(Action(commands=(BeamChoice(tx="mast", rx="car", tx_beam=3),)))
+        >>> decode_payload("action", header, body).commands[0].tx_beam
+        3
     """
     writer = BodyWriter()
     fields = plain(payload, writer)
@@ -163,7 +187,15 @@ def _payload_decoder(cls: type[Payload]) -> msgspec.msgpack.Decoder[Payload]:
 
 
 def decode_payload(topic: str, header: Buffer, body: Buffer) -> Payload:
-    """Typed payload of a product; its arrays are read-only views into ``body``.
+    """Decode a product of a topic.
+
+    Args:
+        topic: Name of the topic, one of `PAYLOADS`.
+        header: First part of the product.
+        body: Second part of the product; the bytes of its arrays.
+
+    Returns:
+        The typed payload; its arrays are read-only views into ``body``.
 
     Raises:
         DecodeError: The topic is unknown, or the bytes are not a payload of it.
@@ -187,9 +219,14 @@ class _NonFiniteError(Exception):
 
 
 def plain(payload: Payload, writer: BodyWriter) -> dict[str, Any]:
-    """Header of a payload as plain objects, its arrays placed in ``writer``.
+    """Turn a payload into plain objects, its arrays placed in ``writer``.
 
-    Raises `PayloadError` for a non-finite value (clause 21) or one of the wrong type.
+    Args:
+        payload: The payload.
+        writer: Takes the arrays; the plain objects refer to their places in it.
+
+    Raises:
+        PayloadError: A value is not finite (clause 21) or of the wrong type.
     """
     try:
         return _struct(type(payload))(payload, writer)  # type: ignore[no-any-return]

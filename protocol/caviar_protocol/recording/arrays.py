@@ -235,7 +235,12 @@ class TopicArrays(Generic[P, K]):
     def select(self, *, episode: int | None = None, frames: Iterable[int] | None = None) -> Self:
         """The frames with these numbers, of this episode.
 
-        Raises `RecordingError` naming an episode or frame that was not recorded, and what was.
+        Args:
+            episode: Number of an episode; None: all.
+            frames: Numbers of frames in their episodes; None: all.
+
+        Raises:
+            RecordingError: An episode or a frame was not recorded; the text says what was.
         """
         chosen = np.ones(len(self), dtype=bool)
         if episode is not None:
@@ -245,9 +250,21 @@ class TopicArrays(Generic[P, K]):
         return self._view(self._indices[chosen])
 
     def blocks(self, frames: int) -> Iterator[Self]:
-        """Parts of at most so many frames, one after the other, with the rows and sizes of the whole.
+        """Parts of the frames, one after the other, with the rows and sizes of the whole.
 
         So a recording of any length is read in the memory of one block.
+
+        Args:
+            frames: Frames of a block at most.
+
+        Raises:
+            ValueError: A block would have no frame.
+
+        Example:
+            >>> from caviar_protocol.recording import Recording, newest_run
+            >>> channel = Recording(newest_run(name="smoke-*"))["channel"]
+            >>> [block.los.shape for block in channel.blocks(40)]
+            [(40, 2), (40, 2), (20, 2)]
         """
         if frames < 1:
             raise ValueError(f"a block has at least 1 frame, got {frames}")

@@ -230,7 +230,11 @@ def recorded_until(path: Path) -> tuple[tuple[int, int] | None, tuple[str, ...]]
 
 
 def metadata_of(segment: Segment) -> RecordingMetadata:
-    """The metadata of a segment. `RecordingError` naming the file where they cannot be read."""
+    """The metadata of a segment.
+
+    Raises:
+        RecordingError: They cannot be read; the text names the file.
+    """
     try:
         raw = {key: msgspec.json.decode(text) for key, text in segment.metadata.items()}
         metadata = msgspec.convert(raw, RecordingMetadata)
@@ -291,7 +295,11 @@ class RunDigestReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def recorded_digest(recorded: RecordedSegments) -> RunDigestReport:
-    """The digest of a recording (`caviar_protocol.recording.reader.Recording.run_digest`)."""
+    """Compute the digest of a recording from its bytes, and look at every byte for damage.
+
+    Args:
+        recorded: The segments of the recording.
+    """
     chain, damage = RunDigest(), list(recorded.damage)
     earlier: FrameEntry | None = None
     for segment in recorded.segments:

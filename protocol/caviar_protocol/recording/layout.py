@@ -114,7 +114,15 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Whether the recorder came to its end and closed the recording."""
 
     def save(self, folder: Path, *, sync: bool) -> None:
-        """Write it to a run directory, in one step. Raises `OSError` where that fails."""
+        """Write the manifest to a run directory, in one step.
+
+        Args:
+            folder: The run directory.
+            sync: Whether it is on the disk when this returns.
+
+        Raises:
+            OSError: It cannot be written.
+        """
         content = msgspec.json.encode(self)
         replace_file(RunDirectory(folder).manifest, _sealed(content), durable=sync)
 
@@ -126,9 +134,16 @@ class _Envelope(msgspec.Struct):
 
 
 def read_manifest(folder: Path) -> Manifest | None:
-    """The manifest in a run directory; None where there is none.
+    """Read the manifest in a run directory.
 
-    Raises `RecordingError` naming the file where a byte of it differs from what was written.
+    Args:
+        folder: The run directory.
+
+    Returns:
+        The manifest; None where there is none.
+
+    Raises:
+        RecordingError: It cannot be read, or a byte of it differs from what was written.
     """
     path = RunDirectory(folder).manifest
     try:

@@ -1,19 +1,9 @@
-"""Reading what a run recorded.
+"""The reader of a recording: frames, products, and topics as arrays.
 
->>> from caviar_protocol.recording import Recording
->>> recording = Recording("runs/smoke-20261122-101500")
->>> recording["channel"].h.shape  # frames × users × Nr × Nt
-(100, 2, 4, 32)
->>> recording.frame(episode=0, frame=7).scene().names
-('car', 'uav')
-
-`newest_run` gives the directory of the newest run, `Recording.__getitem__` a topic as arrays over all frames,
-`Recording.frames` the products frame by frame; docs/reference/recordings.md has more.
-
-A recording is a directory with ``recording-0000.mcap``, ``recording-0001.mcap``, … and the
-scenery in ``assets/``. After a crash it is readable up to the last frame whose record was
-written whole; `Recording.complete` then is false. What is damaged or missing is in `Recording.damage`, and
-said by a `RecordingWarning`.
+A recording is a run directory with segments ``recording-0000.mcap``, ``recording-0001.mcap``, … and the
+scenery in ``assets/``. After a crash it is readable up to the last frame whose record was written whole;
+`Recording.complete` then is false. What is damaged or missing is in `Recording.damage`, and said by a
+`RecordingWarning`.
 """
 
 from __future__ import annotations
@@ -68,7 +58,11 @@ TOPIC_ARRAYS: dict[str, type[TopicArrays[Any, Any]]] = {
 
 
 def check_topic(topic: str) -> str:
-    """The topic; `RecordingError` with a suggestion where there is none of this name."""
+    """Check that there is a topic of this name, and return it.
+
+    Raises:
+        RecordingError: There is none; the text suggests the one that was probably meant.
+    """
     if topic not in PAYLOADS:
         raise RecordingError(f"there is no topic {topic!r}; {suggestion(topic, PAYLOADS)}")
     return topic
@@ -79,7 +73,13 @@ class RecordingWarning(UserWarning):
 
 
 class RecordedProduct:
-    """One product of a frame; its payload is decoded on first use."""
+    """One product of a frame; its payload is decoded on first use.
+
+    Args:
+        provenance: What the frame's record says about it.
+        data: Its bytes in the file: length of the header, header, body.
+        place: Recording, frame, topic and source, as errors name them.
+    """
 
     def __init__(self, provenance: GrantInput, data: memoryview, place: str) -> None:
         self.provenance = provenance
@@ -111,7 +111,11 @@ class RecordedProduct:
 
     @cached_property
     def payload(self) -> Payload:
-        """The typed payload; its arrays are read-only views into the file."""
+        """The typed payload; its arrays are read-only views into the file.
+
+        Raises:
+            RecordingError: The bytes are not a payload of the topic.
+        """
         try:
             return decode_payload(self.provenance.topic, self.header, self.body)
         except ProtocolError as error:
@@ -124,7 +128,12 @@ class RecordedProduct:
 
 
 class RecordedFrame:
-    """One frame: the provenance of all its products, and the products, read on first use."""
+    """One frame: the provenance of all its products, and the products, read on first use.
+
+    Args:
+        recording: The recording.
+        index: Place of the frame in it, from 0.
+    """
 
     def __init__(self, recording: Recording, index: int) -> None:
         self._recording = recording
@@ -148,14 +157,27 @@ class RecordedFrame:
     def products(self) -> tuple[RecordedProduct, ...]:
         """What is not absent, in the order of `inputs`.
 
-        Raises `RecordingError` naming the place where the bytes are damaged or missing.
+        Raises:
+            RecordingError: Bytes are damaged or missing; the text names the place.
         """
         return self._recording.products_of(self._index)
 
     def of(self, topic: str, cls: type[P]) -> dict[str, P]:
         """Payloads of a topic by source, fresh and held ones.
 
-        Raises `RecordingError` where there is no such topic, or ``cls`` is not its payload class.
+        Args:
+            topic: Name of the topic.
+            cls: Its payload class, of which the result is.
+
+        Raises:
+            RecordingError: There is no such topic, or ``cls`` is not its payload class.
+
+        Example:
+            >>> from caviar_protocol.recording import Recording, newest_run
+            >>> from caviar_protocol.topics import Link
+            >>> frame = Recording(newest_run(name="smoke-*")).frame(episode=0, frame=7)
+            >>> frame.of("link", Link)["link"].rx
+            ('car/rx', 'uav/rx-uav')
         """
         if PAYLOADS.get(topic) is not cls:
             check_topic(topic)
@@ -298,7 +320,15 @@ class Recording:
         return (RecordedFrame(self, index) for index in range(len(self)))
 
     def frame(self, episode: int, frame: int) -> RecordedFrame:
-        """One frame. Raises `RecordingError` naming what there is where it was not recorded."""
+        """One frame.
+
+        Args:
+            episode: Number of the episode, from 0.
+            frame: Number of the frame in it, from 0.
+
+        Raises:
+            RecordingError: It was not recorded; the text says which frames are there.
+        """
         index = self._index.get((episode, frame))
         if index is None:
             has = f"frames {min(self._index)} to {max(self._index)}" if self._index else "no frame"
@@ -308,7 +338,17 @@ class Recording:
         return RecordedFrame(self, index)
 
     def product(self, episode: int, frame: int, topic: str, source: str) -> Payload:
-        """The payload of one product, fresh or held. Raises `RecordingError` where absent."""
+        """The payload of one product, fresh or held.
+
+        Args:
+            episode: Number of the episode.
+            frame: Number of the frame in it.
+            topic: Name of the topic.
+            source: Name of the service.
+
+        Raises:
+            RecordingError: The frame was not recorded, or the product is absent in it.
+        """
         check_topic(topic)
         for product in self.frame(episode, frame).products:
             entry = product.provenance
@@ -319,7 +359,11 @@ class Recording:
     def of(self, topic: str) -> Iterator[tuple[RecordedFrame, RecordedProduct]]:
         """Every fresh or held product of a topic, with its frame.
 
-        Raises `RecordingError` where there is no topic of this name.
+        Args:
+            topic: Name of the topic.
+
+        Raises:
+            RecordingError: There is no topic of this name.
         """
         return self._products(check_topic(topic))
 
@@ -347,7 +391,11 @@ class Recording:
         return self._segments[number], index - self._starts[number]
 
     def products_of(self, index: int) -> tuple[RecordedProduct, ...]:
-        """The products of the ``index``-th frame, held ones fetched from where they stand."""
+        """The products of the ``index``-th frame, held ones fetched from where they stand.
+
+        Raises:
+            RecordingError: The frame's chunk is damaged, or the bytes of a product are missing.
+        """
         own = self._messages(index)
         return tuple(
             self._product(index, item, own)
@@ -358,7 +406,10 @@ class Recording:
     def recorded_product(self, index: int, item: GrantInput) -> RecordedProduct:
         """One product of the ``index``-th frame, which is not absent, wherever it stands.
 
-        Of the frame only this product's bytes are read; `RecordingError` where their digest is another.
+        Of the frame only this product's bytes are read.
+
+        Raises:
+            RecordingError: The bytes are missing, or have another digest than the frame's record says.
         """
         product = self._product(index, item, self._stored(index))
         if product.digest != item.digest:
@@ -441,7 +492,14 @@ Imposed: TypeAlias = Mapping[tuple[str, int, int], Mapping[str, str]]
 
 
 def recorded_decisions(recording: Recording) -> Imposed:
-    """All decisions that services took in a recorded run."""
+    """All decisions that services took in a recorded run, for a replay to impose (contract, clause 6).
+
+    Args:
+        recording: Of the run.
+
+    Returns:
+        Decisions by (service, episode, frame).
+    """
     return {
         (report.source, frame.episode, frame.number): report.decisions
         for frame in recording.frames()

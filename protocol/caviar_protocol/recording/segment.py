@@ -94,9 +94,14 @@ _entry_decoder = msgspec.msgpack.Decoder(FrameEntry)
 class Segment:
     """A segment file: its metadata, channels and chunks.
 
-    Raises `RecordingError` naming file and offset unless ``path`` begins as a segment. One that breaks off
-    ends with the last whole frame, and one that is damaged lacks the frames that are: `damage` says which.
-    Frame entries come in the order of `chunks`.
+    One that breaks off ends with the last whole frame, and one that is damaged lacks the frames that are:
+    `damage` says which. Frame entries come in the order of `chunks`.
+
+    Args:
+        path: The file.
+
+    Raises:
+        RecordingError: The file does not begin as a segment; the text names file and offset.
     """
 
     def __init__(self, path: Path) -> None:

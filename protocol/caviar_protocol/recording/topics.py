@@ -107,7 +107,7 @@ class UserArrays(TopicArrays[P, User], Generic[P]):
             >>> from caviar_protocol.recording import Recording, newest_run
             >>> channel = Recording(newest_run(name="smoke-*"))["channel"]
             >>> channel.select(frames=range(10), rx="uav/rx-uav").h.shape
-            (10, 1, 4, 32)
+            (10, 1, 1, 32)
         """
         chosen = super().select(episode=episode, frames=frames)
         return chosen._narrowed([(0, "transmitter", tx), (1, "receiver", rx), (2, "carrier", carrier)])

@@ -60,10 +60,15 @@ class Place(msgspec.Struct, frozen=True):
 
 
 def located(text: str, service: str, source: Source) -> str:
-    """What a service says about the scenario, ``KEY: message``, with the file and the line before it.
+    """Put file and line before what a service says about the scenario.
 
     A key that begins with ``settings``, or that the file has only among the service's settings, is one of the
-    service's own. A text that begins with no key of the file comes back as it is.
+    service's own.
+
+    Args:
+        text: ``KEY: message``. A text that begins with no key of the file comes back as it is.
+        service: Name of the service.
+        source: The file of the scenario.
     """
     key, separator, message = text.partition(": ")
     if not separator or _KEY.fullmatch(key) is None:
@@ -78,19 +83,33 @@ def located(text: str, service: str, source: Source) -> str:
 
 
 def convert_settings(cls: type[T], settings: Mapping[str, Any], place: Place | None = None) -> T:
-    """Settings of a service as its implementation's ``Settings`` struct.
+    """Convert the settings of a service to its implementation's ``Settings`` struct.
 
-    ``place`` is where they stand in the scenario (`caviar_protocol.scenario.rules.settings_place`);
-    a service that was handed its settings leaves it out.
+    Args:
+        cls: The struct.
+        settings: As they stand in the scenario.
+        place: Where they stand (`caviar_protocol.scenario.rules.settings_place`); a service that was handed
+            its settings leaves it out.
 
-    Raises `ScenarioError` naming the key (and file and line where known), the value and what to
-    write instead.
+    Raises:
+        ScenarioError: A setting is unknown, missing or out of range; the text has the key, file and line
+            where they are known, the value and what to write instead.
     """
     return convert_table(cls, settings, place or Place("settings"))
 
 
 def convert_table(cls: type[T], table: object, place: Place) -> T:
-    """A TOML table as a struct. Raises `ScenarioError` for the first thing wrong with it."""
+    """Convert a TOML table to a struct.
+
+    Args:
+        cls: The struct; ``unknown_key_hint`` of it is added to errors about unknown keys, and fields in its
+            ``not_in_file`` are unknown.
+        table: As `tomllib` gives it.
+        place: Where it stands.
+
+    Raises:
+        ScenarioError: The first thing wrong with it.
+    """
     _check(table, inspect.type_info(cls), place)
     try:
         return msgspec.convert(table, cls)

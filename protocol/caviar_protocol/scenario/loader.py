@@ -31,9 +31,13 @@ def shipped_scenarios() -> dict[str, Path]:
 
 
 def find_scenario(scenario: Path | str) -> Path:
-    """File of a scenario that is given as a path, or as the name of one that ships: ``smoke``.
+    """File of a scenario that is given as a path, or as the name of one that ships.
 
-    A file of that path comes first. What is neither is returned as it is; reading it says what is wrong.
+    Args:
+        scenario: ``"my/scenario.toml"`` or ``"smoke"``. A file of that path comes first.
+
+    Returns:
+        The file. What is neither is returned as it is; reading it says what is wrong.
     """
     path = Path(scenario)
     if path.is_file() or path.name != str(scenario):
@@ -42,12 +46,22 @@ def find_scenario(scenario: Path | str) -> Path:
 
 
 def load_scenario(path: Path | str) -> Scenario:
-    """Read and check a scenario, given as a path or as the name of one that ships (`find_scenario`).
+    """Read and check a scenario.
 
     Strings that begin with ``file:`` in settings of services, and in the ``pattern_file`` of antennas, are
     paths relative to the file's folder; they come out as absolute paths.
 
-    Raises `ScenarioError` naming file, line, key, value and what to write instead.
+    Args:
+        path: A file, or the name of a scenario that ships, as of `find_scenario`.
+
+    Raises:
+        ScenarioError: The file cannot be read or breaks a rule; the text has file, line, key, value and what
+            to write instead.
+
+    Example:
+        >>> scenario = load_scenario("smoke")
+        >>> scenario.services["channel"].use
+        'free-space'
     """
     path = find_scenario(path)
     try:
@@ -62,7 +76,16 @@ def load_scenario(path: Path | str) -> Scenario:
 
 
 def parse_scenario(text: str, file: str = "", folder: Path | None = None) -> Scenario:
-    """Check a scenario given as text; ``folder`` is what its ``file:`` paths are relative to."""
+    """Check a scenario given as text.
+
+    Args:
+        text: TOML.
+        file: What errors call it.
+        folder: What its ``file:`` paths are relative to; by default the working directory.
+
+    Raises:
+        ScenarioError: The text breaks a rule, as of `load_scenario`.
+    """
     try:
         table = parse_toml(text)
     except tomllib.TOMLDecodeError as error:
@@ -203,12 +226,19 @@ def instants_ns(instants_s: Iterable[float]) -> tuple[int, ...]:
 def with_instants(table: Mapping[str, Any], place: Place, folder: Path = Path()) -> dict[str, Any]:
     """The table ``run`` of a scenario with ``frames`` and ``sampling_period_ns`` from its instants.
 
-    They stand in ``instants_s``, or as whole numbers in ``instants_ns``, or one a line in a CSV file
-    with the header ``t_s`` that ``instants_s = "file:PATH.csv"`` names, relative to ``folder``.
+    Instants stand in ``instants_s``, or as whole numbers in ``instants_ns``, or one a line in a CSV file
+    with the header ``t_s`` that ``instants_s = "file:PATH.csv"`` names. The period is their greatest common
+    divisor, so that each is a multiple of it.
 
-    The period is the greatest common divisor of the instants, so that each is a multiple of it.
-    Raises `ScenarioError` for instants that are no strictly increasing whole nanoseconds, or beside
-    a key that they replace. A table without instants, or with ones of a wrong type, is left alone.
+    Args:
+        table: As it stands in the file. Without instants, or with ones of a wrong type, it comes back as it
+            is.
+        place: Where it stands.
+        folder: What the path of the CSV file is relative to.
+
+    Raises:
+        ScenarioError: Instants are no strictly increasing whole nanoseconds, or stand beside a key that they
+            replace.
     """
     if NANOSECONDS in table:
         return with_instants(_in_seconds(table, place), place, folder)

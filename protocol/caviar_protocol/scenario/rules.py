@@ -29,9 +29,12 @@ _KIND_KEYS = {
 
 
 def scenario_error(scenario: Scenario, key: str, message: str) -> ScenarioError:
-    """An error about a key of a scenario, for a check made later than the loader's.
+    """Make an error about a key of a scenario, for a check later than the loader's.
 
-    ``key`` is dotted: ``services.channel.use``, ``devices[0].on``. The line is found from it.
+    Args:
+        scenario: The scenario.
+        key: Dotted: ``services.channel.use``, ``devices[0].on``. The line is found from it.
+        message: What is wrong, and what to write instead.
     """
     return Place(key, scenario.source).error(message)
 
@@ -42,7 +45,11 @@ def settings_place(scenario: Scenario, service: str) -> Place:
 
 
 def check_scenario(scenario: Scenario) -> None:
-    """Raise `ScenarioError` for the first rule that the scenario breaks."""
+    """Check the rules that concern several keys of a scenario.
+
+    Raises:
+        ScenarioError: The first rule that the scenario breaks.
+    """
     root = Place("", scenario.source)
     _check_duration(scenario, root.at("run"))
     _check_record(scenario, root.at("run").at("record"))
@@ -69,7 +76,11 @@ def _check_duration(scenario: Scenario, place: Place) -> None:
 
 
 def refuse_remote(scenario: Scenario) -> None:
-    """Raise `ScenarioError` for a remote service, in a run that has no broker to connect to."""
+    """Check that a scenario has no remote service, for a run that has no broker to connect to.
+
+    Raises:
+        ScenarioError: A service has ``use = "remote"``.
+    """
     for name, spec in scenario.services.items():
         if spec.remote:
             raise scenario_error(
@@ -84,8 +95,14 @@ def devices_of(scenario: Scenario, world: str) -> tuple[DeviceSpec, ...]:
     """The devices that a world publishes.
 
     A device belongs to the world it names, or to the only world of the run, or to the one with
-    whose ``prefix`` (a setting; else its name and a dot) ``on`` begins. Raises `ScenarioError` for a device
-    whose world these do not tell.
+    whose ``prefix`` (a setting; else its name and a dot) ``on`` begins.
+
+    Args:
+        scenario: The scenario.
+        world: Name of a service.
+
+    Raises:
+        ScenarioError: The world of a device cannot be told.
     """
     return tuple(
         device for index, device in enumerate(scenario.devices) if world_of(scenario, index) == world
@@ -120,7 +137,19 @@ def with_overrides(
 ) -> Scenario:
     """The scenario with values from the command line in place of its own.
 
-    Raises `ScenarioError` where one is out of range.
+    Args:
+        scenario: The scenario.
+        frames: Frames of an episode; None: those of the scenario, as for the others.
+        seed: Seed of the run.
+        pace: ``"free"``, ``"realtime"``, or a number as text.
+
+    Raises:
+        ScenarioError: A value is out of range.
+
+    Example:
+        >>> from caviar_protocol.scenario import load_scenario
+        >>> with_overrides(load_scenario("smoke"), frames=3).run.frames
+        3
     """
     given = {"frames": frames, "seed": seed, "pace": None if pace is None else _number_or_word(pace)}
     changes = {name: value for name, value in given.items() if value is not None}
@@ -141,9 +170,12 @@ def with_overrides(
 
 
 def resolved(scenario: Scenario, settings: Mapping[str, msgspec.Struct] | None = None) -> dict[str, Any]:
-    """Everything the scenario says, defaults included, as built-in types.
+    """Everything that a scenario says, defaults included, as built-in types.
 
-    ``settings`` are those of services by name after conversion, so that their defaults show too.
+    Args:
+        scenario: The scenario.
+        settings: Settings of services after conversion, by the service's name, so that their defaults show
+            too.
     """
     table = plain(scenario)
     del table["source"]
@@ -372,8 +404,8 @@ def with_numerology(carrier: Carrier, sampling_period_ns: int | None, place: Pla
         place: Where the carrier stands in the scenario.
 
     Raises:
-        ScenarioError: Naming the key, where subcarriers do not fit into the bandwidth, or slots have no
-            duration.
+        ScenarioError: Subcarriers do not fit into the bandwidth, or slots have no duration; the text names
+            the key.
     """
     count, spacing, bandwidth = carrier.subcarriers, carrier.subcarrier_spacing_hz, carrier.bandwidth_hz
     if spacing and not count:

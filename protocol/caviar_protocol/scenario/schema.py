@@ -213,12 +213,25 @@ def carries(spec: DeviceSpec, name: str) -> bool:
 
 
 def fixed_device(spec: DeviceSpec) -> Device:
-    """The device of a scenario that stands in the world, without ``on``."""
+    """The device of a scenario that stands in the world, without ``on``.
+
+    Raises:
+        ScenarioError: An antenna has no role.
+    """
     return _device(spec, spec.name, "", 0.0)
 
 
 def mounted_device(spec: DeviceSpec, parent: str, dimensions: Vector) -> Device:
-    """The device of a scenario on the object ``parent`` with a bounding box of ``dimensions`` [m]."""
+    """The device of a scenario on one object.
+
+    Args:
+        spec: The device of the scenario, with ``on``.
+        parent: Name of the object.
+        dimensions: Of its bounding box (length, width, height) [m].
+
+    Raises:
+        ScenarioError: An antenna has no role.
+    """
     return _device(spec, f"{parent}/{spec.name}", parent, dimensions[2])
 
 
@@ -281,5 +294,5 @@ def _device(spec: DeviceSpec, name: str, parent: str, height: float) -> Device:
 
 
 def owned_by(patterns: Iterable[str], name: str) -> bool:
-    """Whether one of the patterns, with ``*`` and ``?``, matches a name (clause 17)."""
+    """Whether one of the patterns, with ``*`` and ``?``, matches a name (contract, clause 17)."""
     return any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)

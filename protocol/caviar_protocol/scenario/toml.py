@@ -29,10 +29,11 @@ _LONG_KEY = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*\.[ \t]*{_PART}){{{MAX_DEPTH
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """The table that TOML text is.
+    """Parse TOML text from elsewhere.
 
-    Raises `tomllib.TOMLDecodeError`, whose text ends with the line where one is known, for what is no TOML,
-    larger than `MAX_SIZE`, deeper than `MAX_DEPTH`, or has a number of a thousand digits.
+    Raises:
+        tomllib.TOMLDecodeError: It is no TOML, larger than `MAX_SIZE`, deeper than `MAX_DEPTH`, or has a
+            number of a thousand digits. The text ends with the line where one is known.
     """
     if len(text) > MAX_SIZE:
         raise tomllib.TOMLDecodeError(f"{len(text)} characters, of which a file may have {MAX_SIZE}")
@@ -85,7 +86,12 @@ def dotted(path: KeyPath) -> str:
 
 
 def key_lines(text: str) -> dict[KeyPath, int]:
-    """The 1-based line of every key, table and array element of a valid TOML document."""
+    r"""The 1-based line of every key, table and array element of a valid TOML document.
+
+    Example:
+        >>> key_lines("[run]\nframes = 3\n")
+        {('run',): 1, ('run', 'frames'): 2}
+    """
     return _Scanner(text).scan()
 
 

@@ -29,9 +29,16 @@ from caviar_protocol.topics.scene import AntennaArray, Panel
 def straight_beams(
     transmit: AntennaArray, towards_rx: Sequence[float], receive: AntennaArray, towards_tx: Sequence[float]
 ) -> tuple[int, int]:
-    """Beams of two arrays along the straight line between them; directions in the axes of each device.
+    """Beams of two arrays along the straight line between them.
 
-    Of dual polarizations those that couple best between upright devices.
+    Args:
+        transmit: Array of the transmitter.
+        towards_rx: Unit vector to the receiver, in the transmitter's axes.
+        receive: Array of the receiver.
+        towards_tx: Unit vector to the transmitter, in the receiver's axes.
+
+    Returns:
+        TX beam and RX beam; of dual polarizations those that couple best between upright devices.
     """
     sent = taken = 0
     if not (transmit.is_uniform and receive.is_uniform):
@@ -40,16 +47,25 @@ def straight_beams(
 
 
 def beam_towards(array: AntennaArray, direction: Sequence[float], polarization: int = 0) -> int:
-    """Beam with the greatest ``|c_k* a(k̂)|`` towards a direction, a unit vector in device axes.
-
-    Of several panels the one that faces the direction most is taken, of dual polarizations the one of index
-    ``polarization``.
+    """Beam with the greatest ``|c_k* a(k̂)|`` towards a direction.
 
     Along one axis of N elements with a spacing of d wavelengths, and u the direction's cosine,
     ``|c_k* a| = |sin(πNv)| / (sqrt(N)·|sin πv|)`` with ``v = d·u − k/N`` (Tse and Viswanath, section
     7.3.4). The numerator is the same for all k, so the best k is the one nearest to N·d·u, modulo N:
-    wrapped beams, end-fire directions and grating lobes need no special cases. Of two beams with equal
-    gain the one of lower index is taken.
+    wrapped beams, end-fire directions and grating lobes need no special cases.
+
+    Args:
+        array: The array.
+        direction: Unit vector in device axes.
+        polarization: Which of dual polarizations, by its index.
+
+    Returns:
+        Index of the beam: of several panels one of the panel that faces the direction most, of two beams with
+        equal gain the one of lower index.
+
+    Example:
+        >>> beam_towards(AntennaArray(rows=1, columns=8), (1.0, 0.0, 0.0))  # boresight
+        0
     """
     if array.is_uniform:
         return _uniform_beam(array, direction)
@@ -75,10 +91,16 @@ def _nearest(size: int, turns: float) -> int:
 
 
 def beam_gain(array: AntennaArray, beam: int, directions: Float64Array) -> Float64Array:
-    """Amplitude of a beam towards unit vectors in device axes, 1 at its greatest; ``[..., 3]`` to ``[...]``.
+    """Amplitude of a beam towards directions, 1 at its greatest.
 
-    The array factor ``|sin(πNv)| / (N·|sin πv|)`` of `beam_towards` over columns times that over rows, of
-    the beam's own subarray.
+    Args:
+        array: The array.
+        beam: Index of the beam.
+        directions: Unit vectors in device axes, Shape ``[..., 3]``.
+
+    Returns:
+        The array factor ``|sin(πNv)| / (N·|sin πv|)`` of `beam_towards` over columns times that over rows,
+        of the beam's own subarray, Shape ``[...]``.
     """
     if not array.is_uniform:
         part, beam = subarray_of(array, beam)
@@ -166,8 +188,11 @@ def coupled_polarizations(transmit: AntennaArray, receive: AntennaArray) -> tupl
 def jones(polarization: str) -> tuple[complex, complex]:
     """Field of an element along θ̂ and φ̂, as parts of the amplitude of its pattern.
 
-    Linear ones are those of model 2 of 3GPP TR 38.901, section 7.3.2, (cos ζ, sin ζ) at a slant of ζ.
-    Circular ones follow IEEE Std 145 for waves exp(+j2πft): looking along the wave, RHCP turns clockwise.
+    Linear polarizations are those of model 2 of 3GPP TR 38.901, section 7.3.2, (cos ζ, sin ζ) at a slant of
+    ζ. Circular ones follow IEEE Std 145 for waves exp(+j2πft): looking along the wave, RHCP turns clockwise.
+
+    Args:
+        polarization: ``V``, ``H``, ``-45``, ``+45``, ``RHCP`` or ``LHCP``.
     """
     if polarization == "V":
         return 1.0, 0.0

@@ -29,10 +29,16 @@ class Pose(NamedTuple):
 
 
 def quaternion_from_euler(yaw: float, pitch: float = 0.0, roll: float = 0.0) -> UnitQuaternion:
-    """Unit quaternion of intrinsic z–y′–x″ rotations [rad].
+    """Unit quaternion of intrinsic z–y′–x″ rotations, equal to Sionna RT's (α, β, γ) orientation.
 
-    Yaw turns counter-clockwise seen from above, positive pitch lowers the nose (right-handed
-    about +y), roll is about +x. Equal to Sionna RT's (α, β, γ) orientation.
+    Args:
+        yaw: Counter-clockwise seen from above [rad].
+        pitch: Right-handed about +y, so that positive pitch lowers the nose [rad].
+        roll: About +x [rad].
+
+    Example:
+        >>> [round(part, 3) for part in quaternion_from_euler(math.pi / 2)]  # from east to north
+        [0.707, 0.0, 0.0, 0.707]
     """
     cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
     cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
@@ -46,7 +52,7 @@ def quaternion_from_euler(yaw: float, pitch: float = 0.0, roll: float = 0.0) -> 
 
 
 def euler_from_quaternion(q: Sequence[float]) -> Vector:
-    """(yaw, pitch, roll) [rad] of a unit quaternion; the inverse of `quaternion_from_euler`."""
+    """Yaw, pitch and roll [rad] of a unit quaternion; the inverse of `quaternion_from_euler`."""
     w, x, y, z = q
     sin_pitch = max(-1.0, min(1.0, 2 * (w * y - z * x)))
     return (
@@ -69,7 +75,15 @@ def rotation_matrix(q: Sequence[float]) -> Float64Array:
 
 
 def rotated(q: Sequence[float], v: Sequence[float]) -> Vector:
-    """World components of a vector given in body axes: R·v, for one vector without an array."""
+    """World components of one vector given in body axes, without an array.
+
+    Args:
+        q: Unit quaternion (w, x, y, z) of the body.
+        v: Components in body axes.
+
+    Returns:
+        R·v with the `rotation_matrix` R.
+    """
     w, x, y, z = q
     a, b, c = v
     return (
@@ -80,7 +94,7 @@ def rotated(q: Sequence[float], v: Sequence[float]) -> Vector:
 
 
 def unrotated(q: Sequence[float], v: Sequence[float]) -> Vector:
-    """Body components of a vector given in world axes: the inverse of `rotated`, by the transposed matrix."""
+    """Body components of one vector given in world axes: the inverse of `rotated`."""
     w, x, y, z = q
     a, b, c = v
     return (
@@ -91,7 +105,7 @@ def unrotated(q: Sequence[float], v: Sequence[float]) -> Vector:
 
 
 def multiply(p: Sequence[float], q: Sequence[float]) -> UnitQuaternion:
-    """Hamilton product p·q: first q, then p."""
+    """Hamilton product p·q of two quaternions: the rotation q, followed by p."""
     pw, px, py, pz = p
     qw, qx, qy, qz = q
     return (
@@ -103,14 +117,29 @@ def multiply(p: Sequence[float], q: Sequence[float]) -> UnitQuaternion:
 
 
 def compose(parent: Pose, mount: Pose) -> Pose:
-    """World pose of something mounted on a parent with the relative pose ``mount``."""
+    """World pose of something that is mounted on a parent.
+
+    Args:
+        parent: World pose of the parent.
+        mount: Pose relative to the parent, in its axes.
+
+    Example:
+        >>> bus = Pose((10.0, 0.0, 1.5), quaternion_from_euler(math.pi / 2))
+        >>> [round(x, 6) for x in compose(bus, Pose((2.0, 0.0, 1.5), (1.0, 0.0, 0.0, 0.0))).position]
+        [10.0, 2.0, 3.0]
+    """
     x, y, z = rotated(parent.orientation, mount.position)
     px, py, pz = parent.position
     return Pose((px + x, py + y, pz + z), multiply(parent.orientation, mount.orientation))
 
 
 def direction(zenith: float, azimuth: float) -> Float64Array:
-    """Unit vector [3] of a direction given by zenith from +z and azimuth from +x [rad]."""
+    """Unit vector of a direction, Shape ``[3]``.
+
+    Args:
+        zenith: Angle from +z [rad].
+        azimuth: Counter-clockwise from +x [rad].
+    """
     return np.array(
         [
             math.sin(zenith) * math.cos(azimuth),
@@ -121,9 +150,14 @@ def direction(zenith: float, azimuth: float) -> Float64Array:
 
 
 def angles(vectors: Float64Array) -> Float64Array:
-    """(zenith, azimuth) [rad] of vectors; Shape ``[..., 3]`` to ``[..., 2]``.
+    """Zenith and azimuth [rad] of vectors.
 
-    Uses atan2 of the horizontal part, so that directions near the poles keep their precision.
+    Args:
+        vectors: Of any length but 0, Shape ``[..., 3]``.
+
+    Returns:
+        (zenith from +z, azimuth from +x), Shape ``[..., 2]``. Zenith is the atan2 of the horizontal part, so
+        that directions near the poles keep their precision.
     """
     found = np.empty((*vectors.shape[:-1], 2))
     found[..., 0] = np.arctan2(np.hypot(vectors[..., 0], vectors[..., 1]), vectors[..., 2])

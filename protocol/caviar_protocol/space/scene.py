@@ -19,9 +19,13 @@ from caviar_protocol.topics.scene import AntennaDevice, Device, Scene
 
 
 def merge_scenes(scenes: Mapping[str, Scene]) -> Scene:
-    """The union of the scenes of all worlds, keyed by source, sorted by name.
+    """Unite the scenes of all worlds (contract, clause 3), sorted by name.
 
-    Raises `PayloadError` naming the object and both worlds where a name occurs twice.
+    Args:
+        scenes: Scene of each world, by the world's name.
+
+    Raises:
+        PayloadError: A name occurs twice; the text names the object and both worlds.
     """
     if len(scenes) == 1:
         return next(iter(scenes.values()))
@@ -71,7 +75,12 @@ def object_pose(scene: Scene, index: int) -> Pose:
 def device_pose(scene: Scene, device: Device) -> Pose:
     """World pose of a device: its mount pose on top of its parent's pose.
 
-    Raises `PayloadError` where the parent is not in the scene.
+    Args:
+        scene: The scene of the device.
+        device: One of its devices.
+
+    Raises:
+        PayloadError: The parent is not in the scene.
     """
     # Channel, link and agent ask for the same poses: what was composed is kept with the scene.
     known: dict[str, tuple[Device, Pose]] = scene.__dict__.setdefault("_poses", {})
@@ -86,7 +95,15 @@ def device_pose(scene: Scene, device: Device) -> Pose:
 
 
 def device_velocity(scene: Scene, device: Device) -> Float64Array:
-    """Velocity [m/s] of a device in world axes, Shape ``[3]``: that of its parent, at the device's place."""
+    """Velocity of a device in world axes: that of its parent, at the device's place.
+
+    Args:
+        scene: The scene of the device.
+        device: One of its devices.
+
+    Returns:
+        v + ω × r with the parent's velocity v and angular velocity ω [m/s], Shape ``[3]``.
+    """
     if not device.parent:
         return np.zeros(3)
     index = _parent_index(scene, device)
@@ -102,7 +119,12 @@ _antennas: dict[str, tuple[tuple[Device, ...], list[AntennaDevice]]] = {}
 
 
 def antennas(scene: Scene, role: str) -> Sequence[AntennaDevice]:
-    """Antenna devices that transmit (``"tx"``) or receive (``"rx"``), sorted by name."""
+    """Antenna devices of a scene, sorted by name.
+
+    Args:
+        scene: The scene.
+        role: ``"tx"`` for those that transmit, ``"rx"`` for those that receive.
+    """
     known = _antennas.get(role)
     if known is None or known[0] is not scene.devices:
         found = (d for d in scene.devices if isinstance(d, AntennaDevice) and d.role in (role, "both"))
@@ -132,15 +154,28 @@ class Pair:
 
 
 def pairs_of(scene: Scene) -> list[Pair]:
-    """All pairs of the scene, sorted by TX, then RX."""
+    """All pairs of a transmitting and a receiving device, sorted by TX, then RX.
+
+    Example:
+        >>> from caviar_protocol.recording import Recording, newest_run
+        >>> scene = Recording(newest_run(name="smoke-*"))["scene"][0]
+        >>> [(pair.tx.name, pair.rx.name) for pair in pairs_of(scene)]
+        [('bs', 'car/rx'), ('bs', 'uav/rx-uav')]
+    """
     receivers = antennas(scene, "rx")
     return [Pair(tx, rx) for tx in antennas(scene, "tx") for rx in receivers if rx.name != tx.name]
 
 
 def directions(scene: Scene, pairs: Sequence[Pair]) -> tuple[list[Vector], list[Vector]]:
-    """Direction of RX from TX in the TX device's axes, and of TX from RX in the RX device's axes.
+    """Where the two devices of each pair see each other.
 
-    Unit vectors, one of each for every pair. Two devices at one point see each other at boresight.
+    Args:
+        scene: The scene of the pairs.
+        pairs: Pairs of its antennas.
+
+    Returns:
+        Unit vectors to RX from TX in the TX device's axes, and to TX from RX in the RX device's axes; a list
+        of each, one vector a pair. Two devices at one point see each other at boresight.
     """
     # Link and agent ask for the same pairs: what was computed is kept with the scene.
     known: dict[tuple[str, str], tuple[Pair, Vector, Vector]] = scene.__dict__.setdefault("_directions", {})
