@@ -109,6 +109,7 @@ Quaternion = Annotated[
 ]
 
 
+# Type hints are evaluated anew at each call of `get_type_hints`, and payloads are made in every frame.
 @cache
 def array_fields(cls: type) -> dict[str, ArrayField]:
     """The array fields of a payload class, by name, in wire order."""
@@ -157,6 +158,7 @@ class Payload(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
             is_known = False
         if not is_known or (layout.optional and any(getattr(self, f) is not None for f in layout.optional)):
             self._check_arrays()
+            # A lidar has another number of hits in every frame: without a bound the set would grow for hours.
             if len(layout.known) >= KNOWN_SHAPES:
                 layout.known.clear()
             layout.known.add(shapes)
@@ -185,6 +187,7 @@ class Payload(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
             return NotImplemented
         return all(_equal(getattr(self, f), getattr(other, f)) for f in self.__struct_fields__)
 
+    # Without this line `msgspec.Struct` gives frozen classes a hash of their fields.
     __hash__ = None  # type: ignore[assignment]  # arrays are not hashable, so neither is their owner
 
 
@@ -230,6 +233,7 @@ def _getter(paths: Sequence[str]) -> Callable[[Any], tuple[Any, ...]]:
         return attrgetter(*paths)
     if not paths:
         return lambda owner: ()
+    # With one name `attrgetter` gives the bare value and not a tuple.
     single = attrgetter(*paths)
     return lambda owner: (single(owner),)
 

@@ -137,6 +137,7 @@ class AssetStore:
         try:
             if path.stat().st_size != size:
                 return False
+            # Hashed once a process and not once a run, of which an environment has thousands.
             if digest not in self._verified:
                 if _file_digest(path) != digest:
                     return False
@@ -147,6 +148,7 @@ class AssetStore:
 
     def _lay_out(self, asset: Asset, target: Path) -> None:
         source = self.path(asset.digest)
+        # A file that is a link to the one in the store needs no second hash.
         if target.is_file() and (target.samefile(source) or _file_digest(target) == asset.digest):
             return
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -207,7 +209,9 @@ class Incoming:
             AssetError: The chunk is not the next one, or the content has another digest than announced.
         """
         name, announced = self.asset.name, self.asset
+        # Chunks come in order over one connection; anything else is another sender's mistake, never a loss.
         fits = offset == self.offset and size == announced.size and offset + len(chunk) <= size
+        # An empty chunk of a file that has bytes would be asked for again without end.
         if not fits or (size and not len(chunk)):
             raise AssetError(
                 f"asset {name!r}: got {len(chunk)} B at {offset} of {size} B, expected them at "

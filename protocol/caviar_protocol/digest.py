@@ -63,6 +63,7 @@ class RunDigest:
     def __init__(self, begun: str = "") -> None:
         """Begin a chain, or go on behind the digest ``begun``."""
         self._state = bytes.fromhex(begun) or hashlib.sha256(b"caviar-run-1").digest()
+        # Hashing waits until no service waits for a grant: it is no part of a frame's latency.
         self._waiting: list[tuple[int, int, list[tuple[str, str, str]]]] = []
 
     def add_frame(self, episode: int, frame: int, products: Iterable[tuple[str, str, str]]) -> None:
@@ -83,6 +84,7 @@ class RunDigest:
         """Hash the frames that wait. The broker calls it while no service waits for a grant."""
         state = self._state
         for episode, frame, products in self._waiting:
+            # Services finish in another order in every run; the digest must not tell.
             for topic, source, digest in sorted(products):
                 prefix = f"{episode}\0{frame}\0{topic}\0{source}\0".encode()
                 state = hashlib.sha256(state + prefix + bytes.fromhex(digest)).digest()

@@ -12,7 +12,9 @@ from caviar_protocol.arrays import described, quantity
 MAX_INTEGER = 2**63 - 1
 """Every integer of the protocol fits into a signed 64-bit one."""
 
+# ``$`` alone would let a line feed pass at the end, which breaks a log line.
 _PRINTABLE = r"^[^\x00-\x1f\x7f]+$(?!\n)"
+# Neither ``.`` nor ``..`` as a segment, so that a path never leads out of its folder.
 _SEGMENT = r"(?!\.{1,2}(?:/|$))[^/\\\x00-\x1f\x7f]+"
 
 Name = Annotated[str, described("name of a service or topic that was declared", min_length=1, max_length=128)]

@@ -63,10 +63,12 @@ def replace_file(
             if durable:
                 file.flush()
                 os.fsync(file.fileno())
+        # The rename is the only step that a reader can see; it is atomic on every POSIX file system.
         draft.replace(path)
     except BaseException:
         draft.unlink(missing_ok=True)
         raise
+    # A rename is on the disk only when the folder is: fsync of the file alone leaves the old name.
     if durable:
         sync_file(path.parent)
 
@@ -139,6 +141,7 @@ def refuse_other_kinds(path: Path, remedy: str = "move it away") -> None:
     try:
         status = path.stat()
     except OSError:
+        # A path that is not there, or not readable, is not of another kind.
         return  # the call that opens it says why
     _refuse_kind(status, path, remedy)
 

@@ -11,10 +11,10 @@ import time
 from pathlib import Path
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
+# [B] Buffers from here on come from the system and return to it; each of their pages costs a fault.
 _LARGE = 4 << 20
-"""[B] Buffers from here on come from the system and return to it; each of their pages costs a fault."""
+# [B] that a heap may keep at its end.
 _SPARE = 64 << 20
-"""[B] that a heap may keep at its end."""
 
 
 def host_identity() -> str:
@@ -67,6 +67,7 @@ def _glibc(function: str, *arguments: int) -> None:
     try:
         getattr(ctypes.CDLL(None), function)(*arguments)
     except (OSError, AttributeError):
+        # musl and others have no mallopt; ctypes raises AttributeError for it.
         return  # another C library: it has a strategy of its own
 
 
@@ -89,10 +90,12 @@ class SignOfLife:
 
     def give(self) -> None:
         """Touch the file, unless that has just been done."""
+        # The event loop gives a sign in every turn, thousands of times a second: a touch a second is enough.
         now = time.monotonic()
         if self._path is None or now < self._due:
             return
         self._due = now + INTERVAL_S
+        # A file that cannot be written is no reason to end a run: the health check says so.
         with contextlib.suppress(OSError):
             self._path.touch()
 
@@ -100,8 +103,8 @@ class SignOfLife:
 DISTRIBUTION = "caviar-sim"
 """Name under which pip knows this project."""
 
+# A module that each extra brings and the base install does not.
 _MODULES = {"channel": "sionna", "sensors": "mitsuba", "world": "libsumo", "plot": "matplotlib"}
-"""A module that each extra brings and the base install does not."""
 
 
 def has_extra(extra: str) -> bool:

@@ -148,6 +148,7 @@ def write_pair(directory: Path, name: str, pair: Pair) -> tuple[Path, Path]:
     """
     check_name(name)
     key, pub = directory / f"{name}.key", directory / f"{name}.pub"
+    # A dangling link does not `exist`, and opening it with O_EXCL would fail with less to say.
     for path in (key, pub):
         if path.exists() or path.is_symlink():
             raise SetupError(f"{path} exists and is not overwritten; choose another name, or remove it first")
@@ -175,6 +176,7 @@ def read_pair(path: Path) -> Pair:
     """
     pair = _decoded(path, Pair, "make it with  caviar keys new NAME")
     mode = stat.S_IMODE(path.stat().st_mode)
+    # ssh refuses such keys for the same reason: every account of the machine could be this service.
     if mode & 0o077:
         raise SetupError(
             f"{path} holds a secret key, and its mode is {mode:03o}, so that others can read it; "
@@ -337,6 +339,7 @@ def _table(key: str, text: str) -> str:
 def _create(path: Path, text: str, mode: int) -> None:
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
     with os.fdopen(descriptor, "w") as file:
+        # The umask may have taken bits of the mode away, or another default may have added some (ACLs).
         os.fchmod(descriptor, mode)
         file.write(text)
 

@@ -34,6 +34,7 @@ TAPS_BEFORE = 6
 
 def subcarrier_offsets(carrier: Carrier) -> Float64Array:
     """Frequency of each subcarrier from the carrier's centre [Hz], Shape ``[K]``; that of index K//2 is 0."""
+    # As in 3GPP TS 38.211, section 5.3, and `numpy.fft.fftshift`: one more below the centre for even K.
     steps = np.arange(carrier.subcarriers, dtype=np.float64) - carrier.subcarriers // 2
     offsets: Float64Array = steps * carrier.subcarrier_spacing_hz
     return offsets
@@ -70,6 +71,7 @@ def subcarrier_weights(carrier: Carrier, tau: Float64Array, doppler: Float64Arra
     drifting, turning = _in_slots(carrier, tau, doppler)
     step = carrier.subcarrier_spacing_hz * drifting
     # Frequencies are evenly spaced: of blocks and of places within a block √K phases each make all K.
+    # 264 subcarriers of 1000 paths: 33 exponentials a path in place of 264.
     block = max(1, math.isqrt(count))
     blocks = -(-count // block)
     shape = (-1, *(1,) * step.ndim)
@@ -111,6 +113,7 @@ def _in_slots(
 
 def _phasor(turns: Float64Array) -> Complex128Array:
     """exp(−j2π·turns)."""
+    # At 28 GHz and 1 µs a phase has 28,000 turns: whole ones go first, or the cosine loses 5 digits.
     angle = (turns - np.round(turns)) * (-2 * np.pi)
     phasor = np.empty(angle.shape, np.complex128)
     np.cos(angle, out=phasor.real)
@@ -165,6 +168,7 @@ def k_factor(a: Complex128Array, tau: Float64Array, los: BoolArray) -> Float64Ar
     Returns:
         Shape ``[...]``; NaN without line of sight, infinite where there is no other path.
     """
+    # `np.put_along_axis` below writes into this copy, never into the caller's amplitudes.
     power = np.nan_to_num(np.abs(a) ** 2)
     has_path = np.isfinite(tau).any(-1) & los
     direct = np.where(np.isfinite(tau), tau, np.inf).argmin(-1)[..., None] if tau.shape[-1] else None
@@ -236,6 +240,7 @@ def changes(before: Channel, after: Channel) -> Changes:
         before: The earlier product.
         after: The later product, of the same source.
     """
+    # Where no path changed, two comparisons take the place of a sort.
     same = before.tx == after.tx and before.rx == after.rx
     if same and np.array_equal(before.offsets, after.offsets) and np.array_equal(before.id, after.id):
         return Changes(np.zeros(len(after.id), np.bool_), np.zeros(len(before.id), np.bool_))

@@ -105,6 +105,7 @@ def newest_run(root: str | Path = "runs", name: str = "*") -> Path:
         >>> newest_run(name="smoke-2*").name
         'smoke-20261122-101500'
     """
+    # The newest file counts, not the newest name: a run of yesterday may have been gone on with.
     written = {
         file.parent: file.stat().st_mtime_ns for file in sorted(Path(root).glob(f"{name}/{SEGMENT_PATTERN}"))
     }

@@ -287,6 +287,7 @@ def _aliases() -> dict[int, str]:
 def _attribute_docs(cls: type) -> dict[str, str]:
     """Docstrings below the fields of a class and of its bases."""
     found: dict[str, str] = {}
+    # A class may say more about a field than its base; the last one wins.
     for base in reversed(cls.__mro__):
         if base.__module__.startswith("caviar_protocol"):
             node = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0]

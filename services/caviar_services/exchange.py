@@ -15,8 +15,9 @@ from caviar_protocol.arrays import Payload
 from caviar_protocol.digest import geometry_digest, payload_digest
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.scene_validation import SceneRules
 from caviar_protocol.topics import PAYLOADS, Carrier
-from caviar_protocol.validation import ContentCheck, SceneRules
+from caviar_protocol.validation import ContentCheck
 from caviar_services.encoded import Encoded, decoded, encoded
 from caviar_services.service import (
     Frame,

@@ -11,11 +11,11 @@ import msgspec
 from caviar_clients.conform import street
 from caviar_clients.conform.case import Case, Failed, NotApplicable, case
 from caviar_clients.conform.session import ACTIVE, Session
-from caviar_protocol import validation as scenes
+from caviar_protocol import scene_validation as scenes
 from caviar_protocol.codec import decode_payload
 from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.scene_validation import SceneRules
 from caviar_protocol.topics import Scene
-from caviar_protocol.validation import SceneRules
 
 if TYPE_CHECKING:
     from caviar_clients.conform.kit import Kit

@@ -24,8 +24,8 @@ HARMLESS = 256
 _CONTAINERS = bytes([*range(0x80, 0xA0), *range(0xDC, 0xE0)])
 _OTHERS = bytes(byte for byte in range(256) if byte not in _CONTAINERS)
 
+# Bytes of a value by its first byte; 0 where it has a length field, or is a map or an array.
 _FIXED = [0] * 256
-"""Bytes of a value by its first byte; 0 where it has a length field, or is a map or an array."""
 for _byte in range(256):
     if _byte < 0x80 or _byte >= 0xE0 or 0xC0 <= _byte <= 0xC3:
         _FIXED[_byte] = 1
@@ -54,6 +54,7 @@ def check_nesting(header: bytes | bytearray | memoryview, what: str) -> None:
     Raises:
         LimitError: Maps and arrays are nested in more than `limits.MAX_NESTING` levels.
     """
+    # A pass in C counts the bytes that may open a container, text included: few mean shallow.
     data = header if isinstance(header, bytes) else bytes(header)
     if len(data) <= HARMLESS or len(data.translate(None, _OTHERS)) <= HARMLESS:
         return
@@ -80,6 +81,7 @@ def _deeper_than(data: bytes, limit: int) -> bool:
             left = children
             if len(due) > limit:
                 return True
+        # A container that is full closes all those of which it was the last value.
         while not left and due:
             left = due.pop()
     return False
@@ -112,6 +114,7 @@ def choices(kind: Any, encoded: bytes | bytearray | memoryview, complaint: str) 
     try:
         value = msgspec.msgpack.decode(encoded)
     except (msgspec.MsgspecError, ValueError, RecursionError):
+        # The complaint was about these bytes, so they decode without a type; else no word can be named.
         return ()
     steps = [name or int(number) for name, number in _STEP.findall(found["path"])]
     return _words(_at(_type_info(kind), value, steps))
@@ -196,6 +199,7 @@ def decode_bounded(decoder: msgspec.msgpack.Decoder[_T], header: Buffer, what: s
     check_nesting(header, what)
     try:
         return decoder.decode(header)
+    # What the walk let pass (few containers) may still be deeper than a small thread's stack.
     except RecursionError as error:
         raise LimitError(f"{what} nests deeper than {limits.MAX_NESTING} levels") from error
     except (PayloadError, msgspec.MsgspecError, ValueError, TypeError, OverflowError) as error:

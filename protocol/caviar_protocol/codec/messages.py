@@ -100,6 +100,7 @@ def decode_message(header: Buffer) -> Message:
         )
     try:
         message = decode_bounded(_message_decoder, header, "message header")
+    # A peer of another major version is told that, and not that its first message is malformed.
     except DecodeError:
         _check_opening(header)
         raise
@@ -143,6 +144,7 @@ def check_parts(message: Message, parts: Sequence[Any]) -> None:
     if isinstance(message, AssetData):
         _check_chunk(message, len(parts[1]))
         return
+    # The only part of RESTORE and CHECKPOINT_DONE is a state, which is as large as a body.
     payload_header = limits.MAX_HEADER if isinstance(message, (Grant, Done)) else limits.MAX_BODY
     for index, part in enumerate(parts[1:], 1):
         limit = payload_header if index % 2 else limits.MAX_BODY
@@ -230,6 +232,7 @@ def join_parts(parts: Sequence[Buffer]) -> bytes:
     Args:
         parts: Header, then payload headers and bodies, as on ZeroMQ.
     """
+    # `len` of a memoryview counts elements, which need not be bytes.
     views = [memoryview(part) for part in parts]
     return struct.pack(f"<{len(views) + 1}I", len(views), *(view.nbytes for view in views)) + b"".join(views)
 
@@ -258,6 +261,7 @@ def split_frame(frame: Buffer) -> list[memoryview]:
         raise DecodeError(f"a frame has {len(view)} B, it begins with the number of its parts in 4 B")
     (count,) = _COUNT.unpack_from(view)
     if not 1 <= count <= limits.MAX_PARTS:
+        # JavaScript's DataView writes big-endian unless told otherwise: the most frequent mistake.
         swapped = 1 <= int.from_bytes(view[: _COUNT.size], "big") <= limits.MAX_PARTS
         text = f"a frame announces {count} parts, a message has 1 to {limits.MAX_PARTS}"
         raise LimitError(text + BIG_ENDIAN * swapped)

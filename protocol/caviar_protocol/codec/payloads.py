@@ -31,8 +31,8 @@ from caviar_protocol.topics import PAYLOADS
 ALIGNMENT = 8
 """[B] Offsets are multiples of this."""
 
+# [B] Arrays from this size on are copied once, into the body; of smaller ones a view costs more.
 _VIEWED = 1 << 16
-"""[B] Arrays from this size on are copied once, into the body; of smaller ones a view costs more."""
 
 
 _CODES = {dtype: code for code, dtype in WIRE_DTYPES.items()}
@@ -54,6 +54,7 @@ class BodyWriter:
         Raises:
             PayloadError: Elements of this type, or so many dimensions, cannot travel.
         """
+        # Equal dtypes hash alike whatever made them; arrays in native little-endian order take this way.
         code = _CODES.get(value.dtype)
         if code is None:
             dtype = value.dtype.newbyteorder("<")
@@ -62,6 +63,7 @@ class BodyWriter:
             code, value = _CODES[dtype], value.astype(dtype)
         if value.ndim > MAX_DIMENSIONS:
             raise PayloadError(f"{value.ndim} dimensions cannot travel, at most {MAX_DIMENSIONS}")
+        # A view keeps the producer's array alive until the body is joined, within this call.
         is_viewed = value.nbytes >= _VIEWED and value.flags.c_contiguous
         data = value.reshape(-1).view(np.uint8).data if is_viewed else value.tobytes()
         padding = -self.length % ALIGNMENT
@@ -96,6 +98,7 @@ class BodyReader:
         """
         code, shape, offset = _reference(reference)
         dtype, count, room = WIRE_DTYPES[code], 1, 1
+        # A shape may multiply to more than 64 bits, which Python's numbers hold and NumPy's do not.
         for size in shape:
             count *= size
             room *= size or 1
@@ -111,6 +114,7 @@ class BodyReader:
             raise DecodeError(f"array at offset {offset} overlaps the one before, which ends at {self._end}")
         self._end = end
         array: NDArray[Any] = np.ndarray(shape, dtype, self._body, offset)
+        # NumPy would take any other byte as true, and its digest would not be that of the array.
         if code == "|b1" and bytes(self._body[offset:end]).strip(b"\0\1"):
             raise DecodeError("a |b1 array holds a byte other than 0 and 1")
         return array
@@ -122,6 +126,7 @@ def _reference(reference: Any) -> tuple[str, list[int], int]:
         code, shape, offset = reference["dtype"], reference["shape"], reference["offset"]
     except (TypeError, KeyError, IndexError):
         raise DecodeError("an array is a map with dtype, shape and offset") from None
+    # `isinstance` would let subclasses pass, and an unhashable code would raise in the lookup.
     if type(code) is not str or code not in WIRE_DTYPES:
         raise DecodeError(f"array dtype {code!r:.40} is not one of {', '.join(WIRE_DTYPES)}")
     if type(shape) is not list:
@@ -172,6 +177,7 @@ def encode_payload(payload: Payload) -> tuple[bytes, bytes]:
     return header, writer.body()
 
 
+# msgspec hands a decoding hook the value alone, so the body has to come another way.
 class _Reading(threading.local):
     """The body that this thread is decoding: decoders are shared, what they read is not."""
 
@@ -248,6 +254,7 @@ def _struct(cls: type[msgspec.Struct]) -> Convert:
         found: dict[str, Any] = {config.tag_field: config.tag} if config.tag_field else {}
         for name, default, inner in fields:
             item = getattr(value, name)
+            # Identity with the default saves a conversion; equality, which is looked at below, saves bytes.
             if item is default:
                 continue
             try:
@@ -330,6 +337,7 @@ def _literal(allowed: frozenset[Any]) -> Convert:
 
 
 def _sequence(item: Any) -> Convert:
+    # Names are most of a header: a loop of their own saves a call for each.
     if item is str:
         return _strings
     inner = _converter(item)

@@ -42,8 +42,8 @@ S = TypeVar("S", bound=np.generic)
 Rows: TypeAlias = Sequence[Any] | NDArray[Any]
 """One array or number a row of a product, in the order of its keys; an array counts rows along axis 0."""
 
+# What stands where there is no value, by kind of element.
 _MISSING: dict[str, Any] = {"f": np.nan, "c": complex(np.nan, np.nan), "i": -1, "u": 0, "b": False}
-"""What stands where there is no value, by kind of element."""
 _FRESHNESS = (Status.ABSENT, Status.HELD, Status.FRESH)
 
 
@@ -304,15 +304,18 @@ class TopicArrays(Generic[P, K]):
     def stack(self, column: Column[S]) -> NDArray[S]:
         """The array of a column, Shape ``[F, rows, …]``."""
         shape = self._shape(column)
+        # Padding comes first, so that rows and frames that are absent need no step of their own.
         out: NDArray[S] = np.full(shape, _MISSING[column.dtype.kind], dtype=column.dtype)
         for at, payload in enumerate(self):
             if payload is None:
                 continue
             rows, (own, places) = column.rows(self, payload), self._places(self.keys_of(payload))
+            # One assignment for all rows where they are of full size; ragged ones go one by one.
             if isinstance(rows, np.ndarray) and rows.shape[1:] == shape[2:]:
                 out[at, places] = rows[own]
             else:
                 for row, place in zip(own, places, strict=True):
+                    # The Ellipsis keeps a view where the row is one number, which an index alone would copy.
                     part = out[at, place, ...]
                     part[tuple(map(slice, np.shape(rows[row])))] = rows[row]
         return out
@@ -321,6 +324,7 @@ class TopicArrays(Generic[P, K]):
         lines = [f"{self.topic} of {', '.join(map(repr, self.sources))}, F = {len(self)} frames"]
         shapes: dict[str, tuple[int, ...]] = {}
         with suppress(OSError):  # damaged: reading an array says where
+            # Ragged axes need every product decoded: too long for the text of a large recording.
             if sum(file.stat().st_size for file in self._recording.files) <= MEASURED_B:
                 for name, column in self.columns.items():
                     with suppress(RecordingError):  # damaged likewise, or a part that was not recorded
@@ -420,6 +424,7 @@ class TopicArrays(Generic[P, K]):
 
     def _sizes(self, column: Column[Any]) -> tuple[int, ...]:
         """Sizes of one row of the array."""
+        # A block has the sizes of the whole, or blocks could not be concatenated.
         if type(self._reference) is type(self):
             return self._reference._sizes(column)
         if all(isinstance(size, int) for size in column.shape):

@@ -27,8 +27,8 @@ from caviar_protocol.recording.layout import (
 from caviar_protocol.recording.segment import Channel, Chunk, Segment
 from caviar_protocol.run_directory import SEGMENT_PATTERN, RunDirectory
 
+# A recorder replaces the manifest a few times while it goes on with a recording, then once a segment.
 _READINGS = 8
-"""A recorder replaces the manifest a few times while it goes on with a recording, then once a segment."""
 
 
 @dataclass
@@ -57,12 +57,13 @@ class RecordedSegments:
     """What is missing or cannot be read, as far as can be told without reading products: a line each."""
     closed: bool = False
     """Whether the recorder closed the recording, and all of it is there."""
+    # What the manifest says, by file name.
     _listed: dict[str, SegmentRecord] = field(default_factory=dict, init=False)
-    """What the manifest says, by file name."""
+    # The manifest as it was read, also where it is of another run.
     _on_disk: Manifest | None = field(default=None, init=False)
-    """The manifest as it was read, also where it is of another run."""
 
     def __post_init__(self) -> None:
+        # A recorder that goes on replaces files meanwhile: only a manifest that stayed the same counts.
         for _ in range(_READINGS - 1):
             try:
                 self._read()
@@ -83,6 +84,7 @@ class RecordedSegments:
         except RecordingError as error:
             self.damage.append(str(error))
         self._listed = {record.name: record for record in self.manifest.segments} if self.manifest else {}
+        # The manifest knows of segments that were removed; the folder of those begun after its last save.
         expected = files if alone else _expected(self._folder, files, self._listed)
         if self.trusted_before is not None:
             self._trust(expected, self._listed, self.trusted_before)
@@ -96,6 +98,7 @@ class RecordedSegments:
             raise RecordingError(
                 self.damage[0] if self.damage else f"{self.path} holds no recording any more"
             )
+        # Closed means that nothing can come any more: all segments, the last one finished, no damage.
         there = len(self.trusted) + len(self.segments)
         self.closed = there == len(expected) and self.segments[-1].finished and not self.damage
         if self.manifest is not None and not alone:
@@ -161,6 +164,7 @@ class RecordedSegments:
             what = f"{file} breaks off at byte {segment.readable}"
         else:
             what = ""
+        # The summary at the end is an index that MCAP tools use; frames are found without it.
         if what and record is not None and self.instants[-1:] == [record.last]:
             self.damage.append(f"{what}: its index is damaged, and no frame is lost")
             return True

@@ -104,6 +104,7 @@ class RecordedProduct:
 
     @property
     def _header_length(self) -> int:
+        # The bytes are checked only where their CRC or digest was: a length may be anything.
         length = int.from_bytes(self._data[:8], "little")
         if len(self._data) < 8 or 8 + length > len(self._data):
             raise RecordingError(f"{self.place}: a header of {length} B does not fit {len(self._data)} B")
@@ -387,6 +388,7 @@ class Recording:
 
     def segment_of(self, index: int) -> tuple[Segment, int]:
         """The segment of the ``index``-th frame of the recording, and the frame's place in it."""
+        # Empty segments have the start of the next one: the last of equal starts has the frame.
         number = bisect_right(self._starts, index) - 1
         return self._segments[number], index - self._starts[number]
 
@@ -422,6 +424,7 @@ class Recording:
         entry, key = self.entry(index), (Channel(item.topic, item.source), item.frame)
         place = f"{self._at(entry.episode, entry.frame)}, {item.topic} of {item.source!r}"
         data = own.get(key)
+        # A held product is stored once, in the frame it was computed for, or where it came late.
         if data is None and item.status is Status.HELD:
             data = self._held(entry.episode, *key)
         if data is None:
@@ -464,6 +467,7 @@ class Recording:
         }
 
     def _build_index(self) -> dict[tuple[int, int], int]:
+        # Segments of two runs in one folder would interleave: numbers must ascend without exception.
         order = [(entry.episode, entry.frame) for segment in self._segments for entry in segment.entries]
         for earlier, later in pairwise(order):
             if later <= earlier:

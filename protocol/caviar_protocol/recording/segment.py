@@ -43,8 +43,8 @@ _FOOTER_CONTENT = struct.Struct("<QQI")
 _HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE_OPCODE, _CHUNK_OPCODE = range(1, 7)
 _METADATA = 0x0C
 _DATA_END, _LAST_OPCODE, _FIRST_PRIVATE_OPCODE = 0x0F, 0x0F, 0x80
+# [B] of a chunk in which its frame record is looked for, first and at most.
 _FIRST_LOOK, _LAST_LOOK = 1 << 16, 1 << 24
-"""[B] of a chunk in which its frame record is looked for, first and at most."""
 
 
 def seal(crc: int) -> bytes:
@@ -116,8 +116,8 @@ class Segment:
         """Bytes up to the end of what can be read."""
         self.damage: list[str] = []
         """What of it cannot be read, other than an end that was not written: a line each, with its place."""
+        # Place and CRC-32 of each seal.
         self._seals: list[tuple[int, int]] = []
-        """Place and CRC-32 of each seal."""
         self._data_end = (0, 0)
         self._data = _mapped(path)
         self._scan()
@@ -196,8 +196,10 @@ class Segment:
                 position = start + length
                 self.readable = position + (len(MAGIC) if self.finished else 0)
                 continue
+            # A seal is the next place whose bytes vouch for what precedes: behind it records fit again.
             following = _find(data, _SEAL_HEAD, position + 1)
             if following < 0:
+                # A record that is cut at the end of a file without an end is what a kill leaves, no damage.
                 if not is_cut or self._end_is_in_place() or data[position] not in _KNOWN_OPCODES:
                     self.damage.append(f"the record at byte {position} {fault}")
                 break
@@ -211,6 +213,7 @@ class Segment:
 
     def _cut_behind_last_good_seal(self) -> None:
         """Of a segment that was not closed, and may have holes after a power loss, keep what is sealed."""
+        # After a power loss pages in the middle may be zero while later ones are there: CRCs find them.
         good, crc = 0, 0
         for place, recorded in self._seals:
             if zlib.crc32(self._data[good:place], crc) != recorded:
@@ -298,6 +301,7 @@ class Segment:
     def _first_message(self, chunk: Chunk) -> tuple[int, int, memoryview] | None:
         """The first message of a chunk, of which no more is looked at than that takes."""
         size = _FIRST_LOOK
+        # A chunk may have hundreds of megabytes, of which the frame record is the first kilobytes.
         while size < min(chunk.size, _LAST_LOOK):
             try:
                 return next(self._walk(chunk, self._content(chunk, size)), None)
@@ -360,6 +364,7 @@ def _mapped(path: Path) -> memoryview:
     try:
         with open_regular(path) as stream:
             stream.seek(0, 2)
+            # An empty file cannot be mapped; it is what a recorder leaves that is killed as it opens one.
             if stream.tell() == 0:
                 return memoryview(b"")
             return memoryview(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))

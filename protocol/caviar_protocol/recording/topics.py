@@ -300,8 +300,8 @@ def _wideband(field: str, carrier_field: str) -> Callable[[Any, Channel], Rows]:
     return rows
 
 
+# Of a carrier without subcarriers or taps.
 _NO_BINS = np.zeros((0, 0, 0, 0), np.complex64)
-"""Of a carrier without subcarriers or taps."""
 
 
 class ChannelArrays(UserArrays[Channel]):

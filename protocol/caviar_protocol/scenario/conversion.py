@@ -15,8 +15,8 @@ from caviar_protocol.errors import ScenarioError, suggestion
 T = TypeVar("T", bound=msgspec.Struct)
 
 _NAME = r'([A-Za-z0-9_-]+|"[^"]*")'
+# A dotted key.
 _KEY = re.compile(rf"{_NAME}(\.{_NAME}|\[\d+\])*")
-"""A dotted key."""
 
 _ARRAYS = (inspect.VarTupleType, inspect.ListType, inspect.TupleType)
 
@@ -51,6 +51,7 @@ class Place(msgspec.Struct, frozen=True):
         """The place of an entry of the table or array at this place."""
         if isinstance(name, int):
             return Place(f"{self.key}[{name}]", self.source)
+        # Quoted as TOML needs it, since a user copies the key from the error into the file.
         bare = name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else f'"{name}"'
         return Place(f"{self.key}.{bare}" if self.key else bare, self.source)
 
@@ -110,6 +111,7 @@ def convert_table(cls: type[T], table: object, place: Place) -> T:
     Raises:
         ScenarioError: The first thing wrong with it.
     """
+    # Checked before msgspec, whose errors have neither unit nor suggestion.
     _check(table, inspect.type_info(cls), place)
     try:
         return msgspec.convert(table, cls)

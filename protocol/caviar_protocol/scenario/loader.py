@@ -90,6 +90,7 @@ def parse_scenario(text: str, file: str = "", folder: Path | None = None) -> Sce
         table = parse_toml(text)
     except tomllib.TOMLDecodeError as error:
         raise _syntax_error(error, text, file) from error
+    # tomllib counts CR LF as one line end, and so must the scanner.
     lines = {dotted(path): line for path, line in key_lines(text.replace("\r\n", "\n")).items()}
     source = Source(file=file, lines=lines)
     if isinstance(table.get("run"), dict):
@@ -97,6 +98,7 @@ def parse_scenario(text: str, file: str = "", folder: Path | None = None) -> Sce
     scenario = convert_table(Scenario, table, Place("", source))
     scenario = msgspec.structs.replace(scenario, source=_with_device_names(source, scenario))
     check_scenario(scenario)
+    # After the rules: what follows from keys is never what an error is about.
     scenario = _with_numerologies(scenario)
     return _with_files(scenario, folder or Path())
 
@@ -187,6 +189,7 @@ def _check_patterns(devices: Sequence[DeviceSpec], source: Source) -> None:
     first: dict[str, str] = {}
     for index, device in enumerate(devices):
         file = device.array.pattern_file if device.array is not None else ""
+        # A pattern travels as ``patterns/FILE``: its folder is no part of the asset's name.
         if file and first.setdefault(pattern_asset(file), file) != file:
             place = Place("devices", source).at(index).at("array").at("pattern_file")
             raise place.error(
@@ -254,6 +257,7 @@ def with_instants(table: Mapping[str, Any], place: Place, folder: Path = Path())
     if not isinstance(values, list) or not all(type(value) in (int, float) for value in values):
         return {**table, "frames": 1}  # so that its own type is what is found wrong
     here = place.at(KEY)
+    # An empty list would be a run without a frame, which nothing downstream expects.
     if not values:
         raise here.error("is empty, write the instant of each frame: [0.0, 0.1, 0.35]")
     for index, value in enumerate(values):

@@ -186,6 +186,7 @@ def resolved(scenario: Scenario, settings: Mapping[str, msgspec.Struct] | None =
 
 def patterns_overlap(a: str, b: str) -> bool:
     """Whether some name matches both patterns, in which ``*`` is any text and ``?`` any character."""
+    # Pairs of places in both patterns, each looked at once: no backtracking, whatever the patterns are.
     reachable = {(0, 0)}
     todo = [(0, 0)]
     while todo:
@@ -277,6 +278,7 @@ def _check_timeouts(scenario: Scenario, place: Place) -> None:
 def _check_limits(scenario: Scenario, place: Place) -> None:
     """What services need to take part at all is not too much."""
     limits, heartbeat_s = scenario.limits, scenario.timeouts.heartbeat_s
+    # Each service has a connection for messages and one for heartbeats.
     needed = 2 * len(scenario.services)
     for key, value in (
         ("connections", limits.connections),
@@ -339,6 +341,7 @@ def _check_device(device: DeviceSpec, place: Place) -> None:
     for kind, keys in _KIND_KEYS.items():
         for key in keys:
             here = place.at(key)
+            # A key that has its default value is a mistake too where the file has it.
             is_given = here.key in here.source.lines or getattr(device, key) != getattr(blank, key)
             if kind != device.kind and is_given:
                 others = ", ".join(_KIND_KEYS[device.kind])
@@ -370,6 +373,7 @@ def _check_antennas(scenario: Scenario, place: Place) -> None:
 
 def _check_users(scenario: Scenario, place: Place) -> None:
     """Users that an agent owns are receivers of the scenario; remote worlds may bring others."""
+    # A remote world may bring devices that the scenario does not list.
     if any(service.role == "world" and service.remote for service in scenario.services.values()):
         return
     there = [
@@ -409,6 +413,7 @@ def with_numerology(carrier: Carrier, sampling_period_ns: int | None, place: Pla
     """
     count, spacing, bandwidth = carrier.subcarriers, carrier.subcarrier_spacing_hz, carrier.bandwidth_hz
     if spacing and not count:
+        # 100e6 / 120e3 and the like must not lose a subcarrier to rounding.
         count = math.floor(bandwidth / spacing * (1 + 1e-12))
         if not count:
             raise place.at("subcarrier_spacing_hz").error(

@@ -31,6 +31,7 @@ REMOTE_REJOIN_S = 30.0
 """[s] that a remote service gets to come back, where ``rejoin_s`` is not given."""
 
 
+# Each table repeats the options: msgspec does not inherit ``kw_only``.
 class _Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Base of all tables of a scenario: unknown keys are refused."""
 
@@ -202,8 +203,8 @@ class Scenario(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
 PATTERNS = "patterns/"
 """What the names of assets begin with that are patterns of antenna elements."""
 
+# Mount point along z, in heights of the object's bounding box from its centre.
 _HEIGHT = {"centre": 0.0, "roof": 0.5, "floor": -0.5}
-"""Mount point along z, in heights of the object's bounding box from its centre."""
 
 
 def carries(spec: DeviceSpec, name: str) -> bool:
@@ -255,6 +256,7 @@ def _device(spec: DeviceSpec, name: str, parent: str, height: float) -> Device:
     )
     match spec.kind:
         case "antenna":
+            # The loader refuses it with file and line; a world that is given devices by a test gets here.
             if not spec.role:
                 raise ScenarioError(
                     f'antenna {spec.name!r} lacks its role; write role = "tx", "rx" or "both"', key="devices"

@@ -23,8 +23,8 @@ _STRING_OR_COMMENT = re.compile(
 )
 _BRACKET = re.compile(r"[][{}]")
 _PART = r'(?:[\w-]++|"")'
+# A number of so many digits takes quadratic time to be read, and to be printed.
 _LONG_WORD = re.compile(r"\w{1000}")
-"""A number of so many digits takes quadratic time to be read, and to be printed."""
 _LONG_KEY = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*\.[ \t]*{_PART}){{{MAX_DEPTH}}}")
 
 
@@ -40,6 +40,7 @@ def parse_toml(text: str) -> dict[str, Any]:
     # Strings keep their lines, so that places stay right.
     bare = _STRING_OR_COMMENT.sub(lambda found: '""' + "\n" * found[0].count("\n"), text)
     depth = 0
+    # Before tomllib, whose recursion a few kilobytes of ``[`` exhaust.
     for bracket in _BRACKET.finditer(bare):
         depth += 1 if bracket[0] in "[{" else -1
         if depth > MAX_DEPTH:
@@ -126,12 +127,14 @@ class _Scanner:
         return match.group()
 
     def current_line(self) -> int:
+        # Counted from where the last count ended: from the beginning each time would be quadratic.
         self.line += self.text.count("\n", self.counted, self.at)
         self.counted = self.at
         return self.line
 
     def note(self, path: KeyPath) -> None:
         """Record the line of a path, and of each of its parents not seen before."""
+        # A table that no header names (``[a.b]`` names ``a``) has the line of its first child.
         line = self.current_line()
         for depth in range(1, len(path) + 1):
             self.lines.setdefault(path[:depth], line)

@@ -84,6 +84,7 @@ def _uniform_beam(array: AntennaArray, direction: Sequence[float]) -> int:
 def _nearest(size: int, turns: float) -> int:
     """The k of 0 … size − 1 with the least ``|turns − k/size|`` modulo 1."""
     exact = size * turns
+    # Half a beam rounds down, so that of two equal beams the lower index is taken; `round` would go to even.
     below = math.ceil(exact - 0.5)
     is_tie = exact - below == 0.5
     beam = below % size
@@ -122,6 +123,7 @@ def subarray_of(array: AntennaArray, beam: int) -> tuple[Subarray, int]:
 def _factor(size: int, v: Float64Array) -> Float64Array:
     v = v - np.round(v)
     sine = np.sin(np.pi * v)
+    # At its maxima the array factor is 0/0.
     peak = np.abs(sine) < 1e-9
     factor: Float64Array = np.where(
         peak, 1.0, np.abs(np.sin(np.pi * size * v)) / (size * np.abs(np.where(peak, 1.0, sine)))
@@ -153,6 +155,7 @@ class Subarray:
         return unrotated(self.orientation, (x, y, z))
 
 
+# Arrays are few and frozen; link, agent and channel ask for their parts in every frame.
 @lru_cache(maxsize=256)
 def subarrays(array: AntennaArray) -> tuple[Subarray, ...]:
     """The subarrays of an array: panels in their order, within each the polarizations."""

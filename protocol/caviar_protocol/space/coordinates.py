@@ -54,6 +54,7 @@ def quaternion_from_euler(yaw: float, pitch: float = 0.0, roll: float = 0.0) -> 
 def euler_from_quaternion(q: Sequence[float]) -> Vector:
     """Yaw, pitch and roll [rad] of a unit quaternion; the inverse of `quaternion_from_euler`."""
     w, x, y, z = q
+    # Rounding takes the sine of a vertical nose out of asin's range.
     sin_pitch = max(-1.0, min(1.0, 2 * (w * y - z * x)))
     return (
         math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),

@@ -40,6 +40,7 @@ def merge_scenes(scenes: Mapping[str, Scene]) -> Scene:
             owner[name] = source
     parts = list(scenes.values())
     names = [name for scene in parts for name in scene.names]
+    # By name as one world would have them: nothing downstream knows how many worlds there are.
     order = sorted(range(len(names)), key=names.__getitem__)
     classes = [item for scene in parts for item in scene.classes]
     assets = [item for scene in parts for item in scene.assets]
@@ -48,6 +49,7 @@ def merge_scenes(scenes: Mapping[str, Scene]) -> Scene:
         stacked: Float64Array = np.concatenate([getattr(scene, field) for scene in parts])
         return stacked[order]
 
+    # A world that does not turn objects, next to one that does, counts as not turning.
     turning = None
     if any(scene.angular_velocity is not None for scene in parts):
         known = [(scene.angular_velocity, np.zeros_like(scene.velocity)) for scene in parts]
@@ -114,8 +116,8 @@ def device_velocity(scene: Scene, device: Device) -> Float64Array:
     return velocity + np.cross(scene.angular_velocity[index], arm)
 
 
+# Of the last scene, by role: the devices of one frame mostly are those of the next.
 _antennas: dict[str, tuple[tuple[Device, ...], list[AntennaDevice]]] = {}
-"""Of the last scene, by role: the devices of one frame mostly are those of the next."""
 
 
 def antennas(scene: Scene, role: str) -> Sequence[AntennaDevice]:

@@ -67,6 +67,7 @@ class LidarScan(Payload, frozen=True, kw_only=True, omit_defaults=True):
         """Hits in world axes [m], Shape ``[N, 3]``: ``points_world``, or else of ``points`` and the pose."""
         if self.points_world is not None:
             return self.points_world
+        # In double precision up to the sum, so that a point is rounded once.
         turned = self.points.astype(np.float64) @ rotation_matrix(self.orientation).T
         world: Float32Array = (turned + np.array(self.position)).astype(np.float32)
         return world

@@ -19,11 +19,11 @@ from caviar_protocol.host import keep_large_buffers
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.multipath import changes
 from caviar_protocol.scenario.schema import PATTERNS
+from caviar_protocol.scene_validation import too_fast
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import AntennaDevice, Channel, ChannelOptions, Scene
 from caviar_protocol.topics.scene import Device, Panel
-from caviar_protocol.validation import too_fast
 from caviar_services.channel.arrays.channel_matrices import Matrices
 from caviar_services.channel.assemble import Product, assemble
 from caviar_services.channel.outage import outage_counts

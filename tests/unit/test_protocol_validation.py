@@ -18,6 +18,7 @@ from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.errors import ProductError
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.scene_validation import SceneRules, numbers_are_right, wrong_number
 from caviar_protocol.topics import (
     Action,
     AntennaArray,
@@ -30,6 +31,7 @@ from caviar_protocol.topics import (
     VelocityCommand,
     WaypointCommand,
 )
+<<<<<<< HEAD:tests/unit/test_protocol_content.py
 from caviar_protocol.topics.scene import Device, Panel
 from caviar_protocol.validation import (
     FIRST_LOOKS,
@@ -40,6 +42,10 @@ from caviar_protocol.validation import (
     wrong_number,
     wrong_values,
 )
+=======
+from caviar_protocol.topics.scene import Device
+from caviar_protocol.validation import FIRST_LOOKS, ContentCheck, check_digest, wrong_values
+>>>>>>> 63a2448 (Protocol: validation of scenes apart from that of products; comments say why):tests/unit/test_protocol_validation.py
 
 COUNT = 20
 NAMES = tuple(f"car.{index:02d}" for index in range(COUNT))
