@@ -31,21 +31,8 @@ from caviar_protocol.topics import (
     VelocityCommand,
     WaypointCommand,
 )
-<<<<<<< HEAD:tests/unit/test_protocol_content.py
 from caviar_protocol.topics.scene import Device, Panel
-from caviar_protocol.validation import (
-    FIRST_LOOKS,
-    ContentCheck,
-    SceneRules,
-    check_digest,
-    numbers_are_right,
-    wrong_number,
-    wrong_values,
-)
-=======
-from caviar_protocol.topics.scene import Device
 from caviar_protocol.validation import FIRST_LOOKS, ContentCheck, check_digest, wrong_values
->>>>>>> 63a2448 (Protocol: validation of scenes apart from that of products; comments say why):tests/unit/test_protocol_validation.py
 
 COUNT = 20
 NAMES = tuple(f"car.{index:02d}" for index in range(COUNT))

@@ -261,8 +261,8 @@ class TopicArrays(Generic[P, K]):
             ValueError: A block would have no frame.
 
         Example:
-            >>> from caviar_protocol.recording import Recording, newest_run
-            >>> channel = Recording(newest_run(name="smoke-*"))["channel"]
+            >>> from caviar_protocol.recording import Recording
+            >>> channel = Recording("runs/smoke-20261122-101500")["channel"]
             >>> [block.los.shape for block in channel.blocks(40)]
             [(40, 2), (40, 2), (20, 2)]
         """

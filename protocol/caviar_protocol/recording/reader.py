@@ -174,9 +174,9 @@ class RecordedFrame:
             RecordingError: There is no such topic, or ``cls`` is not its payload class.
 
         Example:
-            >>> from caviar_protocol.recording import Recording, newest_run
+            >>> from caviar_protocol.recording import Recording
             >>> from caviar_protocol.topics import Link
-            >>> frame = Recording(newest_run(name="smoke-*")).frame(episode=0, frame=7)
+            >>> frame = Recording("runs/smoke-20261122-101500").frame(episode=0, frame=7)
             >>> frame.of("link", Link)["link"].rx
             ('car/rx', 'uav/rx-uav')
         """

@@ -104,8 +104,8 @@ class UserArrays(TopicArrays[P, User], Generic[P]):
             RecordingError: A frame, an episode or a name is not there; the text says what is.
 
         Example:
-            >>> from caviar_protocol.recording import Recording, newest_run
-            >>> channel = Recording(newest_run(name="smoke-*"))["channel"]
+            >>> from caviar_protocol.recording import Recording
+            >>> channel = Recording("runs/smoke-20261122-101500")["channel"]
             >>> channel.select(frames=range(10), rx="uav/rx-uav").h.shape
             (10, 1, 1, 32)
         """

@@ -159,8 +159,8 @@ def pairs_of(scene: Scene) -> list[Pair]:
     """All pairs of a transmitting and a receiving device, sorted by TX, then RX.
 
     Example:
-        >>> from caviar_protocol.recording import Recording, newest_run
-        >>> scene = Recording(newest_run(name="smoke-*"))["scene"][0]
+        >>> from caviar_protocol.recording import Recording
+        >>> scene = Recording("runs/smoke-20261122-101500")["scene"][0]
         >>> [(pair.tx.name, pair.rx.name) for pair in pairs_of(scene)]
         [('bs', 'car/rx'), ('bs', 'uav/rx-uav')]
     """
