@@ -77,8 +77,6 @@ class JournalReader:
         """Of the file [B]."""
         self.end, self.crc = 0, MAGIC_CRC
         """Behind the last whole entry [B], and its CRC."""
-        self.is_blank = not any(self._data[: len(MAGIC)])
-        """Whether the file was made and nothing of it reached the disk."""
         if self._data[: len(MAGIC)] == MAGIC:
             self.end = len(MAGIC)
         elif self.size and (self._data[0] & 0xF0 == 0x80 or self._data[0] == 0xDE):

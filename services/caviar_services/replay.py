@@ -138,11 +138,6 @@ def use_of(role: str, topics: Iterable[str]) -> str:
     return f"{__name__}:{'_'.join((role, *sorted(topics)))}"
 
 
-def is_replayed(use: str) -> bool:
-    """Whether ``use`` names a class of this module."""
-    return use.startswith(f"{__name__}:")
-
-
 @cache
 def _replayer(name: str) -> type[Replayer]:
     role, *topics = name.split("_")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Awaitable, Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Annotated, Any
 
 from fastapi import Depends, FastAPI, HTTPException, Query, Request, WebSocket
@@ -92,91 +94,19 @@ def _escaped(text: str) -> str:
     return text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
 
 
-_WAIT: dict[str, Any] = {
-    "service": "channel",
-    "role": "channel",
-    "frame": 41,
-    "phase": "tracing",
-    "progress": 3107,
-    "heartbeat_age_s": 0.121,
-    "elapsed_s": 0.734,
-    "limit_s": 0.5,
-    "late": True,
-    "missing": "link waits for channel of frame 41",
-    "text": "channel 'channel' is late in frame 41: 734 ms since its grant, budget 500 ms; last heartbeat "
-    "121 ms ago: phase 'tracing', progress 3107; link waits for channel of frame 41",
+EXAMPLES: dict[str, Any] = json.loads(Path(__file__).with_name("examples.json").read_text())
+"""An answer to each request, which the OpenAPI description shows."""
+QUESTIONS = {
+    "status": "The run, its services, and what each of them does now.",
+    "why": "Which services the run waits for now, and why; the last blame.",
+    "latencies": "How each service keeps its budget; quantiles of its newest 512 answers.",
 }
-_BLAME: dict[str, Any] = {
-    "kind": "miss",
-    "service": "channel",
-    "text": "channel 'channel' overran its budget in frame 41: 500 ms since its grant, budget 500 ms; "
-    "last heartbeat 86.4 ms ago: phase 'tracing', progress 3101; the frame waits",
-    "episode": 0,
-    "frame": 41,
-    "at": 1767225600.25,
+"""Requests of the control channel that are read under their own names."""
+ORDERS = {
+    "pause": "Let no new frame begin; those that have begun are finished.",
+    "resume": "Let frames begin again.",
 }
-_FIGURES: dict[str, Any] = {
-    "p50_ms": 212.4,
-    "p99_ms": 480.2,
-    "total_ms": 9012.7,
-    "grants_answered": 41,
-    "misses": 1,
-    "budget_ms": 500.0,
-}
-
-WHY: dict[str, Any] = {
-    "run": "street-canyon-20260101-120000",
-    "state": "running",
-    "paused": False,
-    "episode": 0,
-    "frame": 42,
-    "late": True,
-    "waits": [_WAIT],
-    "last_blame": _BLAME,
-    "error": "",
-}
-LATENCIES: dict[str, Any] = {"channel": _FIGURES}
-ORDERED: dict[str, Any] = {"state": "running", "paused": True, "frame": 42}
-STATUS: dict[str, Any] = {
-    "run": "street-canyon-20260101-120000",
-    "epoch": 1,
-    "state": "running",
-    "since_s": 12.81,
-    "paused": False,
-    "steps": 0,
-    "episode": 0,
-    "episodes": 1,
-    "frame": 42,
-    "frames": 120,
-    "pace": "free",
-    "services": [
-        {
-            "name": "channel",
-            "role": "channel",
-            "use": "sionna-rt",
-            "policy": "wait",
-            "state": "active",
-            "since_s": 12.81,
-            "attempt": 1,
-            "phase": "tracing",
-            "progress": 3107,
-            "heartbeat_age_s": 0.121,
-            "grants": [{"frame": 41, "state": "granted", "elapsed_s": 0.734, "budget_s": 0.5}],
-            **_FIGURES,
-        }
-    ],
-    "waits": [_WAIT],
-    "error": "",
-    "culprit": "",
-    "frames_finished": 40,
-    "misses": 1,
-    "frames_per_second": 3.2,
-    "endpoint": "tcp://127.0.0.1:5570",
-    "http": "http://127.0.0.1:8080",
-    "last_blame": _BLAME,
-}
-
-
+"""Requests that change the run, and need no parameters."""
 ABOUT = """Look at a running CAVIAR broker, and have it pause, step or stop.
 
 Where there are tokens, `Authorization: Bearer TOKEN` is asked for: a *viewer* may read, an *operator* may
@@ -224,20 +154,16 @@ def make_app(ask: Ask, tokens: Tokens, gateway: Gateway) -> FastAPI:
 
 
 def _questions(app: FastAPI, ask: Ask, gateway: Gateway, viewer: list[Any]) -> None:
-    @app.get("/status", dependencies=viewer, responses=_example(STATUS))
-    async def status() -> Any:
-        """The run, its services, and what each of them does now."""
-        return (await ask(do="status"))["status"]
+    def answers(name: str) -> Callable[[], Awaitable[Any]]:
+        async def answer() -> Any:
+            return (await ask(do=name))[name]
 
-    @app.get("/why", dependencies=viewer, responses=_example(WHY))
-    async def why() -> Any:
-        """Whom the run waits for now, and why; the last blame."""
-        return (await ask(do="why"))["why"]
+        return answer
 
-    @app.get("/latencies", dependencies=viewer, responses=_example(LATENCIES))
-    async def latencies() -> Any:
-        """How each service keeps its budget; quantiles of its newest 512 answers."""
-        return (await ask(do="latencies"))["latencies"]
+    for name, about in QUESTIONS.items():
+        app.get(f"/{name}", name=name, description=about, dependencies=viewer, responses=_example(name))(
+            answers(name)
+        )
 
     @app.get("/metrics", dependencies=viewer, response_class=PlainTextResponse)
     async def prometheus() -> Any:
@@ -247,17 +173,16 @@ def _questions(app: FastAPI, ask: Ask, gateway: Gateway, viewer: list[Any]) -> N
 
 
 def _orders(app: FastAPI, ask: Ask, operator: list[Any]) -> None:
-    done = _example(ORDERED) | {409: {"description": "not possible in this state of the run"}}
+    done = _example("ordered") | {409: {"description": "not possible in this state of the run"}}
 
-    @app.post("/pause", dependencies=operator, responses=done)
-    async def pause() -> Any:
-        """Let no new frame begin; those that have begun are finished."""
-        return _state(await ask(do="pause"))
+    def obeys(name: str) -> Callable[[], Awaitable[Any]]:
+        async def obey() -> Any:
+            return _state(await ask(do=name))
 
-    @app.post("/resume", dependencies=operator, responses=done)
-    async def resume() -> Any:
-        """Let frames begin again."""
-        return _state(await ask(do="resume"))
+        return obey
+
+    for name, about in ORDERS.items():
+        app.post(f"/{name}", name=name, description=about, dependencies=operator, responses=done)(obeys(name))
 
     @app.post("/step", dependencies=operator, responses=done)
     async def step(
@@ -275,13 +200,13 @@ def _orders(app: FastAPI, ask: Ask, operator: list[Any]) -> None:
 
 
 def _probes(app: FastAPI, ask: Ask) -> None:
-    @app.get("/healthz", responses=_example({"ok": True}) | _unready("the broker does not answer"))
+    @app.get("/healthz", responses=_example("healthz") | _unready("the broker does not answer"))
     async def healthz() -> Any:
         """Whether the broker answers. Needs no token."""
         await ask(do="why")
         return {"ok": True}
 
-    @app.get("/readyz", responses=_example({"ready": True}) | _unready("services are missing or prepare"))
+    @app.get("/readyz", responses=_example("readyz") | _unready("services are missing or prepare"))
     async def readyz() -> Any:
         """Whether all services are there and ready. Needs no token."""
         state = (await ask(do="why"))["why"]["state"]
@@ -316,8 +241,8 @@ async def _no_broker(_: Request, error: Exception) -> JSONResponse:
     return JSONResponse({"detail": str(error)}, 503)
 
 
-def _example(value: Any) -> dict[int | str, dict[str, Any]]:
-    return {200: {"content": {"application/json": {"example": value}}}}
+def _example(name: str) -> dict[int | str, dict[str, Any]]:
+    return {200: {"content": {"application/json": {"example": EXAMPLES[name]}}}}
 
 
 def _unready(text: str) -> dict[int | str, dict[str, Any]]:

@@ -30,7 +30,6 @@ HELLO_BYTES = 1 << 16
 """[B] of a WebSocket until its HELLO is accepted; one with 256 inputs and outputs has less than half."""
 LOOK_S = 0.5
 """[s] between looks at whose time is over."""
-POLICY = 1008
 TOO_LARGE = 1009
 
 
