@@ -9,7 +9,7 @@ frame, and the error names the service that made it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from typing import Any, cast
 
@@ -20,6 +20,7 @@ from caviar_protocol.arrays import Payload, array_fields, require_finite
 from caviar_protocol.digest import payload_digest
 from caviar_protocol.errors import PayloadError, ProductError
 from caviar_protocol.messages import GrantInput, Status
+from caviar_protocol.parts import PartCheck
 from caviar_protocol.scene_validation import (
     UNIT_TOLERANCE,
     SceneRules,
@@ -27,12 +28,21 @@ from caviar_protocol.scene_validation import (
     wrong_description,
     wrong_number,
 )
-from caviar_protocol.topics import Action, Camera, Channel, Depth, Lidar, Link, Segmentation
+from caviar_protocol.topics import Action, Camera, Carrier, Channel, Depth, Lidar, Link, Segmentation
 from caviar_protocol.topics.scene import Scene
 
 _MADE_OF_SCENES = frozenset({"channel", "link", "lidar", "camera", "depth", "segmentation"})
 FIRST_LOOKS = 16
 """Products of each source that every consumer looks at, and of which it compares the digest."""
+
+
+class ContentRules(SceneRules, frozen=True, kw_only=True):
+    """What the run says about products, beside scenes; what is not known is not checked."""
+
+    carriers: tuple[Carrier, ...] = ()
+    """Of the scenario."""
+    parts: Mapping[str, frozenset[str]] = {}
+    """By topic: the parts of products that the consumer asks for."""
 
 
 class ContentCheck:
@@ -42,11 +52,13 @@ class ContentCheck:
     numbers in every frame.
 
     Args:
-        rules: What the run says about scenes, once that is known.
+        rules: What the run says about products, once that is known (`adopt`).
     """
 
     def __init__(self, rules: SceneRules | None = None) -> None:
-        self.rules = rules or SceneRules()
+        self.rules = SceneRules()
+        self._parts = PartCheck({})
+        self.adopt(rules or self.rules)
         # Frames of whose scenes a product was made that is an input beside them.
         self._derived: frozenset[int] = frozenset()
         # Products that were looked at, by (topic, source).
@@ -55,6 +67,16 @@ class ContentCheck:
         self._passed: dict[tuple[str, str], Payload] = {}
         # By world, the last header, or scene, of which names and devices are right.
         self._described: dict[str, bytes | Scene] = {}
+
+    def adopt(self, rules: SceneRules) -> None:
+        """Go by these rules; what consumers before asked for stays in demand."""
+        self.rules = rules
+        if isinstance(rules, ContentRules):
+            demand = dict(self._parts.demand)
+            for topic, parts in rules.parts.items():
+                demand[topic] = demand.get(topic, frozenset()) | parts
+            specs = [spec for published in rules.devices.values() for spec in published]
+            self._parts = PartCheck(demand, rules.carriers, specs)
 
     def begin(self, inputs: Iterable[GrantInput]) -> None:
         """Take note of the inputs of the next grant, before they are checked.
@@ -100,7 +122,7 @@ class ContentCheck:
         if isinstance(payload, Scene):
             found = self._wrong_scene(payload, entry.source, header)
         else:
-            found = wrong_values(payload)
+            found = wrong_values(payload) or self._parts(entry.topic, payload)
         if found:
             raise ProductError(entry.topic, entry.source, entry.frame, found)
         self._looks[key] = self._looks.get(key, 0) + 1
@@ -161,7 +183,11 @@ def _wrong_channel(channel: Channel) -> str:
     if not found and channel.tau.size and not channel.tau.min() >= 0:
         index = int(np.argmin(channel.tau))
         found = f"tau[{index}] is {channel.tau[index]:g} s: a delay is at least 0"
-    return found or next((f"h[{i}]: {f}" for i, m in enumerate(channel.h) if (f := _not_finite(m))), "")
+    parts = {"h": channel.h, "hf": channel.hf, "taps": channel.taps}
+    return found or next(
+        (f"{n}[{i}]: {f}" for n, part in parts.items() for i, m in enumerate(part) if (f := _not_finite(m))),
+        "",
+    )
 
 
 def _wrong_link(link: Link) -> str:
@@ -220,9 +246,12 @@ def _not_finite(payload: Payload) -> str:
     return ""
 
 
+_FLOATS = frozenset({"<f4", "<f8", "<c8", "<c16"})
+
+
 @cache
 def _float_arrays(cls: type[Payload]) -> tuple[str, ...]:
-    return tuple(name for name, field in array_fields(cls).items() if field.dtype in ("<f4", "<f8", "<c16"))
+    return tuple(name for name, field in array_fields(cls).items() if field.dtype in _FLOATS)
 
 
 _JUDGES = cast(

@@ -15,9 +15,8 @@ from caviar_protocol.arrays import Payload
 from caviar_protocol.digest import geometry_digest, payload_digest
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.scenario import DeviceSpec
-from caviar_protocol.scene_validation import SceneRules
 from caviar_protocol.topics import PAYLOADS, Carrier
-from caviar_protocol.validation import ContentCheck
+from caviar_protocol.validation import ContentCheck, ContentRules
 from caviar_services.encoded import Encoded, decoded, encoded
 from caviar_services.service import (
     Frame,
@@ -109,17 +108,20 @@ def frame_of(service: Service[Any], reset: m.Reset, grant: m.Grant, inputs: tupl
     )
 
 
-def scene_rules_of(run: RunInfo, order: m.Prepare) -> SceneRules:
-    """What WELCOME and PREPARE say about the scenes that a service is going to get."""
+def content_rules_of(service: Service[Any], order: m.Prepare) -> ContentRules:
+    """What WELCOME and PREPARE say about the products that a service is going to get."""
+    run = service.run
     worlds = order.producers.get("scene", ())
     devices: dict[str, list[DeviceSpec]] = {world: [] for world in worlds}
     for device in run.devices:
         world = device.world or (worlds[0] if len(worlds) == 1 else "")
         devices.setdefault(world, []).append(device)
-    return SceneRules(
+    return ContentRules(
         prefixes=order.prefixes,
         devices={world: tuple(specs) for world, specs in devices.items()},
         assets=frozenset(asset.name for asset in order.assets) if order.prefixes else None,
+        carriers=run.carriers,
+        parts=service.parts,
     )
 
 

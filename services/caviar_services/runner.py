@@ -35,6 +35,7 @@ from caviar_services.connection import (
     describe,
 )
 from caviar_services.exchange import (
+    content_rules_of,
     done_of,
     frame_of,
     hello_of,
@@ -43,7 +44,6 @@ from caviar_services.exchange import (
     preparation_of,
     ready_of,
     run_info,
-    scene_rules_of,
 )
 from caviar_services.registry import load
 from caviar_services.restarts import restart_status
@@ -246,7 +246,7 @@ class Runner:
 
     def _prepare(self, message: m.Prepare, _: Sequence[zmq.Frame]) -> None:
         service = self._running
-        self._check.rules = scene_rules_of(service.run, message)
+        self._check.adopt(content_rules_of(service, message))
         with self._reporting("prepare"):
             prepared: Prepared | None = None
             assets: list[m.Asset] = []

@@ -285,6 +285,14 @@ class Service(ABC, Generic[S]):
         it is to do in this run needs files."""
         return self.uses_scenery
 
+    @property
+    def parts(self) -> Mapping[str, frozenset[str]]:
+        """Parts of the products that it asks for, by topic; a product without them is refused."""
+        found: dict[str, frozenset[str]] = {}
+        for entry in self.inputs:
+            found[entry.topic] = found.get(entry.topic, frozenset()) | {*entry.parts}
+        return found
+
     def scenery(self) -> Mapping[str, Path | bytes]:
         """Worlds: the files of scenery this world brings, by asset name (clause 4)."""
         return {}

@@ -79,6 +79,24 @@ def test_a_false_digest_is_refused_before_it_is_recorded(tmp_path: Path) -> None
     assert "world 'world' made a wrong product: scene of 'world', frame 0: its digest is" in finished.output
 
 
+@pytest.mark.parametrize("part", ["h", "taps"])
+def test_a_channel_without_a_part_in_demand_is_refused(tmp_path: Path, part: str) -> None:
+    text = (SCENARIOS / "smoke.toml").read_text()
+    for old, new in [
+        ('use = "free-space"', f'use = "wrong_worlds:Partless"\nsettings = {{ lacks = "{part}" }}'),
+        ('record = ["scene", "channel", "action", "link"]', 'record = ["channel.taps"]'),
+        ("[[carriers]]", "[[carriers]]\ntaps = 4"),
+        ("frames = 100", "frames = 3"),
+    ]:
+        assert old in text
+        text = text.replace(old, new, 1)
+    made = EmbeddedRun(parse_scenario(text), tmp_path)
+    outcome = made.run()
+    assert outcome.error.startswith("channel 'channel' made a wrong product: channel of 'channel', frame 0: ")
+    assert f"part {part!r} is in demand" in outcome.error
+    assert outcome.culprit == "channel"
+
+
 def test_the_recorder_refuses_a_large_product_with_a_false_digest(tmp_path: Path) -> None:
     liar = '[services.liar]\nrole = "sensors"\nuse = "wrong_worlds:Liar"\nbudget_ms = 50\n'
     demand = ('record = ["scene", "channel", "action", "link"]', 'record = ["scene", "lidar"]')

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import msgspec
 import numpy as np
@@ -13,6 +13,7 @@ from caviar_protocol.codec import encode_payload
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.topics import Lidar, LidarScan, Scene
 from caviar_services import exchange
+from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.encoded import Encoded
 from caviar_services.service import Frame, RunInfo, Service, StepResult
 from caviar_services.world.trajectory import TrajectorySettings, TrajectoryWorld
@@ -131,3 +132,20 @@ def _with_nan(scene: Scene) -> Encoded:
     header, body = encode_payload(replace(scene, position=np.full_like(scene.position, 12345.0)))
     number, nan = (np.array(value).tobytes() for value in (12345.0, np.nan))
     return Encoded(topic="scene", header=header, body=body.replace(number, nan, 1))
+
+
+class PartlessSettings(FreeSpaceSettings, frozen=True, kw_only=True):
+    """Settings of the free-space channel, and what it leaves out."""
+
+    lacks: str
+    """Part of the channel."""
+
+
+class Partless(FreeSpaceChannel):
+    """A channel without a part that is in demand."""
+
+    Settings: ClassVar[type[msgspec.Struct]] = PartlessSettings
+
+    def step(self, frame: Frame) -> StepResult:
+        made, lacks = super().step(frame), cast(PartlessSettings, self.settings).lacks
+        return replace(made, products={"channel": replace(made.products["channel"], **{lacks: ()})})

@@ -189,7 +189,9 @@ def frame(number: int, *inputs: FrameInput, episode: int = 0) -> Frame:
     )
 
 
-def recorder(folder: Path, assets: dict[str, Path] | None = None, **settings: object) -> McapRecorder:
+def recorder(
+    folder: Path, assets: dict[str, Path] | None = None, record: tuple[str, ...] = (), **settings: object
+) -> McapRecorder:
     """A prepared recorder that writes to ``folder``."""
     run = RunInfo(
         name="recorder",
@@ -197,7 +199,7 @@ def recorder(folder: Path, assets: dict[str, Path] | None = None, **settings: ob
         seed=7,
         sampling_period_ns=PERIOD_NS,
         frames=10,
-        scenario=SCENARIO,
+        scenario=SCENARIO | ({"run": {"record": record}} if record else {}),
         directory=folder,
     )
     made = McapRecorder(McapSettings(**settings), run)

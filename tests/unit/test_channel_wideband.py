@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 
 from caviar_protocol.codec import decode_payload, encode_payload
-from caviar_protocol.errors import ScenarioError
 from caviar_protocol.multipath import slot_offsets, subcarrier_offsets
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import AntennaArray, Carrier, Channel, ChannelOptions
 from caviar_services.antenna import element_positions
 from caviar_services.channel.assemble import Product, assemble
 from caviar_services.channel.paths import Antenna, PathTable
-from caviar_services.channel.wideband import required_parts, superposed
+from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
+from caviar_services.channel.wideband import empty_parts, superposed
+from caviar_services.service import Preparation, RunInfo
 
 CARRIERS = (
     Carrier(
@@ -109,12 +110,17 @@ def test_parts_are_made_where_asked_for_and_change_nothing_else() -> None:
         assert matrix.h.tobytes() == other.h.tobytes()
 
 
-def test_a_part_that_no_carrier_defines_is_refused_with_what_to_write() -> None:
-    assert required_parts({"h", "hf"}, CARRIERS) == {"hf"}
-    with pytest.raises(ScenarioError, match=r"channel\.hf needs a carrier .* subcarriers = 264"):
-        required_parts({"hf"}, CARRIERS[1:])
-    with pytest.raises(ScenarioError, match=r"channel\.taps needs a carrier .* taps = 64"):
-        required_parts({"taps"}, CARRIERS[1:])
+def test_a_part_that_no_carrier_defines_is_empty_and_a_note_says_what_to_write() -> None:
+    assert empty_parts({"h", "hf", "taps"}, CARRIERS) == ()
+    notes = empty_parts({"h", "hf", "taps"}, CARRIERS[1:])
+    assert [note.partition(";")[0] for note in notes] == [
+        "a part in demand is empty: channel.hf needs a carrier with subcarriers",
+        "a part in demand is empty: channel.taps needs a carrier with taps",
+    ]
+    run = RunInfo(name="channel", carriers=CARRIERS[1:])
+    model = FreeSpaceChannel(FreeSpaceSettings(), run)
+    prepared = model.prepare(Preparation(demand={"channel": BOTH}))
+    assert prepared.notes == empty_parts(BOTH, CARRIERS[1:])
 
 
 @pytest.mark.parametrize(("bins", "paths", "sizes"), [(7, 0, (2, 3)), (5, 130, (8, 64)), (3, 2, (64, 1024))])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from recording_samples import absent, channel, frame, lidar, link, product, record, recorder, scene
 
-from caviar_protocol.errors import RecordingError
+from caviar_protocol.errors import ProductError, RecordingError
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import Recording
 from caviar_protocol.recording.arrays import TopicArrays
@@ -33,6 +33,8 @@ from caviar_protocol.topics import (
     SegmentationImage,
     WaypointCommand,
 )
+from caviar_protocol.validation import ContentCheck, ContentRules
+from caviar_services.service import FrameInput
 
 
 @pytest.fixture
@@ -388,6 +390,23 @@ def test_paths_without_h_say_how_to_record_it(tmp_path: Path) -> None:
         RecordingError, match=r"channel was recorded without channel\.h: write it into `record`"
     ):
         rays.h  # noqa: B018
+
+
+def test_a_recorder_that_asks_for_a_part_refuses_a_channel_without_it(tmp_path: Path) -> None:
+    made = recorder(tmp_path, record=("channel.h",))
+    check = ContentCheck(ContentRules(parts=made.parts))
+    bare = product("channel", "rt", channel(0), 0)
+    with pytest.raises(ProductError, match="channel of 'rt', frame 0: part 'h' is in demand"):
+        made.step(frame(0, FrameInput(bare.provenance, bare.header, bare.body, check=check)))
+    made.close()
+
+
+def test_a_part_that_was_asked_for_and_not_delivered_is_laid_on_its_source(tmp_path: Path) -> None:
+    made = recorder(tmp_path, record=("channel.h",))
+    made.step(frame(0, product("channel", "rt", channel(0), 0)))
+    made.close()
+    with pytest.raises(RecordingError, match=r"has no channel\.h, which `record` .* asks for: 'rt' did not"):
+        Recording(tmp_path)["channel"].h  # noqa: B018
 
 
 def test_an_empty_recording_has_no_product(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from caviar_protocol.scenario.conversion import convert_settings
 from caviar_protocol.validation import ContentCheck
 from caviar_services.answers import Guard
 from caviar_services.exchange import (
+    content_rules_of,
     done_of,
     frame_of,
     hello_of,
@@ -23,7 +24,6 @@ from caviar_services.exchange import (
     preparation_of,
     ready_of,
     run_info,
-    scene_rules_of,
 )
 from caviar_services.runner import TRIM_EVERY
 from caviar_services.service import Frame, FrameInput, Service, StepResult
@@ -103,7 +103,7 @@ class Place:
         with self._guard("prepare"):
             service, assets = self._running, list(message.assets)
             if self._cls.role != "world":  # which are prepared before anything is known about scenes
-                self._check.rules = scene_rules_of(service.run, message)
+                self._check.adopt(content_rules_of(service, message))
             prepared = None
             if is_needed(service, message):
                 offered = [self._store.add(n, c) for n, c in sorted(service.scenery().items())]

@@ -9,7 +9,7 @@ sensors) become rows of an array whose first axis counts frames. `caviar_protoco
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
 from typing import (
@@ -158,6 +158,11 @@ class TopicArrays(Generic[P, K]):
     def place(self) -> str:
         """File or directory, and topic, as an error names them."""
         return f"{self._recording.path}: {self.topic}"
+
+    def was_asked_for(self, part: str) -> bool:
+        """Whether ``record`` of the scenario names a part, as ``channel.h``."""
+        run = self._recording.metadata.scenario.get("run", {})
+        return isinstance(run, Mapping) and part in run.get("record", ())
 
     def __len__(self) -> int:
         """Number of frames F."""

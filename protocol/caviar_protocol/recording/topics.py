@@ -50,6 +50,11 @@ def recorded_part(
     """
     found = [row for row in rows if row is not None]
     if len(found) < len(rows):
+        if view.was_asked_for(part):
+            raise RecordingError(
+                f"{view.place} has no {part}, which `record` below [run] of its scenario asks for: "
+                f"{' and '.join(map(repr, view.sources))} did not deliver it; mend it, and run again"
+            )
         raise RecordingError(
             f"{view.place} was recorded without {part}: write it into `record` below [run] of the scenario, "
             "and run again"

@@ -30,7 +30,7 @@ from caviar_services.channel.outage import outage_counts
 from caviar_services.channel.paths import Antenna, PathTable
 from caviar_services.channel.propagation.atmosphere import Atmosphere, specific_attenuation
 from caviar_services.channel.propagation.patterns import Patterns
-from caviar_services.channel.wideband import required_parts
+from caviar_services.channel.wideband import empty_parts
 from caviar_services.pattern_files import read_pattern
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
 
@@ -165,7 +165,7 @@ class ChannelModel(Service[S]):
     def prepare(self, preparation: Preparation) -> Prepared:
         demand = preparation.demand.get("channel", frozenset())
         self.with_h = "h" in demand
-        self.wideband = required_parts(demand, self.run.carriers)
+        self.wideband = demand & {"hf", "taps"}
         self.patterns = Patterns(
             {
                 name: read_pattern(file)
@@ -175,7 +175,8 @@ class ChannelModel(Service[S]):
         )
         if self.wideband:
             keep_large_buffers()
-        return Prepared(notes=(*self.load(preparation), *self._absorption_notes()))
+        notes = (*self.load(preparation), *self._absorption_notes(), *empty_parts(demand, self.run.carriers))
+        return Prepared(notes=notes)
 
     def step(self, frame: Frame) -> StepResult:
         scene = frame.scene()

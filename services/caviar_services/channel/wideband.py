@@ -17,7 +17,6 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Complex64Array, Complex128Array, Float64Array, Int64Array
-from caviar_protocol.errors import ScenarioError
 from caviar_protocol.multipath import first_tap, subcarrier_weights, tap_weights
 from caviar_protocol.scenario.rules import undefined_part
 from caviar_protocol.topics import Carrier, ChannelResponse, ChannelTaps
@@ -66,13 +65,10 @@ class Bins:
         return found.reshape(self.count, *tau.shape)
 
 
-def required_parts(demand: Collection[str], carriers: Sequence[Carrier]) -> frozenset[str]:
-    """The wideband parts in demand. Raises `ScenarioError` where no carrier says what they consist of."""
-    parts = frozenset({"hf", "taps"} & set(demand))
-    for part in sorted(parts):
-        if problem := undefined_part(part, carriers):
-            raise ScenarioError(problem, key="carriers")
-    return parts
+def empty_parts(demand: Collection[str], carriers: Sequence[Carrier]) -> tuple[str, ...]:
+    """Notes for the user on wideband parts in demand that no carrier has, so that they are empty."""
+    found = [undefined_part(part, carriers) for part in sorted({"hf", "taps"} & set(demand))]
+    return tuple(f"a part in demand is empty: {problem}" for problem in found if problem)
 
 
 def bins_of(

@@ -37,6 +37,16 @@ class Recorder(Service[S], Generic[S]):
     role: ClassVar[Role] = "recorder"
     inputs: ClassVar[tuple[Input, ...]] = (Input(topic="*", required=False),)
 
+    @property
+    def parts(self) -> Mapping[str, frozenset[str]]:
+        """Those that ``run.record`` of the scenario names."""
+        run = self.run.scenario.get("run", {})
+        found: dict[str, frozenset[str]] = {}
+        for entry in run.get("record", ()) if isinstance(run, Mapping) else ():
+            topic, _, part = entry.partition(".")
+            found[topic] = found.get(topic, frozenset()) | ({part} - {""})
+        return found
+
 
 _REMEDIES = {
     errno.ENOSPC: "free space on its file system, then go on with caviar run --resume {folder}, "

@@ -54,7 +54,8 @@ from caviar_services.recorder.segment_writer import SegmentWriter
 from caviar_services.service import Frame, FrameInput, Preparation, Prepared, RunInfo, StepResult
 
 _LOOKED_INTO = frozenset({"scene", "lidar", "camera", "depth", "segmentation"})
-"""Topics that may have no other consumer: a data set needs no agent. All others have one that checks them."""
+"""Topics that may have no other consumer: a data set needs no agent. All others have one that checks them,
+but for parts that are asked for by the recorder alone."""
 
 
 class McapSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -148,7 +149,7 @@ class McapRecorder(Recorder[McapSettings]):
         )
         new = [item for item in inputs if self._stored.is_new(item.provenance)]
         for item in new:
-            _check(item)
+            self._look_at(item)
         try:
             segment.write(entry, new, base_ns)
             self._kept.written(segment)
@@ -177,6 +178,15 @@ class McapRecorder(Recorder[McapSettings]):
             self._persistence.close()
         except OSError as error:
             raise self._failed(segment, error) from error
+
+    def _look_at(self, item: FrameInput) -> None:
+        """Raise `ProductError` where a product is not that of its digest, or one that may have no other
+        consumer cannot be."""
+        if item.provenance.digest:
+            check_digest(item.provenance, item.header, item.body)
+        topic = item.provenance.topic
+        if topic in _LOOKED_INTO or self.parts.get(topic):
+            item.look()
 
     @property
     def _kept(self) -> Persistence:
@@ -245,14 +255,6 @@ def _as_text(metadata: RecordingMetadata) -> dict[str, str]:
 
 def _canonical(item: FrameInput) -> tuple[str, str, int]:
     return item.provenance.topic, item.provenance.source, item.provenance.frame
-
-
-def _check(item: FrameInput) -> None:
-    """Raise `ProductError` where a product is not that of its digest, or a world's or sensor's cannot be."""
-    if item.provenance.digest:
-        check_digest(item.provenance, item.header, item.body)
-    if item.provenance.topic in _LOOKED_INTO:
-        item.look()
 
 
 def _with_digest(item: FrameInput) -> GrantInput:
