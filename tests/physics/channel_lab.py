@@ -189,7 +189,7 @@ def free_space(*frequencies: float) -> ChannelModel[Any]:
 
 def geometric(*frequencies: float, seed: int = 1, **settings: Any) -> ChannelModel[Any]:
     from caviar_services.channel.statistical.geometric import GeometricChannel
-    from caviar_services.channel.statistical.geometric_settings import GeometricSettings
+    from caviar_services.channel.statistical.waves import GeometricSettings
 
     run = RunInfo(name="channel", seed=seed, carriers=carriers(*frequencies))
     model = GeometricChannel(msgspec.convert(settings, GeometricSettings), run)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from caviar_services.channel.stability.run import cases, run
+from caviar_services.channel.stability.case import cases, run
 
 pytestmark = pytest.mark.channel
 

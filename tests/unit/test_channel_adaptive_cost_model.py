@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from caviar_services.channel.adaptive.cost_model import CostModel, Workload
+from caviar_services.channel.adaptive.controller import CostModel, Workload
 
 MS = 1_000_000
 WORK = Workload(pairs=10, objects=0)

@@ -14,7 +14,7 @@ from caviar_protocol.errors import ScenarioError
 from caviar_protocol.topics import Channel
 from caviar_services.channel.propagation.atmosphere import Atmosphere, amplitude_factor, specific_attenuation
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
-from caviar_services.channel.statistical.geometric_settings import GeometricSettings
+from caviar_services.channel.statistical.waves import GeometricSettings
 from caviar_services.service import Preparation, RunInfo
 
 C = 299_792_458.0

@@ -16,7 +16,7 @@ from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Channel, Panel, Scene
 from caviar_services.channel.propagation.occlusion import Boxes
 from caviar_services.channel.statistical.geometric import GeometricChannel
-from caviar_services.channel.statistical.geometric_settings import GeometricSettings
+from caviar_services.channel.statistical.waves import GeometricSettings
 from caviar_services.registry import load
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo, StepResult
 

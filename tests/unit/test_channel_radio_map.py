@@ -8,8 +8,7 @@ import pytest
 from caviar_protocol.errors import RunError
 from caviar_protocol.topics import AntennaArray
 from caviar_services.channel.radio_map.cell_gains import least_memory, part_of
-from caviar_services.channel.radio_map.coverage import Coverage, decibels
-from caviar_services.channel.radio_map.mapping import beams_of
+from caviar_services.channel.radio_map.mapping import Coverage, beams_of, decibels
 from caviar_services.channel.radio_map.measurement_surface import (
     cell_counts,
     draped_surface,

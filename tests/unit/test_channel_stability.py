@@ -13,11 +13,23 @@ from caviar_clients.cli import stability as cli_stability
 from caviar_clients.cli.main import app
 from caviar_protocol.errors import AssetError, PayloadError
 from caviar_services.channel.stability import case as cases_module
+from caviar_services.channel.stability import case as run_module
 from caviar_services.channel.stability import formulas
-from caviar_services.channel.stability import run as run_module
 from caviar_services.channel.stability.bench import Bench
-from caviar_services.channel.stability.case import Case, Outcome, Result, all_of, close, equal, refused, worst
-from caviar_services.channel.stability.run import cases, markdown, run, wrong
+from caviar_services.channel.stability.case import (
+    Case,
+    Outcome,
+    Result,
+    all_of,
+    cases,
+    close,
+    equal,
+    markdown,
+    refused,
+    run,
+    worst,
+    wrong,
+)
 
 QUICK = [case for case in cases() if not case.traced]
 

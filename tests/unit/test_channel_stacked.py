@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from caviar_services.channel.arrays.stacked import summed
+from caviar_services.channel.arrays.channel_matrices import summed
 
 
 @pytest.mark.parametrize("shape", [(0, 3, 2), (1, 1, 1), (700, 8, 64), (100, 64, 64), (9, 300, 300)])

@@ -23,10 +23,11 @@ from caviar_clients.tradeoff.scenes import is_recording, scene_at
 from caviar_protocol.errors import RunError, SetupError, suggestion
 from caviar_protocol.host import DISTRIBUTION, has_extra, install_command
 from caviar_protocol.topics import Scene
-from caviar_services.channel.radio_map.coverage import Coverage, decibels
 from caviar_services.channel.radio_map.mapping import (
     BeamChoice,
+    Coverage,
     RadioMap,
+    decibels,
     radio_map,
     rays_at_once,
     transmitters_of,

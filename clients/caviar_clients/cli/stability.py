@@ -14,8 +14,7 @@ from rich.text import Text
 from caviar_clients.files import write_file
 from caviar_protocol.errors import SetupError
 from caviar_protocol.host import install_command
-from caviar_services.channel.stability.case import Case, Result
-from caviar_services.channel.stability.run import EXTRA, cases, markdown, run, wrong
+from caviar_services.channel.stability.case import EXTRA, Case, Result, cases, markdown, run, wrong
 
 
 def stability(

@@ -27,8 +27,7 @@ from caviar_services.channel.arrays.channel_matrices import (
     carrier_phase,
     subarray_amplitudes,
 )
-from caviar_services.channel.path_ids import stable_ids
-from caviar_services.channel.paths import Antenna, PathTable, antenna_fields
+from caviar_services.channel.paths import Antenna, PathTable, antenna_fields, stable_ids
 from caviar_services.channel.propagation.atmosphere import amplitude_factor
 from caviar_services.channel.propagation.geometry import PathGeometry, path_geometry
 from caviar_services.channel.wideband import Wideband, bins_of, wideband_parts

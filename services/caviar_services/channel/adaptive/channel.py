@@ -23,10 +23,15 @@ from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import AntennaDevice, Scene
-from caviar_services.channel.adaptive.calibration import Calibration, CalibrationState
-from caviar_services.channel.adaptive.controller import Choice, Controller, ControllerState
-from caviar_services.channel.adaptive.cost_model import CostModel, CostState, Workload
-from caviar_services.channel.adaptive.rehearsal import rehearsal_scene
+from caviar_services.channel.adaptive.calibration import Calibration, CalibrationState, rehearsal_scene
+from caviar_services.channel.adaptive.controller import (
+    Choice,
+    Controller,
+    ControllerState,
+    CostModel,
+    CostState,
+    Workload,
+)
 from caviar_services.channel.adaptive.settings import AdaptiveSettings, Rung, built, models, rung_of
 from caviar_services.channel.base import Modelled
 from caviar_services.channel.outage import outage_counts

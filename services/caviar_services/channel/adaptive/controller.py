@@ -1,11 +1,253 @@
-"""Which rung the next frame is computed on: down at once, up with patience."""
+"""The rung that the next frame runs on: down at once, up with patience, from a model of what rungs cost.
+
+Cost of a rung, learned while running from measured durations:
+
+    log duration = log timing + load + bias
+                   + α · log(pairs / pairs₀) + β · log((10 + objects) / (10 + objects₀)) + scatter
+
+``timing`` is what a rung took before the first frame with pairs₀ and objects₀; its ``bias``, α and β are
+learned. ``load`` is common to all rungs, since what slows one of them slows its neighbours: so a rung that
+does not run is still judged by how busy the machine is now. Recursive least squares (a Kalman filter: Kalman,
+"A New Approach to Linear Filtering and Prediction Problems", 1960) tells these apart: load wanders from frame
+to frame, and what changes with the rung is the rung's. What a rung has learned goes back towards its
+prior in time, so that one that was slow once is tried again.
+
+Stated is a quantile: the expected duration times that quantile of the recent ratios measured / expected,
+raised as long as more frames than that take longer (the quantile tracking of Angelopoulos, Candès and
+Tibshirani, "Conformal PID Control for Time Series Prediction", 2023): slow frames come in bursts.
+"""
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import msgspec
+import numpy as np
+
+from caviar_protocol.arrays import Float64Array
+from caviar_services.state import Packed
+
+HALF_LIFE = 32
+"""Frames after which a ratio counts half. One slow frame is then 2 to 4 % of all, and leaves a p95 alone."""
+
+TRACKING = 0.1
+"""How much the stated quantile is raised by a frame that exceeds it, in the logarithm."""
+
+REVERSION = 128
+"""Frames after which half of what is not seen again of a rung is gone."""
+
+OBJECTS = 10.0
+"""Moving objects whose cost is compared with that of a scene without."""
+
+_WINDOW = 6 * HALF_LIFE
+"""Older ratios weigh less than two percent together."""
+
+_ASSUMED = 32
+"""Frames that are taken to have gone by before the first, so that it alone decides little."""
+_ASSUMED_SCATTER = 0.15
+"""Their standard deviation: what a machine with other things to do showed."""
+
+_PRIOR = np.array([0.0, 0.5, 0.1])
+_PRIOR_DEVIATION = np.array([0.2, 0.3, 0.2])
+"""Of bias, α and β: half of a frame grows with its pairs, a little with its objects."""
+
+_LOAD_DEVIATION = 0.3
+"""Of load before the first frame: the timings are of another scene."""
+_LOAD_STEP = 0.06
+"""Standard deviation of what load changes from one frame to the next."""
+_SCATTER = 0.1
+"""Standard deviation of a frame, as far as it decides how fast is learned."""
+_SURPRISE = 0.5
+"""One frame that is so far from what was expected says only that it was slower or faster, not how much; the
+second in a row, that something has changed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Workload:
+    """What the cost of a frame depends on."""
+
+    pairs: int
+    """Transmitters times receivers."""
+    objects: int
+    """Moving objects in the scene."""
+
+
+class CostState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A `CostModel` between two frames."""
+
+    timing: Packed
+    pairs: int
+    objects: int
+    mean: Packed
+    covariance: Packed
+    side: int
+    changed: int
+    rung: int | None
+    raised: float
+    rows: Packed
+    measured: tuple[float, ...]
+    expected: tuple[float, ...]
+
+
+class CostModel:
+    """Durations of the next frame on every rung, as quantiles.
+
+    Parameters
+    ----------
+    timings_ns
+        What each rung took before the first frame [ns], a few times each.
+    work
+        What those timings are of.
+    quantile
+        That predictions state, in (0, 1).
+    """
+
+    def __init__(self, timings_ns: Sequence[Sequence[int]], work: Workload, quantile: float) -> None:
+        self._timing = np.log([max(float(np.median(timings)), 1.0) for timings in timings_ns])
+        self._timed, self._quantile, count = work, quantile, len(timings_ns)
+        self._prior = np.concatenate([[0.0], np.tile(_PRIOR, count)])
+        self._mean = self._prior.copy()
+        deviation = np.tile(_PRIOR_DEVIATION, count)
+        self._covariance = np.diag(np.concatenate([[_LOAD_DEVIATION], deviation]) ** 2)
+        kept = 0.5 ** (1 / REVERSION)
+        self._kept = np.concatenate([[1.0], np.full(3 * count, kept)])
+        # What makes the prior the spread that a rung goes back to.
+        self._drift = np.diag(np.concatenate([[_LOAD_STEP], deviation * math.sqrt(1 - kept**2)]) ** 2)
+        self._side = 0
+        """Of the last frame: 1 slower than expected by far, −1 faster by far."""
+        self._changed = 0
+        """What has changed if the next one is so, too: the load, or the bias of the rung that came."""
+        self._rung: int | None = None
+        self._raised = 0.0
+        """Logarithm of what the stated quantile is raised by."""
+        self._rows: deque[Float64Array] = deque(maxlen=_WINDOW)
+        self._measured: deque[float] = deque(maxlen=_WINDOW)
+        self._expected: deque[float] = deque(maxlen=_WINDOW)
+        self._assume(timings_ns)
+
+    def _assume(self, timings_ns: Sequence[Sequence[int]]) -> None:
+        """Frames as those timings, with the scatter that frames are assumed to have."""
+        rows = [self._row(rung, self._timed) for rung in range(len(timings_ns))]
+        timed = [
+            (rung, math.log(max(duration, 1)) - float(self._timing[rung]))
+            for rung, timings in enumerate(timings_ns)
+            for duration in timings
+        ]
+        scatter = NormalDist(0.0, _ASSUMED_SCATTER)
+        for index in range(_ASSUMED):
+            rung, measured = timed[index % len(timed)]
+            # 7 and the count have no common factor, so every share comes once, and high and low by turns.
+            share = (index * 7 % _ASSUMED + 0.5) / _ASSUMED
+            self._rows.append(rows[rung])
+            self._measured.append(measured + scatter.inv_cdf(share))
+            self._expected.append(0.0)
+
+    @property
+    def state(self) -> CostState:
+        """All that was learned, and what it is relative to."""
+        return CostState(
+            timing=Packed.of(self._timing, "<f8"),
+            pairs=self._timed.pairs,
+            objects=self._timed.objects,
+            mean=Packed.of(self._mean, "<f8"),
+            covariance=Packed.of(self._covariance, "<f8"),
+            side=self._side,
+            changed=self._changed,
+            rung=self._rung,
+            raised=self._raised,
+            rows=Packed.of(np.array(self._rows), "<f8"),
+            measured=tuple(self._measured),
+            expected=tuple(self._expected),
+        )
+
+    def go_on(self, state: CostState) -> None:
+        """Predict what another one would have, of the same ladder.
+
+        Its timings come with what it learned, which is relative to them; how this machine differs from
+        the other's is learned as a change of load.
+        """
+        self._timing = state.timing.array(np.float64)
+        self._timed = Workload(pairs=state.pairs, objects=state.objects)
+        self._mean, self._covariance = state.mean.array(np.float64), state.covariance.array(np.float64)
+        self._side, self._changed, self._rung = state.side, state.changed, state.rung
+        self._raised = state.raised
+        self._rows = deque(state.rows.array(np.float64), maxlen=_WINDOW)
+        self._measured = deque(state.measured, maxlen=_WINDOW)
+        self._expected = deque(state.expected, maxlen=_WINDOW)
+
+    @property
+    def load(self) -> float:
+        """How much longer than before the first frame everything takes now."""
+        return math.exp(self._mean[0])
+
+    def expect(self, work: Workload) -> list[float]:
+        """The expected duration of a frame on each rung [ns]."""
+        rows = [self._row(rung, work) for rung in range(len(self._timing))]
+        return [
+            math.exp(timing + float(row @ self._mean)) for timing, row in zip(self._timing, rows, strict=True)
+        ]
+
+    def predict(self, work: Workload) -> list[float]:
+        """The stated quantile of the duration of a frame on each rung [ns]."""
+        factor = math.exp(self._log_factor())
+        return [factor * expected for expected in self.expect(work)]
+
+    def _log_factor(self) -> float:
+        """Logarithm of the ratio of the stated quantile to what is expected."""
+        measured = np.array(self._measured)
+        # Against what was expected then, a rise is remembered for long after it was understood; against
+        # what would be expected now, a fall. The smaller one has understood both.
+        then = _weighted_quantile(measured - np.array(self._expected), self._quantile)
+        now = _weighted_quantile(measured - np.array(self._rows) @ self._mean, self._quantile)
+        return min(then, now) + self._raised
+
+    def observe(self, rung: int, work: Workload, duration_ns: int) -> None:
+        """A frame on this rung took so long."""
+        self._mean = self._prior + self._kept * (self._mean - self._prior)
+        covariance = self._kept[:, None] * self._covariance * self._kept + self._drift
+        row, measured = self._row(rung, work), math.log(max(duration_ns, 1)) - float(self._timing[rung])
+        expected = float(row @ self._mean)
+        surprise = measured - expected
+        missed = surprise > self._log_factor()
+        self._raised = max(0.0, self._raised + TRACKING * (missed - (1 - self._quantile)))
+        side = 0 if abs(surprise) < _SURPRISE else 1 if surprise > 0 else -1
+        if side and side == self._side:
+            covariance[self._changed, self._changed] += surprise**2
+        else:
+            surprise = min(max(surprise, -_SURPRISE), _SURPRISE)
+            self._changed = 0 if self._rung in (None, rung) else 1 + 3 * rung
+        self._side, self._rung = side, rung
+        gain = covariance @ row
+        gain /= _SCATTER**2 + float(row @ gain)
+        self._mean = self._mean + gain * surprise
+        covariance = covariance - np.outer(gain, row @ covariance)
+        self._covariance = (covariance + covariance.T) / 2
+        self._rows.append(row)
+        self._measured.append(measured)
+        self._expected.append(expected)
+
+    def _row(self, rung: int, work: Workload) -> Float64Array:
+        """What load, and bias, α and β of every rung are multiplied with."""
+        row = np.zeros(len(self._prior))
+        row[0] = 1.0
+        row[1 + 3 * rung : 4 + 3 * rung] = (
+            1.0,
+            math.log((1 + work.pairs) / (1 + self._timed.pairs)),
+            math.log((OBJECTS + work.objects) / (OBJECTS + self._timed.objects)),
+        )
+        return row
+
+
+def _weighted_quantile(values: Float64Array, quantile: float) -> float:
+    """Quantile of values of which the last one counts most."""
+    order = np.argsort(values, kind="stable")
+    share = np.cumsum(0.5 ** (np.arange(len(values))[::-1] / HALF_LIFE)[order])
+    index = int(np.searchsorted(share, quantile * share[-1]))
+    return float(values[order[min(index, len(values) - 1)]])
 
 
 @dataclass(frozen=True, kw_only=True)

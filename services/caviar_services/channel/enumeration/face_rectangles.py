@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
-from caviar_services.channel.propagation.vectors import cross
+from caviar_services.channel.propagation.geometry import cross
 
 RIM = 1e-4
 """[m]; a point this far outside of a triangle is in it, so that none falls between two."""

@@ -20,8 +20,15 @@ from caviar_protocol.topics import AntennaDevice, Channel, ChannelMatrix, Scene
 from caviar_protocol.topics.channel import PLANE_WAVES
 from caviar_services.antenna import element_positions, steering_vector
 from caviar_services.channel.interpolation.course import Course, Courses
-from caviar_services.channel.interpolation.joined import Joined, carrier_phase, join
-from caviar_services.channel.interpolation.motion import Places, ends_of, places, velocities
+from caviar_services.channel.interpolation.joined import (
+    Joined,
+    Places,
+    carrier_phase,
+    ends_of,
+    join,
+    places,
+    velocities,
+)
 from caviar_services.channel.paths import Antenna
 
 CURVATURE = 4.0

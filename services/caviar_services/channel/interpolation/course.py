@@ -20,8 +20,7 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
-from caviar_services.channel.interpolation.joined import Joined
-from caviar_services.channel.interpolation.motion import Places, corners, image_moves, normals
+from caviar_services.channel.interpolation.joined import Joined, Places, corners, image_moves, normals
 from caviar_services.channel.propagation.geometry import path_geometry
 
 ROUNDING_M = 1e-8

@@ -21,7 +21,7 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt8Array
 from caviar_protocol.topics import Interaction
-from caviar_services.channel.propagation.vectors import cross
+from caviar_services.channel.propagation.geometry import cross
 
 _NEAR = 0.05
 """[m]; a point that moves less is the same."""

@@ -35,7 +35,7 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int64Array, UInt8Array
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Interaction
-from caviar_services.channel.propagation.vectors import cross
+from caviar_services.channel.propagation.geometry import cross
 from caviar_services.channel.sionna.contributing import slab
 
 IN_PLANE = 1e-8

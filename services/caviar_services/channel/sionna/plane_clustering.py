@@ -16,7 +16,7 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_services.channel.enumeration.face_rectangles import ranges
-from caviar_services.channel.propagation.vectors import cross
+from caviar_services.channel.propagation.geometry import cross
 
 _SLACK = 1.001
 """Room for rounding beyond the tolerances, so that no pair within them falls into separate cells."""

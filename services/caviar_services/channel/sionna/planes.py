@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
-from caviar_services.channel.propagation.vectors import cross
+from caviar_services.channel.propagation.geometry import cross
 from caviar_services.channel.sionna.plane_clustering import coplanar
 from caviar_services.meshes import Mesh
 

@@ -16,7 +16,7 @@ from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Channel
 from caviar_services.channel.base import ChannelModel
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.channel.statistical.geometric import GeometricChannel
-from caviar_services.channel.statistical.geometric_settings import GeometricSettings
+from caviar_services.channel.statistical.waves import GeometricSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 
 Point = Sequence[float]

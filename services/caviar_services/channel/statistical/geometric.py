@@ -58,9 +58,9 @@ from caviar_services.antenna import steering_vector
 from caviar_services.channel.base import ChannelModel, Modelled
 from caviar_services.channel.propagation.atmosphere import amplitude_factor
 from caviar_services.channel.propagation.occlusion import Boxes
-from caviar_services.channel.statistical.geometric_settings import GeometricSettings
 from caviar_services.channel.statistical.waves import (
     Draws,
+    GeometricSettings,
     Line,
     PairWaves,
     Waves,
