@@ -1,4 +1,4 @@
-"""When the rungs of a ladder are timed and their errors measured: before the first frame and while frames run.
+"""When the rungs of a ladder are timed and their errors measured: before the first frame while frames run.
 
 Rehearsal scenes, which every rung is timed on before the first frame, have the scenario's antennas on bodies
 that drive. Errors are those against the reference; what a rung states follows from them.

@@ -1,4 +1,4 @@
-"""Delays, directions and Doppler shifts of paths from their corner points; vector products; all in float64."""
+"""Delays, directions and Doppler shifts of paths from their corner points; vector products; in float64."""
 
 from __future__ import annotations
 
