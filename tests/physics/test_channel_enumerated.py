@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,12 +40,18 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monk
 
 
 def street(
-    folder: Path, standing: bool = True, plates: Sequence[Plate] = PLATES, **settings: Any
+    folder: Path,
+    standing: bool = True,
+    plates: Sequence[Plate] = PLATES,
+    stations: Mapping[str, tuple[float, float, float]] = {"bs": STATION},
+    **settings: Any,
 ) -> tuple[ChannelModel[Any], tuple[str, ...]]:
     """A channel between two walls, and what it said when it was prepared."""
     own = {"samples": 20_000, "bodies": 4, "candidates": "enumerated", "max_depth": DEPTH, **settings}
-    station = DeviceSpec(name="bs", kind="antenna", role="tx", position_m=STATION)
-    run = RunInfo(name="channel", seed=1, carriers=carriers(28e9), devices=(station,) if standing else ())
+    devices = tuple(
+        DeviceSpec(name=name, kind="antenna", role="tx", position_m=at) for name, at in stations.items()
+    )
+    run = RunInfo(name="channel", seed=1, carriers=carriers(28e9), devices=devices if standing else ())
     model = SionnaChannel(msgspec.convert(own, SionnaSettings), run)
     folder.mkdir(exist_ok=True)
     prepared = model.prepare(Preparation(demand={}, assets=write_scenery(folder, plates)))
@@ -252,6 +258,34 @@ def test_deeper_paths_than_are_enumerated_are_launched(tmp_path: Path) -> None:
     at = traffic(0)
     two, three = measure(shallow, at), measure(mixed, at)
     assert set(keys(two)) < set(keys(three))
+
+
+def test_transmitters_on_both_sides_of_a_thin_wall_have_the_paths_that_each_has_alone(tmp_path: Path) -> None:
+    """However near to one another: each is launched from where it stands."""
+    plates = [*PLATES, Plate("wall", [(-20, 0, 0), (20, 0, 0), (20, 0, 20), (-20, 0, 20)])]
+    sides = {"north": (-3.0, 0.021, 9.0), "south": (-3.0, -0.021, 9.0)}
+    receivers = [antenna(f"rx{y}", "rx", (4.0, y, 2.0)) for y in (-7.0, 7.0)]
+    both, _ = street(tmp_path / "both", plates=plates, stations=sides, scenery_launches=1)
+    together = measure(both, scene([*(antenna(name, "tx", at) for name, at in sides.items()), *receivers]))
+    for t, (name, at) in enumerate(sides.items()):
+        alone, _ = street(tmp_path / name, plates=plates, stations={name: at}, scenery_launches=1)
+        one = measure(alone, scene([antenna(name, "tx", at), *receivers]))
+        assert len(one.tau) > 3
+        begin, end = together.offsets[2 * t], together.offsets[2 * t + 2]
+        assert np.array_equal(together.tau[begin:end], one.tau)
+        assert np.array_equal(together.a[:, begin:end], one.a)
+
+
+def test_a_position_in_single_precision_is_that_of_the_scenario(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Worlds in other languages may send it so; its launch before the first frame counts."""
+    place = (-3.1, -8.3, 5.7)
+    model, _ = street(tmp_path, stations={"bs": place}, scenery_launches=1)
+    monkeypatch.setattr(scenery_chains.SceneryChains, "_now", None)
+    rounded = tuple(np.float32(place).tolist())
+    assert rounded != place
+    assert len(measure(model, scene([antenna("bs", "tx", rounded), antenna("rx", "rx", (0, 0, 2))])).tau) > 3
 
 
 @pytest.mark.parametrize("more", [{"follow": 4}, {"rung": "mimo-rt"}])

@@ -30,8 +30,9 @@ from caviar_services.channel.sionna.scene import SionnaScene
 _SIGHT_RAYS, _SIGHT_RAYS_PER_FRAME = 4096, 64
 """From each plane, to find which others it sees: before the first frame, and in each."""
 
-_SAME_PLACE = 0.05
-"""[m]; a transmitter this near has the same chains: what stands off a surface may be moved by less."""
+_ROUNDING = float(np.finfo(np.float32).eps)
+"""Of a coordinate; a transmitter that is this near to where it was prepared has not moved: worlds in other
+languages may send its position in single precision."""
 
 _SEEN_RAYS = 8192
 """Of a transmitter that moves, to find the faces that may come first: 2.2° apart."""
@@ -90,13 +91,16 @@ class SceneryChains:
         self._launcher = PartedLauncher(scene.mi_scene, only_reflected(options, per_frame))
         self._look = Faces(scene)
         self._faces = SceneFaces(scene)
-        self._known: list[tuple[Float64Array, KnownScenery]] = []
+        self._known: dict[str, tuple[Float64Array, KnownScenery]] = {}
+        """By the name of a transmitter that stands: its place in the world [m], and what is known from there.
+
+        Each has its own: however near to another one it stands, a wall may be between them."""
         self._every = self._every_chain()
         """All chains, and which planes see one another; None: too many."""
         self._last: tuple[bytes, int, KnownScenery] | None = None
 
-    def prepare(self, transmitter: Float64Array, progress: Callable[[int, int], None]) -> str:
-        """Launch from where a transmitter stands [m], Shape ``[3]``, while nothing else is in the scene.
+    def prepare(self, name: str, transmitter: Float64Array, progress: Callable[[int, int], None]) -> str:
+        """Launch from where the transmitter ``name`` stands [m], Shape ``[3]``, while no body is there.
 
         ``progress`` is called before each part with its number and how many there are. Returns what was
         found.
@@ -114,15 +118,17 @@ class SceneryChains:
             if self._cache:
                 self._cache.save(key, known)
         chains, sights = known
-        self._known.append((place, KnownScenery(chains, sights)))
+        self._known[name] = transmitter, KnownScenery(chains, sights)
         return f"{len(chains)} chains of scenery {source}"
 
-    def of(self, transmitter: Float64Array) -> KnownScenery:
-        """Those from a position in the world [m], Shape ``[3]``, in the scene as it stands."""
-        place = transmitter - self._scene.centre
-        for known, scenery in self._known:
-            if np.abs(known - place).max() <= _SAME_PLACE:
+    def of(self, name: str, transmitter: Float64Array) -> KnownScenery:
+        """Those of the transmitter ``name`` at a position in the world [m], Shape ``[3]``, in the scene as it
+        stands."""
+        if name in self._known:
+            known, scenery = self._known[name]
+            if np.all(np.abs(known - transmitter) <= _ROUNDING * np.abs(known)):
                 return scenery
+        place = transmitter - self._scene.centre
         last = self._last
         if last is None or last[:2] != (place.tobytes(), self._scene.version):
             last = self._last = place.tobytes(), self._scene.version, self._now(place)

@@ -396,7 +396,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
             self._without_edge += 1
         found = []
         if self._enumerated is not None:
-            scenery = self._scenery.of(transmitter.position)
+            scenery = self._scenery.of(transmitter.name, transmitter.position)
             found.append(self._enumerated.trace(transmitter.position, targets, scenery))
         if self._launches:
             launched = tracer.trace(
@@ -460,7 +460,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
 
                 place = self._scene.surfaces.cleared(np.array(device.position_m))
                 with all_threads():
-                    known = self._scenery.prepare(place, progress)
+                    known = self._scenery.prepare(name, place, progress)
                 notes.append(f"transmitter {name!r}: {known}")
         return (*notes, *(cache.notes if cache else ()))
 
