@@ -19,7 +19,7 @@ from caviar_protocol.errors import ProtocolError, VersionError
 from caviar_protocol.host import host_identity
 
 COMPLAINTS = (m.Error, m.Stale, m.Refuse, m.HeartbeatAck)
-"""Messages that nobody answers: they give no right to a further message."""
+"""Messages that have no answer: they give no right to a further message."""
 
 
 @dataclass(slots=True)
@@ -41,10 +41,10 @@ class Connections:
         epoch: Of the run.
         port: Where messages come and go.
         loop: Where processes are watched.
-        watchdog, assets: Are told of incarnations that come and go.
+        watchdog, assets: Follow incarnations that come and go.
         feed: Gives the clock an event, and does what it wants.
         perform: Does what the clock wants.
-        note: Is told service, text and kind of something that the user should know.
+        note: Called with service, text and kind of something that the user should know.
     """
 
     clock: FrameClock
@@ -79,7 +79,7 @@ class Connections:
             self.reply(route, m.Error(code="unknown-peer", of=kind, message=text))
             self._refused("strangers", f"{self._stranger(route)}: {text}; not used")
         elif not is_assigned(route):
-            # It could be one that somebody else has just had, and what is known of it would be of both.
+            # It could be one that another connection has just had, and what is known of it would be of both.
             text = f"{message_type(message)} of {message.name!r}: its socket has a routing id of its own; "
             text += "leave ZMQ_ROUTING_ID unset: who it is, it says with HELLO and ATTACH"
             self.reply(route, m.Refuse(code="declaration", message=text))
@@ -135,7 +135,7 @@ class Connections:
         peer = self.clock.peer(hello.name)
         if peer is not None and peer.attempt > attempt:
             self._admit(route, hello, local)
-        self.perform()  # WELCOME goes to whom was admitted; one turned away changes nothing
+        self.perform()  # WELCOME goes to an admitted service; one turned away changes nothing
 
     def _admit(self, route: bytes, hello: m.Hello, local: bool) -> None:
         """A new incarnation is in the run: nothing counts any more that comes from the one before."""
@@ -219,7 +219,7 @@ class Connections:
             self.grumble(f"reply {service}", f"{message_type(message)} reached nobody: {reason}", service)
 
     def grumble(self, kind: str, text: str, service: str = "") -> None:
-        """Tell the user something that may come often: the same kind is told once in a while."""
+        """Note something that may come often: the same kind is noted once in a while."""
         self._tell(kind, text, service, "note")
 
     def _refused(self, kind: str, text: str) -> None:

@@ -70,7 +70,7 @@ Source = int | zmq.Socket[Any]
 
 
 COARSE_NS = 1_000_000
-"""[ns] The poller counts whole milliseconds, and may take one more than it was told."""
+"""[ns] The poller counts whole milliseconds, and may take one more than it was given."""
 _EVENTS = int(zmq.EVENTS)
 _POLLIN = int(zmq.POLLIN)
 SELECTABLE = 1024

@@ -99,14 +99,14 @@ def serve(arguments: argparse.Namespace) -> int:
 
 
 def _serve(arguments: argparse.Namespace, record: RunRecord, directory: Path, forced: Sequence[str]) -> int:
-    told = with_ownership(record.scenario)
-    reserve_descriptors(len(told.services))
-    local = {name: spec.role for name, spec in told.services.items() if not spec.remote}
+    scenario = with_ownership(record.scenario)
+    reserve_descriptors(len(scenario.services))
+    local = {name: spec.role for name, spec in scenario.services.items() if not spec.remote}
     access = _access(arguments, local)
     check_bind(record.endpoint, keys=access is not None)
     beside = HttpProcess(directory, arguments.http, arguments.keys, again=bool(arguments.resume))
-    plan = replace(plan_run(told, record.run, briefings(told, directory)), epoch=record.epoch)
-    plan = with_replay(plan, told.replay)
+    plan = replace(plan_run(scenario, record.run, briefings(scenario, directory)), epoch=record.epoch)
+    plan = with_replay(plan, scenario.replay)
     durability = record.scenario.run.durability
     checkpoints = CheckpointFiles(directory, durable=durability != "none")
     # A launcher that starts its broker again has not summed the run up yet.
@@ -125,13 +125,13 @@ def _serve(arguments: argparse.Namespace, record: RunRecord, directory: Path, fo
     )
     with closing(journal_file) as journal:
         supervised = arguments.supervised if arguments.control else ()
-        desk = ControlServer(directory, reporter)
-        with closing(beside), closing(desk):
+        control = ControlServer(directory, reporter)
+        with closing(beside), closing(control):
             server = BrokerServer(
                 plan,
                 record.endpoint,
                 journal,
-                desk,
+                control,
                 supervised=supervised,
                 access=access,
                 peer_limits=PeerLimits.of(record.scenario.limits),
@@ -141,7 +141,7 @@ def _serve(arguments: argparse.Namespace, record: RunRecord, directory: Path, fo
             )
             msgspec.structs.replace(record, endpoint=server.endpoint).save(directory)
             reporter.attach(server)
-            desk.attach(server)
+            control.attach(server)
             if resumption is not None:
                 server.statistics.earlier = resumption.finished_before + resumption.finished
             if arguments.control:

@@ -147,14 +147,14 @@ class _Reader:
     # --- decisions -----------------------------------------------------------------------------------
 
     def _decided(self, entry: JournalEntry) -> None:
-        told = {decision.topic: decision for decision in entry.decisions}
+        entered = {decision.topic: decision for decision in entry.decisions}
         for topic, header, body in entry.products:
-            if payload_digest(header, body) != told[topic].digest:
+            if payload_digest(header, body) != entered[topic].digest:
                 raise RecordingError(
-                    f"{topic} of {entry.service!r} in frame {told[topic].frame} is not the one whose "
+                    f"{topic} of {entry.service!r} in frame {entered[topic].frame} is not the one whose "
                     "digest the journal has: it cannot be granted again, and the run cannot go on"
                 )
-            product = _product(entry.service, told[topic], (header, body))
+            product = _product(entry.service, entered[topic], (header, body))
             self._products.setdefault((entry.service, topic), {})[product.frame] = product, entry.number
         if entry.outcome in ("done", "late"):
             digests = {d.topic: d.digest for d in entry.decisions if d.status in (Status.FRESH, Status.LATE)}
@@ -169,12 +169,12 @@ class _Reader:
             self._tasks.setdefault(entry.service, {})[entry.frame] = task
             self._finish()
 
-    def _decision(self, service: str, told: GrantInput) -> Decision:
-        if told.status is Status.ABSENT:
-            return Decision(told)
-        known = self._products.get((service, told.topic), {}).get(told.frame)
-        product, number = known or (_product(service, told, None), 0)
-        return Decision(told, product, number if told.status is Status.HELD else 0)
+    def _decision(self, service: str, entered: GrantInput) -> Decision:
+        if entered.status is Status.ABSENT:
+            return Decision(entered)
+        known = self._products.get((service, entered.topic), {}).get(entered.frame)
+        product, number = known or (_product(service, entered, None), 0)
+        return Decision(entered, product, number if entered.status is Status.HELD else 0)
 
     def _finish(self) -> None:
         begin = self._begin
@@ -277,5 +277,7 @@ class _Reader:
         )
 
 
-def _product(service: str, told: GrantInput, payload: tuple[bytes, bytes] | None) -> Product:
-    return Product(told.topic, service, told.frame, told.t_ns, told.digest, told.fidelity, payload)
+def _product(service: str, entered: GrantInput, payload: tuple[bytes, bytes] | None) -> Product:
+    return Product(
+        entered.topic, service, entered.frame, entered.t_ns, entered.digest, entered.fidelity, payload
+    )

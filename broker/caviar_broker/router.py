@@ -36,7 +36,7 @@ def free_endpoints(endpoint: str) -> Iterator[str]:
     """Addresses to try for one that asks for any free port (port 0); any other address as it is.
 
     They lie outside the range of ports for outgoing connections: a broker that is started again has to listen
-    where its services know it, and must not find that port taken by a connection that somebody opened in
+    where its services know it, and must not find that port taken by a connection that a program opened in
     between. The last address leaves the choice to the operating system.
     """
     if endpoint.endswith(":0"):

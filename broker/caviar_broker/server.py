@@ -43,15 +43,15 @@ SOON_NS = 8_000_000
 LONG_NS = 10_000_000
 """[ns] Budgets from here on bring nothing that would be due before deadlines are looked at again."""
 DISK_NOTE_S = 2.0
-"""[s] that the disk may take for an entry of the journal before that is told."""
+"""[s] that the disk may take for an entry of the journal before a notice says so."""
 MESSAGES_A_TURN = 64
 """Messages taken before the clock is looked at again."""
-# Actions that no service waits for: carried out once whoever can be is at work.
+# Actions that no service waits for: carried out once the services have their grants.
 _CAN_WAIT = frozenset({ev.Notice, ev.Latency, ev.FrameFinished})
 
 
 class Observer(Protocol):
-    """Who is told what happens in a run: the command line, a log, a page. Must not wait."""
+    """Gets what happens in a run: the command line, a log, a page. Must not wait."""
 
     def notice(self, notice: ev.Notice) -> None:
         """Something the user should know."""
@@ -67,9 +67,9 @@ class BrokerServer:
         plan: The run.
         endpoint: Address to bind, ``tcp://127.0.0.1:0`` for any free port.
         journal: Where decisions are written.
-        observer: Who is told.
+        observer: Gets notices and finished frames.
         store: Where scenery is kept.
-        supervised: Services whose death somebody else reports, who knows their exit status and last words.
+        supervised: Services whose death a launcher reports, which knows their exit status and last words.
         access: The keys of those who may take part; None: every process of this machine may.
         peer_limits: What each peer may use of the broker.
         resumption: What another broker left of the run.
@@ -97,7 +97,7 @@ class BrokerServer:
         self._plan, self._observer = plan, observer
         # Number of the last journal entry that the clock knows to be handed over.
         self._confirmed = 0
-        # [s] for which the disk had taken nothing when that was told; 0: it takes what comes.
+        # [s] for which the disk had taken nothing at the last notice; 0: it takes what comes.
         self._disk_told = 0.0
         self._sign = SignOfLife()
         self._assets = AssetExchange(
@@ -113,9 +113,9 @@ class BrokerServer:
         self._finished_frames = 0
         # Decisions that are not in the journal yet.
         self._entries: list[ev.Journal] = []
-        # Notices, latencies and finished frames, in order: nobody waits for these.
+        # Notices, latencies and finished frames, in order: no service waits for these.
         self._later: list[ev.Action] = []
-        # Whether somebody was sent something in this turn.
+        # Whether a service was sent something in this turn.
         self._has_sent = False
         self._next_check = self._look_at = 0
         self._budgets_are_long = not plan.realtime and all(s.budget_ns >= LONG_NS for s in plan.services)
@@ -176,7 +176,7 @@ class BrokerServer:
             ev.Overdue: lambda a: self.statistics.decision(time.monotonic_ns() - a.due_ns),
             ev.Notice: self._observer.notice,
             ev.FrameFinished: self._frame_finished,
-            ev.EpisodeFinished: lambda _: None,  # its frames are told one by one
+            ev.EpisodeFinished: lambda _: None,  # its frames are reported one by one
             ev.TurnAway: self._connections.turn_away,
             ev.Finished: lambda outcome: setattr(self, "outcome", outcome),
         }
@@ -207,7 +207,7 @@ class BrokerServer:
         return self._standby.cpu_s
 
     def _turn(self) -> None:
-        """Serve whoever is there; with nobody there, or after `LOOK_NS` at the latest, see to deadlines.
+        """Serve the messages that are there; without any, or after `LOOK_NS` at the latest, see to deadlines.
 
         Deadlines are looked for once in `LOOK_NS` at most: that costs as much as an answer. Where nothing can
         be due soon, it is `UNHURRIED_LOOK_NS`, and others than the port wait that long and a millisecond.
@@ -228,7 +228,7 @@ class BrokerServer:
         self._catch_up()
 
     def _catch_up(self) -> None:
-        """Write what somebody waits for, and do what nobody does, now that those who can be are at work."""
+        """Flush journal entries that block a grant, then run deferred actions."""
         if self._has_sent or self.clock.waits_for_journal or self.clock.over:
             self._write_journal()
             self._has_sent = False
@@ -326,7 +326,7 @@ class BrokerServer:
     def _write_journal(self) -> None:
         """Clause 18: nothing that relies on an entry is granted before the system has it.
 
-        Written once somebody waits for it, while services are at work, and whenever deadlines are looked
+        Written once a grant waits for it, while services are at work, and whenever deadlines are looked
         at; so services that answer one after the other cost one write.
         """
         while self._entries and not self._standby.calling:

@@ -14,7 +14,7 @@ from caviar_broker.core.clock import FrameClock
 class LocalProcess:
     """A process of this kernel and PID namespace, watched through a pidfd.
 
-    The descriptor becomes readable the moment the process dies, whoever its parent is, and never
+    The descriptor becomes readable the moment the process dies, whichever its parent is, and never
     means another process that was given the same number later.
     """
 
@@ -23,7 +23,7 @@ class LocalProcess:
         self.fd = os.pidfd_open(pid)
 
     def verdict(self) -> str:
-        """How the process ended, as far as can be told."""
+        """How the process ended, as far as the system says."""
         fields = _stat(self.pid)
         if fields is not None and fields[0] == "Z":
             return describe_exit(os.waitstatus_to_exitcode(int(fields[-1])))
@@ -117,8 +117,8 @@ class Watchdog:
         clock: Who is present in the run.
         heartbeat_ns, liveness_ns: Of the run [ns].
         probe: Sends a harmless message to a heartbeat connection; why that did not go, or an empty text.
-        lost: Is told service and verdict.
-        warn: Is told service and text.
+        lost: Called with service and verdict.
+        warn: Called with service and text.
         gone_words: What is said of a service without a connection.
     """
 
@@ -196,7 +196,7 @@ class Watchdog:
                 self._check_remote(service, watched, now)
 
     def recheck(self, service: str) -> None:
-        """Somebody else claims the name of a service: whether a remote one still is there, asked now."""
+        """Probe a remote service now, since another process claims its name."""
         watched = self._watched.get(service)
         if watched is not None and watched.process is None and watched.pulse is not None:
             self._probe(service, watched.pulse)

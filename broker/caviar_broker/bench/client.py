@@ -77,26 +77,26 @@ def speak(part: Part, payload: int, endpoint: str) -> None:
             first = rest = receive(0, False)
             while rest.more:  # payloads come into this process, and are not looked at
                 rest = receive(0, False)
-            told = _decoder.decode(first.buffer)
-            if told.type == "GRANT":
-                done.episode, done.frame = told.episode, told.frame
+            message = _decoder.decode(first.buffer)
+            if message.type == "GRANT":
+                done.episode, done.frame = message.episode, message.frame
                 send(_encoder.encode(done), _MORE)
                 send(header, _MORE)
                 send(body, 0, payload < _COPIED)
                 continue
             epoch, attempt = done.epoch, done.attempt
-            match told.type:
+            match message.type:
                 case "WELCOME":
-                    done.epoch, done.attempt = told.epoch, told.attempt
+                    done.epoch, done.attempt = message.epoch, message.attempt
                 case "PREPARE":
                     send(encode_message(m.Ready(epoch=epoch, attempt=attempt)))
                 case "RESET":
-                    send(encode_message(m.ResetDone(epoch=epoch, attempt=attempt, episode=told.episode)))
+                    send(encode_message(m.ResetDone(epoch=epoch, attempt=attempt, episode=message.episode)))
                 case "SHUTDOWN":
                     send(encode_message(m.Bye(epoch=epoch, attempt=attempt)))
                     return
                 case "REFUSE":
-                    raise SystemExit(f"{part.name}: {told.message}")
+                    raise SystemExit(f"{part.name}: {message.message}")
 
 
 class _Told(msgspec.Struct):

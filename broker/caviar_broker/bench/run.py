@@ -68,10 +68,10 @@ class Measured(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class _Silent:
-    """Observer that tells nobody."""
+    """Observer that reports nothing."""
 
     def notice(self, notice: ev.Notice) -> None:
-        """Problems end the run, which is told; misses are counted."""
+        """Problems end the run, whose outcome names them; misses are counted."""
 
     def frame(self, frame: ev.FrameFinished, statistics: Statistics) -> None:
         """Measured by the statistics."""

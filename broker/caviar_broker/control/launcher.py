@@ -1,4 +1,4 @@
-"""How a broker process talks with whoever launched it, and with signals."""
+"""A broker process and its launcher: the pipe between them, the console, the log of notices, signals."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ class Outbox:
         self._poll = select.poll()
         self._poll.register(fd, select.POLLOUT)
         self.gone = False
-        """Whether nobody reads any more."""
+        """Whether the reader has gone."""
 
     @property
     def log_error(self) -> str:
@@ -198,7 +198,7 @@ class Outbox:
     def _write(self) -> None:
         try:
             taken = os.write(self._fd, self._pending[:CHUNK])
-        except OSError:  # whoever read is gone: the log remains
+        except OSError:  # the reader is gone: the log remains
             self.gone = True
             self._pending.clear()
             self._behind = None
@@ -245,7 +245,7 @@ class Reporter:
         self._see_to_the_rest()
 
     def frame(self, frame: ev.FrameFinished, statistics: Statistics) -> None:
-        """Report progress, not more often than somebody could read it."""
+        """Report progress, not more often than a person could read it."""
         now = time.monotonic()
         if self._control and now - self._last_frame >= FRAME_REPORT_S:
             self._last_frame = now

@@ -1,4 +1,4 @@
-"""The desk of a running broker: who runs it asks there what goes on, and has it pause, step or stop.
+"""The control channel of a running broker: its user asks there what goes on, and has it pause, step or stop.
 
 A Unix socket in the run's directory, served by the broker's own loop. A request is one line of JSON,
 ``{"do": "why"}``; so is its answer, ``{"ok": true, …}`` or ``{"ok": false, "error": TEXT}``. After
@@ -26,13 +26,13 @@ from caviar_broker.statistics import Statistics
 MAX_REQUEST = 1 << 12
 """[B] of a request."""
 MAX_WAITING = 1 << 18
-"""[B] that may wait for somebody who does not read; behind that the connection is cut."""
+"""[B] that may wait for a client that does not read; behind that the connection is cut."""
 MAX_CONNECTIONS = 32
 FRAME_EVENT_NS = 50_000_000
 """[ns] between ``frame`` events at least."""
 MAX_STEPS = 1_000_000_000
 NOTED = ("note", "refused")
-"""Kinds of notices that can be given at the desk."""
+"""Kinds of notices that a client may give."""
 BLAMES = frozenset({"miss", "lost", "away", "fault", "skipped"})
 """Kinds of notices that name a culprit."""
 
@@ -42,11 +42,11 @@ Answer = dict[str, Any]
 class ControlServer:
     """Answers questions about one broker.
 
-    It is the server's observer, in front of the one that it is given, so it knows what was told last.
+    It is the server's observer, in front of the one that it is given, so it knows the last blame.
 
     Args:
         directory: Of the run; the socket is made there.
-        observer: Who is told everything too.
+        observer: Gets everything too.
 
     Raises:
         RunError: Another broker serves that directory, or no socket can be made.
@@ -63,9 +63,9 @@ class ControlServer:
         self._orders: dict[str, Callable[[Mapping[str, Any]], Answer]] = {
             "status": self._status,
             "why": self._why,
-            "latencies": self._latencies,
-            "pause": self._pause,
-            "resume": self._resume,
+            "latencies": lambda _: {"ok": True, "latencies": self._figures()},
+            "pause": lambda _: self._ordered(ev.PauseRequested(), "the run is paused: no new frame begins"),
+            "resume": lambda _: self._ordered(ev.ResumeRequested(), "the run goes on"),
             "step": self._step,
             "stop": self._stop,
             "gateway": self._gateway,
@@ -93,8 +93,8 @@ class ControlServer:
 
     @property
     def server(self) -> BrokerServer:
-        """Whose desk this is."""
-        assert self._server is not None  # noqa: S101  # nobody calls before `attach`
+        """The broker that answers here."""
+        assert self._server is not None  # noqa: S101  # requests come after `attach` only
         return self._server
 
     # --- what the server tells ------------------------------------------------------------------------
@@ -109,7 +109,7 @@ class ControlServer:
         self._observer.notice(notice)
 
     def frame(self, frame: ev.FrameFinished, statistics: Statistics) -> None:
-        """Pass it on; subscribers hear of it not more often than somebody could read it."""
+        """Pass it on; subscribers get it not more often than a person could read it."""
         self._observer.frame(frame, statistics)
         if not self._callers:
             return
@@ -189,9 +189,6 @@ class ControlServer:
         }
         return {"ok": True, "why": found}
 
-    def _latencies(self, _: Mapping[str, Any]) -> Answer:
-        return {"ok": True, "latencies": self._figures()}
-
     def _figures(self) -> dict[str, Answer]:
         return {
             name: msgspec.to_builtins(figures)
@@ -199,12 +196,6 @@ class ControlServer:
         }
 
     # --- orders ---------------------------------------------------------------------------------------
-
-    def _pause(self, _: Mapping[str, Any]) -> Answer:
-        return self._ordered(ev.PauseRequested(), "the run is paused: no new frame begins")
-
-    def _resume(self, _: Mapping[str, Any]) -> Answer:
-        return self._ordered(ev.ResumeRequested(), "the run goes on")
 
     def _step(self, request: Mapping[str, Any]) -> Answer:
         frames = request.get("frames", 1)
@@ -230,7 +221,7 @@ class ControlServer:
         return {"ok": True, "state": view.state, "paused": view.paused, "frame": view.frame}
 
     def _gateway(self, _: Mapping[str, Any]) -> Answer:
-        """What the gateway needs to connect: whoever may ask here may read the keys directory as well."""
+        """What the gateway needs to connect: a user who may ask here may read the keys directory as well."""
         access = self.server.access
         if access is None:
             return {"ok": True, "keys": None}
@@ -262,9 +253,9 @@ class ControlServer:
 class _Caller:
     """One connection. One request is answered a turn, so that frames are never held up by many."""
 
-    def __init__(self, connection: socket.socket, desk: ControlServer) -> None:
+    def __init__(self, connection: socket.socket, control: ControlServer) -> None:
         self.subscribed = False
-        self._socket, self._desk, self._fd = connection, desk, connection.fileno()
+        self._socket, self._control, self._fd = connection, control, connection.fileno()
         self._received, self._waiting = b"", bytearray()
         self._watched = 0
         self._watch()
@@ -273,7 +264,7 @@ class _Caller:
         """Wait for what is due: room for what waits, the turn of the next request, or a request."""
         events = zmq.POLLOUT if self._waiting or b"\n" in self._received else zmq.POLLIN
         if events != self._watched:
-            loop, self._watched = self._desk.server.loop, events
+            loop, self._watched = self._control.server.loop, events
             loop.unwatch(self._fd)
             loop.watch(self._fd, self._turn, events)
 
@@ -282,7 +273,7 @@ class _Caller:
             self._flush()
         elif b"\n" in self._received or self._receive():
             line, _, self._received = self._received.partition(b"\n")
-            answer, events = self._desk.answer(line)
+            answer, events = self._control.answer(line)
             self.subscribed |= events
             self.say(answer)
         if self._watched:
@@ -324,8 +315,8 @@ class _Caller:
         """Hang up."""
         if self._watched:
             self._watched = 0
-            self._desk.server.loop.unwatch(self._fd)
-            self._desk.forget(self._fd)
+            self._control.server.loop.unwatch(self._fd)
+            self._control.forget(self._fd)
             self._socket.close()
 
 

@@ -147,12 +147,12 @@ class FrameClock:
 
     @property
     def over(self) -> bool:
-        """Whether the run has ended, if perhaps not everybody has left."""
+        """Whether the run has ended, although services may still be leaving."""
         return self._run.over
 
     @property
     def graph(self) -> Graph | None:
-        """Who gets what from whom; None until all services have joined."""
+        """Which service gets what from which; None until all services have joined."""
         return self._run.graph
 
     @property
@@ -184,7 +184,7 @@ class FrameClock:
 
     @property
     def waits_for_journal(self) -> bool:
-        """Whether somebody waits for the journal to be written; nobody does where no frames are granted."""
+        """Whether a grant waits for the journal to be written."""
         dispatcher = self._episodes.dispatcher
         return dispatcher is not None and dispatcher.waits_for_journal
 
@@ -224,4 +224,4 @@ class FrameClock:
             absent = [p.name for p in away if not p.rejoin(self.plan.limits)]
             assert not absent, f"{absent} are not in the episode"
         if run.state is RunState.FINISHED:
-            assert not any(p.present for p in peers), "finished while somebody is here"
+            assert not any(p.present for p in peers), "finished while a service is here"

@@ -174,7 +174,7 @@ class Participant:
 
 
 def provenance_of(product: Product, status: Status, frame: int, cause: str = "") -> GrantInput:
-    """What a consumer in ``frame`` is told about where a product comes from."""
+    """Provenance of a product, as a consumer in ``frame`` is granted it."""
     return GrantInput(
         topic=product.topic,
         source=product.source,
@@ -200,7 +200,7 @@ class DecisionTable:
     decided it; the fresh products of finished frames make the digest of the run.
 
     Args:
-        graph: Who takes what from whom.
+        graph: Which service takes what from which.
         plan: The run.
         episode: Number of the episode.
         digest: The run's chain; finished frames are added to it.
@@ -310,14 +310,14 @@ class DecisionTable:
                 continue
             origin = source.tasks[frame - edge.lag]
             decision = origin.decisions[edge.topic]
-            told, product = decision.provenance, decision.product
+            granted, product = decision.provenance, decision.product
             if product is not None:
                 products.append(product)
                 if edge.lag:
-                    told = provenance_of(product, told.status, frame, told.cause)
+                    granted = provenance_of(product, granted.status, frame, granted.cause)
             elif edge.required and cause is None:
-                cause = told.cause
-            inputs.append(told)
+                cause = granted.cause
+            inputs.append(granted)
             if edge.lag and origin.journal > entry:
                 entry = origin.journal
             if decision.journal > entry:
@@ -378,8 +378,8 @@ class DecisionTable:
                 decisions[topic] = _absent(task, topic, cause)
             else:
                 product, number = held
-                told = provenance_of(product, Status.HELD, task.frame, cause)
-                decisions[topic] = Decision(told, product, number)
+                granted = provenance_of(product, Status.HELD, task.frame, cause)
+                decisions[topic] = Decision(granted, product, number)
         self._decide(task, decisions, outcome, now)
 
     def decide_consequence(self, task: Task, cause: str, now: int) -> None:

@@ -45,7 +45,7 @@ class Dispatcher:
     few answers bring it back in vain.
 
     Args:
-        graph: Who takes what from whom.
+        graph: Which service takes what from which.
         plan: The run.
         capacity: Grants that each service can have outstanding (clause 7).
         episode: Number of the episode.
@@ -121,7 +121,7 @@ class Dispatcher:
             service: Who answers.
             products: By topic, all of them declared (checked by the caller).
             now: The time [ns].
-            report: What a recorder is told of the answer.
+            report: What goes to recorders about the answer.
             end: Whether an agent ends the episode with this frame.
         """
         participant = self._participants[service]

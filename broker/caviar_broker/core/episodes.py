@@ -256,8 +256,8 @@ class Episodes:
         if dispatcher is not None and participant is not None and participant.outstanding:
             outstanding = participant.outstanding[0].frame
             asked = (run.plan.epoch, peer.attempt, run.episode, outstanding)
-            told = (answer.epoch, answer.attempt, answer.episode, answer.frame)
-            if peer.state is _ACTIVE and told == asked:
+            answered = (answer.epoch, answer.attempt, answer.episode, answer.frame)
+            if peer.state is _ACTIVE and answered == asked:
                 dispatcher.deadlines.expire_before_answer(participant, now)
                 return dispatcher
         if not run.current(peer, answer.epoch, answer.attempt, kind, outstanding):

@@ -89,7 +89,7 @@ class CheckpointReceived(msgspec.Struct, frozen=True):
 
 
 class Violated(msgspec.Struct, frozen=True):
-    """A service sent what it may not, in a way it cannot be told to mend."""
+    """A service sent what it may not, and no answer would mend it."""
 
     service: str
     text: str
@@ -189,7 +189,7 @@ class Journal(msgspec.Struct, frozen=True):
     chosen: Mapping[str, str] | None = None
     """Decisions that the service took."""
     facts: Mapping[str, int] | None = None
-    """``seed``, ``seed_episode`` and ``frames``, where they are told."""
+    """``seed``, ``seed_episode`` and ``frames``, where they belong to the entry."""
     members: tuple[str, ...] = ()
     """Services of the run, where an episode begins."""
     state: Any = None

@@ -26,7 +26,7 @@ class Edge:
 
 @dataclass(frozen=True)
 class Graph:
-    """Who gets what from whom, among the services that are run."""
+    """Which service gets what from which, among those that are run."""
 
     order: tuple[str, ...]
     """Active services, producers before the consumers of their frame."""
@@ -45,7 +45,7 @@ class Graph:
     retained: frozenset[str]
     """Active services whose products someone takes with lag 1."""
     idle: tuple[str, ...]
-    """Services that nobody asks for anything: not run."""
+    """Services whose outputs no service takes: not run."""
 
 
 def build_graph(hellos: Mapping[str, Hello], record: Iterable[str] = ()) -> Graph:

@@ -29,7 +29,7 @@ class Liveness:
         self._run.fail(f"{self._run.peers[event.service]} {event.text}", event.service, now)
 
     def handle_bye(self, event: ev.ByeReceived, now: int) -> None:
-        """A service leaves: as it was told to, or on its own account."""
+        """A service leaves: after SHUTDOWN, or on its own account."""
         peer = self._run.peers[event.service]
         if peer.present and self._run.over:
             peer.move(ServiceEvent.BYE, now)
@@ -59,8 +59,8 @@ class Liveness:
             run.fail(text, peer.name, now)
             return
         limit = peer.rejoin(run.plan.limits) / 1e9
-        told = f"{peer} is away; the run waits for it for at most {limit:g} s (timeouts.rejoin_s)"
-        run.notice("away", peer.name, told, owed[0].frame if owed else -1)
+        text = f"{peer} is away; the run waits for it for at most {limit:g} s (timeouts.rejoin_s)"
+        run.notice("away", peer.name, text, owed[0].frame if owed else -1)
         if dispatcher:
             dispatcher.suspend_service(peer.name)
 
@@ -73,7 +73,7 @@ class Liveness:
     # --- deadlines -----------------------------------------------------------------------------------
 
     def next_deadline(self) -> int | None:
-        """When somebody's silence will be too long [ns]; None: nobody has to say anything."""
+        """When the silence of a service will be too long [ns]; None: none has to say anything."""
         run = self._run
         if run.state is RunState.FINISHED:
             return None

@@ -1,4 +1,4 @@
-"""What the core is told about a run before it starts."""
+"""The plan of a run: what the core knows of it before it starts, and what WELCOME says to each service."""
 
 from __future__ import annotations
 
@@ -114,8 +114,8 @@ class RunPlan:
         return self.instants_ns[min(frame, last)] + max(0, frame - last) * self.sampling_period_ns
 
 
-def plan_run(scenario: Scenario, run: str, told: Mapping[str, Mapping[str, Any]]) -> RunPlan:
-    """Plan of a validated scenario; ``told`` is what WELCOME says to each service by name."""
+def plan_run(scenario: Scenario, run: str, welcome: Mapping[str, Mapping[str, Any]]) -> RunPlan:
+    """Plan of a validated scenario; ``welcome`` is what WELCOME says to each service, by name."""
     t = scenario.timeouts
     return RunPlan(
         run=run,
@@ -129,7 +129,7 @@ def plan_run(scenario: Scenario, run: str, told: Mapping[str, Mapping[str, Any]]
                 policy=spec.policy,
                 max_in_flight=spec.max_in_flight,
                 settings=spec.settings,
-                scenario=told.get(name, {}),
+                scenario=welcome.get(name, {}),
                 rejoin=round(REMOTE_REJOIN_S * SECOND) if spec.remote and t.rejoin_s is None else None,
                 features=_features(scenario, name if spec.role == "world" else ""),
             )
@@ -174,7 +174,7 @@ def _features(scenario: Scenario, world: str) -> tuple[Feature, ...]:
 def briefings(scenario: Scenario, directory: Path) -> dict[str, dict[str, Any]]:
     """By service: carriers, devices, timing, and for the recorder where to write what.
 
-    Worlds are told the devices that they publish, all other services all of them, with their worlds.
+    Worlds get the devices that they publish, all other services all of them, with their worlds.
     """
     plain = resolved(scenario)
     devices = [device | {"world": world_of(scenario, index)} for index, device in enumerate(plain["devices"])]
@@ -184,14 +184,14 @@ def briefings(scenario: Scenario, directory: Path) -> dict[str, dict[str, Any]]:
         "frames": scenario.run.frames,
         "episodes": scenario.run.episodes,
     }
-    told = {}
+    found = {}
     for name, spec in scenario.services.items():
-        told[name] = common | {"devices": devices}
+        found[name] = common | {"devices": devices}
         if spec.role == "world":
-            told[name]["devices"] = [device for device in devices if device["world"] == name]
+            found[name]["devices"] = [device for device in devices if device["world"] == name]
         if spec.role == "recorder":
-            told[name] |= {"directory": str(directory), "resolved": plain}
-    return told
+            found[name] |= {"directory": str(directory), "resolved": plain}
+    return found
 
 
 def with_ownership(scenario: Scenario) -> Scenario:

@@ -74,8 +74,8 @@ class Registration:
     def _held_open(self, peer: Peer, local: bool) -> int:
         """How long a service may try to come back by itself once its connections are lost [ns].
 
-        A connection within one machine is lost with the broker alone. Whoever started that starts the local
-        services again too, and one that tried to come back would take the place of its successor.
+        A connection within one machine is lost with the broker alone. What started the broker starts the
+        local services again too, and one that tried to come back would take the place of its successor.
         """
         return peer.rejoin(self._run.plan.limits) if peer.plan.remote or not local else 0
 
@@ -172,7 +172,7 @@ class Registration:
         peer.assets, peer.advanced_at = event.assets, now
 
     def handle_ready(self, event: ev.ReadyReceived, now: int) -> None:
-        """READY: check what it claims, and go on when everybody is."""
+        """READY: check what it claims, and go on when all services are ready."""
         run, peer, message = self._run, self._run.peers[event.service], event.message
         if not run.current(peer, message.epoch, message.attempt, "READY"):
             return

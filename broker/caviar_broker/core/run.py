@@ -117,7 +117,7 @@ class Peer:
         return _DOING[self.state]
 
     def last_words(self, now: int) -> str:
-        """What its heartbeats told last."""
+        """What its last heartbeat said."""
         if self.heard_at is None:
             return "no heartbeat ever came"
         phase = f"phase {self.phase!r}" if self.phase else "no phase told"
@@ -218,7 +218,7 @@ class Run:
         self.gate = PauseGate()
         self.ledger = Ledger(kept=not plan.ephemeral)
         self.over = False
-        """Whether the run has ended, if perhaps not everybody has left."""
+        """Whether the run has ended, although services may still be leaving."""
         if resumption is not None:
             self._take_over(resumption)
         self.error = ""
@@ -268,14 +268,14 @@ class Run:
             self.stop(error, now)
 
     def stop(self, reason: str, now: int) -> None:
-        """End the run: everybody shall leave."""
+        """End the run: SHUTDOWN to every service."""
         self.enter(RunEvent.STOP, now)
         for peer in self.peers.values():
             if peer.present:
                 self.send(peer, Shutdown(reason=reason, grace_ns=self.plan.limits.shutdown))
 
     def finish_if_alone(self, now: int) -> None:
-        """The run is finished once everybody has left."""
+        """Finish the run once every service has left."""
         if self.state is RunState.STOPPING and not any(peer.present for peer in self.peers.values()):
             self.enter(RunEvent.ALL_GONE, now)
             digest = "" if self.plan.ephemeral else self.digest.hexdigest()
@@ -300,7 +300,7 @@ class Run:
             self.actions.append(Journal(number, self.episode, frame, service, outcome, **facts))
 
     def notice(self, kind: str, service: str, text: str, frame: int = -1) -> None:
-        """Have something told to the user."""
+        """Have the user notified."""
         self.actions.append(Notice(kind, service, text, self.episode, frame))
 
     # --- what came out of turn -----------------------------------------------------------------------

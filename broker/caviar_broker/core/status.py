@@ -1,4 +1,4 @@
-"""A run as somebody sees who asks: who does what, and who is waited for (contract, clause 14)."""
+"""The status of a run: what each service does, and which ones the run waits for (contract, clause 14)."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Wait(msgspec.Struct, frozen=True, kw_only=True):
     late: bool
     """Whether that is up."""
     missing: str
-    """Who waits for which input of it; empty if nobody does."""
+    """Which services wait for which input of it; empty if none does."""
     text: str
 
 
@@ -137,7 +137,7 @@ def _service(peer: Peer, episodes: Episodes, now: int) -> ServiceStatus:
 
 
 def _wait(run: Run, episodes: Episodes, peer: Peer, now: int) -> Wait | None:
-    """Whether the run waits for a service, and how that is told."""
+    """Whether the run waits for a service, and the words for that."""
     if not run.takes_part(peer):
         return None
     if run.state is RunState.STOPPING:

@@ -86,8 +86,8 @@ def _family(name: str, kind: str, about: str) -> Iterator[str]:
 
 
 def _sample(name: str, value: float, **labels: str | int) -> str:
-    told = ",".join(f'{key}="{_escaped(str(text))}"' for key, text in labels.items())
-    return f"{name}{{{told}}} {value}" if told else f"{name} {value}"
+    listed = ",".join(f'{key}="{_escaped(str(text))}"' for key, text in labels.items())
+    return f"{name}{{{listed}}} {value}" if listed else f"{name} {value}"
 
 
 def _escaped(text: str) -> str:
@@ -195,7 +195,7 @@ def _orders(app: FastAPI, ask: Ask, operator: list[Any]) -> None:
     async def stop(
         reason: Annotated[str, Query(min_length=1, max_length=500)] = "stopped over HTTP",
     ) -> Any:
-        """End the run in order: every service is told to leave."""
+        """End the run in order: every service gets SHUTDOWN."""
         return _state(await ask(do="stop", reason=reason))
 
 

@@ -17,7 +17,7 @@ class Tokens:
     """The tokens of a keys directory, as they are now: the file is read again when it changes.
 
     Args:
-        directory: Keys directory; None: there are no tokens, and everybody on this machine may do everything.
+        directory: Keys directory; None: there are no tokens, and a process of this machine may do everything.
     """
 
     def __init__(self, directory: Path | None) -> None:

@@ -163,7 +163,7 @@ class _Bridge:
         self._dealer: asyncio.Future[zmq.asyncio.Socket] = asyncio.get_running_loop().create_future()
         # Whether the broker has accepted the peer, and how many messages of it came before that.
         self._admitted, self._messages = False, 0
-        # What the peer is told on its ordered connection; None before, and once it has said BYE.
+        # The WELCOME that the peer got on its ordered connection; None before that, and after its BYE.
         self._welcome: m.Welcome | None = None
         self._awaits_welcome = False
         # What the peer is called, once it said so.
@@ -281,9 +281,9 @@ class _Bridge:
     async def _identify(self, name: str, role: str) -> None:
         token = self._token
         if token is not None and (token.name != name or role not in ("", token.role)):
-            told = f"the token is of {token.role} {token.name!r}, not of {role} {name!r}".replace("  ", " ")
-            await self._answer(m.Refuse(code="unauthorized", message=told))
-            raise _CutOff(1008, told)
+            text = f"the token is of {token.role} {token.name!r}, not of {role} {name!r}".replace("  ", " ")
+            await self._answer(m.Refuse(code="unauthorized", message=text))
+            raise _CutOff(1008, text)
         if self._name not in ("", name):
             raise _CutOff(1008, f"it said that it is {name!r}, on the connection of {self._name!r}")
         self._name = name

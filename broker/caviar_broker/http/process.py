@@ -126,14 +126,14 @@ async def serve(run: Path, address: str, keys: Path | None) -> None:
     remedy = f"{REMEDY} --directory {keys}" if keys is not None else REMEDY
     gateway = Gateway(_reachable(status["endpoint"]), tokens, tell, credentials, remedy)
     listening = listening_socket(host, port)
-    told: set[asyncio.Task[None]] = set()
+    notices: set[asyncio.Task[None]] = set()
 
-    def tell_soon(text: str) -> None:
+    def notify_soon(text: str) -> None:
         task = asyncio.create_task(tell("", text, NOTE))
-        told.add(task)
-        task.add_done_callback(told.discard)
+        notices.add(task)
+        task.add_done_callback(notices.discard)
 
-    server = http_server(make_app(ask, tokens, gateway), tell_soon, own_process=True)
+    server = http_server(make_app(ask, tokens, gateway), notify_soon, own_process=True)
 
     def end() -> None:
         server.should_exit = True
@@ -151,14 +151,14 @@ async def _keys_of_broker(ask: Ask, keys: Path | None) -> tuple[Path | None, Cre
 
     The key comes over the control socket, where only the broker's user can ask; it is written nowhere.
     """
-    told = await ask(do="gateway")
-    if told["keys"] is None:
+    answer = await ask(do="gateway")
+    if answer["keys"] is None:
         return keys, None
-    directory = Path(told["keys"])
+    directory = Path(answer["keys"])
     if keys is not None and keys.resolve() != directory:
         raise RunError(f"the broker has its keys and tokens in {directory}, not in {keys}; leave out --keys")
-    pair = Pair(public=told["public"], secret=told["secret"])
-    return directory, Credentials(pair, told["broker"])
+    pair = Pair(public=answer["public"], secret=answer["secret"])
+    return directory, Credentials(pair, answer["broker"])
 
 
 def _reachable(endpoint: str) -> str:
@@ -173,13 +173,13 @@ def _place(host: str, listening: socket.socket) -> str:
 
 
 @contextlib.contextmanager
-def gateway_in_front(endpoint: str, address: str, tell: Callable[[str], None]) -> Iterator[str]:
+def gateway_in_front(endpoint: str, address: str, notify: Callable[[str], None]) -> Iterator[str]:
     """Serve WebSockets for a ROUTER that is no broker's, such as that of the conformance kit, without tokens.
 
     Args:
         endpoint: Where the ROUTER listens.
         address: ``HOST:PORT`` of this machine to serve at; port 0: any.
-        tell: Is told of each connection that is refused or cut off, from another thread.
+        notify: Called in another thread with a text about each connection that is refused or cut off.
 
     Yields the URL, and serves until the context is left.
     Raises:
@@ -199,10 +199,10 @@ def gateway_in_front(endpoint: str, address: str, tell: Callable[[str], None]) -
 
     async def serve() -> None:
         async def note(_service: str, text: str, _kind: str) -> None:
-            tell(text)
+            notify(text)
 
         gateway = Gateway(endpoint, Tokens(None), note)
-        servers.append(http_server(Starlette(routes=[WebSocketRoute("/ws", gateway.serve)]), tell))
+        servers.append(http_server(Starlette(routes=[WebSocketRoute("/ws", gateway.serve)]), notify))
         try:
             await servers[0].serve(sockets=[listening])
         finally:

@@ -45,7 +45,7 @@ class Strangers:
     """The strangers of one server, oldest first.
 
     Args:
-        tell: Is told, once in `LOOK_S` at most, how many were turned out to make room, and from where.
+        tell: Called, once in `LOOK_S` at most, with a text about connections that had to make room.
         own_process: Whether the memory of connections that have ended goes back to the system, which takes a
             look at all objects of the process.
     """
@@ -198,7 +198,7 @@ def http_server(app: Any, tell: Callable[[str], None], *, own_process: bool = Fa
     Args:
         app: The application; ``scope["state"]["admit"]`` of a WebSocket is to be called once its peer is
             accepted.
-        tell: Is told of connections that were ended because there were too many.
+        tell: Called with a text about connections that were ended because there were too many.
         own_process: Whether the process is this server's own, so that its memory may be tuned for it.
     """
     if own_process:

@@ -176,7 +176,7 @@ class Access:
         return _stamp(self.directory / AUTHORIZED), _stamp(self.directory / TOKENS)
 
     def _token_refusal(self, name: str, role: str) -> str:
-        """Why nobody may appear as that service by the gateway, which sees to whose token it is."""
+        """Why no peer of the gateway may appear as that service; the gateway checks whose token it is."""
         roles = [token.role for token in self._tokens if token.name == name and token.of_service]
         if not roles:
             return f"there is no token of a service {name!r} ({self._remedy(name, role or 'ROLE')})"
@@ -202,7 +202,7 @@ def answer(access: Access | None, request: Sequence[bytes]) -> tuple[list[bytes]
     """Reply to a request of the ZeroMQ Authentication Protocol (RFC 27), and why it is a refusal.
 
     The user id that it gives to each message of the connection is the public key, in Z85. Without
-    ``access`` everybody is let in who asks for no mechanism.
+    ``access`` every peer is let in that asks for no mechanism.
     """
     version, sequence = [*request, b"", b""][:2]
     reason = f"a request of {len(request)} parts"

@@ -22,7 +22,7 @@ PERIOD_NS = 10_000_000_000
 
 
 class NoticeThrottle:
-    """Counts repetitions: the first of a kind is told at once, later ones together, every `PERIOD_NS`.
+    """Counts repetitions: the first of a kind passes at once, later ones together, every `PERIOD_NS`.
 
     What a peer sends must never decide how much the broker writes; what is held back is counted.
     """
@@ -137,7 +137,7 @@ class PeerGuard:
     ) -> None:
         self.access, self.limits = access, limits or PeerLimits()
         self.gone_words = "its connection is gone"
-        """What is said of a peer that has none. libzmq ends one over too large a part, and tells nobody."""
+        """What is said of a peer that has none. libzmq ends one over too large a part without saying so."""
         if self.limits.part < MAX_BODY:
             most = f"{self.limits.part >> 20} MiB"
             self.gone_words += f"; a part of more than {most}, part_mib in [limits], ends it too"
@@ -173,9 +173,9 @@ class PeerGuard:
 
         Args:
             loop: The broker's.
-            lost: Is told routing id and reason of a peer that is cut off; whether that was a service.
-            gone: Is told the routing id of a service whose connection has ended.
-            tell: Is told of what others than services did: its kind, and a text.
+            lost: Called with routing id and reason of a peer that is cut off; whether that was a service.
+            gone: Called with the routing id of a service whose connection has ended.
+            tell: Called with kind and text of what others than services did.
         """
         self._lost, self._gone, self._tell = lost, gone, tell
         loop.watch(self._wires.monitor, self._connections_changed)
@@ -318,7 +318,7 @@ class PeerGuard:
                 self._peers.pop(peer.route, None)
 
     def _measure(self, wire: TcpConnection, maybe: _Peer | None, now: int) -> None:
-        """Cut off whoever has more waiting than it may; ``maybe``: whose the connection may be."""
+        """Cut off a peer that has more waiting than it may; ``maybe``: whose connection it may be."""
         acknowledged, received = wire.transferred()
         peer = self._by_wire.get(wire)
         chatter = CHATTER * (1 + (now - wire.since) // 10**9)

@@ -25,7 +25,7 @@ _BYTES = struct.Struct("=QQ")
 _BYTES_AT = 120
 _WATCHED = int(zmq.EVENT_ACCEPTED) | int(zmq.EVENT_DISCONNECTED) | int(zmq.EVENT_CLOSED)
 UNKNOWN = "somewhere"
-"""Address of a connection that ended before anybody could ask for it."""
+"""Address of a connection that ended before it could be asked for."""
 UNCLEAR_NS = 2_000_000_000
 """[ns] for which messages of a closed connection may still come, while its descriptor is another's."""
 
@@ -127,7 +127,7 @@ class TcpConnections:
 
     def claim(self, wire: TcpConnection, address: str) -> bool:
         """Whether a connection certainly is that of a routing id with such an address, which had a message
-        with its descriptor; it is nobody else's from then on."""
+        with its descriptor; no other routing id claims it from then on."""
         if not wire.open or wire.claimed or time.monotonic_ns() < wire.unclear_until:
             return False
         if address and wire.address and address != wire.address:
@@ -174,7 +174,7 @@ def plain(address: str) -> str:
 
 
 def _identity(fd: int) -> tuple[int, str] | None:
-    """Inode and peer address of somebody else's socket, also where no descriptor is left for one of our own;
+    """Inode and peer address of libzmq's socket, also where no descriptor is left for one of our own;
     None where it is no socket."""
     try:
         found = os.fstat(fd)
@@ -193,7 +193,7 @@ def _identity(fd: int) -> tuple[int, str] | None:
 
 
 def _duplicate(fd: int) -> socket.socket | None:
-    """A socket of our own on somebody else's descriptor; None where that is none."""
+    """A socket of our own on libzmq's descriptor; None where that is no socket."""
     try:
         if not stat.S_ISSOCK(os.fstat(fd).st_mode):
             return None
