@@ -4,19 +4,46 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Protocol
 
 import zmq
 
 from caviar_broker.core import events as ev
 from caviar_broker.core.clock import FrameClock
+from caviar_broker.core.plan import PatternFile
 from caviar_broker.core.transitions import ServiceState
 from caviar_protocol import messages as m
 from caviar_protocol.assets import AssetStore, Incoming
 from caviar_protocol.errors import AssetError
+from caviar_protocol.scenario import Scenario
+from caviar_protocol.scenario.rules import world_of
+from caviar_protocol.scenario.schema import pattern_asset
 
 FILES_AT_ONCE = 8
 """Files that a world is asked for at a time: a city has thousands, and queues are finite."""
+
+
+def pattern_files(scenario: Scenario, store: AssetStore) -> tuple[PatternFile, ...]:
+    """The pattern files of a scenario's devices, put into the store: worlds need not bring them.
+
+    Args:
+        scenario: With absolute paths, as it is loaded.
+        store: That of the broker.
+
+    Raises:
+        AssetError: A file cannot be read or stored, or is too large.
+    """
+    found: dict[str, PatternFile] = {}
+    for index, device in enumerate(scenario.devices):
+        if device.array is not None and device.array.pattern_file:
+            path = device.array.pattern_file
+            name, key = pattern_asset(path), f"devices[{index}].array.pattern_file"
+            # A replayed world brings what was recorded, whatever the file has become since.
+            known = scenario.replay is None and Path(path).is_file()
+            asset = store.add(name, Path(path)) if known else None
+            found.setdefault(name, PatternFile(name, key, path, world_of(scenario, index), asset))
+    return tuple(found.values())
 
 
 class Reply(Protocol):

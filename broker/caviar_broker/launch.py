@@ -23,6 +23,7 @@ from pathlib import Path
 
 import msgspec
 
+from caviar_broker.assets import pattern_files
 from caviar_broker.control.launcher import LauncherPipe, Reporter, stop_on_signals
 from caviar_broker.control.server import ControlServer
 from caviar_broker.control.socket import locked, refuse_second_broker
@@ -42,6 +43,7 @@ from caviar_broker.run_record import RunRecord, changes, read_record, versions_o
 from caviar_broker.security.access import Access, check_bind
 from caviar_broker.security.limits import PeerLimits
 from caviar_broker.server import BrokerServer
+from caviar_protocol.assets import AssetStore
 from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.files import file_system_of
 from caviar_protocol.host import steady_memory
@@ -106,7 +108,8 @@ def _serve(arguments: argparse.Namespace, record: RunRecord, directory: Path, fo
     check_bind(record.endpoint, keys=access is not None)
     beside = HttpProcess(directory, arguments.http, arguments.keys, again=bool(arguments.resume))
     plan = replace(plan_run(scenario, record.run, briefings(scenario, directory)), epoch=record.epoch)
-    plan = with_replay(plan, scenario.replay)
+    store = AssetStore()
+    plan = replace(with_replay(plan, scenario.replay), patterns=pattern_files(scenario, store))
     durability = record.scenario.run.durability
     checkpoints = CheckpointFiles(directory, durable=durability != "none")
     # A launcher that starts its broker again has not summed the run up yet.
@@ -132,6 +135,7 @@ def _serve(arguments: argparse.Namespace, record: RunRecord, directory: Path, fo
                 record.endpoint,
                 journal,
                 control,
+                store=store,
                 supervised=supervised,
                 access=access,
                 peer_limits=PeerLimits.of(record.scenario.limits),

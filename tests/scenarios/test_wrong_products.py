@@ -9,7 +9,7 @@ import wrong_worlds
 from scenarios_support import SCENARIOS, run, scenario_file
 
 from caviar_clients.session.embedded import EmbeddedRun
-from caviar_protocol.scenario import Scenario, parse_scenario
+from caviar_protocol.scenario import Scenario, load_scenario, parse_scenario
 
 OBJECTS = "[[services.world.settings.objects]]"
 WORDS = {
@@ -77,6 +77,25 @@ def test_a_false_digest_is_refused_before_it_is_recorded(tmp_path: Path) -> None
     finished = run(scenario_file(tmp_path, wrong("a false digest")), tmp_path / "out")
     assert finished.status == 1
     assert "world 'world' made a wrong product: scene of 'world', frame 0: its digest is" in finished.output
+
+
+def test_the_broker_brings_a_pattern_file_that_the_world_does_not(tmp_path: Path) -> None:
+    rows = ["theta_deg,phi_deg,gain_dbi", *(f"{t},{p},{-t / 60}" for t in (0, 90, 180) for p in (0, 180, 360))]
+    (tmp_path / "sector.csv").write_text("\n".join(rows))
+    text = (SCENARIOS / "smoke.toml").read_text().replace("frames = 100", "frames = 3")
+    old = "array = { rows = 4, columns = 8"
+    assert old in text
+    text = text.replace(old, old.replace("{", '{ pattern_file = "file:sector.csv",'), 1)
+    digests = set()
+    for name, use in [("own", "trajectory"), ("broker", "wrong_worlds:Patternless")]:
+        file = tmp_path / f"{name}.toml"
+        file.write_text(text.replace('use = "trajectory"', f'use = "{use}"'))
+        (tmp_path / name).mkdir()
+        outcome = EmbeddedRun(load_scenario(file), tmp_path / name).run()
+        assert outcome.error == ""
+        assert [item.name for item in (tmp_path / name).rglob("sector.csv")] == ["sector.csv"]
+        digests.add(outcome.digest)
+    assert len(digests) == 1
 
 
 @pytest.mark.parametrize("part", ["h", "taps"])

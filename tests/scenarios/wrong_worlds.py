@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, ClassVar, cast
 
 import msgspec
@@ -149,3 +150,10 @@ class Partless(FreeSpaceChannel):
     def step(self, frame: Frame) -> StepResult:
         made, lacks = super().step(frame), cast(PartlessSettings, self.settings).lacks
         return replace(made, products={"channel": replace(made.products["channel"], **{lacks: ()})})
+
+
+class Patternless(TrajectoryWorld):
+    """A world that offers no pattern files, as one on another machine that does not have them."""
+
+    def scenery(self) -> Mapping[str, Path | bytes]:
+        return {name: file for name, file in super().scenery().items() if not name.startswith("patterns/")}

@@ -6,7 +6,7 @@ import pytest
 from core_harness import MS, SECOND, Sim, Simulation, agent, channel, link, loop, recorder, sensors, world
 
 from caviar_broker.core import events as ev
-from caviar_broker.core.plan import Feature, Limits, plan_run
+from caviar_broker.core.plan import Feature, Limits, PatternFile, plan_run
 from caviar_broker.core.transitions import RunState
 from caviar_protocol import messages as m
 from caviar_protocol.digest import geometry_digest
@@ -223,6 +223,38 @@ def test_clause_4_the_geometry_of_all_worlds_is_accepted() -> None:
     worlds = [world(assets=files[1:]), world("uav", assets=files[:1])]
     both = channel(ready={"geometry": geometry_digest(files)})
     assert Simulation([*worlds, both, agent(), link()]).join().run().outcome.error == ""
+
+
+def patterned(own: m.Asset | None, offered: tuple[m.Asset, ...]) -> Simulation:
+    """A run whose scenario names a pattern file, which the broker has as ``own``."""
+    file = PatternFile("patterns/a.csv", "devices[0].array.pattern_file", "/here/a.csv", "world", own)
+    return Simulation(loop(world={"assets": offered}), patterns=(file,)).join().run()
+
+
+def test_a_pattern_file_that_no_world_offers_comes_from_the_broker() -> None:
+    mine = asset("patterns/a.csv")
+    for offered in ((), (mine,)):
+        run = patterned(mine, offered)
+        assert run.outcome.error == ""
+        assert run.seen(m.Prepare, "channel")[0].assets == (mine,)
+
+
+def test_another_pattern_file_than_the_scenarios_is_refused_and_its_world_named() -> None:
+    run = patterned(asset("patterns/a.csv"), (asset("patterns/a.csv", "b"),))
+    assert run.outcome.culprit == "world"
+    assert (
+        "world 'world' offers another file as 'patterns/a.csv' than the scenario's /here/a.csv"
+        in run.outcome.error
+    )
+    assert not run.seen(m.Grant)
+
+
+def test_a_pattern_file_that_is_nowhere_ends_the_run_before_its_first_frame() -> None:
+    run = patterned(None, ())
+    assert run.outcome.culprit == "world"
+    assert "devices[0].array.pattern_file: world 'world' offers no 'patterns/a.csv', and" in run.outcome.error
+    assert not run.seen(m.Grant)
+    assert patterned(None, (asset("patterns/a.csv"),)).outcome.error == ""
 
 
 def test_scenery_of_somebody_who_is_no_world_is_not_used() -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from caviar_protocol.fields import Version
-from caviar_protocol.messages import GrantInput, Policy, Role
+from caviar_protocol.messages import Asset, GrantInput, Policy, Role
 from caviar_protocol.scenario import REMOTE_REJOIN_S, Scenario, ServiceSpec
 from caviar_protocol.scenario.conversion import Source
 from caviar_protocol.scenario.loader import instants_ns
@@ -30,6 +30,22 @@ class Feature:
     text: str
     """What it is, for people."""
     since: Version
+
+
+@dataclass(frozen=True)
+class PatternFile:
+    """A pattern of antenna elements that a device of the scenario names."""
+
+    name: str
+    """Of the asset that it travels as."""
+    key: str
+    """Where it stands: ``devices[0].array.pattern_file``."""
+    path: str
+    """On the machine of the broker."""
+    world: str
+    """The world that publishes the device."""
+    asset: Asset | None
+    """As it lies on the machine of the broker; None: it is not there, or what was recorded goes before it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,6 +110,8 @@ class RunPlan:
     """Whether nothing is kept of the run: no journal, digest or latencies. An embedded run without files."""
     source: Source = field(default_factory=Source)
     """Where the scenario was read from, to name the lines of what services find wrong in it."""
+    patterns: tuple[PatternFile, ...] = ()
+    """Pattern files that the scenario names, each once; the broker offers those that no world does."""
     checkpoint_frames: int = 0
     """Frames after which a service that can do so saves its state; 0: never."""
     imposed: Mapping[tuple[str, int, int], Mapping[str, str]] = field(default_factory=dict)

@@ -135,6 +135,9 @@ class Registration:
         assert run.graph is not None
         worlds = [p for p in run.peers.values() if p.role == "world" and run.takes_part(p)]
         scenery_is_known = all(p.ready for p in worlds)
+        if scenery_is_known and (missing := self._missing_pattern()):
+            run.fail(*missing, now)
+            return
         for peer in run.peers.values():
             if peer.state is ServiceState.JOINED and (peer.role == "world" or scenery_is_known):
                 peer.move(ServiceEvent.PREPARE, now)
@@ -149,9 +152,22 @@ class Registration:
                 run.send(peer, prepare)
 
     def _scenery(self) -> tuple[Asset, ...]:
-        """The scenery of all worlds, each file once."""
-        found = {asset.name: asset for peer in self._run.peers.values() for asset in peer.assets}
+        """The scenery of all worlds, each file once, and pattern files that no world brings."""
+        found = {pattern.name: pattern.asset for pattern in self._run.plan.patterns if pattern.asset}
+        found |= {asset.name: asset for peer in self._run.peers.values() for asset in peer.assets}
         return tuple(found[name] for name in sorted(found))
+
+    def _missing_pattern(self) -> tuple[str, str] | None:
+        """What to say of the first pattern file that neither a world nor the broker has, and its world."""
+        known = {asset.name for asset in self._scenery()}
+        for pattern in self._run.plan.patterns:
+            if pattern.name not in known:
+                text = (
+                    f"{pattern.key}: world {pattern.world!r} offers no {pattern.name!r}, and the broker has "
+                    f"no file {pattern.path}; put it there, or have the world offer it"
+                )
+                return located(text, pattern.world, self._run.plan.source), pattern.world
+        return None
 
     def handle_asset_offer(self, event: ev.AssetsOffered, now: int) -> None:
         """A world's scenery: one name stands for one file in the run (clause 4)."""
@@ -168,6 +184,15 @@ class Registration:
             if other is not peer and clashing:
                 text = f"{other} and {peer} bring different files named {clashing[0]!r}; rename one of them"
                 self._refuse(peer, "clash", text, now)
+                return
+        for pattern in run.plan.patterns:
+            offered = digests.get(pattern.name)
+            if offered and pattern.asset and offered != pattern.asset.digest:
+                text = (
+                    f"{pattern.key}: {peer} offers another file as {pattern.name!r} than the scenario's "
+                    f"{pattern.path}: have it offer that one, or none, and the broker does"
+                )
+                self._refuse(peer, "geometry", located(text, peer.name, run.plan.source), now)
                 return
         peer.assets, peer.advanced_at = event.assets, now
 

@@ -16,6 +16,7 @@ from typing import Any
 
 from msgspec.structs import replace as replace_field
 
+from caviar_broker.assets import pattern_files
 from caviar_broker.core import events as ev
 from caviar_broker.core.clock import FrameClock
 from caviar_broker.core.plan import briefings, plan_run, with_ownership
@@ -77,8 +78,14 @@ class EmbeddedRun:
         # Whoever runs ahead gains nothing in one process, and works in vain where an agent ends the episode.
         plan = with_replay(plan, scenario.replay)
         imposed = plan.imposed if imposed is None else imposed
+        store = AssetStore()
         plan = replace(
-            plan, frames_in_flight=1, checkpoint_frames=0, ephemeral=directory is None, imposed=imposed
+            plan,
+            frames_in_flight=1,
+            checkpoint_frames=0,
+            ephemeral=directory is None,
+            imposed=imposed,
+            patterns=pattern_files(scenario, store),
         )
         self.statistics = Statistics({s.name: s.budget_ns for s in plan.services})
         self._now = 0
@@ -91,7 +98,7 @@ class EmbeddedRun:
         """How it ended; None until then."""
         self._stop_reason = ""
         self._orders: deque[ev.Send] = deque()
-        store, check, seats = AssetStore(), ContentCheck(), seats or {}
+        check, seats = ContentCheck(), seats or {}
         self.seats = {
             name: Seat(
                 name,
