@@ -248,7 +248,8 @@ class Done(_Message, frozen=True, kw_only=True, tag="DONE"):
     measured: dict[str, Duration] = {}
     """How long a named phase took. Wall time stands here, never in a product (clause 6)."""
     counts: dict[str, Count] = {}
-    """What was dropped or skipped, by name (clause 21): ``non-finite-paths``."""
+    """What was dropped or skipped, by name (clause 21): ``dropped``, the paths of a channel that are
+    not finite, of which the user is warned."""
     end_episode: bool = False
     """An agent ends the episode with this frame (clause 16)."""
     seed: SeedOrNone = -1

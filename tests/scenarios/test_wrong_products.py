@@ -80,7 +80,7 @@ def test_a_false_digest_is_refused_before_it_is_recorded(tmp_path: Path) -> None
 
 
 def test_the_broker_brings_a_pattern_file_that_the_world_does_not(tmp_path: Path) -> None:
-    rows = ["theta_deg,phi_deg,gain_dbi", *(f"{t},{p},{-t / 60}" for t in (0, 90, 180) for p in (0, 180, 360))]
+    rows = ["theta_deg,phi_deg,gain_dbi", *(f"{t},{p},0" for t in (0, 90, 180) for p in (0, 180, 360))]
     (tmp_path / "sector.csv").write_text("\n".join(rows))
     text = (SCENARIOS / "smoke.toml").read_text().replace("frames = 100", "frames = 3")
     old = "array = { rows = 4, columns = 8"

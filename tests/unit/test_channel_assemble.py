@@ -44,7 +44,7 @@ def build(table: PathTable, with_h: bool = False) -> Channel:
     product = Product(rung="siso-rt", options=ChannelOptions(), carriers=CARRIERS, with_h=with_h)
     transmitters = [antenna("t0", 0.0, columns=4), antenna("t1", 5.0)]
     receivers = [antenna("r0", 50.0), antenna("r1", 60.0, columns=2), antenna("r2", 70.0)]
-    return assemble(product, transmitters, receivers, table, np.ones((2, 3), bool))
+    return assemble(product, transmitters, receivers, table, np.ones((2, 3), bool))[0]
 
 
 @pytest.mark.parametrize("seed", range(5))

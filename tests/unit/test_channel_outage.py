@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,10 +13,13 @@ from caviar_protocol.arrays import Float64Array
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.topics import AntennaDevice, Carrier, Channel, Scene
+from caviar_services.channel.base import Found
 from caviar_services.channel.outage import outage_counts
+from caviar_services.channel.paths import Antenna
 from caviar_services.channel.propagation.clearance import RISING_RAYS, Surfaces
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.sionna.settings import SionnaSettings
+from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.meshes import box
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 
@@ -102,6 +106,37 @@ def test_users_with_a_path_are_not_counted_and_a_carrier_without_amplitude_has_n
     found = channel([1, 2, 0], [False] * 3, [[1, 0, 1], [1, 0, 0]])
     assert outage_counts(found, devices, Town()) == {"no-path/blocked": 1 + 2}
     assert outage_counts(channel([1, 1, 1], [False] * 3), devices, Town()) == {}
+
+
+def test_users_whose_paths_were_dropped_are_told_from_those_without() -> None:
+    devices = scene(BS, *(antenna(f"r{i}", (20.0, 9.0, 1.0)) for i in range(3)))
+    found = outage_counts(channel([0, 0, 1], [True, False, True]), devices, Town(), {0, 2})
+    assert found == {"no-path/not-finite": 2, "no-path/blocked": 2}
+
+
+class NotFinite(FreeSpaceChannel):
+    """A model that computes no amplitude for its second receiver."""
+
+    def paths(self, scene: Scene, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]) -> Found:
+        found = super().paths(scene, transmitters, receivers)
+        found.table.transfer[:, found.table.pair == 1] = np.nan
+        return found
+
+
+def test_a_model_that_computes_no_number_says_so_in_its_counts() -> None:
+    devices = scene(BS, *(antenna(f"r{i}", (20.0, 9.0, 1.0)) for i in range(2)))
+    model = NotFinite(FreeSpaceSettings(), RunInfo(name="channel", carriers=CARRIERS))
+    model.prepare(Preparation(demand={"channel": frozenset()}))
+    provenance = GrantInput(topic="scene", source="world", status=Status.FRESH, frame=0)
+    made = model.step(
+        Frame(
+            episode=0, number=0, t_ns=0, inputs=(FrameInput(provenance, payload=devices),), service="channel"
+        )
+    )
+    assert {name: made.counts[name] for name in ("dropped", "no-path/not-finite")} == {
+        "dropped": 1,
+        "no-path/not-finite": 2,
+    }
 
 
 def test_no_device_is_a_user_of_itself() -> None:

@@ -53,7 +53,7 @@ def product(parts: frozenset[str], reached: tuple[int, ...] = (0,)) -> Channel:
         object_velocity=np.zeros((1, 3)),
     )
     asked = Product(rung="siso-rt", options=ChannelOptions(), carriers=CARRIERS, with_h=True, wideband=parts)
-    return assemble(asked, transmitters, receivers, table, np.array([[True, False]]))
+    return assemble(asked, transmitters, receivers, table, np.array([[True, False]]))[0]
 
 
 BOTH = frozenset({"hf", "taps"})

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from msgspec.structs import replace
 from recording_samples import frame, link, product, recorder, scene
 
-from caviar_clients.cli.recording_summary import SHOWN_INSIDE, Outages, outage_lines, summarise
+from caviar_clients.cli.recording_summary import SHOWN_INSIDE, Dropped, Outages, outage_lines, summarise
 from caviar_protocol.messages import Report
 from caviar_protocol.recording import Recording
 
@@ -45,6 +46,23 @@ def test_what_stands_inside_of_what_is_named_and_the_list_is_bounded() -> None:
     lines = outage_lines(found)
     assert lines[1] == "inside an object: car-0/rx in car-0, in 2 frames"
     assert lines[-1] == "inside an object: 3 more antennas"
+
+
+def test_paths_that_were_dropped_are_warned_of() -> None:
+    dropped = Dropped()
+    for count in (0, 3, 4):
+        dropped.add([channel(dropped=count), Report(source="link", counts={"x": 9})])
+    (warning,) = dropped.warnings()
+    assert warning.startswith("channel dropped 7 paths with values that are not finite, in 2 frames: ")
+    assert Dropped().warnings() == []
+
+
+def test_a_recording_warns_of_paths_that_were_dropped(tmp_path: Path) -> None:
+    made = recorder(tmp_path)
+    made.step(replace(frame(0), reports=(channel(dropped=2, no_path__not_finite=1),)))
+    made.close()
+    summary = summarise(Recording(tmp_path))
+    assert [warning.partition(" with")[0] for warning in summary.warnings] == ["channel dropped 2 paths"]
 
 
 def test_where_all_users_had_a_path_nothing_is_said() -> None:

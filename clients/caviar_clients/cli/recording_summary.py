@@ -182,6 +182,32 @@ class Unserved:
         ]
 
 
+_DROPPED = "dropped"
+
+
+class Dropped:
+    """Sums paths that channels dropped because their values are not finite."""
+
+    def __init__(self) -> None:
+        self._paths: Counter[str] = Counter()
+        self._frames: Counter[str] = Counter()
+
+    def add(self, reports: Iterable[Report]) -> None:
+        """What services reported of a frame."""
+        for report in reports:
+            if paths := report.counts.get(_DROPPED):
+                self._paths[report.source] += paths
+                self._frames[report.source] += 1
+
+    def warnings(self) -> list[str]:
+        """For a user: a line for each channel that dropped paths."""
+        return [
+            f"{source} dropped {counted(paths, 'path')} with values that are not finite, in "
+            f"{_frames(self._frames[source])}: what its model computes is wrong there"
+            for source, paths in sorted(self._paths.items())
+        ]
+
+
 SHOWN_DAMAGE = 20
 """Lines about damage that are printed; how many there are more is said."""
 
@@ -264,12 +290,14 @@ def summarise(recording: Recording) -> RunSummary:
     metadata, damage = recording.metadata, list(recording.damage)
     sources: dict[tuple[str, str], SourceSummary] = {}
     totals, decisions, unserved, outages = _LinkTotals(), Decisions(), Unserved(), Outages()
+    dropped = Dropped()
     episodes: dict[int, int] = {}  # to the last instant [ns]
     for frame in recording.frames():
         episodes[frame.episode] = max(frame.t_ns, episodes.get(frame.episode, 0))
         decisions.add(frame.episode, frame.reports)
         unserved.add(frame.reports)
         outages.add(frame.reports)
+        dropped.add(frame.reports)
         for entry in frame.inputs:
             key = (entry.topic, entry.source)
             source = sources.setdefault(key, SourceSummary(topic=entry.topic, source=entry.source))
@@ -294,7 +322,7 @@ def summarise(recording: Recording) -> RunSummary:
         link=totals.summary(),
         outage=outages.summary(totals.users - totals.served),
         decided=decisions.summary(),
-        warnings=unserved.warnings(),
+        warnings=[*unserved.warnings(), *dropped.warnings()],
         versions=metadata.versions,
         machine=metadata.machine,
         notes=metadata.notes,

@@ -251,6 +251,8 @@ class Channel(Payload, frozen=True, kw_only=True, omit_defaults=True):
 class Cause(Enum):
     """Why no path reaches a user; of several causes the one that stands first."""
 
+    NOT_FINITE = "not finite"
+    """The paths that were found have values that are not finite, and were dropped: a defect of the model."""
     INSIDE = "inside an object"
     """An end is inside a building or a body, its own or another."""
     TOO_CLOSE = "too close"

@@ -54,8 +54,10 @@ def assemble(
     table: PathTable,
     los: BoolArray,
     matrices: Matrices | None = None,
-) -> Channel:
-    """The canonical product: antennas, phase and absorption applied, non-finite paths dropped, sorted.
+) -> tuple[Channel, frozenset[int]]:
+    """The canonical product, and the numbers of the pairs of which paths were dropped.
+
+    Antennas, phase and absorption are applied, paths that are not finite dropped, the others sorted.
 
     ``matrices`` makes H, and its wideband parts, where they are in demand: `PlaneWaves` unless the model has
     a way of its own.
@@ -69,6 +71,7 @@ def assemble(
             a = a * amplitude_factor(product.absorption_db_per_km, geometry.tau)
     finite = _finite(table, geometry, a)
     dropped = len(finite) - int(np.count_nonzero(finite))
+    dropped_pairs = frozenset(table.pair[~finite].tolist())
     if dropped:
         table, geometry, a, row = table.take(finite), _select(geometry, finite), a[:, finite], row[finite]
     aod, aoa = angles(geometry.departure), angles(geometry.arrival)
@@ -97,7 +100,7 @@ def assemble(
         offsets = np.searchsorted(table.pair, np.arange(pairs + 1)).astype(np.int64)
     frequency = np.array([carrier.frequency_hz for carrier in product.carriers])
     depth = int((table.types != 0).sum(1).max(initial=0))
-    return Channel(
+    channel = Channel(
         rung=product.rung,
         options=product.options,
         carriers=product.carriers,
@@ -120,6 +123,7 @@ def assemble(
         hf=wideband.hf,
         taps=wideband.taps,
     )
+    return channel, dropped_pairs
 
 
 def _located(

@@ -71,6 +71,8 @@ class Modelled:
     """Nanoseconds that named phases took."""
     split_nmse: Float64Array | None = None
     """See `Found.split_nmse`."""
+    dropped_pairs: frozenset[int] = frozenset()
+    """Numbers of the pairs of which paths were dropped, for values that are not finite."""
 
 
 class ChannelModel(Service[S]):
@@ -197,7 +199,7 @@ class ChannelModel(Service[S]):
                 "paths": len(channel.tau),
                 "dropped": channel.dropped,
                 **made.counts,
-                **outage_counts(channel, scene, self),
+                **outage_counts(channel, scene, self, made.dropped_pairs),
             },
             measured=made.measured,
         )
@@ -315,7 +317,7 @@ class PathModel(ChannelModel[S]):
             wideband=self.wideband,
             absorption_db_per_km=self.absorption_db_per_km,
         )
-        channel = assemble(product, tx, rx, found.table, found.los, found.matrices)
+        channel, dropped = assemble(product, tx, rx, found.table, found.los, found.matrices)
         if np.abs(channel.a).max(initial=0.0) > 1:
             _refuse_amplified(channel)
         done = time.perf_counter_ns()
@@ -324,6 +326,7 @@ class PathModel(ChannelModel[S]):
             counts={**self._turnover(frame, channel), **found.counts},
             measured={"paths": traced - begin, "assemble": done - traced},
             split_nmse=found.split_nmse,
+            dropped_pairs=dropped,
         )
 
     def _turnover(self, frame: Frame, channel: Channel) -> dict[str, int]:

@@ -6,7 +6,7 @@ Only users without a path cost anything here, and nothing of it is part of the p
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Protocol
 
 import numpy as np
@@ -30,8 +30,17 @@ class Surroundings(Protocol):
         """Name of the object that a point [m], Shape ``[3]``, is inside; empty: none."""
 
 
-def outage_counts(channel: Channel, scene: Scene, surroundings: Surroundings) -> dict[str, int]:
-    """Users without a path by `Cause`, and the antennas that stand inside an object, for a report."""
+def outage_counts(
+    channel: Channel, scene: Scene, surroundings: Surroundings, dropped_pairs: Collection[int] = ()
+) -> dict[str, int]:
+    """Users without a path by `Cause`, and the antennas that stand inside an object, for a report.
+
+    Args:
+        channel: The product of a frame.
+        scene: The scene that it was made of.
+        surroundings: What the model knows about places.
+        dropped_pairs: Pairs of which paths were dropped, for values that are not finite.
+    """
     offsets = channel.offsets
     if (offsets[1:] > offsets[:-1]).all() and channel.a.all():
         return {}
@@ -41,7 +50,8 @@ def outage_counts(channel: Channel, scene: Scene, surroundings: Surroundings) ->
     for p in np.flatnonzero(users).tolist():
         t, r = divmod(p, len(channel.rx))
         if channel.tx[t] != channel.rx[r]:
-            causes[ends.cause(t, r)] += int(users[p])
+            cause = Cause.NOT_FINITE if p in dropped_pairs else ends.cause(t, r)
+            causes[cause] += int(users[p])
     counts = {cause.count_name: number for cause, number in causes.items()}
     return counts | {f"{INSIDE_PREFIX}{name} in {around}": 1 for name, around in ends.inside.items()}
 

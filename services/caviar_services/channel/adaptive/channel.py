@@ -196,7 +196,7 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
                 "paths": len(channel.tau),
                 "dropped": channel.dropped,
                 **made.counts,
-                **outage_counts(channel, scene, rung.model),
+                **outage_counts(channel, scene, rung.model, made.dropped_pairs),
                 **{name: count for name, count in counts.items() if count},
             },
             measured=measured,
