@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from caviar_protocol.errors import DeclarationError
-from caviar_services.service import Service
+from caviar_services.service import NoSettings, Service
 
 BUILT_IN: dict[str, str] = {
     "world:sumo": "caviar_services.world.sumo:SumoWorld",
@@ -86,6 +86,16 @@ def load(role: str, name: str) -> type[Service[Any]]:
     if inspect.isabstract(cls):
         missing = ", ".join(sorted(cls.__abstractmethods__))
         raise DeclarationError(f"{role} {name!r} is {target}, which does not define: {missing}")
+    missing = ", ".join(name for name in cls.attributes_to_set if not hasattr(cls, name))
+    if missing:
+        raise DeclarationError(f"{role} {name!r} is {target}, which does not set: {missing}")
+    for base in cls.__mro__[1:]:
+        inherited = vars(base).get("Settings", NoSettings)
+        if inherited is not NoSettings and not issubclass(cls.Settings, inherited):
+            raise DeclarationError(
+                f"{role} {name!r} is {target}, whose Settings is {cls.Settings.__name__}: it has to be a "
+                f"subclass of {inherited.__name__}, that of {base.__name__}"
+            )
     return cls
 
 

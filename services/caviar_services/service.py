@@ -265,6 +265,8 @@ class Service(ABC, Generic[S]):
     """Whether `checkpoint` and `restore` are implemented: the service has state that outlives a frame."""
     extra: ClassVar[str] = ""
     """Extra of the distribution that brings the libraries of this service; empty: the base install does."""
+    attributes_to_set: ClassVar[tuple[str, ...]] = ()
+    """Class attributes that an implementation has to set; looked for when its class is loaded."""
     Settings: ClassVar[type[msgspec.Struct]] = NoSettings
     """Settings from the scenario: a frozen struct, ``forbid_unknown_fields=True``, units in names."""
 

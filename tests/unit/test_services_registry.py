@@ -65,7 +65,29 @@ def test_an_unknown_name_comes_with_the_nearest_and_all_known() -> None:
         load("channel", "freespace")
 
 
+UNFINISHED = """
+import msgspec
+from caviar_services.channel.base import ChannelSettings, PathModel
+
+class NoRung(PathModel):
+    def paths(self, scene, transmitters, receivers): ...
+
+class Plain(msgspec.Struct, frozen=True): ...
+
+class PlainSettings(NoRung):
+    Settings, rung = Plain, "plain"
+
+class Right(NoRung):
+    rung = "right"
+"""
+
+
 BROKEN = {
+    "no rung": ("unfinished:NoRung", "which does not set: rung"),
+    "settings of another kind": (
+        "unfinished:PlainSettings",
+        "whose Settings is Plain: it has to be a subclass of ChannelSettings, that of ChannelModel",
+    ),
     "no module": ("nowhere_at_all:Channel", "No module named 'nowhere_at_all'"),
     "no class": ("caviar_services.channel.statistical.free_space:Chanel", "has no attribute 'Chanel'"),
     "no place": (":Channel", "cannot be loaded from :Channel"),
@@ -83,6 +105,8 @@ def test_what_is_wrong_with_an_implementation_is_said(
 ) -> None:
     module(tmp_path, monkeypatch, "broken_syntax", "class Channel(:\n")
     module(tmp_path, monkeypatch, "broken_import", "1 / 0\n")
+    module(tmp_path, monkeypatch, "unfinished", UNFINISHED)
+    assert load("channel", "unfinished:Right").__name__ == "Right"
     with pytest.raises(DeclarationError) as caught:
         load("channel", place)
     assert words in str(caught.value)

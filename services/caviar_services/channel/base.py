@@ -86,6 +86,7 @@ class ChannelModel(Service[S]):
     Settings: ClassVar[type[msgspec.Struct]] = ChannelSettings
     inputs: ClassVar[tuple[Input, ...]] = (Input(topic="scene"),)
     outputs: ClassVar[tuple[str, ...]] = ("channel",)
+    attributes_to_set: ClassVar[tuple[str, ...]] = ("rung",)
     rung: str
     """Step of the fidelity ladder."""
 

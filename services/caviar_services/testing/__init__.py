@@ -11,6 +11,14 @@ Implementations in the registry are tested without even that (``tests/conformanc
 
 from __future__ import annotations
 
+try:
+    import pytest  # noqa: F401 - an extra: users who run no tests do not need it
+except ModuleNotFoundError as missing:
+    from caviar_protocol.errors import SetupError
+    from caviar_protocol.host import install_command
+
+    raise SetupError(f"the conformance tests need pytest; run: {install_command('testing')}") from missing
+
 from caviar_services.testing.base import Played, ServiceConformance
 from caviar_services.testing.recorders import RecorderConformance
 from caviar_services.testing.roles import (
