@@ -6,7 +6,9 @@ import dataclasses
 import json
 import struct
 import sys
+from io import StringIO
 from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
 import numpy as np
@@ -15,8 +17,9 @@ from recording_samples import record, scene
 from rich.console import Console
 
 from caviar_clients.cli import main as command
+from caviar_clients.cli import radio_map as radio_map_command
 from caviar_clients.cli.radio_map import ARRAYS, draw_radio_map, options_of
-from caviar_clients.cli.radio_map_inputs import Wanted, channel_of, in_hertz, noise_of
+from caviar_clients.cli.radio_map_inputs import Wanted, channel_of, in_hertz, noise_of, surface_of
 from caviar_clients.plots.radio_map import RadioMapView, colour_limits, draw_servers, draw_values
 from caviar_clients.tradeoff.scenes import scene_at
 from caviar_protocol.errors import RecordingError, RunError, ScenarioError
@@ -170,3 +173,91 @@ def test_a_scenario_gives_pictures_and_arrays_that_agree(tmp_path: Path) -> None
     np.testing.assert_allclose(arrays["rss"] - arrays["gain"], arrays["power"][0], atol=1e-4)
     noise = 10 * np.log10(about["noise_w"]) + 30
     np.testing.assert_allclose(arrays["sinr"], arrays["rss"] - noise, atol=1e-4)
+
+
+PATTERN = "theta_deg,phi_deg,gain_dbi\n0,0,-3\n90,0,-3\n180,0,-3\n0,180,-3\n90,180,-3\n180,180,-3\n"
+
+
+def with_pattern(folder: Path, *changes: tuple[str, str]) -> Path:
+    """`smoke` whose base station has elements of a file."""
+    (folder / "flat.csv").write_text(PATTERN)
+    text = (Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml").read_text()
+    for old, new in (("array = { rows = 4, columns = 8 }", 'array.pattern_file = "file:flat.csv"'), *changes):
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "mine.toml").write_text(text)
+    return folder / "mine.toml"
+
+
+@pytest.mark.channel
+def test_elements_of_a_pattern_file_radiate(tmp_path: Path) -> None:
+    """3 dB less than an isotropic element towards everywhere."""
+    cells = Wanted(cell=20.0, area=(-50.0, -40.0, 50.0, 40.0))
+    options = options_of(None, cells, "wide", samples=20_000)
+    files = draw_radio_map(with_pattern(tmp_path), tmp_path / "m.png", options, Console(quiet=True))
+    arrays = np.load(files[-1], allow_pickle=False)
+    about = json.loads(str(arrays["metadata"]))
+    x, y = np.meshgrid(arrays["x"], arrays["y"])
+    distance = np.linalg.norm(np.stack([x, y, arrays["z"]], -1) - arrays["position"][0], axis=-1)
+    friis = 20 * np.log10(299_792_458.0 / about["frequency_hz"] / (4 * np.pi * distance)) - 3
+    far = distance > 30
+    np.testing.assert_allclose(arrays["gain"][0][far], friis[far], atol=1.0)
+
+
+class _Scenery:
+    """What `surface_of` asks a channel for."""
+
+    has_scenery = True
+    low, high = np.array([0.0, 0.0, 0.0]), np.array([100.0, 50.0, 30.0])
+
+
+def _surface(tmp_path: Path, **wanted: object) -> tuple[str, ...]:
+    """Notes about the cells over a slope from 0 to 30 m, 100 m long and 50 m wide."""
+    (tmp_path / "slope.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+        "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
+        "0 0 0\n100 0 30\n100 50 30\n0 50 0\n3 0 1 2\n3 0 2 3\n"
+    )
+    (tmp_path / "a.xml").write_text(
+        '<scene version="2.1.0"><shape type="ply" id="mesh-slope">'
+        '<string name="filename" value="slope.ply"/></shape></scene>'
+    )
+    channel = SimpleNamespace(scene=_Scenery())
+    _, _, notes = surface_of(channel, scene(0), tmp_path / "a.xml", Wanted(**wanted))  # type: ignore[arg-type]
+    return notes
+
+
+def test_what_is_unusual_about_the_cells_is_said(tmp_path: Path) -> None:
+    rising, buried = _surface(tmp_path, cell=1.0, height=15.0)
+    assert rising == "the ground rises by 30 m, --surface ground follows it"
+    assert buried == "50.0% of the cells are below the ground, and have no signal"
+    beside = _surface(tmp_path, area=(1000.0, 1000.0, 1100.0, 1100.0))[0]
+    assert beside == ("warning: the area is beside the scenery, which reaches x 0 to 100 m, y 0 to 50 m")
+
+
+@pytest.mark.parametrize(
+    ("wanted", "words"),
+    [
+        (
+            {"cell": 0.001},
+            r"--cell 0.001 makes 5e\+09 cells, at most 20,000,000 can be; take cells of 0.016 m",
+        ),
+        ({"cell": 1e-320}, "at most 20,000,000 can be; take cells of 0.016 m or a smaller --area"),
+        ({"area": (-1e308, -1e308, 1e308, 1e308)}, "is inf × inf m; take a smaller one"),
+        ({"surface": "roof"}, "--surface 'roof' does not exist; write plane, ground or .* scenery: slope"),
+        ({"surface": "slop"}, "did you mean 'slope'"),
+    ],
+)
+def test_cells_that_cannot_be_are_refused_with_those_that_can(tmp_path: Path, wanted, words: str) -> None:
+    with pytest.raises(RunError, match=words):
+        _surface(tmp_path, **wanted)
+
+
+def test_a_power_in_another_unit_is_warned_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As before a run; the map itself is made."""
+    screen = StringIO()
+    monkeypatch.setattr(radio_map_command, "_mapped", lambda *_: (_ for _ in ()).throw(RunError("enough")))
+    source = with_pattern(tmp_path, ("power_dbm = 30.0", "power_dbm = 150.0"))
+    with pytest.raises(RunError, match="enough"):
+        draw_radio_map(source, tmp_path / "m.png", options_of(None, Wanted(), "wide"), Console(file=screen))
+    assert "power_dbm: is 150 dBm, beyond any transmitter's" in screen.getvalue()

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import dataclasses
 import mmap
 from pathlib import Path
 
 import numpy as np
 import pytest
 from link_builders import CARRIER, antenna, scene_of
+from msgspec.structs import replace
 
 from caviar_clients.tradeoff.ladder import SCATTERING, Setting
+from caviar_clients.tradeoff.report import comparable
 from caviar_clients.tradeoff.rows import error_fields
 from caviar_clients.tradeoff.scenes import Instant, Scenes
 from caviar_clients.tradeoff.users import FLOOR_DB, Noise, UserChannel, difference, differences
 from caviar_clients.tradeoff.worker import Rung, peak_mib, reset_peak, scattering_materials, seen
 from caviar_protocol.errors import ScenarioError
+from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.space.scene import antennas
+from caviar_protocol.topics import AntennaArray
 
 NOISE = Noise(figure_db=9.0, temperature_k=290.0)
 
@@ -77,6 +82,35 @@ def test_a_sample_has_the_users_of_the_scene() -> None:
     # Friis: the difference of gains is that of the squared distances.
     assert near.path_gain_db - far.path_gain_db == pytest.approx(20 * np.log10(distance[1] / distance[0]))
     assert near.capacity_bps_hz > far.capacity_bps_hz > 0
+
+
+def test_patterns_of_files_reach_channels_that_know_no_scenery(tmp_path: Path) -> None:
+    """Elements that radiate 10 dB less everywhere bring 10 dB less."""
+    name, file = "patterns/weak.csv", tmp_path / "weak.csv"
+    rows = [f"{theta},{phi},-10" for theta in (0, 90, 180) for phi in (0, 180)]
+    file.write_text("\n".join(["theta_deg,phi_deg,gain_dbi", *rows]))
+    plain = scenes()
+    devices = tuple(
+        replace(device, array=replace(device.array, pattern_file=name)) if device.name == "bs" else device
+        for device in antennas(plain.instants[0].scene, "tx") + antennas(plain.instants[0].scene, "rx")
+    )
+    weak = Instant(5, 500, replace(plain.instants[0].scene, devices=devices))
+    spec = DeviceSpec(name="bs", kind="antenna", role="tx", array=AntennaArray(pattern_file="weak.csv"))
+    given = dataclasses.replace(plain, instants=(weak,), devices=(spec,), assets={name: file})
+    gains = []
+    for at in (plain, given):
+        rung = Rung(Setting(label="f", use="free-space"), at, None, NOISE)
+        gains.append(rung.sample(at.instants[0]).users[5, "bs", "near", "mmwave"].path_gain_db)
+        rung.close()
+    assert gains[1] - gains[0] == pytest.approx(-10)
+
+
+def test_free_space_is_no_reference_where_there_is_scenery(tmp_path: Path) -> None:
+    traced, free = Setting(label="t", use="sionna-rt"), Setting(label="f", use="free-space")
+    with_scenery = dataclasses.replace(scenes(), assets={"scenery/a.xml": tmp_path / "a.xml"})
+    assert comparable([traced, free], with_scenery) == [traced]
+    assert comparable([traced, free], scenes()) == [traced, free]
+    assert comparable([free], with_scenery) == [free]
 
 
 def test_a_setting_that_the_channel_does_not_know_is_refused() -> None:

@@ -15,6 +15,8 @@ from caviar_clients.tradeoff.ladder import (
     samples_of,
     spacing_settings,
 )
+from caviar_protocol.scenario.conversion import convert_settings
+from caviar_services.channel.sionna.settings import SionnaSettings
 
 
 def test_what_the_cheap_leave_goes_to_the_dear() -> None:
@@ -95,3 +97,27 @@ def test_what_traces_every_pair_comes_behind_what_is_cheap() -> None:
         "mimo-rt 64×8",
         "mimo-rt 64×64",
     ]
+
+
+CHOSEN = {
+    "rung": "spherical",
+    "diffraction": True,
+    "free_edges": True,
+    "edges_within_m": 200.0,
+    "scattering": True,
+    "scattering_samples": 1000,
+    "scattering_paths": 10,
+    "ray_spacing_deg": 0.5,
+}
+
+
+@pytest.mark.parametrize("chosen", [CHOSEN, {"follow": 4}], ids=["choices", "follow"])
+def test_no_choice_of_the_scenario_keeps_a_setting_from_being_measured(chosen: dict[str, object]) -> None:
+    """Choices that exclude each other, and those that need what a setting switches off."""
+    settings = (*LADDER, *spacing_settings(), *array_settings(), *convergence_settings(1))
+    for setting in (setting for setting in settings if setting.use == "sionna-rt"):
+        known = convert_settings(SionnaSettings, setting.over(chosen))
+        known.launched_samples("channel")
+        assert known.rung == setting.settings.get("rung", "siso-rt")
+        if setting.settings["diffraction"]:
+            assert known.free_edges == chosen.get("free_edges", False)

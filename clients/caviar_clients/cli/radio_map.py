@@ -19,6 +19,7 @@ from caviar_clients.cli.radio_map_inputs import Wanted, carrier_of, channel_of, 
 from caviar_clients.files import reserved, writing
 from caviar_clients.plots.radio_map import RadioMapView, draw_servers, draw_values
 from caviar_clients.plots.rays import footprints
+from caviar_clients.session.checks import checked_scenario, implausible_values
 from caviar_clients.tradeoff.scenes import is_recording, scene_at
 from caviar_protocol.errors import RunError, SetupError, suggestion
 from caviar_protocol.host import DISTRIBUTION, has_extra, install_command
@@ -161,6 +162,9 @@ def draw_radio_map(source: Path, out: Path | None, options: MapOptions, console:
         for metric in options.metrics
     }
     arrays = picture.with_suffix(".npz")
+    if not is_recording(source):
+        for warning in implausible_values(checked_scenario(source)):
+            console.print(f"warning: {warning}", markup=False, highlight=False, soft_wrap=True)
     with reserved(*pictures.values(), arrays):
         mapped = _mapped(source, options, console)
         save(mapped.found, mapped.metadata, arrays)
@@ -175,6 +179,8 @@ def draw_radio_map(source: Path, out: Path | None, options: MapOptions, console:
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Mapped:
     found: RadioMap
+    notes: tuple[str, ...]
+    """For the user: what is unusual about the cells, and what of the settings the map leaves out."""
     metadata: dict[str, Any]
     scene: Scene
     title: str
@@ -191,8 +197,10 @@ def _mapped(source: Path, options: MapOptions, console: Console) -> _Mapped:
     noise_w, noise = noise_of(scenes.services, carrier)
     with _progress(console) as bar:
         task = bar.add_task("loading the scene", total=None)
-        channel.load_scene(Preparation(demand={}, assets=assets))
-        surface, about = surface_of(channel, instant.scene, find_scenery(assets), options.cells)
+        preparation = Preparation(demand={}, assets=assets)
+        channel.load_patterns(preparation)
+        channel.load_scene(preparation)
+        surface, about, notes = surface_of(channel, instant.scene, find_scenery(assets), options.cells)
         memory = int(options.memory_gib * 2**30)
         part = rays_at_once(surface, devices, options.beam, options.samples, memory)
         bar.update(task, description="shooting rays")
@@ -220,6 +228,7 @@ def _mapped(source: Path, options: MapOptions, console: Console) -> _Mapped:
     served = beams.get(str(options.beam), f"beam {options.beam}")
     return _Mapped(
         found=found,
+        notes=(*notes, *found.notes),
         metadata=metadata,
         scene=instant.scene,
         title=f"{scenes.name}: {at}\n{about}, {served}",
@@ -260,7 +269,7 @@ def _summary(mapped: _Mapped) -> Iterator[str]:
     share = np.count_nonzero(reached) / max(int(np.count_nonzero(cells)), 1)
     yield f"{nx} × {ny} cells of {mapped.metadata['cell_m']:g} m, {mapped.metadata['surface']}"
     yield f"noise {10 * math.log10(coverage.noise_w) + 30:.1f} dBm: {mapped.metadata['noise']}"
-    yield from found.notes
+    yield from mapped.notes
     yield f"{share:.1%} of the cells have a signal"
     few = np.count_nonzero(found.rays.max(axis=0)[reached] < _FEW_RAYS) / max(int(reached.sum()), 1)
     if few > 0.1:

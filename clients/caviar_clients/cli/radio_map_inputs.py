@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,15 +16,18 @@ from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import RunError, ScenarioError, suggestion
 from caviar_protocol.scenario import ServiceSpec
 from caviar_protocol.scenario.conversion import Place, convert_settings
+from caviar_protocol.scenario.schema import PATTERNS
 from caviar_protocol.space.ply import read_ply
 from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import Carrier, Scene
 from caviar_services.channel.adaptive.settings import AdaptiveSettings, models
+from caviar_services.channel.radio_map.mapping import rounded_up
 from caviar_services.channel.radio_map.measurement_surface import (
     Area,
     MeasurementSurface,
     cell_counts,
     draped_surface,
+    heights,
     level_surface,
 )
 from caviar_services.channel.sionna.model import SionnaChannel
@@ -37,6 +41,9 @@ from caviar_services.service import RunInfo
 _MOST_CELLS = 20_000_000
 _AROUND = 100.0
 """[m] around devices and objects where there is no scenery."""
+
+_SHOWN_NAMES = 20
+"""Pieces of scenery that an error names."""
 
 _RELIEF = 2.0
 """[m] between lowest and highest ground; beyond, a level plane is hardly meant."""
@@ -71,7 +78,7 @@ def carrier_of(carriers: Sequence[Carrier], name: str | None) -> int:
 
 
 def channel_of(scenes: Scenes, scene: Scene) -> tuple[SionnaChannel, Mapping[str, Path]]:
-    """The ray-traced channel of the run, and the scenery that it stands in."""
+    """The ray-traced channel of the run, with its files: scenery that it stands in, patterns of antennas."""
     refused = []
     for name, spec in scenes.services.items():
         if spec.role != "channel":
@@ -103,7 +110,8 @@ def channel_of(scenes: Scenes, scene: Scene) -> tuple[SionnaChannel, Mapping[str
                 bodies=0,
                 without_body=tuple(sorted(set(scene.classes))),
             )
-            return SionnaChannel(nothing, run), {}
+            patterns = {name: file for name, file in scenes.assets.items() if name.startswith(PATTERNS)}
+            return SionnaChannel(nothing, run), patterns
         refused.append(f"channel {name!r} is {spec.use!r}, which traces no rays")
     what = "; ".join(refused) or f"{scenes.origin} has no channel"
     raise RunError(f"{what}; a radio map is made with the channel sionna-rt, adaptive or free-space")
@@ -129,33 +137,71 @@ def noise_of(services: Mapping[str, ServiceSpec], carrier: Carrier) -> tuple[flo
 
 def surface_of(
     channel: SionnaChannel, scene: Scene, description: Path | None, wanted: Wanted
-) -> tuple[MeasurementSurface, str]:
-    """The cells, and what they are at or over. Raises `RunError` where there is no such surface."""
+) -> tuple[MeasurementSurface, str, tuple[str, ...]]:
+    """The cells, what they are at or over, and notes for the user.
+
+    Raises `RunError` where there is no such surface, and for more than `_MOST_CELLS` cells.
+    """
     area = wanted.area or _area(channel, scene)
-    ny, nx = cell_counts(area, wanted.cell)
-    if nx * ny > _MOST_CELLS:
-        raise RunError(
-            f"--cell {wanted.cell:g} makes {nx} × {ny} cells; take larger cells or a smaller --area"
-        )
+    _check_size(area, wanted.cell)
     shapes = read_scenery(description).shapes if description else ()
     if wanted.surface == "plane":
-        return _plane(area, wanted, shapes)
+        surface, ground_notes = _plane(area, wanted, shapes)
+        about = f"plane at z = {surface.z[0, 0]:g} m"
+        return surface, about, (*_beside(channel, area), *ground_notes)
     surface = draped_surface(area, wanted.cell, wanted.height, _ground(wanted.surface, shapes))
     if not surface.covered.any():
         raise RunError(
             f"--surface {wanted.surface!r}: none of it is in the area; choose another --area, "
             "--surface plane, or a piece of the scenery by its name"
         )
-    return surface, f"{wanted.height:g} m above {wanted.surface!r}"
+    return surface, f"{wanted.height:g} m above {wanted.surface!r}", ()
 
 
-def _plane(area: Area, wanted: Wanted, shapes: Sequence[SceneryShape]) -> tuple[MeasurementSurface, str]:
-    level = ground((shape.file, shape.to_world) for shape in shapes)[..., 2]
-    z = wanted.height + (float(level.min()) if level.size else 0.0)
-    about = f"plane at z = {z:g} m"
+def _check_size(area: Area, cell: float) -> None:
+    """Raise `RunError` with the cell that would do where there are too many."""
+    x0, y0, x1, y1 = area
+    count = max(1.0, (x1 - x0) / cell) * max(1.0, (y1 - y0) / cell)
+    if count < _MOST_CELLS and math.prod(cell_counts(area, cell)) <= _MOST_CELLS:
+        return
+    enough = max(math.sqrt((x1 - x0) * (y1 - y0) / _MOST_CELLS), max(x1 - x0, y1 - y0) / _MOST_CELLS) * 1.01
+    if not math.isfinite(enough):
+        raise RunError(
+            f"--area {x0:g} {y0:g} {x1:g} {y1:g} is {x1 - x0:g} × {y1 - y0:g} m; take a smaller one"
+        )
+    raise RunError(
+        f"--cell {cell:g} makes {count:.2g} cells, at most {_MOST_CELLS:,} can be; take cells of "
+        f"{rounded_up(enough):g} m or a smaller --area"
+    )
+
+
+def _beside(channel: SionnaChannel, area: Area) -> tuple[str, ...]:
+    """A warning where no cell is over or under any scenery."""
+    if not channel.scene.has_scenery:
+        return ()
+    (x0, y0, _), (x1, y1, _) = channel.scene.low.tolist(), channel.scene.high.tolist()
+    if area[0] < x1 and area[2] > x0 and area[1] < y1 and area[3] > y0:
+        return ()
+    reach = f"x {x0:.4g} to {x1:.4g} m, y {y0:.4g} to {y1:.4g} m"
+    return (f"warning: the area is beside the scenery, which reaches {reach}",)
+
+
+def _plane(
+    area: Area, wanted: Wanted, shapes: Sequence[SceneryShape]
+) -> tuple[MeasurementSurface, tuple[str, ...]]:
+    """A level surface above the lowest ground, and notes about ground that is above it."""
+    triangles = ground((shape.file, shape.to_world) for shape in shapes)
+    level = triangles[..., 2]
+    surface = level_surface(area, wanted.cell, wanted.height + (float(level.min()) if level.size else 0.0))
+    notes = []
     if level.size and np.ptp(level) > _RELIEF:
-        about += f"; the ground rises by {np.ptp(level):.0f} m, --surface ground follows it"
-    return level_surface(area, wanted.cell, z), about
+        notes.append(f"the ground rises by {np.ptp(level):.0f} m, --surface ground follows it")
+    if level.size and level.max() > surface.z[0, 0]:
+        x, y = surface.centres[0, :, 0], surface.centres[:, 0, 1]
+        buried = np.count_nonzero(heights(triangles, x, y) > surface.z[0, 0]) / (len(x) * len(y))
+        if buried:
+            notes.append(f"{buried:.1%} of the cells are below the ground, and have no signal")
+    return surface, tuple(notes)
 
 
 def _ground(name: str, shapes: Sequence[SceneryShape]) -> Float64Array:
@@ -165,8 +211,14 @@ def _ground(name: str, shapes: Sequence[SceneryShape]) -> Float64Array:
     named = [shape for shape in shapes if shape.name == name]
     if named:
         return _triangles(named)
-    near = difflib.get_close_matches(name, ("plane", "ground", *(shape.name for shape in shapes)), n=1)
-    remedy = f"did you mean {near[0]!r}?" if near else "write plane, ground or the name of a piece of scenery"
+    names = sorted(shape.name for shape in shapes)
+    near = difflib.get_close_matches(name, ("plane", "ground", *names), n=1)
+    pieces = ", ".join(names[:_SHOWN_NAMES]) + (f", … {len(names)} in all" * (len(names) > _SHOWN_NAMES))
+    remedy = (
+        f"did you mean {near[0]!r}?"
+        if near
+        else f"write plane, ground or the name of a piece of scenery: {pieces or 'there is none'}"
+    )
     raise RunError(f"--surface {name!r} does not exist; {remedy}")
 
 

@@ -39,6 +39,10 @@ class Setting:
     most_receivers: int | None = None
     """Receivers at most, likewise."""
 
+    def over(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """These settings over a scenario's; one that is None here is left out, whatever the scenario says."""
+        return {key: value for key, value in {**given, **self.settings}.items() if value is not None}
+
 
 SCATTERING = 0.4
 """Scattering coefficient S of Degli-Esposti et al., "Measurement and modelling of scattering from buildings",
@@ -64,10 +68,27 @@ _CHOSEN_EFFORT = 3
 _ALL = {"refraction": True, "diffraction": True}
 
 
+_LAUNCH: Mapping[str, Any] = {
+    "rung": "siso-rt",
+    "candidates": "launched",
+    "refraction": False,
+    "diffraction": False,
+    "scattering": False,
+    "ray_spacing_deg": None,
+    "scattering_samples": None,
+    "scattering_paths": None,
+    "follow": None,
+}
+"""What a ray-traced setting has unless it says otherwise. All of it is given, so that none of the scenario's
+own choices, many of which exclude each other, is measured in its place."""
+_WITHOUT_DIFFRACTION: Mapping[str, Any] = {"free_edges": False, "edges_within_m": None}
+"""Which edges diffract is the scenario's choice where any do."""
+
+
 def _traced(samples: int, depth: int, **more: Any) -> dict[str, Any]:
     """Settings of a ray-traced rung; what is not named is off."""
-    off = {"refraction": False, "diffraction": False, "scattering": False}
-    return {**off, "candidates": "launched", "samples": samples, "max_depth": depth, **more}
+    edges = {} if more.get("diffraction") else _WITHOUT_DIFFRACTION
+    return {**_LAUNCH, **edges, "samples": samples, "max_depth": depth, **more}
 
 
 def chosen_diffuse(samples: int) -> dict[str, Any]:
@@ -123,7 +144,8 @@ LADDER: tuple[Setting, ...] = (
 
 REFERENCES = ("spherical 1e6 d5 +r+d", "siso-rt 1e6 d5 +r+d", "siso-rt 1e6 d3", "free-space")
 """The default reference is the first of these that the channels of this installation know and that can be
-loaded. ``mimo-rt`` is none of them: it is affordable for few scenes, receivers and samples only."""
+loaded, ``free-space`` only where there is no scenery. ``mimo-rt`` is none of them: it is affordable for few
+scenes, receivers and samples only."""
 
 BASELINES = ("siso-rt 1e5 d3", "free-space")
 """The default baseline of the factors, likewise."""
@@ -209,7 +231,7 @@ def _effort(setting: Setting) -> float:
     """What a scene will cost, in rays; no more than an order."""
     rays = float(setting.settings["samples"])
     if setting.scattering:
-        chosen = "scattering_paths" in setting.settings
+        chosen = setting.settings.get("scattering_paths") is not None
         rays *= _CHOSEN_EFFORT if chosen else _DIFFUSE_EFFORT
         rays *= 1 if chosen or setting.column == "siso-rt" else _ELEMENTS_EFFORT
     if setting.column not in FEW:

@@ -21,6 +21,8 @@ from caviar_clients.tradeoff.worker import is_known, seen
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import RunError
 from caviar_protocol.space.scene import antennas
+from caviar_services.registry import load
+from caviar_services.scenery import find_scenery
 
 
 class Point(msgspec.Struct, frozen=True, kw_only=True):
@@ -125,7 +127,7 @@ def compare(
     begun = time.monotonic()
     known = (*ladder.LADDER, *ladder.spacing_settings())
     references = candidates(options.reference, ladder.REFERENCES, known, "--reference")
-    references = [s for s in references if is_known(s, scenes)] or references
+    references = comparable([s for s in references if is_known(s, scenes)], scenes) or references
     baselines = candidates(options.baseline, ladder.BASELINES, known, "--baseline")
     campaign = Campaign(
         scenes,
@@ -164,6 +166,15 @@ def compare(
         convergence=tuple(points([entry for entry in measured if _is_of_a_curve(entry)])),
         skipped=tuple(campaign.skipped),
     )
+
+
+def comparable(references: Sequence[Setting], scenes: Scenes) -> list[Setting]:
+    """References without those that know no scenery, where there is some and others know it: against these,
+    what scenery does would count as an error."""
+    if find_scenery(scenes.assets) is None:
+        return list(references)
+    traced = [setting for setting in references if load("channel", setting.use).uses_scenery]
+    return traced or list(references)
 
 
 def _plan(options: Options, needed: Sequence[Setting]) -> list[tuple[Block, list[Setting]]]:

@@ -193,7 +193,7 @@ def _planned(
 ) -> Scenes:
     return Scenes(
         name=scenario.run.name,
-        origin=f"scenario {path.name}, {scenario.run.frames} frames",
+        origin=f"scenario {path.name}, {scenario.run.frames} frame{'s' * (scenario.run.frames != 1)}",
         instants=tuple(instants),
         carriers=scenario.carriers,
         devices=scenario.devices,

@@ -43,7 +43,7 @@ def is_known(setting: Setting, scenes: Scenes) -> bool:
     """Whether the channel knows a setting; nothing is loaded."""
     try:
         cls = load("channel", setting.use)
-        convert_settings(cls.Settings, {**scenes.settings_of("channel", setting.use), **setting.settings})
+        convert_settings(cls.Settings, setting.over(scenes.settings_of("channel", setting.use)))
     except CaviarError:
         return False
     return True
@@ -68,7 +68,7 @@ class Rung:
         limits = [n for n in (receivers, setting.most_receivers) if n is not None]
         self._receivers = min(limits, default=None)
         cls = load("channel", setting.use)
-        settings = {**scenes.settings_of("channel", setting.use), **setting.settings}
+        settings = setting.over(scenes.settings_of("channel", setting.use))
         if setting.scattering:
             settings["materials"] = scattering_materials(settings.get("materials", {}), scenes.assets)
         before, begin = resident_mib(), time.perf_counter()
@@ -85,7 +85,7 @@ class Rung:
         )
         if cls.uses_scenery and not scenes.assets:
             raise ScenarioError("the scenes have no scenery to trace rays in")
-        assets = scenes.assets if cls.uses_scenery else {}
+        assets = scenes.assets if self._model.needs_assets else {}
         self._model.prepare(Preparation(demand={"channel": frozenset({"h"})}, assets=assets))
         self._seed = scenes.seed
         first = self.sample(scenes.instants[0])

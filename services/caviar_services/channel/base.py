@@ -169,6 +169,14 @@ class ChannelModel(Service[S]):
         demand = preparation.demand.get("channel", frozenset())
         self.with_h = "h" in demand
         self.wideband = demand & {"hf", "taps"}
+        self.load_patterns(preparation)
+        if self.wideband:
+            keep_large_buffers()
+        notes = (*self.load(preparation), *self._absorption_notes(), *empty_parts(demand, self.run.carriers))
+        return Prepared(notes=notes)
+
+    def load_patterns(self, preparation: Preparation) -> None:
+        """Read the pattern files of the run's antennas; `prepare` begins with it."""
         self.patterns = Patterns(
             {
                 name: read_pattern(file)
@@ -176,10 +184,6 @@ class ChannelModel(Service[S]):
                 if name.startswith(PATTERNS)
             }
         )
-        if self.wideband:
-            keep_large_buffers()
-        notes = (*self.load(preparation), *self._absorption_notes(), *empty_parts(demand, self.run.carriers))
-        return Prepared(notes=notes)
 
     def step(self, frame: Frame) -> StepResult:
         scene = frame.scene()

@@ -54,6 +54,8 @@ class Shooting:
     reflection: bool = True
     refraction: bool = False
     diffraction: bool = False
+    free_edges: bool = False
+    """Whether edges at which one face ends and no other begins diffract, too."""
     scattering: bool = False
 
 
@@ -307,6 +309,7 @@ def _solver(
                 diffuse_reflection=shooting.scattering,
                 refraction=shooting.refraction,
                 diffraction=shooting.diffraction,
+                edge_diffraction=shooting.free_edges,
                 seed=seed,
             )
             return np.array(self._sums.power).reshape(-1, cells), np.array(self._sums.rays)

@@ -24,6 +24,7 @@ from caviar_services.channel.radio_map.cell_gains import (
 )
 from caviar_services.channel.radio_map.measurement_surface import MeasurementSurface
 from caviar_services.channel.sionna.model import SionnaChannel
+from caviar_services.channel.sionna.settings import SionnaSettings
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -91,6 +92,8 @@ _NO_DIFFRACTION = (
     "diffraction is left out: Sionna RT's solver finds none over a surface that is not level; a plane has it"
 )
 """Its test for what is in the way ends after 1 m there (`spawn_ray_to`, sionna-rt 2.2.0)."""
+
+_ALL_EDGES = "edges_within_m is left out: in maps all edges diffract"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -166,7 +169,7 @@ def rays_at_once(
     with_beams = f" and {beams} beams" if beams else ""
     raise RunError(
         f"{nx} × {ny} cells of {side:g} m{with_beams} need {needed / 2**30:.1f} GiB, --memory-gib allows "
-        f"{memory / 2**30:.3g}; take cells of {_rounded_up(enough):g} m (--cell), a smaller --area"
+        f"{memory / 2**30:.3g}; take cells of {rounded_up(enough):g} m (--cell), a smaller --area"
         + (", --beam wide" if beams > 1 else "")
         + " or more memory"
     )
@@ -214,6 +217,7 @@ def radio_map(
         reflection=s.reflection,
         refraction=s.refraction,
         diffraction=s.diffraction and surface.is_level,
+        free_edges=s.free_edges and surface.is_level,
         scattering=s.scattering,
     )
     rt.place(scene, frozenset(s.without_body))
@@ -252,8 +256,17 @@ def radio_map(
         beam=np.stack(chosen),
         rays=np.stack(rays),
         shooting=shooting,
-        notes=(_NO_DIFFRACTION,) * (s.diffraction and not surface.is_level),
+        notes=_left_out(s, surface),
     )
+
+
+def _left_out(settings: SionnaSettings, surface: MeasurementSurface) -> tuple[str, ...]:
+    """What of the settings a map of this surface has not."""
+    if not settings.diffraction:
+        return ()
+    if not surface.is_level:
+        return (_NO_DIFFRACTION,)
+    return (_ALL_EDGES,) * (settings.edges_within_m is not None)
 
 
 def _served(found: CellGains, beams: range) -> tuple[Float64Array, Int32Array]:
@@ -276,7 +289,7 @@ def _transmittance(
     return 10 ** (-absorbed / 10)
 
 
-def _rounded_up(value: float) -> float:
-    """With two significant digits."""
+def rounded_up(value: float) -> float:
+    """A value above 0 with two significant digits, not less than it is."""
     unit = 10 ** (np.floor(np.log10(value)) - 1)
     return float(np.ceil(value / unit) * unit)
