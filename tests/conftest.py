@@ -12,9 +12,7 @@ import hypothesis
 import psutil
 import pytest
 
-pytest.register_assert_rewrite(
-    "caviar_services.testing.base", "caviar_services.testing.recorders", "caviar_services.testing.roles"
-)
+pytest.register_assert_rewrite("caviar_services.testing.base", "caviar_services.testing.roles")
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 MARKER = "CAVIAR_TEST_SESSION"

@@ -1,11 +1,19 @@
-"""The ordered connection of a service to its broker: bounded waits, and what ends them."""
+"""The connections of a service to its broker: ordered messages with bounded waits, and heartbeats.
+
+`Connection` carries everything that is ordered. A `HeartbeatThread` has a socket of its own (contract,
+clause 2) and watches that the broker lives. `Handshake` explains why a broker with keys does not let a
+service in.
+"""
 
 from __future__ import annotations
 
 import logging
+import math
+import os
+import struct
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import zmq
@@ -14,10 +22,10 @@ from caviar_protocol import limits
 from caviar_protocol import messages as m
 from caviar_protocol.codec import check_parts, decode_message, encode_message, message_type
 from caviar_protocol.errors import ProtocolError, RunError, VersionError
-from caviar_protocol.keys import Credentials
-from caviar_services.handshake import Handshake, dress
-from caviar_services.heartbeat import HeartbeatThread
-from caviar_services.termination import Termination
+from caviar_protocol.host import SignOfLife
+from caviar_protocol.keys import BROKER_KEY_VARIABLE, KEY_VARIABLE, Credentials
+from caviar_protocol.messages import Attach, Heartbeat, HeartbeatAck, Welcome
+from caviar_services.process import Termination
 
 _log = logging.getLogger("caviar.service")
 
@@ -191,3 +199,191 @@ def describe(message: m.Message) -> str:
     """A message for an error text: its type, and for an ERROR what it says."""
     text = f": {message.message}" if isinstance(message, m.Error | m.Refuse) else ""
     return f"{message_type(message)}{text}"
+
+
+_EVENT = struct.Struct("=HI")
+_WATCHED = (
+    int(zmq.EVENT_HANDSHAKE_SUCCEEDED)
+    | int(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL)
+    | int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL)
+    | int(zmq.EVENT_HANDSHAKE_FAILED_AUTH)
+)
+CONNECT_TIMEOUT_MS = 1000
+"""[ms] after which an attempt to connect that is not answered is followed by another one."""
+REPEATED = 3
+"""Handshakes in a row that fail without a reason being given, which a broker that is just starting or
+ending may cause once."""
+
+
+def dress(socket: zmq.Socket[Any], endpoint: str, credentials: Credentials | None) -> None:
+    """Give a socket what it needs before it connects. Raises `zmq.ZMQError` for impossible keys."""
+    socket.setsockopt(zmq.IPV6, int("[" in endpoint))
+    # The system sends the packet that opens a connection again after 1, 3, 7 and 15 s: behind an outage of
+    # 8 s it would be silent for 7 s more.
+    socket.setsockopt(zmq.CONNECT_TIMEOUT, CONNECT_TIMEOUT_MS)
+    if credentials is not None:
+        credentials.give(socket)
+
+
+class Handshake:
+    """Watches whether a socket, not connected yet, comes to terms with its broker."""
+
+    def __init__(
+        self, context: zmq.Context[Any], socket: zmq.Socket[Any], endpoint: str, with_keys: bool
+    ) -> None:
+        address = f"inproc://handshake-{id(self)}"
+        socket.monitor(address, _WATCHED)
+        self._watched = socket
+        self._monitor = context.socket(zmq.PAIR)
+        self._monitor.rcvhwm = 0
+        self._monitor.connect(address)
+        self._endpoint, self._with_keys = endpoint, with_keys
+        self._failures = 0
+
+    def check(self) -> None:
+        """Raises `RunError` with the remedy, where the two do not come to terms."""
+        while (kind := self._next()) is not None:
+            if kind == zmq.EVENT_HANDSHAKE_SUCCEEDED:
+                self._failures = 0
+                continue
+            self._failures += 1
+            if kind == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
+                raise RunError(
+                    f"the broker at {self._endpoint} refused the key: it is not authorized there, or barred "
+                    "for a while; on the broker's machine:  "
+                    "caviar keys authorize NAME.pub --name NAME --role ROLE"
+                )
+            if kind == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL or self._failures >= REPEATED:
+                raise RunError(self._disagreement())
+
+    def close(self) -> None:
+        """Stop watching."""
+        if not self._monitor.closed:
+            self._watched.disable_monitor()
+            self._monitor.close(0)
+
+    def _next(self) -> int | None:
+        try:
+            header, _ = self._monitor.recv_multipart(zmq.NOBLOCK)
+        except zmq.Again:
+            return None
+        kind, _ = _EVENT.unpack(header)
+        return int(kind)
+
+    def _disagreement(self) -> str:
+        if self._with_keys:
+            return (
+                f"there is no secure connection to {self._endpoint}: the broker's public key is not the one "
+                f"given (--broker-key or {BROKER_KEY_VARIABLE}), or that broker has no keys"
+            )
+        return (
+            f"{self._endpoint} does not let this service in: a broker there asks for keys "
+            f"(--key and --broker-key, or {KEY_VARIABLE} and {BROKER_KEY_VARIABLE}), or it is no broker"
+        )
+
+
+_heartbeat_log = logging.getLogger("caviar.heartbeat")
+
+
+class HeartbeatThread(threading.Thread):
+    """Tells the broker that this process lives, and watches that the broker does.
+
+    ``gone`` is called in this thread when the broker has been silent for longer than the run's
+    liveness, at least two heartbeats are unanswered, and then no more.
+    """
+
+    def __init__(
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        endpoint: str,
+        name: str,
+        welcome: Welcome,
+        gone: Callable[[], None],
+        credentials: Credentials | None = None,
+    ) -> None:
+        super().__init__(name="heartbeat", daemon=True)
+        self._context, self._endpoint, self._gone = context, endpoint, gone
+        self._credentials = credentials
+        self._attach = Attach(epoch=welcome.epoch, attempt=welcome.attempt, name=name)
+        self._interval = welcome.heartbeat_ns / 1e9
+        self._liveness = welcome.liveness_ns / 1e9
+        self._lock = threading.Lock()
+        self._progress, self._phase, self._grace_ns = 0, "", 0
+        self._sign = SignOfLife()
+        self._halt = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self.broker_silence: float | None = None
+        """For how long the broker has been silent [s], once that is too long; None while it lives."""
+
+    def progress(self, phase: str, grace_s: float = 0.0) -> None:
+        """Say what the service is doing, and that it advances."""
+        with self._lock:
+            self._progress += 1
+            self._phase, self._grace_ns = phase, round(grace_s * 1e9)
+
+    def stop(self) -> None:
+        """End the thread and wait for it."""
+        os.eventfd_write(self._halt, 1)
+        self.join(timeout=1.0)
+        if not self.is_alive():
+            os.close(self._halt)
+
+    def run(self) -> None:
+        """Send heartbeats until told to stop, or until the broker is silent for too long."""
+        with self._context.socket(zmq.DEALER) as socket:
+            socket.linger = 0
+            dress(socket, self._endpoint, self._credentials)
+            socket.connect(self._endpoint)
+            socket.send(encode_message(self._attach), zmq.NOBLOCK)
+            self._beat(socket)
+        if self.broker_silence is not None:
+            self._gone()
+
+    def _beat(self, socket: zmq.Socket[bytes]) -> None:
+        poller = zmq.Poller()
+        poller.register(socket, zmq.POLLIN)
+        poller.register(self._halt, zmq.POLLIN)
+        due, sequence, answered, silence = time.monotonic(), 0, 0, 0.0
+        while True:
+            began = time.monotonic()
+            if began >= due:
+                socket.send(self._heartbeat(sequence), zmq.NOBLOCK)
+                sequence += 1
+                due = began + self._interval
+            ready = dict(poller.poll(math.ceil((due - began) * 1000)))
+            if self._halt in ready:
+                return
+            if socket in ready and self._heard(socket):
+                answered, silence = sequence, 0.0
+                self._sign.give()
+                continue
+            # Only time in which this thread really listened counts as silence: while somebody else
+            # holds the interpreter's lock, answers wait in the socket.
+            silence += min(time.monotonic() - began, self._interval)
+            if silence > self._liveness and sequence - answered >= 2:
+                self.broker_silence = silence
+                return
+
+    def _heartbeat(self, sequence: int) -> bytes:
+        with self._lock:
+            return encode_message(
+                Heartbeat(
+                    sequence=sequence, progress=self._progress, phase=self._phase, grace_ns=self._grace_ns
+                )
+            )
+
+    @staticmethod
+    def _heard(socket: zmq.Socket[bytes]) -> bool:
+        """Take all that has come: whether an answer was among it."""
+        heard = False
+        while True:
+            try:
+                message = decode_message(socket.recv(zmq.NOBLOCK))
+            except zmq.Again:
+                return heard
+            except ProtocolError as error:
+                _heartbeat_log.warning("the broker sent what is no message: %s", error)
+                continue
+            if isinstance(message, HeartbeatAck):
+                heard = True
+            else:
+                _heartbeat_log.warning("the broker says on the heartbeat connection: %s", message)

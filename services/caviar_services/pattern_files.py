@@ -2,20 +2,20 @@
 
 A table is a CSV file, ``.csv``, with one direction a line, all zenith angles combined with all azimuths:
 
-- ``theta_deg,phi_deg,gain_dbi``: the gain; the polarization is that of the array, or
-- ``theta_deg,phi_deg,e_theta_re,e_theta_im,e_phi_re,e_phi_im``: the far field along θ̂ and φ̂, so that
-  ``|E_θ|² + |E_φ|²`` is the gain as a factor.
+- ``theta_deg,phi_deg,gain_dbi``: the gain; the polarization is that of the array, or -
+``theta_deg,phi_deg,e_theta_re,e_theta_im,e_phi_re,e_phi_im``: the far field along θ̂ and φ̂, so that
+``|E_θ|² + |E_φ|²`` is the gain as a factor.
 
-Lines that begin with ``#`` are comments. Angles are those of the device: zenith from +z, 0° to 180°, azimuth
-counter-clockwise from +x, once around. Between the directions of a table, the gain [dB] or the field is
-bilinear in both angles.
+Lines that begin with ``#`` are comments. Angles are those of the device: zenith from +z, 0° to 180°,
+azimuth counter-clockwise from +x, once around. Between the directions of a table, the gain [dB] or the
+field is bilinear in both angles.
 
 An MSI/Planet file, ``.msi`` or ``.pln``, has a horizontal and a vertical cut as attenuation [dB] against
 ``GAIN`` (dBd unless it says dBi). Horizontal angles count clockwise from boresight, vertical ones downwards
 from the horizon. The directions between follow by summing: the attenuation is that of the horizontal cut at
-the azimuth plus that of the front half of the vertical cut at the elevation (T. G. Vasiliadis,
-A. G. Dimitriou and G. D. Sergiadis, "A novel technique for the approximation of 3-D antenna radiation
-patterns", IEEE Trans. Antennas Propag. 53(7), 2005).
+the azimuth plus that of the front half of the vertical cut at the elevation (T. G. Vasiliadis, A. G.
+Dimitriou and G. D. Sergiadis, "A novel technique for the approximation of 3-D antenna radiation patterns",
+IEEE Trans. Antennas Propag. 53(7), 2005).
 """
 
 from __future__ import annotations

@@ -30,11 +30,11 @@ BUILT_IN: dict[str, str] = {
     "channel:sionna-rt": "caviar_services.channel.sionna.model:SionnaChannel",
     "sensors:camera": "caviar_services.sensors.camera:CameraSensors",
     "sensors:lidar": "caviar_services.sensors.lidar:LidarSensors",
-    "link:beams": "caviar_services.link.beams:BeamLink",
-    "agent:los-beam": "caviar_services.agent.los_beam:LosBeamAgent",
-    "agent:random": "caviar_services.agent.random:RandomAgent",
+    "link:beams": "caviar_services.link.beam_sweep:BeamLink",
+    "agent:los-beam": "caviar_services.agent.baselines:LosBeamAgent",
+    "agent:random": "caviar_services.agent.baselines:RandomAgent",
     "agent:waypoints": "caviar_services.agent.waypoints:WaypointsAgent",
-    "agent:oracle": "caviar_services.agent.oracle:OracleAgent",
+    "agent:oracle": "caviar_services.agent.baselines:OracleAgent",
     "recorder:mcap": "caviar_services.recorder.mcap:McapRecorder",
 }
 """``role:name`` to ``module:Class``. To add an implementation: one file, one line here."""

@@ -25,7 +25,6 @@ from caviar_protocol.keys import Credentials
 from caviar_protocol.keys import credentials as find_credentials
 from caviar_protocol.scenario.conversion import convert_settings
 from caviar_protocol.validation import ContentCheck
-from caviar_services.answers import Answers, Guard
 from caviar_services.connection import (
     Connection,
     Disconnected,
@@ -34,7 +33,12 @@ from caviar_services.connection import (
     UnansweredError,
     describe,
 )
-from caviar_services.exchange import (
+from caviar_services.process import TERMINATED, SignalTermination, Termination, restart_status
+from caviar_services.registry import load
+from caviar_services.service import Prepared, Service
+from caviar_services.session import (
+    Answers,
+    Guard,
     content_rules_of,
     done_of,
     frame_of,
@@ -45,10 +49,6 @@ from caviar_services.exchange import (
     ready_of,
     run_info,
 )
-from caviar_services.registry import load
-from caviar_services.restarts import restart_status
-from caviar_services.service import Prepared, Service
-from caviar_services.termination import TERMINATED, SignalTermination, Termination
 
 TRIM_EVERY = 10
 """Frames after which free memory is given back to the system. Megabytes come and go in each frame in ever

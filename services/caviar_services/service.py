@@ -9,6 +9,8 @@ Life of a service: ``__init__`` → ``scenery`` (worlds) → ``prepare`` → per
 ``step`` for each frame, ``end_episode`` → ``close``. What a service with state knows after a frame
 it saves with ``checkpoint``; another process takes it over with ``restore``, behind ``reset`` of the
 same episode, and goes on with the same bytes (`state` makes bytes of a struct, and checks them).
+
+Products that are on the wire already: a recorded one is sent as it was, not decoded and made again.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Payload
-from caviar_protocol.codec import decode_payload
+from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.errors import PayloadError, ProductError, ProtocolError
 from caviar_protocol.messages import GrantInput, Input, Report, Role, Status
 from caviar_protocol.scenario import DeviceSpec
@@ -330,3 +332,24 @@ class Service(ABC, Generic[S]):
 
     def close(self) -> None:  # optional hook
         """Release what is held. Called once, also after an error."""
+
+
+class Encoded(Payload, frozen=True, kw_only=True):
+    """Stands in `StepResult.products` for a payload; only its bytes are known."""
+
+    topic: str
+    header: bytes
+    body: bytes
+    fidelity: str = ""
+
+
+def encoded(payload: Payload) -> tuple[bytes, bytes]:
+    """Header and body of a product (`caviar_protocol.codec.payloads.encode_payload`)."""
+    return (payload.header, payload.body) if isinstance(payload, Encoded) else encode_payload(payload)
+
+
+def decoded(payload: Payload) -> Payload:
+    """The product for a consumer in the same process."""
+    if isinstance(payload, Encoded):
+        return decode_payload(payload.topic, payload.header, payload.body)
+    return payload

@@ -14,12 +14,10 @@ from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, quaternion_from_euler, rotation_matrix
 from caviar_protocol.topics import Action, AntennaArray, AntennaDevice, Carrier, Channel, Link, Scene
 from caviar_services.agent.base import Agent, AgentSettings
-from caviar_services.agent.los_beam import LosBeamAgent
-from caviar_services.agent.oracle import OracleAgent
-from caviar_services.antenna import element_positions, steering_vector
+from caviar_services.agent.baselines import LosBeamAgent, OracleAgent
+from caviar_services.antenna_arrays import dft_codebook, element_positions, steering_vector
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
-from caviar_services.link.beams import BeamLink, BeamLinkSettings
-from caviar_services.link.codebook import dft_codebook
+from caviar_services.link.beam_sweep import BeamLink, BeamLinkSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 
 CARRIER = Carrier(name="mmwave", frequency_hz=28e9, bandwidth_hz=100e6)

@@ -28,7 +28,7 @@ from caviar_services.channel.stability.bench import (
     square,
     world,
 )
-from caviar_services.meshes import box
+from caviar_services.mesh.shapes import box
 
 pytestmark = pytest.mark.channel
 

@@ -13,7 +13,7 @@ from channel_lab import Array, C, Plate, Thing, antenna, measure, scene, sionna,
 from caviar_protocol.errors import RunError
 from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import AntennaArray, Scene
-from caviar_services.antenna import steering_vector
+from caviar_services.antenna_arrays import dft_codebook, steering_vector
 from caviar_services.channel.paths import Antenna
 from caviar_services.channel.radio_map.mapping import RadioMap, radio_map, rays_at_once, transmitters_of
 from caviar_services.channel.radio_map.measurement_surface import (
@@ -22,7 +22,6 @@ from caviar_services.channel.radio_map.measurement_surface import (
     level_surface,
 )
 from caviar_services.channel.sionna.model import SionnaChannel
-from caviar_services.link.codebook import dft_codebook
 
 pytestmark = pytest.mark.channel
 

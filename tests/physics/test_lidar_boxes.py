@@ -14,9 +14,8 @@ from lidar_world import Body, expected, observed, prepared, scene_of
 
 from caviar_protocol.space.coordinates import Pose, compose, multiply, quaternion_from_euler, rotation_matrix
 from caviar_protocol.topics import LidarDevice
-from caviar_services.meshes import box
+from caviar_services.mesh.shapes import box, ply
 from caviar_services.sensors.lidar import LidarSensors, LidarSettings
-from caviar_services.world.shapes import ply
 
 pytestmark = pytest.mark.channel
 

@@ -19,11 +19,9 @@ from caviar_protocol.errors import AssetError, PayloadError
 from caviar_protocol.host import trim_memory
 from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import AntennaDevice, Lidar, LidarDevice
-from caviar_services.meshes import box
+from caviar_services.mesh.shapes import box, car, ply
 from caviar_services.runner import TRIM_EVERY
-from caviar_services.sensors.grid import GridSettings
-from caviar_services.sensors.lidar import LidarSensors, LidarSettings
-from caviar_services.world.shapes import car, ply
+from caviar_services.sensors.lidar import GridSettings, LidarSensors, LidarSettings
 
 pytestmark = pytest.mark.channel
 

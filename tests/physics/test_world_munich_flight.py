@@ -11,9 +11,9 @@ import pytest
 
 from caviar_protocol.errors import SetupError
 from caviar_protocol.scenario import load_scenario
-from caviar_services.llvm import activate_llvm
-from caviar_services.scenery import read_scenery
-from caviar_services.sensors.geometry import active_variant, load_scenery
+from caviar_services.mesh.scenery import read_scenery
+from caviar_services.ray_tracing import activate_llvm
+from caviar_services.sensors.traced_scene import active_variant, load_scenery
 from caviar_services.world.assets import scenery_assets
 from caviar_services.world.trajectory import Track, read_waypoints
 

@@ -34,9 +34,9 @@ IMPORTED = (
     "caviar_broker.launch",
     "caviar_clients.cli.launch",
     "caviar_services.__main__",
-    "caviar_services.agent.los_beam",
+    "caviar_services.agent.baselines",
     "caviar_services.channel.statistical.free_space",
-    "caviar_services.link.beams",
+    "caviar_services.link.beam_sweep",
     "caviar_services.recorder.mcap",
     "caviar_services.world.trajectory",
 )

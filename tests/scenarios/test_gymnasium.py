@@ -25,8 +25,7 @@ from caviar_protocol.errors import PayloadError, RunError
 from caviar_protocol.messages import Input
 from caviar_protocol.recording import Recording
 from caviar_protocol.topics import Action, VelocityCommand
-from caviar_services.meshes import box
-from caviar_services.world.shapes import joined, ply
+from caviar_services.mesh.shapes import box, joined, ply
 
 PARTS = ("aoa", "aod", "position", "velocity", "last_abs_y")
 FRAMES, EPISODES, BEAMS = 60, 3, 64

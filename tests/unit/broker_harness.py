@@ -24,7 +24,7 @@ from caviar_protocol.assets import AssetStore
 from caviar_protocol.codec import decode_message, encode_message
 from caviar_protocol.digest import payload_digest
 from caviar_protocol.keys import Credentials
-from caviar_services.handshake import dress
+from caviar_services.connection import dress
 
 M = TypeVar("M", bound=m.Message)
 MS = 1_000_000

@@ -9,7 +9,7 @@ from link_builders import antenna, frame_of, given, scene_of
 
 from caviar_protocol.topics import Action, BeamChoice
 from caviar_services.agent.base import AgentSettings
-from caviar_services.agent.los_beam import LosBeamAgent
+from caviar_services.agent.baselines import LosBeamAgent
 from caviar_services.service import RunInfo
 
 

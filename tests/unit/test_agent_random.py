@@ -8,7 +8,7 @@ from link_builders import antenna, frame_of, given, scene_of
 
 from caviar_protocol.topics import Action, AntennaDevice, BeamChoice
 from caviar_services.agent.base import AgentSettings
-from caviar_services.agent.random import RandomAgent
+from caviar_services.agent.baselines import RandomAgent
 from caviar_services.service import RunInfo
 
 BS = antenna("bs", "tx", (1, 4))

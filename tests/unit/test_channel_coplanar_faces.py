@@ -7,7 +7,7 @@ import pytest
 
 from caviar_services.channel.sionna.coplanar_faces import CoplanarFaces, JoinedFaces
 from caviar_services.channel.sionna.planes import PlaneTable, plane_numbers
-from caviar_services.meshes import Mesh, box
+from caviar_services.mesh.shapes import Mesh, box
 
 FACES = 6
 

@@ -9,7 +9,7 @@ import pytest
 
 from caviar_protocol.arrays import Float64Array
 from caviar_services.channel.mesh_detail.decimation import decimated, welded
-from caviar_services.meshes import Mesh, box, unit_box
+from caviar_services.mesh.shapes import Mesh, box, unit_box
 
 
 def sphere(count: int) -> Mesh:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from caviar_services.channel.mesh_detail.detail import DetailSettings, detailed, piece_numbers
-from caviar_services.meshes import Mesh, box
+from caviar_services.mesh.shapes import Mesh, box
 
 
 def joined(*meshes: Mesh) -> Mesh:

@@ -9,7 +9,7 @@ import pytest
 
 from caviar_services.channel.sionna.mesh_edges import MeshEdges, mesh_edges
 from caviar_services.channel.sionna.planes import plane_numbers
-from caviar_services.meshes import Mesh, box, unit_box
+from caviar_services.mesh.shapes import Mesh, box, unit_box
 
 Array = np.ndarray[tuple[int, ...], np.dtype[Any]]
 FAR = np.array([1e3, -2e3, 50.0])

@@ -20,7 +20,7 @@ from caviar_services.channel.propagation.clearance import RISING_RAYS, Surfaces
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
-from caviar_services.meshes import box
+from caviar_services.mesh.shapes import box
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 
 HOUSE = box((-5.0, 5.0), (10.0, 20.0), (0.0, 8.0))

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from caviar_services.channel.sionna import plane_clustering
 from caviar_services.channel.sionna.planes import plane_numbers, plane_numbers_of
-from caviar_services.meshes import Mesh, unit_box
+from caviar_services.mesh.shapes import Mesh, unit_box
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from caviar_services.channel.sionna.planes import PlaneTable, plane_numbers, shared_planes
-from caviar_services.meshes import Mesh, box, unit_box
+from caviar_services.mesh.shapes import Mesh, box, unit_box
 
 Array = NDArray[np.float64]
 

@@ -18,8 +18,7 @@ from test_envs_uav_path import scenario
 import caviar_clients.envs
 from caviar_clients.envs.uav_path_v1 import UavPathV1Env
 from caviar_protocol.errors import RunError, ScenarioError
-from caviar_services.meshes import Mesh, box
-from caviar_services.world.shapes import ply
+from caviar_services.mesh.shapes import Mesh, box, ply
 
 gymnasium.register_envs(caviar_clients.envs)
 

@@ -10,10 +10,10 @@ import pytest
 
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.topics import AntennaArray, Carrier, Channel, Scene
+from caviar_services.antenna_arrays import dft_beam, dft_codebook
 from caviar_services.channel.statistical.geometric import GeometricChannel
 from caviar_services.channel.statistical.waves import GeometricSettings
 from caviar_services.link.beam_response import beam_responses
-from caviar_services.link.codebook import dft_beam, dft_codebook
 from caviar_services.link.users import Users, users_of
 from caviar_services.service import Preparation, RunInfo
 from caviar_services.testing import samples

@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 from link_builders import random_h
 
 from caviar_protocol.topics import AntennaArray
-from caviar_services.antenna import steering_vector
-from caviar_services.link.codebook import dft_codebook, pointing_directions
-from caviar_services.link.sweep import Pairs, best_pairs, sweep
+from caviar_services.antenna_arrays import dft_codebook, pointing_directions, steering_vector
+from caviar_services.link.beam_sweep import Pairs, best_pairs, sweep
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ from caviar_clients.plots.rays import rays
 from caviar_protocol.space.beams import beam_towards
 from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import AntennaArray, AntennaDevice, LidarDevice, LidarScan
-from caviar_services.link.codebook import pointing_directions
+from caviar_services.antenna_arrays import pointing_directions
 
 pytest.importorskip("matplotlib")
 Image = pytest.importorskip("PIL.Image")

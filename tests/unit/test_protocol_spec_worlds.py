@@ -18,7 +18,7 @@ from caviar_protocol.space.coordinates import rotated, rotation_matrix
 from caviar_protocol.space.ply import read_ply
 from caviar_protocol.topics import Interaction
 from caviar_protocol.versions import CHANGES_OTHERS, PARTS_SINCE, VALUES_SINCE
-from caviar_services.scenery import find_scenery, read_scenery
+from caviar_services.mesh.scenery import find_scenery, read_scenery
 
 SPEC = (Path(__file__).parents[2] / "protocol" / "SPEC.md").read_text("utf-8")
 

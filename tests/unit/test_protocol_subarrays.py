@@ -16,9 +16,8 @@ from caviar_protocol.space.beams import (
     subarrays,
 )
 from caviar_protocol.topics import AntennaArray, Panel
-from caviar_services.antenna import steering_vector
-from caviar_services.link.codebook import dft_beam, dft_codebook, pointing_directions
-from caviar_services.link.sweep import sweep
+from caviar_services.antenna_arrays import dft_beam, dft_codebook, pointing_directions, steering_vector
+from caviar_services.link.beam_sweep import sweep
 
 CROSS = AntennaArray(rows=2, columns=4, polarization="cross")
 SIDES = (Panel(position_m=(0.0, 0.1, 0.0), yaw_deg=90.0), Panel(position_m=(0.0, -0.1, 0.0), yaw_deg=-90.0))

@@ -11,7 +11,7 @@ import pytest
 from caviar_clients.cli.launch import Launcher
 from caviar_protocol.errors import SetupError
 from caviar_protocol.scenario import load_scenario
-from caviar_services.ray_tracing_threads import ENVIRONMENT, limited_threads, share_of_each
+from caviar_services.ray_tracing import THREADS_VARIABLE, limited_threads, share_of_each
 
 SCENARIOS = Path(__file__).parents[2] / "deploy" / "caviar_scenarios"
 
@@ -33,13 +33,13 @@ def test_the_launcher_counts_the_services_that_trace_rays(
     monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(6)))
     path = SCENARIOS / f"{scenario}.toml"
     with Launcher(load_scenario(path), path, tmp_path) as launcher:
-        assert launcher._threads == {ENVIRONMENT: threads}
+        assert launcher._threads == {THREADS_VARIABLE: threads}
 
 
 @pytest.mark.parametrize("text", ["0", "-1", "two", "1.5", "²"])
 def test_what_is_no_number_of_threads_is_refused(text: str) -> None:
-    with pytest.raises(SetupError, match=rf"{ENVIRONMENT} is '{text}'; write a number"):
-        limited_threads({ENVIRONMENT: text})
+    with pytest.raises(SetupError, match=rf"{THREADS_VARIABLE} is '{text}'; write a number"):
+        limited_threads({THREADS_VARIABLE: text})
 
 
 def test_without_a_word_the_ray_tracer_keeps_its_own_number() -> None:
@@ -51,14 +51,14 @@ def test_a_limit_holds_but_for_what_is_done_once() -> None:
     """In a process of its own: threads are the process's."""
     code = (
         "import drjit as dr\n"
-        "from caviar_services.ray_tracing_threads import all_threads, cores, limit_threads\n"
+        "from caviar_services.ray_tracing import all_threads, cores, limit_threads\n"
         "limit_threads()\n"
         "assert dr.thread_count() == 1, dr.thread_count()\n"
         "with all_threads():\n"
         "    assert dr.thread_count() == cores(), dr.thread_count()\n"
         "assert dr.thread_count() == 1, dr.thread_count()\n"
     )
-    environment = {"PATH": "/usr/bin:/bin", ENVIRONMENT: "1"}
+    environment = {"PATH": "/usr/bin:/bin", THREADS_VARIABLE: "1"}
     done = subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False, timeout=60
     )

@@ -16,7 +16,7 @@ from recording_samples import PERIOD_NS, SCENARIO, frame, recorder
 from caviar_protocol.errors import RunError
 from caviar_protocol.files import Durability
 from caviar_protocol.recording import Recording
-from caviar_services.recorder import persistence
+from caviar_services.recorder import segment_writer
 from caviar_services.recorder.base import failure
 from caviar_services.recorder.mcap import McapRecorder, McapSettings
 from caviar_services.service import Preparation, RunInfo
@@ -156,7 +156,7 @@ def test_with_frame_each_frame_is_on_disk_before_it_is_acknowledged(tmp_path, mo
 
 
 def test_with_periodic_a_thread_brings_frames_to_disk(tmp_path, monkeypatch):
-    monkeypatch.setattr(persistence, "_PAUSE_S", 0.01)
+    monkeypatch.setattr(segment_writer, "_PAUSE_S", 0.01)
     syncs = Syncs(monkeypatch)
     made = durable(tmp_path, "periodic", segment_frames=2)
     for number in range(4):
@@ -168,7 +168,7 @@ def test_with_periodic_a_thread_brings_frames_to_disk(tmp_path, monkeypatch):
 
 
 def test_with_periodic_an_error_of_the_disk_ends_the_run(tmp_path, monkeypatch):
-    monkeypatch.setattr(persistence, "_PAUSE_S", 0.01)
+    monkeypatch.setattr(segment_writer, "_PAUSE_S", 0.01)
     tried = threading.Event()
 
     def fdatasync(fd: int) -> None:

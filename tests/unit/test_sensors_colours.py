@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from caviar_services.scenery import SceneryShape
-from caviar_services.sensors.colours import (
+from caviar_services.mesh.scenery import SceneryShape
+from caviar_services.sensors.shading import (
     CLASSES,
     MATERIALS,
     OBJECT_SHADES,
+    encoded,
     linear,
     object_colour,
     shape_colour,
 )
-from caviar_services.sensors.shading import encoded
 
 
 def shape(

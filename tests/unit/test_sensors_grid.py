@@ -10,7 +10,7 @@ import pytest
 
 from caviar_protocol.arrays import Float32Array, Float64Array
 from caviar_protocol.topics import AntennaDevice, LidarDevice, Scene
-from caviar_services.sensors.grid import GridSettings, antenna_positions, occupancy, quantised
+from caviar_services.sensors.lidar import GridSettings, antenna_positions, occupancy, quantised
 
 ROSSLYN = GridSettings(
     minimum_m=(744.0, 429.0, 0.0), maximum_m=(767.0, 679.0, 10.0), cells=(20, 200, 10), tx="bs", rx="me"

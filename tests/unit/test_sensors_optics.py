@@ -9,7 +9,7 @@ import pytest
 
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.topics import CameraDevice, Intrinsics
-from caviar_services.sensors.optics import intrinsics, pixel_rays
+from caviar_services.sensors.camera import intrinsics, pixel_rays
 
 
 def test_a_field_of_view_of_90_degrees_has_a_focal_length_of_half_the_width() -> None:

@@ -92,7 +92,7 @@ BROKEN = {
     "no class": ("caviar_services.channel.statistical.free_space:Chanel", "has no attribute 'Chanel'"),
     "no place": (":Channel", "cannot be loaded from :Channel"),
     "no service": ("pathlib:Path", "which is not a Service"),
-    "another role": ("caviar_services.agent.random:RandomAgent", "whose role is 'agent'"),
+    "another role": ("caviar_services.agent.baselines:RandomAgent", "whose role is 'agent'"),
     "a base without a role": ("caviar_services.service:Service", "whose role is None"),
     "bad syntax": ("broken_syntax:Channel", "broken_syntax.py"),
     "fails on import": ("broken_import:Channel", "ZeroDivisionError: division by zero"),
@@ -135,7 +135,9 @@ def test_a_module_is_found_in_a_folder_that_was_added_and_hides_no_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "path", list(sys.path))
-    (tmp_path / "only_here.py").write_text((Path(registry.__file__).parent / "agent/random.py").read_text())
+    (tmp_path / "only_here.py").write_text(
+        (Path(registry.__file__).parent / "agent/baselines.py").read_text()
+    )
     with pytest.raises(DeclarationError, match="No module named 'only_here'; modules are looked for beside"):
         load("agent", "only_here:RandomAgent")
     registry.find_modules_in(tmp_path)

@@ -14,8 +14,7 @@ from caviar_clients.cli.run import run_scenario
 from caviar_clients.envs.beam_selection import BeamSelectionEnv
 from caviar_clients.session.checks import checked_scenario, implausible_values
 from caviar_protocol.scenario import shipped_scenarios
-from caviar_services.meshes import Mesh
-from caviar_services.world.shapes import ply
+from caviar_services.mesh.shapes import Mesh, ply
 
 SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
 GROUND = 'use = "trajectory"\nbudget_ms = 20\n'

@@ -10,11 +10,17 @@ import pytest
 
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.space.coordinates import Vector
-from caviar_services.meshes import box
+from caviar_services.mesh.shapes import box
 from caviar_services.service import Preparation, RunInfo
 from caviar_services.world.assets import scenery_assets
 from caviar_services.world.flight import FlightSettings, FlightWorld, FlownObject
-from caviar_services.world.flyer import SLID_ALONG_OBSTACLE, STOPPED_BY_OBSTACLE, Flyer, Limits, Motion
+from caviar_services.world.flight_dynamics import (
+    SLID_ALONG_OBSTACLE,
+    STOPPED_BY_OBSTACLE,
+    Flyer,
+    Limits,
+    Motion,
+)
 from caviar_services.world.obstacles import Obstacles, scenery_triangles
 
 Bounds = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]

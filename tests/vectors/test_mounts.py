@@ -13,7 +13,7 @@ from caviar_protocol.messages import Welcome
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import Scene
-from caviar_services.world.devices import Mounts
+from caviar_services.world.base import Mounts
 
 VECTORS = Path(__file__).parents[2] / "protocol" / "vectors"
 ARRIVALS = (("car.2", "uav"), ("car.1",), ("car.0",), (), ("car.2",))

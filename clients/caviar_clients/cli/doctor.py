@@ -31,7 +31,7 @@ from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.errors import CaviarError, SetupError
 from caviar_protocol.host import DISTRIBUTION, install_command
-from caviar_services import llvm
+from caviar_services import ray_tracing
 
 EXTRAS = ("channel", "sensors", "world", "plot", "learning")
 MINIMUM_PYTHON = (3, 11)
@@ -179,22 +179,22 @@ def check_llvm() -> Check:
     """The LLVM that the ray tracer would use, and that it compiles."""
     tracer = importlib.util.find_spec("drjit") is not None
     try:
-        library = llvm.choose_llvm()
+        library = ray_tracing.choose_llvm()
     except SetupError as error:
         if not tracer:
-            return Check("LLVM", True, f"none; extras channel and sensors need one: {llvm.INSTALL}")
-        return Check("LLVM", False, str(error), llvm.INSTALL)
+            return Check("LLVM", True, f"none; extras channel and sensors need one: {ray_tracing.INSTALL}")
+        return Check("LLVM", False, str(error), ray_tracing.INSTALL)
     if not tracer:
         return Check("LLVM", True, f"{library}; not tried, Dr.Jit is not installed")
-    outcome = _run([sys.executable, "-c", _KERNEL], {llvm.ENVIRONMENT: str(library.path)})
+    outcome = _run([sys.executable, "-c", _KERNEL], {ray_tracing.ENVIRONMENT: str(library.path)})
     if outcome.ok:
         return Check("LLVM", True, f"{library}; compiled a kernel")
-    return Check("LLVM", False, f"{library} cannot compile: {outcome.text}", llvm.INSTALL)
+    return Check("LLVM", False, f"{library} cannot compile: {outcome.text}", ray_tracing.INSTALL)
 
 
 def check_gpu() -> Check:
     """CUDA devices; none is fine."""
-    count = llvm.cuda_devices()
+    count = ray_tracing.cuda_devices()
     return Check("CUDA", True, f"{count} device(s)" if count else "none, the CPU computes")
 
 

@@ -20,7 +20,7 @@ from caviar_protocol.errors import RunError
 from caviar_protocol.files import file_system_of, open_to_append
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario, ServiceSpec
-from caviar_services.ray_tracing_threads import ENVIRONMENT, share_of_each
+from caviar_services.ray_tracing import THREADS_VARIABLE, share_of_each
 
 KILL_AFTER_S = 1.0
 """[s] that a process gets after SIGTERM before SIGKILL, beyond the run's ``shutdown_s``."""
@@ -206,7 +206,7 @@ class Launcher:
     def _threads(self) -> Mapping[str, str]:
         """What tells services that trace rays how many threads they share."""
         tracers = [spec for spec in self._local.values() if spec.role in _TRACING_ROLES]
-        return {ENVIRONMENT: str(share_of_each(len(tracers)))}
+        return {THREADS_VARIABLE: str(share_of_each(len(tracers)))}
 
     def _start_again(self, name: str) -> None:
         """Start a service that died and is waited for, unless that was in vain too often."""

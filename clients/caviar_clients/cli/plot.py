@@ -22,10 +22,9 @@ from caviar_protocol.recording import RecordedFrame, Recording
 from caviar_protocol.space.beams import subarray_of
 from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.topics import AntennaArray, Camera, Channel, Depth, Lidar, Link, Segmentation
-from caviar_services.antenna import steering_vector
+from caviar_services.antenna_arrays import dft_codebook, steering_vector
 from caviar_services.channel.propagation.patterns import element_amplitude
-from caviar_services.link.codebook import dft_codebook
-from caviar_services.scenery import find_scenery, read_scenery
+from caviar_services.mesh.scenery import find_scenery, read_scenery
 
 
 def plot_run(

@@ -33,7 +33,7 @@ from caviar_services.channel.radio_map.mapping import (
     rays_at_once,
     transmitters_of,
 )
-from caviar_services.scenery import find_scenery, read_scenery
+from caviar_services.mesh.scenery import find_scenery, read_scenery
 from caviar_services.service import Preparation
 
 FORMAT = "caviar-radio-map-1"

@@ -33,9 +33,9 @@ from caviar_services.channel.radio_map.measurement_surface import (
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
-from caviar_services.link.beams import BeamLink, BeamLinkSettings, noise_power
+from caviar_services.link.beam_sweep import BeamLink, BeamLinkSettings, noise_power
+from caviar_services.mesh.scenery import SceneryShape, read_scenery
 from caviar_services.registry import load
-from caviar_services.scenery import SceneryShape, read_scenery
 from caviar_services.service import RunInfo
 
 _MOST_CELLS = 20_000_000

@@ -29,9 +29,8 @@ from caviar_protocol.recording.segment import Segment
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario
 from caviar_services.recorder.base import failure
-from caviar_services.recorder.continuing import stored_products
-from caviar_services.recorder.persistence import Persistence
-from caviar_services.recorder.segment_writer import SegmentWriter
+from caviar_services.recorder.continuation import stored_products
+from caviar_services.recorder.segment_writer import Persistence, SegmentWriter
 
 SHOWN = 10
 """Lines about a part that are printed; how many there are more is said."""

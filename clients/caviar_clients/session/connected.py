@@ -13,9 +13,9 @@ from caviar_protocol.keys import Credentials
 from caviar_protocol.limits import MAX_IN_FLIGHT
 from caviar_protocol.messages import Input
 from caviar_services.connection import Terminated
+from caviar_services.process import Termination
 from caviar_services.runner import CONNECT_TIMEOUT_S, Runner
 from caviar_services.service import StepResult
-from caviar_services.termination import Termination
 
 IMPLEMENTATION = "gymnasium"
 LEAVE_S = 5.0

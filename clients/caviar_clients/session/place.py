@@ -12,8 +12,10 @@ from caviar_protocol.assets import AssetStore
 from caviar_protocol.errors import RunError
 from caviar_protocol.scenario.conversion import convert_settings
 from caviar_protocol.validation import ContentCheck
-from caviar_services.answers import Guard
-from caviar_services.exchange import (
+from caviar_services.runner import TRIM_EVERY
+from caviar_services.service import Frame, FrameInput, Service, StepResult
+from caviar_services.session import (
+    Guard,
     content_rules_of,
     done_of,
     frame_of,
@@ -25,8 +27,6 @@ from caviar_services.exchange import (
     ready_of,
     run_info,
 )
-from caviar_services.runner import TRIM_EVERY
-from caviar_services.service import Frame, FrameInput, Service, StepResult
 
 ABSENT = m.Status.ABSENT
 Feed = Callable[[ev.Event], None]

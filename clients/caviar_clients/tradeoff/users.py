@@ -12,8 +12,7 @@ from caviar_clients.tradeoff.scenes import Scenes
 from caviar_protocol.arrays import Complex128Array, Float64Array
 from caviar_protocol.scenario.conversion import convert_settings
 from caviar_protocol.topics import Channel, Scene
-from caviar_services.link.beams import BeamLinkSettings, noise_power, transmit_power
-from caviar_services.link.sweep import sweep
+from caviar_services.link.beam_sweep import BeamLinkSettings, noise_power, sweep, transmit_power
 from caviar_services.link.users import User, channels_of, users_of
 
 FLOOR_DB = -200.0

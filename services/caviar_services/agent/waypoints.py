@@ -13,9 +13,9 @@ from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.space.scene import Pair
 from caviar_protocol.topics import BeamChoice, Scene, WaypointCommand
 from caviar_services.agent.base import Agent, AgentSettings
-from caviar_services.agent.los_beam import straight_choices
+from caviar_services.agent.baselines import straight_choices
+from caviar_services.checkpoint import restored, saved
 from caviar_services.service import Frame, RunInfo
-from caviar_services.state import restored, saved
 
 
 class WaypointsSettings(AgentSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):

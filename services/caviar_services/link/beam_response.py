@@ -20,8 +20,7 @@ from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import AntennaDevice, Channel, Scene
 from caviar_protocol.topics.channel import PLANE_WAVES
-from caviar_services.antenna import steering_vector
-from caviar_services.link.codebook import dft_beam
+from caviar_services.antenna_arrays import dft_beam, steering_vector
 from caviar_services.link.users import Users
 
 

@@ -24,11 +24,10 @@ from caviar_protocol.space.coordinates import Pose, rotation_matrix
 from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import Scene
 from caviar_protocol.topics.scene import Device
-from caviar_services.llvm import activate_llvm, choose_variant, cuda_devices
-from caviar_services.meshes import Mesh, unit_box
-from caviar_services.ray_tracing_threads import limit_threads
-from caviar_services.scenery import SceneryShape, find_scenery, read_scenery
-from caviar_services.sensors.geometry import TracedScene, active_variant, load_scenery, load_unit_mesh
+from caviar_services.mesh.scenery import SceneryShape, find_scenery, read_scenery
+from caviar_services.mesh.shapes import Mesh, unit_box
+from caviar_services.ray_tracing import activate_llvm, choose_variant, cuda_devices, limit_threads
+from caviar_services.sensors.traced_scene import TracedScene, active_variant, load_scenery, load_unit_mesh
 from caviar_services.service import Frame, Preparation, Prepared, Service, StepResult
 
 

@@ -20,12 +20,12 @@ except ModuleNotFoundError as missing:
     raise SetupError(f"the conformance tests need pytest; run: {install_command('testing')}") from missing
 
 from caviar_services.testing.base import Played, ServiceConformance
-from caviar_services.testing.recorders import RecorderConformance
 from caviar_services.testing.roles import (
     CONFORMANCE,
     AgentConformance,
     ChannelConformance,
     LinkConformance,
+    RecorderConformance,
     SensorConformance,
     WorldConformance,
 )

@@ -39,12 +39,11 @@ from caviar_protocol.topics import (
     SegmentationImage,
 )
 from caviar_services.agent.base import AgentSettings
-from caviar_services.agent.random import RandomAgent
+from caviar_services.agent.baselines import RandomAgent
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
-from caviar_services.link.beams import BeamLink, BeamLinkSettings
-from caviar_services.meshes import Mesh, box
+from caviar_services.link.beam_sweep import BeamLink, BeamLinkSettings
+from caviar_services.mesh.shapes import SHAPES, Mesh, box, ply
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
-from caviar_services.world.shapes import SHAPES, ply
 
 SAMPLING_PERIOD_NS = 100_000_000
 CARRIERS = (

@@ -13,9 +13,9 @@ from caviar_protocol.host import install_command
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.scenario.schema import pattern_asset
+from caviar_services.mesh.scenery import read_scenery
+from caviar_services.mesh.shapes import SHAPES, ply
 from caviar_services.pattern_files import read_pattern
-from caviar_services.scenery import read_scenery
-from caviar_services.world.shapes import SHAPES, ply
 
 _BUNDLED = "sionna:"
 

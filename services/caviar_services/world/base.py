@@ -1,4 +1,4 @@
-"""What every virtual world does: names, devices, scenery, and the ``scene`` payload.
+"""What every virtual world does: names, mounted devices, scenery, and the ``scene`` payload.
 
 To add a world, subclass `World`, say in `objects_at` where things are, and register the class.
 """
@@ -19,12 +19,14 @@ import numpy as np
 from caviar_protocol.arrays import Float64Array, quantity
 from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.messages import Role
+from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.scenario.conversion import Place
+from caviar_protocol.scenario.schema import carries, fixed_device, mounted_device
 from caviar_protocol.space.coordinates import UnitQuaternion, Vector
 from caviar_protocol.topics import Scene
+from caviar_protocol.topics.scene import Device
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
 from caviar_services.world.assets import object_assets, pattern_assets, scenery_assets
-from caviar_services.world.devices import Mounts
 
 
 class ObjectState(NamedTuple):
@@ -194,3 +196,68 @@ def _tables(states: Sequence[ObjectState]) -> tuple[Float64Array, ...]:
         tables.append(numbers[begin : begin + count * width].reshape(count, width))
         begin += count * width
     return tuple(tables)
+
+
+class Mounts:
+    """Which devices exist in a frame, and where they are mounted.
+
+    A pattern with ``count`` devices gives them to the objects that came first. Who has one
+    keeps it, since all that came earlier have one too or have left.
+    """
+
+    def __init__(self, specs: Sequence[DeviceSpec]) -> None:
+        self._fixed = tuple(fixed_device(spec) for spec in specs if not spec.on)
+        self._mounted = tuple(spec for spec in specs if spec.on)
+        self._arrived: list[str] = []
+        self._objects: Sequence[tuple[str, Vector]] | None = None
+        self._devices: tuple[Device, ...] = ()
+        """Of the objects of the frame before, which mostly are those of the next one."""
+
+    @property
+    def fixed_names(self) -> tuple[str, ...]:
+        """Names of the devices that stand in the world without a parent."""
+        return tuple(device.name for device in self._fixed)
+
+    @property
+    def arrived(self) -> tuple[str, ...]:
+        """The objects of the last frame, those that came first in front."""
+        return tuple(self._arrived)
+
+    def clear(self, arrived: Sequence[str] = ()) -> None:
+        """Forget who came first: a new episode begins, or goes on behind a frame with these objects."""
+        self._arrived = list(arrived)
+        self._objects = None
+
+    def devices(self, objects: Sequence[tuple[str, Vector]]) -> tuple[Device, ...]:
+        """Devices of a frame, sorted by name.
+
+        ``objects`` are the names and dimensions [m] of all objects of the frame. Those that
+        were not there in the previous frame count as having come in the given order.
+        """
+        if objects == self._objects:
+            return self._devices
+        dimensions = dict(objects)
+        known = set(self._arrived)
+        self._arrived = [name for name in self._arrived if name in dimensions]
+        self._arrived += [name for name, _ in objects if name not in known]
+        found = list(self._fixed)
+        for spec in self._mounted:
+            carriers = [name for name in self._arrived if carries(spec, name)][: spec.count]
+            found += [mounted_device(spec, name, dimensions[name]) for name in carriers]
+        self._objects, self._devices = objects, tuple(sorted(found, key=lambda device: device.name))
+        return self._devices
+
+
+_TURNS = 1e-9
+"""[rad/s]; slower is the rounding of a straight line."""
+
+
+def turning(rate: float) -> float:
+    """A yaw rate [rad/s]; 0 where it is but rounding, so that a scene in which nothing turns says so."""
+    return rate if abs(rate) > _TURNS else 0.0
+
+
+def course_rate(velocity: Sequence[float], acceleration: Sequence[float]) -> float:
+    """How fast [rad/s] the horizontal course of a velocity [m/s] turns with an acceleration [m/s²]."""
+    (vx, vy, _), (ax, ay, _) = velocity, acceleration
+    return turning((vx * ay - vy * ax) / (vx * vx + vy * vy))

@@ -16,7 +16,7 @@ from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_protocol.errors import AssetError
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.space.ply import read_ply
-from caviar_services.scenery import read_scenery
+from caviar_services.mesh.scenery import read_scenery
 
 _CELL = 10.0
 """Side of a grid cell [m]."""

@@ -1,4 +1,9 @@
-"""World ``sumo``: road traffic and people of Eclipse SUMO, in this process."""
+"""World ``sumo``: road traffic and people of Eclipse SUMO, in this process.
+
+SUMO gives the centre of the front bumper on the ground, a heading in degrees clockwise from north, and a
+slope in degrees, positive uphill; a scene has the centre of the bounding box and angles counter-clockwise
+from +x.
+"""
 
 from __future__ import annotations
 
@@ -12,14 +17,12 @@ import msgspec
 from caviar_protocol.arrays import Vector3, quantity
 from caviar_protocol.errors import RunError, ScenarioError
 from caviar_protocol.seeding import derive_seed
-from caviar_protocol.space.coordinates import Vector
+from caviar_protocol.space.coordinates import Pose, Vector, quaternion_from_euler
+from caviar_services.checkpoint import restored, saved
+from caviar_services.mesh.shapes import SHAPES
 from caviar_services.service import Preparation, Prepared, RunInfo
-from caviar_services.state import restored, saved
-from caviar_services.world.base import ObjectState, World, WorldSettings
-from caviar_services.world.shapes import SHAPES
-from caviar_services.world.sumo_frame import Placement, body_pose, heading, object_class
+from caviar_services.world.base import ObjectState, World, WorldSettings, turning
 from caviar_services.world.sumo_process import Simulation, check_file, load_libsumo
-from caviar_services.world.yaw_rate import turning
 
 _NS_PER_MS = 1_000_000
 _LONGEST_STEP_MS = 1000
@@ -301,3 +304,92 @@ def _tuple(files: Files) -> tuple[str, ...]:
     if isinstance(files, str):
         return (files,) if files else ()
     return files
+
+
+class Placement(NamedTuple):
+    """How the road network lies in the scene: turned about its origin, then shifted."""
+
+    offset: Vector = (0.0, 0.0, 0.0)
+    """[m]"""
+    yaw: float = 0.0
+    """[rad], counter-clockwise."""
+
+
+class Heading(NamedTuple):
+    """Where a body on the road points [rad]."""
+
+    yaw: float
+    slope: float
+
+    @property
+    def forward(self) -> Vector:
+        """Unit vector out of the nose."""
+        horizontal = math.cos(self.slope)
+        return (math.cos(self.yaw) * horizontal, math.sin(self.yaw) * horizontal, math.sin(self.slope))
+
+    @property
+    def up(self) -> Vector:
+        """Unit vector out of the roof."""
+        horizontal = -math.sin(self.slope)
+        return (math.cos(self.yaw) * horizontal, math.sin(self.yaw) * horizontal, math.cos(self.slope))
+
+
+def heading(angle_deg: float, slope_deg: float, placement: Placement) -> Heading:
+    """Heading in the scene: yaw = 90° − angle, turned with the network."""
+    return Heading(math.radians(90.0 - angle_deg) + placement.yaw, math.radians(slope_deg))
+
+
+def body_pose(bumper: Vector, towards: Heading, length: float, height: float, placement: Placement) -> Pose:
+    """Pose of the bounding box of a body whose front bumper stands at ``bumper`` in SUMO [m]."""
+    c, s = math.cos(placement.yaw), math.sin(placement.yaw)
+    x, y, z = bumper
+    dx, dy, dz = placement.offset
+    front = (c * x - s * y + dx, s * x + c * y + dy, z + dz)
+    fx, fy, fz = towards.forward
+    ux, uy, uz = towards.up
+    back, rise = length / 2, height / 2
+    position = (
+        front[0] - back * fx + rise * ux,
+        front[1] - back * fy + rise * uy,
+        front[2] - back * fz + rise * uz,
+    )
+    # Positive pitch lowers the nose, a positive slope lifts it.
+    return Pose(position, quaternion_from_euler(towards.yaw, -towards.slope))
+
+
+_CLASS_OF: dict[str, str] = {
+    "aircraft": "uav",
+    "bicycle": "bicycle",
+    "bus": "bus",
+    "cable_car": "train",
+    "coach": "bus",
+    "container": "container",
+    "delivery": "truck",
+    "drone": "uav",
+    "moped": "motorcycle",
+    "motorcycle": "motorcycle",
+    "pedestrian": "pedestrian",
+    "rail": "train",
+    "rail_electric": "train",
+    "rail_fast": "train",
+    "rail_urban": "train",
+    "scooter": "bicycle",
+    "ship": "ship",
+    "subway": "train",
+    "trailer": "truck",
+    "tram": "train",
+    "truck": "truck",
+    "wheelchair": "pedestrian",
+}
+
+
+def object_class(type_id: str, vehicle_class: str, chosen: dict[str, str]) -> str:
+    """Our class of a SUMO vehicle type: as chosen for its id or its vClass, else by its vClass.
+
+    Whatever is not in the table drives on roads and is a ``car``.
+    """
+    base_type = type_id.partition("@")[0]  # SUMO appends @VEHICLE to a type changed for one vehicle
+    for key in (base_type, vehicle_class):
+        if key in chosen:
+            return chosen[key]
+    return _CLASS_OF.get(vehicle_class, "car")

@@ -36,8 +36,8 @@ from caviar_services.channel.adaptive.settings import AdaptiveSettings, Rung, bu
 from caviar_services.channel.base import Modelled
 from caviar_services.channel.outage import outage_counts
 from caviar_services.channel.sionna.scene_sharing import shared_scenes
+from caviar_services.checkpoint import restored, saved
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
-from caviar_services.state import restored, saved
 
 DECISION = "rung"
 """Key of the decision in DONE."""

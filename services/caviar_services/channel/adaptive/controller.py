@@ -29,7 +29,7 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array
-from caviar_services.state import Packed
+from caviar_services.checkpoint import Packed
 
 HALF_LIFE = 32
 """Frames after which a ratio counts half. One slow frame is then 2 to 4 % of all, and leaves a p95 alone."""

@@ -12,7 +12,7 @@ import numpy as np
 from caviar_protocol.arrays import Complex64Array, Complex128Array, Float64Array, Int64Array
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Carrier, ChannelMatrix
-from caviar_services.antenna import steering_vector
+from caviar_services.antenna_arrays import steering_vector
 from caviar_services.channel.paths import Antenna
 from caviar_services.channel.propagation.geometry import PathGeometry
 from caviar_services.channel.propagation.patterns import radiated_field

@@ -22,7 +22,7 @@ from caviar_services.channel.enumeration.image_beams import (
 )
 from caviar_services.channel.enumeration.lane_pairs import filtered, gathered, numbers, pairs
 from caviar_services.channel.sionna.candidates import positions
-from caviar_services.columns import aligned_indices, several
+from caviar_services.ray_tracing import aligned_indices, several
 
 _BLOCK = 16
 """Beams of one group that are looked at together: groups are filled up to a multiple of it."""

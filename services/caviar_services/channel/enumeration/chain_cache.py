@@ -16,7 +16,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Int32Array
 from caviar_protocol.files import replace_file
-from caviar_services.state import Packed
+from caviar_services.checkpoint import Packed
 
 _FORMAT: Literal["caviar-chains-1"] = "caviar-chains-1"
 

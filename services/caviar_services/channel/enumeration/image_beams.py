@@ -23,7 +23,7 @@ from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_services.channel.enumeration.face_rectangles import FaceRectangles
 from caviar_services.channel.enumeration.lane_pairs import filtered, gathered, numbers, opaque, pairs
 from caviar_services.channel.sionna.candidates import positions
-from caviar_services.columns import aligned_columns, aligned_indices, several
+from caviar_services.ray_tracing import aligned_columns, aligned_indices, several
 
 _SLACK = 5e-3
 """[m] around everything that is looked for."""

@@ -8,7 +8,7 @@ from caviar_protocol.arrays import BoolArray, Int32Array, Int64Array
 from caviar_services.channel.enumeration.face_rectangles import FaceRectangles, narrowest_sides, ranges
 from caviar_services.channel.sionna.planes import two_sided_planes
 from caviar_services.channel.sionna.scene import SionnaScene
-from caviar_services.meshes import Mesh
+from caviar_services.mesh.shapes import Mesh
 
 
 class SceneFaces:

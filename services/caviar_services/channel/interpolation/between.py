@@ -18,7 +18,7 @@ from caviar_protocol.errors import PayloadError
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, angles
 from caviar_protocol.topics import AntennaDevice, Channel, ChannelMatrix, Scene
 from caviar_protocol.topics.channel import PLANE_WAVES
-from caviar_services.antenna import element_positions, steering_vector
+from caviar_services.antenna_arrays import element_positions, steering_vector
 from caviar_services.channel.interpolation.course import Course, Courses
 from caviar_services.channel.interpolation.joined import (
     Joined,

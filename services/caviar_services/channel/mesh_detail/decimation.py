@@ -17,7 +17,7 @@ from typing import TypeAlias
 import numpy as np
 
 from caviar_protocol.arrays import Int64Array
-from caviar_services.meshes import Mesh
+from caviar_services.mesh.shapes import Mesh
 
 _Vector: TypeAlias = tuple[float, float, float]
 _Plane: TypeAlias = tuple[float, float, float, float]

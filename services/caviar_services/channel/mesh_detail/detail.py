@@ -16,7 +16,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array, quantity
 from caviar_services.channel.mesh_detail.decimation import decimated, welded
-from caviar_services.meshes import Mesh
+from caviar_services.mesh.shapes import Mesh
 
 
 class DetailSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

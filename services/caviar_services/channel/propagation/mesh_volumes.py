@@ -16,7 +16,7 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_services.channel.enumeration.face_rectangles import ranges
-from caviar_services.meshes import Mesh
+from caviar_services.mesh.shapes import Mesh
 
 _BRANCHES = 8
 """Boxes in a box of the next level, and triangles in one of the first."""

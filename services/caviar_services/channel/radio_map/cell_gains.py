@@ -25,7 +25,7 @@ from caviar_services.channel.radio_map.measurement_surface import MeasurementSur
 from caviar_services.channel.sionna.meshes import Shape, mi_mesh
 from caviar_services.channel.sionna.ray_launcher import spread_directions
 from caviar_services.channel.sionna.scene import SionnaScene
-from caviar_services.columns import aligned_columns, aligned_indices
+from caviar_services.ray_tracing import aligned_columns, aligned_indices
 
 PART = 1_000_000
 """Rays that are shot together at most."""
@@ -141,7 +141,7 @@ def beam_gains(antenna: Antenna, beams: range, directions: Any) -> Any:
     ``|atᵀ f|²`` with the steering vector at: N at the most, and 1 in the mean over the whole codebook. For a
     uniform planar array it is the product of two Dirichlet kernels, one along the columns and one along the
     rows (C. A. Balanis, Antenna Theory, 3rd ed., eq. 6-10c and section 6.10.1); beams are those of
-    `caviar_services.link.codebook.dft_codebook`.
+    `caviar_services.antenna_arrays.dft_codebook`.
 
     Parameters
     ----------

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
-from caviar_services.meshes import Mesh
+from caviar_services.mesh.shapes import Mesh
 
 Area = tuple[float, float, float, float]
 """Lowest x and y, highest x and y [m]."""

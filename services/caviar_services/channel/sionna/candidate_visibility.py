@@ -15,7 +15,7 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
 from caviar_services.channel.sionna.candidates import Candidates, Planes, positions
 from caviar_services.channel.sionna.scene import SionnaScene
-from caviar_services.columns import aligned_indices, several
+from caviar_services.ray_tracing import aligned_indices, several
 
 _OFF_SURFACE = 2e-4
 """[m]; rays from face to face start this far from the first, whose points are known to some 1e-5 m. From and

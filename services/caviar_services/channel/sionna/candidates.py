@@ -18,7 +18,7 @@ from caviar_services.channel.sionna.diffuse_paths import Points
 from caviar_services.channel.sionna.planes import PlaneTable
 from caviar_services.channel.sionna.ray_launcher import Launch, LaunchOptions
 from caviar_services.channel.sionna.scene import SionnaScene
-from caviar_services.columns import aligned_columns, aligned_indices
+from caviar_services.ray_tracing import aligned_columns, aligned_indices
 
 _SLACK = 0.1
 """[m] that a point may lie outside the box of its plane: more than float32 and the planes' tolerance do."""

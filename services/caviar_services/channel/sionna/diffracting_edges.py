@@ -16,8 +16,8 @@ from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Arr
 from caviar_services.channel.propagation.utd import Faces, faces_of
 from caviar_services.channel.sionna.mesh_edges import MeshEdges, mesh_edges
 from caviar_services.channel.sionna.triangle_numbering import NumberedTriangles
-from caviar_services.columns import aligned_columns, aligned_indices
-from caviar_services.meshes import Mesh
+from caviar_services.mesh.shapes import Mesh
+from caviar_services.ray_tracing import aligned_columns, aligned_indices
 
 _SAME_PLACE = 1e-3
 """[m]; corners of scenery that are nearer to each other are one."""

@@ -12,9 +12,9 @@ import numpy as np
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import AssetError
 from caviar_protocol.space.ply import read_ply_vertices
-from caviar_services.columns import aligned_columns
-from caviar_services.meshes import Mesh, unit_box
-from caviar_services.scenery import SceneryShape, asset_name, read_scenery
+from caviar_services.mesh.scenery import SceneryShape, asset_name, read_scenery
+from caviar_services.mesh.shapes import Mesh, unit_box
+from caviar_services.ray_tracing import aligned_columns
 
 _SAME_VERTEX = 1e-5
 """By how much of its size a mesh in float32 may differ from its file."""

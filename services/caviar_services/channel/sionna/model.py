@@ -51,10 +51,9 @@ from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.channel.sionna.traced_surfaces import traced_surfaces
 from caviar_services.channel.sionna.tracked_chains import Following, FollowingState
 from caviar_services.channel.sionna.warmup import compile_kernels
-from caviar_services.llvm import activate_llvm, choose_variant
-from caviar_services.ray_tracing_threads import all_threads, limit_threads
+from caviar_services.checkpoint import restored, saved
+from caviar_services.ray_tracing import activate_llvm, all_threads, choose_variant, limit_threads
 from caviar_services.service import Frame, Preparation, RunInfo, StepResult
-from caviar_services.state import restored, saved
 
 _COMPILE_GRACE_S = 120.0
 

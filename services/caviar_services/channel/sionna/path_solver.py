@@ -38,7 +38,7 @@ from caviar_services.channel.sionna.path_buffer import (
 from caviar_services.channel.sionna.ray_launcher import SCATTERED, Launch, LaunchOptions, PartedLauncher
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.channel.sionna.tracking import Followed, FollowedOffer, TableState
-from caviar_services.columns import aligned_columns, aligned_indices, several
+from caviar_services.ray_tracing import aligned_columns, aligned_indices, several
 
 _REMEMBERED = 4
 """Transmitters whose last launch is kept, in case nothing moves."""

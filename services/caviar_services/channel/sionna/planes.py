@@ -9,7 +9,7 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
 from caviar_services.channel.propagation.geometry import cross
 from caviar_services.channel.sionna.plane_clustering import coplanar
-from caviar_services.meshes import Mesh
+from caviar_services.mesh.shapes import Mesh
 
 _OFF_PLANE = 2e-5
 """Farthest corner from the plane, as a part of the mesh's extent; float32 corners are within 1e-7."""

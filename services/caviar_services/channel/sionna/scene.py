@@ -49,8 +49,8 @@ from caviar_services.channel.sionna.meshes import (
 from caviar_services.channel.sionna.object_materials import Constants, ObjectMaterials, body_kind
 from caviar_services.channel.sionna.scene_loading import by_material, loaded, with_detail
 from caviar_services.channel.sionna.triangle_numbering import Body, NumberedTriangles
-from caviar_services.meshes import BodyPool, Mesh, box, placed
-from caviar_services.scenery import find_scenery
+from caviar_services.mesh.scenery import find_scenery
+from caviar_services.mesh.shapes import BodyPool, Mesh, box, placed
 
 _Tuning = tuple[float, list[tuple[Any, Constants]]]
 """Frequency [Hz] of a carrier, and what is to be set at materials."""

@@ -11,8 +11,8 @@ from caviar_protocol.errors import AssetError, ScenarioError
 from caviar_services.channel.mesh_detail.detail import DetailEffect, DetailSettings, detailed
 from caviar_services.channel.sionna.materials import any_frequency, freeze
 from caviar_services.channel.sionna.meshes import Shape
-from caviar_services.meshes import Mesh
-from caviar_services.scenery import asset_name
+from caviar_services.mesh.scenery import asset_name
+from caviar_services.mesh.shapes import Mesh
 
 
 def loaded(description: Path | None) -> Any:

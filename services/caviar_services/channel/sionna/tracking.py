@@ -27,8 +27,8 @@ from caviar_services.channel.sionna.ray_launcher import (
     PartedLauncher,
 )
 from caviar_services.channel.sionna.scene import SionnaScene
-from caviar_services.columns import aligned_columns, aligned_indices
-from caviar_services.state import Packed
+from caviar_services.checkpoint import Packed
+from caviar_services.ray_tracing import aligned_columns, aligned_indices
 
 _JUMP = 20.0
 """[m] A transmitter that has moved farther since the frame before is looked for anew."""

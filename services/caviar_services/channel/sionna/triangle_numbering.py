@@ -25,7 +25,7 @@ from caviar_services.channel.sionna.planes import (
     shared_planes,
     two_sided_planes,
 )
-from caviar_services.meshes import Mesh
+from caviar_services.mesh.shapes import Mesh
 
 Body = tuple[str, int]
 """Asset and slot of a body in the pool."""

@@ -54,7 +54,7 @@ from caviar_protocol.seeding import generator
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, Pose
 from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import AntennaDevice, Channel, ChannelMatrix, ChannelOptions, Scene
-from caviar_services.antenna import steering_vector
+from caviar_services.antenna_arrays import steering_vector
 from caviar_services.channel.base import ChannelModel, Modelled
 from caviar_services.channel.propagation.atmosphere import amplitude_factor
 from caviar_services.channel.propagation.occlusion import Boxes

@@ -13,8 +13,12 @@ from hypothesis import strategies as st
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.space.beams import beam_towards
 from caviar_protocol.topics import AntennaArray
-from caviar_services.antenna import element_positions, steering_vector
-from caviar_services.link.codebook import dft_codebook, pointing_directions
+from caviar_services.antenna_arrays import (
+    dft_codebook,
+    element_positions,
+    pointing_directions,
+    steering_vector,
+)
 
 SIZES = [(1, 1), (1, 8), (8, 1), (1, 5), (4, 3), (2, 7), (1, 64)]
 

@@ -1,4 +1,4 @@
-"""How a service process is told to end, and made to."""
+"""How a service process ends: on SIGTERM, by force after a grace, and with which exit status."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import select
 import signal
 import sys
 import threading
+
+from caviar_protocol.messages import RUN_COMPLETE, STOPPED_BY
 
 TERMINATION_GRACE_S = 1.5
 """[s] from SIGTERM until the process is ended by force, so that it is gone within 2 s."""
@@ -82,3 +84,19 @@ class SignalTermination(Termination):
                 words = "ended by SIGTERM in the middle of a call that does not return"
                 self.enforce(TERMINATION_GRACE_S, self._status, words)
                 return
+
+
+def restart_status(status: int, ended: str) -> int:
+    """Status 0 where the work is done or nobody wants it any more; 1 where another run may follow.
+
+    Parameters
+    ----------
+    status
+        What the runner returned.
+    ended
+        Why the broker ended the run; "" where it did not.
+    """
+    if status == TERMINATED:
+        return 0
+    failed = bool(ended) and ended != RUN_COMPLETE and not ended.startswith(STOPPED_BY)
+    return 1 if failed else status

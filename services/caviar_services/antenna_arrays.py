@@ -1,13 +1,21 @@
-"""DFT codebooks: beams, the beam towards a direction, the direction of a beam.
+"""Uniform antenna arrays: element positions, steering vectors and DFT codebooks.
 
-Beam ``k`` of an array is a unit-norm vector c_k in element order. It is matched to waves from
-the direction it points to: a receiver combines with ``w = c_k``, a transmitter precodes with
-``f = conj(c_k)``, so that one index means one direction at both ends. With eq. (1) of the
-paper, ``y = w* H f``, a single path of amplitude a that lies on both grids gives
-``|y| = sqrt(Nr·Nt)·|a|``.
+An array with dual polarization or several panels is a set of these (`caviar_protocol.space.beams`).
 
-The codebook of an array with several panels or dual polarization is that of each of its subarrays
-(`caviar_protocol.space.beams`), block by block: a beam has the elements of one panel and one polarization.
+One phase convention holds for the channel, the link and the agents. The element at ``r`` [wavelengths] sees
+a plane wave of direction k̂ (unit vector from the array *towards* the other end, device axes) with the
+phase ``exp(+j2π k̂·r)``: an element nearer to the other end has the shorter path and, with exp(−j2πfτ), the
+larger phase. At both ends the same vector applies, so a single path of amplitude a has ``H = a · ar · atᵀ``
+(Tse and Viswanath, Fundamentals of Wireless Communication, section 7.2, with directions taken from each
+array outwards).
+
+Beam ``k`` of an array is a unit-norm vector c_k in element order. It is matched to waves from the direction
+it points to: a receiver combines with ``w = c_k``, a transmitter precodes with ``f = conj(c_k)``, so that
+one index means one direction at both ends. With eq. (1) of the paper, ``y = w* H f``, a single path of
+amplitude a that lies on both grids gives ``|y| = sqrt(Nr·Nt)·|a|``. The codebook of an array with several
+subarrays is that of each of them, block by block: a beam has the elements of one panel and one
+polarization. The link's sweep (`link.beam_sweep.sweep`) is a Fourier transform and forms no codebook;
+`tests/unit/test_link_sweep.py` holds the two against each other.
 """
 
 from __future__ import annotations
@@ -23,6 +31,58 @@ from caviar_protocol.errors import PayloadError
 from caviar_protocol.space.beams import subarray_of
 from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.topics.scene import AntennaArray
+
+
+def element_positions(array: AntennaArray) -> Float64Array:
+    """Element positions [wavelengths] in device axes around the array's centre, Shape ``[N, 3]``.
+
+    Element ``i`` is row ``i % rows`` of column ``i // rows``: rows from +z to −z, columns from
+    −y to +y, boresight +x.
+    """
+    y, z = _grid(array)
+    positions = np.zeros((array.size, 3))
+    positions[:, 1] = np.repeat(y, array.rows)
+    positions[:, 2] = np.tile(z, array.columns)
+    return positions
+
+
+def steering_vector(array: AntennaArray, directions: Float64Array) -> Complex128Array:
+    """Phases ``exp(+j2π k̂·r)`` of the elements, Shape ``[..., N]``, each of magnitude 1.
+
+    ``directions`` are unit vectors k̂ from the array towards the other end in device axes,
+    Shape ``[..., 3]``. The element pattern is not part of it.
+    """
+    if array.size == 1:
+        return np.ones((*directions.shape[:-1], 1), np.complex128)
+    y, z = _phases(array)
+    # k̂·r separates, so rows + columns exponentials do instead of rows · columns.
+    columns: Complex128Array = np.exp(directions[..., 1, None] * y)
+    if array.rows == 1:
+        return columns
+    rows = np.exp(directions[..., 2, None] * z)
+    vector: Complex128Array = (columns[..., :, None] * rows[..., None, :]).reshape(
+        *directions.shape[:-1], array.size
+    )
+    return vector
+
+
+@lru_cache(maxsize=256)
+def _grid(array: AntennaArray) -> tuple[Float64Array, Float64Array]:
+    """y of each column and z of each row [wavelengths]."""
+    y: Float64Array = (
+        np.arange(array.columns, dtype=np.float64) - (array.columns - 1) / 2
+    ) * array.horizontal_spacing
+    z: Float64Array = (
+        (array.rows - 1) / 2 - np.arange(array.rows, dtype=np.float64)
+    ) * array.vertical_spacing
+    return y, z
+
+
+@lru_cache(maxsize=256)
+def _phases(array: AntennaArray) -> tuple[Complex128Array, Complex128Array]:
+    """j2π times the grid."""
+    y, z = _grid(array)
+    return np.multiply(2j * np.pi, y, dtype=np.complex128), np.multiply(2j * np.pi, z, dtype=np.complex128)
 
 
 def dft_codebook(array: AntennaArray) -> Complex128Array:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from caviar_services.meshes import box
-from caviar_services.sensors.geometry import contains
+from caviar_services.mesh.shapes import SHAPES, box
 from caviar_services.sensors.lidar import ray_directions
-from caviar_services.world.shapes import SHAPES
+from caviar_services.sensors.traced_scene import contains
 
 
 @pytest.mark.parametrize("seed", range(3))

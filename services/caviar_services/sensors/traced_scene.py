@@ -19,9 +19,9 @@ from caviar_protocol.errors import AssetError, PayloadError
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.space.scene import object_pose
 from caviar_protocol.topics import Scene
-from caviar_services.columns import aligned_columns, aligned_indices
-from caviar_services.meshes import BodyPool, Mesh, placed
-from caviar_services.scenery import Scenery
+from caviar_services.mesh.scenery import Scenery
+from caviar_services.mesh.shapes import BodyPool, Mesh, placed
+from caviar_services.ray_tracing import aligned_columns, aligned_indices
 
 NO_HIT = -1
 """Owner of a ray that hits nothing."""

@@ -18,8 +18,8 @@ from typing import Annotated, NamedTuple
 import msgspec
 
 from caviar_protocol.space.coordinates import Vector
+from caviar_services.world.base import course_rate
 from caviar_services.world.obstacles import Obstacles
-from caviar_services.world.yaw_rate import course_rate
 
 SUB_STEP_NS = 10_000_000
 """[ns]"""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from caviar_protocol.messages import Grant, Reset
 from caviar_protocol.topics import Carrier
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
-from caviar_services.exchange import frame_of
 from caviar_services.service import RunInfo
+from caviar_services.session import frame_of
 
 SERVICE = FreeSpaceChannel(
     FreeSpaceSettings(), RunInfo(name="channel", carriers=(Carrier(name="c", frequency_hz=1e9),))

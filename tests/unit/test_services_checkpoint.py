@@ -10,10 +10,10 @@ import pytest
 
 from caviar_protocol.errors import RunError
 from caviar_protocol.topics import Carrier
-from caviar_services.agent.random import RandomAgent
+from caviar_services.agent.baselines import RandomAgent
 from caviar_services.agent.waypoints import WaypointsAgent, WaypointsSettings
+from caviar_services.checkpoint import Packed, restored, saved
 from caviar_services.service import RunInfo
-from caviar_services.state import Packed, restored, saved
 
 
 class Kept(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -1,0 +1,105 @@
+"""States that services save and take over (contract, clause 18): bytes that say what they are of.
+
+A service keeps its state in a frozen struct, `saved` makes bytes of it and `restored` a struct again.
+Equal states give equal bytes. What is in them is data alone: nothing in them is ever run.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any, Literal, TypeVar
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from caviar_protocol.errors import RunError
+from caviar_services.service import Service
+
+_FORMAT: Literal["caviar-state-1"] = "caviar-state-1"
+
+T = TypeVar("T", bound=msgspec.Struct)
+
+
+class _Envelope(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """What stands around a state."""
+
+    format: Literal["caviar-state-1"]
+    implementation: str
+    version: int
+    circumstances: bytes
+    """Digest of the settings, and of what the run told the service."""
+    digest: bytes
+    """Of the body."""
+    body: bytes
+
+
+class Packed(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """An array inside a state, C order."""
+
+    dtype: Literal["<f8", "<i8", "<i4"]
+    shape: tuple[int, ...]
+    data: bytes
+
+    @classmethod
+    def of(cls, array: NDArray[Any], dtype: Literal["<f8", "<i8", "<i4"]) -> Packed:
+        """The array, with its numbers in this type, which must hold them all."""
+        return cls(dtype, array.shape, array.astype(dtype).tobytes())
+
+    def array(self, kind: type[Any]) -> NDArray[Any]:
+        """An array of its own, of this type of numbers."""
+        return np.frombuffer(self.data, self.dtype).reshape(self.shape).astype(kind)
+
+
+def saved(service: Service[Any], version: int, state: msgspec.Struct) -> bytes:
+    """A state as bytes.
+
+    ``version`` is that of the struct ``state``: it is raised whenever what its fields mean changes.
+    """
+    body = msgspec.msgpack.encode(state, order="deterministic")
+    name = type(service).__qualname__
+    return msgspec.msgpack.encode(
+        _Envelope(_FORMAT, name, version, _circumstances(service), _digest(body), body)
+    )
+
+
+def restored(service: Service[Any], version: int, cls: type[T], state: bytes) -> T:
+    """The struct that `saved` was given.
+
+    Raises `RunError` where that was another implementation, another version of it, or the same in
+    other circumstances (settings, seed, sampling period, carriers, devices), and for all other bytes.
+    """
+    who = f"{service.run.name!r} cannot go on from a saved state"
+    try:
+        envelope = msgspec.msgpack.decode(state, type=_Envelope)
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        raise RunError(f"{who}: these {len(state)} bytes are none ({error}); start the run again") from error
+    if _digest(envelope.body) != envelope.digest:
+        raise RunError(f"{who}: its bytes are not those that were saved; start the run again")
+    name = type(service).__qualname__
+    if envelope.implementation != name:
+        raise RunError(f"{who} of {envelope.implementation}: this is {name}; use the same implementation")
+    if envelope.version != version:
+        raise RunError(
+            f"{who} of version {envelope.version}: this is version {version} of {name}; "
+            "use the release that saved it, or start the run again"
+        )
+    if envelope.circumstances != _circumstances(service):
+        raise RunError(
+            f"{who} of another scenario: settings, seed, sampling period, carriers or devices differ; "
+            "use the scenario that it was saved in, or start the run again"
+        )
+    try:
+        return msgspec.msgpack.decode(envelope.body, type=cls)
+    except msgspec.MsgspecError as error:
+        raise RunError(f"{who}: it is no state of {name} ({error}); start the run again") from error
+
+
+def _circumstances(service: Service[Any]) -> bytes:
+    run = service.run
+    told = (run.name, run.seed, run.sampling_period_ns, run.carriers, run.devices)
+    return _digest(msgspec.msgpack.encode((service.settings, told), order="deterministic"))
+
+
+def _digest(data: bytes) -> bytes:
+    return hashlib.blake2b(data, digest_size=16).digest()

@@ -1,0 +1,1 @@
+"""Triangle meshes: shapes of moving objects, and the scenery."""
