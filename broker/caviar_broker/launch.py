@@ -217,7 +217,9 @@ def _resumed(arguments: argparse.Namespace) -> tuple[RunRecord, Path, tuple[str,
             f"cannot go on with {directory}: it was begun with other versions, and its results may differ: "
             f"{different}. Go on with the versions that began it, or with these by --force"
         )
-    endpoint = arguments.bind or before.endpoint
+    # The directory of a private socket goes with the launcher that made it.
+    listened = DEFAULT_BIND if before.endpoint.startswith("ipc://") else before.endpoint
+    endpoint = arguments.bind or listened
     record = msgspec.structs.replace(before, epoch=before.epoch + 1, endpoint=endpoint, versions=versions)
     return record, directory, (f"the run goes on with other versions: {different}",) if different else ()
 

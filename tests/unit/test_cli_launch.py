@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from caviar_clients.cli import launch
@@ -75,6 +76,39 @@ def test_a_run_tells_where_it_listens_and_how_it_ended(tmp_path: Path) -> None:
     assert sorted(path.stem for path in (tmp_path / "run" / "logs").iterdir()) == sorted(
         ["agent", "broker", "channel", "link", "recorder", "world"]
     )
+
+
+def test_a_local_run_talks_over_a_socket_file_of_its_user_alone(tmp_path: Path) -> None:
+    """A broker that dies is followed by another at the same file; the directory goes with the run."""
+    extra = "[timeouts]\nrejoin_s = 5.0\n"
+    with launcher(tmp_path, frames=100, extra=extra, bind="") as started:
+        [*_, listening] = wait_for(started, "listening")
+        folder = Path(listening["endpoint"].removeprefix("ipc://")).parent
+        assert (listening["endpoint"], folder.stat().st_mode & 0o777) == (f"ipc://{folder}/broker", 0o700)
+        wait_for(started, "frame")
+        assert started._broker is not None
+        started._broker.kill()
+        finished = wait_for(started, "finished")[-1]
+        assert started.endpoint == listening["endpoint"]
+    assert (finished["error"], finished["frames"]) == ("", 100)
+    assert not folder.exists()
+
+
+@pytest.mark.parametrize("case", ["remote", "keys", "long path"])
+def test_a_run_that_cannot_use_a_socket_file_listens_on_a_port(
+    tmp_path: Path, case: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if case == "long path":
+        long = tmp_path / ("x" * 100)
+        long.mkdir()
+        monkeypatch.setattr("tempfile.tempdir", str(long))
+    plain = launcher(tmp_path, keys=tmp_path / "keys" if case == "keys" else None)
+    services = dict(plain.scenario.services)
+    if case == "remote":
+        services["agent"] = msgspec.structs.replace(services["agent"], use="remote", settings={})
+    scenario = msgspec.structs.replace(plain.scenario, services=services)
+    with Launcher(scenario, plain.path, plain.directory, bind="", keys=plain.keys) as started:
+        assert started.bind == "tcp://127.0.0.1:0"
 
 
 def test_a_block_that_is_left_in_the_middle_leaves_no_process(tmp_path: Path) -> None:

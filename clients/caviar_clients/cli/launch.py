@@ -7,11 +7,14 @@ import os
 import selectors
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+import zmq
 
 from caviar_broker.supervision import describe_exit, describe_stop, is_stopped
 from caviar_clients.cli.children import BorrowedKey, Child, end, wait
@@ -30,6 +33,7 @@ MAX_RESTARTS = 5
 """Processes that are started for a service that died, before it comes back."""
 LISTEN_S = 120.0
 """[s] from its start until the broker listens: one that goes on with a run reads its journal before."""
+ANY_PORT = "tcp://127.0.0.1:0"
 _TRACING_ROLES = ("channel", "sensors")
 """Of services that trace rays, or may."""
 LOOK_S = 0.05
@@ -51,6 +55,7 @@ class Launcher:
     frames: int | None = None
     seed: int | None = None
     bind: str = "tcp://127.0.0.1:0"
+    """Address of the broker; "" for a socket file of this user alone where every service is local."""
     keys: Path | None = None
     """Keys directory of the broker."""
     http: str = ""
@@ -62,6 +67,8 @@ class Launcher:
     pace: str | None = None
     endpoint: str = ""
     _key: BorrowedKey = field(init=False)
+    _socket_folder: tempfile.TemporaryDirectory[str] | None = None
+    """Where the socket file of the broker is; None where it listens elsewhere."""
     _children: dict[str, Child] = field(default_factory=dict)
     _broker: subprocess.Popen[bytes] | None = None
     _verdict: str = ""
@@ -94,6 +101,20 @@ class Launcher:
 
     def __post_init__(self) -> None:
         self._key = BorrowedKey(self.keys)
+        if not self.bind and self.keys is None and len(self._local) == len(self.scenario.services):
+            self.bind = self._private_address()
+        if not self.bind and not self.resume:
+            self.bind = ANY_PORT
+
+    def _private_address(self) -> str:
+        """An ``ipc://`` address in a new directory of mode 0700; "" where its path is too long for one."""
+        folder = tempfile.TemporaryDirectory(prefix="caviar-", ignore_cleanup_errors=True)
+        socket = Path(folder.name, "broker")
+        if len(os.fsencode(socket)) > zmq.IPC_PATH_MAX_LEN:
+            folder.cleanup()
+            return ""
+        self._socket_folder = folder
+        return f"ipc://{socket}"
 
     def __enter__(self) -> Launcher:
         return self
@@ -102,6 +123,8 @@ class Launcher:
         self._end_all()
         self._selector.close()
         self._key.close()
+        if self._socket_folder is not None:
+            self._socket_folder.cleanup()
 
     def events(self) -> Iterator[Mapping[str, Any]]:
         """Start everything; what the broker tells, then what became of the processes.

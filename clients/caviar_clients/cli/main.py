@@ -46,7 +46,6 @@ _errors = Console(stderr=True)
 _WHAT_TO_RUN = (
     "give a scenario, by its name (caviar scenarios) or a file, or --resume with the directory of a run"
 )
-ANY_PORT = "tcp://127.0.0.1:0"
 
 
 def _show_version(wanted: bool) -> None:
@@ -78,7 +77,8 @@ def run(
     json: Annotated[Path | None, typer.Option(help="write the summary to this file too")] = None,
     out: Annotated[Path, typer.Option(help="directory in which the run's own is made")] = Path("runs"),
     bind: Annotated[
-        str, typer.Option(help="address of the broker; port 0: any, and the default but for --resume")
+        str,
+        typer.Option(help="address of the broker; port 0: any; default: a private socket, or any port"),
     ] = "",
     embedded: Annotated[
         bool, typer.Option("--embedded", help="all in this process, without sockets")
@@ -100,9 +100,7 @@ def run(
             "give a scenario, by name (caviar scenarios) or file, or --resume with the directory of a run"
         )
     raise typer.Exit(
-        run_scenario(
-            scenario, out, _console, frames, seed, json, bind or ANY_PORT, embedded, keys, http, pace
-        )
+        run_scenario(scenario, out, _console, frames, seed, json, bind, embedded, keys, http, pace)
     )
 
 

@@ -174,7 +174,7 @@ def run_scenario(
     frames: int | None = None,
     seed: int | None = None,
     json_file: Path | None = None,
-    bind: str = "tcp://127.0.0.1:0",
+    bind: str = "",
     embedded: bool = False,
     keys: Path | None = None,
     http: str = "",
@@ -182,7 +182,8 @@ def run_scenario(
 ) -> int:
     """Run a scenario; the exit status: 0 exactly if it came to its end."""
     scenario = checked_scenario(path, frames, seed, pace)
-    check_bind(bind, keys=keys is not None)
+    if bind:
+        check_bind(bind, keys=keys is not None)
     require_extras(scenario)
     if embedded:
         refuse_remote(scenario)
