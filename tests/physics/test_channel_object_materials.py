@@ -28,7 +28,6 @@ from channel_lab import (
 
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.topics import Channel, Interaction, Scene
-from caviar_services.channel.base import ChannelModel
 from caviar_services.channel.sionna.object_materials import OTHER_MATERIALS, ObjectMaterials, body_kind
 
 pytestmark = pytest.mark.channel
@@ -142,7 +141,8 @@ def test_name_then_pattern_then_class_say_what_an_object_is_made_of() -> None:
     materials = ObjectMaterials({"car": "glass", "car.*": "wood", "car.1": "skin"})
     asked = ("car.1", "car"), ("car.2", "car"), ("bus.1", "car"), ("x", "y")
     assert [materials.of(*of) for of in asked] == ["skin", "wood", "glass", ""]
-    assert materials.unmatched(("car",)) == ("car.1",)
+    assert materials.unmatched([("bus.1", "car"), ("car.2", "")]) == ("car.1",)
+    assert materials.unmatched([("car.1", "car")]) == ("car", "car.*")
     assert (body_kind("objects/car.ply", ""), body_kind("", "skin")) == ("objects/car.ply", "the box of skin")
 
 
@@ -173,14 +173,20 @@ def test_what_is_wrong_with_a_material_names_its_key(settings: dict[str, Any], k
     assert refused.value.key == f"services.channel.settings.{key}"
 
 
-def test_keys_that_nothing_is_called_are_noted() -> None:
-    from channel_lab import carriers
-
-    from caviar_services.channel.sionna.model import SionnaChannel
-    from caviar_services.channel.sionna.settings import SionnaSettings
-    from caviar_services.service import Preparation, RunInfo
-
-    settings = SionnaSettings(object_materials={"pedestrian": "skin"}, samples=1000, max_depth=1, bodies=1)
-    model: ChannelModel[Any] = SionnaChannel(settings, RunInfo(name="channel", carriers=carriers(F)))
-    notes = model.prepare(Preparation(demand={})).notes
-    assert any("no piece of scenery is called 'pedestrian'" in note for note in notes)
+def test_keys_that_are_for_nothing_in_a_frame_are_counted_and_those_of_objects_with_a_mesh_are_not() -> None:
+    keys = {"sign": "wood", "board": "glass", "pedestrian": "skin", "bus.*": "metal", "wall": "concrete"}
+    model: Any = sionna(60e9, object_materials=keys, samples=1000, max_depth=1)
+    scene = Scene(
+        names=("bus.1", "s"),
+        classes=("bus", "sign"),
+        assets=("", "objects/board.ply"),
+        position=np.zeros((2, 3)),
+        orientation=np.tile([1.0, 0, 0, 0], (2, 1)),
+        velocity=np.zeros((2, 3)),
+        dimensions=np.ones((2, 3)),
+    )
+    assert model._unmatched(scene) == {
+        "unmatched/object_materials.board": 1,
+        "unmatched/object_materials.pedestrian": 1,
+        "unmatched/object_materials.wall": 1,
+    }

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from caviar_protocol.codec import decode_payload, encode_payload
+from caviar_protocol.errors import ScenarioError
 from caviar_protocol.multipath import slot_offsets, subcarrier_offsets
+from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import AntennaArray, Carrier, Channel, ChannelOptions
 from caviar_services.antenna_arrays import element_positions
 from caviar_services.channel.assemble import Product, assemble
 from caviar_services.channel.paths import Antenna, PathTable
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
-from caviar_services.channel.wideband import empty_parts, superposed
+from caviar_services.channel.wideband import check_size, empty_parts, superposed
 from caviar_services.service import Preparation, RunInfo
 
 CARRIERS = (
@@ -121,6 +124,24 @@ def test_a_part_that_no_carrier_defines_is_empty_and_a_note_says_what_to_write()
     model = FreeSpaceChannel(FreeSpaceSettings(), run)
     prepared = model.prepare(Preparation(demand={"channel": BOTH}))
     assert prepared.notes == empty_parts(BOTH, CARRIERS[1:])
+
+
+def test_parts_that_no_product_holds_are_refused_before_the_first_frame_by_their_key() -> None:
+    huge = replace(CARRIERS[0], subcarriers=65536, slots=17)
+    check_size({"hf", "taps"}, CARRIERS, 512, 64)
+    with pytest.raises(
+        ScenarioError, match=r"hf of 'wide' takes 1\.06 GiB between 128 transmitting and 1 "
+    ) as told:
+        check_size({"h", "hf"}, (CARRIERS[1], huge), 128, 1)
+    assert told.value.key == "carriers[1].subcarriers"
+    check_size({"h"}, (CARRIERS[1], huge), 128, 1)
+    devices = (
+        DeviceSpec(name="bs", kind="antenna", role="tx", array=AntennaArray(rows=8, columns=16)),
+        DeviceSpec(name="rx", kind="antenna", role="rx", on="car*", count=9),
+    )
+    model = FreeSpaceChannel(FreeSpaceSettings(), RunInfo(name="channel", carriers=(huge,), devices=devices))
+    with pytest.raises(ScenarioError, match=r"takes 1\.06 GiB"):
+        model.prepare(Preparation(demand={"channel": BOTH}))
 
 
 @pytest.mark.parametrize(("bins", "paths", "sizes"), [(7, 0, (2, 3)), (5, 130, (8, 64)), (3, 2, (64, 1024))])

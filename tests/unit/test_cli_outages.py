@@ -7,7 +7,14 @@ from pathlib import Path
 from msgspec.structs import replace
 from recording_samples import frame, link, product, recorder, scene
 
-from caviar_clients.cli.recording_summary import SHOWN_INSIDE, Dropped, Outages, outage_lines, summarise
+from caviar_clients.cli.recording_summary import (
+    SHOWN_INSIDE,
+    Dropped,
+    Outages,
+    Unmatched,
+    outage_lines,
+    summarise,
+)
 from caviar_protocol.messages import Report
 from caviar_protocol.recording import Recording
 
@@ -55,6 +62,16 @@ def test_paths_that_were_dropped_are_warned_of() -> None:
     (warning,) = dropped.warnings()
     assert warning.startswith("channel dropped 7 paths with values that are not finite, in 2 frames: ")
     assert Dropped().warnings() == []
+
+
+def test_a_key_that_is_for_nothing_in_any_frame_is_warned_of() -> None:
+    unmatched = Unmatched()
+    names = [{"unmatched/object_materials.sing": 1, "unmatched/object_materials.bus": 1},
+             {"unmatched/object_materials.sing": 1}]  # fmt: skip
+    for counts in names:
+        unmatched.add([Report(source="channel", counts=counts), Report(source="link")])
+    (warning,) = unmatched.warnings()
+    assert warning.startswith("channel: object_materials.sing had no effect: no object, class or piece")
 
 
 def test_a_recording_warns_of_paths_that_were_dropped(tmp_path: Path) -> None:

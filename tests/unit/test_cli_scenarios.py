@@ -20,8 +20,10 @@ from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol import host
 from caviar_protocol.errors import RunError, SetupError
 from caviar_protocol.scenario import load_scenario, parse_scenario, shipped_scenarios
+from caviar_protocol.topics import AntennaArray
 
 runner = CliRunner()
+SCENARIOS = Path(__file__).parents[2] / "deploy" / "caviar_scenarios"
 ENVIRONMENT = {"COLUMNS": "150", "TERM": "dumb"}
 
 
@@ -43,6 +45,13 @@ def test_every_shipped_scenario_is_listed_with_a_line_and_what_it_needs(
     assert re.search(r"^smoke .* base install *$", text, re.MULTILINE)
     assert re.search(r"^street-canyon .* channel, sensors, world *$", text, re.MULTILINE)
     assert "pip install" not in text
+
+
+def test_the_keys_that_the_file_of_a_new_scenario_advertises_are_keys() -> None:
+    (line,) = re.findall(
+        r"^array = .*also: (.*)", (SCENARIOS / "new" / "scenario.toml").read_text(), re.MULTILINE
+    )
+    assert set(line.split(", ")) <= set(AntennaArray.__struct_fields__)
 
 
 def test_the_list_marks_what_is_not_installed_and_names_one_command(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,7 +17,7 @@ from caviar_protocol.messages import Report, Status
 from caviar_protocol.recording import RecordedFrame, Recording
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.topics import Link
-from caviar_protocol.topics.channel import INSIDE_PREFIX, Cause
+from caviar_protocol.topics.channel import INSIDE_PREFIX, UNMATCHED_PREFIX, Cause
 
 STATE = "state:"
 """Begins the name of a decision that is no choice, but what a service knew when the episode began."""
@@ -182,6 +182,30 @@ class Unserved:
         ]
 
 
+class Unmatched:
+    """Keys of a channel's settings that were for nothing, in each of the frames that it reported of."""
+
+    def __init__(self) -> None:
+        self._frames: Counter[str] = Counter()
+        self._unmatched: Counter[tuple[str, str]] = Counter()
+
+    def add(self, reports: Iterable[Report]) -> None:
+        """What services reported of a frame."""
+        for report in reports:
+            self._frames[report.source] += 1
+            for name in report.counts:
+                if name.startswith(UNMATCHED_PREFIX):
+                    self._unmatched[report.source, name.removeprefix(UNMATCHED_PREFIX)] += 1
+
+    def warnings(self) -> list[str]:
+        """For a user: a line for each key that had no effect from the first frame to the last."""
+        return [
+            f"{source}: {key} had no effect: no object, class or piece of scenery was called so in any frame"
+            for (source, key), frames in sorted(self._unmatched.items())
+            if frames == self._frames[source]
+        ]
+
+
 _DROPPED = "dropped"
 
 
@@ -290,7 +314,7 @@ def summarise(recording: Recording) -> RunSummary:
     metadata, damage = recording.metadata, list(recording.damage)
     sources: dict[tuple[str, str], SourceSummary] = {}
     totals, decisions, unserved, outages = _LinkTotals(), Decisions(), Unserved(), Outages()
-    dropped = Dropped()
+    dropped, unmatched = Dropped(), Unmatched()
     episodes: dict[int, int] = {}  # to the last instant [ns]
     for frame in recording.frames():
         episodes[frame.episode] = max(frame.t_ns, episodes.get(frame.episode, 0))
@@ -298,6 +322,7 @@ def summarise(recording: Recording) -> RunSummary:
         unserved.add(frame.reports)
         outages.add(frame.reports)
         dropped.add(frame.reports)
+        unmatched.add(frame.reports)
         for entry in frame.inputs:
             key = (entry.topic, entry.source)
             source = sources.setdefault(key, SourceSummary(topic=entry.topic, source=entry.source))
@@ -322,7 +347,7 @@ def summarise(recording: Recording) -> RunSummary:
         link=totals.summary(),
         outage=outages.summary(totals.users - totals.served),
         decided=decisions.summary(),
-        warnings=[*unserved.warnings(), *dropped.warnings()],
+        warnings=[*unserved.warnings(), *dropped.warnings(), *unmatched.warnings()],
         versions=metadata.versions,
         machine=metadata.machine,
         notes=metadata.notes,

@@ -270,6 +270,8 @@ class Cause(Enum):
         return f"no-path/{self.value.replace(' ', '-')}"
 
 
+UNMATCHED_PREFIX = "unmatched/"
+"""Before ``SETTING.KEY`` in the counts of a report: a key that is for nothing in the frame."""
 INSIDE_PREFIX = "inside/"
 """Before ``ANTENNA in OBJECT`` in the counts of a report: an antenna that no path reaches, and the object
 that it stands inside."""

@@ -22,7 +22,7 @@ from caviar_protocol.scenario.schema import PATTERNS
 from caviar_protocol.scene_validation import too_fast
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.space.scene import antennas
-from caviar_protocol.topics import AntennaDevice, Channel, ChannelOptions, Scene
+from caviar_protocol.topics import AntennaArray, AntennaDevice, Channel, ChannelOptions, Scene
 from caviar_protocol.topics.scene import Device, Panel
 from caviar_services.channel.arrays.channel_matrices import Matrices
 from caviar_services.channel.assemble import Product, assemble
@@ -30,7 +30,7 @@ from caviar_services.channel.outage import outage_counts
 from caviar_services.channel.paths import Antenna, PathTable
 from caviar_services.channel.propagation.atmosphere import Atmosphere, specific_attenuation
 from caviar_services.channel.propagation.patterns import Patterns
-from caviar_services.channel.wideband import empty_parts
+from caviar_services.channel.wideband import check_size, empty_parts
 from caviar_services.pattern_files import read_pattern
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
 
@@ -169,6 +169,11 @@ class ChannelModel(Service[S]):
         demand = preparation.demand.get("channel", frozenset())
         self.with_h = "h" in demand
         self.wideband = demand & {"hf", "taps"}
+        elements = [(spec.role, spec.array or AntennaArray()) for spec in self.run.devices]
+        sent, taken = (
+            sum(array.size for role, array in elements if role in (end, "both")) for end in ("tx", "rx")
+        )
+        check_size(demand, self.run.carriers, sent, taken)  # each device once: how many there are scenes say
         self.load_patterns(preparation)
         if self.wideband:
             keep_large_buffers()
@@ -195,7 +200,11 @@ class ChannelModel(Service[S]):
             wrong = too_fast(scene)
             if wrong:
                 raise PayloadError(f"{wrong}; is it in km/h, or of another unit of time?")
-        made = self.model(frame, scene, antennas(scene, "tx"), antennas(scene, "rx"))
+        transmitters, receivers = antennas(scene, "tx"), antennas(scene, "rx")
+        if self.wideband:
+            sent, taken = (sum(end.array.size for end in ends) for ends in (transmitters, receivers))
+            check_size(self.wideband, self.run.carriers, sent, taken)
+        made = self.model(frame, scene, transmitters, receivers)
         channel = made.channel
         return StepResult(
             products={"channel": channel},

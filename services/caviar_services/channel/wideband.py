@@ -17,6 +17,8 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Complex64Array, Complex128Array, Float64Array, Int64Array
+from caviar_protocol.errors import ScenarioError
+from caviar_protocol.limits import MAX_BODY
 from caviar_protocol.multipath import first_tap, subcarrier_weights, tap_weights
 from caviar_protocol.scenario.rules import undefined_part
 from caviar_protocol.topics import Carrier, ChannelResponse, ChannelTaps
@@ -69,6 +71,37 @@ def empty_parts(demand: Collection[str], carriers: Sequence[Carrier]) -> tuple[s
     """Notes for the user on wideband parts in demand that no carrier has, so that they are empty."""
     found = [undefined_part(part, carriers) for part in sorted({"hf", "taps"} & set(demand))]
     return tuple(f"a part in demand is empty: {problem}" for problem in found if problem)
+
+
+def check_size(demand: Collection[str], carriers: Sequence[Carrier], sent: int, taken: int) -> None:
+    """Refuse parts that no product holds.
+
+    Args:
+        demand: Parts in demand.
+        carriers: Carriers with their numerologies.
+        sent: Elements of all transmitters together.
+        taken: Elements of all receivers together.
+
+    Raises:
+        ScenarioError: They have more bytes than `MAX_BODY`; names the carrier's key that costs most.
+    """
+    sizes = {}
+    for index, carrier in enumerate(carriers):
+        bins = {"h": 2, "hf": carrier.slots * carrier.subcarriers, "taps": carrier.slots * carrier.taps}
+        for part in bins.keys() & set(demand):
+            sizes[part, index] = 8 * bins[part] * sent * taken
+    total = sum(sizes.values())
+    if total <= MAX_BODY:
+        return
+    part, index = max(sizes, key=sizes.__getitem__)
+    key = {"h": "name", "hf": "subcarriers", "taps": "taps"}[part]
+    carrier = carriers[index]
+    raise ScenarioError(
+        f"{part} of {carrier.name!r} takes {sizes[part, index] / 2**30:.3g} GiB between {sent} transmitting "
+        f"and {taken} receiving elements in {carrier.slots} slots, and a product holds "
+        f"{MAX_BODY / 2**30:g} GiB; write fewer subcarriers, taps or slots, or smaller arrays",
+        key=f"carriers[{index}].{key}",
+    )
 
 
 def bins_of(

@@ -10,7 +10,6 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import PurePosixPath
 from typing import ClassVar
 
 import msgspec
@@ -24,6 +23,7 @@ from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.seeding import derive_seed
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import AntennaDevice, ChannelOptions, Scene
+from caviar_protocol.topics.channel import UNMATCHED_PREFIX
 from caviar_services.channel.arrays.channel_matrices import Matrices
 from caviar_services.channel.arrays.element_visibility import outermost
 from caviar_services.channel.arrays.mimo_rt import ElementTracer
@@ -107,6 +107,8 @@ class SionnaChannel(PathModel[SionnaSettings]):
         self._detail = ""
         self._room: dict[str, int] = {}
         self._names: tuple[str, ...] = ()
+        self._keys: dict[str, ObjectMaterials] = {}
+        self._known_unmatched: tuple[object, dict[str, int]] = (None, {})
         """Of the pieces of the scene in the last frame."""
         self._missed = np.zeros((0, 0))
         """Power that half of the rays would have missed in the last frame, Shape ``[T, R]``."""
@@ -196,9 +198,9 @@ class SionnaChannel(PathModel[SionnaSettings]):
             notes += tuple(f"foliage {brief}" for brief in self.foliage.briefs)
         self._names = self._scene.names
         self._outside = self._scene.outside
-        notes += self._unmatched("object_materials", ObjectMaterials(s.object_materials), preparation)
+        self._keys = {"object_materials": ObjectMaterials(s.object_materials)}
         if self.foliage is not None:
-            notes += self._unmatched("foliage", self.foliage.keys, preparation)
+            self._keys["foliage"] = self.foliage.keys
         notes += tuple(use.note(self.run.carriers[use.carrier].name) for use in self._outside)
         if self._scene.detail_effect is not None:
             notes += (self._scene.detail_effect.note,)
@@ -315,6 +317,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
             counts={
                 "path_limit_reached": sum(part.lost for _, part in parts),
                 "too_close": too_close,
+                **self._unmatched(scene),
                 **({} if self._edge_range is None else {"no_edge_in_range": self._without_edge}),
             },
             matrices=self._matrices([part for _, part in parts], table, (sources, targets)),
@@ -416,15 +419,20 @@ class SionnaChannel(PathModel[SionnaSettings]):
         first, index = t * len(receivers), np.array(others, np.int64)
         return [(first + index[traced.receiver], traced) for traced in found]
 
-    def _unmatched(self, setting: str, keys: ObjectMaterials, preparation: Preparation) -> tuple[str, ...]:
-        """Keys of a setting that neither a mesh nor a piece of scenery is called."""
-        pieces = {*self._scene.names, *self._scene.foliage_meshes}
-        known = pieces | {PurePosixPath(name).stem for name in preparation.assets}
-        return tuple(
-            f"{setting}: no mesh and no piece of scenery is called {key!r}; it counts for objects of "
-            "this name, and for those of this class without a mesh"
-            for key in keys.unmatched(known)
-        )
+    def _unmatched(self, scene: Scene) -> dict[str, int]:
+        """Counts of the keys of settings that are for no object of a scene and no piece of scenery."""
+        named = scene.names, scene.classes
+        if self._known_unmatched[0] != named:
+            pieces = [(name, "") for name in (*self._scene.names, *self._scene.foliage_meshes)]
+            objects = zip(*named, strict=True)
+            found = [*pieces, *objects]
+            counts = {
+                f"{UNMATCHED_PREFIX}{setting}.{key}": 1
+                for setting, keys in self._keys.items()
+                for key in keys.unmatched(found)
+            }
+            self._known_unmatched = named, counts
+        return self._known_unmatched[1]
 
     def _moving(self, preparation: Preparation) -> bool:
         """Whether objects move in the run, for all that is known before its first frame."""

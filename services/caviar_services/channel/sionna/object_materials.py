@@ -64,23 +64,27 @@ class ObjectMaterials:
         return tuple(sorted(set(self.by_key.values())))
 
     def of(self, name: str, cls: str = "") -> str:
-        """Material of an object: by its name, else by the first pattern that matches it, else by its class;
+        """Material of an object, or of a piece of scenery; empty where no key is for it."""
+        return self.by_key.get(self.key_for(name, cls), "")
+
+    def key_for(self, name: str, cls: str = "") -> str:
+        """Key that counts for an object: its name, else the first pattern that matches it, else its class;
         empty where none of these is there."""
         if not self.by_key:
             return ""
-        found = self.by_key.get(name)
-        if found is None:
-            found = next((m for key, m in self.by_key.items() if "*" in key and fnmatchcase(name, key)), None)
-        return self.by_key.get(cls, "") if found is None else found
+        if name in self.by_key:
+            return name
+        patterns = (key for key in self.by_key if "*" in key and fnmatchcase(name, key))
+        return next(patterns, cls if cls in self.by_key else "")
 
     def key_of(self, material: str) -> str:
         """The first key of a material."""
         return next(key for key, found in self.by_key.items() if found == material)
 
-    def unmatched(self, names: Iterable[str]) -> tuple[str, ...]:
-        """Keys that are none of these names, of classes or pieces of scenery; patterns are left out."""
-        known = set(names)
-        return tuple(key for key in self.by_key if "*" not in key and key not in known)
+    def unmatched(self, named: Iterable[tuple[str, str]]) -> tuple[str, ...]:
+        """Keys that count for none of these names and classes."""
+        used = {self.key_for(name, cls) for name, cls in named}
+        return tuple(key for key in self.by_key if key not in used)
 
 
 def body_kind(asset: str, material: str) -> str:
