@@ -37,9 +37,11 @@ _PRODUCT_SCHEMA = (
     "the header (a msgpack map), the body (the arrays that the header refers to by dtype, shape and offset)."
 )
 _FRAME_SCHEMA = (
-    "msgpack map: episode, frame, t_ns [ns], seed, inputs; inputs lists the provenance of every product of "
+    "msgpack map: episode, frame, t_ns [ns], seed, inputs, reports, of which those that are left out are 0 or "
+    "empty; inputs lists the provenance of every product of "
     "the frame, sorted by (topic, source, frame): topic, source, status (fresh, held, absent, late), "
-    "frame and t_ns it was computed for, age [frames], fidelity, digest (SHA-256), cause."
+    "frame and t_ns it was computed for, age [frames], fidelity, digest (SHA-256), cause; reports lists what "
+    "services said beside their products: source, decisions, measured [ns], counts."
 )
 
 
