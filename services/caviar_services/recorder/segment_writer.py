@@ -37,7 +37,7 @@ _PRODUCT_SCHEMA = (
     "the header (a msgpack map), the body (the arrays that the header refers to by dtype, shape and offset)."
 )
 _FRAME_SCHEMA = (
-    "msgpack map: episode, frame, t_ns [ns], seed, inputs, reports, of which those that are left out are 0 or "
+    "msgpack map: episode, frame, t_ns [ns], seed, inputs, reports; what is left out is 0 or "
     "empty; inputs lists the provenance of every product of "
     "the frame, sorted by (topic, source, frame): topic, source, status (fresh, held, absent, late), "
     "frame and t_ns it was computed for, age [frames], fidelity, digest (SHA-256), cause; reports lists what "
