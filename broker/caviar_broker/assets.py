@@ -14,7 +14,7 @@ from caviar_broker.core.clock import FrameClock
 from caviar_broker.core.plan import PatternFile
 from caviar_broker.core.transitions import ServiceState
 from caviar_protocol import messages as m
-from caviar_protocol.assets import AssetStore, Incoming
+from caviar_protocol.assets import AssetStore, IncomingAsset
 from caviar_protocol.errors import AssetError
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario.rules import world_of
@@ -60,7 +60,7 @@ class _Delivery:
     # By digest: not asked for yet.
     waiting: dict[str, m.Asset]
     # By digest: asked for.
-    coming: dict[str, Incoming] = field(default_factory=dict)
+    coming: dict[str, IncomingAsset] = field(default_factory=dict)
 
     @property
     def owed(self) -> tuple[m.Asset, ...]:
@@ -114,7 +114,7 @@ class AssetExchange:
             self.feed(ev.Violated(service, text))
             return
         try:
-            if not incoming.take(message.offset, message.size, parts[0].buffer):
+            if not incoming.add_chunk(message.offset, message.size, parts[0].buffer):
                 self.reply(service, m.AssetGet(digest=message.digest, offset=incoming.offset))
                 return
             del delivery.coming[message.digest]
@@ -168,7 +168,7 @@ class AssetExchange:
         delivery = self._deliveries[service]
         while delivery.waiting and len(delivery.coming) < FILES_AT_ONCE:
             digest = next(iter(delivery.waiting))
-            delivery.coming[digest] = Incoming(self.store, delivery.waiting.pop(digest))
+            delivery.coming[digest] = IncomingAsset(self.store, delivery.waiting.pop(digest))
             self.reply(service, m.AssetGet(digest=digest))
 
 

@@ -242,7 +242,7 @@ class BrokerServer:
         if now >= self._next_check:
             self._next_check = now + CHECK_NS
             self._watchdog.check(now)
-            self._sign.give()
+            self._sign.touch()
             self._guard.check(now)
             self._look_at_disk()
         self._write_journal()

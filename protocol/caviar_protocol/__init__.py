@@ -1,1 +1,1 @@
-"""What anyone who plugs into CAVIAR must know: messages, payloads, codec, scenarios, recordings."""
+"""The protocol of CAVIAR: messages, payloads, codec, scenarios, recordings."""

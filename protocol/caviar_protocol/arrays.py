@@ -154,7 +154,7 @@ class Payload(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
             lengths = [len(getattr(self, field)) for field in layout.listed]
             shapes = (*layout.shapes_of(self), *lengths)
             is_known = layout.dtypes_of(self) == layout.dtypes and shapes in layout.known
-        except (AttributeError, TypeError):  # no array, or no length: told below
+        except (AttributeError, TypeError):  # no array, or no length: reported below
             is_known = False
         if not is_known or (layout.optional and any(getattr(self, f) is not None for f in layout.optional)):
             self._check_arrays()

@@ -54,7 +54,7 @@ class AssetStore:
             ) from error
 
     def holds(self, asset: Asset) -> bool:
-        """Whether the whole file is here, with the size and content that its description tells."""
+        """Whether the whole file is here, with the size and content of its description."""
         return self._intact(asset.digest, asset.size)
 
     def path(self, digest: str) -> Path:
@@ -172,7 +172,7 @@ class AssetStore:
         self._verified.add(asset.digest)
 
 
-class Incoming:
+class IncomingAsset:
     """One file on its way, chunk by chunk.
 
     Args:
@@ -194,7 +194,7 @@ class Incoming:
         """How much has come [B]: where the next chunk begins."""
         return len(self._data)
 
-    def take(self, offset: int, size: int, chunk: bytes | memoryview) -> bool:
+    def add_chunk(self, offset: int, size: int, chunk: bytes | memoryview) -> bool:
         """Append a chunk.
 
         Args:

@@ -84,7 +84,7 @@ class RunDigest:
         """Hash the frames that wait. The broker calls it while no service waits for a grant."""
         state = self._state
         for episode, frame, products in self._waiting:
-            # Services finish in another order in every run; the digest must not tell.
+            # Services finish in another order in every run; the digest must not depend on it.
             for topic, source, digest in sorted(products):
                 prefix = f"{episode}\0{frame}\0{topic}\0{source}\0".encode()
                 state = hashlib.sha256(state + prefix + bytes.fromhex(digest)).digest()

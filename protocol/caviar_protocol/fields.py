@@ -108,9 +108,9 @@ class Demand(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """What the run asks of one output of a service (contract, clause 5)."""
 
     topic: Name
-    """Topic of this service that someone consumes."""
+    """Topic of this service that has a consumer."""
     parts: Annotated[tuple[Word, ...], few] = ()
-    """Parts of its payload that someone asks for."""
+    """Parts of its payload that a consumer asks for."""
 
 
 class Asset(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):

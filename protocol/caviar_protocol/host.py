@@ -88,7 +88,7 @@ class SignOfLife:
         self._path = Path(name) if name else None
         self._due = 0.0
 
-    def give(self) -> None:
+    def touch(self) -> None:
         """Touch the file, unless that has just been done."""
         # The event loop gives a sign in every turn, thousands of times a second: a touch a second is enough.
         now = time.monotonic()

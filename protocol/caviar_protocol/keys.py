@@ -1,4 +1,4 @@
-"""Keys of a run: who may take part, and as what.
+"""Keys of a run: which services may take part, and in which roles.
 
 A keys directory holds, all of them TOML that a person can read:
 
@@ -69,7 +69,7 @@ class Token(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_
     """One token of the HTTP interface."""
 
     name: Name
-    """Of who has it; of the service, where it is for one."""
+    """Of the user that holds it, or of the service that it is for."""
     role: str
     """``viewer`` may read, ``operator`` may also pause, step and stop; a role of a service, such as
     ``agent``, may take part through the gateway under that name and in that role, and nothing else."""
@@ -94,7 +94,7 @@ class Pair(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_d
 
     @classmethod
     def new(cls) -> Pair:
-        """A pair that nobody else has."""
+        """A new pair."""
         public, secret = zmq.curve_keypair()
         return cls(public=public.decode(), secret=secret.decode())
 
@@ -156,7 +156,7 @@ def write_pair(directory: Path, name: str, pair: Pair) -> tuple[Path, Path]:
         "public", pair.public
     )
     secret += _table("secret", pair.secret)
-    public = f"# Public key of {name!r}: for whoever shall recognise it.\n" + _table("public", pair.public)
+    public = f"# Public key of {name!r}: for its peers.\n" + _table("public", pair.public)
     try:
         directory.mkdir(parents=True, exist_ok=True)
         _create(key, secret, 0o600)
@@ -276,7 +276,7 @@ class Credentials(msgspec.Struct, frozen=True):
     broker: str
     """Public key of the broker."""
 
-    def give(self, socket: zmq.Socket[Any]) -> None:
+    def apply_to(self, socket: zmq.Socket[Any]) -> None:
         """Give a socket what it needs before it connects.
 
         Raises:
@@ -324,7 +324,7 @@ def _decoded(path: Path, kind: type[T], remedy: str) -> T:
     except OSError as error:
         raise SetupError(f"cannot read {path}: {error.strerror}; {remedy}") from error
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        # What the file holds may be secret: only the place and the rule are told, never the content.
+        # What the file holds may be secret: only the place and the rule are shown, never the content.
         raise SetupError(f"{path} is not what it should be: {_rule(error)}; {remedy}") from None
 
 

@@ -3,7 +3,7 @@
 A message is a ZeroMQ multipart: one msgpack map (the *header*, with the message's ``type``),
 then, for messages that carry products, two parts a product: its payload header and its body
 (see `caviar_protocol.arrays`). DEALER and ROUTER add and take away the routing part. SPEC.md
-says who sends what when, and what answers what is wrong.
+says which side sends which message when, and how a wrong one is answered.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class Hello(_Message, frozen=True, kw_only=True, tag="HELLO"):
     host: Text = ""
     """Identifies kernel and process namespace, so that a broker on the same one can watch ``pid``."""
     pid: Count = 0
-    """Process id on ``host``; 0: not told."""
+    """Process id on ``host``; 0: unknown."""
 
 
 class Welcome(_Message, frozen=True, kw_only=True, tag="WELCOME"):
@@ -107,7 +107,7 @@ class Welcome(_Message, frozen=True, kw_only=True, tag="WELCOME"):
     """Settings of this service from the scenario, as they stand there."""
     scenario: dict[str, Any] = {}
     """What concerns every service: ``carriers``, ``devices``, ``episodes``, ``frames``,
-    ``sampling_period_ns``; a recorder is also told its ``directory`` and, in ``resolved``, the whole
+    ``sampling_period_ns``; a recorder also gets its ``directory`` and, in ``resolved``, the whole
     scenario."""
     rejoin_ns: Duration = 0
     """How long the broker waits for this service once its connections are lost: until then it may say HELLO
@@ -130,7 +130,7 @@ class Prepare(_Message, frozen=True, kw_only=True, tag="PREPARE"):
     epoch: Epoch
     attempt: Attempt
     demand: Annotated[tuple[Demand, ...], few] = ()
-    """Outputs that someone consumes, with the parts asked for. Nobody asks: not run (clause 5)."""
+    """Outputs with a consumer, and the parts asked for. A service without any is not run (clause 5)."""
     assets: tuple[Asset, ...] = ()
     """All scenery of the run; empty for worlds, which announce it."""
     producers: dict[str, tuple[Name, ...]] = {}
@@ -267,7 +267,7 @@ class Fault(_Message, frozen=True, kw_only=True, tag="FAULT"):
     phase: Text
     """``prepare``, ``reset``, ``step``, ``encode``, …"""
     message: Text
-    """One line for the user. ``KEY: …``, where a key of the scenario is wrong, is told with file and line."""
+    """One line for the user. ``KEY: …``, of a wrong key of the scenario, is shown with file and line."""
     detail: Text = ""
     """Traceback, for the log."""
     culprit: Text = ""
@@ -276,7 +276,7 @@ class Fault(_Message, frozen=True, kw_only=True, tag="FAULT"):
 
 
 class Cancel(_Message, frozen=True, kw_only=True, tag="CANCEL"):
-    """Broker to service, advisory: nobody waits for this frame any more. DONE or FAULT is still due."""
+    """Broker to service, advisory: the run no longer waits for this frame. DONE or FAULT is still due."""
 
     epoch: Epoch
     attempt: Attempt
@@ -370,7 +370,7 @@ class Error(_Message, frozen=True, kw_only=True, tag="ERROR"):
     message: Text
     """What is wrong with it."""
     of: Text = ""
-    """Type of the message that could not be used, where it could be told."""
+    """Type of the message that could not be used, where it is known."""
     subject: Text = ""
     """What it was about: the digest of an unknown asset."""
 

@@ -27,7 +27,7 @@ class RunDirectory:
 
     @property
     def record(self) -> Path:
-        """Who runs what, where and with which code: scenario, endpoint, versions. Written by the broker."""
+        """Scenario, endpoint and versions of the run. Written by the broker."""
         return self.path / "run.json"
 
     @property

@@ -222,7 +222,7 @@ def dress(socket: zmq.Socket[Any], endpoint: str, credentials: Credentials | Non
     # 8 s it would be silent for 7 s more.
     socket.setsockopt(zmq.CONNECT_TIMEOUT, CONNECT_TIMEOUT_MS)
     if credentials is not None:
-        credentials.give(socket)
+        credentials.apply_to(socket)
 
 
 class Handshake:
@@ -354,7 +354,7 @@ class HeartbeatThread(threading.Thread):
                 return
             if socket in ready and self._heard(socket):
                 answered, silence = sequence, 0.0
-                self._sign.give()
+                self._sign.touch()
                 continue
             # Only time in which this thread really listened counts as silence: while somebody else
             # holds the interpreter's lock, answers wait in the socket.

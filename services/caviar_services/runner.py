@@ -17,7 +17,7 @@ from typing import Any
 import zmq
 
 from caviar_protocol import messages as m
-from caviar_protocol.assets import AssetStore, Incoming
+from caviar_protocol.assets import AssetStore, IncomingAsset
 from caviar_protocol.codec import check_version, encode_message, message_type
 from caviar_protocol.errors import AssetError, ProtocolError, RunError
 from caviar_protocol.host import host_identity, trim_memory
@@ -269,12 +269,12 @@ class Runner:
         missing = [asset for asset in assets if not self._store.holds(asset)]
         for number, asset in enumerate(missing, 1):
             self._broker.progress(f"fetching scenery, file {number} of {len(missing)}")
-            incoming = Incoming(self._store, asset)
+            incoming = IncomingAsset(self._store, asset)
             complete = False
             while not complete:
                 self._broker.send(m.AssetGet(digest=asset.digest, offset=incoming.offset))
                 answer, chunk = self._asset_data(asset)
-                complete = incoming.take(answer.offset, answer.size, chunk)
+                complete = incoming.add_chunk(answer.offset, answer.size, chunk)
         return list(assets)
 
     def _asset_data(self, asset: m.Asset) -> tuple[m.AssetData, memoryview]:

@@ -193,7 +193,7 @@ class Frame(msgspec.Struct, frozen=True, kw_only=True):
     seed_episode: int = 0
     """Episodes since the first one with this seed."""
 
-    def of(self, topic: str, cls: type[P]) -> dict[str, P]:
+    def payloads(self, topic: str, cls: type[P]) -> dict[str, P]:
         """Payloads of a topic by source, those that are present."""
         found: dict[str, P] = {}
         for item in self.inputs:
@@ -202,12 +202,14 @@ class Frame(msgspec.Struct, frozen=True, kw_only=True):
                 found[entry.source] = cast(P, item.payload)
         return found
 
+    of = payloads  # its earlier name
+
     def only(self, topic: str, cls: type[P]) -> P | None:
         """Payload of a topic that has one source; None where absent.
 
         Raises `PayloadError` naming the sources where there are several.
         """
-        found = self.of(topic, cls)
+        found = self.payloads(topic, cls)
         if len(found) > 1:
             raise PayloadError(
                 f"{self.service} takes {topic} from one source, the run has {', '.join(sorted(found))}; "
@@ -217,7 +219,7 @@ class Frame(msgspec.Struct, frozen=True, kw_only=True):
 
     def scene(self) -> Scene:
         """The scenes of all worlds as one (contract, clause 3)."""
-        scenes = self.of("scene", Scene)
+        scenes = self.payloads("scene", Scene)
         if not scenes:
             raise PayloadError(f"{self.service} was granted frame {self.number} without a scene")
         return merge_scenes(scenes)

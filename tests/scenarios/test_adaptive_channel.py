@@ -200,7 +200,7 @@ def test_stated_errors_hold_in_most_frames_of_a_run(tmp_path: Path) -> None:
     assert isinstance(found, Decided)
     assert found.frames == {"1e4": 12}
     products = [
-        channel for _, item in recording.of("channel") if isinstance(channel := item.payload, Channel)
+        channel for _, item in recording.products("channel") if isinstance(channel := item.payload, Channel)
     ]
     bounds = [channel.error_bound_db for channel in products]
     assert all(bound is not None and np.isfinite(bound).all() for bound in bounds)

@@ -60,8 +60,8 @@ def test_frames_stand_at_the_instants_of_the_scenario(smoke: Finished, tmp_path:
     planned = load_scenario(SCENARIOS / "instants.toml").run
     frames = list(Recording(finished.directory).frames())
     assert tuple(frame.t_ns for frame in frames) == instants_ns(planned.instants_s)
-    places = {frame.t_ns: product.body for frame, product in Recording(smoke.directory).of("scene")}
-    own = {frame.t_ns: product.body for frame, product in Recording(finished.directory).of("scene")}
+    places = {frame.t_ns: product.body for frame, product in Recording(smoke.directory).products("scene")}
+    own = {frame.t_ns: product.body for frame, product in Recording(finished.directory).products("scene")}
     common = places.keys() & own.keys()
     assert len(common) == 12
     assert all(bytes(places[t]) == bytes(own[t]) for t in common)

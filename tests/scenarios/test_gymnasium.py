@@ -343,7 +343,7 @@ def test_an_action_longer_than_1_is_shortened_to_the_greatest_speed(tmp_path: Pa
     flown = [
         command.velocity
         for frame in range(3)
-        for command in recording.frame(0, frame).of("action", Action)["agent"].commands
+        for command in recording.frame(0, frame).payloads("action", Action)["agent"].commands
         if isinstance(command, VelocityCommand)
     ]
     each = 15.0 / 3**0.5

@@ -28,7 +28,7 @@ OUT_OF_SIGHT = "waypoints_m = [[9.0, 178.0, 15.0], [23.0, 195.0, 14.0]]\n"
 def recorded(finished: Finished, topic: str) -> list[Scene | Channel | Link]:
     """Payloads of a topic, one per frame."""
     assert finished.status == 0, finished.output
-    products = [product for _, product in Recording(finished.directory).of(topic)]
+    products = [product for _, product in Recording(finished.directory).products(topic)]
     payloads = [decode_payload(topic, product.header, product.body) for product in products]
     return [payload for payload in payloads if isinstance(payload, Scene | Channel | Link)]
 

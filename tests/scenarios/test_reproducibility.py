@@ -69,7 +69,7 @@ def test_overlapping_frames_do_not_change_the_digest(smoke: Finished, tmp_path: 
 
 def test_one_changed_payload_byte_gives_another_digest(smoke: Finished, tmp_path: Path) -> None:
     """The byte is in the middle of the recorded link product of a frame in the middle of the run."""
-    product = next(iter(p for f, p in Recording(smoke.directory).of("link") if f.number == 50))
+    product = next(iter(p for f, p in Recording(smoke.directory).products("link") if f.number == 50))
     needle = bytes(product.header) + bytes(product.body)
     damaged = tmp_path / "damaged"
     shutil.copytree(smoke.directory, damaged)

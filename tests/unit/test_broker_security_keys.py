@@ -288,7 +288,7 @@ def test_a_socket_monitor_shows_what_the_specification_says(
     ):
         socket.linger = 0
         if shown is not None:
-            shown.give(socket)
+            shown.apply_to(socket)
         socket.connect(broker.endpoint)
         events = []
         last = expected[0] if key == "authorized" else zmq.EVENT_DISCONNECTED

@@ -113,16 +113,16 @@ def test_a_sign_of_life_touches_the_file_and_not_in_every_turn(
     file = tmp_path / "alive"
     monkeypatch.setenv(VARIABLE, str(file))
     sign = SignOfLife()
-    sign.give()
+    sign.touch()
     assert file.exists()
     file.unlink()
-    sign.give()
+    sign.touch()
     assert not file.exists()
 
 
 def test_a_sign_of_life_that_cannot_be_given_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(VARIABLE, "/proc/none/alive")
-    SignOfLife().give()
+    SignOfLife().touch()
 
 
 def requirements(*arguments: str) -> list[str]:

@@ -291,7 +291,7 @@ def chosen(folder: Path, frames: int) -> list[tuple[str, int, int]]:
     return [
         (command.rx, command.tx_beam, command.rx_beam)
         for frame in range(frames)
-        for command in recording.frame(0, frame).of("action", Action)["agent"].commands
+        for command in recording.frame(0, frame).payloads("action", Action)["agent"].commands
         if isinstance(command, BeamChoice)
     ]
 
@@ -451,7 +451,7 @@ def test_a_directory_is_recorded_into_and_can_be_read(tmp_path: Path) -> None:
         env.step(np.int64(0))
     recording = Recording(tmp_path / "run")
     assert len(recording) >= 7
-    found = [recording.frame(0, frame).of("link", Link)["link"].abs_y.tolist() for frame in range(6)]
+    found = [recording.frame(0, frame).payloads("link", Link)["link"].abs_y.tolist() for frame in range(6)]
     assert found == [[reward] for reward in rewards]
 
 

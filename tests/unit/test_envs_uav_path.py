@@ -86,7 +86,7 @@ def test_an_action_longer_than_1_is_shortened_to_it(tmp_path: Path, action: list
     with flight(tmp_path, directory=tmp_path / "run") as env:
         env.reset(seed=1)
         env.step(np.array(action, np.float32))
-    commands = Recording(tmp_path / "run").frame(0, 0).of("action", Action)["agent"].commands
+    commands = Recording(tmp_path / "run").frame(0, 0).payloads("action", Action)["agent"].commands
     velocity = next(c.velocity for c in commands if isinstance(c, VelocityCommand))
     assert math.dist(velocity, (0, 0, 0)) == pytest.approx(MAX_SPEED, rel=1e-6)
     assert np.cross(velocity, action) == pytest.approx([0, 0, 0], abs=1e-4)
@@ -100,7 +100,7 @@ def test_beams_point_along_the_straight_line(tmp_path: Path) -> None:
     recording, beams = Recording(tmp_path / "run"), []
     for number in range(6):
         frame = recording.frame(0, number)
-        scene, commands = frame.scene(), frame.of("action", Action)["agent"].commands
+        scene, commands = frame.scene(), frame.payloads("action", Action)["agent"].commands
         assert scene is not None
         (choice,) = (c for c in commands if isinstance(c, BeamChoice))
         assert (choice.tx, choice.rx, choice.rx_beam) == ("bs", "uav/rx", 0)

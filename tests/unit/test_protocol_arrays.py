@@ -164,7 +164,7 @@ def test_arrays_of_every_type_and_shape_come_back(arrays: list[Any]) -> None:
     assert len(body) == writer.length
     reader = BodyReader(memoryview(body).toreadonly())
     for sent, reference in zip(arrays, references, strict=True):
-        came = reader.take(reference)
+        came = reader.read(reference)
         assert (came.dtype, came.shape, came.tobytes()) == (sent.dtype, sent.shape, sent.tobytes())
         assert not came.flags.writeable
 
@@ -175,7 +175,7 @@ def test_a_reference_is_served_from_within_the_body_or_refused(
 ) -> None:
     for code in WIRE_DTYPES:
         try:
-            taken = BodyReader(memoryview(body)).take({"dtype": code, "shape": shape, "offset": offset})
+            taken = BodyReader(memoryview(body)).read({"dtype": code, "shape": shape, "offset": offset})
         except ProtocolError:
             continue
         assert offset % 8 == 0
@@ -206,14 +206,14 @@ def test_a_reference_is_served_from_within_the_body_or_refused(
 )
 def test_what_is_no_reference_is_refused(reference: Any) -> None:
     with pytest.raises(DecodeError):
-        BodyReader(memoryview(bytes(8))).take(reference)
+        BodyReader(memoryview(bytes(8))).read(reference)
 
 
 def test_an_array_behind_the_one_before_is_served_and_one_that_overlaps_is_not() -> None:
     def take(*offsets: int) -> None:
         reader = BodyReader(memoryview(bytes(32)))
         for offset in offsets:
-            reader.take({"dtype": "<f8", "shape": [1], "offset": offset})
+            reader.read({"dtype": "<f8", "shape": [1], "offset": offset})
 
     take(0, 8, 24)
     for wrong in ((0, 0), (8, 0), (24, 16)):
@@ -227,7 +227,7 @@ def test_a_writer_refuses_what_no_reader_accepts() -> None:
     with pytest.raises(PayloadError, match="7 dimensions"):
         BodyWriter().place(np.zeros((1,) * 7))
     with pytest.raises(LimitError, match="7 dimensions"):
-        BodyReader(memoryview(bytes(8))).take({"dtype": "|u1", "shape": [1] * 7, "offset": 0})
+        BodyReader(memoryview(bytes(8))).read({"dtype": "|u1", "shape": [1] * 7, "offset": 0})
 
 
 def test_a_body_is_little_endian_wherever_it_is_written() -> None:

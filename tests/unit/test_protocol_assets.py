@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from caviar_protocol.assets import MAX_ASSET, AssetStore, Incoming, default_folder
+from caviar_protocol.assets import MAX_ASSET, AssetStore, IncomingAsset, default_folder
 from caviar_protocol.errors import AssetError, SetupError
 from caviar_protocol.limits import MAX_ASSET_CHUNK
 from caviar_protocol.messages import Asset
@@ -158,17 +158,17 @@ def test_the_cache_is_where_the_user_keeps_caches(monkeypatch: pytest.MonkeyPatc
 
 def test_chunks_become_a_file(store: AssetStore) -> None:
     asset = described("a", b"abcdef")
-    incoming = Incoming(store, asset)
-    assert not incoming.take(0, 6, b"abc")
+    incoming = IncomingAsset(store, asset)
+    assert not incoming.add_chunk(0, 6, b"abc")
     assert incoming.offset == 3
     assert not store.holds(asset)
-    assert incoming.take(3, 6, memoryview(b"def"))
+    assert incoming.add_chunk(3, 6, memoryview(b"def"))
     assert store.holds(asset)
 
 
 def test_an_empty_file_is_one_empty_chunk(store: AssetStore) -> None:
     asset = described("empty", b"")
-    assert Incoming(store, asset).take(0, 0, b"")
+    assert IncomingAsset(store, asset).add_chunk(0, 0, b"")
     assert store.folder_of([asset])["empty"].read_bytes() == b""
 
 
@@ -181,16 +181,16 @@ def test_a_chunk_that_is_not_the_next_one_is_refused(
     store: AssetStore, offset: int, size: int, chunk: bytes
 ) -> None:
     with pytest.raises(AssetError, match="expected them at 0 of 6 B"):
-        Incoming(store, described("a", b"abcdef")).take(offset, size, chunk)
+        IncomingAsset(store, described("a", b"abcdef")).add_chunk(offset, size, chunk)
 
 
 def test_content_of_another_digest_is_refused_and_not_kept(store: AssetStore) -> None:
     asset = described("a", b"abcdef")
     with pytest.raises(AssetError, match=f"announced was {asset.digest}"):
-        Incoming(store, asset).take(0, 6, b"abcdeF")
+        IncomingAsset(store, asset).add_chunk(0, 6, b"abcdeF")
     assert list((store.folder / "assets").iterdir()) == []
 
 
 def test_a_file_larger_than_any_may_be_is_refused_before_it_comes(store: AssetStore) -> None:
     with pytest.raises(AssetError, match=f"has {MAX_ASSET + 1} B"):
-        Incoming(store, Asset(name="a", digest="0" * 64, size=MAX_ASSET + 1))
+        IncomingAsset(store, Asset(name="a", digest="0" * 64, size=MAX_ASSET + 1))

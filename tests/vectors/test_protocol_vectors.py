@@ -44,7 +44,7 @@ def read(vector: Vector) -> Any:
     if vector.stated["kind"] == "payload":
         return decode_payload(vector.stated["topic"], vector.header, vector.body)
     reader = BodyReader(memoryview(vector.body).toreadonly())
-    return [reader.take(reference) for reference in msgpack.unpackb(vector.header)]
+    return [reader.read(reference) for reference in msgpack.unpackb(vector.header)]
 
 
 @pytest.mark.parametrize("vector", ACCEPTED, ids=named)

@@ -65,7 +65,7 @@ def speak(part: Part, payload: int, endpoint: str) -> None:
     with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
         keys = credentials()
         if keys is not None:
-            keys.give(socket)
+            keys.apply_to(socket)
         socket.connect(endpoint)
         socket.send(encode_message(_hello(part)))
         header, body = b"\x80", bytes(payload)

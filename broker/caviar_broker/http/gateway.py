@@ -127,7 +127,7 @@ class Gateway:
         dealer.sndhwm = dealer.rcvhwm = QUEUE
         dealer.setsockopt(zmq.IPV6, int("[" in self._endpoint))
         if self._credentials is not None:
-            self._credentials.give(dealer)
+            self._credentials.apply_to(dealer)
         dealer.connect(self._endpoint)
         return dealer
 

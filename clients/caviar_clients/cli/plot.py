@@ -128,8 +128,8 @@ def map_data(
         return None
     return MapData(
         scene=scene,
-        channel=next(iter(frame.of("channel", Channel).values()), None),
-        link=next(iter(frame.of("link", Link).values()), None),
+        channel=next(iter(frame.payloads("channel", Channel).values()), None),
+        link=next(iter(frame.payloads("link", Link).values()), None),
         footprints=footprints,
         beam_gain=beam_gain,
         user=user,
@@ -145,7 +145,7 @@ def _map(recording: Recording, frame: RecordedFrame, user: tuple[str, str, str] 
 
 
 def _scan(frame: RecordedFrame, file: Path) -> None:
-    lidars = frame.of("lidar", Lidar)
+    lidars = frame.payloads("lidar", Lidar)
     lidar = next((lidar for _, lidar in sorted(lidars.items()) if lidar.scans), None)
     if lidar is None:
         raise RecordingError(f"frame {frame.number} has no LIDAR scan; choose another with --frame")
@@ -165,7 +165,7 @@ def camera_view(frame: RecordedFrame, camera: str | None) -> CameraView:
     }
     found: dict[str, dict[str, Any]] = {}
     for topic, cls in topics.items():
-        for _, payload in sorted(frame.of(topic, cls).items()):
+        for _, payload in sorted(frame.payloads(topic, cls).items()):
             for image in payload.images:
                 found.setdefault(image.sensor, {})[topic] = (payload, image)
     sensor = choose_camera(found, camera, f"frame {frame.number} has")
@@ -257,14 +257,14 @@ def _frame_with_points(recording: Recording, frame: RecordedFrame) -> RecordedFr
     scanned = (
         other
         for other in reversed(until)
-        if any(len(scan.ray) for lidar in other.of("lidar", Lidar).values() for scan in lidar.scans)
+        if any(len(scan.ray) for lidar in other.payloads("lidar", Lidar).values() for scan in lidar.scans)
     )
     return next(scanned, frame)
 
 
 def _worth(frame: RecordedFrame, user: tuple[str, str, str] | None) -> int:
     """3: the user has a line of sight, 2: a path, 1: is there, 0: is not."""
-    for link in frame.of("link", Link).values() if user is not None else ():
+    for link in frame.payloads("link", Link).values() if user is not None else ():
         users = list(zip(link.tx, link.rx, link.carrier, strict=True))
         if user in users:
             index = users.index(user)

@@ -204,7 +204,7 @@ def _survey(recording: Recording, indices: Sequence[int], user: User | None, cam
 
 def _seen(frame: RecordedFrame) -> dict[str, UInt8Array]:
     """Pictures by camera."""
-    payloads = frame.of("camera", Camera).values()
+    payloads = frame.payloads("camera", Camera).values()
     return {image.sensor: image.rgb for payload in payloads for image in payload.images}
 
 

@@ -258,7 +258,7 @@ class LidarGrid(Part):
         return spaces.Box(-2, 1, self._shape, np.int8)
 
     def read(self, moment: Moment) -> NDArray[np.int8] | None:
-        for lidar in moment.frame.of("lidar", Lidar).values():
+        for lidar in moment.frame.payloads("lidar", Lidar).values():
             for scan in lidar.scans:
                 if scan.sensor.rpartition("/")[2] == self.sensor and scan.grid is not None:
                     return scan.grid.occupancy
@@ -281,7 +281,7 @@ class DepthImage(Part):
         return spaces.Box(0, FAR, self._shape, np.float32)
 
     def read(self, moment: Moment) -> NDArray[np.float32] | None:
-        for depth in moment.frame.of("depth", Depth).values():
+        for depth in moment.frame.payloads("depth", Depth).values():
             for image in depth.images:
                 if image.sensor.rpartition("/")[2] == self.sensor:
                     return image.depth
@@ -298,7 +298,7 @@ class CameraImage(DepthImage):
         return spaces.Box(0, 255, (*self._shape, 3), np.uint8)
 
     def read(self, moment: Moment) -> NDArray[Any] | None:
-        for camera in moment.frame.of("camera", Camera).values():
+        for camera in moment.frame.payloads("camera", Camera).values():
             for image in camera.images:
                 if image.sensor.rpartition("/")[2] == self.sensor:
                     return image.rgb

@@ -79,7 +79,7 @@ def series(recording: Recording, user: tuple[str, str, str]) -> UserSeries:
             episode, base = frame.episode, last + recording.metadata.sampling_period_ns - frame.t_ns
         last = base + frame.t_ns
         time.append(last * 1e-9)
-        rows.append(_row(frame.of("link", Link).get(source), user))
+        rows.append(_row(frame.payloads("link", Link).get(source), user))
     table = np.array(rows, dtype=np.float64).reshape(-1, 6)
     present = ~np.isnan(table[:, 0])
     return UserSeries(
@@ -203,6 +203,6 @@ def _links(recording: Recording) -> list[Link]:
     source = link_source(recording)
     return [
         cast(Link, product.payload)
-        for _, product in recording.of("link")
+        for _, product in recording.products("link")
         if product.provenance.source == source and product.provenance.status is Status.FRESH
     ]

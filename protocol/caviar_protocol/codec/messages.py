@@ -100,7 +100,7 @@ def decode_message(header: Buffer) -> Message:
         )
     try:
         message = decode_bounded(_message_decoder, header, "message header")
-    # A peer of another major version is told that, and not that its first message is malformed.
+    # A peer of another major version gets a VersionError, not one about a malformed message.
     except DecodeError:
         _check_opening(header)
         raise
@@ -261,7 +261,7 @@ def split_frame(frame: Buffer) -> list[memoryview]:
         raise DecodeError(f"a frame has {len(view)} B, it begins with the number of its parts in 4 B")
     (count,) = _COUNT.unpack_from(view)
     if not 1 <= count <= limits.MAX_PARTS:
-        # JavaScript's DataView writes big-endian unless told otherwise: the most frequent mistake.
+        # JavaScript's DataView writes big-endian by default: the most frequent mistake.
         swapped = 1 <= int.from_bytes(view[: _COUNT.size], "big") <= limits.MAX_PARTS
         text = f"a frame announces {count} parts, a message has 1 to {limits.MAX_PARTS}"
         raise LimitError(text + BIG_ENDIAN * swapped)

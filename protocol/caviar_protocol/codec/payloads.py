@@ -86,7 +86,7 @@ class BodyReader:
         self._body = body
         self._end = 0
 
-    def take(self, reference: Any) -> NDArray[Any]:
+    def read(self, reference: Any) -> NDArray[Any]:
         """The array that a reference points to.
 
         Args:
@@ -189,7 +189,7 @@ _reading = _Reading()
 
 @cache
 def _payload_decoder(cls: type[Payload]) -> msgspec.msgpack.Decoder[Payload]:
-    return msgspec.msgpack.Decoder(cls, dec_hook=lambda _, reference: _reading.reader.take(reference))
+    return msgspec.msgpack.Decoder(cls, dec_hook=lambda _, reference: _reading.reader.read(reference))
 
 
 def decode_payload(topic: str, header: Buffer, body: Buffer) -> Payload:

@@ -128,7 +128,7 @@ class TopicArrays(Generic[P, K]):
     (None where it is absent), with a slice, a list of positions or a mask the same topic in these frames.
 
     Where a frame has no product, or a product lacks a row that other frames have, arrays hold NaN, or −1 for
-    integers, 0 for unsigned ones and false for booleans; `present` tells which rows are there, `status` why.
+    integers, 0 for unsigned ones and false for booleans; `present` says which rows are there, `status` why.
     Axis F counts the frames.
 
     Raises:

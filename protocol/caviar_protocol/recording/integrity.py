@@ -54,7 +54,7 @@ class RecordedSegments:
     """None where there is none, or it is damaged."""
     segments: list[Segment] = field(default_factory=list)
     damage: list[str] = field(default_factory=list)
-    """What is missing or cannot be read, as far as can be told without reading products: a line each."""
+    """What is missing or cannot be read, as far as it shows without reading products: a line each."""
     closed: bool = False
     """Whether the recorder closed the recording, and all of it is there."""
     # What the manifest says, by file name.
@@ -185,7 +185,7 @@ class RecordedSegments:
     def _strange(self, segment: Segment) -> str:
         """What is said of a segment of another run than those before it; empty where it is of the same.
 
-        The first one tells of which run the recording is. A manifest of another run is left aside.
+        The recording is of the run of its first segment. A manifest of another run is left aside.
         """
         if self.segments and not self.past_gaps:
             return ""  # where several runs are mixed, `Recording` refuses them all
@@ -259,7 +259,7 @@ def _opened(file: Path) -> Segment:
 
 
 def follows(earlier: tuple[int, int], later: tuple[int, int]) -> bool:
-    """Whether no frame is between two (episode, frame), as far as they tell: episodes may end early."""
+    """Whether no frame is between two (episode, frame), by their numbers: episodes may end early."""
     return later in ((earlier[0], earlier[1] + 1), (earlier[0] + 1, 0))
 
 
@@ -308,7 +308,7 @@ def recorded_digest(recorded: RecordedSegments) -> RunDigestReport:
     earlier: FrameEntry | None = None
     for segment in recorded.segments:
         places: list[tuple[int, int]] = []
-        """Bytes of which damage is told frame by frame."""
+        # Bytes whose damage is reported frame by frame.
         for entry, chunk in zip(segment.entries, segment.chunks, strict=True):
             at = (
                 f"{recorded.path}: episode {entry.episode}, frame {entry.frame} "
@@ -355,14 +355,14 @@ def damaged_assets(recorded: RecordedSegments) -> list[str]:
     return found
 
 
-def _altered(segment: Segment, recorded: RecordedSegments, told: list[tuple[int, int]]) -> list[str]:
-    """Ranges of a segment that are not as they were written, other than those of damage ``told`` already."""
+def _altered(segment: Segment, recorded: RecordedSegments, reported: list[tuple[int, int]]) -> list[str]:
+    """Ranges of a segment that are not as they were written, other than those of ``reported`` damage."""
     record = recorded.record(segment)
     found = segment.altered(record.crc if record is not None and len(segment) == record.size else None)
     return [
         f"{segment.path}: bytes {start} to {stop} are not what was written (CRC-32)"
         for start, stop in found
-        if not any(start < end and begin < stop for begin, end in told)
+        if not any(start < end and begin < stop for begin, end in reported)
     ]
 
 

@@ -1,7 +1,7 @@
 """What a recording consists of: the names and records that its writer and its reader share.
 
 ``recording.json``, the *manifest*, says which segments a recording has, and what each finished one is. A
-segment that is removed, exchanged or cut leaves no trace in the other segments; the manifest tells. It is
+segment that is removed, exchanged or cut leaves no trace in the other segments; the manifest shows it. It is
 replaced as a whole: when a segment has its first frame (and then is listed as open), when a segment is
 finished (once it is on disk, where the run's ``durability`` wants that), and when the recording is closed. So
 what it says of a finished segment holds after a loss of power too. A segment that is not listed was begun

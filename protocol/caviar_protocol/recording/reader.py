@@ -22,7 +22,7 @@ import numpy as np
 from caviar_protocol.arrays import Payload
 from caviar_protocol.codec.payloads import decode_payload
 from caviar_protocol.errors import ProtocolError, RecordingError, suggestion
-from caviar_protocol.messages import GrantInput, Report, Status
+from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.recording.arrays import TopicArrays
 from caviar_protocol.recording.integrity import (
     RecordedSegments,
@@ -31,7 +31,7 @@ from caviar_protocol.recording.integrity import (
     recorded_digest,
 )
 from caviar_protocol.recording.layout import FrameEntry, RecordingMetadata
-from caviar_protocol.recording.segment import Channel, Chunk, Segment
+from caviar_protocol.recording.segment import Channel, Segment
 from caviar_protocol.recording.sensors import CameraArrays, DepthArrays, LidarArrays, SegmentationArrays
 from caviar_protocol.recording.topics import ActionArrays, ChannelArrays, LinkArrays, SceneArrays
 from caviar_protocol.run_directory import RunDirectory
@@ -143,16 +143,10 @@ class RecordedFrame:
         self.episode = self.entry.episode
         self.number = self.entry.frame
         self.t_ns = self.entry.t_ns
-
-    @property
-    def inputs(self) -> tuple[GrantInput, ...]:
+        self.inputs = self.entry.inputs
         """Provenance of every product, absent ones included."""
-        return self.entry.inputs
-
-    @property
-    def reports(self) -> tuple[Report, ...]:
+        self.reports = self.entry.reports
         """What services reported beside their products: decisions, counts, wall times."""
-        return self.entry.reports
 
     @cached_property
     def products(self) -> tuple[RecordedProduct, ...]:
@@ -163,7 +157,7 @@ class RecordedFrame:
         """
         return self._recording.products_of(self._index)
 
-    def of(self, topic: str, cls: type[P]) -> dict[str, P]:
+    def payloads(self, topic: str, cls: type[P]) -> dict[str, P]:
         """Payloads of a topic by source, fresh and held ones.
 
         Args:
@@ -177,7 +171,7 @@ class RecordedFrame:
             >>> from caviar_protocol.recording import Recording
             >>> from caviar_protocol.topics import Link
             >>> frame = Recording("runs/smoke-20261122-101500").frame(episode=0, frame=7)
-            >>> frame.of("link", Link)["link"].rx
+            >>> frame.payloads("link", Link)["link"].rx
             ('car/rx', 'uav/rx-uav')
         """
         if PAYLOADS.get(topic) is not cls:
@@ -189,9 +183,11 @@ class RecordedFrame:
             if product.provenance.topic == topic and product.provenance.status is not Status.LATE
         }
 
+    of = payloads  # its earlier name
+
     def scene(self) -> Scene | None:
         """The scenes of all worlds as one (contract, clause 3); None where there is none."""
-        scenes = self.of("scene", Scene)
+        scenes = self.payloads("scene", Scene)
         return merge_scenes(scenes) if scenes else None
 
 
@@ -357,7 +353,7 @@ class Recording:
                 return product.payload
         raise RecordingError(f"{self._at(episode, frame)} has no {topic} of {source!r}")
 
-    def of(self, topic: str) -> Iterator[tuple[RecordedFrame, RecordedProduct]]:
+    def products(self, topic: str) -> Iterator[tuple[RecordedFrame, RecordedProduct]]:
         """Every fresh or held product of a topic, with its frame.
 
         Args:
@@ -366,13 +362,15 @@ class Recording:
         Raises:
             RecordingError: There is no topic of this name.
         """
-        return self._products(check_topic(topic))
+        check_topic(topic)  # here, and not when the first product is asked for
+        return (
+            (frame, product)
+            for frame in self.frames()
+            for product in frame.products
+            if product.provenance.topic == topic and product.provenance.status is not Status.LATE
+        )
 
-    def _products(self, topic: str) -> Iterator[tuple[RecordedFrame, RecordedProduct]]:
-        for frame in self.frames():
-            for product in frame.products:
-                if product.provenance.topic == topic and product.provenance.status is not Status.LATE:
-                    yield frame, product
+    of = products  # its earlier name
 
     def run_digest(self) -> RunDigestReport:
         """The run's digest, recomputed from the payload bytes alone (contract, clause 20).
@@ -439,9 +437,10 @@ class Recording:
         return None
 
     def _messages(self, index: int) -> dict[tuple[Channel, int], memoryview]:
-        segment, chunk = self._place(index)
+        segment, place = self.segment_of(index)
+        chunk = segment.chunks[place]
         if segment.damaged(chunk):
-            entry = self.entry(index)
+            entry = segment.entries[place]
             raise RecordingError(
                 f"{self._at(entry.episode, entry.frame)}: the chunk at offset {chunk.offset} of "
                 f"{segment.path} is damaged, its CRC-32 differs; `caviar inspect --digest` names the product"
@@ -450,12 +449,8 @@ class Recording:
 
     def _stored(self, index: int) -> dict[tuple[Channel, int], memoryview]:
         """The products in a frame's chunk, whose CRC is not looked at."""
-        segment, chunk = self._place(index)
-        return {(m.channel, m.frame): m.data for m in segment.messages(chunk)}
-
-    def _place(self, index: int) -> tuple[Segment, Chunk]:
         segment, place = self.segment_of(index)
-        return segment, segment.chunks[place]
+        return {(m.channel, m.frame): m.data for m in segment.messages(segment.chunks[place])}
 
     @cached_property
     def _late(self) -> dict[tuple[int, Channel, int], int]:

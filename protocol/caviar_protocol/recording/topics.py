@@ -183,7 +183,7 @@ class SceneArrays(NamedArrays[Scene]):
     orientation = payload_column(np.float64, Scene, "orientation")
     velocity = payload_column(np.float64, Scene, "velocity")
     angular_velocity = Column(
-        np.float64, 3, unit="rad/s", doc="in world axes; 0 where the world does not tell", rows=_turning
+        np.float64, 3, unit="rad/s", doc="in world axes; 0 where the world does not say", rows=_turning
     )
     dimensions = payload_column(np.float64, Scene, "dimensions")
 

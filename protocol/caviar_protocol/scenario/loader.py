@@ -216,7 +216,7 @@ NANOSECONDS = "instants_ns"
 FILE = "file:"
 COLUMN = "t_s"
 REPLACED = ("frames", "sampling_period_ns")
-"""What the instants tell, too."""
+"""Keys that follow from the instants."""
 
 _LATEST_S = 2**63 // 10**9
 
@@ -272,7 +272,7 @@ def with_instants(table: Mapping[str, Any], place: Place, folder: Path = Path())
 
 
 def _in_seconds(table: Mapping[str, Any], place: Place) -> dict[str, Any]:
-    """The table with `KEY` for `NANOSECONDS`, checked as far as seconds would not tell."""
+    """The table with `KEY` for `NANOSECONDS`, checked for what seconds would not show."""
     here, values = place.at(NANOSECONDS), table[NANOSECONDS]
     for key in (KEY, *REPLACED):
         if key in table:
@@ -284,7 +284,7 @@ def _in_seconds(table: Mapping[str, Any], place: Place) -> dict[str, Any]:
             raise here.at(index).error(f"is {value!r}, write whole nanoseconds ≥ 0")
         if value >= 2**63 or instants_ns([value / 1e9]) != (value,):
             raise here.at(index).error(
-                f"is {value}, so late that nanoseconds are not told apart; write at most {10**15}"
+                f"is {value}, so late that nanoseconds are not distinguished; write at most {10**15}"
             )
         if index and value <= values[index - 1]:
             raise here.at(index).error(

@@ -102,7 +102,7 @@ def devices_of(scenario: Scenario, world: str) -> tuple[DeviceSpec, ...]:
         world: Name of a service.
 
     Raises:
-        ScenarioError: The world of a device cannot be told.
+        ScenarioError: The world of a device is ambiguous.
     """
     return tuple(
         device for index, device in enumerate(scenario.devices) if world_of(scenario, index) == world
@@ -385,7 +385,7 @@ def _check_users(scenario: Scenario, place: Place) -> None:
         for index, text in enumerate(service.users):
             pattern = text.removeprefix(BEAM)
             if ":" in pattern or any(patterns_overlap(receiver, pattern) for receiver in there):
-                continue  # another actuator (``motion:uav``), or somebody
+                continue  # another actuator (``motion:uav``), or a receiver of the scenario
             known = f"there are: {', '.join(there)}" if there else 'no antenna has role = "rx"'
             raise place.at(name).at("users").at(index).error(f"no receiver is named {pattern!r}; {known}")
 

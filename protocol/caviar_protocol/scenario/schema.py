@@ -100,7 +100,7 @@ class Run(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """When frames are released: ``free`` (``fast`` is its older name) as soon as they can be, ``realtime``
     as simulated time passes, a number that many times as fast. Never is a frame skipped (clause 8)."""
     record: tuple[str, ...] = ()
-    """Topics that are produced because they shall be recorded, though nobody else asks (clause 5):
+    """Topics that are produced because they shall be recorded, though no service consumes them (clause 5):
     ``lidar``, or with a part of it ``lidar.grid``."""
     checkpoint_frames: Annotated[
         int, quantity("frame", "after which services that can do so save their state; 0: never", ge=0)
@@ -126,7 +126,7 @@ class DeviceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True
     mount: Literal["centre", "roof", "floor"] = "centre"
     """What ``position_m`` is relative to: a point of the parent's bounding box."""
     world: str = ""
-    """The world that publishes a device; needed where it cannot be told from ``on``."""
+    """The world that publishes a device; needed where ``on`` leaves it open."""
     position_m: Vector3 = (0.0, 0.0, 0.0)
     yaw_deg: Annotated[float, quantity("°", "counter-clockwise from +x")] = 0.0
     pitch_deg: Annotated[float, quantity("°", "positive lowers the nose")] = 0.0
@@ -162,7 +162,7 @@ class ServiceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     ] = 1
     users: tuple[str, ...] = ()
     """Agents: the receivers (or actuators) this agent owns, as patterns; empty: a default agent,
-    which serves whoever is left (clause 17)."""
+    which serves the receivers without another agent (clause 17)."""
     settings: dict[str, Any] = {}
 
     @property

@@ -1,4 +1,4 @@
-"""Scenes of several worlds as one, where things are in it, and who could talk to whom (contract, clause 3).
+"""Scenes of several worlds as one, where things are in it, and pairs of antennas (contract, clause 3).
 
 A *pair* is a transmitting and a receiving device of the scene. A device that both transmits and receives is
 no pair with itself.

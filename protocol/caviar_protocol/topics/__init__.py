@@ -1,4 +1,4 @@
-"""Payloads of the topics: what services tell each other about a frame.
+"""Payloads of the topics: what services exchange about a frame.
 
 Each topic has one payload class, found in `PAYLOADS`. All coordinates are right-handed ENU
 metres, angles radians, yaw counter-clockwise from +x, stamps whole nanoseconds. Payloads are

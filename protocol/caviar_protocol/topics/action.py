@@ -64,4 +64,4 @@ class Action(Payload, frozen=True, kw_only=True, omit_defaults=True):
     """
 
     commands: tuple[Command, ...]
-    """Told apart by their ``type``."""
+    """Each with its ``type``."""

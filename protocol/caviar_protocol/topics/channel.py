@@ -164,7 +164,7 @@ class Channel(Payload, frozen=True, kw_only=True, omit_defaults=True):
 
     A path's ``id`` is unique in its pair. It is a hash of the interaction types, the names of the objects
     and, where a model knows them, the numbers of their faces, which are planes of an object; paths that agree
-    in all that are told apart by their rank. So a path keeps its id while ends and objects move;
+    in all that are numbered by their rank. So a path keeps its id while ends and objects move;
     `caviar_protocol.multipath.changes` says which were born and died between two products.
     """
 

@@ -178,7 +178,7 @@ class FlightWorld(TrajectoryWorld):
     def _motions(self, frame: Frame) -> dict[str, Motion]:
         """What each flown object is told to do; beams and schedules are not for worlds."""
         found: dict[str, tuple[str, Motion]] = {}
-        for agent, action in frame.of("action", Action).items():
+        for agent, action in frame.payloads("action", Action).items():
             for command in action.commands:
                 if not isinstance(command, VelocityCommand | WaypointCommand):
                     continue

@@ -49,7 +49,7 @@ def test_it_gives_metadata_topics_and_typed_frames(run):
     assert len(recording) == 6
     for number, stored in enumerate(recording.frames()):
         assert (stored.episode, stored.number, stored.t_ns) == (0, number, number * 100_000_000)
-        assert stored.of("link", Link) == {"link": link(number)}
+        assert stored.payloads("link", Link) == {"link": link(number)}
         assert stored.scene() == scene(number)
         assert [entry.status for entry in stored.inputs] == [Status.FRESH] * 2
 
@@ -57,7 +57,7 @@ def test_it_gives_metadata_topics_and_typed_frames(run):
 def test_products_are_found_by_frame_and_by_topic(run):
     recording = Recording(run)
     assert recording.product(0, 3, "scene", "world") == scene(3)
-    assert [p.payload for _, p in recording.of("link")] == [link(k) for k in range(6)]
+    assert [p.payload for _, p in recording.products("link")] == [link(k) for k in range(6)]
     assert isinstance(recording.product(0, 0, "scene", "world"), Scene)
     with pytest.raises(RecordingError, match=r"frame 1 has no lidar of 'top'"):
         recording.product(0, 1, "lidar", "top")
@@ -116,12 +116,12 @@ def test_a_damaged_frame_is_refused_by_place_and_its_neighbours_are_read(tmp_pat
     chunk = Segment(file).chunks[2]
     flip(file, chunk.stop - 20)
     recording = Recording(tmp_path / "run")
-    assert recording.frame(0, 1).of("link", Link) == {"link": link(1)}
-    assert recording.frame(0, 3).of("link", Link) == {"link": link(3)}
+    assert recording.frame(0, 1).payloads("link", Link) == {"link": link(1)}
+    assert recording.frame(0, 3).payloads("link", Link) == {"link": link(3)}
     with pytest.raises(
         RecordingError, match=rf"frame 2: the chunk at offset {chunk.offset} of .*recording-0000\.mcap"
     ):
-        recording.frame(0, 2).of("link", Link)
+        recording.frame(0, 2).payloads("link", Link)
 
 
 @pytest.mark.parametrize("closed", [True, False])
@@ -165,7 +165,9 @@ def test_cut_anywhere_it_yields_every_whole_frame(tmp_path):
         whole = sum(place <= size for place in sealed)
         assert len(recording) == whole
         assert not recording.complete
-        assert [f.of("link", Link)["link"] for f in recording.frames()] == [link(k) for k in range(whole)]
+        assert [f.payloads("link", Link)["link"] for f in recording.frames()] == [
+            link(k) for k in range(whole)
+        ]
         assert recording.run_digest().damage == ()
 
 

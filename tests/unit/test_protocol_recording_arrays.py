@@ -357,10 +357,13 @@ def test_actions_are_beams_by_user_and_motion_by_object(tmp_path: Path) -> None:
     ("mistake", "message"),
     [
         (lambda run: run["chanel"], "there is no topic 'chanel'; did you mean 'channel'?"),
-        (lambda run: run.of("lnk"), "there is no topic 'lnk'; did you mean 'link'?"),
+        (lambda run: run.products("lnk"), "there is no topic 'lnk'; did you mean 'link'?"),
         (lambda run: run.product(0, 0, "scen", "world"), "there is no topic 'scen'; did you mean 'scene'?"),
-        (lambda run: run.frame(0, 0).of("scen", Scene), "there is no topic 'scen'; did you mean 'scene'?"),
-        (lambda run: run.frame(0, 0).of("scene", Link), "payloads of 'scene' are Scene, not Link"),
+        (
+            lambda run: run.frame(0, 0).payloads("scen", Scene),
+            "there is no topic 'scen'; did you mean 'scene'?",
+        ),
+        (lambda run: run.frame(0, 0).payloads("scene", Link), "payloads of 'scene' are Scene, not Link"),
         (lambda run: run["camera"], "holds no product of 'camera'; it holds channel, link, scene"),
         (lambda run: run["link", "lonk"], "has no link of 'lonk'; did you mean 'link'?"),
         (lambda run: run["link"].select(episode=2), "link has no episode 2 here; it has 0 to 1"),

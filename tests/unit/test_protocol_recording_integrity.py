@@ -96,7 +96,7 @@ def test_zeros_at_the_end_cost_no_frame_before_them(tmp_path, zeros):
     (tmp_path / "recording.json").unlink()
     file.write_bytes(left)
     recording, told = read(tmp_path)
-    assert [f.of("link", Link)["link"] for f in recording.frames()] == [link(k) for k in range(4)]
+    assert [f.payloads("link", Link)["link"] for f in recording.frames()] == [link(k) for k in range(4)]
     assert not recording.complete
     if zeros >= 9:  # else it is a record whose head was not written whole
         assert f"readable up to byte {len(left) - zeros} of {len(left)}: lost are all frames behind" in told
