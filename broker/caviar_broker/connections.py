@@ -128,6 +128,7 @@ class Connections:
         before = self.clock.peer(hello.name)
         attempt = before.attempt if before else 0
         self._replying = route
+        # The clock decides; whether it did is seen by the attempt, which counts incarnations.
         if before is not None and before.present:
             self.watchdog.recheck(hello.name)  # one that was killed may be back before its death shows
         local = bool(hello.pid and hello.host and hello.host == self._host)

@@ -99,9 +99,13 @@ class EventLoop:
         *,
         prompt: bool = False,
     ) -> None:
-        """Call back when ``source`` is readable, or as ``events`` say.
+        """Call back when a source is ready.
 
-        A descriptor that is ``prompt`` is waited for with the sockets.
+        Args:
+            source: A file descriptor or a ZeroMQ socket.
+            callback: Called in the thread that polls.
+            events: ``zmq.POLLIN`` or ``zmq.POLLOUT``.
+            prompt: Whether a descriptor is waited for with the sockets, to 0.1 ms.
         """
         if self._callbacks.get(source) != callback:
             self._callbacks[source] = callback
@@ -120,8 +124,9 @@ class EventLoop:
             self._prompt -= {fd for fd in self._prompt if fd == source}
 
     def poll(self, wait_ns: int = 0) -> list[Source]:
-        """What is ready, after at most that long [ns]."""
+        """Wait for at most ``wait_ns`` [ns]; the sources that are ready."""
         self._polls += 1
+        # One millisecond less than there is: the poller rounds up, and the rest is waited for exactly.
         until = time.monotonic_ns() + wait_ns
         ready = [source for source, _ in self._poller.poll(max(0, wait_ns // COARSE_NS - 1))]
         return ready if ready or wait_ns <= 0 else self.poll_sockets(until)

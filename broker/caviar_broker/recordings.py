@@ -32,6 +32,7 @@ def recorded_frames(directory: Path, scenario: Scenario) -> tuple[tuple[int, int
     None where no recorder of this machine takes part: how far another got is known to that one alone.
     """
     recorders = [spec for spec in scenario.services.values() if spec.role == "recorder"]
+    # A recording on another machine cannot be looked at: its recorder says what it lacks when it is granted.
     if not any(not spec.remote for spec in recorders):
         return None, ()
     last, damage = recorded_until(directory)

@@ -33,7 +33,7 @@ TRIES = 50
 
 
 def free_endpoints(endpoint: str) -> Iterator[str]:
-    """Addresses to try for one that asks for any free port (port 0); any other address as it is.
+    """Addresses to try in turn for one that asks for any free port (port 0); any other address as it is.
 
     They lie outside the range of ports for outgoing connections: a broker that is started again has to listen
     where its services know it, and must not find that port taken by a connection that a program opened in
@@ -85,7 +85,9 @@ class Router:
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self.socket = self._context.socket(zmq.ROUTER)
         liveness_ms = liveness_ns // 1_000_000
+        # Without it a message to a peer that is gone would be dropped in silence.
         self.socket.setsockopt(zmq.ROUTER_MANDATORY, 1)
+        # A third and a half: a peer that answers none of the probes is cut off within the liveness time.
         self.socket.setsockopt(zmq.HEARTBEAT_IVL, max(1, liveness_ms // 3))
         self.socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, max(1, liveness_ms // 2))
         # What waits of a peer is bounded by the guard. A queue that is full would have libzmq 4.3.5 abort
@@ -145,6 +147,7 @@ class Router:
         parts: list[zmq.Frame] = []
         more, size = True, 0
         while more:
+            # Not copied: a product of 10 MB goes to its consumers from where libzmq put it.
             part = receive(_NOBLOCK, False)
             more = part.more
             size += len(part)

@@ -119,6 +119,7 @@ class Statistics:
 
     def frames_per_second(self) -> float:
         """Finished frames a second of wall time, after the warm-up frames [1/s]; 0 if unknown."""
+        # The first frames compile, load and fill caches: with them a short run would look slow.
         first = self.warm_up_frames
         if self.frames - first < 2:
             return 0.0
@@ -136,7 +137,7 @@ class Statistics:
         """By service, in a time that does not depend on how long the run is."""
         found = {}
         for name, values in self._latencies.items():
-            newest = sorted(values[-RECENT:])
+            newest = sorted(values[-RECENT:])  # all of them would hold up the frames of a long run
             found[name] = RecentStatistics(
                 p50_ms=_rank(newest, 0.50),
                 p99_ms=_rank(newest, 0.99),

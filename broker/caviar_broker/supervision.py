@@ -134,9 +134,14 @@ class Watchdog:
     _watched: dict[str, _Watched] = field(default_factory=dict)
 
     def welcome(self, service: str, pid: int | None) -> int | None:
-        """A new incarnation of a service; ``pid`` on this machine, None if it is elsewhere.
+        """Begin to watch a new incarnation of a service.
 
-        Returns a descriptor that is readable once its process is dead, if it can be watched.
+        Args:
+            service: Its name.
+            pid: Of its process on this machine; None if it is elsewhere.
+
+        Returns:
+            A descriptor that is readable once the process is dead; None where it cannot be watched.
         """
         watched = self._watched[service] = _Watched(since=time.monotonic_ns())
         if pid is None:
@@ -148,7 +153,7 @@ class Watchdog:
         return watched.process.fd if watched.process else None
 
     def forget(self, service: str) -> int | None:
-        """An incarnation is of no interest any more; the descriptor that `welcome` returned, now closed."""
+        """Stop to watch an incarnation; the descriptor that `welcome` returned, now closed."""
         watched = self._watched.pop(service, None)
         if watched is None or watched.process is None:
             return None
@@ -156,28 +161,33 @@ class Watchdog:
         return watched.process.fd
 
     def attach(self, service: str, pulse: bytes) -> bytes | None:
-        """A service has a heartbeat connection; returns the one that it had before."""
+        """Note the heartbeat connection of a service; the one that it had before."""
         watched = self._watched[service]
         before, watched.pulse = watched.pulse, pulse
         self.heard(service)
         return before
 
     def heard(self, service: str) -> None:
-        """A heartbeat came."""
+        """Note that a heartbeat came."""
         watched = self._watched.get(service)
         if watched is not None:
             watched.heard_at = time.monotonic_ns()
 
     def died(self, service: str) -> None:
-        """The descriptor of a local process says that it is dead."""
+        """Act on the death of a local process, which its descriptor shows."""
         watched = self._watched[service]
         watched.died_at = time.monotonic_ns()
+        # A launcher knows more of its child, exit status and last words: it gets `SUPERVISOR_NS` to say so.
         if service not in self.supervised and watched.process is not None:
             self.lost(service, watched.process.verdict())
 
     def cut_off(self, service: str) -> bool:
-        """A message found no connection. Whether the verdict is left to the operating system, which
-        tells a moment later how a local process ended."""
+        """Note that a message found no connection.
+
+        Returns:
+            Whether the verdict is left to the operating system, which says a moment later how a local process
+            ended.
+        """
         watched = self._watched.get(service)
         if watched is None or watched.process is None:
             return False

@@ -76,17 +76,26 @@ class FrameClock:
     # --- the interface of a shell ----------------------------------------------------------------
 
     def receive(self, event: ev.Event, now: int) -> None:
-        """Take in one event at the time ``now`` [ns]."""
+        """Take in one event.
+
+        Args:
+            event: One of those in `caviar_broker.core.events`; its service is one that the plan names.
+            now: The time [ns].
+        """
         self.handle(event, now)
         self.settle(now)
 
     def handle(self, event: ev.Event, now: int) -> None:
-        """The first half of `receive`, for several events that came together: `settle` follows the last."""
+        """Do the first half of `receive`, for several events that came together: `settle` follows the last.
+
+        What services answer together is dispatched once, which is what keeps a frame of many services cheap.
+        """
+        # What still arrives behind the end of a run is work for nothing, and changes no result.
         handler = self._late if self._run.over else self._handlers[type(event)]
         handler(event, now)
 
     def expire(self, now: int) -> None:
-        """Act on every deadline that has passed."""
+        """Act on every deadline that has passed at the time ``now`` [ns]."""
         if self._episodes.dispatcher is not None:
             self._episodes.dispatcher.expire(now)
             self._episodes.pump(now)
@@ -95,6 +104,7 @@ class FrameClock:
 
     def next_deadline(self) -> int | None:
         """When `expire` has to be called at the latest [ns]; None if nothing is awaited."""
+        # Kept between looks at the deadlines: only `settle` can change it.
         if not self._deadline_is_known:
             dispatcher = self._episodes.dispatcher
             of_frames = dispatcher.next_deadline() if dispatcher is not None else None
@@ -104,7 +114,8 @@ class FrameClock:
         return self._deadline
 
     def actions(self) -> list[ev.Action]:
-        """What the shell has to do, in order; each is handed out once."""
+        """Hand out what the shell has to do, in order, each action once; empty once all is handed out."""
+        # The list itself stays: dispatcher, decisions and deadlines of the episode append to it.
         waiting = self._run.actions
         if not waiting:
             return []
@@ -113,7 +124,7 @@ class FrameClock:
         return actions
 
     def settle(self, now: int) -> None:
-        """What follows from any event: the dispatcher acts, and a run that is over gets done."""
+        """Draw the consequences of the events so far: the dispatcher acts, and a run that is over ends."""
         self._deadline_is_known = False
         self._episodes.pump(now)
         if self._run.over:
@@ -121,7 +132,7 @@ class FrameClock:
             self._run.finish_if_alone(now)
 
     def _late(self, event: ev.Event, now: int) -> None:
-        """An event of a run that is over: who leaves and who comes matters, work does not."""
+        """Take an event of a run that is over: services that come and go matter, work does not."""
         match event:
             case ev.Joined() | ev.Lost() | ev.ByeReceived() | ev.Progressed():
                 self._handlers[type(event)](event, now)
@@ -167,7 +178,7 @@ class FrameClock:
         return 0 if dispatcher is None else dispatcher.table.finished_frames
 
     def snapshot(self) -> Snapshot | None:
-        """The run up to its last finished frame; None where the episode has none."""
+        """The run up to its last finished frame, as a compacted journal opens with it; None without one."""
         run, dispatcher = self._run, self._episodes.dispatcher
         if dispatcher is None or not dispatcher.table.finished_frames:
             return None

@@ -49,9 +49,15 @@ class Graph:
 
 
 def build_graph(hellos: Mapping[str, Hello], record: Iterable[str] = ()) -> Graph:
-    """Graph of the declarations, or `DeclarationError` naming what does not fit.
+    """Build the graph of a run from what its services declared.
 
-    ``record`` holds ``topic`` or ``topic.part`` entries that are in demand for the recording.
+    Args:
+        hellos: HELLO of each service, by name.
+        record: ``topic`` or ``topic.part`` entries that are in demand for the recording.
+
+    Raises:
+        DeclarationError: An input has no source, inputs of one frame form a cycle, or the recording asks for
+            a topic that no service produces; it names the service and the remedy.
     """
     producers = _producers(hellos)
     edges = {name: _edges(hello, producers) for name, hello in hellos.items()}
@@ -159,6 +165,7 @@ def _edges(hello: Hello, producers: Mapping[str, tuple[str, ...]]) -> list[Edge]
 
 
 def _topological_order(hellos: Mapping[str, Hello], edges: Mapping[str, list[Edge]]) -> list[str]:
+    # Depth first, by name, so that a consumer stands right behind its sources; graphlib orders by levels.
     order: list[str] = []
     trail: list[Edge] = []
 

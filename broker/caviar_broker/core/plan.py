@@ -128,12 +128,19 @@ class RunPlan:
         """Simulated time of a frame of any episode [ns]; one behind the last comes a period later."""
         if not self.instants_ns:
             return frame * self.sampling_period_ns
+        # An agent's final grant stands behind the last frame, where the scenario lists no instant.
         last = len(self.instants_ns) - 1
         return self.instants_ns[min(frame, last)] + max(0, frame - last) * self.sampling_period_ns
 
 
 def plan_run(scenario: Scenario, run: str, welcome: Mapping[str, Mapping[str, Any]]) -> RunPlan:
-    """Plan of a validated scenario; ``welcome`` is what WELCOME says to each service, by name."""
+    """Make the plan of a run.
+
+    Args:
+        scenario: A validated one, after `with_ownership`.
+        run: Id of the run.
+        welcome: What WELCOME says to each service about the scenario, by name (`briefings`).
+    """
     t = scenario.timeouts
     return RunPlan(
         run=run,
@@ -148,6 +155,7 @@ def plan_run(scenario: Scenario, run: str, welcome: Mapping[str, Mapping[str, An
                 max_in_flight=spec.max_in_flight,
                 settings=spec.settings,
                 scenario=welcome.get(name, {}),
+                # A remote service is started by hand, and so may come back where nothing is set.
                 rejoin=round(REMOTE_REJOIN_S * SECOND) if spec.remote and t.rejoin_s is None else None,
                 features=_features(scenario, name if spec.role == "world" else ""),
             )
@@ -172,7 +180,7 @@ def plan_run(scenario: Scenario, run: str, welcome: Mapping[str, Mapping[str, An
             shutdown=round(t.shutdown_s * SECOND),
             heartbeat=round(t.heartbeat_s * SECOND),
             liveness=round(t.liveness_s * SECOND),
-            rejoin=round((t.rejoin_s or 0.0) * SECOND),
+            rejoin=round((t.rejoin_s or 0.0) * SECOND),  # not set: a local service that dies ends the run
         ),
     )
 

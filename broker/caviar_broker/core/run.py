@@ -90,6 +90,7 @@ class Peer:
         self.move(ServiceEvent.HELLO, now)
         self.hello, self.attempt = hello, self.attempt + 1
         self.outputs = frozenset(hello.outputs)
+        # Silence and progress of the incarnation before would blame this one, or excuse it.
         self.heard_at, self.progress, self.phase, self.grace_ns = None, 0, "", 0
         self.restored = False
 
@@ -263,6 +264,7 @@ class Run:
 
     def fail(self, error: str, culprit: str, now: int) -> None:
         """End the run with blame; the first blame counts."""
+        # What fails later mostly follows from the first failure.
         if not self.over:
             self.error, self.culprit = error, culprit
             self.stop(error, now)

@@ -140,6 +140,7 @@ def _wait(run: Run, episodes: Episodes, peer: Peer, now: int) -> Wait | None:
     """Whether the run waits for a service, and the words for that."""
     if not run.takes_part(peer):
         return None
+    # First what keeps the run from its end, then services that are not there, then those at work.
     if run.state is RunState.STOPPING:
         if not peer.present:
             return None

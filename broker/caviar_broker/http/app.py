@@ -134,7 +134,13 @@ class LocalOnly:
 
 
 def make_app(ask: Ask, tokens: Tokens, gateway: Gateway) -> FastAPI:
-    """The application."""
+    """Build the application.
+
+    Args:
+        ask: Asks the broker.
+        tokens: Which requests are allowed; without any, all from this machine.
+        gateway: Serves ``/ws``.
+    """
     version = ".".join(map(str, PROTOCOL_VERSION))
     app = FastAPI(title="CAVIAR broker", version=version, description=ABOUT, docs_url=None, redoc_url=None)
     app.add_middleware(LocalOnly, tokens=tokens)
@@ -214,7 +220,7 @@ def _probes(app: FastAPI, ask: Ask) -> None:
 
 
 def _may(role: str, tokens: Tokens) -> Callable[[Request], Awaitable[None]]:
-    """What checks that a request's token has a role."""
+    """A dependency that checks a request's token for a role."""
 
     async def check(request: Request) -> None:
         if not tokens.exist:

@@ -50,7 +50,7 @@ class Tokens:
             self._take_in(self._directory)
         except SetupError:
             if self._stamp is None:
-                raise
+                raise  # at the start; later a file that is being edited must not lock its users out
 
     def _take_in(self, directory: Path) -> None:
         path = directory / TOKENS
@@ -119,7 +119,7 @@ def foreign(headers: Mapping[str, str], tokens: Tokens) -> str:
     machine, by ``Host``.
     """
     if tokens.exist:
-        return ""
+        return ""  # a page cannot know a token, wherever it is from
     if not is_loopback(_host(f"//{headers.get('host', '')}")):
         return "without tokens only this machine's own names and addresses are served"
     origin = headers.get("origin")
