@@ -119,8 +119,40 @@ def test_the_yaw_rate_is_the_derivative_of_the_yaw(waypoints: list[Waypoint]) ->
             velocity = track.velocity(t)
             if 0 < math.hypot(*velocity[:2]) < 0.1:
                 continue  # near a point of rest the course turns within no time
+            if track.yaw_rate(t, velocity) == 0:
+                continue  # the course is straight, or reverses
             turned = math.remainder(track.yaw(t + h) - track.yaw(t - h), 2 * math.pi)
             assert track.yaw_rate(t, velocity) == pytest.approx(turned / (2 * h), rel=1e-3, abs=1e-5)
+
+
+@pytest.mark.parametrize("drift", [0.0, 1e-12, 1e-6, 1e-3, 0.01, 0.1])
+@pytest.mark.parametrize("way", [5.0, 50.0])
+def test_a_vehicle_that_backs_turns_no_faster_than_its_speed_allows(drift: float, way: float) -> None:
+    """Its course reverses in a moment; no corner of it sweeps around at a multiple of the vehicle's speed."""
+    track = Track(
+        [Waypoint(0.0, (0, drift, 0)), Waypoint(0.5, (way, 2 * drift, 0)), Waypoint(1.0, (0, 3 * drift, 0))]
+    )
+    for t in np.concatenate([np.linspace(0, 1, 401), 0.5 + np.geomspace(1e-12, 1e-2, 200)]).tolist():
+        velocity = track.velocity(t)
+        assert abs(track.yaw_rate(t, velocity)) <= 10 * math.hypot(*velocity[:2])
+    assert track.reversals() == [(1, 0.5)]
+
+
+def test_a_turn_of_a_vehicle_has_its_rate() -> None:
+    """On a circle of 8 m at 10 m/s: 1.25 rad/s."""
+    angles = np.linspace(0.0, 2 * np.pi, 121)
+    track = Track([Waypoint(0.8 * a, (8 * math.cos(a), 8 * math.sin(a), 0.0)) for a in angles.tolist()])
+    t = 0.8 * math.radians(120.0 + 1.5)
+    assert track.yaw_rate(t, track.velocity(t)) == pytest.approx(1.25, rel=0.05)
+    assert track.reversals() == []
+
+
+def test_noise_of_a_vehicle_that_stands_does_not_turn_it_fast() -> None:
+    """Millimetres, ten times a second: they gave turns of hundreds of radians a second."""
+    noise = np.random.default_rng(7).normal(0.0, 1e-3, (200, 2)).tolist()
+    track = Track([Waypoint(0.1 * k, (x, y, 0.75)) for k, (x, y) in enumerate(noise)])
+    rates = [track.yaw_rate(t, track.velocity(t)) for t in np.linspace(0, 19, 5000).tolist()]
+    assert max(map(abs, rates)) < 1.0
 
 
 def test_a_straight_flight_does_not_turn_not_even_by_rounding() -> None:
@@ -274,6 +306,16 @@ def test_a_frame_does_not_depend_on_the_ones_before() -> None:
     for k in range(18):
         scene = scene_at(steady, k)
     assert wire_bytes(scene_at(gap, 17, previous=-1)) == wire_bytes(scene)
+
+
+def test_a_note_names_the_waypoint_at_which_an_object_turns_round() -> None:
+    back = ((0.0, 0.0, 12.0, 0.75), (0.5, 5.0, 12.01, 0.75), (1.0, 0.0, 12.02, 0.75))
+    car = MovingObject(name="car", kind="car", waypoints=back)
+    (note,) = [note for note in world(car).prepare(Preparation(demand={})).notes if "turns round" in note]
+    assert "object 'car' turns round at once at waypoint 1 (t_s = 0.5)" in note
+    assert "write yaw_deg" in note
+    heading = MovingObject(name="car", waypoints=tuple((*waypoint, 0.0) for waypoint in back))
+    assert not any("turns round" in note for note in world(heading).prepare(Preparation(demand={})).notes)
 
 
 def test_whole_names_are_declared_without_a_prefix() -> None:

@@ -5,6 +5,7 @@ To add a world, subclass `World`, say in `objects_at` where things are, and regi
 
 from __future__ import annotations
 
+import math
 import re
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
@@ -251,6 +252,11 @@ class Mounts:
 _TURNS = 1e-9
 """[rad/s]; slower is the rounding of a straight line."""
 
+_TIGHTEST_M = 0.1
+"""[m]; a course that bends with a smaller radius is a vehicle that backs, or that stands and is measured
+with noise, and no turn: the rate, which grows without bounds as such a vehicle slows down, would move its
+antennas by kilometres a second."""
+
 
 def turning(rate: float) -> float:
     """A yaw rate [rad/s]; 0 where it is but rounding, so that a scene in which nothing turns says so."""
@@ -258,6 +264,17 @@ def turning(rate: float) -> float:
 
 
 def course_rate(velocity: Sequence[float], acceleration: Sequence[float]) -> float:
-    """How fast [rad/s] the horizontal course of a velocity [m/s] turns with an acceleration [m/s²]."""
+    """How fast [rad/s] the horizontal course of a velocity [m/s] turns with an acceleration [m/s²].
+
+    0 where the course reverses rather than turns (`reverses`): it jumps there.
+    """
+    if reverses(velocity, acceleration):
+        return 0.0
     (vx, vy, _), (ax, ay, _) = velocity, acceleration
     return turning((vx * ay - vy * ax) / (vx * vx + vy * vy))
+
+
+def reverses(velocity: Sequence[float], acceleration: Sequence[float]) -> bool:
+    """Whether a course bends more tightly than a vehicle turns: its radius is v³ / |v × a|."""
+    (vx, vy, _), (ax, ay, _) = velocity, acceleration
+    return math.hypot(vx, vy) ** 3 < _TIGHTEST_M * abs(vx * ay - vy * ax)

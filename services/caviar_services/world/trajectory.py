@@ -6,6 +6,7 @@ import csv
 import math
 from bisect import bisect_right
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, ClassVar, NamedTuple
 
@@ -16,14 +17,17 @@ from caviar_protocol.arrays import Float64Array, quantity
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.space.coordinates import Vector, quaternion_from_euler
 from caviar_services.mesh.shapes import SHAPES
-from caviar_services.service import RunInfo
-from caviar_services.world.base import ObjectState, World, WorldSettings, course_rate, turning
+from caviar_services.service import Preparation, Prepared, RunInfo
+from caviar_services.world.base import ObjectState, World, WorldSettings, course_rate, reverses, turning
 
 COLUMNS = ("t_s", "x_m", "y_m", "z_m")
 YAW_COLUMN = "yaw_deg"
 
 _SLOW = 1e-6
 """Horizontal speed [m/s] below which rounding would choose the course."""
+
+_ROUND_DEG = 90.0
+"""[°]; a course that reverses by more at a waypoint turns the object round."""
 
 
 Length = Annotated[float, quantity("m", "side of a bounding box", gt=0)]
@@ -77,6 +81,17 @@ class TrajectoryWorld(World[TrajectorySettings]):
     def mesh_classes(self) -> tuple[str, ...]:
         """The classes of the objects, those that have a mesh."""
         return tuple({thing.kind for thing, _ in self._tracks.values()} & SHAPES.keys())
+
+    def prepare(self, preparation: Preparation) -> Prepared:
+        """As `World.prepare`, with a note for each object that a waypoint turns round at once."""
+        prepared = super().prepare(preparation)
+        notes = [
+            f"object {name!r} turns round at once at waypoint {waypoint} (t_s = {t:g}), where its course "
+            f"reverses, and has no angular velocity there; if it drives backwards, write {YAW_COLUMN}"
+            for name, (_, track) in self._tracks.items()
+            for waypoint, t in track.reversals()[:1]
+        ]
+        return replace(prepared, notes=(*prepared.notes, *notes))
 
     def begin(self, episode: int, seed: int) -> None:
         """Every episode is the same: nothing here is random."""
@@ -150,7 +165,8 @@ class Track:
         return start + (end - start) * s * s * (3 - 2 * s)
 
     def yaw_rate(self, t: float, velocity: Vector) -> float:
-        """[rad/s] at instant ``t`` [s], where the velocity [m/s] is this: the derivative of `yaw`."""
+        """[rad/s] at instant ``t`` [s], where the velocity [m/s] is this: the derivative of `yaw`, and 0
+        where the course reverses (`yaw_rate.reverses`)."""
         if self._given is not None:
             return turning(self._given.at(t, 1)[0])
         k = self._curve.segment(t)
@@ -162,6 +178,22 @@ class Track:
         length = float(self._curve.times[k + 1] - self._curve.times[k])
         s = (t - float(self._curve.times[k])) / length
         return turning((end - start) * 6 * s * (1 - s) / length)
+
+    def reversals(self) -> list[tuple[int, float]]:
+        """Number and instant [s] of each waypoint at which the course turns round on the spot."""
+        if self._given is not None:
+            return []
+        steps = np.diff(self._curve.points, axis=0)
+        found = []
+        for k in range(1, len(steps)):
+            t = float(self._curve.times[k])
+            (ax, ay), (bx, by) = steps[k - 1 : k + 1, :2].tolist()
+            angle = math.degrees(abs(math.atan2(ax * by - ay * bx, ax * bx + ay * by)))
+            velocity = self.velocity(t)
+            rests = math.hypot(*velocity[:2]) <= _SLOW
+            if angle > _ROUND_DEG and (rests or reverses(velocity, self._curve.at(t, 2))):
+                found.append((k, t))
+        return found
 
     def _moves(self, k: int) -> bool:
         return self._moving[k]
