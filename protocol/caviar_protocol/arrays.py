@@ -215,6 +215,7 @@ class _Layout:
 @cache
 def _layout(cls: type[Payload]) -> _Layout:
     fields = array_fields(cls)
+    # Arrays that may be None are checked each time: their absence is no shape to remember.
     optional = {f.name for f in msgspec.structs.fields(cls) if f.name in fields and not f.required}
     required = tuple(name for name in fields if name not in optional)
     return _Layout(
@@ -239,6 +240,7 @@ def _getter(paths: Sequence[str]) -> Callable[[Any], tuple[Any, ...]]:
 
 
 def _equal(a: Any, b: Any) -> bool:
+    # `==` of arrays is an array, and of different dtypes may hold: bytes on the wire would differ.
     if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
         return (
             isinstance(a, np.ndarray)
@@ -283,6 +285,7 @@ def require_finite(payload: msgspec.Struct, path: str = "") -> None:
 
 def _require_finite(value: Any, path: str) -> None:
     if isinstance(value, np.ndarray):
+        # Integers and flags are always finite, and `isfinite` of a camera image would cost its size.
         if value.dtype.kind in "fc" and not np.isfinite(value).all():
             bad = np.argwhere(~np.isfinite(value))[0].tolist()
             raise PayloadError(

@@ -154,6 +154,7 @@ class AssetStore:
         target.parent.mkdir(parents=True, exist_ok=True)
         staged = target.with_name(f".staged-{uuid4().hex}")
         try:
+            # A link costs neither time nor space; a city in each run's folder would.
             try:
                 os.link(source, staged)
             except OSError:  # no hard links on this file system
@@ -220,6 +221,7 @@ class IncomingAsset:
         self._data += chunk
         if self.offset < size:
             return False
+        # Hashed when it is complete: chunks of a peer may come in any size.
         digest = hashlib.sha256(self._data).hexdigest()
         if digest != announced.digest:
             raise AssetError(f"asset {name!r} has digest {digest}, announced was {announced.digest}")

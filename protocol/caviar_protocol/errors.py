@@ -92,6 +92,7 @@ class ScenarioError(CaviarError):
 
     def __init__(self, message: str, file: str = "", key: str = "", line: int | None = None) -> None:
         self.file, self.key, self.line, self.message = file, key, line, message
+        # As compilers write it, so that editors and terminals make it a link.
         place = file + (f":{line}" if line is not None else "")
         prefix = ": ".join(part for part in (place, key) if part)
         super().__init__(f"{prefix}: {message}" if prefix else message)

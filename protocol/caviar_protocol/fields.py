@@ -71,6 +71,7 @@ DigestOrNone = Annotated[
     ),
 ]
 
+# Without a bound a header of 1 MB could announce a million parts, each of which costs an object.
 few = msgspec.Meta(max_length=256)
 """Bound of a list whose items each belong to message parts, or to a declaration of such."""
 

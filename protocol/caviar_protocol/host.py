@@ -43,6 +43,7 @@ def steady_memory() -> None:
     a small fixed size it stays flat too, but a product of 1 MB costs 250 page faults each time it passes.
     Without glibc nothing happens.
     """
+    # Setting either of the two stops glibc from adapting both.
     _glibc("mallopt", _M_MMAP_THRESHOLD, _LARGE)
     _glibc("mallopt", _M_TRIM_THRESHOLD, _SPARE)
 

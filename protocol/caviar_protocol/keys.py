@@ -193,6 +193,7 @@ def read_public(path: Path) -> str:
     """
     remedy = "it is the file NAME.pub that  caviar keys new NAME  writes"
     if path.suffix == ".key":
+        # The most likely mistake, and one that would send the secret to another machine.
         raise SetupError(f"{path} holds a secret key, which stays where it is; give the .pub file beside it")
     return _decoded(path, _Public, remedy).public
 
@@ -239,6 +240,7 @@ def read_tokens(directory: Path) -> tuple[Token, ...]:
     if not path.exists():
         return ()
     tokens = _decoded(path, _TokenFile, "mend that line").token
+    # Checked here and not by type, so that the error can name the line.
     for number, token in enumerate(tokens):
         if token.role not in TOKEN_ROLES:
             raise SetupError(

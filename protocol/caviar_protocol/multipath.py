@@ -176,6 +176,7 @@ def k_factor(a: Complex128Array, tau: Float64Array, los: BoolArray) -> Float64Ar
         return np.full(tau.shape[:-1], np.nan)
     straight = np.take_along_axis(power, direct, -1)[..., 0]
     np.put_along_axis(power, direct, 0.0, -1)
+    # Summed without the direct path: its difference from the sum of all would lose small ones.
     others = power.sum(-1)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio: Float64Array = np.where(has_path, straight / others, np.nan)
@@ -207,6 +208,7 @@ def _spread(a: Complex128Array, of: Float64Array) -> Float64Array:
         share = power / power.sum(-1, keepdims=True)
     mean = (share * value).sum(-1, keepdims=True)
     spread: Float64Array = np.sqrt((share * (value - mean) ** 2).sum(-1))
+    # 0/0 above: a user without a path has no spread, and 0 would be that of one path.
     return np.where(power.sum(-1) > 0, spread, np.nan)
 
 

@@ -62,6 +62,7 @@ def numbers_are_right(scene: Scene) -> bool:
     # Written so that a NaN fails: a comparison with it is false.
     if not abs(np.vdot(orientation, orientation) - count) <= UNIT_TOLERANCE:
         return False
+    # The sum alone would let a squared norm of 1.5 pass beside one of 0.5.
     excess = np.vecdot(orientation, orientation) - 1.0
     return bool(
         # |n − 1| ≤ |n² − 1| for any norm n
@@ -223,6 +224,7 @@ def wrong_asset(scene: Scene, rules: SceneRules) -> str:
 
 def wrong_device(scene: Scene) -> str:
     """The first device whose parent, name, pose or range cannot be."""
+    # Looked up for each device.
     names = set(scene.names)
     return next((found for device in scene.devices if (found := _wrong_device(device, names))), "")
 
@@ -252,6 +254,7 @@ def missing_device(scene: Scene, world: str, rules: SceneRules) -> str:
             if spec.name not in published:
                 return f"device {spec.name!r} of the scenario is missing"
             continue
+        # Objects come and go; the world may choose which of the matching ones carry it.
         able = [name for name in scene.names if carries(spec, name)]
         carriers = sum(f"{name}/{spec.name}" in published for name in able)
         due = min(spec.count, len(able))

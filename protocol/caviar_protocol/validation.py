@@ -126,6 +126,7 @@ class ContentCheck:
         if found:
             raise ProductError(entry.topic, entry.source, entry.frame, found)
         self._looks[key] = self._looks.get(key, 0) + 1
+        # In one process all consumers get the same object: a look of the first counts for all.
         if not header:
             self._passed[key] = payload
 

@@ -67,6 +67,7 @@ def _deeper_than(data: bytes, limit: int) -> bool:
     position, end = 0, len(data)
     due: list[int] = []  # how many values each open container still lacks
     left = 1
+    # Bytes that end early are left to the decoder, which says where.
     while left and position < end:
         left -= 1
         byte = data[position]
@@ -89,6 +90,7 @@ def _deeper_than(data: bytes, limit: int) -> bool:
 
 def _open(data: bytes, position: int, byte: int) -> tuple[int, int]:
     """Position of the first value in a container, and how many there are (keys count too)."""
+    # fixmap and fixarray have their size in the low bits; the others two or four bytes behind.
     if byte < 0xA0:
         return position + 1, (byte & 0x0F) * (1 if byte >= 0x90 else 2)
     width = 2 if byte in (0xDC, 0xDE) else 4
@@ -138,6 +140,7 @@ def _at(
         if step in tags and number == len(steps) - 1:
             return tuple(str(struct.tag) for struct in structs)
         fields = value if isinstance(value, dict) else {}
+        # Of a union the member with this tag; without a tag any, of which msgspec allows one.
         matching = [s for s in structs if s.tag_field is None or fields.get(s.tag_field) == s.tag] or structs[
             :1
         ]

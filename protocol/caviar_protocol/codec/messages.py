@@ -69,6 +69,7 @@ def encode_message(message: Message) -> bytes:
         >>> decode_message(encode_message(HeartbeatAck(sequence=3)))
         HeartbeatAck(sequence=3)
     """
+    # Settings alone have no declared type, so a Python object in them would be found by the peer only.
     if isinstance(message, Welcome):
         _check_settings(message, PayloadError)
     try:
@@ -182,6 +183,7 @@ def _check_opening(header: Buffer) -> None:
 def _check_chunk(message: AssetData, length: int) -> None:
     if length > limits.MAX_ASSET_CHUNK:
         raise LimitError(f"ASSET_DATA carries {length} B, at most {limits.MAX_ASSET_CHUNK} are accepted")
+    # A peer that sends more than it announced would fill the memory of the other.
     if message.offset + length > message.size:
         raise DecodeError(
             f"ASSET_DATA carries bytes {message.offset} to {message.offset + length} of an asset of "

@@ -66,6 +66,7 @@ class BodyWriter:
         # A view keeps the producer's array alive until the body is joined, within this call.
         is_viewed = value.nbytes >= _VIEWED and value.flags.c_contiguous
         data = value.reshape(-1).view(np.uint8).data if is_viewed else value.tobytes()
+        # Aligned elements are read in place; of others NumPy makes a copy for every operation.
         padding = -self.length % ALIGNMENT
         if padding:
             self._chunks.append(bytes(padding))
@@ -236,6 +237,7 @@ def plain(payload: Payload, writer: BodyWriter) -> dict[str, Any]:
     """
     try:
         return _struct(type(payload))(payload, writer)  # type: ignore[no-any-return]
+    # The path of the value is looked for only once it is known that there is one.
     except _NonFiniteError:
         require_finite(payload)
         raise

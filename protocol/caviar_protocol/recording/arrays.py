@@ -71,6 +71,7 @@ class Column(Generic[S]):
         rows: Callable[[Any, Any], Rows] | None = None,
     ) -> None:
         self.dtype, self.shape, self.unit, self.doc = np.dtype(dtype), shape, unit, doc
+        # Set by `__set_name__`, when the class body is done.
         self.name = ""
         self._rows = rows
 
@@ -292,6 +293,7 @@ class TopicArrays(Generic[P, K]):
         found: dict[K, None] = {}
         seen: Sequence[K] | None = None
         for payload in self:
+            # Rows are those of the frame before in most frames: one comparison of tuples a frame.
             if payload is not None and (keys := self.keys_of(payload)) != seen:
                 found.update(dict.fromkeys(keys))
                 seen = keys

@@ -131,6 +131,7 @@ class RecordedSegments:
             record = known.get(file.name)
             if record is None or record.last is None or record.last >= before or not later.exists():
                 return
+            # Size alone: CRCs would read all of a recording before each resumption.
             if not file.exists() or file.stat().st_size != record.size:
                 return
             self.trusted.append(record)
@@ -187,6 +188,7 @@ class RecordedSegments:
 
         The recording is of the run of its first segment. A manifest of another run is left aside.
         """
+        # The metadata of one segment are read here; comparing all is the reader's.
         if self.segments and not self.past_gaps:
             return ""  # where several runs are mixed, `Recording` refuses them all
         run = metadata_of(segment).run

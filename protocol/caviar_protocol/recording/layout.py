@@ -154,6 +154,7 @@ def read_manifest(folder: Path) -> Manifest | None:
         raise RecordingError(f"{path} cannot be read: {error.strerror} (errno {error.errno})") from error
     try:
         content = bytes(msgspec.json.decode(data, type=_Envelope).manifest)
+        # Bytes are compared, and not the CRC alone: what stands around the manifest is covered too.
         if data != _sealed(content):
             raise RecordingError(f"{path} is damaged: its content does not have its CRC-32")
         return msgspec.json.decode(content, type=Manifest)

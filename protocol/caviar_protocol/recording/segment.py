@@ -163,6 +163,7 @@ class Segment:
         end, data_crc = self._data_end
         if data_crc and zlib.crc32(self._data[:end]) != data_crc:
             found.append((0, end))
+        # A seal that differs has named the place already; the CRC of the file would name all of it again.
         if not found and expected is not None and zlib.crc32(self._data[start:], crc) != expected:
             found.append((start, len(self)))
         if not found and self.finished and not self._summary_is_whole(end):
@@ -222,6 +223,7 @@ class Segment:
             good, crc = place + _SEAL.size, zlib.crc32(seal(recorded), recorded)
         self.readable = good
         self.chunks = [chunk for chunk in self.chunks if chunk.stop <= good]
+        # Not even the metadata are sealed: the segment counts as one without any.
         if not self.chunks and not good:
             self.metadata = {}
 
@@ -272,6 +274,7 @@ class Segment:
         at += name_length + 8
         if at + length != stop or (not compression and size != length):
             return f"is a chunk that its data of {length} B do not fit"
+        # A few bytes may claim to be a terabyte, which is asked for before the first of it is seen.
         if not may_expand(length, size):
             return f"is a chunk of {length} B that would take {size} B in memory, which no recorder writes"
         self.chunks.append(Chunk(offset, log_time, at, at + length, size, crc, compression))

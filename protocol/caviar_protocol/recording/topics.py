@@ -119,6 +119,7 @@ class UserArrays(TopicArrays[P, User], Generic[P]):
 
     def sorted_keys(self, keys: Iterable[User]) -> Iterable[User]:
         found = list(keys)
+        # Carriers in the order of the channel, which is that of the scenario; a sort by name would lose it.
         rank = {name: at for at, name in enumerate(dict.fromkeys(user.carrier for user in found))}
         return sorted(found, key=lambda user: (rank[user.carrier], user.tx, user.rx))
 
@@ -200,6 +201,7 @@ class SceneArrays(NamedArrays[Scene]):
     @property
     def devices(self) -> DeviceArrays:
         """The antennas and sensors of the same frames, where they are in the world."""
+        # Of the same frames, but not of the same rows: those are objects.
         return DeviceArrays(self._recording, self.topic, self.sources, self._indices)
 
     def keys_of(self, payload: Scene) -> Sequence[str]:

@@ -33,6 +33,7 @@ class Source(msgspec.Struct, frozen=True, kw_only=True):
         while key:
             if key in self.lines:
                 return self.lines[key]
+            # Missing keys have no line: that of the nearest table around is where to write them.
             key = re.sub(r"(^|\.)([^.\"\[]+|\"[^\"]*\")$|\[\d+\]$", "", key)
         return None
 
@@ -224,6 +225,7 @@ def _array(value: object, place: Place, written: str = "[ … ]") -> list[object
 
 
 def _fits(value: object, expected: inspect.Type) -> bool:
+    # bool is a subclass of int, and `frames = true` is a mistake.
     if isinstance(value, bool) or isinstance(expected, inspect.BoolType):
         return isinstance(value, bool) and isinstance(expected, inspect.BoolType)
     match expected:
@@ -235,6 +237,7 @@ def _fits(value: object, expected: inspect.Type) -> bool:
                 and (pattern is None or re.search(pattern, value) is not None)
             )
         case inspect.IntType():
+            # TOML's integers are 64-bit ones, Python's are not.
             return isinstance(value, int) and -(2**63) <= value < 2**63 and _in_range(value, expected)
         case inspect.FloatType():
             return isinstance(value, int | float) and math.isfinite(value) and _in_range(value, expected)

@@ -39,6 +39,7 @@ def find_scenario(scenario: Path | str) -> Path:
     Returns:
         The file. What is neither is returned as it is; reading it says what is wrong.
     """
+    # A file beside the user is meant before one that ships under the same name.
     path = Path(scenario)
     if path.is_file() or path.name != str(scenario):
         return path
@@ -266,6 +267,7 @@ def with_instants(table: Mapping[str, Any], place: Place, folder: Path = Path())
     for index, (before, value) in enumerate(pairwise(values), 1):
         if value <= before:
             raise here.at(index).error(f"{value} does not come after {before}; order the instants by time")
+    # By their shortest decimal form, as it stands in the file: 0.1 s is 100,000,000 ns and not a bit more.
     instants = instants_ns(values)
     period = math.gcd(*instants)
     return {**table, "frames": len(instants), **({"sampling_period_ns": period} if period else {})}

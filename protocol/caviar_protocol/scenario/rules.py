@@ -121,6 +121,7 @@ def world_of(scenario: Scenario, index: int) -> str:
         return device.world
     if len(worlds) == 1:
         return worlds[0]
+    # What precedes the first wildcard is certain to be in the object's name.
     literal = device.on.partition("*")[0].partition("?")[0].partition("[")[0]
     matching = [name for name in worlds if literal.startswith(_prefix(name, scenario.services[name]))]
     if len(matching) == 1:
@@ -156,6 +157,7 @@ def with_overrides(
     if not changes:
         return scenario
     run = type(scenario.run)
+    # Fewer frames are the first instants; there are none to add.
     instants = len(scenario.run.instants_s)
     if frames is not None and 0 < instants < frames:
         raise (

@@ -43,20 +43,23 @@ LONGEST_S = 1e8
 class Timeouts(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How long the broker waits for what."""
 
-    connect_s: Annotated[float, quantity("s", "for HELLO of every service", gt=0, le=LONGEST_S)] = 30.0
-    ready_s: Annotated[float, quantity("s", "for READY, beyond a declared grace", gt=0, le=LONGEST_S)] = 120.0
-    reset_s: Annotated[float, quantity("s", "for RESET_DONE", gt=0, le=LONGEST_S)] = 60.0
-    stall_s: Annotated[float, quantity("s", "without progress, under wait", gt=0, le=LONGEST_S)] = 30.0
+    connect_s: Annotated[float, quantity("s", "wait for HELLO of every service", gt=0, le=LONGEST_S)] = 30.0
+    ready_s: Annotated[float, quantity("s", "wait for READY", gt=0, le=LONGEST_S)] = 120.0
+    """A grace that a service declares with its heartbeats comes on top."""
+    reset_s: Annotated[float, quantity("s", "wait for RESET_DONE", gt=0, le=LONGEST_S)] = 60.0
+    stall_s: Annotated[float, quantity("s", "wait without progress", gt=0, le=LONGEST_S)] = 30.0
+    """For a service of policy ``wait`` that neither answers nor reports progress."""
     rejoin_s: (
         Annotated[
-            float, quantity("s", "for a service that died to come back; 0: the run ends", ge=0, le=LONGEST_S)
+            float,
+            quantity("s", "wait for a service that died to come back; 0: the run ends", ge=0, le=LONGEST_S),
         ]
         | None
     ) = None
     """Absent: `REMOTE_REJOIN_S` for remote services, 0 for those that `caviar run` starts."""
-    shutdown_s: Annotated[float, quantity("s", "for BYE; then the process is killed", gt=0, le=LONGEST_S)] = (
-        2.0
-    )
+    shutdown_s: Annotated[
+        float, quantity("s", "wait for BYE; then the process is killed", gt=0, le=LONGEST_S)
+    ] = 2.0
     heartbeat_s: Annotated[float, quantity("s", "between heartbeats", gt=0, le=LONGEST_S)] = 0.25
     liveness_s: Annotated[
         float, quantity("s", "silence after which a remote peer is gone", gt=0, le=LONGEST_S)
@@ -70,18 +73,23 @@ class Limits(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     connections_before_hello: Annotated[
         int, quantity("1", "open connections of one address before HELLO", ge=1, le=1_000_000)
     ] = 256
-    messages_before_hello: Annotated[int, quantity("1", "of one connection", ge=1, le=1_000_000)] = 16
+    messages_before_hello: Annotated[int, quantity("1", "messages of a connection", ge=1, le=1_000_000)] = 16
     waiting_before_hello_mib: Annotated[
-        int, quantity("MiB", "that wait of a connection before HELLO", ge=1, le=1024)
+        int, quantity("MiB", "unread messages of a connection before HELLO", ge=1, le=1024)
     ] = 4
     messages_at_once: Annotated[
-        int, quantity("1", "of a service, beyond one for each that it was sent", ge=100, le=1_000_000_000)
+        int, quantity("1", "messages of a service, beyond answers", ge=100, le=1_000_000_000)
     ] = 4000
+    """Bucket that ``messages_per_s`` fills; one message for each that the service was sent is free."""
     messages_per_s: Annotated[
-        float, quantity("1/s", "of a service on and on, beyond the same", gt=0, le=1e9)
+        float, quantity("1/s", "messages of a service, beyond answers", gt=0, le=1e9)
     ] = 500.0
-    part_mib: Annotated[int, quantity("MiB", "of one part of a message, as a product", ge=4, le=1024)] = 1024
-    waiting_mib: Annotated[int, quantity("MiB", "that wait of a service, or for it", ge=2, le=2**20)] = 1088
+    part_mib: Annotated[
+        int, quantity("MiB", "largest part of a message, such as a product", ge=4, le=1024)
+    ] = 1024
+    waiting_mib: Annotated[
+        int, quantity("MiB", "unread messages of a service, or unsent ones to it", ge=2, le=2**20)
+    ] = 1088
 
 
 class Run(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -89,12 +97,15 @@ class Run(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     # The name of the run's directory has a date and a time behind it, and 255 B at most.
     name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,199}$")]
-    frames: Annotated[int, quantity("frame", "of an episode", ge=1)]
-    sampling_period_ns: Annotated[int, quantity("ns", "T_sam", gt=0)] = 100_000_000
+    """Name of the scenario, with which the run's directory begins."""
+    frames: Annotated[int, quantity("frame", "frames of an episode", ge=1)]
+    sampling_period_ns: Annotated[int, quantity("ns", "T_sam, from one frame to the next", gt=0)] = (
+        100_000_000
+    )
     instants_s: tuple[Annotated[float, quantity("s", "instant of a frame", ge=0)], ...] = ()
     """Instants of the frames of an episode, in place of ``frames`` and ``sampling_period_ns``, which
     follow from it. ``instants_ns`` and ``file:PATH.csv`` are read into it."""
-    episodes: Annotated[int, quantity("1", "episodes", ge=1)] = 1
+    episodes: Annotated[int, quantity("1", "episodes of the run", ge=1)] = 1
     seed: Annotated[int, quantity("1", "seed of everything random", ge=0, le=2**63 - 1)] = 1
     pace: Literal["free", "realtime", "fast"] | Annotated[float, quantity("1", "", ge=1e-6, le=1e6)] = "free"
     """When frames are released: ``free`` (``fast`` is its older name) as soon as they can be, ``realtime``
@@ -102,10 +113,9 @@ class Run(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     record: tuple[str, ...] = ()
     """Topics that are produced because they shall be recorded, though no service consumes them (clause 5):
     ``lidar``, or with a part of it ``lidar.grid``."""
-    checkpoint_frames: Annotated[
-        int, quantity("frame", "after which services that can do so save their state; 0: never", ge=0)
-    ] = 20
-    frames_in_flight: Annotated[int, quantity("frame", "frames that may overlap at most", ge=1, le=64)] = 4
+    checkpoint_frames: Annotated[int, quantity("frame", "from one checkpoint to the next", ge=0)] = 20
+    """Services that can do so then save their state; 0: never."""
+    frames_in_flight: Annotated[int, quantity("frame", "frames that may overlap", ge=1, le=64)] = 4
     durability: Durability = "periodic"
     """What a loss of power costs: ``frame`` at most the frame in progress, ``periodic`` at most
     `caviar_protocol.files.SYNC_PERIOD_S` and a frame, ``none`` what the system had not written yet."""
@@ -120,29 +130,35 @@ class DeviceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True
     """
 
     name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
+    """Name of the device, behind that of the object it is mounted on."""
     kind: Literal["antenna", "lidar", "camera"]
+    """What the device is; keys of the other kinds are refused."""
     on: str = ""
-    count: Annotated[int, quantity("1", "devices at most, with a pattern", ge=1)] = 1
+    """Name of the object that carries the device, or a pattern with ``*``; empty: fixed in the world."""
+    count: Annotated[int, quantity("1", "objects that carry the device, of those that match", ge=1)] = 1
     mount: Literal["centre", "roof", "floor"] = "centre"
     """What ``position_m`` is relative to: a point of the parent's bounding box."""
     world: str = ""
     """The world that publishes a device; needed where ``on`` leaves it open."""
     position_m: Vector3 = (0.0, 0.0, 0.0)
+    """In the world's axes [m], or with ``on`` in the object's axes, from the mount point."""
     yaw_deg: Annotated[float, quantity("°", "counter-clockwise from +x")] = 0.0
     pitch_deg: Annotated[float, quantity("°", "positive lowers the nose")] = 0.0
     roll_deg: Annotated[float, quantity("°", "about +x")] = 0.0
     # antenna
     role: Literal["tx", "rx", "both", ""] = ""
+    """Antennas: transmits, receives, or both. Antennas need it."""
     array: AntennaArray | None = None
+    """Antennas: the elements; absent: one isotropic element."""
     power_dbm: Annotated[float, quantity("dBm", "transmit power")] = 0.0
     # lidar
-    beams: Annotated[int, quantity("1", "beams", ge=1, le=1024)] = 64
+    beams: Annotated[int, quantity("1", "beams of a lidar, one above the other", ge=1, le=1024)] = 64
     azimuth_steps: Annotated[int, quantity("1", "rays of a beam in a turn", ge=1, le=36000)] = 1800
     elevation_deg: Annotated[tuple[float, float], quantity("°", "lowest and highest beam")] = (-25.0, 3.0)
     range_m: Annotated[tuple[float, float], quantity("m", "nearest and farthest hit")] = (0.0, 100.0)
     # camera
     size_px: Annotated[tuple[int, int], quantity("px", "width, height")] = (640, 480)
-    field_of_view_deg: Annotated[float, quantity("°", "horizontal", gt=0, lt=180)] = 90.0
+    field_of_view_deg: Annotated[float, quantity("°", "horizontal field of view", gt=0, lt=180)] = 90.0
 
 
 class ServiceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -151,19 +167,23 @@ class ServiceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     unknown_key_hint: ClassVar[str] = "settings of the implementation stand in its table `settings`"
 
     role: Role
+    """What the service does in the run."""
     use: str
-    """Registered implementation of that role; `REMOTE`: whatever the user starts and connects."""
+    """Registered implementation of the role, or ``module:Class``; ``remote``: the user starts the service."""
     budget_ms: Annotated[
         float, quantity("ms", "wall time for a frame; misses are counted", gt=0, le=1e3 * LONGEST_S)
     ]
     policy: Policy = "wait"
+    """What follows when the budget is up: ``wait`` for the answer, ``hold`` the last product, ``drop`` the
+    product of this frame, ``abort`` the run (clause 9)."""
     max_in_flight: Annotated[
-        int, quantity("1", "grants queued; more than 1 only under wait", ge=1, le=64)
+        int, quantity("1", "grants that it may have queued; more than 1 only under wait", ge=1, le=64)
     ] = 1
     users: tuple[str, ...] = ()
     """Agents: the receivers (or actuators) this agent owns, as patterns; empty: a default agent,
     which serves the receivers without another agent (clause 17)."""
     settings: dict[str, Any] = {}
+    """Settings of the implementation, which its ``Settings`` class defines."""
 
     @property
     def remote(self) -> bool:
@@ -190,14 +210,21 @@ class Scenario(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     not_in_file: ClassVar[tuple[str, ...]] = ("source",)
 
     run: Run
+    """The run as a whole."""
     services: dict[str, ServiceSpec]
+    """Services by name."""
     timeouts: Timeouts = Timeouts()
+    """How long the broker waits for what."""
     limits: Limits = Limits()
+    """What one peer may use of the broker."""
     carriers: tuple[Carrier, ...] = ()
+    """Radio carriers of every channel."""
     devices: tuple[DeviceSpec, ...] = ()
+    """Antennas and sensors."""
     replay: ReplaySpec | None = None
+    """What the run repeats of a recorded one."""
     source: Source = Source()
-    """Where this was read from, so that whatever turns out wrong later can name the line."""
+    """File and lines of the scenario, with which later checks name the place of an error."""
 
 
 PATTERNS = "patterns/"

@@ -137,6 +137,7 @@ class _Text:
         width = len(element.numbers)
         rows = self._take(element.count * width)
         names = [name for name, _ in element.numbers]
+        # Rows in double precision, whatever the header says: what is written is what is meant.
         table = np.array(rows, dtype=np.float64).reshape(element.count, width)
         return table[:, [names.index(axis) for axis in element.axes]]
 

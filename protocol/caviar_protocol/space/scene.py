@@ -27,6 +27,7 @@ def merge_scenes(scenes: Mapping[str, Scene]) -> Scene:
     Raises:
         PayloadError: A name occurs twice; the text names the object and both worlds.
     """
+    # The usual case, in which nothing is copied.
     if len(scenes) == 1:
         return next(iter(scenes.values()))
     owner: dict[str, str] = {}
@@ -197,6 +198,7 @@ def _along(scene: Scene, pair: Pair) -> tuple[Vector, Vector]:
     (x0, y0, z0), (x1, y1, z1) = tx.position, rx.position
     dx, dy, dz = x1 - x0, y1 - y0, z1 - z0
     length = math.hypot(dx, dy, dz)
+    # A direction is needed all the same, and this one is in every codebook.
     if length == 0:
         return BORESIGHT, BORESIGHT
     dx, dy, dz = dx / length, dy / length, dz / length
