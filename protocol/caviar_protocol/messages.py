@@ -169,6 +169,10 @@ class AssetData(_Message, frozen=True, kw_only=True, tag="ASSET_DATA"):
     """Length of the whole asset."""
 
 
+WARNING = "warning: "
+"""What a note of `Ready` begins with that the user is to see on the screen."""
+
+
 class Ready(_Message, frozen=True, kw_only=True, tag="READY"):
     """Service to broker: loaded and warmed up."""
 
@@ -181,7 +185,8 @@ class Ready(_Message, frozen=True, kw_only=True, tag="READY"):
     actuators: tuple[NamePattern, ...] = ()
     """Agents: the actuators they own, as patterns with ``*``: ``beam:car.*``, ``motion:uav``."""
     notes: tuple[Text, ...] = ()
-    """What a user should know: the library chosen, the GPU used."""
+    """What a user should know: the library chosen, the GPU used. One that begins with ``warning: `` is shown
+    as such; the others are logged."""
     seed: SeedOrNone = -1
     """Agents: seed of the first episode, instead of the run's."""
 

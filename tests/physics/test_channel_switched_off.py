@@ -174,10 +174,10 @@ def test_each_switch_is_a_note(tmp_path: Path) -> None:
         note for note in model.prepare(Preparation(demand={}, assets=assets)).notes if "switched off" in note
     ]
     assert notes == [
-        "scattering is switched off: no material has a scattering_coefficient above 0",
+        "warning: scattering is switched off: no material has a scattering_coefficient above 0",
         (
-            "refraction is switched off: no ray is ever sent through a material (skin-plate0 −136 dB, "
-            "skin-plate1 −136 dB, body_material −∞ dB at most)"
+            "warning: refraction is switched off: no ray is ever sent through a material "
+            "(skin-plate0 −136 dB, skin-plate1 −136 dB, body_material −∞ dB at most)"
         ),
     ]
     assert model.options.diffraction

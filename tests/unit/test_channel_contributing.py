@@ -87,7 +87,7 @@ def test_only_what_was_asked_for_is_switched_off() -> None:
     asked = replace(ASKED, scattering=False, refraction=False)
     left, notes = contributing(asked, surfaces(METAL, edges=False), (28e9,))
     assert left == replace(asked, diffraction=False)
-    assert notes == ("diffraction is switched off: no two faces meet at an edge",)
+    assert notes == ("warning: diffraction is switched off: no two faces meet at an edge",)
 
 
 def test_a_material_counts_on_every_carrier() -> None:
@@ -120,7 +120,7 @@ def test_without_interactions_nothing_is_launched(
     assert left == replace(
         asked, max_depth=0, reflection=False, refraction=False, diffraction=False, scattering=False
     )
-    assert [note.split(": ")[1] for note in notes] == [reason] * 4
+    assert [note.rpartition(": ")[2] for note in notes] == [reason] * 4
 
 
 def test_a_launch_of_nothing_has_no_depth() -> None:

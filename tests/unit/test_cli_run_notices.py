@@ -35,3 +35,13 @@ def test_every_refused_peer_is_shown_with_the_reason() -> None:
 @pytest.mark.parametrize("kind", ["note", "stale"])
 def test_what_is_of_no_use_to_a_user_is_only_logged(kind: str) -> None:
     assert shown((kind, "world", "something")) == ""
+
+
+def test_every_warning_of_a_service_is_shown_and_kept_for_the_summary() -> None:
+    console = Console(file=io.StringIO(), width=200)
+    watcher = _Watcher(Progress(console=console), console, load_scenario(SMOKE), None)
+    for text in ("scattering is switched off: why", "a file is damaged"):
+        watcher.take({"event": "notice", "kind": "warning", "service": "channel", "frame": -1, "text": text})
+    assert watcher.warnings == ["channel: scattering is switched off: why", "channel: a file is damaged"]
+    for text in watcher.warnings:
+        assert f"warning: {text}\n" in console.file.getvalue()  # type: ignore[attr-defined]

@@ -19,3 +19,21 @@ def test_only_an_agent_without_users_in_every_frame_is_warned_of() -> None:
 
 def test_a_recording_without_frames_warns_of_nobody() -> None:
     assert Unserved().warnings() == []
+
+
+def test_what_was_of_no_use_in_any_frame_is_named() -> None:
+    """A device without an object; not one that had one in one frame."""
+    unserved = Unserved()
+    unserved.add(
+        [
+            Report(source="world", counts={"device-without-object/rx": 1, "device-without-object/late": 1}),
+        ]
+    )
+    unserved.add(
+        [
+            Report(source="world", counts={"device-without-object/rx": 1}),
+        ]
+    )
+    assert unserved.warnings() == [
+        "device 'rx' stood on no object of world in any frame; see its `on`",
+    ]

@@ -299,6 +299,15 @@ def test_a_service_that_fails_while_preparing_ends_the_run_with_its_words() -> N
     assert "no libLLVM; apt-get install libllvm19" in run.outcome.error
 
 
+def test_a_note_that_is_a_warning_is_noticed_as_one() -> None:
+    run = Simulation(loop(channel={"ready_after": None})).join()
+    run.run(lambda run: bool(run.seen(m.Prepare, "channel")))
+    notes = ("sionna-rt 2.2.0", f"{m.WARNING}scattering is switched off")
+    run.feed(ev.ReadyReceived("channel", m.Ready(epoch=1, attempt=1, notes=notes)))
+    assert [n.text for n in run.notices("note", "channel")] == ["sionna-rt 2.2.0"]
+    assert [n.text for n in run.notices("warning", "channel")] == ["scattering is switched off"]
+
+
 def test_ready_of_another_attempt_is_stale_and_not_used() -> None:
     run = Simulation(loop(channel={"ready_after": None})).join()
     run.run(lambda run: bool(run.seen(m.Prepare, "channel")))

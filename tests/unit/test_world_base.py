@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from world_builders import ScriptedWorld, scene_at, state, wire_bytes
+from world_builders import T_SAM_NS, ScriptedWorld, scene_at, state, wire_bytes
 
 from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.scenario import DeviceSpec
@@ -16,7 +16,8 @@ from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.space.scene import device_pose, device_velocity
 from caviar_protocol.topics import AntennaDevice, CameraDevice, LidarDevice
 from caviar_protocol.topics.scene import AntennaArray
-from caviar_services.service import Preparation
+from caviar_services.service import Frame, Preparation, RunInfo
+from caviar_services.world.trajectory import MovingObject, TrajectorySettings, TrajectoryWorld
 
 
 def antenna(name: str = "rx", on: str = "car.*", **changes: object) -> DeviceSpec:
@@ -93,6 +94,28 @@ def test_a_device_on_what_can_never_come_is_refused(on: str) -> None:
     assert refused.value.key == "devices.rx.on"
     if on == "cra.1":
         assert "did you mean 'car.'?" in str(refused.value)
+
+
+@pytest.mark.parametrize(("on", "passes"), [("bus", True), ("b*", True), ("bus2", False), ("cart", False)])
+def test_where_all_objects_are_known_a_device_stands_on_one_of_them(on: str, passes: bool) -> None:
+    """A typo that begins with an object's name is one, too."""
+    objects = [MovingObject(name=name, waypoints=((0.0, 0.0, 0.0, 0.0),)) for name in ("bus", "car")]
+    run = RunInfo(name="world", devices=(antenna(on=on),))
+    world = TrajectoryWorld(TrajectorySettings(objects=tuple(objects)), run)
+    if passes:
+        world.prepare(Preparation(demand={}))
+        return
+    with pytest.raises(
+        ScenarioError, match=rf"on '{on}', which .* did you mean '{on[:3]}'\? its objects are"
+    ):
+        world.prepare(Preparation(demand={}))
+
+
+def test_a_device_without_an_object_is_counted() -> None:
+    world = ScriptedWorld([[], [state("car.a")]], [antenna()])
+    world.reset(0, 1, 0)
+    frames = [Frame(episode=0, number=k, t_ns=k * T_SAM_NS) for k in range(2)]
+    assert [world.step(frame).counts for frame in frames] == [{"device-without-object/rx": 1}, {}]
 
 
 def test_first_come_keep_their_devices_and_the_next_takes_over() -> None:

@@ -16,6 +16,7 @@ from caviar_protocol.errors import DeclarationError, VersionError, suggestion
 from caviar_protocol.messages import (
     CAPABILITIES,
     PROTOCOL_VERSION,
+    WARNING,
     Asset,
     Hello,
     Prepare,
@@ -209,7 +210,8 @@ class Registration:
             return
         peer.move(ServiceEvent.READY, now)
         for note in message.notes:
-            run.notice("note", peer.name, note)
+            kind = "warning" if note.startswith(WARNING) else "note"
+            run.notice(kind, peer.name, note.removeprefix(WARNING))
         if not self._accepted(peer, message, now):
             return
         peer.ready = message

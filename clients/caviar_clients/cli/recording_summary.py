@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, Any, cast
 
 import msgspec
@@ -18,6 +18,7 @@ from caviar_protocol.recording import RecordedFrame, Recording
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.topics import Link
 from caviar_protocol.topics.channel import INSIDE_PREFIX, UNMATCHED_PREFIX, Cause
+from caviar_protocol.topics.scene import WITHOUT_OBJECT_PREFIX
 
 STATE = "state:"
 """Begins the name of a decision that is no choice, but what a service knew when the episode began."""
@@ -156,29 +157,37 @@ def _frames(count: int) -> str:
     return f"{count} frame" if count == 1 else f"{count} frames"
 
 
-_WITHOUT_USERS = "frames-without-users"
+_NEVER: Mapping[str, str] = {
+    "frames-without-users": "{source} had nobody to serve in any frame; see its `users`, and `on` of the "
+    "receivers",
+    WITHOUT_OBJECT_PREFIX: "device {rest!r} stood on no object of {source} in any frame; see its `on`",
+}
+"""What a count means that every frame of a run has, by the count's name or what that begins with."""
 
 
 class Unserved:
-    """Counts frames, and those in which an agent had no user."""
+    """Counts frames, and those in which something that the scenario asks for was of no use: an agent without
+    users, a device without an object."""
 
     def __init__(self) -> None:
         self._frames = 0
-        self._without: Counter[str] = Counter()
+        self._without: Counter[tuple[str, str]] = Counter()
 
     def add(self, reports: Iterable[Report]) -> None:
         """What services reported of a frame."""
         self._frames += 1
         for report in reports:
-            if report.counts.get(_WITHOUT_USERS):
-                self._without[report.source] += 1
+            for name, count in report.counts.items():
+                if count and name.startswith(tuple(_NEVER)):
+                    self._without[report.source, name] += 1
 
     def warnings(self) -> list[str]:
-        """For a user: a line for each agent that served nobody from the first frame to the last."""
+        """For a user: a line for each of these that was so from the first frame to the last."""
         return [
-            f"{agent} had nobody to serve in any frame; see its `users`, and `on` of the receivers"
-            for agent, frames in sorted(self._without.items())
-            if frames == self._frames
+            text.format(source=source, rest=name.removeprefix(prefix))
+            for (source, name), frames in sorted(self._without.items())
+            for prefix, text in _NEVER.items()
+            if frames == self._frames and name.startswith(prefix)
         ]
 
 

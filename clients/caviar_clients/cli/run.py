@@ -143,7 +143,7 @@ def with_recording_checked(
 
 QUIET = frozenset({"stale", "note", "lag"})
 """Kinds of notices that are logged, and only counted on the screen."""
-REPEATED = frozenset({"lost", "away", "back", "restarted", "refused", "disk"})
+REPEATED = frozenset({"warning", "lost", "away", "back", "restarted", "refused", "disk"})
 """Kinds of notices that are shown every time, since what they ask of the user is always new."""
 
 
@@ -256,7 +256,7 @@ def _follow(
         return 130 if interrupted.came else 1
     outcome = with_recording_checked(directory, scenario, outcome)
     recorded = recorded_figures(directory) if outcome["frames"] else None
-    told = [*warnings, *watcher.idle.values()]
+    told = [*warnings, *watcher.warnings, *watcher.idle.values()]
     summary = summary_of(outcome, recorded, scenario.run.name, directory, scenario.run.seed, told)
     if outcome["frames"]:
         _show(console, summary)
@@ -325,6 +325,8 @@ class _Watcher:
         self._scenario, self._endpoint, self._keys = scenario, "", keys
         self.idle: dict[str, str] = {}
         """Services that are not run, with the reason, for the summary."""
+        self.warnings: list[str] = []
+        """Of services, for the summary."""
 
     def take(self, event: Mapping[str, Any]) -> None:
         """Show one event."""
@@ -366,6 +368,8 @@ class _Watcher:
         key = (event["kind"], event["service"])
         if event["kind"] == "idle":
             self.idle[event["service"]] = f"{event['service']}: {event['text']}"
+        if event["kind"] == "warning":
+            self.warnings.append(f"{event['service']}: {event['text']}")
         self._shown[key] = self._shown.get(key, 0) + 1
         if self._shown[key] == 1 or event["kind"] in REPEATED:
             frame = f" in frame {event['frame']}" if event["frame"] >= 0 else ""

@@ -152,3 +152,7 @@ class Scene(Payload, frozen=True, kw_only=True, omit_defaults=True, dict=True):
     ) = None
     """How objects turn [rad/s, world axes]: what is at r from an object's position moves with velocity +
     angular_velocity × r; absent: no object turns, or the world does not know."""
+
+
+WITHOUT_OBJECT_PREFIX = "device-without-object/"
+"""Before the name of a device in the counts of a world's report: there was no object for it to stand on."""

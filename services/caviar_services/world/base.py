@@ -25,7 +25,7 @@ from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.scenario.schema import carries, fixed_device, mounted_device
 from caviar_protocol.space.coordinates import UnitQuaternion, Vector
 from caviar_protocol.topics import Scene
-from caviar_protocol.topics.scene import Device
+from caviar_protocol.topics.scene import WITHOUT_OBJECT_PREFIX, Device
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
 from caviar_services.world.assets import object_assets, pattern_assets, scenery_assets
 
@@ -85,6 +85,11 @@ class World(Service[W]):
         """
         return ()
 
+    @classmethod
+    def known_objects(cls, settings: W) -> Mapping[str, str] | None:
+        """Class of each object that may come, by name; None where they are not known before the run."""
+        return None
+
     @abstractmethod
     def prefixes(self) -> tuple[str, ...]:
         """What the names of this world's objects begin with; whole names where they are known."""
@@ -124,19 +129,23 @@ class World(Service[W]):
 
     def _check_parents(self) -> None:
         """Refuse a device on an object that can never come."""
-        prefixes = self.prefixes()
+        objects, prefixes = self.known_objects(self.settings), self.prefixes()
+        known = prefixes if objects is None else tuple(objects)
         for spec in self.run.devices:
-            literal = re.split(r"[*?[]", spec.on)[0]
-            is_pattern = literal != spec.on
-            if spec.on and not any(
-                literal.startswith(prefix) or (is_pattern and prefix.startswith(literal))
-                for prefix in prefixes
-            ):
-                near = get_close_matches(spec.on, prefixes, n=1)
+            if not spec.on:
+                continue
+            if objects is not None:
+                possible = any(carries(spec, name) for name in objects)
+                others = f"its objects are {', '.join(sorted(objects)) or 'none'}"
+            else:
+                possible = any(_may_begin(spec.on, prefix) for prefix in prefixes)
+                others = f"their names begin with {', '.join(prefixes)}"
+            if not possible:
+                near = get_close_matches(spec.on, known, n=1)
                 meant = f"did you mean {near[0]!r}? " if near else ""
                 raise ScenarioError(
                     f"device {spec.name!r} stands on {spec.on!r}, which no object of world "
-                    f"{self.run.name!r} can be: {meant}their names begin with {', '.join(prefixes)}",
+                    f"{self.run.name!r} can be: {meant}{others}",
                     key=Place("devices").at(spec.name).at("on").key,
                 )
 
@@ -148,7 +157,9 @@ class World(Service[W]):
 
     def step(self, frame: Frame) -> StepResult:
         """The scene at the frame's instant."""
-        return StepResult(products={"scene": self._scene(list(self.objects_at(frame.t_ns - self._t0_ns)))})
+        scene = self._scene(list(self.objects_at(frame.t_ns - self._t0_ns)))
+        counts = {f"{WITHOUT_OBJECT_PREFIX}{name}": 1 for name in self._mounts.without_object}
+        return StepResult(products={"scene": scene}, counts=counts)
 
     def _scene(self, states: list[ObjectState]) -> Scene:
         devices = self._mounts.devices([(state.name, state.dimensions) for state in states])
@@ -170,6 +181,12 @@ class World(Service[W]):
             devices=devices,
             angular_velocity=_turning(states),
         )
+
+
+def _may_begin(on: str, prefix: str) -> bool:
+    """Whether a name, or one that a pattern matches, may begin with a prefix."""
+    literal = re.split(r"[*?[]", on)[0]
+    return literal.startswith(prefix) or (literal != on and prefix.startswith(literal))
 
 
 def _turning(states: Sequence[ObjectState]) -> Float64Array | None:
@@ -211,6 +228,8 @@ class Mounts:
         self._mounted = tuple(spec for spec in specs if spec.on)
         self._arrived: list[str] = []
         self._objects: Sequence[tuple[str, Vector]] | None = None
+        self.without_object: tuple[str, ...] = ()
+        """Devices that found no object to stand on in the last frame."""
         self._devices: tuple[Device, ...] = ()
         """Of the objects of the frame before, which mostly are those of the next one."""
 
@@ -241,10 +260,13 @@ class Mounts:
         known = set(self._arrived)
         self._arrived = [name for name in self._arrived if name in dimensions]
         self._arrived += [name for name, _ in objects if name not in known]
-        found = list(self._fixed)
+        found, without = list(self._fixed), []
         for spec in self._mounted:
             carriers = [name for name in self._arrived if carries(spec, name)][: spec.count]
             found += [mounted_device(spec, name, dimensions[name]) for name in carriers]
+            if not carriers:
+                without.append(spec.name)
+        self.without_object = tuple(without)
         self._objects, self._devices = objects, tuple(sorted(found, key=lambda device: device.name))
         return self._devices
 

@@ -96,6 +96,13 @@ class FlightWorld(TrajectoryWorld):
             for index, thing in enumerate(settings.flown):
                 yield f"flown[{index}].start_m", thing.name, [thing.start_m]
 
+    @classmethod
+    def known_objects(cls, settings: TrajectorySettings) -> Mapping[str, str] | None:
+        """Scripted and flown ones."""
+        flown = settings.flown if isinstance(settings, FlightSettings) else ()
+        own = {(settings.prefix or "") + thing.name: thing.kind for thing in flown}
+        return {**(super().known_objects(settings) or {}), **own}
+
     def prefixes(self) -> tuple[str, ...]:
         """The setting, or all names, which are known."""
         return (self.settings.prefix,) if self.settings.prefix else (*self._tracks, *self._flown)
@@ -144,7 +151,8 @@ class FlightWorld(TrajectoryWorld):
         for name, flyer in self._flyers.items():
             counts.update(flyer.fly(motions.get(name), length_ns))
         self._elapsed_ns = elapsed_ns
-        return replace(super().step(frame), counts=dict(counts))
+        made = super().step(frame)
+        return replace(made, counts={**made.counts, **counts})
 
     def _place(self, motions: Mapping[str, Motion]) -> None:
         """Put the objects where they are to be at once; they hover there.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 from bisect import bisect_right
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, ClassVar, NamedTuple
@@ -73,6 +73,11 @@ class TrajectoryWorld(World[TrajectorySettings]):
         for index, thing in enumerate(settings.objects):
             key = f"objects[{index}].waypoints"
             yield key, thing.name, [waypoint.position for waypoint in read_waypoints(thing.waypoints, key)]
+
+    @classmethod
+    def known_objects(cls, settings: TrajectorySettings) -> Mapping[str, str] | None:
+        """All of them."""
+        return {(settings.prefix or "") + thing.name: thing.kind for thing in settings.objects}
 
     def prefixes(self) -> tuple[str, ...]:
         """The setting, or all names, which are known."""

@@ -16,6 +16,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Int32Array
 from caviar_protocol.files import replace_file
+from caviar_protocol.messages import WARNING
 from caviar_services.checkpoint import Packed
 
 _FORMAT: Literal["caviar-chains-1"] = "caviar-chains-1"
@@ -55,7 +56,9 @@ class ChainCache:
         except FileNotFoundError:
             return None
         except OSError as error:
-            self.notes.append(f"{path} cannot be read ({error.strerror}); its chains are launched again")
+            self.notes.append(
+                f"{WARNING}{path} cannot be read ({error.strerror}); its chains are launched again"
+            )
             return None
         try:
             file = msgspec.msgpack.decode(data, type=_ChainFile)
@@ -65,7 +68,7 @@ class ChainCache:
             intact = False
         if intact and [table.shape[1:] for table in tables] == [(width,) for width in widths]:
             return tables
-        self.notes.append(f"{path} is damaged; its chains are launched again")
+        self.notes.append(f"{WARNING}{path} is damaged; its chains are launched again")
         return None
 
     def save(self, key: str, tables: tuple[Int32Array, ...]) -> None:
@@ -77,8 +80,8 @@ class ChainCache:
             replace_file(self._folder / key, msgspec.msgpack.encode(file), durable=False)
         except OSError as error:
             self.notes.append(
-                f"chains cannot be kept in {self._folder} ({error.strerror}); the next run launches them "
-                "again, unless XDG_CACHE_HOME names a folder that can be written"
+                f"{WARNING}chains cannot be kept in {self._folder} ({error.strerror}); the next run "
+                "launches them again, unless XDG_CACHE_HOME names a folder that can be written"
             )
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from caviar_protocol.arrays import Complex128Array, Float64Array
+from caviar_protocol.messages import WARNING
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_services.channel.sionna.object_materials import Constants
 from caviar_services.channel.sionna.ray_launcher import LaunchOptions
@@ -29,6 +30,9 @@ lost beside that of a reflection. The factor of two is a margin.
 
 _VANISHED = 2.0**-150
 """Half of the smallest float32 above 0."""
+
+_ASKED_FOR = frozenset({"refraction", "diffraction", "scattering"})
+"""Options that are on only where the user asked for them."""
 
 _INCIDENCE = np.radians(np.linspace(0.0, 89.9, 900))
 """Angles [rad] between ray and normal at which slabs are looked at."""
@@ -77,7 +81,11 @@ def contributing(
             off["diffraction"] = "no two faces meet at an edge"
     off = {name: reason for name, reason in off.items() if getattr(options, name)}
     left = replace(options, **dict.fromkeys(off, False))
-    notes = tuple(f"{name} is switched off: {reason}" for name, reason in off.items())
+    # What is on by default, or is off by a setting, surprises nobody who did not ask for it.
+    asked = frozenset() if options.max_depth == 0 else _ASKED_FOR
+    notes = tuple(
+        f"{WARNING * (name in asked)}{name} is switched off: {reason}" for name, reason in off.items()
+    )
     if not (left.reflection or left.refraction or left.diffraction or left.scattering):
         left = replace(left, max_depth=0)
     return left, notes
