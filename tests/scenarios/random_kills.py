@@ -87,7 +87,7 @@ class Disturber:
     kills: list[Kill] = field(default_factory=list)
 
     def status(self) -> Mapping[str, Any]:
-        """What the broker's desk says; empty where no broker answers."""
+        """What the broker answers over its control socket; empty where none does."""
         try:
             answer = ask(self.directory, do="status")
         except (RunError, OSError, ValueError):
