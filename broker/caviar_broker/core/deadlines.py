@@ -6,9 +6,9 @@ has its budget (`Deadlines`).
 
 from __future__ import annotations
 
-from caviar_broker.core.decisions import DecisionTable, Participant, Task, milliseconds
+from caviar_broker.core.decisions import DecisionTable, Participant, Task
 from caviar_broker.core.events import Action, Latency, Notice, Overdue
-from caviar_broker.core.plan import RunPlan
+from caviar_broker.core.plan import RunPlan, milliseconds
 from caviar_broker.core.transitions import TaskEvent, TaskState
 
 # On the path of every frame: a member that is looked up in its class costs four times as much.

@@ -137,8 +137,6 @@ class Participant:
     """Place in the graph's order: producers come before the consumers of their frame."""
     outputs: tuple[str, ...]
     """Topics in demand."""
-    wanted: frozenset[str] = field(init=False)
-    """The same, as a set."""
     capacity: int = 1
     """Grants that may be outstanding (clause 7)."""
     tasks: dict[int, Task] = field(default_factory=dict)
@@ -162,9 +160,6 @@ class Participant:
     waiting: set[Participant] = field(default_factory=set)
     """Services that can be granted nothing before this one's next decision."""
 
-    def __post_init__(self) -> None:
-        self.wanted = frozenset(self.outputs)
-
     def task(self, frame: int) -> Task:
         """Its task in a frame; a new one where there is none."""
         found = self.tasks.get(frame)
@@ -186,11 +181,6 @@ def provenance_of(product: Product, status: Status, frame: int, cause: str = "")
         digest=product.digest,
         cause=cause,
     )
-
-
-def milliseconds(ns: int) -> str:
-    """A duration as notices have it."""
-    return f"{ns / 1e6:.1f} ms"
 
 
 class DecisionTable:
@@ -253,25 +243,13 @@ class DecisionTable:
         tasks: Mapping[str, Mapping[int, Task]],
         newest: Mapping[tuple[str, str], tuple[Product, int]],
     ) -> None:
-        """Go on behind the last finished frame of an episode; the table must be new.
-
-        Args:
-            finished: How many frames are finished.
-            frames: Of the episode.
-            tasks: Decided tasks by service and frame.
-            newest: Newest product and its journal entry by (service, topic).
-        """
+        """Go on behind the last finished frame, with what `Resumption` has; the table must be new."""
         assert not self.finished_frames, "only a new table can go on"
         self.finished_frames, self.frames = finished, frames
         for name, participant in self.participants.items():
             participant.next_frame = finished
             participant.tasks = dict(tasks.get(name, {}))
         self._newest = {key: known for key, known in newest.items() if key[0] in self._holding}
-
-    def forget_before(self, frame: int) -> None:
-        """Drop the tasks of earlier frames."""
-        for participant in self.participants.values():
-            participant.tasks = {n: task for n, task in participant.tasks.items() if n >= frame}
 
     def release(self, task: Task) -> None:
         """Forget a task that was answered when its frame had been over already."""
@@ -338,36 +316,34 @@ class DecisionTable:
 
     # --- deciding ----------------------------------------------------------------------------------
 
-    def decide_fresh(self, task: Task, products: Mapping[str, Product], now: int) -> None:
-        """Decide a task that was answered in time; a declared product that is missing is absent."""
-        decisions = {}
-        for topic in self._due_topics(task):
-            product = products.get(topic)
-            if product is not None:
-                decisions[topic] = Decision(provenance_of(product, _FRESH, task.frame), product)
-            else:
-                decisions[topic] = _absent(task, topic, _not_produced(task, topic))
-        self._decide(task, decisions, "done", now)
-        if task.service in self._holding:
-            self._renew(products.values(), task.journal)
-
-    def decide_as_recorded(
-        self, task: Task, entries: Iterable[GrantInput], products: Mapping[str, Product], now: int
+    def decide_answered(
+        self, task: Task, products: Mapping[str, Product], now: int, recorded: Iterable[GrantInput] = ()
     ) -> None:
-        """Decide a task of a replayed service: held or absent as it was, with the recorded cause."""
-        recorded, decisions = {entry.topic: entry for entry in entries}, {}
+        """Decide a task that was answered in time; a declared product that is missing is absent.
+
+        Args:
+            task: The task.
+            products: By topic.
+            now: The time [ns].
+            recorded: Of a replayed service: what became of its products then. They are held or absent again
+                where they were, with the recorded cause.
+        """
+        entries, decisions = {entry.topic: entry for entry in recorded}, {}
         for topic in self._due_topics(task):
-            entry, product = recorded.get(topic), products.get(topic)
-            status = entry.status if entry is not None else _FRESH
-            cause = entry.cause if entry is not None else ""
+            product, entry = products.get(topic), entries.get(topic)
+            status, cause = (_FRESH, "") if entry is None else (entry.status, entry.cause)
             if product is None or status is _ABSENT:
-                decisions[topic] = _absent(task, topic, cause or _not_produced(task, topic))
+                cause = cause or f"{task.service} produced no {topic} in frame {task.frame}"
+                decisions[topic] = _absent(task, topic, cause)
             elif entry is not None and status is Status.HELD:
                 product = replace(product, frame=entry.frame, t_ns=entry.t_ns)
                 decisions[topic] = Decision(provenance_of(product, status, task.frame, cause), product)
             else:
                 decisions[topic] = Decision(provenance_of(product, _FRESH, task.frame), product)
         self._decide(task, decisions, "done", now)
+        # A replayed service holds what it held, whatever came last.
+        if task.service in self._holding and not entries:
+            self._renew(products.values(), task.journal)
 
     def decide_without_answer(self, task: Task, cause: str, outcome: str, now: int) -> None:
         """Decide for a service (clause 9): under hold its newest earlier product, where there is one."""
@@ -501,10 +477,6 @@ class DecisionTable:
 def is_decided(edge: Edge, source: Participant, frame: int) -> bool:
     """Whether it is known what a consumer gets over an edge in a frame."""
     return frame - edge.lag < source.next_frame or frame < edge.lag
-
-
-def _not_produced(task: Task, topic: str) -> str:
-    return f"{task.service} produced no {topic} in frame {task.frame}"
 
 
 def _absent(task: Task, topic: str, cause: str) -> Decision:

@@ -19,12 +19,11 @@ from caviar_broker.core.decisions import (
     Task,
     TaskInputs,
     is_decided,
-    milliseconds,
     provenance_of,
 )
 from caviar_broker.core.events import Action, Notice, Product
 from caviar_broker.core.graph import Graph
-from caviar_broker.core.plan import RunPlan
+from caviar_broker.core.plan import RunPlan, milliseconds
 from caviar_broker.core.run import Resumption
 from caviar_broker.core.transitions import OUTSTANDING, TaskEvent, TaskState
 from caviar_protocol.digest import RunDigest
@@ -100,7 +99,9 @@ class Dispatcher:
     def resume(self, before: Resumption, completed: Mapping[str, int]) -> None:
         """Go on behind the last finished frame; ``completed`` says how far services got that have state."""
         self.table.resume(before.finished, before.frames, before.tasks, before.newest)
-        self.table.forget_before(before.finished - 1)
+        for participant in self._participants.values():  # lag 1 needs the last frame, nothing an earlier one
+            tasks = participant.tasks
+            participant.tasks = {n: task for n, task in tasks.items() if n >= before.finished - 1}
         for name, frame in completed.items():
             self._participants[name].completed = frame
 
@@ -126,8 +127,7 @@ class Dispatcher:
         """
         participant = self._participants[service]
         task = self._answered(participant, now)
-        if products.keys() != participant.wanted:
-            products = {topic: product for topic, product in products.items() if topic in participant.wanted}
+        products = {topic: product for topic, product in products.items() if topic in participant.outputs}
         state = task.state
         task.move(_ANSWER)
         if state is _ABANDONED:
@@ -140,11 +140,8 @@ class Dispatcher:
             self._record_late(task, products, now)
         else:
             task.report = report
-            recorded = self.plan.recorded.get((service, self.episode, task.frame))
-            if recorded is None:
-                self.table.decide_fresh(task, products, now)
-            else:
-                self.table.decide_as_recorded(task, recorded, products, now)
+            recorded = self.plan.recorded.get((service, self.episode, task.frame), ())
+            self.table.decide_answered(task, products, now, recorded)
         if task.frame >= self.table.frames and products:
             self._notice("discarded", task, f"answered its final grant with {', '.join(sorted(products))}")
         if end and participant in self._agents:

@@ -21,6 +21,16 @@ SECOND = 1_000_000_000
 """[ns]"""
 
 
+def milliseconds(ns: int) -> str:
+    """A duration as notices about frames have it."""
+    return f"{ns / 1e6:.1f} ms"
+
+
+def duration(ns: int) -> str:
+    """A duration as blames have it: in seconds, or below one in milliseconds."""
+    return f"{ns / 1e9:.3g} s" if ns >= SECOND else f"{ns / 1e6:.3g} ms"
+
+
 @dataclass(frozen=True)
 class Feature:
     """Something in the scenario that services of earlier protocol versions do not know."""

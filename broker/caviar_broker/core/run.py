@@ -10,7 +10,7 @@ from caviar_broker.core.deadlines import PauseGate
 from caviar_broker.core.decisions import Ledger, Task
 from caviar_broker.core.events import Action, Finished, Journal, Notice, Product, Send
 from caviar_broker.core.graph import Graph
-from caviar_broker.core.plan import Limits, RunPlan, ServicePlan
+from caviar_broker.core.plan import Limits, RunPlan, ServicePlan, duration
 from caviar_broker.core.transitions import (
     PRESENT,
     RUN,
@@ -122,22 +122,18 @@ class Peer:
         if self.heard_at is None:
             return "no heartbeat ever came"
         phase = f"phase {self.phase!r}" if self.phase else "no phase told"
-        return f"last heartbeat {_seconds(now - self.heard_at)} ago: {phase}, progress {self.progress}"
+        return f"last heartbeat {duration(now - self.heard_at)} ago: {phase}, progress {self.progress}"
 
     def blame_task(self, task: Task, problem: str, now: int, waiting: str = "") -> str:
         """Clause 14: service, frame, who lacks what, elapsed and budget, last heartbeat, phase, progress."""
         return (
-            f"{self} {problem} in frame {task.frame}: {_seconds(now - task.started_at)} since its grant, "
-            f"budget {_seconds(self.plan.budget_ns)}; {self.last_words(now)}"
+            f"{self} {problem} in frame {task.frame}: {duration(now - task.started_at)} since its grant, "
+            f"budget {duration(self.plan.budget_ns)}; {self.last_words(now)}"
         ) + (f"; {waiting}" if waiting else "")
 
     def blame(self, problem: str, now: int) -> str:
         """The same outside a frame."""
-        return f"{self} {problem} for {_seconds(now - self.since)}; {self.last_words(now)}"
-
-
-def _seconds(ns: int) -> str:
-    return f"{ns / 1e9:.3g} s" if ns >= 1_000_000_000 else f"{ns / 1e6:.3g} ms"
+        return f"{self} {problem} for {duration(now - self.since)}; {self.last_words(now)}"
 
 
 @dataclass(frozen=True, kw_only=True)

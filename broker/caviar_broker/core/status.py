@@ -6,6 +6,7 @@ import msgspec
 
 from caviar_broker.core.decisions import Task
 from caviar_broker.core.episodes import Episodes
+from caviar_broker.core.plan import duration
 from caviar_broker.core.run import Peer, Run
 from caviar_broker.core.transitions import RunState, ServiceState, TaskState
 
@@ -145,7 +146,7 @@ def _wait(run: Run, episodes: Episodes, peer: Peer, now: int) -> Wait | None:
         if not peer.present:
             return None
         limit = run.plan.limits.shutdown
-        text = f"{peer} has not said BYE for {_told(now - run.since)}; {peer.last_words(now)}"
+        text = f"{peer} has not said BYE for {duration(now - run.since)}; {peer.last_words(now)}"
         return _of(peer, -1, now - run.since, limit, "", text, now)
     owed = [task for task in _owed(peer, episodes) if task.state is not TaskState.ABANDONED]
     dispatcher = episodes.dispatcher
@@ -158,8 +159,8 @@ def _wait(run: Run, episodes: Episodes, peer: Peer, now: int) -> Wait | None:
             ServiceState.RESETTING: limits.reset,
             ServiceState.LOST: peer.rejoin(limits),
         }[peer.state]
-        text = f"{peer} {_UNDER_WAY[peer.state]}, for {_told(now - peer.since)} now, "
-        text += f"at most {_told(limit)}; {peer.last_words(now)}"
+        text = f"{peer} {_UNDER_WAY[peer.state]}, for {duration(now - peer.since)} now, "
+        text += f"at most {duration(limit)}; {peer.last_words(now)}"
         text += f"; {peer.verdict}" if peer.state is ServiceState.LOST else ""
         text += f"; {lacking}" if lacking and owed else ""
         return _of(peer, owed[0].frame if owed else -1, now - peer.since, limit, lacking, text, now)
@@ -201,7 +202,3 @@ def _age(peer: Peer, now: int) -> float | None:
 
 def _s(ns: int) -> float:
     return round(ns / 1e9, 6)
-
-
-def _told(ns: int) -> str:
-    return f"{ns / 1e9:.3g} s" if ns >= 1_000_000_000 else f"{ns / 1e6:.3g} ms"
