@@ -261,6 +261,11 @@ class SionnaScene(NumberedTriangles):
             for i, cls in enumerate(scene.classes)
             if cls not in without_body and not self._foliage.of(scene.names[i], cls)
         ]
+        return self.place_bodies(scene, {i: self._kind(scene, i) for i in solid})
+
+    def place_bodies(self, scene: Scene, kinds: Mapping[int, str]) -> tuple[tuple[str, ...], Float64Array]:
+        """The same for the objects of these indices, each with a body of a kind (`body_kind`)."""
+        solid = list(kinds)
         index = {scene.names[i]: i for i in solid}
         clash = self._scenery & index.keys()
         if clash:
@@ -268,8 +273,7 @@ class SionnaScene(NumberedTriangles):
         if not self.has_scenery and solid:
             self._count_from_objects(scene.position[solid])
         # A new assignment each frame: the product follows from this frame alone, also after a restart.
-        kinds = ((scene.names[i], self._kind(scene, i)) for i in solid)
-        taken = BodyPool(self._pool).assign(kinds)
+        taken = BodyPool(self._pool).assign((scene.names[i], kind) for i, kind in kinds.items())
         standing = {body: index[name] for name, body in taken.items()}
         names, velocity = list(self.names), np.zeros((len(self.names), 3))
         turning = None

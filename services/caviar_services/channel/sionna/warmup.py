@@ -72,18 +72,20 @@ def _enumerate(scene: SionnaScene, tracer: EnumeratedTracer, depth: int) -> None
     """Enumerate paths among two bodies of each mesh, with a chain of scenery of each length."""
     middle = (scene.low + scene.high) / 2
     above = np.array([middle[0], middle[1], scene.high[2] + 10.0])
-    assets = [asset for asset in scene.unit_meshes for _ in scene.bodies_of(asset)[:2]]
-    if not assets:
+    # Kinds are given, and not by names and classes, which the user's patterns may match.
+    kinds = dict(enumerate(kind for kind in scene.unit_meshes for _ in scene.bodies_of(kind)[:2]))
+    count = len(kinds)
+    if not count:
         return
-    place = above + np.arange(len(assets))[:, None] * np.array([2.0, 7.0, 0.5])
+    place = above + np.arange(count)[:, None] * np.array([2.0, 7.0, 0.5])
     objects = Scene(
-        names=tuple(f"caviar-warming-{number:04d}" for number in range(len(assets))),
-        classes=("",) * len(assets),
-        assets=tuple(assets),
+        names=tuple(f"caviar-warming-{number:04d}" for number in kinds),
+        classes=("",) * count,
+        assets=("",) * count,
         position=place,
-        orientation=np.tile([1.0, 0.0, 0.0, 0.0], (len(assets), 1)),
-        velocity=np.zeros((len(assets), 3)),
-        dimensions=np.tile([4.0, 2.0, 1.5], (len(assets), 1)),
+        orientation=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+        velocity=np.zeros((count, 3)),
+        dimensions=np.tile([4.0, 2.0, 1.5], (count, 1)),
     )
     chains = np.full((depth + 1, depth), -1, np.int32)
     for length in range(depth + 1):
@@ -92,20 +94,6 @@ def _enumerate(scene: SionnaScene, tracer: EnumeratedTracer, depth: int) -> None
     some = np.arange(depth)
     sights = np.stack(np.meshgrid(some, some), axis=-1).reshape(-1, 2).astype(np.int32)
     scenery = KnownScenery(chains[1:], sights)
-    for parked in (0, len(assets) // 2, len(assets)):
-        scene.place(_without(objects, parked), frozenset())
+    for parked in (0, count // 2, count):
+        scene.place_bodies(objects, {number: kind for number, kind in kinds.items() if number >= parked})
         tracer.trace(above + np.array([0.0, 3.0, 4.0]), place + np.array([0.3, 0.2, 1.0]), scenery)
-
-
-def _without(scene: Scene, count: int) -> Scene:
-    """A scene without its first objects."""
-    rest = slice(count, None)
-    return Scene(
-        names=scene.names[rest],
-        classes=scene.classes[rest],
-        assets=scene.assets[rest],
-        position=scene.position[rest],
-        orientation=scene.orientation[rest],
-        velocity=scene.velocity[rest],
-        dimensions=scene.dimensions[rest],
-    )
