@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -26,7 +27,7 @@ from channel_lab import (
     write_scenery,
 )
 
-from caviar_protocol.errors import ScenarioError
+from caviar_protocol.errors import AssetError, ScenarioError
 from caviar_protocol.topics import Channel, Interaction, Scene
 from caviar_services.channel.sionna.object_materials import OTHER_MATERIALS, ObjectMaterials, body_kind
 
@@ -171,6 +172,39 @@ def test_what_is_wrong_with_a_material_names_its_key(settings: dict[str, Any], k
     with pytest.raises(ScenarioError, match=says) as refused:
         sionna(60e9, **settings)
     assert refused.value.key == f"services.channel.settings.{key}"
+
+
+@pytest.mark.parametrize("key", ["*", "c*", ""])
+@pytest.mark.parametrize("setting", ["object_materials", "foliage"])
+def test_a_pattern_of_everything_ends_no_enumerated_run(setting: str, key: str) -> None:
+    """Kernels are compiled with objects of no name that the user's patterns could match."""
+    value: dict[str, Any] = {
+        "object_materials": "glass",
+        "foliage": {"attenuation_db_per_m": {"c0": 1.0}, "source": "a test"},
+    }
+    sionna(F, **{setting: {key: value[setting]}}, candidates="enumerated", samples=1000, max_depth=1)
+
+
+@pytest.mark.parametrize(
+    ("broken", "says"),
+    [
+        ("3 0 1 7", "faces refer to vertices 0 to 7 of 4"),
+        ("3 0 1 -2", "faces refer to vertices -2 to 3 of 4"),
+    ],
+)
+def test_a_face_without_its_vertices_is_named_by_line_and_mesh(
+    tmp_path: Path, broken: str, says: str
+) -> None:
+    """The ray tracer reads beyond its memory there."""
+    assets = write_scenery(tmp_path, [WALL])
+    mesh = assets["scenery/meshes/wall.ply"]
+    mesh.write_text(mesh.read_text().replace("3 0 1 2", broken))
+    with pytest.raises(
+        AssetError, match=rf"scenery/scene\.xml:\d+: shape 'mesh-wall': mesh wall\.ply: .*{says}"
+    ):
+        sionna(F, assets, samples=1000, max_depth=1)
+    with pytest.raises(AssetError, match=rf"mesh 'objects/wall\.ply': .*{says}"):
+        sionna(F, {"objects/wall.ply": mesh}, samples=1000, max_depth=1)
 
 
 def test_keys_that_are_for_nothing_in_a_frame_are_counted_and_those_of_objects_with_a_mesh_are_not() -> None:

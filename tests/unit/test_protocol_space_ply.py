@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from caviar_protocol.errors import AssetError
-from caviar_protocol.space.ply import read_ply_vertices
+from caviar_protocol.space.ply import read_ply, read_ply_vertices
 
 VERTICES = [(10_000.123456789, -2.5, 1e-3), (1 / 3, 7.0, -8.25), (0.0, 1e6 + 1 / 7, 4.0)]
 
@@ -70,3 +70,25 @@ def test_what_is_no_mesh_is_named(tmp_path: Path, data: bytes) -> None:
     file.write_bytes(data)
     with pytest.raises(AssetError, match=r"bad\.ply: not a PLY file"):
         read_ply_vertices(file)
+
+
+@pytest.mark.parametrize("faces", [[(3, 0, 1, 2)], [(3, 2, 1, 0), (4, 0, 1, 2, 1)]], ids=["triangle", "quad"])
+@pytest.mark.parametrize("form", ["ascii", "binary_big_endian"])
+def test_faces_may_have_numbers_beside_their_corners(
+    tmp_path: Path, form: str, faces: list[tuple[int, ...]]
+) -> None:
+    """Colours and flags, as modelling tools write them."""
+    head = header(form, "double").replace("face 1", f"face {len(faces)}\nproperty ushort flag")
+    head = head.replace("end_header", "property uchar red\nend_header")
+    if form == "ascii":
+        rows = "".join(f"{z!r} 200 {x!r} {y!r}\n" for x, y, z in VERTICES)
+        data = (head + rows + "".join(f"7 {' '.join(map(str, face))} 255\n" for face in faces)).encode()
+    else:
+        data = head.encode() + b"".join(struct.pack(">dBdd", z, 200, x, y) for x, y, z in VERTICES)
+        data += b"".join(struct.pack(f">HB{len(f) - 1}iB", 7, *f, 255) for f in faces)
+    file = tmp_path / "a.ply"
+    file.write_bytes(data)
+    vertices, triangles = read_ply(file)
+    assert np.array_equal(vertices, VERTICES)
+    corners = [face[1:] for face in faces]
+    assert triangles.tolist() == [[c[0], c[i], c[i + 1]] for c in corners for i in range(1, len(c) - 1)]

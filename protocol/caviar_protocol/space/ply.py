@@ -5,6 +5,7 @@ Text and binary files of either byte order are read, with any elements beside ve
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,11 +24,12 @@ _TYPES = {
 _BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
-def read_ply(file: Path) -> tuple[Float64Array, Int64Array]:
+def read_ply(file: Path, called: str = "") -> tuple[Float64Array, Int64Array]:
     """Read the vertices and triangles of a PLY mesh.
 
     Args:
         file: A PLY file with elements ``vertex`` and ``face``; polygons are cut into triangles.
+        called: What errors call the file, where its path would mean nothing to the user: a copy.
 
     Returns:
         Vertices [m], Shape ``[V, 3]``, and indices of the corners of each triangle, Shape ``[F, 3]``.
@@ -36,7 +38,7 @@ def read_ply(file: Path) -> tuple[Float64Array, Int64Array]:
         AssetError: The file cannot be read, is no mesh, breaks off, has a vertex that is not finite, or a
             face that refers to a vertex that is not there.
     """
-    elements = _read(file, "face")
+    elements = _read(file, "face", called or str(file))
     return elements["vertex"], elements["face"]
 
 
@@ -53,36 +55,43 @@ def read_ply_vertices(file: Path) -> Float64Array:
     Raises:
         AssetError: The file cannot be read, is no mesh, breaks off, or has a vertex that is not finite.
     """
-    vertices: Float64Array = _read(file, "vertex")["vertex"]
+    vertices: Float64Array = _read(file, "vertex", str(file))["vertex"]
     return vertices
 
 
-def _read(file: Path, last: str) -> dict[str, NDArray[Any]]:
+def _read(file: Path, last: str, called: str) -> dict[str, NDArray[Any]]:
     """Elements of a file up to ``last``, by name: vertices as coordinates, elements of lists as triangles."""
     try:
         found = _parse(file.read_bytes(), last)
     except OSError as error:
-        raise AssetError(f"{file} cannot be read: {error.strerror}") from error
+        raise AssetError(f"{called} cannot be read: {error.strerror}") from error
     except (ValueError, KeyError, IndexError) as error:
-        raise AssetError(f"{file}: not a PLY file that can be read ({error!r}); export it again") from error
+        raise AssetError(f"{called}: not a PLY file that can be read ({error!r}); export it again") from error
     vertices = found["vertex"]
     bad = np.flatnonzero(~np.isfinite(vertices).all(1))
     if len(bad):
         where = vertices[bad[0]].tolist()
-        raise AssetError(f"{file}: vertex {bad[0]} is at {where}; give every vertex finite coordinates")
+        raise AssetError(f"{called}: vertex {bad[0]} is at {where}; give every vertex finite coordinates")
     return found
 
 
 @dataclass
 class _Element:
-    """An element of the header: so many rows, each of numbers or of lists."""
+    """An element of the header: so many rows of numbers, lists, or both."""
 
     name: str
     count: int
-    numbers: list[tuple[str, str]] = field(default_factory=list)
-    """(name, type) of each property that is one number."""
-    lists: list[tuple[str, str]] = field(default_factory=list)
-    """(type of the length, type of the items) of each property that is a list."""
+    properties: list[tuple[str, str, str]] = field(default_factory=list)
+    """Name, type of the length (empty: a number, no list), type of the items."""
+
+    @property
+    def has_lists(self) -> bool:
+        return any(length for _, length, _ in self.properties)
+
+    @property
+    def numbers(self) -> list[tuple[str, str]]:
+        """Name and type of each property that is one number."""
+        return [(name, kind) for name, length, kind in self.properties if not length]
 
     @property
     def axes(self) -> list[str]:
@@ -94,9 +103,7 @@ def _parse(data: bytes, last: str) -> dict[str, NDArray[Any]]:
     body = _Binary(data, begin, order) if order else _Text(data[begin:])
     found: dict[str, NDArray[Any]] = {}
     for element in elements:
-        if element.numbers and element.lists:
-            raise ValueError(f"element {element.name} mixes lists and numbers")
-        found[element.name] = body.triangles(element) if element.lists else body.columns(element)
+        found[element.name] = body.triangles(element) if element.has_lists else body.columns(element)
         if element.name == last:
             break
     if missing := {"vertex", last} - set(found):
@@ -117,10 +124,10 @@ def _header(data: bytes) -> tuple[str, list[_Element], int]:
                 order = _BYTE_ORDERS[name]
             case ["element", name, count]:
                 elements.append(_Element(name, int(count)))
-            case ["property", "list", length, item, _]:
-                elements[-1].lists.append((_TYPES[length], _TYPES[item]))
+            case ["property", "list", length, item, name]:
+                elements[-1].properties.append((name, _TYPES[length], _TYPES[item]))
             case ["property", kind, name]:
-                elements[-1].numbers.append((name, _TYPES[kind]))
+                elements[-1].properties.append((name, "", _TYPES[kind]))
     if order is None:
         raise ValueError(f"no format; the file begins with {data[:8]!r}")
     return order, elements, data.index(b"\n", end) + 1
@@ -142,10 +149,10 @@ class _Text:
         return table[:, [names.index(axis) for axis in element.axes]]
 
     def triangles(self, element: _Element) -> Int64Array:
-        polygons = []
+        polygons, first = [], _first_list(element)
         for _ in range(element.count):
-            row = [self._take(int(self._take(1)[0])) for _ in element.lists]
-            polygons.append([int(word) for word in row[0]])
+            row = [self._take(int(self._take(1)[0]) if length else 1) for _, length, _ in element.properties]
+            polygons.append([int(word) for word in row[first]])
         return _fans(polygons)
 
     def _take(self, count: int) -> list[bytes]:
@@ -170,20 +177,25 @@ class _Binary:
         return np.stack([table[axis].astype(np.float64) for axis in element.axes], axis=-1)
 
     def triangles(self, element: _Element) -> Int64Array:
-        kinds = [tuple(np.dtype(self._order + kind) for kind in kinds) for kinds in element.lists]
-        length, item = kinds[0]
-        triangle: Any = np.dtype([("length", length), ("corners", item, 3)])
+        properties = [
+            (name, np.dtype(self._order + length) if length else None, np.dtype(self._order + item))
+            for name, length, item in element.properties
+        ]
+        triangle = _triangle_row(properties)
         # Most meshes have triangles only: one look at all of them instead of a step for each.
-        if len(kinds) == 1 and len(self._data) >= self._at + element.count * triangle.itemsize:
+        if triangle and len(self._data) >= self._at + element.count * triangle.itemsize:
             table = np.frombuffer(self._data, triangle, element.count, self._at)
             if (table["length"] == 3).all():
                 self._at += table.nbytes
                 corners: Int64Array = table["corners"].astype(np.int64)
                 return corners
-        polygons = []
+        polygons, first = [], _first_list(element)
         for _ in range(element.count):
-            row = [self._take(item, int(self._take(length, 1)[0])).tolist() for length, item in kinds]
-            polygons.append(row[0])
+            row = [
+                self._take(item, 1 if length is None else int(self._take(length, 1)[0]))
+                for _, length, item in properties
+            ]
+            polygons.append(row[first].tolist())
         return _fans(polygons)
 
     def _take(self, kind: np.dtype[Any], count: int) -> NDArray[Any]:
@@ -194,6 +206,23 @@ class _Binary:
         )
         self._at += values.nbytes
         return values
+
+
+def _first_list(element: _Element) -> int:
+    """Which property of an element is its first list: the corners of faces."""
+    return next(i for i, (_, length, _) in enumerate(element.properties) if length)
+
+
+def _triangle_row(
+    properties: Sequence[tuple[str, np.dtype[Any] | None, np.dtype[Any]]],
+) -> np.dtype[Any] | None:
+    """A row with one list, if that has three items; None where there are several lists."""
+    if sum(length is not None for _, length, _ in properties) != 1:
+        return None
+    row: list[Any] = []
+    for name, length, item in properties:
+        row += [(f"number {name}", item)] if length is None else [("length", length), ("corners", item, 3)]
+    return np.dtype(row)
 
 
 def _fans(polygons: list[list[int]]) -> Int64Array:

@@ -11,7 +11,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import AssetError
-from caviar_protocol.space.ply import read_ply_vertices
+from caviar_protocol.space.ply import read_ply
 from caviar_services.mesh.scenery import SceneryShape, asset_name, read_scenery
 from caviar_services.mesh.shapes import Mesh, unit_box
 from caviar_services.ray_tracing import aligned_columns
@@ -39,7 +39,9 @@ def file_vertices(description: Path) -> dict[str, Float64Array]:
     for shape in read_scenery(description, asset_name(description)).shapes:
         _check_material(shape)
         turned, moved = shape.to_world[:3, :3], shape.to_world[:3, 3]
-        vertices[shape.name] = read_ply_vertices(shape.file) @ turned.T + moved
+        # Faces are read to be checked: of one that names a vertex that is not there the ray tracer dies.
+        found, _ = read_ply(shape.file, f"{shape.place}: mesh {shape.file.name}")
+        vertices[shape.name] = found @ turned.T + moved
     return vertices
 
 
@@ -80,11 +82,12 @@ def unit_mesh(asset: str, assets: Mapping[str, Path]) -> Mesh:
     if path is None:
         known = ", ".join(sorted(name for name in assets if name.startswith("objects/"))) or "none"
         raise AssetError(f"there is no mesh {asset!r} among the assets; object meshes: {known}")
+    vertices, _ = read_ply(path, f"mesh {asset!r}")
     try:
         loaded = _mesh_of(mi.load_dict({"type": "ply", "filename": str(path), "face_normals": True}))
     except RuntimeError as error:
         raise AssetError(f"mesh {asset!r} ({path}) cannot be read: {error}") from error
-    return _as_in_file(loaded, read_ply_vertices(path))
+    return _as_in_file(loaded, vertices)
 
 
 def _mesh_of(shape: Any) -> Mesh:
