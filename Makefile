@@ -16,7 +16,7 @@ endif
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all lint doctor clean another-python
+.PHONY: help setup demo test test-all lint docs doctor clean another-python
 
 help: ## List these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -42,10 +42,14 @@ lint: setup ## Style, types and the imports that the architecture allows
 test: lint ## Everything that CI checks; TESTS=tests/unit runs a part, in WORKERS processes
 	@$(BIN)/pytest --numprocesses=$(WORKERS) --dist=loadfile --durations=10 $(TESTS)
 
-test-all: lint ## The same and the long forms: a million fuzzed inputs, the whole fault matrix, containers
+test-all: lint ## The same and the long forms: the documentation, a million fuzzed inputs, the whole fault matrix, containers
 	@if docker info >/dev/null 2>&1 && command -v docker-compose >/dev/null; then \
 	  (cd deploy && docker-compose build --quiet) || echo "the images of deploy/ were not built"; fi
 	@$(BIN)/pytest --all --numprocesses=$(WORKERS) --dist=loadfile --durations=20 $(TESTS)
+
+docs: setup ## Render the documentation; build/docs/index.html opens without a server
+	@$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going --jobs=auto -c docs . build/docs
+	@echo "build/docs/index.html"
 
 doctor: setup ## What this machine has, and what mends what it lacks
 	@$(BIN)/caviar doctor

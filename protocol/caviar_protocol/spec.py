@@ -100,6 +100,8 @@ def type_text(hint: Any) -> str:
         return f"map, {type_text(arguments[0])} to {type_text(arguments[1])}"
     if hint is Any:
         return "plain value"
+    if not isinstance(hint, type) or origin is not None:
+        return re.sub(r"\b[a-z_]+\.(?=\w)", "", str(hint))
     if issubclass(hint, Enum):
         return ", ".join(f"`{member.value}`" for member in hint)
     if issubclass(hint, msgspec.Struct):
@@ -289,7 +291,7 @@ def _attribute_docs(cls: type) -> dict[str, str]:
     found: dict[str, str] = {}
     # A class may say more about a field than its base; the last one wins.
     for base in reversed(cls.__mro__):
-        if base.__module__.startswith("caviar_protocol"):
+        if base.__module__.startswith("caviar_"):
             node = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0]
             if isinstance(node, ast.ClassDef):
                 found |= _docs_in(node.body)

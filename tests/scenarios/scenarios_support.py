@@ -52,6 +52,17 @@ def caviar(*arguments: str | Path, timeout: float = 60.0, **extra: str) -> Finis
     return Finished(done.returncode, done.stdout + done.stderr, Path(), marked(mark))
 
 
+def run_as_printed(command: Sequence[str | Path], folder: Path) -> str:
+    """Run a command of a page in a folder, with the environment activated; return what it printed."""
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    done = subprocess.run(
+        command, cwd=folder, env=os.environ | {"PATH": path, "COLUMNS": "200"},
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=240,
+    )  # fmt: skip
+    assert done.returncode == 0, f"{command}\n{done.stdout}"
+    return done.stdout
+
+
 def run(scenario: Path, out: Path, *arguments: str | Path, timeout: float = 60.0, **extra: str) -> Finished:
     """``caviar run`` into an empty folder; the run's own directory is found there."""
     finished = caviar("run", scenario, "--out", out, *arguments, timeout=timeout, **extra)

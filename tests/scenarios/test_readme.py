@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from scenarios_support import ROOT
+from scenarios_support import ROOT, run_as_printed
 
 from caviar_protocol.recording import Recording, newest_run
 
@@ -19,16 +18,6 @@ README = (ROOT / "README.md").read_text()
 def blocks(language: str) -> list[str]:
     """Blocks of a language, in their order."""
     return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
-
-
-def run(command: list[str | Path], folder: Path) -> str:
-    """Run a command in a folder as with an activated environment; what it printed."""
-    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-    done = subprocess.run(
-        command, cwd=folder, env=os.environ | {"PATH": path}, capture_output=True, text=True, timeout=240
-    )
-    assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
-    return done.stdout
 
 
 def script(text: str, folder: Path) -> list[str | Path]:
@@ -43,11 +32,11 @@ def test_the_first_half_is_followed_from_top_to_bottom_in_an_empty_folder(tmp_pa
     shell = blocks("sh")
     assert len(shell) == 2
     for block in shell:
-        run(["bash", "-e", "-c", block], tmp_path)
+        run_as_printed(["bash", "-e", "-c", block], tmp_path)
     assert (tmp_path / "crossing.toml").is_file()
     assert len(list(tmp_path.glob("runs/crossing-*/summary.json"))) == 1
     _, read, _ = blocks("python")
-    printed = run(script(read, tmp_path), tmp_path)
+    printed = run_as_printed(script(read, tmp_path), tmp_path)
     assert "(100, 2, 4, 32)" in printed
     assert re.search(r"\|y\| of the agent: (100\.0|99\.\d)%", printed), printed
 
@@ -55,14 +44,14 @@ def test_the_first_half_is_followed_from_top_to_bottom_in_an_empty_folder(tmp_pa
 def test_a_class_beside_the_scenario_takes_part(tmp_path: Path) -> None:
     agent, _, _ = blocks("python")
     (tmp_path / "my_agent.py").write_text(agent)
-    run(["caviar", "new", "crossing"], tmp_path)
+    run_as_printed(["caviar", "new", "crossing"], tmp_path)
     file = tmp_path / "crossing.toml"
     use = re.search(r"`(use = \"my_agent:\w+\")`", README)
     assert use is not None
     text = file.read_text()
     assert text.count('use = "los-beam"') == 1
     file.write_text(text.replace('use = "los-beam"', use[1]))
-    run(["caviar", "run", "crossing.toml", "--frames", "9", "--embedded"], tmp_path)
+    run_as_printed(["caviar", "run", "crossing.toml", "--frames", "9", "--embedded"], tmp_path)
     link = Recording(newest_run(tmp_path / "runs"))["link"]
     assert link.tx_beam.tolist() == [[frame, frame] for frame in range(9)]
 
@@ -70,7 +59,7 @@ def test_a_class_beside_the_scenario_takes_part(tmp_path: Path) -> None:
 def test_a_mistake_is_told_as_the_readme_shows(tmp_path: Path) -> None:
     shown = re.search(r"^caviar: (crossing\.toml:\d+: .*)$", README, re.MULTILINE)
     assert shown is not None
-    run(["caviar", "new", "crossing"], tmp_path)
+    run_as_printed(["caviar", "new", "crossing"], tmp_path)
     file = tmp_path / "crossing.toml"
     file.write_text(file.read_text().replace("normalization", "normalisation"))
     refused = subprocess.run(
@@ -86,7 +75,8 @@ def test_the_learning_script_trains_and_compares(steps: int, tmp_path: Path) -> 
     pytest.importorskip("stable_baselines3", reason="needs the extra `learning`")
     _, _, train = blocks("python")
     assert "agent.learn(2000)" in train
-    out = run(script(train.replace("agent.learn(2000)", f"agent.learn({steps})"), tmp_path), tmp_path)
+    shorter = train.replace("agent.learn(2000)", f"agent.learn({steps})")
+    out = run_as_printed(script(shorter, tmp_path), tmp_path)
     printed = re.search(r"DQN ([\d.]+), los-beam ([\d.]+), oracle ([\d.]+)", out)
     assert printed is not None, out
     dqn, straight, best = map(float, printed.groups())

@@ -27,6 +27,10 @@ PACKAGES = ("caviar_protocol", "caviar_broker", "caviar_services", "caviar_clien
 ROOT = Path(__file__).parents[2]
 RUN = "runs/smoke-20261122-101500"
 ELSEWHERE = {
+    **dict.fromkeys(
+        (str(page.relative_to(ROOT)) for page in ROOT.glob("docs/tutorials/*.md")),
+        "tests/scenarios/test_tutorials.py",
+    ),
     "README.md": "tests/scenarios/test_readme.py",
     "protocol/SPEC.md": "tests/unit/test_protocol_spec.py",
 }

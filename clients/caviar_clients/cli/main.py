@@ -124,6 +124,23 @@ def new(
 
 
 @app.command(rich_help_panel=RUN)
+def schema(
+    out: Annotated[Path | None, typer.Option(help="write the schema to this file")] = None,
+) -> None:
+    """Print the JSON Schema of scenario files, with which an editor completes and checks them."""
+    import json
+
+    from caviar_clients.files import write_file
+    from caviar_services.scenario_schema import scenario_schema
+
+    text = json.dumps(scenario_schema(), indent=1, ensure_ascii=False)
+    if out is None:
+        typer.echo(text)
+    else:
+        write_file(out, text + "\n")
+
+
+@app.command(rich_help_panel=RUN)
 def broker(
     scenario: ScenarioOrNone = None,
     bind: Annotated[

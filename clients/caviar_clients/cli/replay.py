@@ -18,6 +18,7 @@ from caviar_clients.replay.request import request_of
 from caviar_clients.replay.toml import scenario_text
 from caviar_clients.session.checks import check_implementations
 from caviar_protocol.recording import Recording
+from caviar_services.registry import find_modules_in
 
 PARTS = {
     "recorded": "as recorded",
@@ -43,6 +44,7 @@ def replay_run(
 ) -> int:
     """Replay a run; the exit status: 0 exactly if it came to its end, and where nothing was replaced with
     the digest that it had."""
+    find_modules_in(Path.cwd())  # of classes that --replace names as module:Class
     found = RecordedRun(Recording(run))
     request = request_of(found.scenario.services, replace, settings, keep, recorded, again)
     plan = plan_replay(found, request, frames)

@@ -61,6 +61,7 @@ class McapSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     segment_frames: Annotated[int, quantity("frame", "a segment with so many frames is closed", ge=1)] = 2000
     """Bounds what a segment's index takes in memory, and what a crash leaves without an index."""
     compression: Literal["none", "lz4", "zstd"] = "none"
+    """Of the chunks, a frame each."""
     copy_assets: bool = True
     """Copy the scenery into the run directory."""
     notes: tuple[str, ...] = ()

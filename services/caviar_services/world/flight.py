@@ -32,6 +32,7 @@ class FlownObject(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     """One object that agents fly, and what it is capable of."""
 
     name: Annotated[str, msgspec.Meta(min_length=1, max_length=100)]
+    """Of the object; its actuator is ``motion:<name>``."""
     kind: str = "uav"
     """Class of the object; one without a mesh of its own is a box."""
     dimensions_m: tuple[Length, Length, Length] = (0.6, 0.6, 0.25)
@@ -39,6 +40,7 @@ class FlownObject(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     start_m: tuple[float, float, float]
     """Centre of the object at the start of every episode."""
     start_yaw_deg: float = 0.0
+    """Yaw at the start of every episode, counter-clockwise from +x [°]."""
     max_speed_m_s: Annotated[float, quantity("m/s", "in any direction", gt=0)]
     max_acceleration_m_s2: Annotated[float, quantity("m/s2", "in any direction", gt=0)]
     clearance_m: Annotated[float, quantity("m", "least distance of the centre from scenery", gt=0)] = 1.0
@@ -55,6 +57,7 @@ class FlightSettings(TrajectorySettings, frozen=True, kw_only=True, forbid_unkno
     objects: tuple[MovingObject, ...] = ()
     """Scripted objects, as in the world ``trajectory``."""
     flown: tuple[FlownObject, ...]
+    """Objects that agents fly."""
 
 
 class _State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -37,6 +37,7 @@ class MovingObject(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     """One object and where it is when."""
 
     name: Annotated[str, msgspec.Meta(min_length=1, max_length=100)]
+    """Unique among the objects of the run."""
     kind: str = "uav"
     """Class of the object: ``uav``, ``car``, …; one without a mesh of its own is a box."""
     dimensions_m: tuple[Length, Length, Length] = (0.6, 0.6, 0.25)
@@ -50,6 +51,7 @@ class TrajectorySettings(WorldSettings, frozen=True, kw_only=True, forbid_unknow
     """Settings of the world ``trajectory``."""
 
     objects: tuple[MovingObject, ...]
+    """Objects along timed waypoints."""
 
 
 class TrajectoryWorld(World[TrajectorySettings]):

@@ -28,10 +28,15 @@ class MaterialSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     """What to change about a material of the scenery; what is not given stays."""
 
     relative_permittivity: float | None = None
+    """Real part of the relative permittivity."""
     conductivity_s_per_m: float | None = None
+    """Conductivity [S/m]."""
     scattering_coefficient: float | None = None
+    """Share of the reflected amplitude that is scattered, 0 to 1."""
     xpd_coefficient: float | None = None
+    """Share of the scattered power in the other polarization, 0 to 1."""
     thickness_m: float | None = None
+    """Thickness of walls [m]."""
 
     @property
     def is_electric(self) -> bool:

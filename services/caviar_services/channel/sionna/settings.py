@@ -54,9 +54,13 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     ) = None
     """N rays that share the sphere's 4π sr have a mean spacing Δ [rad] with N = 4π/Δ²."""
     los: bool = True
+    """Whether the direct path counts."""
     reflection: bool = True
+    """Whether specular reflections count."""
     refraction: bool = False
+    """Whether waves pass through walls."""
     diffraction: bool = False
+    """Whether edges diffract."""
     free_edges: bool = False
     """Whether the rims of open surfaces diffract, too, that of the ground or of a screen without thickness:
     edges at which one face ends and no other begins."""

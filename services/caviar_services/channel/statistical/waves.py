@@ -61,6 +61,7 @@ class GeometricSettings(ChannelSettings, frozen=True, kw_only=True):
     obstacles: tuple[Obstacle, ...] = ()
     """With ``nlos = "geometry"``."""
     normalization: Literal["unit", "path-loss"] = "unit"
+    """Mean power of H: ``unit`` whatever the distance, or of free space at that distance (``path-loss``)."""
     nlos_loss_db: (
         Annotated[float, quantity("dB", "further loss without line of sight", ge=0, le=200)] | None
     ) = None

@@ -1,0 +1,115 @@
+"""Settings of Sphinx, which renders the documentation: ``make docs``.
+
+The source folder is the repository, so that links between pages are the same in a checkout and in the
+rendered documentation. Pages of the reference are generated before the sources are read (`reference_pages`).
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+DOCS = Path(__file__).resolve().parent
+sys.path.insert(0, str(DOCS))
+
+import reference_pages  # noqa: E402 - a package beside this file
+from docutils import nodes  # noqa: E402
+from reference_pages import api  # noqa: E402
+from sphinx.domains.python import PythonDomain  # noqa: E402
+from sphinx.ext.napoleon import Config  # noqa: E402
+
+project = "CAVIAR"
+author = copyright = "The CAVIAR developers"  # noqa: A001 - Sphinx's name
+release = version = metadata.version("caviar-sim")
+
+extensions = ["myst_parser", "sphinx.ext.autodoc"]
+root_doc = "docs/index"
+include_patterns = ["docs/**", "protocol/**", "CHANGELOG.md", "CONTRIBUTING.md"]
+exclude_patterns = [".*", "build", "runs", "node_modules", "**/__pycache__", "protocol/caviar_protocol"]
+suppress_warnings = [
+    "myst.header",  # SPEC.md and pages of one topic begin where they like
+    "ref.python",  # a class of the same name in two modules: the reader chooses by the module
+]
+nitpicky = False  # names in docstrings may be those of other libraries
+
+# --- Markdown ---
+myst_enable_extensions = ["colon_fence", "deflist"]
+myst_heading_anchors = 4
+
+# --- API reference ---
+default_role = "py:obj"
+add_module_names = False
+autodoc_default_options = {
+    "members": True,
+    "member-order": "bysource",
+    "show-inheritance": True,
+    "ignore-module-all": True,  # a class is shown where it is defined
+}
+autodoc_typehints = "signature"
+autodoc_typehints_format = "short"
+maximum_signature_line_length = 88
+
+# --- HTML ---
+html_theme = "furo"
+html_title = "CAVIAR"
+html_static_path = ["_static"]
+html_css_files = ["caviar.css"]
+html_copy_source = False
+html_show_sphinx = False
+html_extra_path = ["../build/docs-files"]
+pygments_style = "friendly"
+pygments_dark_style = "monokai"
+highlight_language = "none"
+
+
+class QuickPythonDomain(PythonDomain):
+    """The Python domain, with a search for names that skips the scan of all objects where none can match.
+
+    Sphinx compares every builtin of every signature (``int``, ``str``) with each of some thousand objects,
+    which took most of the time of a build.
+    """
+
+    def find_obj(
+        self, env: Any, modname: Any, classname: Any, name: str, kind: Any, searchmode: int = 0
+    ) -> Any:
+        """Objects that a name may mean."""
+        if len(self.objects) != getattr(self, "_counted", -1):
+            self._counted = len(self.objects)
+            self._last_words = {full.rpartition(".")[2] for full in self.objects}
+        if name.removesuffix("()").rpartition(".")[2] not in self._last_words:
+            return []
+        return super().find_obj(env, modname, classname, name, kind, searchmode)
+
+
+def setup(app: Any) -> None:
+    """Connect the generators of the reference."""
+    for name, default, rebuild, types in Config._config_values:  # `api.finish_docstring` calls Napoleon
+        app.add_config_value(name, default, rebuild, types)
+    app.config.napoleon_use_rtype = False
+    app.add_domain(QuickPythonDomain, override=True)
+    app.connect("builder-inited", lambda app: reference_pages.generate(Path(app.srcdir)))
+    app.connect("autodoc-process-bases", api.shorten_bases)
+    app.connect("autodoc-process-signature", api.hide_signature)
+    app.connect("autodoc-skip-member", api.hide_fields)
+    app.connect("autodoc-process-docstring", api.finish_docstring)
+    app.connect("doctree-read", drop_plain_bases)
+    app.connect("build-finished", write_entry_page)
+
+
+def drop_plain_bases(app: Any, doctree: nodes.document) -> None:
+    """Remove the line of base classes where it names `object` alone."""
+    for paragraph in list(doctree.findall(nodes.paragraph)):
+        if paragraph.astext() == "Bases: object" and paragraph.parent is not None:
+            paragraph.parent.remove(paragraph)
+
+
+def write_entry_page(app: Any, error: Exception | None) -> None:
+    """Write ``index.html``, which leads to the first page: the source folder is the repository, not docs/."""
+    if error is None and app.builder.format == "html":
+        target = f"{root_doc}.html"
+        (Path(app.outdir) / "index.html").write_text(
+            f'<!doctype html><meta charset="utf-8"><title>{project}</title>'
+            f'<meta http-equiv="refresh" content="0; url={target}"><a href="{target}">{project}</a>\n'
+        )
