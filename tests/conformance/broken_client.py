@@ -17,6 +17,9 @@ import msgpack
 import zmq
 from broken_world import scene
 
+if sys.argv[4:] == ["channel"]:
+    from broken_channel import channel
+
 ENDPOINT, NAME, FAULT = sys.argv[1:4]
 ROLE = sys.argv[4] if len(sys.argv) > 4 else "agent"
 MAX_HEADER = 1 << 20
@@ -37,9 +40,10 @@ KNOWN_TO_BROKERS = {"HELLO", "READY", "RESET_DONE", "DONE", "FAULT", "BYE", "WEL
 INPUTS = {
     "agent": [{"topic": "scene"}, {"topic": "link", "lag": 1, "required": False}],
     "world": [],
+    "channel": [{"topic": "scene"}],
     "recorder": [{"topic": "*", "required": False}],
 }
-OUTPUTS = {"agent": ["action"], "world": ["scene"], "recorder": []}
+OUTPUTS = {"agent": ["action"], "world": ["scene"], "recorder": [], "channel": ["channel"]}
 ballast: list[bytes] = []
 asked_to_stop = threading.Event()
 
@@ -115,7 +119,7 @@ class Client:
         outputs = ["weather"] if bad("declares an unknown topic") else OUTPUTS[ROLE]
         self.say(
             "HELLO",
-            version=[2, 0] if bad("speaks another version") else [1, 0],
+            version=[2, 0] if bad("speaks another version") else [1, 4],
             name="somebody" if bad("has another name") else NAME,
             role="channel" if bad("has another role") else ROLE,
             **({"inputs": INPUTS[ROLE]} if INPUTS[ROLE] else {}),
@@ -353,6 +357,8 @@ class Client:
     def product(self, frame: int) -> tuple[bytes, bytes]:
         if ROLE == "world":
             return scene(NAME, self.devices, frame, FAULT)
+        if ROLE == "channel":
+            return channel(frame, FAULT)
         beam = self.lived if bad("remembers the episode before") else self.counted % 4
         command: dict[str, Any] = {"type": "beam", "tx": "bs", "rx": "car.1/rx", "tx_beam": beam}
         if bad("writes out a default in a payload"):

@@ -23,6 +23,7 @@ def scene(name: str, specs: list[dict[str, Any]], frame: int, fault: str) -> tup
         "orientation": [[math.cos(0.1 * frame), 0.0, 0.0, math.sin(0.1 * frame)], [1.0, 0.0, 0.0, 0.0]],
         "velocity": [[9.0, 0.0, 0.0], [0.0, -7.0, 0.0]],
         "dimensions": [list(SIZE), list(SIZE)],
+        "angular_velocity": [[0.0, 0.0, 2.0], [0.0, 0.0, 0.0]],  # frames are 0.1 s apart
     }
     assets = ["", ""]
     devices = [found for spec in specs for found in _devices(spec, names, frame, fault)]
@@ -35,6 +36,10 @@ def scene(name: str, specs: list[dict[str, Any]], frame: int, fault: str) -> tup
             arrays["position"][0][2] = math.nan
         case "publishes cars that are faster than light":
             arrays["velocity"][0][0] = 3e8
+        case "turns the other way":
+            arrays["angular_velocity"][0][2] = -2.0
+        case "gives degrees per second":
+            arrays["angular_velocity"][0][2] = math.degrees(2.0)
         case "publishes negative dimensions":
             arrays["dimensions"][1][1] = -1.9
         case "publishes flat boxes":
@@ -58,10 +63,10 @@ def scene(name: str, specs: list[dict[str, Any]], frame: int, fault: str) -> tup
     header: dict[str, Any] = {"names": names, "classes": ["car", "car"], "assets": assets}
     body = b""
     for field, rows in arrays.items():
+        if field == "angular_velocity" and devices:
+            header["devices"] = devices
         header[field] = {"dtype": "<f8", "shape": [2, len(rows[0])], "offset": len(body)}
         body += struct.pack(f"<{2 * len(rows[0])}d", *rows[0], *rows[1])
-    if devices:
-        header["devices"] = devices
     return msgpack.packb(header), body
 
 
@@ -104,13 +109,11 @@ def _device(spec: dict[str, Any], parent: str, height: float, fault: str) -> dic
     match spec["kind"]:
         case "antenna":
             device["role"] = spec["role"]
-            array = {
-                key: n
-                for key, n in (spec.get("array") or {}).items()
-                if key in ("rows", "columns") and n != 1
-            }
+            array = _array(spec.get("array") or {}, fault)
             if array:
                 device["array"] = array
+            if spec.get("power_dbm"):
+                device["power_dbm"] = float(spec["power_dbm"])
         case "lidar":
             device |= {"beams": spec["beams"], "azimuth_steps": spec["azimuth_steps"]}
             low, high = (math.radians(angle) for angle in spec.get("elevation_deg", (-25.0, 3.0)))
@@ -121,6 +124,20 @@ def _device(spec: dict[str, Any], parent: str, height: float, fault: str) -> dic
         case "camera":
             device["width"], device["height"] = spec["size_px"]
     return device
+
+
+def _array(spec: dict[str, Any], fault: str) -> dict[str, Any]:
+    """An array in the order of SPEC.md, without what equals its default."""
+    found: dict[str, Any] = {key: spec[key] for key in ("rows", "columns") if spec.get(key, 1) != 1}
+    if spec.get("polarization", "V") != "V" and fault != "drops dual polarizations":
+        found["polarization"] = spec["polarization"]
+    if spec.get("pattern_file") and fault != "drops pattern files":
+        found["pattern_file"] = f"patterns/{spec['pattern_file'].rpartition('/')[2]}"
+    if spec.get("panels") and fault != "drops panels":
+        found["panels"] = [
+            {key: n for key, n in panel.items() if n not in (0.0, [0.0] * 3)} for panel in spec["panels"]
+        ]
+    return found
 
 
 def _orientation(spec: dict[str, Any], fault: str) -> list[float]:

@@ -327,8 +327,23 @@ FAULTS: dict[str, tuple[str, ...]] = {
         "lifts the nose where it is to be lowered/world",
         "ignores roll/world",
         "forgets to convert degrees/world",
+        "drops panels/world",
+        "drops dual polarizations/world",
+        "drops pattern files/world",
     ),
     "scene-carriers": ("hands devices around/world",),
+    "scene-turning": ("turns the other way/world", "gives degrees per second/world"),
+    "channel-parts": (
+        "leaves hf out/channel",
+        "forgets a subcarrier/channel",
+        "transposes hf/channel",
+        "leaves taps out/channel",
+    ),
+    "channel-consistency": (
+        "doubles hf/channel",
+        "conjugates h/channel",
+        "begins taps at the first path/channel",
+    ),
 }
 
 

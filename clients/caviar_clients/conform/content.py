@@ -1,26 +1,37 @@
-"""Cases of what a world's scenes say: each looks at one aspect, as consumers do in every run."""
+"""Cases of what the scenes of a world and the channels of a channel say, each of one aspect."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import pairwise
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
+import numpy as np
 
 from caviar_clients.conform import street
 from caviar_clients.conform.case import Case, Failed, NotApplicable, case
-from caviar_clients.conform.session import ACTIVE, Session
+from caviar_clients.conform.session import ACTIVE, Session, known_parts
 from caviar_protocol import scene_validation as scenes
+from caviar_protocol.arrays import Float64Array
 from caviar_protocol.codec import decode_payload
+from caviar_protocol.parts import PartCheck
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.scene_validation import SceneRules
-from caviar_protocol.topics import Scene
+from caviar_protocol.space.coordinates import rotation_matrix
+from caviar_protocol.topics import Carrier, Channel, Scene
+from caviar_protocol.topics.channel import PLANE_WAVES
 
 if TYPE_CHECKING:
     from caviar_clients.conform.kit import Kit
 
 FRAMES = 4
+AMBIGUOUS_RAD = 2.5
+"""Between two frames; behind half a turn the other way is the shorter one."""
+TURN_TOLERANCE, SLIGHT_RAD = 0.5, 0.01
+"""Of an angular velocity: worlds take it between two frames, at one of them, or of their engine."""
+PART_TOLERANCE = 1e-3
+"""Relative, of the norm of a matrix: far above single precision, and of what models leave out."""
 CLAUSES = "Content"
 
 
@@ -138,4 +149,120 @@ def carriers(kit: Kit) -> str:
     return f"{len(found[-1].devices)} devices, in {len(found)} frames"
 
 
-CASES = (orientations, places, dimensions, names, prefixes, meshes, devices, poses, mounts, carriers)
+@case("scene-turning", "Worlds", "`angular_velocity` in world axes [rad/s] by which orientations turn")
+def turning(kit: Kit) -> str:
+    """Objects turn from frame to frame as their angular velocity says."""
+    _, found = _published(kit)
+    compared = 0
+    for before, after in pairwise(found):
+        if before.angular_velocity is None or after.angular_velocity is None:
+            continue
+        for name in set(before.names) & set(after.names):
+            i, j = before.names.index(name), after.names.index(name)
+            turned = _rotation(before.orientation[i], after.orientation[j])
+            stated = (before.angular_velocity[i] + after.angular_velocity[j]) / 2 * street.PERIOD_NS / 1e9
+            largest = max(np.linalg.norm(turned), np.linalg.norm(stated))
+            if np.linalg.norm(turned) > AMBIGUOUS_RAD:
+                continue
+            compared += 1
+            if np.linalg.norm(turned - stated) > TURN_TOLERANCE * largest + SLIGHT_RAD:
+                per_s = turned / (street.PERIOD_NS / 1e9)
+                raise Failed(
+                    f"an angular velocity of {name!r} of about {_shown(per_s)} rad/s, by its orientations",
+                    _shown(stated / (street.PERIOD_NS / 1e9)),
+                )
+    if not compared:
+        raise NotApplicable("it gives no angular velocity")
+    return f"so in {compared} steps of objects"
+
+
+def _rotation(before: Float64Array, after: Float64Array) -> Float64Array:
+    """Rotation vector [rad] in world axes that turns one orientation into another."""
+    turn = rotation_matrix(after) @ rotation_matrix(before).T
+    cosine = np.clip((np.trace(turn) - 1) / 2, -1, 1)
+    angle = np.arccos(cosine)
+    axis = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    length = np.linalg.norm(axis)
+    vector: Float64Array = axis * (angle / length) if length > 0 else np.zeros(3)
+    return vector
+
+
+def _shown(vector: Float64Array) -> str:
+    return f"({', '.join(f'{value:.3g}' for value in vector)})"
+
+
+@case(
+    "channel-parts", CLAUSES, "each part in demand, for each carrier that has it and each pair, of its shape"
+)
+def parts(kit: Kit) -> str:
+    """A channel delivers the parts that PREPARE asks for, as large as carriers and arrays say."""
+    session, _, channel = _channel(kit)
+    briefing = street.briefing(session.hello)
+    carriers = msgspec.convert(briefing["carriers"], tuple[Carrier, ...])
+    devices = msgspec.convert(briefing["devices"], tuple[DeviceSpec, ...])
+    asked = frozenset(known_parts("channel", session.hello))
+    if problem := PartCheck({"channel": asked}, carriers, devices)("channel", channel):
+        raise Failed(f"parts {', '.join(sorted(asked))}", problem)
+    return ", ".join(f"{len(getattr(channel, part))} of {part}" for part in sorted(asked))
+
+
+@case(
+    "channel-consistency", "Payloads", "`h`, `hf` and `taps` that follow from each other and from the paths"
+)
+def consistency(kit: Kit) -> str:
+    """The parts of a channel say the same as its paths, where arrays see plane waves."""
+    _, scene, channel = _channel(kit)
+    whole = {(entry.carrier, entry.tx, entry.rx): entry.h for entry in channel.h}
+    for entry in channel.hf:
+        middle = entry.h[0, channel.carriers[entry.carrier].subcarriers // 2]
+        _compare("hf of the middle subcarrier in slot 0", middle, whole[entry.carrier, entry.tx, entry.rx])
+    if channel.rung not in PLANE_WAVES:
+        return f"hf agrees with h; {channel.rung!r} has no plane waves"
+    for part, expected in street.parts_of(channel, scene).items():
+        for mine, right in zip(getattr(channel, part), expected, strict=False):
+            if part == "taps" and mine.first != right.first:
+                raise Failed(f"taps from sample {right.first} on", f"from {mine.first}")
+            _compare(part, mine.h, right.h)
+    return "all parts follow from the paths"
+
+
+def _channel(kit: Kit) -> tuple[Session, Scene, Channel]:
+    """The channel of a frame of a client, and the scene that it is of."""
+    session = kit.at(ACTIVE)
+    if "channel" not in session.hello.get("outputs", []):
+        raise NotApplicable("it makes no channel")
+    frame = session.frame
+    answer = session.step()
+    topics = [entry["topic"] for entry in answer.fields.get("products", [])]
+    if "channel" not in topics:
+        raise Failed("a channel", f"none in frame {frame}")
+    place = 1 + 2 * topics.index("channel")
+    channel = cast(Channel, decode_payload("channel", *answer.parts[place : place + 2]))
+    return (
+        session,
+        cast(Scene, decode_payload("scene", *street.product("scene", street.WORLD, frame))),
+        channel,
+    )
+
+
+def _compare(what: str, got: Any, right: Any) -> None:
+    off = float(np.linalg.norm(got - right) / max(float(np.linalg.norm(right)), 1e-30))
+    if not off <= PART_TOLERANCE:
+        raise Failed(f"{what} that follows from the rest", f"one that differs by {off:.2g} of its norm")
+
+
+CASES = (
+    orientations,
+    places,
+    dimensions,
+    names,
+    prefixes,
+    meshes,
+    devices,
+    poses,
+    mounts,
+    carriers,
+    turning,
+    parts,
+    consistency,
+)

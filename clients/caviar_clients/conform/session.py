@@ -16,19 +16,26 @@ from caviar_clients.conform.client import BY_HAND_S, Client, End
 from caviar_clients.conform.street import Inputs
 from caviar_clients.conform.wire import Fields, Received, Wire, in_order
 from caviar_protocol.topics import PARTS
+from caviar_protocol.versions import PARTS_SINCE, parsed
 
 CHUNK = 700
 """[B] of an ASSET_DATA from the kit, so that even small files take several."""
+
+
+def known_parts(topic: str, hello: Fields) -> list[str]:
+    """Parts of a topic that the version of a client has."""
+    spoken = tuple(hello["version"])
+    return [
+        part for part in PARTS.get(topic, ()) if spoken >= parsed(PARTS_SINCE.get(f"{topic}.{part}", "1.0"))
+    ]
 
 
 def _preparation(session: Session, topics: list[str], inputs: Inputs) -> Fields:
     """What PREPARE holds beside epoch and attempt."""
     order: Fields = {}
     if topics:
-        order["demand"] = [
-            {"topic": topic, **({"parts": list(PARTS[topic])} if PARTS.get(topic) else {})}
-            for topic in topics
-        ]
+        known = {topic: known_parts(topic, session.hello) for topic in topics}
+        order["demand"] = [{"topic": t, **({"parts": parts} if parts else {})} for t, parts in known.items()]
     if session.hello["role"] != "world":
         files = street.scenery(session.rules.mark)
         session.served = {hashlib.sha256(data).hexdigest(): data for data in files.values()}

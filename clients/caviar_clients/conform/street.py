@@ -7,20 +7,24 @@ from __future__ import annotations
 
 import cmath
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
 from caviar_clients.conform.canonical import product_digest
 from caviar_clients.conform.wire import Fields, pack, unpack
-from caviar_protocol.arrays import Payload
+from caviar_protocol.arrays import Complex64Array, Complex128Array, Float64Array, Payload
 from caviar_protocol.codec import encode_payload
+from caviar_protocol.multipath import first_tap, subcarrier_weights, tap_weights
 from caviar_protocol.scenario import parse_scenario
 from caviar_protocol.scenario.rules import resolved
-from caviar_protocol.space.coordinates import quaternion_from_euler
+from caviar_protocol.space.coordinates import quaternion_from_euler, rotation_matrix
+from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import (
     Action,
     AntennaArray,
@@ -31,6 +35,8 @@ from caviar_protocol.topics import (
     CameraImage,
     Channel,
     ChannelMatrix,
+    ChannelResponse,
+    ChannelTaps,
     Depth,
     DepthImage,
     Intrinsics,
@@ -107,6 +113,24 @@ archive = { role = "recorder", use = "remote", budget_ms = 1000 }
 
 The angles of the camera differ in size and sign, so that no wrong rotation equals the right one.
 """
+SECTOR = f"""
+[[devices]]
+name = "sector"
+kind = "antenna"
+role = "tx"
+position_m = [12.0, 6.0, 7.0]
+yaw_deg = 250.0
+pitch_deg = 5.0
+power_dbm = 27.0
+
+[devices.array]
+rows = 2
+columns = 3
+polarization = "cross"
+pattern_file = "{Path(__file__).with_name("sector.csv").as_posix()}"
+panels = [{{ position_m = [0.0, 0.25, 0.0] }}, {{ position_m = [0.0, -0.25, 0.125], yaw_deg = 120.0 }}]
+"""
+"""A device that worlds of protocol 1.4 and later publish too: all that 1.4 brought to arrays."""
 CAMERA_ORIENTATION = quaternion_from_euler(math.radians(70.0), math.radians(25.0), math.radians(-40.0))
 WORLD = "traffic"
 """The world that publishes the devices."""
@@ -129,14 +153,21 @@ DOUBLED = {**SOURCES, "scene": ["air", "traffic"], "action": ["copilot", "pilot"
 
 
 @cache
-def product(topic: str, source: str, frame: int) -> tuple[bytes, bytes]:
-    """Header and body of a product."""
-    return encode_payload(_payload(topic, source, frame))
+def product(
+    topic: str, source: str, frame: int, parts: frozenset[str] = frozenset({"h"})
+) -> tuple[bytes, bytes]:
+    """Header and body of a product; a channel has these parts."""
+    return encode_payload(_payload(topic, source, frame, parts))
+
+
+def scenario_of(hello: Fields) -> str:
+    """The scenario that the client which said this HELLO takes part in."""
+    return SCENARIO + (SECTOR if hello["role"] == "world" and tuple(hello["version"]) >= (1, 4) else "")
 
 
 def briefing(hello: Fields, directory: str = "") -> Fields:
     """``scenario`` of WELCOME for the client that said this HELLO; ``directory`` is for recorders."""
-    plain = resolved(parse_scenario(SCENARIO))
+    plain = resolved(parse_scenario(scenario_of(hello)))
     world = hello["name"] if hello["role"] == "world" else WORLD
     told: Fields = {
         "carriers": plain["carriers"],
@@ -173,12 +204,12 @@ def scenery(mark: str) -> dict[str, bytes]:
     }
 
 
-def _payload(topic: str, source: str, frame: int) -> Payload:
+def _payload(topic: str, source: str, frame: int, parts: frozenset[str]) -> Payload:
     match topic:
         case "scene":
             return _scene(source, frame)
         case "channel":
-            return _channel(frame)
+            return channel_of(frame, parts)
         case "action":
             return _action(source, frame)
         case "link":
@@ -227,13 +258,17 @@ def _scene(source: str, frame: int) -> Scene:
     )
 
 
-def _channel(frame: int) -> Channel:
-    x, y, z = (a - b for a, b in zip(_place(frame), (0.0, -10.0, 8.1), strict=True))
+def channel_of(frame: int, parts: Collection[str]) -> Channel:
+    """Free space between ``bs`` and ``car.1/rx``, by the formulas of SPEC.md."""
+    scene = _scene("traffic", frame)
+    ends = {device.name: device_pose(scene, device).position for device in scene.devices}
+    x, y, z = (a - b for a, b in zip(ends["car.1/rx"], ends["bs"], strict=True))
     distance = math.hypot(x, y, z)
     tau, zenith, azimuth = distance / C, math.acos(z / distance), math.atan2(y, x)
     gain = C / FREQUENCY_HZ / (4 * math.pi * distance) * cmath.exp(-2j * math.pi * FREQUENCY_HZ * tau)
-    phases = np.exp(1j * math.pi * np.outer(np.arange(2), np.ones(4)) * math.sin(azimuth))
-    return Channel(
+    vx, vy, vz = scene.velocity[0].tolist()
+    shift = -FREQUENCY_HZ * (vx * x + vy * y + vz * z) / distance / C
+    bare = Channel(
         rung="free-space",
         carriers=parse_scenario(SCENARIO).carriers,
         tx=("bs",),
@@ -244,13 +279,58 @@ def _channel(frame: int) -> Channel:
         a=np.array([[gain]]),
         tau=np.array([tau]),
         aod=np.array([[zenith, azimuth]]),
-        aoa=np.array([[math.pi - zenith, azimuth - math.pi]]),
-        doppler=np.array([[12.5]]),
+        aoa=np.array([[math.pi - zenith, azimuth - math.pi if azimuth > 0 else azimuth + math.pi]]),
+        doppler=np.array([[shift]]),
         interactions=np.zeros((1, 0), dtype="|u1"),
         points=np.zeros((1, 0, 3)),
         objects=np.zeros((1, 0), dtype="<i4"),
-        h=(ChannelMatrix(carrier=0, tx=0, rx=0, h=gain * phases),),
     )
+    return replace(bare, **{part: made for part, made in parts_of(bare, scene).items() if part in parts})
+
+
+def parts_of(channel: Channel, scene: Scene) -> dict[str, tuple[Any, ...]]:
+    """H, frequency responses and taps that follow from a channel's paths by plane waves, as SPEC.md says.
+
+    Devices have one panel of one polarization.
+    """
+    found: dict[str, tuple[Any, ...]] = {"h": (), "hf": (), "taps": ()}
+    devices = {device.name: device for device in scene.devices if isinstance(device, AntennaDevice)}
+    for c, carrier in enumerate(channel.carriers):
+        for p in range(len(channel.tx) * len(channel.rx)):
+            t, r = divmod(p, len(channel.rx))
+            paths = slice(*channel.offsets[p : p + 2].tolist())
+            sent = _steering(scene, devices[channel.tx[t]], channel.aod[paths])
+            taken = _steering(scene, devices[channel.rx[r]], channel.aoa[paths])
+            waves = channel.a[c, paths, None, None] * taken[:, :, None] * sent[:, None, :]
+            tau, doppler = channel.tau[paths], channel.doppler[c, paths]
+            found["h"] += (ChannelMatrix(carrier=c, tx=t, rx=r, h=waves.sum(0)),)
+            if carrier.subcarriers:
+                h = _summed(subcarrier_weights(carrier, tau, doppler), waves)
+                found["hf"] += (ChannelResponse(carrier=c, tx=t, rx=r, h=h),)
+            if carrier.taps:
+                first = first_tap(carrier, tau)
+                h = _summed(tap_weights(carrier, tau, doppler, first), waves)
+                found["taps"] += (ChannelTaps(carrier=c, tx=t, rx=r, first=first, h=h),)
+    return found
+
+
+def _summed(weights: Complex128Array, waves: Complex128Array) -> Complex64Array:
+    summed: Complex64Array = np.einsum("skp,pmn->skmn", weights, waves).astype("<c8")
+    return summed
+
+
+def _steering(scene: Scene, device: AntennaDevice, angles: Float64Array) -> Complex128Array:
+    """exp(+j2π/λ·u·d) of each element towards (zenith, azimuth) in world axes, Shape ``[P, N]``."""
+    array, (zenith, azimuth) = device.array, angles.T
+    towards = np.stack(
+        [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], 1
+    )
+    element = np.arange(array.size)
+    y = (element // array.rows - (array.columns - 1) / 2) * array.horizontal_spacing
+    z = ((array.rows - 1) / 2 - element % array.rows) * array.vertical_spacing
+    own = towards @ rotation_matrix(device_pose(scene, device).orientation)
+    phases: Complex128Array = np.exp(2j * np.pi * (own[:, 1, None] * y + own[:, 2, None] * z))
+    return phases
 
 
 def _action(source: str, frame: int) -> Action:
@@ -358,15 +438,16 @@ class Inputs:
             return [({"topic": topic, "source": source, "status": "absent", "cause": cause}, ())]
         held = HELD_FOR if self.held and computed >= HELD_FOR else 0
         status = "held" if held else "fresh"
-        found = [self._entry(topic, source, status, computed - held, lag + held)]
+        parts = frozenset(item.get("parts", ())) if topic == "channel" else frozenset()
+        found = [self._entry(topic, source, status, computed - held, lag + held, parts)]
         if self.late and computed:
-            found.append(self._entry(topic, source, "late", computed - 1, lag + 1))
+            found.append(self._entry(topic, source, "late", computed - 1, lag + 1, parts))
         return found
 
     def _entry(
-        self, topic: str, source: str, status: str, frame: int, age: int
+        self, topic: str, source: str, status: str, frame: int, age: int, parts: frozenset[str]
     ) -> tuple[Fields, tuple[bytes, ...]]:
-        header, body = product(topic, source, frame)
+        header, body = product(topic, source, frame, parts) if parts else product(topic, source, frame)
         if self.stranger:
             header, body = _with_stranger(header, body)
         entry: Fields = {"topic": topic, "source": source, "status": status, "frame": frame}
