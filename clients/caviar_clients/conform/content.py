@@ -178,7 +178,7 @@ def turning(kit: Kit) -> str:
 
 def _rotation(before: Float64Array, after: Float64Array) -> Float64Array:
     """Rotation vector [rad] in world axes that turns one orientation into another."""
-    turn = rotation_matrix(after) @ rotation_matrix(before).T
+    turn = rotation_matrix(after.tolist()) @ rotation_matrix(before.tolist()).T
     cosine = np.clip((np.trace(turn) - 1) / 2, -1, 1)
     angle = np.arccos(cosine)
     axis = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
