@@ -273,6 +273,7 @@ class JournalFile:
         The new file takes the place of the old one in one step. `RunError` naming it where that fails.
         """
         base, kept = needed(self._entries, snapshot)
+        # Not `replace_file`: the journal goes on in the descriptor of the new file.
         partial = self.path.with_name(self.path.name + ".partial")
         try:
             fd = os.open(partial, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_CLOEXEC, 0o644)

@@ -71,7 +71,7 @@ class EmbeddedLauncher:
         outcome, statistics = self._run.outcome, self._run.statistics
         if outcome is None:
             raise RunError("the run ended without an outcome")
-        statistics.save(self._directory / "latency.npz")
+        statistics.save(RunDirectory(self._directory).latencies)
         if self._log_error:
             text = f"the log of notices is incomplete: {self._log_error}"
             yield {"event": "notice", "kind": "note", "service": "", "frame": -1, "text": text}
