@@ -15,12 +15,12 @@ from caviar_clients.conform.session import ACTIVE, Session, known_parts
 from caviar_protocol import scene_validation as scenes
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.codec import decode_payload
-from caviar_protocol.parts import PartCheck
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.scene_validation import SceneRules
 from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.topics import Carrier, Channel, Scene
 from caviar_protocol.topics.channel import PLANE_WAVES
+from caviar_protocol.validation import PartCheck
 
 if TYPE_CHECKING:
     from caviar_clients.conform.kit import Kit
