@@ -55,5 +55,6 @@ doctor: setup ## What this machine has, and what mends what it lacks
 	@$(BIN)/caviar doctor
 
 clean: ## Remove .venv, caches and builds; recorded runs stay
+	@cd docs/reference && rm -rf api commands frame-path scenario
 	@rm -rf .venv .venvs build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
 	@find . -name __pycache__ -not -path './.git/*' -prune -exec rm -rf {} +

@@ -6,6 +6,7 @@ rendered documentation. Pages of the reference are generated before the sources 
 
 from __future__ import annotations
 
+import json
 import sys
 from importlib import metadata
 from pathlib import Path
@@ -19,6 +20,8 @@ from docutils import nodes  # noqa: E402
 from reference_pages import api  # noqa: E402
 from sphinx.domains.python import PythonDomain  # noqa: E402
 from sphinx.ext.napoleon import Config  # noqa: E402
+
+from caviar_services.scenario_schema import scenario_schema  # noqa: E402
 
 project = "CAVIAR"
 author = copyright = "The CAVIAR developers"  # noqa: A001 - Sphinx's name
@@ -58,7 +61,6 @@ html_static_path = ["_static"]
 html_css_files = ["caviar.css"]
 html_copy_source = False
 html_show_sphinx = False
-html_extra_path = ["../build/docs-files"]
 pygments_style = "friendly"
 pygments_dark_style = "monokai"
 highlight_language = "none"
@@ -95,7 +97,7 @@ def setup(app: Any) -> None:
     app.connect("autodoc-skip-member", api.hide_fields)
     app.connect("autodoc-process-docstring", api.finish_docstring)
     app.connect("doctree-read", drop_plain_bases)
-    app.connect("build-finished", write_entry_page)
+    app.connect("build-finished", write_files_beside_pages)
 
 
 def drop_plain_bases(app: Any, doctree: nodes.document) -> None:
@@ -105,11 +107,13 @@ def drop_plain_bases(app: Any, doctree: nodes.document) -> None:
             paragraph.parent.remove(paragraph)
 
 
-def write_entry_page(app: Any, error: Exception | None) -> None:
-    """Write ``index.html``, which leads to the first page: the source folder is the repository, not docs/."""
+def write_files_beside_pages(app: Any, error: Exception | None) -> None:
+    """Write ``index.html``, which leads to the first page below ``docs``, and the schema of scenarios."""
     if error is None and app.builder.format == "html":
-        target = f"{root_doc}.html"
-        (Path(app.outdir) / "index.html").write_text(
+        folder, target = Path(app.outdir), f"{root_doc}.html"
+        (folder / "index.html").write_text(
             f'<!doctype html><meta charset="utf-8"><title>{project}</title>'
             f'<meta http-equiv="refresh" content="0; url={target}"><a href="{target}">{project}</a>\n'
         )
+        schema = json.dumps(scenario_schema(), indent=1, ensure_ascii=False)
+        (folder / "scenario.schema.json").write_text(f"{schema}\n", "utf-8")

@@ -6,11 +6,8 @@ what is new alone.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
-
-from caviar_services.scenario_schema import scenario_schema
 
 from . import api, commands, frame_path, scenario_keys
 
@@ -22,8 +19,6 @@ def generate(root: Path) -> None:
     _replace(reference / "commands", dict(commands.pages()))
     _replace(reference / "scenario", dict(scenario_keys.pages()))
     _replace(reference / "frame-path", dict(frame_path.pages()))
-    schema = json.dumps(scenario_schema(), indent=1, ensure_ascii=False)
-    _replace(root / "build" / "docs-files", {"scenario.schema.json": f"{schema}\n"})
 
 
 def _replace(folder: Path, pages: Mapping[str, str]) -> None:
