@@ -57,7 +57,9 @@ def replace_file(
     """
     draft = path.with_name(f"{path.name}.{uuid4().hex}.partial" if concurrent else f"{path.name}.partial")
     try:
-        descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, mode)
+        # O_NONBLOCK: a pipe that has the draft's name is an error, not a wait for a reader.
+        flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC | os.O_NONBLOCK
+        descriptor = os.open(draft, flags, mode)
         with os.fdopen(descriptor, "wb") as file:
             file.write(data)
             if durable:
@@ -89,8 +91,12 @@ def sync_file(path: Path) -> None:
         os.close(fd)
 
 
-def open_regular(path: Path) -> BufferedReader:
+def open_regular(path: Path, remedy: str = PUT_BACK) -> BufferedReader:
     """Open a regular file, or a link to one, to be read.
+
+    Args:
+        path: The file.
+        remedy: What mends that it is of another kind.
 
     Raises:
         OSError: ``strerror`` says what the path is where that is no file, and what mends it.
@@ -98,16 +104,16 @@ def open_regular(path: Path) -> BufferedReader:
     # Opening a pipe without O_NONBLOCK waits for a writer, which may never come.
     fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
-        _refuse_kind(os.fstat(fd), path, PUT_BACK)
+        _refuse_kind(os.fstat(fd), path, remedy)
         return os.fdopen(fd, "rb")
     except BaseException:
         os.close(fd)
         raise
 
 
-def read_regular(path: Path) -> bytes:
+def read_regular(path: Path, remedy: str = PUT_BACK) -> bytes:
     """The content of a regular file. Raises `OSError` as `open_regular` does."""
-    with open_regular(path) as file:
+    with open_regular(path, remedy) as file:
         return file.read()
 
 

@@ -2,9 +2,9 @@
 
 A table is a CSV file, ``.csv``, with one direction a line, all zenith angles combined with all azimuths:
 
-- ``theta_deg,phi_deg,gain_dbi``: the gain; the polarization is that of the array, or -
-``theta_deg,phi_deg,e_theta_re,e_theta_im,e_phi_re,e_phi_im``: the far field along θ̂ and φ̂, so that
-``|E_θ|² + |E_φ|²`` is the gain as a factor.
+- ``theta_deg,phi_deg,gain_dbi``: the gain; the polarization is that of the array, or
+- ``theta_deg,phi_deg,e_theta_re,e_theta_im,e_phi_re,e_phi_im``: the far field along θ̂ and φ̂, so that
+  ``|E_θ|² + |E_φ|²`` is the gain as a factor.
 
 Lines that begin with ``#`` are comments. Angles are those of the device: zenith from +z, 0° to 180°,
 azimuth counter-clockwise from +x, once around. Between the directions of a table, the gain [dB] or the
@@ -12,28 +12,48 @@ field is bilinear in both angles.
 
 An MSI/Planet file, ``.msi`` or ``.pln``, has a horizontal and a vertical cut as attenuation [dB] against
 ``GAIN`` (dBd unless it says dBi). Horizontal angles count clockwise from boresight, vertical ones downwards
-from the horizon. The directions between follow by summing: the attenuation is that of the horizontal cut at
-the azimuth plus that of the front half of the vertical cut at the elevation (T. G. Vasiliadis, A. G.
-Dimitriou and G. D. Sergiadis, "A novel technique for the approximation of 3-D antenna radiation patterns",
-IEEE Trans. Antennas Propag. 53(7), 2005).
+from the horizon; the number behind ``HORIZONTAL`` and ``VERTICAL`` is that of the lines that follow. The
+directions between follow by summing: the attenuation is that of the horizontal cut at the azimuth plus that
+of the front half of the vertical cut at the elevation (T. G. Vasiliadis, A. G. Dimitriou and G. D. Sergiadis,
+"A novel technique for the approximation of 3-D antenna radiation patterns", IEEE Trans. Antennas Propag.
+53(7), 2005).
 """
 
 from __future__ import annotations
 
+import codecs
 import math
-from dataclasses import dataclass
+import os
+import re
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from caviar_protocol.arrays import Complex128Array, Float64Array, Int64Array
 from caviar_protocol.errors import AssetError
+from caviar_protocol.files import open_regular
 from caviar_protocol.limits import MAX_BODY
 
 SUFFIXES = (".csv", ".msi", ".pln")
 
 GAIN = ("theta_deg", "phi_deg", "gain_dbi")
 FIELD = ("theta_deg", "phi_deg", "e_theta_re", "e_theta_im", "e_phi_re", "e_phi_im")
+
+_MARKS = {codecs.BOM_UTF8: "utf-8", codecs.BOM_UTF16_LE: "utf-16-le", codecs.BOM_UTF16_BE: "utf-16-be"}
+
+_IMPOSSIBLE_DBI = 10.0
+"""[dBi]; a pattern whose gain has a higher mean over the sphere is refused. An antenna has 0 dBi less its
+losses; cuts that are summed may miss that by some decibels."""
+
+_BEYOND_MAXIMUM_DB = 3.0
+"""[dB] by which a direction of a cut may exceed the stated gain, which is rounded, or of another tilt."""
+
+_MOST_ANGLES = 3600
+"""Lines of a cut at most."""
+
+_WIDEST_GAP_DEG = 90.0
+"""Between two neighbouring angles of a cut."""
 
 _DIPOLE_DBI = 2.15
 """Gain of a half-wave dipole, which dBd refer to [dBi]."""
@@ -56,6 +76,17 @@ class PatternTable:
     def is_field(self) -> bool:
         """Whether the values are fields."""
         return self.values.ndim == 3
+
+    @property
+    def mean_gain_dbi(self) -> float:
+        """Mean of the gain over the sphere [dBi]: 0 without losses."""
+        theta, phi = np.radians(np.arange(0.5, 180.0)), np.radians(np.arange(0.5, 360.0))
+        values = self.at(np.repeat(theta, len(phi)), np.tile(phi, len(theta)))
+        with np.errstate(over="ignore"):
+            gain = (np.abs(values) ** 2).sum(1) if self.is_field else 10 ** (values.real / 10)
+            weight = np.repeat(np.sin(theta), len(phi))
+            mean = float(gain @ weight / weight.sum())
+        return 10 * math.log10(mean) if mean > 0 else -math.inf
 
     def at(self, theta: Float64Array, phi: Float64Array) -> Float64Array | Complex128Array:
         """Gains [dBi], Shape ``[P]``, or fields, Shape ``[P, 2]``, at zenith angles and azimuths [rad]."""
@@ -84,13 +115,28 @@ def read_pattern(file: Path) -> PatternTable:
     if file.suffix.lower() not in SUFFIXES:
         raise AssetError(f"{file}: no pattern has the ending {file.suffix!r}; known: {', '.join(SUFFIXES)}")
     try:
-        if file.stat().st_size > MAX_BODY:
-            raise AssetError(f"{file} has more than {MAX_BODY} B; write fewer directions")
-        # Planet files have comments in whatever encoding their maker used; what counts is ASCII.
-        lines = file.read_bytes().decode("latin-1").splitlines()
+        with open_regular(file, "name a file") as opened:
+            if os.fstat(opened.fileno()).st_size > MAX_BODY:
+                raise AssetError(f"{file} has more than {MAX_BODY} B; write fewer directions")
+            lines = _decoded(opened.read()).splitlines()
     except OSError as error:
         raise AssetError(f"pattern {file} cannot be read: {error.strerror}") from error
-    return _table(file, lines) if file.suffix.lower() == ".csv" else _planet(file, lines)
+    table = _table(file, lines) if file.suffix.lower() == ".csv" else _planet(file, lines)
+    if not table.mean_gain_dbi <= _IMPOSSIBLE_DBI:
+        raise AssetError(
+            f"{file}: its gain has a mean of {table.mean_gain_dbi:.3g} dBi over the sphere, where no antenna "
+            "has more than 0 dBi; correct gains, units, and signs"
+        )
+    return table
+
+
+def _decoded(data: bytes) -> str:
+    """The text of a file, which may begin with a byte order mark, as spreadsheets write it."""
+    for mark, encoding in _MARKS.items():
+        if data.startswith(mark):
+            return data[len(mark) :].decode(encoding, errors="replace")
+    # Planet files have comments in whatever encoding their maker used; what counts is ASCII.
+    return data.decode("latin-1")
 
 
 def _table(file: Path, lines: list[str]) -> PatternTable:
@@ -115,15 +161,17 @@ def _table(file: Path, lines: list[str]) -> PatternTable:
     phi, column = np.unique(around, return_inverse=True)
     if theta[0] != 0 or theta[-1] != 180:
         raise AssetError(f"{file}: zenith angles go from {theta[0]:g}° to {theta[-1]:g}°; write 0° to 180°")
-    values = np.full((len(theta), len(phi), len(header) - 2), np.nan)
-    values[row, column] = table[:, 2:]
-    missing = np.argwhere(np.isnan(values[..., 0]))
-    if len(missing):
-        t, f = missing[0]
+    # Of each direction a line is needed, so what is missing is known before a table of all is made.
+    directions = np.unique(row * len(phi) + column)
+    if len(directions) < len(theta) * len(phi):
+        gaps = np.flatnonzero(directions != np.arange(len(directions)))
+        t, f = divmod(int(gaps[0]) if len(gaps) else len(directions), len(phi))
         raise AssetError(
             f"{file}: there is no line for theta_deg = {theta[t]:g}, phi_deg = {phi[f]:g} (modulo 360); "
             "write each zenith angle with each azimuth"
         )
+    values = np.empty((len(theta), len(phi), len(header) - 2))
+    values[row, column] = table[:, 2:]
     if not np.array_equal(values[row, column], table[:, 2:]):
         raise AssetError(f"{file}: a direction has two different values; remove one")
     phi, values = np.append(phi, phi[0] + 360.0), np.concatenate([values, values[:, :1]], axis=1)
@@ -150,24 +198,27 @@ def _made(theta_deg: Float64Array, phi_deg: Float64Array, values: Float64Array) 
 
 def _planet(file: Path, lines: list[str]) -> PatternTable:
     gain_dbi: float | None = None
-    cuts: dict[str, dict[float, float]] = {}
-    cut: dict[float, float] | None = None
+    cuts: dict[str, _CutLines] = {}
+    cut: _CutLines | None = None
     for number, text in enumerate(lines, 1):
         parts = text.replace(",", ".").split()
         key = parts[0].upper() if parts else ""
         if key in _CUTS:
-            cut = cuts[key] = {}
+            if key in cuts:
+                raise AssetError(f"{file}:{number}: is a second {key}; remove one")
+            cut = cuts[key] = _CutLines(file, number, key, _count(file, number, parts))
         elif key == "GAIN":
+            if gain_dbi is not None:
+                raise AssetError(f"{file}:{number}: is a second GAIN; remove one")
             gain_dbi = _gain(file, number, parts[1:])
-        elif cut is not None and parts:
-            angle, loss = _numbers(file, number, tuple(parts), 2)
-            cut[angle % 360.0] = loss
+        elif cut is not None and _is_number(key):
+            cut.add(number, tuple(parts))
     if gain_dbi is None:
         raise AssetError(f"{file} has no GAIN; add a line such as GAIN 15.5 dBi")
-    for key in _CUTS:
-        if len(cuts.get(key, {})) < 2:
-            raise AssetError(f"{file} has no {_CUTS[key]} cut; add {key} 360 and a line for each degree")
-    across, down = (_Cut.of(cuts[key]) for key in _CUTS)
+    for key, name in _CUTS.items():
+        if key not in cuts:
+            raise AssetError(f"{file} has no {name} cut; add {key} 360 and a line for each degree")
+    across, down = (cuts[key].cut() for key in _CUTS)
     # Nodes of the table are those of both cuts, so that it has their values.
     azimuth = np.unique(-across.angle % 360.0)
     depression = (down.angle + 180.0) % 360.0 - 180.0
@@ -178,12 +229,77 @@ def _planet(file: Path, lines: list[str]) -> PatternTable:
     return _made(theta, phi, (gain_dbi - attenuation)[..., None])
 
 
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _count(file: Path, line: int, parts: list[str]) -> int:
+    """How many lines follow a cut's key."""
+    if len(parts) < 2 or not parts[1].isdecimal() or not 1 <= int(parts[1][:9]) <= _MOST_ANGLES:
+        raise AssetError(
+            f"{file}:{line}: is {' '.join(parts)!r:.80}; write {parts[0]} and how many lines follow, up to "
+            f"{_MOST_ANGLES}"
+        )
+    return int(parts[1])
+
+
 def _gain(file: Path, line: int, parts: list[str]) -> float:
+    if len(parts) == 1 and (joined := re.fullmatch(r"(.*\d\.?)(db[di])", parts[0], re.IGNORECASE)):
+        parts = [*joined.groups()]
     unit = parts[1].lower() if len(parts) > 1 else "dbd"
     if not parts or unit not in ("dbd", "dbi"):
         raise AssetError(f"{file}:{line}: is {' '.join(parts)!r:.80}; write GAIN, a number, and dBi or dBd")
     (value,) = _numbers(file, line, (parts[0],), 1)
     return value + (_DIPOLE_DBI if unit == "dbd" else 0.0)
+
+
+@dataclass(frozen=True)
+class _CutLines:
+    """The lines of a cut as they are read."""
+
+    file: Path
+    line: int
+    key: str
+    count: int
+    """Lines that follow, by the key's own."""
+    losses: dict[float, float] = field(default_factory=dict)
+    """Attenuation [dB] by angle [°], 0 to less than 360."""
+    read: list[int] = field(default_factory=list)
+    """Numbers of the lines."""
+
+    def add(self, line: int, parts: tuple[str, ...]) -> None:
+        """One more direction."""
+        angle, loss = _numbers(self.file, line, parts, 2)
+        if loss < -_BEYOND_MAXIMUM_DB:
+            raise AssetError(
+                f"{self.file}:{line}: the loss is {loss:g} dB; write the attenuation against GAIN, which is "
+                "positive"
+            )
+        if self.losses.setdefault(angle % 360.0, loss) != loss:
+            raise AssetError(f"{self.file}:{line}: a second loss at {angle:g}°; remove one")
+        self.read.append(line)
+
+    def cut(self) -> _Cut:
+        """The cut, whole."""
+        if len(self.read) != self.count:
+            raise AssetError(
+                f"{self.file}:{self.line}: {self.key} says {self.count}, {len(self.read)} lines follow; "
+                "complete the cut, or correct the number"
+            )
+        angles = np.array(sorted(self.losses))
+        gaps = np.diff(angles, append=angles[0] + 360.0)
+        widest = int(np.argmax(gaps))
+        if gaps[widest] > _WIDEST_GAP_DEG:
+            raise AssetError(
+                f"{self.file}:{self.line}: {self.key} has no line between {angles[widest]:g}° and "
+                f"{angles[(widest + 1) % len(angles)]:g}°; write angles all around, at most "
+                f"{_WIDEST_GAP_DEG:g}° apart"
+            )
+        return _Cut(angles, np.array([self.losses[angle] for angle in angles.tolist()]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,11 +308,6 @@ class _Cut:
 
     angle: Float64Array
     loss: Float64Array
-
-    @classmethod
-    def of(cls, cut: dict[float, float]) -> _Cut:
-        angles = sorted(cut)
-        return cls(np.array(angles), np.array([cut[angle] for angle in angles]))
 
     def at(self, angle: Float64Array) -> Float64Array:
         return np.interp(angle, self.angle, self.loss, period=360.0)

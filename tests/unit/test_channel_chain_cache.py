@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -45,6 +46,21 @@ def test_damage_of_any_kind_is_noted_and_nothing_is_loaded(tmp_path: Path) -> No
     path.write_bytes(whole)
     assert cache.load(KEY, (4, 2)) is None
     assert "is damaged" in cache.notes.pop()
+    assert cache.load(KEY, (3, 2)) is not None
+
+
+def test_a_pipe_in_place_of_a_file_or_of_its_draft_is_not_waited_for(tmp_path: Path) -> None:
+    cache = ChainCache(tmp_path)
+    os.mkfifo(tmp_path / KEY)
+    assert cache.load(KEY, (3, 2)) is None
+    assert "it is a named pipe, not a file" in cache.notes.pop()
+    cache.save(KEY, TABLES)
+    assert cache.load(KEY, (3, 2)) is not None
+    (tmp_path / KEY).unlink()
+    os.mkfifo(tmp_path / f"{KEY}.partial")
+    cache.save(KEY, TABLES)
+    assert "chains cannot be kept" in cache.notes.pop()
+    cache.save(KEY, TABLES)
     assert cache.load(KEY, (3, 2)) is not None
 
 

@@ -347,6 +347,11 @@ def test_pattern_files_are_found_beside_the_scenario_and_differ_in_name(tmp_path
     array = load_scenario(tmp_path / "one.toml").devices[0].array
     assert array is not None
     assert (array.pattern_file, array.panels[0].yaw_deg) == (str(tmp_path / "a" / "sector.msi"), 90.0)
+    (tmp_path / "linked.msi").symlink_to(tmp_path / "a" / "sector.msi")
+    (tmp_path / "link.toml").write_text(text.replace("a/sector.msi", "linked.msi"))
+    linked = load_scenario(tmp_path / "link.toml").devices[0].array
+    assert linked is not None
+    assert linked.pattern_file == str(tmp_path / "linked.msi")
     second = '\n[[devices]]\nname = "b2"\nkind = "antenna"\nrole = "rx"\n'
     (tmp_path / "two.toml").write_text(text + second + "array.pattern_file = 'file:b/sector.msi'\n")
     with pytest.raises(ScenarioError, match=r"two.toml:\d+: devices\[2\].array.pattern_file: .*rename one"):

@@ -187,7 +187,9 @@ def test_sionna_not_installed_is_answered_with_the_command(monkeypatch: pytest.M
 
 def test_pattern_files_of_devices_travel_and_what_is_wrong_with_one_names_its_key(tmp_path: Path) -> None:
     file = tmp_path / "sector.msi"
-    file.write_text("GAIN 10 dBi\nHORIZONTAL 2\n0 0\n180 20\nVERTICAL 2\n0 0\n90 12\n")
+    file.write_text(
+        "GAIN 10 dBi\nHORIZONTAL 4\n0 0\n90 15\n180 20\n270 15\nVERTICAL 4\n0 0\n90 12\n180 20\n270 12\n"
+    )
     array = AntennaArray(pattern_file=str(file))
     device = DeviceSpec(name="bs", kind="antenna", role="tx", array=array)
     plain = DeviceSpec(name="ue", kind="antenna", role="rx")

@@ -181,7 +181,12 @@ def _with_pattern(device: DeviceSpec, folder: Path, array: Place) -> DeviceSpec:
     name, place = device.array.pattern_file, array.at("pattern_file")
     if not name.startswith(_FILE) and not Path(name).is_absolute():
         raise place.error(f'is {name!r}, write "file:" and a path relative to the folder of the scenario')
-    found = msgspec.structs.replace(device.array, pattern_file=_absolute(name, folder, place))
+    path = Path(_absolute(name, folder, place))
+    if name.startswith(_FILE):
+        # A link keeps its own name: its ending says what the file holds.
+        link = folder / name.removeprefix(_FILE)
+        path = link.parent.resolve() / link.name
+    found = msgspec.structs.replace(device.array, pattern_file=str(path))
     return msgspec.structs.replace(device, array=found)
 
 

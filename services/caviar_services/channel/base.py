@@ -178,7 +178,7 @@ class ChannelModel(Service[S]):
         if self.wideband:
             keep_large_buffers()
         notes = (*self.load(preparation), *self._absorption_notes(), *empty_parts(demand, self.run.carriers))
-        return Prepared(notes=notes)
+        return Prepared(notes=(*notes, *self.patterns.notes()))
 
     def load_patterns(self, preparation: Preparation) -> None:
         """Read the pattern files of the run's antennas; `prepare` begins with it."""

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Int32Array
-from caviar_protocol.files import replace_file
+from caviar_protocol.files import read_regular, replace_file
 from caviar_protocol.messages import WARNING
 from caviar_services.checkpoint import Packed
 
@@ -52,7 +52,7 @@ class ChainCache:
         one."""
         path = self._folder / key
         try:
-            data = path.read_bytes()
+            data = read_regular(path, "it is replaced")
         except FileNotFoundError:
             return None
         except OSError as error:

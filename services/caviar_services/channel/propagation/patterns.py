@@ -19,6 +19,10 @@ Field = Float64Array | Complex128Array
 """Complex where an element is circularly polarized, or its file says so."""
 
 
+_TOLERANCE_DBI = 2.0
+"""[dBi]; mean gain over the sphere that is not remarked on: files round, and sum cuts."""
+
+
 def spherical_basis(directions: Float64Array, pole: float = 0.0) -> tuple[Float64Array, Float64Array]:
     """Unit vectors θ̂ and φ̂ at unit vectors ``directions``; each of Shape ``[..., 3]``.
 
@@ -82,6 +86,16 @@ class Patterns:
 
     def __init__(self, tables: Mapping[str, PatternTable] | None = None) -> None:
         self._tabulated = {name: TabulatedPattern(table) for name, table in (tables or {}).items()}
+
+    def notes(self) -> tuple[str, ...]:
+        """What is to be said about patterns that radiate more than they are fed with."""
+        means = {name: pattern.table.mean_gain_dbi for name, pattern in self._tabulated.items()}
+        return tuple(
+            f"pattern {name!r} has a mean gain of {mean:.1f} dBi over the sphere; an antenna has 0 dBi less "
+            "its losses: check its gain, and the signs of its values"
+            for name, mean in means.items()
+            if mean > _TOLERANCE_DBI
+        )
 
     def of(self, array: AntennaArray) -> ElementPattern:
         """The pattern of an array's elements. Raises `AssetError` for a file that no world brought."""
