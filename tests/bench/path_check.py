@@ -1,8 +1,11 @@
-"""Whether a path of reflections is one, by geometry alone: in float64, against every triangle of a scene.
+"""Whether a path is one, by geometry alone: in float64, against every triangle of a scene.
 
 Nothing of the channel's search is used here: no planes, images, beams, tree or float32. A path is *real*
 where each point lies in a triangle, both legs make equal angles with it on one side, and no triangle crosses
 a leg; at a *border* where it is none, but would be if it ran less than `NEAR` beside; and *wrong* elsewhere.
+Where a path is transmitted, its legs are one line instead; where it is diffracted, the point lies on a side
+of a triangle, and both legs make the same angle with it (J. B. Keller, "Geometrical Theory of Diffraction",
+1962).
 """
 
 from __future__ import annotations
@@ -63,25 +66,41 @@ class PathCheck:
         self._inward = np.cross(self._normal[:, None], self._edges)
         self._inward /= np.linalg.norm(self._inward, axis=2, keepdims=True)
 
-    def __call__(self, start: Float64Array, points: Float64Array, end: Float64Array) -> Verdict:
-        """Of a path start → points ``[D, 3]`` → end, in metres in the world."""
+    def __call__(
+        self,
+        start: Float64Array,
+        points: Float64Array,
+        end: Float64Array,
+        types: Sequence[int] | None = None,
+    ) -> Verdict:
+        """Of a path start → points ``[D, 3]`` → end, in metres in the world; ``types`` are its interactions,
+        absent: all reflections."""
         places = np.array([start, *points, end])
-        planes, notes, real = [], [], True
+        planes: list[Sequence[tuple[Float64Array, Float64Array]]] = []
+        notes, real = [], True
         for number in range(1, len(places) - 1):
             before, here, behind = places[number - 1 : number + 2]
+            come, go = _unit(here - before), _unit(behind - here)
+            kind = Interaction.REFLECTION if types is None else types[number - 1]
+            if kind == Interaction.DIFFRACTION:
+                sides = self._sides_at(here)
+                if not any(abs(float((go - come) @ side)) < _LAW for side, _ in sides):
+                    return Verdict("wrong", f"no edge at point {number}, or not Keller's law")
+                planes.append([(here, normal) for _, normal in sides])
+                continue
             normal, inside = self._surface(here)
             if normal is None or inside < -NEAR:
                 return Verdict("wrong", f"point {number} is on no surface")
             if inside < NEAR:
                 notes.append(f"point {number} is {1e3 * inside:.2g} mm inside of its surface")
             real &= inside >= -_ON_EDGE
-            come, go = _unit(here - before), _unit(behind - here)
-            if np.abs(go - come + 2 * (come @ normal) * normal).max() > _LAW:
-                return Verdict("wrong", f"no law of reflection at point {number}")
-            planes.append((here, normal))
+            bent = 0.0 if kind == Interaction.TRANSMISSION else 2 * (come @ normal)
+            if np.abs(go - come + bent * normal).max() > _LAW:
+                return Verdict("wrong", f"point {number} is no {Interaction(kind).name.lower()}")
+            planes.append([(here, normal)])
         for number in range(len(places) - 1):
             one, other = places[number : number + 2]
-            ends = planes[max(number - 1, 0) : number + 1]
+            ends = [plane for near in planes[max(number - 1, 0) : number + 1] for plane in near]
             free = not self._crossed(one, other, ())
             beside = [not self._crossed(one + off, other + off, ends) for off in _around(one, other)]
             if not free and not any(beside):
@@ -106,6 +125,18 @@ class PathCheck:
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         types = np.full((1, len(triangles)), Interaction.REFLECTION, np.uint8)
         return image_points(start[None], end[None], types, corners[None, :, 0], normal[None])[0]
+
+    def _sides_at(self, point: Float64Array) -> list[tuple[Float64Array, Float64Array]]:
+        """Direction of each side of a triangle that a point is on, and the triangle's normal."""
+        towards = point - self._corners
+        length = np.linalg.norm(self._edges, axis=2)
+        along = np.einsum("tec,tec->te", towards, self._edges) / length
+        off = np.linalg.norm(towards - (along / length)[..., None] * self._edges, axis=2)
+        on = (off < _EXACT) & (along > -_EXACT) & (along < length + _EXACT)
+        return [
+            (self._edges[triangle, side] / length[triangle, side], self._normal[triangle])
+            for triangle, side in zip(*np.nonzero(on), strict=True)
+        ]
 
     def _surface(self, point: Float64Array) -> tuple[Float64Array | None, float]:
         """Normal of the surface that a point is on, and how far inside of its outline [m], up to 2 mm."""

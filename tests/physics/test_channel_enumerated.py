@@ -10,12 +10,25 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from channel_lab import Array, C, Plate, Thing, antenna, carriers, measure, mirrored, scene, write_scenery
+from channel_lab import (
+    Array,
+    C,
+    Plate,
+    Thing,
+    antenna,
+    carriers,
+    measure,
+    mirrored,
+    permittivity,
+    scene,
+    spherical_wave,
+    write_scenery,
+)
 
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.digest import payload_digest
 from caviar_protocol.scenario import DeviceSpec
-from caviar_protocol.topics import Channel, Scene
+from caviar_protocol.topics import Channel, Interaction, Scene
 from caviar_services.channel.base import ChannelModel
 from caviar_services.channel.enumeration import scenery_chains
 from caviar_services.channel.sionna.model import SionnaChannel
@@ -29,6 +42,7 @@ PLATES = [
     Plate("south", [(-30, -10, 0), (30, -10, 0), (30, -10, 9), (-30, -10, 9)]),
 ]
 DEPTH = 3
+DIFFRACTED = int(Interaction.DIFFRACTION)
 
 
 @pytest.fixture(autouse=True)
@@ -73,26 +87,30 @@ def traffic(seed: int) -> Scene:
     return scene(devices, things)
 
 
+def face_of(corner: Array, one: Array, other: Array) -> Array:
+    normal = np.cross(one, other)
+    return np.array([corner, one, other, normal / np.linalg.norm(normal)])
+
+
 def rectangles(at: Scene, plates: Sequence[Plate] = PLATES) -> list[Array]:
-    """Corner and both sides of every face, Shape ``[3, 3]``: of the plates, then of the boxes."""
+    """Corner, both sides and normal of every face, Shape ``[4, 3]``: of the plates, then of the boxes."""
     found = []
     for plate in plates:
         a, b, _, d = np.array(plate.corners, float)
-        found.append(np.array([a, b - a, d - a]))
+        found.append(face_of(a, b - a, d - a))
     for position, (w, _, _, z), size in zip(at.position, at.orientation, at.dimensions, strict=True):
         cosine, sine = w * w - z * z, 2 * w * z
         axes = np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]]) * size[:, None]
         for axis, sign in itertools.product(range(3), (-0.5, 0.5)):
             one, other = axes[(axis + 1) % 3], axes[(axis + 2) % 3]
             corner = position + sign * axes[axis] - (one + other) / 2
-            found.append(np.array([corner, one, other]))
+            found.append(face_of(corner, one, other))
     return found
 
 
 def crossing(start: Array, end: Array, face: Array) -> tuple[float, Array] | None:
     """Where a segment crosses a face, as a part of it, and the point; None: nowhere."""
-    corner, one, other = face
-    normal = np.cross(one, other)
+    corner, one, other, normal = face
     across = (end - start) @ normal
     if abs(across) < 1e-12:
         return None
@@ -111,34 +129,138 @@ def is_free(start: Array, end: Array, faces: list[Array], own: tuple[int, ...]) 
 def paths_by_images(start: Array, end: Array, faces: list[Array]) -> list[float]:
     """Lengths of all paths [m], by trying every sequence of faces."""
     found = []
-    numbers = range(len(faces))
-    for depth in range(DEPTH + 1):
-        for chain in itertools.product(numbers, repeat=depth):
-            if any(one == other for one, other in itertools.pairwise(chain)):
-                continue
-            images = [start]
-            for number in chain:
-                corner, one, other = faces[number]
-                normal = np.cross(one, other)
-                images.append(mirrored(images[-1], corner, normal / np.linalg.norm(normal)))
-            here, points = end, [end]
-            for number, image in zip(chain[::-1], images[:0:-1], strict=True):
-                met = crossing(here, image, faces[number])
-                if met is None:
-                    break
-                here = met[1]
-                points.append(here)
-            else:
-                points.append(start)
-                ends = (None, *chain[::-1], None)
-                segments = zip(itertools.pairwise(points), itertools.pairwise(ends), strict=True)
-                if all(is_free(*segment, faces, own) for segment, own in segments):
-                    found.append(float(np.linalg.norm(images[-1] - end)))
+    for chain in chains_of(faces, DEPTH):
+        points = points_back(start, chain, faces, end)
+        if points is not None:
+            ends = itertools.pairwise((None, *chain[::-1], None))
+            segments = zip(itertools.pairwise(points), ends, strict=True)
+            if all(is_free(*segment, faces, own) for segment, own in segments):
+                found.append(float(np.linalg.norm(images(start, chain, faces)[-1] - end)))
     return sorted(found)
 
 
-def lengths(channel: Channel, rx: int) -> list[float]:
-    return sorted((channel.tau[channel.offsets[rx] : channel.offsets[rx + 1]] * C).tolist())
+def edges_of(at: Scene, first: int) -> list[tuple[Array, Array, Array, tuple[int, int]]]:
+    """Both ends of every edge of the boxes, the outward normals of its faces, and their numbers among
+    `rectangles`, from ``first`` on."""
+    found = []
+    for box, (position, (w, _, _, z), size) in enumerate(
+        zip(at.position, at.orientation, at.dimensions, strict=True)
+    ):
+        cosine, sine = w * w - z * z, 2 * w * z
+        axes = np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
+        for along in range(3):
+            others = [axis for axis in range(3) if axis != along]
+            for signs in itertools.product((-1, 1), repeat=2):
+                normals = np.array([s * axes[axis] for s, axis in zip(signs, others, strict=True)])
+                middle = position + sum(n * size[axis] / 2 for n, axis in zip(normals, others, strict=True))
+                half = axes[along] * size[along] / 2
+                faces = [
+                    first + 6 * box + 2 * axis + (s + 1) // 2 for s, axis in zip(signs, others, strict=True)
+                ]
+                found.append((middle - half, middle + half, normals, (faces[0], faces[1])))
+    return found
+
+
+def images(start: Array, chain: Sequence[int], faces: list[Array]) -> list[Array]:
+    """Images of a point behind each face of a chain, itself first."""
+    found = [start]
+    for number in chain:
+        corner, _, _, normal = faces[number]
+        found.append(mirrored(found[-1], corner, normal))
+    return found
+
+
+def points_back(start: Array, chain: Sequence[int], faces: list[Array], end: Array) -> list[Array] | None:
+    """Points of reflection from the end back to the start, both included; None: no path."""
+    points = [end]
+    for number, image in zip(chain[::-1], images(start, chain, faces)[:0:-1], strict=True):
+        met = crossing(points[-1], image, faces[number])
+        if met is None:
+            return None
+        points.append(met[1])
+    return [*points, start]
+
+
+def chains_of(faces: list[Array], most: int) -> list[tuple[int, ...]]:
+    """Sequences of faces, none twice in turn."""
+    every = itertools.chain.from_iterable(
+        itertools.product(range(len(faces)), repeat=n) for n in range(most + 1)
+    )
+    return [chain for chain in every if all(a != b for a, b in itertools.pairwise(chain))]
+
+
+def lengths_over_edges(start: Array, end: Array, at: Scene) -> list[float]:
+    """Lengths of all paths over one edge [m], by trying every sequence of faces before and behind each."""
+    faces = rectangles(at)
+    edges = edges_of(at, len(PLATES))
+    begin, other = (np.array([edge[side] for edge in edges]) for side in (0, 1))
+    span = np.linalg.norm(other - begin, axis=1)
+    along = (other - begin) / span[:, None]
+    found = []
+
+    def unfolded(point: Array) -> tuple[Array, Array]:
+        s = ((point - begin) * along).sum(1)
+        return s, np.linalg.norm(point - begin - s[:, None] * along, axis=1)
+
+    chains = chains_of(faces, DEPTH - 1)
+    for before, behind in itertools.product(chains, chains):
+        if len(before) + len(behind) >= DEPTH:
+            continue
+        source, target = images(start, before, faces)[-1], images(end, behind, faces)[-1]
+        (s, from_source), (t, from_target) = unfolded(source), unfolded(target)
+        place = (s * from_target + t * from_source) / (from_source + from_target)
+        for number in np.flatnonzero((place > 0) & (place < span)):
+            point = begin[number] + place[number] * along[number]
+            normals, own = edges[number][2:]
+            if any((normals @ (image - point)).max() <= 0 for image in (source, target)):
+                continue
+            if set(own) & {*before[-1:], *behind[-1:]}:
+                continue
+            ways = [
+                points_back(end_of, chain, faces, point) for end_of, chain in ((start, before), (end, behind))
+            ]
+            if all(
+                way is not None
+                and all(
+                    is_free(*segment, faces, (*a, *b))
+                    for segment, (a, b) in zip(
+                        itertools.pairwise(way),
+                        itertools.pairwise([own, *((n,) for n in chain[::-1]), ()]),
+                        strict=True,
+                    )
+                )
+                for way, chain in zip(ways, (before, behind), strict=True)
+            ):
+                found.append(float(np.linalg.norm(source - point) + np.linalg.norm(target - point)))
+    return sorted(found)
+
+
+def lengths_through(start: Array, end: Array, at: Scene) -> list[tuple[float, int]]:
+    """Length [m] and number of reflections of all paths that go through boxes, by every sequence of faces."""
+    faces = rectangles(at)
+    found = []
+    for chain in chains_of(faces, DEPTH - 1):
+        points = points_back(start, chain, faces, end)
+        if points is None:
+            continue
+        crossed: list[int] = []
+        for segment, ends in zip(
+            itertools.pairwise(points), itertools.pairwise((None, *chain[::-1], None)), strict=True
+        ):
+            crossed += [
+                n for n, face in enumerate(faces) if n not in ends and crossing(*segment, face) is not None
+            ]
+        if 0 < len(crossed) <= DEPTH - len(chain) and min(crossed) >= len(PLATES):
+            found.append((float(np.linalg.norm(images(start, chain, faces)[-1] - end)), len(chain)))
+    return sorted(found)
+
+
+def lengths(channel: Channel, rx: int, kind: int | None = None) -> list[float]:
+    """Of the paths of a receiver [m], or of those with an interaction of a kind."""
+    rows = np.arange(channel.offsets[rx], channel.offsets[rx + 1])
+    if kind is not None:
+        rows = rows[(channel.interactions[rows] == kind).any(1)]
+    return sorted((channel.tau[rows] * C).tolist())
 
 
 def keys(channel: Channel) -> list[tuple[int, int]]:
@@ -239,17 +361,68 @@ def test_from_a_transmitter_that_moves_the_same_is_found(
     assert same(measure(stands, at), measure(moves, at))
 
 
-def test_what_is_not_enumerated_is_launched_beside_it(tmp_path: Path) -> None:
-    """Diffraction at the boxes' edges; reflections are there once."""
-    plain, _ = street(tmp_path / "one")
-    bent, _ = street(tmp_path / "two", diffraction=True)
+def test_there_are_the_paths_over_all_edges_of_bodies(tmp_path: Path) -> None:
+    """Of three boxes, by all sequences of faces before and behind; each once, and one ray decides nothing."""
+    model, _ = street(tmp_path, diffraction=True, samples_per_frame=1)
+    plain, _ = street(tmp_path / "plain")
     at = traffic(1)
-    reflections, all_kinds = measure(plain, at), measure(bent, at)
-    diffracted = (all_kinds.interactions == 2).any(1)
-    assert diffracted.any()
-    rest = [key for key, bends in zip(keys(all_kinds), diffracted, strict=True) if not bends]
-    assert sorted(rest) == sorted(keys(reflections))
-    assert len(set(keys(all_kinds))) == len(keys(all_kinds))
+    channel = measure(model, at)
+    for rx, device in enumerate(at.devices[1:]):
+        wanted = lengths_over_edges(np.array(STATION), np.array(device.position), at)
+        assert len(wanted) > 20
+        assert lengths(channel, rx, DIFFRACTED) == pytest.approx(wanted, abs=1e-7)
+    bent = (channel.interactions == DIFFRACTED).any(1)
+    rest = [key for key, bends in zip(keys(channel), bent, strict=True) if not bends]
+    assert sorted(rest) == sorted(keys(measure(plain, at)))
+    assert len(set(keys(channel))) == len(keys(channel))
+
+
+def test_there_are_the_paths_through_all_bodies(tmp_path: Path) -> None:
+    """Also those with a reflection, beside a box or inside; what goes through two crosses too many faces."""
+    model, _ = street(tmp_path, refraction=True, samples_per_frame=1, body_material="plasterboard")
+    found = reflected = 0
+    for seed in range(2):
+        at = traffic(seed)
+        places = np.random.default_rng(seed).uniform((-12, -5, 0.3), (10, 5, 3.0), (16, 3))
+        devices = [antenna(f"rx{i:02d}", "rx", place) for i, place in enumerate(places)]
+        at = msgspec.structs.replace(at, devices=(at.devices[0], *devices))
+        channel = measure(model, at)
+        for rx, device in enumerate(devices):
+            wanted = lengths_through(np.array(STATION), np.array(device.position), at)
+            told = lengths(channel, rx, int(Interaction.TRANSMISSION))
+            assert told == pytest.approx([length for length, _ in wanted], abs=1e-7)
+            found += len(wanted)
+            reflected += sum(count for _, count in wanted)
+    assert found > 12
+    assert reflected > 1
+
+
+def test_what_goes_through_a_body_has_the_field_of_two_slabs(tmp_path: Path) -> None:
+    """At normal incidence (ITU-R P.2040-3, eq. 44), beside a launch's."""
+    settings = {"refraction": True, "reflection": True, "body_material": "plasterboard", "max_depth": 2}
+    frequency, thickness = 28e9, 0.1
+    model, _ = street(tmp_path, samples_per_frame=1, **settings)
+    ends = [antenna("bs", "tx", (-9.0, 0.0, 2.0)), antenna("rx", "rx", (9.0, 0.0, 2.0))]
+    channel = measure(model, scene(ends, [Thing("box", (1.0, 0.2, 2.0), (2.0, 4.0, 3.0))]))
+    straight = (channel.interactions == Interaction.TRANSMISSION).all(1)
+    assert straight.sum() == 1
+    eta = permittivity(2.73, 0.0, 0.0085, 0.9395, frequency)
+    index, back = np.sqrt(eta), (1 - np.sqrt(eta)) / (1 + np.sqrt(eta))
+    within = np.exp(-2j * np.pi * thickness * frequency / C * index)
+    through = (1 - back**2) * within / (1 - (back * within) ** 2)
+    wanted = spherical_wave(18.0, frequency) * through**2
+    assert channel.a[0, straight][0] == pytest.approx(wanted, rel=1e-5)
+
+
+def test_paths_over_edges_have_the_fields_of_launched_ones(tmp_path: Path) -> None:
+    enumerated, _ = street(tmp_path / "one", diffraction=True, samples_per_frame=1)
+    launched, _ = street(tmp_path / "two", diffraction=True, candidates="launched", samples=30_000)
+    at = traffic(2)
+    found, known = measure(enumerated, at), measure(launched, at)
+    row = {key: i for i, key in enumerate(keys(found))}
+    assert set(keys(known)) < row.keys()
+    rows = [row[key] for key in keys(known)]
+    assert np.abs(found.a[0, rows] - known.a[0]).max() < 2e-5 * np.abs(known.a[0]).max()
 
 
 def test_deeper_paths_than_are_enumerated_are_launched(tmp_path: Path) -> None:

@@ -101,7 +101,7 @@ def ends_by_scenery(
         return none, none, none
     views = receiver_beams(targets, receivers[scenery.receiver], scenery.faces[scenery.place])
     view, body = (numbers(part) for part in near_bodies(targets, views))
-    seen, other = _shown(targets, views, scenery)
+    seen, other = shown_scenery(targets, views, scenery)
     view = np.concatenate([view, seen])
     group = np.concatenate([body, targets.bodies + other])
     last = beams.chain[first:, -1]
@@ -145,8 +145,9 @@ def ends_by_scenery(
     return beam, scenery.faces[scenery.place[seen]], scenery.receiver[seen]
 
 
-def _shown(targets: Targets, views: Beams, scenery: SceneryViews) -> tuple[Int64Array, Int64Array]:
-    """Views, and places of the other faces of scenery that they show."""
+def shown_scenery(targets: Targets, views: Beams, scenery: SceneryViews) -> tuple[Int64Array, Int64Array]:
+    """What receivers see by way of faces of scenery: numbers of views, one for each pair of a receiver and a
+    face, and places of the other faces that they show."""
     import drjit as dr
     import mitsuba as mi
 

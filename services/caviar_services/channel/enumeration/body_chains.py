@@ -19,7 +19,6 @@ from caviar_services.channel.enumeration.beam_ends import (
     ends_by_bodies,
     ends_by_scenery,
 )
-from caviar_services.channel.enumeration.face_rectangles import FaceRectangles
 from caviar_services.channel.enumeration.image_beams import (
     Beams,
     Targets,
@@ -50,8 +49,7 @@ class ChainPairs:
 
 
 def chain_pairs(
-    faces: FaceRectangles,
-    sizes: Int64Array,
+    targets: Targets,
     scenery: Int64Array,
     views: SceneryViews,
     transmitter: Float64Array,
@@ -62,10 +60,8 @@ def chain_pairs(
 
     Parameters
     ----------
-    faces
-        Of scenery, and behind them of bodies, body after body.
-    sizes
-        How many of the last ones each body has, Shape ``[V]``.
+    targets
+        Faces of scenery, and behind them of bodies, body after body.
     scenery
         Chains of scenery alone that waves from the transmitter go along, with the beginnings of each, as
         faces, −1 behind the last, Shape ``[K, D]``.
@@ -79,9 +75,8 @@ def chain_pairs(
     depth = scenery.shape[1]
     every = np.arange(len(receivers))
     found = [(np.zeros((len(receivers), 0), np.int64), every)]
-    if not (depth and len(faces) and len(receivers)):
+    if not (depth and len(targets.faces) and len(receivers)):
         return ChainPairs.joined(found, depth)
-    targets = Targets(faces, sizes)
     length = (scenery >= 0).sum(1)
 
     def add(beams: Beams) -> None:

@@ -71,7 +71,7 @@ class Targets:
         columns = [mi.Float(column) for column in aligned_columns(rows[:, several(len(faces))])]
         self.normal, self.centre, self.u, self.v = (mi.Vector3f(*columns[i : i + 3]) for i in (0, 3, 6, 9))
         self.offset, self.radius = columns[12:]
-        self.two_sided = mi.UInt(aligned_indices(faces.two_sided[several(len(faces))])) != 0
+        self.two_sided = mi.Bool(mi.UInt(aligned_indices(faces.two_sided[several(len(faces))])))
         some = several(self.bodies)
         self.body_centre = positions(centre[some])
         self.body_radius = mi.Float(aligned_columns(reach[None, some])[0])
@@ -199,16 +199,16 @@ def next_beams(targets: Targets, beams: Beams, scenery: Int64Array, known: Int64
     )
     before = _rows_of(beams.chain[: beams.first_by_body], known[:, :-1])
     parent = np.concatenate([before, numbers(beam), numbers(of_body[0])])
-    return _longer(targets, beams, parent, chain)
+    return longer_beams(targets, beams, parent, chain)
 
 
 def scenery_beams(targets: Targets, beams: Beams, known: Int64Array) -> Beams:
     """Of `next_beams`, those of chains of scenery alone."""
-    return _longer(targets, beams, _rows_of(beams.chain[: beams.first_by_body], known[:, :-1]), known)
+    return longer_beams(targets, beams, _rows_of(beams.chain[: beams.first_by_body], known[:, :-1]), known)
 
 
-def _longer(targets: Targets, beams: Beams, parent: Int64Array, chain: Int64Array) -> Beams:
-    """Beams of chains, each of which is longer by one than that of its parent."""
+def longer_beams(targets: Targets, beams: Beams, parent: Int64Array, chain: Int64Array) -> Beams:
+    """Beams of chains, Shape ``[B, n + 1]``, each of which is longer by one than that of its parent."""
     import mitsuba as mi
 
     index = mi.UInt(aligned_indices(parent[several(len(parent))]))

@@ -14,13 +14,13 @@ from caviar_services.channel.sionna.coplanar_faces import COPLANAR, COPLANAR_REL
 from caviar_services.channel.sionna.planes import PlaneTable
 from caviar_services.channel.sionna.scene import SionnaScene
 
-_OFF_SURFACE = 2e-4
+OFF_SURFACE = 2e-4
 """[m]; rays from face to face start this far from the first."""
 
 _PARALLEL = 1 - 1e-6
 """Cosine between the normals of planes that are parallel."""
 
-_AT_END = 1e-3
+AT_END = 1e-3
 """[m]; what stands this near the end of a segment is what it ends at: two faces meet there, or are one."""
 
 
@@ -45,18 +45,40 @@ def image_paths(
 ) -> ImagePaths:
     """Those of the pairs whose chains mirror the transmitter, each within a triangle of its face, so that the
     receiver may see it, sorted by receiver and chain; positions in metres."""
-    chain, depth = pairs.chain, pairs.chain.shape[1]
-    count = (chain >= 0).sum(1)
+    chain, count = pairs.chain, (pairs.chain >= 0).sum(1)
     order = np.lexsort((*chain.T[::-1], count, pairs.receiver))
-    chain, receiver, count = chain[order], pairs.receiver[order], count[order]
-    image = np.broadcast_to(transmitter, (len(chain), 3))
-    images = [image]
+    chain, receiver = chain[order], pairs.receiver[order]
+    points, good = reflection_points(
+        faces, chain, np.broadcast_to(transmitter, (len(chain), 3)), receivers[receiver]
+    )
+    return ImagePaths(chain[good], receiver[good], points[good])
+
+
+def reflection_points(
+    faces: FaceRectangles, chain: Int64Array, start: Float64Array, end: Float64Array
+) -> tuple[Float64Array, BoolArray]:
+    """Where chains of faces reflect what goes from N starts to N ends, and which chains do.
+
+    Parameters
+    ----------
+    chain
+        Faces, −1 behind the last, Shape ``[N, D]``.
+    start, end
+        [m], Shape ``[N, 3]``.
+
+    Returns
+    -------
+    Points, the end behind the last [m], Shape ``[N, D, 3]``, and which rows have each of them within a
+    triangle of its face, on the side that reflects, Shape ``[N]``. Of other rows, points are anything.
+    """
+    depth, count = chain.shape[1], (chain >= 0).sum(1)
+    images = [start]
     for d in range(depth):
         used = np.flatnonzero(count > d)
-        image = image.copy()
+        image = images[-1].copy()
         image[used] = faces.mirrored(image[used], chain[used, d])
         images.append(image)
-    here = receivers[receiver]
+    here = end.copy()
     points = np.repeat(here[:, None], depth, axis=1)
     good = np.ones(len(chain), np.bool_)
     for d in reversed(range(depth)):
@@ -75,7 +97,7 @@ def image_paths(
     path = rows[path]
     held = faces.in_triangles(points[path, place], chain[path, place])
     good[path[~held]] = False
-    return ImagePaths(chain[good], receiver[good], points[good])
+    return points, good
 
 
 def unhidden(
@@ -88,7 +110,7 @@ def unhidden(
 ) -> BoolArray:
     """Which paths nothing stands in the way of, Shape ``[P]``; positions in metres.
 
-    A ray along each segment meets the surface of its end first, or something within `_AT_END` of it that
+    A ray along each segment meets the surface of its end first, or something within `AT_END` of it that
     does not stand in front of it: shorter rays would lose what grazes.
     """
     count = (paths.chain >= 0).sum(1)
@@ -109,7 +131,7 @@ def unhidden(
             mirror = paths.chain[lane, d - 1]
             normal = faces.normal[mirror]
             side = np.sign(np.einsum("nc,nc->n", arriving - before, normal))[:, None]
-            lifted = before + _OFF_SURFACE * side * normal
+            lifted = before + OFF_SURFACE * side * normal
             start = np.where(ends[:, None], arriving, lifted)
             arriving = np.where(ends[:, None], before, arriving)
             plane = np.where(ends, faces.plane[mirror], plane)
@@ -125,14 +147,14 @@ def unhidden(
         ends = np.concatenate(last)
         behind, met = look.nearest(np.concatenate(first), ends)
         other = (behind < 0) & (met != np.where(planes >= 0, scene.joined.label[planes], -1))
-        hidden = other & (behind < -_AT_END)
+        hidden = other & (behind < -AT_END)
         near = np.flatnonzero(other & ~hidden & (planes >= 0))
-        hidden[near] = _in_front(scene.plane_table, met[near], planes[near], ends[near])
+        hidden[near] = in_front(scene.plane_table, met[near], planes[near], ends[near])
         free[owners[hidden]] = False
     return free
 
 
-def _in_front(table: PlaneTable, met: Int64Array, wanted: Int64Array, points: Float64Array) -> BoolArray:
+def in_front(table: PlaneTable, met: Int64Array, wanted: Int64Array, points: Float64Array) -> BoolArray:
     """Whether planes that rays met before points [m] of others hide these: they are parallel, and farther
     apart than rounding."""
     normal = table.normal[met]

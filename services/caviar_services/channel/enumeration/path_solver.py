@@ -12,19 +12,25 @@ from dataclasses import replace
 
 import numpy as np
 
-from caviar_protocol.arrays import Float64Array, Int64Array
+from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt8Array
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.enumeration.beam_ends import SceneryViews
 from caviar_services.channel.enumeration.body_chains import chain_pairs
+from caviar_services.channel.enumeration.edge_beams import EdgeTargets, edge_chains, enumerated_scenery
+from caviar_services.channel.enumeration.edge_paths import EdgePaths, edge_paths, unhidden_over_edges
 from caviar_services.channel.enumeration.face_rectangles import FaceRectangles
+from caviar_services.channel.enumeration.image_beams import Targets
 from caviar_services.channel.enumeration.image_paths import ImagePaths, image_paths, unhidden
 from caviar_services.channel.enumeration.plane_visibility import seen_planes
 from caviar_services.channel.enumeration.reflection_fields import reflection_fields
 from caviar_services.channel.enumeration.scene_faces import SceneFaces
 from caviar_services.channel.enumeration.scenery_chains import KnownScenery
+from caviar_services.channel.enumeration.transmitted_paths import crossings
 from caviar_services.channel.sionna.candidate_visibility import Faces
 from caviar_services.channel.sionna.candidates import first_of_each
-from caviar_services.channel.sionna.path_buffer import Traced, nothing
+from caviar_services.channel.sionna.diffracting_edges import SceneEdges
+from caviar_services.channel.sionna.path_buffer import Traced, joined, nothing
+from caviar_services.channel.sionna.ray_launcher import LaunchOptions
 from caviar_services.channel.sionna.scene import SionnaScene
 
 _NO_SHAPE = 0xFFFFFFFF
@@ -40,29 +46,38 @@ _NEAREST = 0.01
 
 
 class EnumeratedTracer:
-    """Paths of reflections, and lines of sight, of a scene as it stands.
+    """Paths of reflections, and lines of sight, of a scene as it stands; with refraction, those that go
+    through what hides them, and with diffraction those over an edge of a body (`edge_beams` says which).
 
     Parameters
     ----------
     scene
         The scene; its bodies are where they were placed last.
-    depth
-        Reflections of a path at most.
-    most
-        Paths of a receiver at most; those of more reflections are lost first.
+    options
+        What is modelled, the interactions of a path at most, and how many paths of a kind a receiver has at
+        most; those of more interactions are lost first.
     """
 
-    def __init__(self, scene: SionnaScene, depth: int, most: int) -> None:
+    def __init__(self, scene: SionnaScene, options: LaunchOptions) -> None:
         self._scene = scene
-        self._depth, self._most = depth, most
-        self._faces = SceneFaces(scene)
+        self._options = options
+        self._depth, self._most = options.max_depth, options.max_paths
+        self._edges = scene.edges if options.diffraction else None
+        self._faces = SceneFaces(scene, inner=options.refraction)
         self._look = Faces(scene)
         self._bodies: tuple[int, FaceRectangles, Int64Array] | None = None
 
-    def trace(self, transmitter: Float64Array, receivers: Float64Array, scenery: KnownScenery) -> Traced:
+    def trace(
+        self,
+        transmitter: Float64Array,
+        receivers: Float64Array,
+        scenery: KnownScenery,
+        over_edges: bool = True,
+    ) -> Traced:
         """Paths from one transmitter [3] to all receivers [R, 3], positions in metres in the world.
 
-        ``scenery`` is what is known of it from there.
+        ``scenery`` is what is known of it from there. Diffracted paths have no fields yet: `path_table`
+        computes those of all.
         """
         scene = self._scene
         if not len(receivers):
@@ -75,14 +90,30 @@ class EnumeratedTracer:
         planes = planes[(np.isin(planes, of_scenery.plane) | (planes < 0)).all(1)]
         chains = np.where(planes >= 0, np.searchsorted(of_scenery.plane, planes), -1)
         views = self._views(of_scenery, sights, ends)
-        pairs = chain_pairs(faces, sizes, chains, views, start, ends)
+        targets = Targets(faces, sizes)
+        pairs = chain_pairs(targets, chains, views, start, ends)
         paths = self._once(faces, image_paths(faces, pairs, start, ends))
-        paths = paths.take(unhidden(scene, self._look, faces, paths, start, ends))
         near = ((ends - start) ** 2).sum(1) <= _NEAREST**2
         paths = paths.take(~near[paths.receiver])
-        kept = first_of_each(paths.receiver, self._most)
-        traced = self._traced(faces, paths.take(kept), start, ends)
-        return replace(traced, lost=len(kept) - int(kept.sum()))
+        free = unhidden(scene, self._look, faces, paths, start, ends)
+        found = [self._reflected(faces, paths.take(free), start, ends)]
+        if self._options.refraction:
+            found.append(self._transmitted(faces, paths.take(~free), start, ends))
+        if self._edges is not None and over_edges:
+            edges = EdgeTargets(scene, self._edges, faces)
+            candidates = edge_chains(targets, edges, chains, views, start, ends)
+            bent = edge_paths(faces, edges, candidates, start, ends, self._depth)
+            bent = bent.take(~near[bent.receiver])
+            bent = bent.take(unhidden_over_edges(scene, self._look, faces, edges, bent, start, ends))
+            found.append(
+                self._bent(faces, edges, self._edges.triangles[edges.number[bent.edge], 0], bent, start, ends)
+            )
+        return joined([self._first(part) for part in found], len(scene.wavelengths), self._depth)
+
+    def _first(self, traced: Traced) -> Traced:
+        """As many paths of each receiver as are wanted."""
+        kept = first_of_each(traced.receiver, self._most)
+        return replace(traced.take(kept), lost=len(kept) - int(kept.sum()))
 
     def _once(self, faces: FaceRectangles, paths: ImagePaths) -> ImagePaths:
         """Paths by way of faces that are one surface, each by way of the first of these."""
@@ -111,56 +142,189 @@ class EnumeratedTracer:
             self._bodies = (version, *self._faces.bodies())
         return self._bodies[1:]
 
-    def _traced(
+    def _reflected(
         self, faces: FaceRectangles, paths: ImagePaths, start: Float64Array, ends: Float64Array
     ) -> Traced:
-        scene = self._scene
         used = paths.chain >= 0
-        count, end = used.sum(1), ends[paths.receiver]
-        shapes = np.full(used.shape, _NO_SHAPE, np.int64)
-        primitives = np.full(used.shape, _NO_SHAPE, np.int64)
-        normals = np.zeros((*used.shape, 3))
+        triangles, normals = self._mirrors(faces, paths.chain, paths.points)
+        types = np.where(used, Interaction.REFLECTION, 0).astype(np.uint8)
+        return self._traced(paths.receiver, types, triangles, normals, paths.points, start, ends)
+
+    def _transmitted(
+        self, faces: FaceRectangles, paths: ImagePaths, start: Float64Array, ends: Float64Array
+    ) -> Traced:
+        """Of hidden paths, those that go through what hides them."""
+        count = (paths.chain >= 0).sum(1)
+        found, through = crossings(self._scene, self._look, faces, paths, start, ends, self._depth - count)
+        number = np.cumsum(through) - 1
+        paths, count, crossing = paths.take(through), count[through], number[found.path]
+        crossed = np.zeros((len(count), paths.chain.shape[1] + 1), np.int64)
+        np.add.at(crossed, (crossing, found.segment), 1)
+        before = np.cumsum(crossed, axis=1)
+        rank = np.arange(len(crossing)) - np.searchsorted(crossing, crossing)
+        at = crossing, rank + found.segment
+        path, d = np.nonzero(paths.chain >= 0)
+        mirrors = path, d + before[path, d]
+        end = ends[paths.receiver]
+        shape = len(count), self._depth
+        types, triangles = np.zeros(shape, np.uint8), np.full(shape, -1)
+        normals, points = np.zeros((*shape, 3)), np.repeat(end[:, None], self._depth, axis=1)
+        of_faces, their_normals = self._mirrors(faces, paths.chain, paths.points)
+        types[mirrors], types[at] = Interaction.REFLECTION, Interaction.TRANSMISSION
+        triangles[mirrors], triangles[at] = of_faces[path, d], found.triangle
+        points[mirrors], points[at] = paths.points[path, d], found.points
+        normals[mirrors] = their_normals[path, d]
+        normals[at] = self._scene.plane_table.normal[self._scene.plane_of[found.triangle]]
+        return self._traced(paths.receiver, types, triangles, normals, points, start, ends)
+
+    def _bent(
+        self,
+        faces: FaceRectangles,
+        edges: EdgeTargets,
+        at_edge: Int64Array,
+        paths: EdgePaths,
+        start: Float64Array,
+        ends: Float64Array,
+    ) -> Traced:
+        """Paths over edges; ``at_edge`` is a triangle at each."""
+        types = np.where(paths.chain >= 0, Interaction.REFLECTION, 0).astype(np.uint8)
+        triangles, _ = self._mirrors(faces, paths.chain, paths.points)
+        rows, edge = np.arange(len(paths.edge)), edges.number[paths.edge]
+        types[rows, paths.bend] = Interaction.DIFFRACTION
+        triangles[rows, paths.bend] = at_edge
+        traced = self._traced(paths.receiver, types, triangles, None, paths.points, start, ends)
+        return replace(traced, edge=edge)
+
+    def _mirrors(
+        self, faces: FaceRectangles, chain: Int64Array, points: Float64Array
+    ) -> tuple[Int64Array, Float64Array]:
+        """Triangles that reflect at points of chains, −1 where none does, and unit normals there."""
+        used, table = chain >= 0, self._scene.plane_table
+        triangles, normals = np.full(chain.shape, -1), np.zeros((*chain.shape, 3))
         if used.any():
-            plane = faces.plane[paths.chain[used]]
-            triangles = scene.plane_table.first_holding(scene.plane_table.triangle[plane], paths.points[used])
-            shapes[used], primitives[used] = scene.shapes_of(triangles)
-            normals[used] = faces.normal[paths.chain[used]]
-        corners = np.concatenate(
-            [np.broadcast_to(start, (len(count), 1, 3)), paths.points, end[:, None]], axis=1
-        )
-        media = scene.media(shapes)
+            plane = faces.plane[chain[used]]
+            triangles[used] = table.first_holding(table.triangle[plane], points[used])
+            normals[used] = faces.normal[chain[used]]
+        return triangles, normals
+
+    def _traced(
+        self,
+        receiver: Int64Array,
+        types: UInt8Array,
+        triangles: Int64Array,
+        normals: Float64Array | None,
+        points: Float64Array,
+        start: Float64Array,
+        ends: Float64Array,
+    ) -> Traced:
+        """Paths of some interactions, with their fields where normals are given, else without."""
+        scene = self._scene
+        used = types != 0
+        count = used.sum(1)
+        shapes, primitives = (np.full(used.shape, _NO_SHAPE, np.int64) for _ in range(2))
+        shapes[used], primitives[used] = scene.shapes_of(triangles[used])
+        transfer = np.zeros((len(scene.wavelengths), len(count), 3, 3), np.complex128)
+        if normals is not None:
+            through = types == Interaction.TRANSMISSION
+            corners = np.concatenate(
+                [np.broadcast_to(start, (len(count), 1, 3)), points, ends[receiver][:, None]], axis=1
+            )
+            transfer = reflection_fields(
+                corners, count, normals, through, scene.media(shapes), scene.wavelengths
+            )
         rest = ((0, 0), (0, self._depth - used.shape[1]))
-        shapes, primitives = (
-            np.pad(column, rest, constant_values=_NO_SHAPE) for column in (shapes, primitives)
-        )
-        types = np.pad(np.where(used, Interaction.REFLECTION, 0).astype(np.uint8), rest)
-        points = np.pad(np.where(used[..., None], paths.points + scene.centre, 0.0), (*rest, (0, 0)))
         return Traced(
-            receiver=paths.receiver,
-            transfer=reflection_fields(corners, count, normals, media, scene.wavelengths),
-            types=types,
-            shapes=shapes,
-            primitives=primitives,
-            points=points,
+            receiver=receiver,
+            transfer=transfer,
+            types=np.pad(types, rest),
+            shapes=np.pad(shapes, rest, constant_values=_NO_SHAPE),
+            primitives=np.pad(primitives, rest, constant_values=_NO_SHAPE),
+            points=np.pad(np.where(used[..., None], points + scene.centre, 0.0), (*rest, (0, 0))),
             edge=np.full(len(count), -1),
             hidden=np.zeros(len(count), np.bool_),
             settled=np.zeros(len(count), np.bool_),
             lost=0,
         )
 
+    def unknown(
+        self, launched: Traced, enumerated: Traced, scenery: KnownScenery, over_edges: bool = True
+    ) -> Traced:
+        """Of launched paths, those that enumeration leaves to rays.
 
-def unknown_paths(launched: Traced, enumerated: Traced, scene: SionnaScene) -> Traced:
-    """Of launched paths, those that are none of the enumerated ones: of another kind, or by other planes."""
-    keys = np.concatenate([_keys(enumerated, scene), _keys(launched, scene)])
-    _, first = np.unique(keys, axis=0, return_index=True)
-    new = np.zeros(len(keys), np.bool_)
-    new[first] = True
-    other = ((launched.types != 0) & (launched.types != Interaction.REFLECTION)).any(1)
-    return launched.take(new[len(enumerated.types) :] | other)
+        That are paths of kinds that it does not know, and reflections by way of planes that it has not found.
+        Of the kinds that it knows all paths of, it decides: what only rays meet there is none.
+
+        Parameters
+        ----------
+        launched, enumerated
+            Paths of one transmitter, the latter as `trace` found them.
+        scenery, over_edges
+            What `trace` got.
+        """
+        scene = self._scene
+        surfaces = _surfaces(launched, scene)
+        keys = np.concatenate(
+            [
+                np.column_stack([part.receiver, of])
+                for part, of in ((enumerated, _surfaces(enumerated, scene)), (launched, surfaces))
+            ]
+        )
+        only = np.concatenate([_only_reflected(part) for part in (enumerated, launched)])
+        _, first = np.unique(np.column_stack([only, keys]), axis=0, return_index=True)
+        new = np.zeros(len(keys), np.bool_)
+        new[first] = True
+        wanted = np.where(_only_reflected(launched), new[len(enumerated.types) :], True)
+        known = np.zeros(len(wanted), np.bool_)
+        chains = scenery.chains.astype(np.int64)
+        if self._options.refraction:
+            known |= self._is_known_through(launched.types, surfaces, chains)
+        if self._edges is not None and over_edges:
+            known |= self._is_known_bent(self._edges, launched, surfaces, chains.shape[1])
+        by_body = surfaces >= scene.first_moving_plane
+        at_face = launched.types == Interaction.REFLECTION
+        known &= (~at_face | by_body | np.isin(surfaces, chains)).all(1)
+        return launched.take(wanted & (launched.hidden | ~known))
+
+    def _is_known_through(self, types: UInt8Array, surfaces: Int64Array, chains: Int64Array) -> BoolArray:
+        """Which paths are transmitted, and reflected by chains that are enumerated: by way of bodies, known
+        ones of scenery, or not at all."""
+        through, mirrors = types == Interaction.TRANSMISSION, types == Interaction.REFLECTION
+        kind = through.any(1) & (through | mirrors | (types == 0)).all(1)
+        kind &= mirrors.sum(1) <= chains.shape[1]
+        order = np.argsort(~mirrors, axis=1, kind="stable")
+        chain = np.where(np.take_along_axis(mirrors, order, 1), np.take_along_axis(surfaces, order, 1), -1)
+        by_body = (chain >= self._scene.first_moving_plane).any(1)
+        chain = chain[:, : chains.shape[1]]
+        straight = np.full((1, chains.shape[1]), -1)
+        _, of = np.unique(np.concatenate([straight, chains, chain]), axis=0, return_inverse=True)
+        of = of.reshape(-1)
+        known: BoolArray = kind & (by_body | np.isin(of[1 + len(chains) :], of[: 1 + len(chains)]))
+        return known
+
+    def _is_known_bent(
+        self, edges: SceneEdges, traced: Traced, surfaces: Int64Array, depth: int
+    ) -> BoolArray:
+        """Which paths are over an edge, with reflections as `edge_beams` has them."""
+        bent, mirrors = (traced.types == kind for kind in (Interaction.DIFFRACTION, Interaction.REFLECTION))
+        used = traced.types != 0
+        of_scenery = surfaces < self._scene.first_moving_plane
+        of_body = traced.edge >= len(edges) - len(edges.of_bodies[0])
+        if enumerated_scenery(edges):
+            of_body |= (traced.edge >= 0) & (mirrors & ~of_scenery).any(1)
+        known: BoolArray = of_body & (bent | mirrors | ~used).all(1) & (used.sum(1) <= depth)
+        after = np.cumsum(bent, axis=1) > 0
+        for side in (mirrors & ~after, mirrors & after):
+            known &= (side.sum(1) <= 2) | (of_scenery | ~side).all(1)
+        return known
 
 
-def _keys(traced: Traced, scene: SionnaScene) -> Int64Array:
-    """Receiver, and surface of each reflection, of paths."""
-    planes = scene.surface_of[scene.triangle_numbers(traced.shapes, traced.primitives)]
-    used = traced.types != 0
-    return np.column_stack([traced.receiver, np.where(used, planes, -1)])
+def _only_reflected(traced: Traced) -> BoolArray:
+    """Which paths have no other interaction than reflections."""
+    only: BoolArray = ((traced.types == 0) | (traced.types == Interaction.REFLECTION)).all(1)
+    return only
+
+
+def _surfaces(traced: Traced, scene: SionnaScene) -> Int64Array:
+    """Surface of each interaction of paths, −1 behind the last."""
+    surfaces = scene.surface_of[scene.triangle_numbers(traced.shapes, traced.primitives)]
+    return np.where(traced.types != 0, surfaces, -1)

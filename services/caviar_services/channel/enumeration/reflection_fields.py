@@ -1,4 +1,4 @@
-"""Fields of reflected paths, in float64: Fresnel's coefficients of a slab at each point (ITU-R P.2040-3)."""
+"""Fields of reflected and transmitted paths, in float64: coefficients of slabs (ITU-R P.2040-3)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from caviar_protocol.arrays import Complex128Array, Float64Array, Int64Array
+from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int64Array
 from caviar_services.channel.propagation.utd import Media, Wall
 
 
@@ -14,6 +14,7 @@ def reflection_fields(
     corners: Float64Array,
     count: Int64Array,
     normals: Float64Array,
+    through: BoolArray,
     media: Media,
     wavelengths: Sequence[float],
 ) -> Complex128Array:
@@ -22,11 +23,13 @@ def reflection_fields(
     Parameters
     ----------
     corners
-        TX, points of reflection, and RX in all places behind the last one [m], Shape ``[P, D + 2, 3]``.
+        TX, points of interactions, and RX in all places behind the last one [m], Shape ``[P, D + 2, 3]``.
     count
-        Reflections of each path, Shape ``[P]``.
+        Interactions of each path, Shape ``[P]``.
     normals
         Unit, of the plane at each point, Shape ``[P, D, 3]``.
+    through
+        Which of them let the wave through, Shape ``[P, D]``; the others reflect it.
     media
         At each point.
     wavelengths
@@ -50,7 +53,7 @@ def reflection_fields(
                 media.scattering[rows, d],
                 wavelength,
             )
-            through = np.zeros(len(rows), np.bool_)
-            field[rows] = wall.dyad(directions[rows, d], normals[rows, d], through) @ field[rows]
+            dyad = wall.dyad(directions[rows, d], normals[rows, d], through[rows, d])
+            field[rows] = dyad @ field[rows]
         fields[carrier] = field * (wavelength / (4 * np.pi) / total)[:, None, None]
     return fields

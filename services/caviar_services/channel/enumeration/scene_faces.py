@@ -18,9 +18,11 @@ class SceneFaces:
     ----------
     scene
         Whose faces; its bodies are where `SionnaScene.place` put them last.
+    inner
+        Whether waves may be inside of closed bodies, so that the inner sides of their faces reflect too.
     """
 
-    def __init__(self, scene: SionnaScene) -> None:
+    def __init__(self, scene: SionnaScene, inner: bool = False) -> None:
         self._scene = scene
         table = scene.plane_table
         first = scene.first_moving_plane
@@ -39,7 +41,7 @@ class SceneFaces:
             numbers = scene.face_numbers(asset)
             both, along = two_sided_planes(mesh, numbers), _sides_of(mesh, numbers)
             for body in scene.bodies_of(asset):
-                self._two_sided[self._body_of == body] = both
+                self._two_sided[self._body_of == body] = both | inner
                 self._along[self._body_of == body] = along
         self._standing: tuple[int, ...] | None = None
         self._rows: tuple[Int64Array, Int64Array, Int64Array]

@@ -133,7 +133,7 @@ def _found(
         paths, at = np.nonzero(diffracted)
         before = _images(start, fixed, types, origin, normal)
         behind = _images(end, fixed[:, ::-1], types[:, ::-1], origin[:, ::-1], normal[:, ::-1])
-        fixed[paths, at] = _keller(before[at, paths], behind[depth - 1 - at, paths], edges[paths])
+        fixed[paths, at] = keller_point(before[at, paths], behind[depth - 1 - at, paths], edges[paths])
     return _traced_back(_images(start, fixed, types, origin, normal), fixed, end, types, origin, normal)
 
 
@@ -214,8 +214,16 @@ def _square(vectors: Float64Array) -> Float64Array:
     return square
 
 
-def _keller(source: Float64Array, target: Float64Array, edges: Float64Array) -> Float64Array:
-    """Where the shortest path from source to target over the line of an edge meets it."""
+def keller_point(source: Float64Array, target: Float64Array, edges: Float64Array) -> Float64Array:
+    """Where the shortest path from source to target over the line of an edge meets it [m].
+
+    Parameters
+    ----------
+    source, target
+        [m], Shape ``[P, 3]``.
+    edges
+        Both ends of each [m], Shape ``[P, 2, 3]``.
+    """
     origin, along = edges[:, 0], edges[:, 1] - edges[:, 0]
     along = along / np.sqrt(_square(along))
     s = ((source - origin) * along).sum(-1, keepdims=True)

@@ -7,6 +7,7 @@ known from the launch.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -50,6 +51,14 @@ class Faces:
         import mitsuba as mi
 
         self._follow_scene()
+        behind, triangle, hit = self._met(start, end, active)
+        return behind, dr.gather(mi.UInt, self._surface, triangle, hit)
+
+    def _met(self, start: Any, end: Any, active: Any) -> tuple[Any, Any, Any]:
+        """How much farther than a segment's end [m] the first triangle along it is, its number, and whether
+        there is one."""
+        import drjit as dr
+        import mitsuba as mi
 
         line = end - start
         length = dr.norm(line)
@@ -58,20 +67,30 @@ class Faces:
         met = self._scene.mi_scene.ray_intersect_preliminary(ray, coherent=False, active=active)
         hit = active & met.is_valid()
         offset = dr.gather(mi.UInt, self._offset, mi.UInt(dr.reinterpret_array(mi.UInt, met.shape)), hit)
-        return met.t - length, dr.gather(mi.UInt, self._surface, offset + met.prim_index, hit)
+        return met.t - length, offset + met.prim_index, hit
 
     def nearest(self, start: Float64Array, end: Float64Array) -> tuple[Float64Array, Int64Array]:
         """The same of segments ``[Q, 3]`` → ``[Q, 3]``; infinite where there is none, its number anything."""
-        import drjit as dr
-        import mitsuba as mi
+        return _looked(self.along, start, end)
 
-        lanes = several(len(start))
-        behind, plane = self.along(
-            positions(start[lanes]), positions(end[lanes]), dr.full(mi.Bool, True, len(lanes))
-        )
-        dr.eval(behind, plane)
-        behind, plane = behind.numpy()[: len(start)], plane.numpy()[: len(start)]
-        return behind.astype(np.float64), plane.astype(np.int64)
+    def first_triangle(self, start: Float64Array, end: Float64Array) -> tuple[Float64Array, Int64Array]:
+        """As `nearest`, with the number of the triangle."""
+        return _looked(self._met, start, end)
+
+
+def _looked(
+    look: Callable[[Any, Any, Any], tuple[Any, ...]], start: Float64Array, end: Float64Array
+) -> tuple[Float64Array, Int64Array]:
+    import drjit as dr
+    import mitsuba as mi
+
+    lanes = several(len(start))
+    behind, number, *_ = look(
+        positions(start[lanes]), positions(end[lanes]), dr.full(mi.Bool, True, len(lanes))
+    )
+    dr.eval(behind, number)
+    behind, number = behind.numpy()[: len(start)], number.numpy()[: len(start)]
+    return behind.astype(np.float64), number.astype(np.int64)
 
 
 @dataclass(frozen=True, eq=False)

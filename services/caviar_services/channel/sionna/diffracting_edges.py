@@ -57,6 +57,7 @@ class SceneEdges:
         self.number: Int32Array = (np.arange(len(self)) - np.searchsorted(owner, owner)).astype(np.int32)
         """Of each edge within the object that its first face is of, the same in every frame."""
         self._moving = int(np.searchsorted(owner, scene.first_body_piece))
+        self._piece = owner[self._moving :]
         self._on_device: tuple[int, DeviceEdges] | None = None
 
     def __len__(self) -> int:
@@ -71,6 +72,12 @@ class SceneEdges:
     def all_ends(self) -> Float64Array:
         """`ends` of all edges, Shape ``[E, 2, 3]``; those of bodies that stand for nothing have no length."""
         return self._scene.vertices[self._edges.ends]
+
+    @property
+    def of_bodies(self) -> tuple[Int64Array, Int64Array]:
+        """Numbers of the edges of bodies, in ascending order, and of the piece that each is of."""
+        edges = np.arange(self._moving, len(self))
+        return edges, self._piece
 
     def ends(self, edges: Int64Array) -> Float64Array:
         """Both ends of these edges as they stand [m], Shape ``[N, 2, 3]``; 0 for −1."""

@@ -30,7 +30,7 @@ from caviar_services.channel.arrays.mimo_rt import ElementTracer
 from caviar_services.channel.arrays.spherical import SphericalWaves
 from caviar_services.channel.base import Found, PathModel
 from caviar_services.channel.enumeration.chain_cache import ChainCache
-from caviar_services.channel.enumeration.path_solver import EnumeratedTracer, unknown_paths
+from caviar_services.channel.enumeration.path_solver import EnumeratedTracer
 from caviar_services.channel.enumeration.scenery_chains import SceneryChains, SceneryLaunch
 from caviar_services.channel.paths import Antenna, PathTable
 from caviar_services.channel.propagation.clearance import with_near_pairs
@@ -397,14 +397,17 @@ class SionnaChannel(PathModel[SionnaSettings]):
             tracer = self._unbent
             self._without_edge += 1
         found = []
+        over_edges = tracer is self._tracer
         if self._enumerated is not None:
             scenery = self._scenery.of(transmitter.name, transmitter.position)
-            found.append(self._enumerated.trace(transmitter.position, targets, scenery))
+            found.append(self._enumerated.trace(transmitter.position, targets, scenery, over_edges))
         if self._launches:
             launched = tracer.trace(
                 transmitter.position, targets, s.receivers_at_once, followed, names, corners=corners
             )
-            found.append(launched if not found else unknown_paths(launched, found[0], self._scene))
+            if self._enumerated is not None:
+                launched = self._enumerated.unknown(launched, found[0], scenery, over_edges)
+            found.append(launched)
             if self.with_split:
                 last = found[-1]
                 missed = tracer.missed_by_half(transmitter.position, last)
@@ -453,7 +456,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         )
         cache = ChainCache(default_folder() / "chains") if s.cache_chains else None
         launch = SceneryLaunch(samples=self._samples, launches=s.scenery_launches)
-        self._enumerated = EnumeratedTracer(self._scene, launched.max_depth, launched.max_paths)
+        self._enumerated = EnumeratedTracer(self._scene, launched)
         options = replace(launched, max_depth=depth)
         self._scenery = SceneryChains(self._scene, options, launch, s.samples_per_frame, cache)
         notes = []
