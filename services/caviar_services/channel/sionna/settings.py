@@ -46,7 +46,7 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     ] = 100_000
     """Where candidates are enumerated: from transmitters that move, and for refraction, diffraction,
     scattering and paths longer than ``enumerated_depth``."""
-    enumerated_depth: Annotated[int, quantity("1", "reflections of enumerated paths at most", ge=1, le=5)] = 3
+    enumerated_depth: Annotated[int, quantity("1", "interactions of an enumerated path", ge=1, le=5)] = 3
     cache_chains: bool = True
     """Keep the scenery's chains in the user's cache, ``$XDG_CACHE_HOME/caviar/chains``, for the next run."""
     ray_spacing_deg: (
