@@ -425,6 +425,40 @@ def test_paths_over_edges_have_the_fields_of_launched_ones(tmp_path: Path) -> No
     assert np.abs(found.a[0, rows] - known.a[0]).max() < 2e-5 * np.abs(known.a[0]).max()
 
 
+def test_a_reflection_and_the_wave_over_the_edge_where_it_ends_have_one_sum(tmp_path: Path) -> None:
+    """Across the line at which the reflection by the top of a box, then by the north wall, ends.
+
+    Where a launch and enumeration do not agree on that reflection, they give the wave over the edge opposite
+    signs, and both are right: the sum is the same, and continuous.
+    """
+    off = np.array([-1e-3, -3e-4, -1e-4, -1e-5, -1e-6, 1e-6, 1e-5, 1e-4, 3e-4, 1e-3])
+    top, edge, wall = 2.0, 2.0, 10.0
+    image = np.array([*STATION[:2], 2 * top - STATION[2]])
+    beyond = np.array([1.0, 2 * wall - 5.0])
+    height = image[2] + (top - image[2]) * (beyond[1] - image[1]) / (edge - image[1])
+    length = np.linalg.norm([[*beyond, z] for z in height + off] - image, axis=1)
+    devices = [antenna(f"rx{i}", "rx", (1.0, 5.0, float(z))) for i, z in enumerate(height + off)]
+    at = scene([antenna("bs", "tx", STATION), *devices], [Thing("box", (0.0, 0.0, 1.0), (4.0, 4.0, 2.0))])
+    sums = []
+    for candidates in ("enumerated", "launched"):
+        model, _ = street(tmp_path / candidates, diffraction=True, candidates=candidates, max_depth=2)
+        channel = measure(model, at)
+        owner = np.repeat(np.arange(len(off)), np.diff(channel.offsets))
+        near = np.abs(channel.tau * C - length[owner]) < 1e-5
+        bent = near & (channel.interactions == DIFFRACTED).any(1)
+        reflected = near & (channel.interactions[:, :2] == Interaction.REFLECTION).all(1)
+        h = channel.a[0] * np.exp(2j * np.pi * length[owner] * 28e9 / C)
+        assert owner[bent].tolist() == list(range(len(off)))
+        there = np.isin(np.arange(len(off)), owner[reflected])
+        assert there[off > 0].all() or candidates == "launched"
+        assert not there[off <= -3e-4].any()
+        assert (np.sign(h[bent].real) == np.where(there, 1, -1) * np.sign(h[bent][-1].real)).all()
+        sums.append(h[bent])
+        np.add.at(sums[-1], owner[reflected], h[reflected])
+        assert np.abs(sums[-1] / sums[0][0] - 1).max() < 0.01
+    assert np.abs(sums[1] / sums[0] - 1).max() < 2e-3
+
+
 def test_deeper_paths_than_are_enumerated_are_launched(tmp_path: Path) -> None:
     shallow, _ = street(tmp_path / "one", max_depth=2)
     mixed, _ = street(tmp_path / "two", enumerated_depth=2)
