@@ -46,6 +46,10 @@ def call_with_timeout(action: Callable[[], object], seconds: float) -> bool:
 
     A thread that waits for a disk cannot be ended: it goes on, and holds up no caller and no exit.
     Raises the `OSError` that the call raised in that time.
+
+    Args:
+        action: What is called.
+        seconds: [s] that are waited for its end.
     """
     errors: list[OSError] = []
 

@@ -58,7 +58,14 @@ class CheckpointFiles:
         self._synced: set[Path] = set()
 
     def save(self, service: str, episode: int, frame: int, state: Any) -> tuple[str, str]:
-        """Write a state; its file's name and SHA-256. `RunError` naming the file where that fails."""
+        """Write a state; its file's name and SHA-256. `RunError` naming the file where that fails.
+
+        Args:
+            service: Whose state it is.
+            episode: Of the checkpoint.
+            frame: Behind which the state was taken.
+            state: Its bytes.
+        """
         path, data = self._folder / f"{service}-{episode}-{frame}.bin", memoryview(state)
         try:
             self._folder.mkdir(exist_ok=True)
@@ -100,7 +107,13 @@ class CheckpointFiles:
         self._synced.update(paths)
 
     def known(self, service: str, file: str, digest: str) -> bytes | None:
-        """A state that was saved before a restart of the broker; None where it is gone, or is another."""
+        """A state that was saved before a restart of the broker; None where it is gone, or is another.
+
+        Args:
+            service: Whose state it is.
+            file: Its name in ``checkpoints/``.
+            digest: SHA-256 that the journal has of it.
+        """
         path = self._folder / file
         try:
             state = read_regular(path)

@@ -210,6 +210,10 @@ def needed(entries: Iterable[EntryLocation], snapshot: Snapshot) -> tuple[int, l
     That frame is the last finished one, or that of the oldest among the services' newest states of a
     finished frame: what came since is granted again to a service that comes back. Of earlier frames the
     newest products remain, which may be held, and how agents end the episode.
+
+    Args:
+        entries: Of the journal, in order.
+        snapshot: The run up to its last finished frame.
     """
     live = [
         entry

@@ -30,6 +30,10 @@ def recorded_frames(directory: Path, scenario: Scenario) -> tuple[tuple[int, int
     """The last recorded episode and how many frames of it there are, and what is damaged, a line each.
 
     None where no recorder of this machine takes part: how far another got is known to that one alone.
+
+    Args:
+        directory: Of the run.
+        scenario: Of the run.
     """
     recorders = [spec for spec in scenario.services.values() if spec.role == "recorder"]
     # A recording on another machine cannot be looked at: its recorder says what it lacks when it is granted.
@@ -88,6 +92,10 @@ def check_run_files(directory: Path, journal: Path, run: str) -> None:
 
 def with_replay(plan: RunPlan, spec: ReplaySpec | None) -> RunPlan:
     """The plan with the recorded decisions and misses of a run that is repeated.
+
+    Args:
+        plan: Of the run that repeats.
+        spec: What it repeats; None: nothing.
 
     Raises:
         RecordingError: There is no such recording.

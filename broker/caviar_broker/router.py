@@ -163,6 +163,15 @@ class Router:
         One that ``earns`` gives its receiver the right to one message more.
 
         Parts that were received go out as they came, without a copy.
+
+        Args:
+            route: Routing id of the receiver.
+            header: The encoded message.
+            parts: What follows it.
+            earns: Whether the receiver may answer it.
+
+        Returns:
+            Why it did not go; empty where it did.
         """
         send = self._send
         try:

@@ -56,7 +56,12 @@ def versions_of(scenario: Scenario) -> dict[str, str]:
 
 
 def changes(before: Mapping[str, str], now: Mapping[str, str]) -> str:
-    """What is of another version than before; empty where nothing is."""
+    """What is of another version than before; empty where nothing is.
+
+    Args:
+        before: Versions that began the run.
+        now: Versions of this process.
+    """
     return "; ".join(
         f"{name} {now.get(name, 'not used')} (was {before.get(name, 'not used')})"
         for name in sorted({*before, *now})

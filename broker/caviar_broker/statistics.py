@@ -77,7 +77,13 @@ class Statistics:
         self._lag_of_episode = (0, 0)
 
     def latency(self, service: str, elapsed_ns: int, missed: bool) -> None:
-        """A grant was answered, or its deadline passed."""
+        """A grant was answered, or its deadline passed.
+
+        Args:
+            service: Which was granted.
+            elapsed_ns: From GRANT to answer or deadline [ns].
+            missed: Whether its budget was up.
+        """
         self._latencies[service].append(elapsed_ns)
         self._misses[service] += missed
         self._totals[service] += elapsed_ns
@@ -87,7 +93,13 @@ class Statistics:
         self._lateness.append(lateness_ns)
 
     def frame(self, now: int, episode: int = 0, lag_ns: int = 0) -> None:
-        """A frame is finished, in an episode that has slipped so far by ``lag_ns``."""
+        """A frame is finished, in an episode that has slipped so far by ``lag_ns``.
+
+        Args:
+            now: The time [ns].
+            episode: Of the frame.
+            lag_ns: Sum of the episode's slips so far [ns].
+        """
         self._finished_at.append(now)
         known, before = self._lag_of_episode
         slip = lag_ns - before if episode == known else lag_ns

@@ -82,6 +82,13 @@ def measure(topology: Topology, services: int, payload: int, frames: int, *, cur
 
     With ``curve`` each of them has a key, and what it says is encrypted, as in a run with keys.
 
+    Args:
+        topology: Which client takes what from which.
+        services: Number of clients.
+        payload: Of each product [B].
+        frames: That are measured, behind the warm-up.
+        curve: Whether with keys.
+
     Raises:
         RunError: The run, or one of the clients, does not come to its end.
     """

@@ -225,7 +225,13 @@ MAX_ORDER = 1 << 16
 
 
 class Reporter:
-    """Reports what happens: JSON lines to a launcher, words to a person, and notices to the log too."""
+    """Reports what happens: JSON lines to a launcher, words to a person, and notices to the log too.
+
+    Args:
+        fd: Where lines go.
+        log: File for notices.
+        control: Whether a launcher reads them.
+    """
 
     def __init__(self, fd: int, log: Path, control: bool) -> None:
         self._control = control
@@ -295,7 +301,12 @@ def _words(line: Line) -> str:
 
 
 class LauncherPipe:
-    """Orders of a launcher, from a descriptor; when that ends, so does the run."""
+    """Orders of a launcher, from a descriptor; when that ends, so does the run.
+
+    Args:
+        server: The broker.
+        fd: Where requests come from.
+    """
 
     def __init__(self, server: BrokerServer, fd: int = 0) -> None:
         self._server, self._fd, self._rest = server, fd, b""

@@ -148,7 +148,13 @@ class Dispatcher:
             self._end_after(task.frame)
 
     def handle_fault(self, service: str, text: str, now: int) -> None:
-        """Take FAULT for the oldest outstanding task of a service that its frame can do without."""
+        """Take FAULT for the oldest outstanding task of a service that its frame can do without.
+
+        Args:
+            service: Which answers.
+            text: Phase and message of the FAULT.
+            now: The time [ns].
+        """
         task = self._answered(self._participants[service], now)
         state = task.state
         task.move(TaskEvent.FAULT)
@@ -202,6 +208,14 @@ class Dispatcher:
         """Take back a service that was gone: the grants that it owes, to be sent again (clause 18).
 
         It has got as far as ``completed``; from its reset that is −1, and a world steps the whole gap.
+
+        Args:
+            service: Its name.
+            now: The time [ns].
+            completed: Frame that it has got to; −1: none.
+
+        Returns:
+            The grants in the order in which they are owed.
         """
         participant = self._participants[service]
         participant.suspended = participant.saving = False

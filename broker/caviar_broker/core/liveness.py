@@ -12,7 +12,12 @@ MAX_LOSSES = 5
 
 
 class Liveness:
-    """Notices of life and death, and what becomes of silence."""
+    """Notices of life and death, and what becomes of silence.
+
+    Args:
+        run: The run.
+        episodes: What services owe now.
+    """
 
     def __init__(self, run: Run, episodes: Episodes) -> None:
         self._run = run

@@ -211,6 +211,10 @@ def briefings(scenario: Scenario, directory: Path) -> dict[str, dict[str, Any]]:
     """By service: carriers, devices, timing, and for the recorder where to write what.
 
     Worlds get the devices that they publish, all other services all of them, with their worlds.
+
+    Args:
+        scenario: A validated one.
+        directory: Of the run, where the recorder writes.
     """
     plain = resolved(scenario)
     devices = [device | {"world": world_of(scenario, index)} for index, device in enumerate(plain["devices"])]

@@ -29,7 +29,12 @@ from caviar_protocol.topics import PARTS, PAYLOADS
 
 
 class Registration:
-    """Clauses 1 and 3 to 5: who takes part, with which declaration and which scenery."""
+    """Clauses 1 and 3 to 5: who takes part, with which declaration and which scenery.
+
+    Args:
+        run: The run.
+        episodes: Begins once all services are ready, and takes back those that rejoin.
+    """
 
     def __init__(self, run: Run, episodes: Episodes) -> None:
         self._run = run

@@ -125,7 +125,14 @@ class Peer:
         return f"last heartbeat {duration(now - self.heard_at)} ago: {phase}, progress {self.progress}"
 
     def blame_task(self, task: Task, problem: str, now: int, waiting: str = "") -> str:
-        """Clause 14: service, frame, who lacks what, elapsed and budget, last heartbeat, phase, progress."""
+        """Clause 14: service, frame, who lacks what, elapsed and budget, last heartbeat, phase, progress.
+
+        Args:
+            task: What the service works on.
+            problem: What is wrong, as in "overran its budget".
+            now: The time [ns].
+            waiting: Which services wait for which input of it.
+        """
         return (
             f"{self} {problem} in frame {task.frame}: {duration(now - task.started_at)} since its grant, "
             f"budget {duration(self.plan.budget_ns)}; {self.last_words(now)}"
@@ -190,7 +197,13 @@ class Resumption:
 
 
 class Run:
-    """One run: its present state, its services, and the actions that wait to be carried out."""
+    """One run: its present state, its services, and the actions that wait to be carried out.
+
+    Args:
+        plan: The run.
+        now: The time [ns].
+        resumption: What another broker left of the run.
+    """
 
     def __init__(self, plan: RunPlan, now: int, resumption: Resumption | None = None) -> None:
         self.plan = plan
@@ -259,7 +272,13 @@ class Run:
         self.over = self.state in (RunState.STOPPING, RunState.FINISHED)
 
     def fail(self, error: str, culprit: str, now: int) -> None:
-        """End the run with blame; the first blame counts."""
+        """End the run with blame; the first blame counts.
+
+        Args:
+            error: The one line that blames.
+            culprit: The service whose fault it is; empty where it is none's.
+            now: The time [ns].
+        """
         # What fails later mostly follows from the first failure.
         if not self.over:
             self.error, self.culprit = error, culprit
@@ -284,7 +303,14 @@ class Run:
     def send(
         self, peer: Peer, message: Message, products: tuple[Product, ...] = (), attachment: Any = None
     ) -> None:
-        """Have a message sent."""
+        """Have a message sent.
+
+        Args:
+            peer: To which service.
+            message: The message.
+            products: Follow it, two parts each.
+            attachment: State of the service, in one part.
+        """
         self.actions.append(Send(peer.name, message, products, attachment))
 
     def ids(self, peer: Peer) -> dict[str, int]:
@@ -292,7 +318,15 @@ class Run:
         return {"epoch": self.plan.epoch, "attempt": peer.attempt, "episode": self.episode}
 
     def enter_journal(self, outcome: str, service: str, frame: int, now: int, **facts: Any) -> None:
-        """Have something written down that is no decision about a task."""
+        """Have something written down that is no decision about a task.
+
+        Args:
+            outcome: As `caviar_broker.core.events.Journal` has it.
+            service: Which it concerns; empty for the run.
+            frame: Frame that it is about; −1: none.
+            now: The time [ns].
+            facts: Further fields of the entry.
+        """
         if not self.plan.ephemeral:
             number = self.ledger.enter(now)
             self.actions.append(Journal(number, self.episode, frame, service, outcome, **facts))
@@ -304,7 +338,15 @@ class Run:
     # --- what came out of turn -----------------------------------------------------------------------
 
     def current(self, peer: Peer, epoch: int, attempt: int, kind: str, outstanding: int = -1) -> bool:
-        """Clause 1: whether a message is of this broker's and this service's present incarnation."""
+        """Clause 1: whether a message is of this broker's and this service's present incarnation.
+
+        Args:
+            peer: The sender.
+            epoch: Of the message.
+            attempt: Of the message.
+            kind: Name of the message, for the answer to a stale one.
+            outstanding: Frame that the sender owes; −1: none.
+        """
         if peer.present and (epoch, attempt) == (self.plan.epoch, peer.attempt):
             return True
         self.stale(peer, kind, f"{kind} of epoch {epoch}, attempt {attempt}", outstanding)

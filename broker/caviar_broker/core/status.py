@@ -91,7 +91,13 @@ class RunStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def status_of(run: Run, episodes: Episodes, now: int) -> RunStatus:
-    """The view of a run at the time ``now`` [ns]."""
+    """The view of a run at the time ``now`` [ns].
+
+    Args:
+        run: The run.
+        episodes: Its episode and what services owe.
+        now: The time [ns].
+    """
     dispatcher = episodes.dispatcher
     waits = [wait for peer in run.peers.values() if (wait := _wait(run, episodes, peer, now)) is not None]
     return RunStatus(

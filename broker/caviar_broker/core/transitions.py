@@ -182,7 +182,13 @@ _E = TypeVar("_E", RunEvent, ServiceEvent, TaskEvent)
 
 
 def step(table: dict[tuple[_S, _E], _S], state: _S, event: _E) -> _S:
-    """The state after ``event``; `IllegalTransitionError` where the table has none."""
+    """The state after ``event``; `IllegalTransitionError` where the table has none.
+
+    Args:
+        table: `RUN`, `SERVICE` or `TASK`.
+        state: The state before.
+        event: What happens.
+    """
     try:
         return table[state, event]
     except KeyError:

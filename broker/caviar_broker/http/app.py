@@ -26,7 +26,12 @@ STATES = ("joining", "preparing", "resetting", "running", "stopping", "finished"
 
 
 def metrics(status: Mapping[str, Any], peers: int) -> str:
-    """The status of a run in Prometheus's text format, and the number of open WebSockets."""
+    """The status of a run in Prometheus's text format, and the number of open WebSockets.
+
+    Args:
+        status: Answer of the control channel to ``status``.
+        peers: Number of open WebSockets.
+    """
     return "\n".join(_lines(status, peers)) + "\n"
 
 
@@ -119,6 +124,10 @@ class LocalOnly:
     """Refuses what a page from elsewhere has a browser send here, where no token protects from that.
 
     WebSockets pass: the gateway refuses those itself, in a way that a page can read.
+
+    Args:
+        app: The application behind it.
+        tokens: Where there are any, they protect instead.
     """
 
     def __init__(self, app: ASGIApp, tokens: Tokens) -> None:

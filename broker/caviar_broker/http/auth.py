@@ -70,6 +70,10 @@ class Tokens:
 def http_address(text: str, keys: Path | None) -> tuple[str, int]:
     """Host and port of ``HOST:PORT``.
 
+    Args:
+        text: ``HOST:PORT``; an IPv6 address in brackets.
+        keys: Keys directory; None: there is none.
+
     Raises:
         SetupError: It is no address, other machines could reach it without a token, or a broker
             with keys has no tokens: a process of this machine without a key could then stop the run.
@@ -136,7 +140,13 @@ def _host(url: str) -> str:
 
 
 def token_of(headers: Mapping[str, str], tokens: Tokens, subprotocols: Iterable[str] = ()) -> Token | None:
-    """The token of ``Authorization: Bearer TOKEN``, or of the subprotocol ``bearer.TOKEN``."""
+    """The token of ``Authorization: Bearer TOKEN``, or of the subprotocol ``bearer.TOKEN``.
+
+    Args:
+        headers: Of the request.
+        tokens: Those that hold.
+        subprotocols: That a WebSocket offers.
+    """
     text = _text(headers, subprotocols)
     return tokens.find(text) if text else None
 

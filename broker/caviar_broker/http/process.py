@@ -107,7 +107,13 @@ def _refuse_taken(host: str, port: int) -> None:
 
 
 async def serve(run: Path, address: str, keys: Path | None) -> None:
-    """Serve until the broker ends. Raises `RunError` where none runs there, or the address is taken."""
+    """Serve until the broker ends. Raises `RunError` where none runs there, or the address is taken.
+
+    Args:
+        run: Directory of the run.
+        address: ``HOST:PORT`` to serve at.
+        keys: Keys directory; None: that of the broker, if any.
+    """
     from caviar_broker.http.app import make_app
     from caviar_broker.http.gateway import NOTE, REMEDY, Gateway
     from caviar_broker.http.server import http_server, listening_socket

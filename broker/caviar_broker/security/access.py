@@ -42,7 +42,12 @@ def is_local(endpoint: str) -> bool:
 
 
 def check_bind(endpoint: str, keys: bool) -> None:
-    """Raises `RunError` for what is no address, and where others could reach a broker without keys."""
+    """Raises `RunError` for what is no address, and where others could reach a broker without keys.
+
+    Args:
+        endpoint: Address to listen at.
+        keys: Whether the broker has keys.
+    """
     if "://" not in endpoint:
         raise RunError(f"{endpoint!r} is no address to listen at; write it as tcp://127.0.0.1:5570")
     if keys or is_local(endpoint):
@@ -129,7 +134,14 @@ class Access:
 
     def refusal(self, key: str, name: str, role: str = "", outputs: Sequence[str] = ()) -> str:
         """Why a key may not appear as that service; empty where it may. Without ``role`` only the name
-        counts."""
+        counts.
+
+        Args:
+            key: Public key of the connection, in Z85.
+            name: Of the service.
+            role: Of the service; empty: not asked about.
+            outputs: Topics that it declares.
+        """
         if key and key == self._local_key:
             known = self._local.get(name)
             if known is None:
@@ -203,6 +215,13 @@ def answer(access: Access | None, request: Sequence[bytes]) -> tuple[list[bytes]
 
     The user id that it gives to each message of the connection is the public key, in Z85. Without
     ``access`` every peer is let in that asks for no mechanism.
+
+    Args:
+        access: The keys; None: none are asked for.
+        request: Parts of the request.
+
+    Returns:
+        Parts of the reply, and why it refuses; empty where it does not.
     """
     version, sequence = [*request, b"", b""][:2]
     reason = f"a request of {len(request)} parts"

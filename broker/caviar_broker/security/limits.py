@@ -31,7 +31,13 @@ class NoticeThrottle:
         self._told: dict[str, tuple[int, int]] = {}
 
     def tell(self, kind: str, text: str, now: int) -> str:
-        """The text to tell now, with the number of those held back; empty: hold it back."""
+        """The text to tell now, with the number of those held back; empty: hold it back.
+
+        Args:
+            kind: What is counted together.
+            text: Of the notice.
+            now: The time [ns].
+        """
         last, held = self._told.get(kind, (None, 0))
         if last is not None and now - last < PERIOD_NS:
             self._told[kind] = (last, held + 1)
@@ -189,7 +195,13 @@ class PeerGuard:
     # --- messages ------------------------------------------------------------------------------------
 
     def admits(self, route: bytes, parts: Sequence[zmq.Frame], size: int) -> bool:
-        """Whether a message of so many bytes is to be handled; else it is dropped."""
+        """Whether a message of so many bytes is to be handled; else it is dropped.
+
+        Args:
+            route: Routing id of the sender.
+            parts: The message.
+            size: Of all its parts [B].
+        """
         peer = self._peers.get(route)
         if peer is None:
             peer = self._meet(route, parts[0])
@@ -214,7 +226,14 @@ class PeerGuard:
             peer.limit = self.limits.stranger_bytes if pulse else self.limits.queued
 
     def refusal(self, route: bytes, name: str, role: str = "", outputs: Sequence[str] = ()) -> str:
-        """Why the key of a connection may not appear as that service; empty where it may."""
+        """Why the key of a connection may not appear as that service; empty where it may.
+
+        Args:
+            route: Routing id of the connection.
+            name: Of the service.
+            role: Of the service; empty: not asked about.
+            outputs: Topics that it declares.
+        """
         if self.access is None:
             return ""
         peer = self._peers.get(route)

@@ -78,7 +78,12 @@ class TcpConnection:
 
 
 class TcpConnections:
-    """The open connections of a bound socket."""
+    """The open connections of a bound socket.
+
+    Args:
+        context: Of the socket.
+        watched: The bound socket.
+    """
 
     def __init__(self, context: zmq.Context[Any], watched: zmq.Socket[Any]) -> None:
         address = f"inproc://monitor-{id(self)}"
