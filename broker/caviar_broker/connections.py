@@ -39,7 +39,7 @@ class Connections:
     Args:
         clock: Who is in the run.
         epoch: Of the run.
-        port: Where messages come and go.
+        router: Where messages come and go.
         loop: Where processes are watched.
         watchdog, assets: Follow incarnations that come and go.
         feed: Gives the clock an event, and does what it wants.
@@ -49,7 +49,7 @@ class Connections:
 
     clock: FrameClock
     epoch: int
-    port: Router
+    router: Router
     loop: EventLoop
     watchdog: Watchdog
     assets: AssetExchange
@@ -62,7 +62,7 @@ class Connections:
     """Service to the routing id of its ordered connection."""
 
     def __post_init__(self) -> None:
-        self._guard = self.port.guard
+        self._guard = self.router.guard
         self._grumbles = NoticeThrottle()
         self._host = host_identity()
         # Whose HELLO the clock looks at.
@@ -213,7 +213,7 @@ class Connections:
 
     def reply(self, route: bytes, message: m.Message, *parts: bytes) -> None:
         """Answer a routing id; a peer that is gone meanwhile needs no answer."""
-        reason = self.port.send(route, encode_message(message), parts, not isinstance(message, COMPLAINTS))
+        reason = self.router.send(route, encode_message(message), parts, not isinstance(message, COMPLAINTS))
         if reason:
             connection = self.known.get(route)
             service = connection.service if connection else ""

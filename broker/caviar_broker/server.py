@@ -108,7 +108,7 @@ class BrokerServer:
             note=self.note,
         )
         # Whether the clock took answers that it has not acted upon yet.
-        self._taken = False
+        self._has_answers = False
         # Frames of the episode that were finished when it last acted.
         self._finished_frames = 0
         # Decisions that are not in the journal yet.
@@ -120,17 +120,17 @@ class BrokerServer:
         self._next_check = self._look_at = 0
         self._budgets_are_long = not plan.realtime and all(s.budget_ns >= LONG_NS for s in plan.services)
         self._unhurried = False
-        self._port = Router(endpoint, plan.limits.liveness, access, peer_limits)
-        self._guard = self._port.guard
+        self._router = Router(endpoint, plan.limits.liveness, access, peer_limits)
+        self._guard = self._router.guard
         self.access = access
         """The keys of those who may take part; None: every process of this machine may."""
         self.disk_answers = True
         """Whether the disk took all of the journal by the end of the run."""
-        self.endpoint = self._port.endpoint
+        self.endpoint = self._router.endpoint
         """Where services connect to."""
         self.loop = EventLoop()
         """Others may have descriptors watched by it."""
-        self.loop.watch(self._port.socket, self._receive_all)
+        self.loop.watch(self._router.socket, self._receive_all)
         self._journal = JournalWriter(journal, durability, sync_recording)
         self._standby = Standby(self._turn, lambda: self.outcome is not None)
         self.loop.watch(self._standby.fd, self._disk_answers_again, prompt=True)
@@ -138,7 +138,7 @@ class BrokerServer:
             clock=self.clock,
             heartbeat_ns=plan.limits.heartbeat,
             liveness_ns=plan.limits.liveness,
-            probe=lambda route: self._port.send(route, encode_message(m.HeartbeatAck(sequence=0))),
+            probe=lambda route: self._router.send(route, encode_message(m.HeartbeatAck(sequence=0))),
             lost=lambda service, verdict: self.feed(ev.Lost(service, verdict)),
             warn=self.note,
             gone_words=self._guard.gone_words,
@@ -147,7 +147,7 @@ class BrokerServer:
         self._connections = Connections(
             clock=self.clock,
             epoch=plan.epoch,
-            port=self._port,
+            router=self._router,
             loop=self.loop,
             watchdog=self._watchdog,
             assets=self._assets,
@@ -194,7 +194,7 @@ class BrokerServer:
             self._standby.run(begin)
         finally:
             self._watchdog.close()
-            self._port.close()
+            self._router.close()
             self.disk_answers = not self._standby.calling and self._journal.close()
             self._standby.close()
         if self.outcome is None:
@@ -214,20 +214,20 @@ class BrokerServer:
         """
         now = time.monotonic_ns()
         if now >= self._look_at:
-            wake = self._see_to_deadlines(now)
-            self._catch_up()
+            wake = self._check_deadlines(now)
+            self._flush()
             self._unhurried = self._budgets_are_long and wake - now > SOON_NS
             self._look_at = min(now + (UNHURRIED_LOOK_NS if self._unhurried else LOOK_NS), wake)
-            self.loop.call(self.loop.poll(0 if self._port.readable else wake - time.monotonic_ns()))
+            self.loop.call(self.loop.poll(0 if self._router.readable else wake - time.monotonic_ns()))
         elif self._unhurried and not self._standby.calling:
             self._receive_all(wait=True)
-        elif self._port.readable:
+        elif self._router.readable:
             self._receive_all()
         else:
             self.loop.call(self.loop.poll_sockets(self._look_at))
-        self._catch_up()
+        self._flush()
 
-    def _catch_up(self) -> None:
+    def _flush(self) -> None:
         """Flush journal entries that block a grant, then run deferred actions."""
         if self._has_sent or self.clock.waits_for_journal or self.clock.over:
             self._write_journal()
@@ -237,7 +237,7 @@ class BrokerServer:
             for action in later:
                 self._performers[type(action)](action)
 
-    def _see_to_deadlines(self, now: int) -> int:
+    def _check_deadlines(self, now: int) -> int:
         """Act on whatever is due; the instant of the next thing that will be [ns]."""
         if now >= self._next_check:
             self._next_check = now + CHECK_NS
@@ -259,14 +259,14 @@ class BrokerServer:
     def _receive_all(self, wait: bool = False) -> None:
         """Take what is there; with ``wait``, what comes within a millisecond."""
         for _ in range(MESSAGES_A_TURN):
-            received = self._port.receive(wait)
+            received = self._router.receive(wait)
             if received is not None:
                 self._handle(*received)
-            if not self._port.readable:
+            if not self._router.readable:
                 break
             wait = False
-        if self._taken:  # what services answer together is acted upon once
-            self._taken = False
+        if self._has_answers:  # what services answer together is acted upon once
+            self._has_answers = False
             finished = self.clock.finished_frames
             if finished != self._finished_frames:
                 self._finished_frames = finished
@@ -300,7 +300,7 @@ class BrokerServer:
     def _done(self, service: str, message: m.Done, parts: Sequence[zmq.Frame]) -> None:
         payloads = tuple(zip(parts[::2], parts[1::2], strict=True))
         self.clock.handle(ev.DoneReceived(service, message, payloads), time.monotonic_ns())
-        self._taken = True
+        self._has_answers = True
 
     def _error(self, service: str, message: m.Error, _: Sequence[zmq.Frame]) -> None:
         if self._assets.handle_error(service, message):
@@ -311,7 +311,7 @@ class BrokerServer:
     # --- what goes -------------------------------------------------------------------------------------
 
     def _perform(self) -> None:
-        """Carry out the clock's actions, until there are no more; `_catch_up` sees to those that can wait."""
+        """Carry out the clock's actions, until there are no more; `_flush` sees to those that can wait."""
         while actions := self.clock.actions():
             for action in actions:
                 if type(action) is ev.Send:
@@ -379,7 +379,7 @@ class BrokerServer:
         self._has_sent = True
         route, message = self._routes[action.service], action.message
         complains = isinstance(message, COMPLAINTS)
-        reason = self._port.send(route, encode_message(message), parts, not complains)
+        reason = self._router.send(route, encode_message(message), parts, not complains)
         # A complaint that does not go is no verdict: who floods gets one for each message, and reads none.
         if not reason or complains or self.clock.state is RunState.FINISHED:
             return

@@ -65,7 +65,7 @@ def test_no_grant_overtakes_the_journal_entries_that_it_relies_on(tmp_path: Path
         return diaries[0]
 
     with serving(plan(*PAIR, frames=20), tmp_path, diary) as broker:
-        events, send = diaries[0].events, broker.server._port.send
+        events, send = diaries[0].events, broker.server._router.send
 
         def recorded(route: bytes, header: bytes, parts: Any = (), earns: bool = True) -> str:
             message = decode_message(header)
@@ -73,7 +73,7 @@ def test_no_grant_overtakes_the_journal_entries_that_it_relies_on(tmp_path: Path
                 events.append(("granted", "", message.frame))
             return send(route, header, parts, earns)
 
-        broker.server._port.send = recorded  # type: ignore[method-assign]
+        broker.server._router.send = recorded  # type: ignore[method-assign]
         feedback = (m.Input(topic="lidar", lag=1, required=False),)
         with (
             Client(broker.endpoint, "world", inputs=feedback) as world,
