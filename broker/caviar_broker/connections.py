@@ -63,7 +63,7 @@ class Connections:
 
     def __post_init__(self) -> None:
         self._guard = self.router.guard
-        self._grumbles = NoticeThrottle()
+        self._throttle = NoticeThrottle()
         self._host = host_identity()
         # Whose HELLO the clock looks at.
         self._replying = b""
@@ -103,7 +103,7 @@ class Connections:
         kind = message_type(message)
         self.reply(route, m.Error(code="unexpected", of=kind, message=f"{kind} has no place on {where}"))
         service = self.known[route].service
-        self.grumble(
+        self.note_rarely(
             f"unexpected {service}", f"sent {kind}, which has no place on {where}; not used", service
         )
 
@@ -149,7 +149,7 @@ class Connections:
             del self.known[old]
         self.routes[name] = route
         self.known[route] = Connection(name, heartbeat=False)
-        self._guard.known(route, name)
+        self._guard.admit_service(route, name)
         fd = self.watchdog.welcome(name, hello.pid if local else None)
         if fd is not None:
             self.loop.watch(fd, lambda: self._died(name, fd))
@@ -169,7 +169,7 @@ class Connections:
         if earlier is not None:
             self.known.pop(earlier, None)
         self.known[route] = Connection(name, heartbeat=True)
-        self._guard.known(route, name, pulse=True)
+        self._guard.admit_service(route, name, pulse=True)
         self.reply(route, m.HeartbeatAck(sequence=0))
 
     def _unauthorized(self, route: bytes, text: str) -> None:
@@ -217,9 +217,9 @@ class Connections:
         if reason:
             connection = self.known.get(route)
             service = connection.service if connection else ""
-            self.grumble(f"reply {service}", f"{message_type(message)} reached nobody: {reason}", service)
+            self.note_rarely(f"reply {service}", f"{message_type(message)} reached nobody: {reason}", service)
 
-    def grumble(self, kind: str, text: str, service: str = "") -> None:
+    def note_rarely(self, kind: str, text: str, service: str = "") -> None:
         """Note something that may come often: the same kind is noted once in a while."""
         self._tell(kind, text, service, "note")
 
@@ -233,6 +233,6 @@ class Connections:
         return f"a connection from {address}" if address else "a connection"
 
     def _tell(self, kind: str, text: str, service: str, notice: str) -> None:
-        text = self._grumbles.tell(kind, text, time.monotonic_ns())
+        text = self._throttle.tell(kind, text, time.monotonic_ns())
         if text:
             self.note(service, text, notice)

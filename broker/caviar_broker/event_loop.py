@@ -17,7 +17,7 @@ NICE = -10
 """Niceness that is asked for where the real-time class is not permitted."""
 
 
-def prefer() -> str:
+def raise_priority() -> str:
     """Have this thread run before the services where the system permits it; how it is scheduled now.
 
     A deadline is decided on time only by a process that gets a core then. The real-time class needs

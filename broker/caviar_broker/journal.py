@@ -26,8 +26,8 @@ from caviar_broker.journal_format import (
     EntryLocation,
     JournalEntry,
     JournalReader,
-    framed,
-    needed,
+    entries_to_keep,
+    entry_head,
 )
 from caviar_protocol.errors import RunError
 from caviar_protocol.files import read_regular, replace_file, sync_file
@@ -77,7 +77,7 @@ class CheckpointFiles:
         self._saved.append(path)
         return path.name, hashlib.sha256(data).hexdigest()
 
-    def entered(self) -> None:
+    def note_entered(self) -> None:
         """The journal names what was saved: remove what nothing needs any more."""
         self._unsynced += self._saved
         self._saved = []
@@ -102,11 +102,11 @@ class CheckpointFiles:
             raise RunError(f"cannot write states to {self._folder}: {error.strerror}") from error
         return paths
 
-    def synced(self, paths: Iterable[Path]) -> None:
+    def note_synced(self, paths: Iterable[Path]) -> None:
         """These files and the entries that name them are on the disk."""
         self._synced.update(paths)
 
-    def known(self, service: str, file: str, digest: str) -> bytes | None:
+    def load(self, service: str, file: str, digest: str) -> bytes | None:
         """A state that was saved before a restart of the broker; None where it is gone, or is another.
 
         Args:
@@ -181,7 +181,7 @@ class JournalFile:
         self._number, self._crc, self.size = 0, MAGIC_CRC, 0
         self._compacted_size = 0
         if path.is_file() and path.stat().st_size:
-            self._take_over(end)
+            self._continue_log(end)
         try:
             self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
         except OSError as error:
@@ -200,16 +200,16 @@ class JournalFile:
             record = self._record(entry)
             saved |= bool(record.file)
             payload = self._encoded(record)
-            head, crc = framed(crc, *payload)
+            head, crc = entry_head(crc, *payload)
             pieces += (head, *payload)
             length = sum(map(len, payload))
-            located.append(EntryLocation.of(record, size + HEAD.size, length))
+            located.append(EntryLocation.locate(record, size + HEAD.size, length))
             size += HEAD.size + length
         self._put(pieces)
         self._crc, self.size = crc, size
         self._entries.extend(located)
         if saved:
-            self.checkpoints.entered()
+            self.checkpoints.note_entered()
 
     def _encoded(self, record: JournalEntry) -> tuple[bytes | memoryview, ...]:
         """A record in one piece, or two where its last product is large."""
@@ -273,7 +273,7 @@ class JournalFile:
                 raise self._failed(error) from error
         finally:
             os.close(fd)
-        self.checkpoints.synced(states)
+        self.checkpoints.note_synced(states)
 
     @property
     def is_long(self) -> bool:
@@ -285,7 +285,7 @@ class JournalFile:
 
         The new file takes the place of the old one in one step. `RunError` naming it where that fails.
         """
-        base, kept = needed(self._entries, snapshot)
+        base, kept = entries_to_keep(self._entries, snapshot)
         # Not `replace_file`: the journal goes on in the descriptor of the new file.
         partial = self.path.with_name(self.path.name + ".partial")
         try:
@@ -332,12 +332,12 @@ class JournalFile:
     ) -> tuple[int, int, list[EntryLocation]]:
         """Write a new journal; its CRC, its size and where its entries are."""
         payload = self._encoder.encode(opening)
-        head, crc = framed(MAGIC_CRC, payload)
+        head, crc = entry_head(MAGIC_CRC, payload)
         os.writev(fd, [MAGIC, head, payload])
         size, moved = len(MAGIC) + len(head) + len(payload), list[EntryLocation]()
         for entry in kept:
             payload = os.pread(self._fd, entry.length, entry.offset)
-            head, crc = framed(crc, payload)
+            head, crc = entry_head(crc, payload)
             pieces: Sequence[bytes | memoryview] = [head, payload]
             while pieces:
                 pieces = _behind(pieces, os.writev(fd, pieces))
@@ -347,7 +347,7 @@ class JournalFile:
 
     # --- opening and closing ---------------------------------------------------------------------------
 
-    def _take_over(self, end: int | None) -> None:
+    def _continue_log(self, end: int | None) -> None:
         """Go on with what another broker wrote; what is cut off is kept beside it."""
         reader = JournalReader(self.path)
         self.size = reader.end
@@ -355,7 +355,7 @@ class JournalFile:
             if end is not None and reader.end > end:
                 break
             offset = self.size + HEAD.size
-            self._entries.extend([EntryLocation.of(entry, offset, reader.end - offset)])
+            self._entries.extend([EntryLocation.locate(entry, offset, reader.end - offset)])
             self._crc, self._number, self.size = reader.crc, max(self._number, entry.number), reader.end
         if reader.size > self.size:
             cut = self.path.with_name(self.path.name + CUT_SUFFIX)

@@ -115,7 +115,7 @@ class JournalReader:
                 self.problem = f"{self.path}: the entry at byte {self.end} is cut off or damaged"
                 return
             payload = self._data[start : start + length]
-            if framed(self.crc, payload)[1] != crc:
+            if entry_head(self.crc, payload)[1] != crc:
                 self.problem = f"{self.path}: the entry at byte {self.end} is damaged, its CRC-32 differs"
                 return
             self.end, self.crc = start + length, crc
@@ -131,7 +131,7 @@ def run_of_journal(path: Path) -> str:
     return next((entry.run for entry in JournalReader(path)), "")
 
 
-def framed(before: int, *pieces: bytes | memoryview) -> tuple[bytes, int]:
+def entry_head(before: int, *pieces: bytes | memoryview) -> tuple[bytes, int]:
     """The head of an entry behind the one with the CRC ``before``, and its CRC; its bytes are ``pieces``."""
     length = sum(map(len, pieces))
     crc = zlib.crc32(length.to_bytes(8, "little"), before)
@@ -174,7 +174,7 @@ class EntryLocation(NamedTuple):
     length: int
 
     @classmethod
-    def of(cls, entry: JournalEntry, offset: int, length: int) -> EntryLocation:
+    def locate(cls, entry: JournalEntry, offset: int, length: int) -> EntryLocation:
         """The place of an entry."""
         topics = tuple([product[0] for product in entry.products])
         return cls(entry.episode, entry.frame, entry.service, entry.outcome, topics, offset, length)
@@ -204,7 +204,7 @@ class EntryIndex:
             yield EntryLocation(episode, frame, *kind, offset, length)
 
 
-def needed(entries: Iterable[EntryLocation], snapshot: Snapshot) -> tuple[int, list[EntryLocation]]:
+def entries_to_keep(entries: Iterable[EntryLocation], snapshot: Snapshot) -> tuple[int, list[EntryLocation]]:
     """Entries that are needed beside a snapshot, in order, and the frame from which all are there.
 
     That frame is the last finished one, or that of the oldest among the services' newest states of a

@@ -28,7 +28,7 @@ from caviar_broker.control.launcher import LauncherPipe, Reporter, stop_on_signa
 from caviar_broker.control.server import ControlServer
 from caviar_broker.control.socket import locked, refuse_second_broker
 from caviar_broker.core.plan import briefings, plan_run, with_ownership
-from caviar_broker.event_loop import call_with_timeout, prefer
+from caviar_broker.event_loop import call_with_timeout, raise_priority
 from caviar_broker.http.process import HttpProcess
 from caviar_broker.journal import CheckpointFiles, JournalFile
 from caviar_broker.recordings import (
@@ -121,7 +121,7 @@ def _serve(arguments: argparse.Namespace, record: RunRecord, directory: Path, fo
             f"cannot go on with {directory}: its recording is gone; put it back, or begin again with --force"
         )
     resumption = left.resumption
-    scheduling = prefer()  # before the threads of the port are started, which inherit it
+    scheduling = raise_priority()  # before the threads of the port are started, which inherit it
     reporter = Reporter(sys.stdout.fileno(), files.events, arguments.control)
     journal_file = JournalFile(
         files.journal, plan.epoch, checkpoints, left.end, run=plan.run, durable=durability != "none"
@@ -138,7 +138,7 @@ def _serve(arguments: argparse.Namespace, record: RunRecord, directory: Path, fo
                 store=store,
                 supervised=supervised,
                 access=access,
-                peer_limits=PeerLimits.of(record.scenario.limits),
+                peer_limits=PeerLimits.from_scenario(record.scenario.limits),
                 resumption=resumption,
                 durability=durability,
                 sync_recording=lambda: sync_recording(directory),
@@ -158,7 +158,7 @@ def _serve(arguments: argparse.Namespace, record: RunRecord, directory: Path, fo
                 server.note("", "; ".join(left.losses), "damage")
             beside.start(server)
             tune_garbage_collector()
-            outcome = server.run(prefer)
+            outcome = server.run(raise_priority)
     statistics = server.statistics
     takes_files = server.disk_answers and call_with_timeout(lambda: statistics.save(files.latencies), SAVE_S)
     reporter.finished(

@@ -57,7 +57,7 @@ def read_resumption(
     for entry in reader:
         if found.is_cut and entry.outcome == "episode":
             break  # frames before it are run again
-        found.take(entry)
+        found.add(entry)
         end = reader.end
     resumption = found.resumption()
     losses = []
@@ -98,7 +98,7 @@ class _Reader:
         # Frames in which agents ended the episode, or chose the next one's seed.
         self._ends: list[JournalEntry] = []
 
-    def take(self, entry: JournalEntry) -> None:
+    def add(self, entry: JournalEntry) -> None:
         """One more entry."""
         self._entries = max(self._entries, entry.number)
         match entry.outcome:
@@ -231,7 +231,7 @@ class _Reader:
 
     def _content(self, saved: JournalEntry) -> bytes | None:
         if saved.file not in self._contents:
-            state = self._checkpoints.known(saved.service, saved.file, saved.digest)
+            state = self._checkpoints.load(saved.service, saved.file, saved.digest)
             self._contents[saved.file] = state
         return self._contents[saved.file]
 

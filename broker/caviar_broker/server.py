@@ -306,7 +306,7 @@ class BrokerServer:
         if self._assets.handle_error(service, message):
             return
         text = f"could not use {message.of or 'a message'}: {message.message}"
-        self._connections.grumble(f"error {service}", text, service)
+        self._connections.note_rarely(f"error {service}", text, service)
 
     # --- what goes -------------------------------------------------------------------------------------
 

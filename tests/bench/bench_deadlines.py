@@ -29,7 +29,7 @@ import zmq
 
 from caviar_broker.core import events as ev
 from caviar_broker.core.plan import SECOND, RunPlan, ServicePlan
-from caviar_broker.event_loop import prefer
+from caviar_broker.event_loop import raise_priority
 from caviar_broker.journal import JournalFile
 from caviar_broker.launch import tune_garbage_collector
 from caviar_broker.server import BrokerServer
@@ -152,10 +152,10 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=500)
     parser.add_argument("--budget-ms", type=float, default=10.0)
     parser.add_argument("--busy", action="store_true", help="with both cores busy")
-    parser.add_argument("--prefer", action="store_true", help="scheduled as the broker of a run is")
+    parser.add_argument("--raise_priority", action="store_true", help="scheduled as the broker of a run is")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
-    scheduling = prefer() if arguments.prefer else "as it is"
+    scheduling = raise_priority() if arguments.prefer else "as it is"
     print(f"load of the machine before: {os.getloadavg()[0]:.1f}; scheduling: {scheduling}")
     count = (os.cpu_count() or 1) if arguments.busy else 0
     kinds: dict[str, Callable[[], np.ndarray]] = {

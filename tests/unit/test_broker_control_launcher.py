@@ -264,9 +264,9 @@ def test_a_directory_that_cannot_be_made_is_named(tmp_path: Path) -> None:
 
 
 def test_repetitions_are_counted_and_told_together() -> None:
-    grumbles = NoticeThrottle()
-    assert grumbles.tell("noise", "first", 0) == "first"
-    assert [grumbles.tell("noise", "more", now) for now in range(1, 1000)] == [""] * 999
-    assert grumbles.tell("other", "another", 5) == "another"
-    assert grumbles.tell("noise", "last", PERIOD_NS) == "last (and 999 more of this kind)"
-    assert grumbles.tell("noise", "later", 2 * PERIOD_NS) == "later"
+    throttle = NoticeThrottle()
+    assert throttle.tell("noise", "first", 0) == "first"
+    assert [throttle.tell("noise", "more", now) for now in range(1, 1000)] == [""] * 999
+    assert throttle.tell("other", "another", 5) == "another"
+    assert throttle.tell("noise", "last", PERIOD_NS) == "last (and 999 more of this kind)"
+    assert throttle.tell("noise", "later", 2 * PERIOD_NS) == "later"

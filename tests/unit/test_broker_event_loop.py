@@ -10,7 +10,7 @@ import pytest
 import zmq
 
 from caviar_broker import event_loop as loop_module
-from caviar_broker.event_loop import EventLoop, prefer
+from caviar_broker.event_loop import EventLoop, raise_priority
 
 MS = 1_000_000
 
@@ -110,7 +110,7 @@ def test_the_broker_takes_the_best_place_that_it_is_permitted(
     permitted("sched_setscheduler", real_time)
     permitted("setpriority", nice)
     monkeypatch.setattr(os, "getpriority", lambda *_: 3)
-    assert prefer() == told
+    assert raise_priority() == told
     assert asked[0] == "sched_setscheduler"
 
 

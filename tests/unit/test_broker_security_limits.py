@@ -147,7 +147,7 @@ def test_an_address_is_barred_unless_a_good_service_is_at_home_there() -> None:
             )
             route, _ = received[-1]  # type: ignore[misc]
             guard._peers[route].address = "10.0.0.2"
-            guard.known(route, "world")
+            guard.admit_service(route, "world")
             guard._bar("10.0.0.2")
         assert set(guard._barred) == {"10.0.0.1"}
     finally:
@@ -203,7 +203,7 @@ def test_a_connection_that_is_not_known_any_more_may_appear_as_nobody(tmp_path: 
 
 
 def test_a_scenario_that_says_nothing_of_limits_has_the_usual_ones() -> None:
-    assert PeerLimits.of(Limits()) == PeerLimits()
+    assert PeerLimits.from_scenario(Limits()) == PeerLimits()
 
 
 def test_the_limits_of_a_scenario_are_those_of_its_broker(
@@ -228,7 +228,7 @@ def test_the_limits_of_a_scenario_are_those_of_its_broker(
     monkeypatch.setattr(broker_main, "BrokerServer", made)
     monkeypatch.setattr(broker_main, "Reporter", lambda *_: None)
     monkeypatch.setattr(broker_main, "steady_memory", lambda: None)
-    monkeypatch.setattr(broker_main, "prefer", lambda: "")
+    monkeypatch.setattr(broker_main, "raise_priority", lambda: "")
     scenario = tmp_path / "scenario.toml"
     scenario.write_text(f"{SMOKE.read_text()}{LIMITS}")
     arguments = broker_main.parser().parse_args([str(scenario), "--directory", str(tmp_path / "run")])

@@ -29,7 +29,7 @@ ENDPOINT = "tcp://127.0.0.1:45123"
 @pytest.fixture(autouse=True)
 def _broker_keeps_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
     """`caviar broker` runs in this process here, which stays in no better place."""
-    monkeypatch.setattr(broker_main, "prefer", lambda: "")
+    monkeypatch.setattr(broker_main, "raise_priority", lambda: "")
 
 
 def spec(role: Role) -> ServiceSpec:

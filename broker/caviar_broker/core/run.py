@@ -230,12 +230,12 @@ class Run:
         self.over = False
         """Whether the run has ended, although services may still be leaving."""
         if resumption is not None:
-            self._take_over(resumption)
+            self._continue(resumption)
         self.error = ""
         self.culprit = ""
         self.actions: list[Action] = []
 
-    def _take_over(self, before: Resumption) -> None:
+    def _continue(self, before: Resumption) -> None:
         self.episode, self.seed, self.seed_episode = before.episode, before.seed, before.seed_episode
         self.digest, self.finished_before = before.digest, before.finished_before
         self.ledger.last = self.ledger.written = before.entries

@@ -76,7 +76,7 @@ class Gateway:
     ) -> None:
         self._endpoint, self._tokens, self._tell = endpoint, tokens, tell
         self._credentials, self._remedy = credentials, remedy
-        self._grumbles = NoticeThrottle()
+        self._throttle = NoticeThrottle()
         self._context: zmq.asyncio.Context = zmq.asyncio.Context()
         self.connections = 0
         """How many are open."""
@@ -118,7 +118,7 @@ class Gateway:
 
     async def _refused(self, kind: str, text: str) -> None:
         """Show a refusal on the run's console, each kind once in a while."""
-        if shown := self._grumbles.tell(kind, text, time.monotonic_ns()):
+        if shown := self._throttle.tell(kind, text, time.monotonic_ns()):
             await self._tell("", shown, REFUSED)
 
     def _dealer(self) -> zmq.asyncio.Socket:

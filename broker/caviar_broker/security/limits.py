@@ -84,8 +84,8 @@ class PeerLimits:
     """[B] of one part of a message."""
 
     @classmethod
-    def of(cls, limits: Limits) -> PeerLimits:
-        """As a scenario has them."""
+    def from_scenario(cls, limits: Limits) -> PeerLimits:
+        """The limits of a scenario's ``[limits]``."""
         return cls(
             connections=limits.connections,
             strangers=limits.connections_before_hello,
@@ -218,7 +218,7 @@ class PeerGuard:
             peer.sent += size
             peer.credit += earns and peer.credit < self.limits.burst
 
-    def known(self, route: bytes, service: str, *, pulse: bool = False) -> None:
+    def admit_service(self, route: bytes, service: str, *, pulse: bool = False) -> None:
         """A connection is a service's."""
         peer = self._peers.get(route)
         if peer is not None:
