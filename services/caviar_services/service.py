@@ -48,8 +48,8 @@ scenario's ``stall_s``. Declare one before compiling kernels or loading large sc
 """
 
 
-def _silent(phase: str, grace_s: float = 0.0) -> None:
-    """Progress of a service that nobody watches."""
+def no_progress(phase: str, grace_s: float = 0.0) -> None:
+    """Report nothing: no broker watches this service."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +70,7 @@ class RunInfo:
     """The scenario as resolved, for the recorder's metadata."""
     directory: Path = Path()
     """Where the recorder writes."""
-    progress: Progress = _silent
+    progress: Progress = no_progress
     again: bool = False
     """Whether another process of this name was in the run before, or may have been."""
 

@@ -1,295 +1,513 @@
-"""Between the messages of the protocol and a `Service`, without I/O: for the runner and the embedded run.
+"""A service's side of a run without I/O: what a `Service` does with each message, from WELCOME to BYE.
 
-What a service answered, kept for a GRANT that is repeated; and exceptions turned into FAULTs.
+`ServiceSession` turns messages of the broker into calls of a service, and what the service makes of them
+into messages. It reads no socket and arms no timer. The shells around it move the messages: `runner.Runner`
+over ZeroMQ, and the embedded run between the frame clock and the services of one process.
 """
 
 from __future__ import annotations
 
+import gc
 import logging
 import time
-import traceback
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
-from typing import Any
-
-import msgspec
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 from caviar_protocol import limits
 from caviar_protocol import messages as m
-from caviar_protocol.arrays import Payload
-from caviar_protocol.digest import geometry_digest, payload_digest
-from caviar_protocol.errors import CaviarError, PayloadError, ProductError
-from caviar_protocol.scenario import DeviceSpec
-from caviar_protocol.topics import PAYLOADS, Carrier
-from caviar_protocol.validation import ContentCheck, ContentRules
+from caviar_protocol.assets import AssetStore, IncomingAsset
+from caviar_protocol.codec import message_type
+from caviar_protocol.digest import geometry_digest
+from caviar_protocol.errors import (
+    AssetError,
+    ProtocolError,
+    RunError,
+)
+from caviar_protocol.host import trim_memory
+from caviar_protocol.scenario.conversion import convert_settings
+from caviar_protocol.validation import ContentCheck
+from caviar_services.conversion import (
+    content_rules_of,
+    done_of,
+    fault_of,
+    frame_inputs,
+    frame_of,
+    is_needed,
+    plain_done_of,
+    run_info,
+)
 from caviar_services.service import (
-    Encoded,
     Frame,
-    FrameInput,
     Preparation,
-    Prepared,
     Progress,
-    RunInfo,
     Service,
     StepResult,
-    decoded,
-    encoded,
+    no_progress,
 )
-
-
-def hello_of(name: str, use: str, cls: type[Service[Any]], host: str = "", pid: int = 0) -> m.Hello:
-    """What a service says of itself."""
-    return m.Hello(
-        version=m.PROTOCOL_VERSION,
-        name=name,
-        role=cls.role,
-        inputs=cls.inputs,
-        outputs=cls.outputs,
-        capabilities=tuple(c for c in m.CAPABILITIES if c != "checkpoint" or cls.checkpoints),
-        implementation=use,
-        max_in_flight=limits.MAX_IN_FLIGHT,
-        host=host,
-        pid=pid,
-    )
-
-
-def run_info(name: str, welcome: m.Welcome, progress: Progress) -> RunInfo:
-    """What WELCOME tells about the run."""
-    told = welcome.scenario
-    return RunInfo(
-        name=name,
-        run=welcome.run,
-        again=welcome.epoch > 1 or welcome.attempt > 1,
-        seed=welcome.seed,
-        sampling_period_ns=int(told.get("sampling_period_ns", 1)),
-        frames=int(told.get("frames", 1)),
-        carriers=msgspec.convert(told.get("carriers", ()), tuple[Carrier, ...]),
-        devices=msgspec.convert(told.get("devices", ()), tuple[DeviceSpec, ...]),
-        scenario=told.get("resolved", {}),
-        directory=Path(str(told.get("directory", "."))),
-        progress=progress,
-    )
-
-
-def is_needed(service: Service[Any], order: m.Prepare) -> bool:
-    """Whether anybody wants what the service makes, or it is there for its own sake."""
-    return bool(order.demand) or service.role in ("agent", "recorder") or not service.outputs
-
-
-def preparation_of(order: m.Prepare, assets: Mapping[str, Path]) -> Preparation:
-    """What PREPARE orders, with the files of scenery where they lie."""
-    return Preparation(
-        demand={d.topic: frozenset(d.parts) for d in order.demand}, assets=assets, producers=order.producers
-    )
-
-
-def ready_of(identity: dict[str, int], prepared: Prepared | None, assets: Sequence[m.Asset]) -> m.Ready:
-    """READY of a service that loaded these assets; ``prepared`` is None where nobody needs it."""
-    if prepared is None:
-        return m.Ready(epoch=identity["epoch"], attempt=identity["attempt"])
-    return m.Ready(
-        **identity,
-        geometry=geometry_digest(assets),
-        prefixes=prepared.prefixes,
-        actuators=prepared.actuators,
-        notes=prepared.notes,
-        seed=prepared.seed,
-    )
-
-
-def frame_of(service: Service[Any], reset: m.Reset, grant: m.Grant, inputs: tuple[FrameInput, ...]) -> Frame:
-    """The frame that GRANT grants, in the episode that RESET began."""
-    return Frame(
-        episode=grant.episode,
-        number=grant.frame,
-        t_ns=grant.t_ns,
-        previous=grant.previous_frame,
-        final=grant.final,
-        budget_ns=grant.budget_ns,
-        inputs=inputs,
-        imposed=grant.decisions,
-        reports=grant.reports,
-        service=service.run.name,
-        seed=reset.seed,
-        seed_episode=reset.seed_episode,
-    )
-
-
-def content_rules_of(service: Service[Any], order: m.Prepare) -> ContentRules:
-    """What WELCOME and PREPARE say about the products that a service is going to get."""
-    run = service.run
-    worlds = order.producers.get("scene", ())
-    devices: dict[str, list[DeviceSpec]] = {world: [] for world in worlds}
-    for device in run.devices:
-        world = device.world or (worlds[0] if len(worlds) == 1 else "")
-        devices.setdefault(world, []).append(device)
-    return ContentRules(
-        prefixes=order.prefixes,
-        devices={world: tuple(specs) for world, specs in devices.items()},
-        assets=frozenset(asset.name for asset in order.assets) if order.prefixes else None,
-        carriers=run.carriers,
-        parts=service.parts,
-    )
-
-
-def inputs_of(grant: m.Grant, parts: Sequence[Any], check: ContentCheck) -> tuple[FrameInput, ...]:
-    """Inputs of a grant; ``parts`` are header and body of each one that is present."""
-    inputs, taken = [], 0
-    for entry in grant.inputs:
-        if entry.status is m.Status.ABSENT:
-            inputs.append(FrameInput(entry))
-        else:
-            inputs.append(FrameInput(entry, parts[taken], parts[taken + 1], check=check))
-            taken += 2
-    return tuple(inputs)
-
-
-def done_of(
-    identity: dict[str, int], use: str, grant: m.Grant, result: StepResult, step_ns: int
-) -> tuple[m.Done, list[Any]]:
-    """DONE, and header and body of each product behind it; ``step_ns`` is what the step took.
-
-    Raises `PayloadError` for a product that is not its topic's.
-    """
-    started = time.monotonic_ns()
-    headers, parts = [], list[Any]()
-    for topic, payload in _products(use, result):
-        header, body = encoded(payload)
-        fidelity = payload.fidelity if isinstance(payload, Encoded) else result.fidelity
-        headers.append(m.ProductHeader(topic=topic, digest=payload_digest(header, body), fidelity=fidelity))
-        parts += [header, body]
-    done = m.Done(
-        **identity,
-        episode=grant.episode,
-        frame=grant.frame,
-        products=tuple(headers),
-        decisions=dict(result.decisions),
-        measured={**result.measured, "step": step_ns, "encode": time.monotonic_ns() - started},
-        counts=dict(result.counts),
-        end_episode=result.end_episode,
-        seed=result.seed,
-    )
-    return done, parts
-
-
-def plain_done_of(
-    identity: dict[str, int], use: str, grant: m.Grant, result: StepResult
-) -> tuple[m.Done, tuple[Payload, ...]]:
-    """DONE without digests, and the products as they are, for a consumer in this process.
-
-    What a recorder would be told beside them is left out: there is none. Raises `PayloadError` for a
-    product that is not its topic's.
-    """
-    products = _products(use, result)
-    done = m.Done(
-        epoch=identity["epoch"],
-        attempt=identity["attempt"],
-        episode=grant.episode,
-        frame=grant.frame,
-        products=tuple([m.ProductHeader(topic=t, digest="", fidelity=result.fidelity) for t, _ in products]),
-        end_episode=result.end_episode,
-        seed=result.seed,
-    )
-    return done, tuple([decoded(payload) for _, payload in products])
-
-
-def _products(use: str, result: StepResult) -> list[tuple[str, Payload]]:
-    products = sorted(result.products.items()) if len(result.products) > 1 else [*result.products.items()]
-    for topic, payload in products:
-        if type(payload) is not PAYLOADS.get(topic) and not isinstance(payload, Encoded):
-            raise PayloadError(f"{use} made a payload {type(payload).__name__} for the topic {topic!r}")
-    return products
-
 
 _log = logging.getLogger("caviar.service")
 
+TRIM_EVERY = 10
+"""Frames after which free memory is given back to the system. Megabytes come and go in each frame in ever
+other sizes, and what they leave behind would creep up for hours; in each frame it would cost page faults."""
+FETCH_TIMEOUT_S = 30.0
+"""[s] until the broker has to answer a request for scenery."""
 KEPT_BYTES = 64 << 20
 """[B] of answers that are kept, beyond the newest two."""
-MAX_MESSAGE = 2000
-MAX_DETAIL = 20000
-"""[characters] of a FAULT's texts."""
+
+Send: TypeAlias = Callable[[m.Message, Sequence[Any]], None]
+"""``send(message, parts)``: hand a message, and the parts behind it, to the broker."""
+Answer: TypeAlias = tuple[m.Done | m.Fault, Sequence[Any]]
+
+
+class ServiceSession:
+    """One service in one run, driven by the messages of its broker.
+
+    Args:
+        name: Name of the service in the run.
+        use: What the implementation is called, for HELLO and error texts.
+        cls: The implementation.
+        send: Takes the answers. An exception of it that is an `Exception` counts as the service's fault.
+        store: Where the files of scenery are.
+        progress: Is told what the service does. No progress is reported by default.
+        check: Check of products that all services of one process share: it looks at each product once, and a
+            frame that is granted twice is computed twice. None: the service has a process of its own.
+        encodes: Whether products travel as bytes, with digests; else parts of GRANT and DONE are payloads.
+        tunes_memory: Whether garbage collection and allocator of the process may be tuned for this service.
+        fetch_timeout_s: Time that the broker has to answer a request for scenery [s].
+
+    Example:
+        >>> from caviar_protocol.assets import AssetStore
+        >>> from caviar_services.agent.baselines import RandomAgent
+        >>> sent = []
+        >>> session = ServiceSession(
+        ...     "agent", "random", RandomAgent, lambda message, parts: sent.append(message), AssetStore()
+        ... )
+        >>> times = {"heartbeat_ns": 100_000_000, "liveness_ns": 1_500_000_000}
+        >>> version = m.PROTOCOL_VERSION
+        >>> session.handle(m.Welcome(version=version, epoch=1, attempt=1, run="demo", seed=1, **times))
+        >>> session.handle(m.Prepare(epoch=1, attempt=1, demand=(m.Demand(topic="action"),)))
+        >>> session.handle(m.Reset(epoch=1, attempt=1, episode=0, seed=1, t0_ns=0))
+        >>> [type(message).__name__ for message in sent]
+        ['Ready', 'ResetDone']
+    """
+
+    def __init__(
+        self,
+        name: str,
+        use: str,
+        cls: type[Service[Any]],
+        send: Send,
+        store: AssetStore,
+        *,
+        progress: Progress = no_progress,
+        check: ContentCheck | None = None,
+        encodes: bool = True,
+        tunes_memory: bool = False,
+        fetch_timeout_s: float = FETCH_TIMEOUT_S,
+    ) -> None:
+        self.name, self.use, self.cls = name, use, cls
+        self._send, self._store, self._progress = send, store, progress
+        self._encodes, self._tunes_memory, self._fetch_timeout_s = encodes, tunes_memory, fetch_timeout_s
+        self._check = check or ContentCheck()
+        # A frame clock in the same process repeats no GRANT: answers would be kept for nothing.
+        self._answers = Answers() if check is None else None
+        self._service: Service[Any] | None = None
+        self._identity: dict[str, Any] = {}  # epoch and attempt, which stand in every message (clause 1)
+        self._reset_to: m.Reset | None = None
+        self._fetch: _Fetch | None = None
+        self._handlers: Mapping[type, Callable[[Any, Sequence[Any], float], None]] = {
+            m.Welcome: self._welcome,
+            m.Prepare: self._prepare,
+            m.AssetGet: self._serve_asset,
+            m.AssetData: self._asset_data,
+            m.Reset: self._reset,
+            m.Grant: self._grant,
+            m.EpisodeEnd: self._episode_end,
+            m.Checkpoint: self._checkpoint,
+            m.Restore: self._restore,
+            m.Error: self._error,
+            # Advisory: a step that has begun is finished, and what is stale is over.
+            m.Cancel: _ignore,
+            m.Stale: _ignore,
+            m.Shutdown: lambda message, parts, now: self.leave(message.reason),
+        }
+
+    @property
+    def joined(self) -> bool:
+        """Whether WELCOME came."""
+        return bool(self._identity)
+
+    @property
+    def attempt(self) -> int:
+        """Incarnation of the service that the broker knows; 0 before WELCOME."""
+        attempt: int = self._identity.get("attempt", 0)
+        return attempt
+
+    @property
+    def deadline(self) -> float | None:
+        """When `expire` is due, on the clock of ``now`` [s]; None while nothing is awaited."""
+        return None if self._fetch is None else self._fetch.deadline
+
+    def hello(self, host: str = "", pid: int = 0) -> m.Hello:
+        """HELLO, with which a service joins.
+
+        Args:
+            host: Identity of the machine, where the broker may watch the process.
+            pid: Process id there.
+        """
+        cls = self.cls
+        return m.Hello(
+            version=m.PROTOCOL_VERSION,
+            name=self.name,
+            role=cls.role,
+            inputs=cls.inputs,
+            outputs=cls.outputs,
+            capabilities=tuple(c for c in m.CAPABILITIES if c != "checkpoint" or cls.checkpoints),
+            implementation=self.use,
+            max_in_flight=limits.MAX_IN_FLIGHT,
+            host=host,
+            pid=pid,
+        )
+
+    def receive(self, message: m.Message, parts: Sequence[Any] = (), now: float = 0.0) -> None:
+        """Handle a message if it is for this incarnation; answer another one with ERROR.
+
+        Args:
+            message: From the broker.
+            parts: What came behind it.
+            now: Time on any monotonic clock [s]; see `deadline`.
+        """
+        mine = self._identity
+        if mine and isinstance(message, m.Welcome):
+            self._unexpected(message, "it is not for a service that is in the run")
+        elif any(getattr(message, key, own) != own for key, own in mine.items()):
+            self._unexpected(message, f"this is attempt {mine['attempt']} in epoch {mine['epoch']}")
+        else:
+            self.handle(message, parts, now)
+
+    def handle(self, message: m.Message, parts: Sequence[Any] = (), now: float = 0.0) -> None:
+        """Handle a message that is known to be for this incarnation. Arguments as for `receive`."""
+        handler = self._handlers.get(type(message))
+        if handler is None:
+            self._unexpected(message, "it is not for a service that is in the run")
+        elif self._fetch is not None and type(message) not in _WHILE_FETCHING:
+            asset, self._fetch = self._fetch.asset, None
+            with self._reporting("prepare"):
+                raise ProtocolError(f"asked for asset {asset.name!r}, got {message_type(message)}")
+        else:
+            handler(message, parts, now)
+
+    def expire(self, now: float) -> None:
+        """Report the scenery that has not come by `deadline`."""
+        fetch = self._fetch
+        if fetch is None or now < fetch.deadline:
+            return
+        self._fetch = None
+        with self._reporting("prepare"):
+            raise AssetError(
+                f"the broker did not deliver asset {fetch.asset.name!r} within {self._fetch_timeout_s:g} s"
+            )
+
+    def leave(self, reason: str) -> None:
+        """Say BYE, if the service is in the run."""
+        if self._identity:
+            self._send(m.Bye(**self._identity, reason=reason), ())
+
+    def close(self) -> None:
+        """Let the service release what it holds. Further calls do nothing."""
+        service, self._service = self._service, None
+        if service is not None:
+            service.close()
+
+    # --- joining and preparing ---------------------------------------------------------------------
+
+    def _welcome(self, welcome: m.Welcome, _: Sequence[Any], __: float) -> None:
+        self._identity = {"epoch": welcome.epoch, "attempt": welcome.attempt}
+        with self._reporting("settings"):
+            settings = convert_settings(self.cls.Settings, welcome.settings)
+            self._service = self.cls(settings, run_info(self.name, welcome, self._progress))
+
+    def _prepare(self, order: m.Prepare, _: Sequence[Any], now: float) -> None:
+        with self._reporting("prepare"):
+            service = self._running
+            # Worlds are prepared before anything is known about scenes, and a shared check is for all.
+            if self._answers is not None or service.role != "world":
+                self._check.adopt(content_rules_of(service, order))
+            if not is_needed(service, order):
+                self._ready(m.Ready(**self._identity))
+                return
+            offered = [self._store.add(name, content) for name, content in sorted(service.scenery().items())]
+            if offered:
+                self._send(m.AssetOffer(**self._identity, assets=tuple(offered)), ())
+            if service.needs_assets:
+                missing = [asset for asset in order.assets if not self._store.holds(asset)]
+                self._fetch_assets(_Fetch(order, missing, len(missing)), now)
+            else:
+                self._load(order, offered)
+
+    def _fetch_assets(self, fetch: _Fetch, now: float) -> None:
+        """Ask the broker for the next chunk that this machine does not hold yet (clause 4), or load."""
+        if not fetch.missing:
+            self._load(fetch.order, fetch.order.assets)
+            return
+        if fetch.incoming is None:
+            number = fetch.count - len(fetch.missing) + 1
+            self._progress(f"fetching scenery, file {number} of {fetch.count}", 0.0)
+            fetch.incoming = IncomingAsset(self._store, fetch.asset)
+        fetch.deadline = now + self._fetch_timeout_s
+        self._fetch = fetch
+        self._send(m.AssetGet(digest=fetch.asset.digest, offset=fetch.incoming.offset), ())
+
+    def _asset_data(self, data: m.AssetData, parts: Sequence[Any], now: float) -> None:
+        fetch, self._fetch = self._fetch, None
+        if fetch is None or fetch.incoming is None:
+            self._unexpected(data, "no asset was asked for")
+            return
+        with self._reporting("prepare"):
+            if data.digest != fetch.asset.digest:
+                raise ProtocolError(f"asked for asset {fetch.asset.name!r}, got that of digest {data.digest}")
+            if fetch.incoming.add_chunk(data.offset, data.size, parts[0]):
+                fetch.missing.pop(0)
+                fetch.incoming = None
+            self._fetch_assets(fetch, now)
+
+    def _error(self, error: m.Error, _: Sequence[Any], __: float) -> None:
+        fetch = self._fetch
+        if fetch is not None and error.subject == fetch.asset.digest:
+            self._fetch = None
+            with self._reporting("prepare"):
+                raise AssetError(f"the broker cannot deliver asset {fetch.asset.name!r}: {error.message}")
+
+    def _load(self, order: m.Prepare, assets: Sequence[m.Asset]) -> None:
+        files = self._store.folder_of(assets) if assets else {}
+        demand = {entry.topic: frozenset(entry.parts) for entry in order.demand}
+        prepared = self._running.prepare(Preparation(demand=demand, assets=files, producers=order.producers))
+        self._ready(
+            m.Ready(
+                **self._identity,
+                geometry=geometry_digest(assets),
+                prefixes=prepared.prefixes,
+                actuators=prepared.actuators,
+                notes=prepared.notes,
+                seed=prepared.seed,
+            )
+        )
+
+    def _ready(self, ready: m.Ready) -> None:
+        if self._tunes_memory:
+            # What was loaded stays: collections look only at what frames leave behind, all of it, soon.
+            gc.collect()
+            gc.freeze()
+        self._send(ready, ())
+
+    def _serve_asset(self, get: m.AssetGet, _: Sequence[Any], __: float) -> None:
+        try:
+            chunk, size = self._store.read(get.digest, get.offset)
+        except AssetError as error:
+            refusal = m.Error(code="unknown-asset", of="ASSET_GET", subject=get.digest, message=str(error))
+            self._send(refusal, ())
+        else:
+            self._send(m.AssetData(digest=get.digest, offset=get.offset, size=size), (chunk,))
+
+    # --- frames ------------------------------------------------------------------------------------
+
+    def _reset(self, reset: m.Reset, _: Sequence[Any], __: float) -> None:
+        with self._reporting("reset", reset.episode):
+            self._progress(f"reset to episode {reset.episode}", 0.0)
+            if self._answers is not None:
+                self._answers.clear()
+            self._running.reset(reset.seed_episode, reset.seed, reset.t0_ns)
+            self._reset_to = reset
+            self._send(m.ResetDone(**self._identity, episode=reset.episode), ())
+
+    def _grant(self, grant: m.Grant, parts: Sequence[Any], _: float) -> None:
+        reset, answers = self._reset_to, self._answers
+        if reset is None or grant.episode != reset.episode:
+            self._unexpected(grant, f"there was no RESET to episode {grant.episode}")
+            return
+        if answers is None:
+            self._step(reset, grant, parts)
+        elif answers.is_new(grant.frame):
+            self._progress(f"frame {grant.frame}", 0.0)
+            self._check.begin(grant.inputs)
+            if (answer := self._step(reset, grant, parts)) is not None:
+                answers.put(grant.frame, answer)
+        elif (kept := answers.get(grant.frame)) is not None:
+            self._send(*kept)
+        else:
+            self._unexpected(grant, f"frame {grant.frame} was answered long ago")
+        if grant.frame % TRIM_EVERY == TRIM_EVERY - 1:
+            with self._reporting("release", grant.episode, grant.frame):
+                self._running.release_memory()
+                if self._tunes_memory:
+                    trim_memory()
+
+    def _step(self, reset: m.Reset, grant: m.Grant, parts: Sequence[Any]) -> Answer | None:
+        """Have the service compute a frame; DONE with its products, or FAULT, as it was sent."""
+        phase = "step"
+        # Without `_reporting`: its context costs as much as a small service.
+        try:
+            frame = self._frame(reset, grant, parts)
+            began = time.monotonic_ns()
+            result = self._running.step(frame)
+            step_ns = time.monotonic_ns() - began
+            phase = "encode"
+            answer: Answer = self._done(grant, result, step_ns)
+            self._send(*answer)
+        except Exception as error:
+            answer = fault_of(error, self._identity, phase, grant.episode, grant.frame), ()
+            self._send(*answer)
+        return answer
+
+    def _frame(self, reset: m.Reset, grant: m.Grant, parts: Sequence[Any]) -> Frame:
+        inputs = frame_inputs(grant, parts, self._check, encoded=self._encodes)
+        return frame_of(self._running, reset, grant, inputs)
+
+    def _done(self, grant: m.Grant, result: StepResult, step_ns: int) -> tuple[m.Done, Sequence[Any]]:
+        if self._encodes:
+            return done_of(self._identity, self.use, grant, result, step_ns)
+        return plain_done_of(self._identity, self.use, grant, result)
+
+    def _episode_end(self, end: m.EpisodeEnd, _: Sequence[Any], __: float) -> None:
+        with self._reporting("end of episode", end.episode):
+            self._running.end_episode(end.frames)
+
+    # --- state (clause 18) -------------------------------------------------------------------------
+
+    def _checkpoint(self, order: m.Checkpoint, _: Sequence[Any], __: float) -> None:
+        if not self._keeps_state(order):
+            return
+        with self._reporting("checkpoint", order.episode, order.frame):
+            self._progress(f"saving the state after frame {order.frame}", 0.0)
+            state = self._running.checkpoint()
+            self._send(m.CheckpointDone(**self._identity, episode=order.episode, frame=order.frame), (state,))
+
+    def _restore(self, order: m.Restore, parts: Sequence[Any], _: float) -> None:
+        if not self._keeps_state(order):
+            return
+        with self._reporting("restore", order.episode, order.frame):
+            self._progress(f"restoring the state after frame {order.frame}", 0.0)
+            self._running.restore(bytes(parts[0]))
+            if self._answers is not None:
+                self._answers.clear(order.frame)
+            self._send(m.Ready(**self._identity), ())
+
+    def _keeps_state(self, order: m.Checkpoint | m.Restore) -> bool:
+        reset = self._reset_to
+        if not self.cls.checkpoints:
+            self._unexpected(order, f"{self.use} has no state, and named no capability 'checkpoint'")
+        elif reset is None or order.episode != reset.episode:
+            self._unexpected(order, f"there was no RESET to episode {order.episode}")
+        else:
+            return True
+        return False
+
+    # --- what all handlers need --------------------------------------------------------------------
+
+    @property
+    def _running(self) -> Service[Any]:
+        if self._service is None:
+            raise RunError(f"{self.name!r} could not be set up")
+        return self._service
+
+    @contextmanager
+    def _reporting(self, phase: str, episode: int = 0, frame: int = -1) -> Iterator[None]:
+        """Send an exception as FAULT; it goes no further."""
+        try:
+            yield
+        except Exception as error:
+            self._send(fault_of(error, self._identity, phase, episode, frame), ())
+
+    def _unexpected(self, message: m.Message, why: str) -> None:
+        kind = message_type(message)
+        self._send(m.Error(code="unexpected", of=kind, message=f"{kind} is not used: {why}"), ())
+
+
+class OutsideSession(ServiceSession):
+    """A session whose frames are answered from outside of the run, by `answer`, and not by the service."""
+
+    frame: Frame | None = None
+    """The frame that is granted and not answered."""
+    _granted: m.Grant | None = None
+
+    def answer(self, result: StepResult) -> None:
+        """Answer `frame`.
+
+        Raises:
+            RunError: No frame is granted.
+            PayloadError: A product is not its topic's.
+        """
+        grant, self._granted, self.frame = self._granted, None, None
+        if grant is None:
+            raise RunError(f"{self.name!r} was granted no frame that could be answered")
+        self._send(*self._done(grant, result, 0))
+
+    def _step(self, reset: m.Reset, grant: m.Grant, parts: Sequence[Any]) -> Answer | None:
+        with self._reporting("step", grant.episode, grant.frame):
+            frame = self._frame(reset, grant, parts)
+            for item in frame.inputs:
+                if item.present:
+                    item.payload  # noqa: B018 - checked here, where a wrong one ends the run with blame
+            self._granted, self.frame = grant, frame
+        return None
+
+
+@dataclass
+class _Fetch:
+    """Scenery on its way from the broker."""
+
+    order: m.Prepare
+    missing: list[m.Asset]
+    count: int
+    incoming: IncomingAsset | None = None
+    deadline: float = 0.0
+
+    @property
+    def asset(self) -> m.Asset:
+        return self.missing[0]
+
+
+_WHILE_FETCHING = frozenset({m.AssetData, m.AssetGet, m.Cancel, m.Error, m.Shutdown, m.Stale})
+
+
+def _ignore(_: m.Message, __: Sequence[Any], ___: float) -> None:
+    """A message that asks for nothing."""
 
 
 class Answers:
-    """The newest answers of an episode, by frame, as they travel (contract, clause 7)."""
+    """The newest answers of an episode, by frame, for a GRANT that is repeated (contract, clause 7)."""
 
     def __init__(self) -> None:
-        self._parts: OrderedDict[int, Sequence[Any]] = OrderedDict()
+        self._answers: OrderedDict[int, Answer] = OrderedDict()
         self._bytes = 0
         self._newest = -1
 
-    def clear(self) -> None:
-        """A new episode begins."""
-        self.go_on_behind(-1)
-
-    def go_on_behind(self, frame: int) -> None:
-        """The service is where it was after this frame: that and those before are not answered again."""
-        self._parts.clear()
-        self._bytes, self._newest = 0, frame
+    def clear(self, newest: int = -1) -> None:
+        """Forget all answers; the service is where it was after frame ``newest``, −1: before the first."""
+        self._answers.clear()
+        self._bytes, self._newest = 0, newest
 
     def is_new(self, frame: int) -> bool:
         """Whether the frame lies behind all that were answered."""
         return frame > self._newest
 
-    def get(self, frame: int) -> Sequence[Any] | None:
+    def get(self, frame: int) -> Answer | None:
         """The answer to a frame; None where it is not kept."""
-        return self._parts.get(frame)
+        return self._answers.get(frame)
 
-    def put(self, frame: int, parts: Sequence[Any]) -> None:
+    def put(self, frame: int, answer: Answer) -> None:
         """Keep an answer, and forget the oldest where they get too many or too large."""
-        self._parts[frame], self._newest = parts, frame
-        self._bytes += _size(parts)
-        while len(self._parts) > 2 and (len(self._parts) > limits.MAX_IN_FLIGHT or self._bytes > KEPT_BYTES):
-            self._bytes -= _size(self._parts.popitem(last=False)[1])
+        self._answers[frame], self._newest = answer, frame
+        self._bytes += _size(answer)
+        while len(self._answers) > 2 and (
+            len(self._answers) > limits.MAX_IN_FLIGHT or self._bytes > KEPT_BYTES
+        ):
+            self._bytes -= _size(self._answers.popitem(last=False)[1])
 
 
-def _size(parts: Sequence[Any]) -> int:
-    return sum(map(len, parts))
-
-
-class Guard:
-    """Context in which an exception becomes a FAULT, handed to ``report``, and goes no further.
-
-    ``phase`` may be changed inside the context.
-    """
-
-    def __init__(
-        self,
-        identity: Mapping[str, Any],
-        report: Callable[[m.Fault], None],
-        phase: str,
-        episode: int = 0,
-        frame: int = -1,
-    ) -> None:
-        self.phase = phase
-        self._identity, self._report = identity, report
-        self._episode, self._frame = episode, frame
-
-    def __enter__(self) -> Guard:
-        return self
-
-    def __exit__(self, _: object, error: BaseException | None, __: object) -> bool:
-        if not isinstance(error, Exception):
-            return False
-        known = isinstance(error, CaviarError)
-        text = str(error) if known else f"{type(error).__name__}: {error}"
-        detail = "" if known else "".join(traceback.format_exception(error))
-        _log.error(detail or text)
-        self._report(
-            m.Fault(
-                **self._identity,
-                episode=self._episode,
-                frame=self._frame,
-                phase=self.phase,
-                message=_sendable(text[:MAX_MESSAGE]),
-                detail=_sendable(detail[-MAX_DETAIL:]),
-                culprit=error.source if isinstance(error, ProductError) else "",
-            )
-        )
-        return True
-
-
-def _sendable(text: str) -> str:
-    """The text without what UTF-8 cannot say: names of files may hold such."""
-    return text.encode(errors="backslashreplace").decode()
+def _size(answer: Answer) -> int:
+    return sum(map(len, answer[1]))

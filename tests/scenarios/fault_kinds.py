@@ -28,19 +28,19 @@ def arm_service(case: Case, name: str) -> None:
     if name != case.victim:
         return
     from caviar_services import runner
-    from caviar_services.runner import Runner
+    from caviar_services.session import ServiceSession
 
     if case.remote:
         runner.host_identity = lambda: "another machine"  # type: ignore[attr-defined]
 
-    granted = Runner._grant
+    granted = ServiceSession._grant
 
-    def grant(self: Runner, message: m.Grant, parts: Sequence[Any]) -> None:
+    def grant(self: ServiceSession, message: m.Grant, parts: Sequence[Any], now: float) -> None:
         if message.frame >= case.frame and claims(case):
-            SERVICE[case.fault](self)
-        granted(self, message, parts)
+            SERVICE[case.fault](self._send.__self__)  # type: ignore[attr-defined]  # the runner
+        granted(self, message, parts, now)
 
-    Runner._grant = grant  # type: ignore[method-assign]
+    ServiceSession._grant = grant  # type: ignore[method-assign]
 
 
 def arm_broker(case: Case) -> None:

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.topics import Lidar, LidarScan, Scene
-from caviar_services import session
+from caviar_services import conversion
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.service import Encoded, Frame, RunInfo, Service, StepResult
 from caviar_services.world.trajectory import TrajectorySettings, TrajectoryWorld
@@ -124,7 +124,7 @@ class Liar(Service[LiarSettings]):
 
 def _lie() -> None:
     """From now on this process, which is the service's own, states a digest of its own choice."""
-    session.payload_digest = lambda header, body: "0" * 64
+    conversion.payload_digest = lambda header, body: "0" * 64
 
 
 def _with_nan(scene: Scene) -> Encoded:

@@ -10,7 +10,7 @@ from caviar_protocol import messages as m
 from caviar_protocol.codec import decode_payload, encode_message
 from caviar_protocol.digest import payload_digest
 from caviar_protocol.topics import Lidar
-from caviar_services.runner import TRIM_EVERY
+from caviar_services.session import TRIM_EVERY
 
 __all__ = ["played_broker"]
 

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from msgspec.structs import replace as replace_field
 
@@ -24,7 +25,6 @@ from caviar_broker.journal import JournalFile
 from caviar_broker.recordings import with_replay
 from caviar_broker.statistics import Statistics
 from caviar_clients.session.base import Frame, Session, declared
-from caviar_clients.session.place import Place, Seat
 from caviar_protocol import messages as m
 from caviar_protocol.assets import AssetStore
 from caviar_protocol.errors import RunError
@@ -35,6 +35,9 @@ from caviar_protocol.scenario import Scenario
 from caviar_protocol.validation import ContentCheck
 from caviar_services.registry import load
 from caviar_services.service import Service, StepResult
+from caviar_services.session import OutsideSession, ServiceSession
+
+S = TypeVar("S", bound=ServiceSession)
 
 
 class EmbeddedRun:
@@ -51,7 +54,7 @@ class EmbeddedRun:
     on_notice, on_frame
         Told what the user should know, and of each finished frame.
     seats
-        By name, services that decide outside of the run (`Seat`), with the class that declares them.
+        By name, services that decide outside of the run (`OutsideSession`), and classes that declare them.
     imposed
         Decisions that services take over in place of their own, as
         `caviar_protocol.recording.reader.recorded_decisions` finds them.
@@ -98,31 +101,18 @@ class EmbeddedRun:
         """How it ended; None until then."""
         self._stop_reason = ""
         self._orders: deque[ev.Send] = deque()
+        self._events: deque[ev.Event] = deque()
+        self._encodes = directory is not None
         check, seats = ContentCheck(), seats or {}
-        self.seats = {
-            name: Seat(
-                name,
-                scenario.services[name].use,
-                cls,
-                store,
-                self._feed,
-                check,
-                digests=directory is not None,
-            )
-            for name, cls in seats.items()
-        }
+
+        def session(kind: type[S], name: str, cls: type[Service[Any]]) -> S:
+            use, send = scenario.services[name].use, partial(self._take, name)
+            return kind(name, use, cls, send, store, check=check, encodes=self._encodes)
+
+        self.seats = {name: session(OutsideSession, name, cls) for name, cls in seats.items()}
         """Services that decide outside of the run."""
-        self._places: dict[str, Place] = {
-            name: self.seats.get(name)
-            or Place(
-                name,
-                spec.use,
-                load(spec.role, spec.use),
-                store,
-                self._feed,
-                check,
-                digests=directory is not None,
-            )
+        self._sessions: dict[str, ServiceSession] = {
+            name: self.seats.get(name) or session(ServiceSession, name, load(spec.role, spec.use))
             for name, spec in scenario.services.items()
         }
 
@@ -143,12 +133,14 @@ class EmbeddedRun:
         with ExitStack() as stack:
             if self._journal is not None:
                 stack.callback(self._journal.close)
-            for place in self._places.values():
-                stack.callback(place.close)
-            for place in self._places.values():
-                self._feed(ev.Joined(place.hello()))
+            for session in self._sessions.values():
+                stack.callback(session.close)
+            for session in self._sessions.values():
+                self._feed(ev.Joined(session.hello()))
             while self.outcome is None:
-                if self._stop_reason:
+                if self._events:
+                    self._feed(self._events.popleft())
+                elif self._stop_reason:
                     reason, self._stop_reason = self._stop_reason, ""
                     self._feed(ev.StopRequested(reason))
                 elif self._orders:
@@ -162,13 +154,33 @@ class EmbeddedRun:
         self._stop_reason = reason
 
     def _obey(self, order: ev.Send) -> None:
-        place = self._places[order.service]
-        if self._journal is None or type(order.message) is not m.Grant:
-            place.obey(order)
-            return
+        session = self._sessions[order.service]
+        payloads = [product.payload for product in order.products]
+        parts = [part for payload in payloads for part in payload] if self._encodes else payloads
         began = time.monotonic_ns()
-        place.obey(order)
-        self.statistics.latency(order.service, time.monotonic_ns() - began, missed=False)
+        session.handle(order.message, parts)
+        if self._journal is not None and type(order.message) is m.Grant:
+            self.statistics.latency(order.service, time.monotonic_ns() - began, missed=False)
+
+    def _take(self, name: str, message: m.Message, parts: Sequence[Any]) -> None:
+        """Keep what a service sends as an event, for the clock to receive once the service has returned."""
+        match message:
+            case m.Done():
+                payloads = tuple(zip(parts[::2], parts[1::2], strict=True)) if self._encodes else tuple(parts)
+                event: ev.Event = ev.DoneReceived(name, message, payloads)
+            case m.ResetDone():
+                event = ev.ResetDoneReceived(name, message)
+            case m.AssetOffer():
+                event = ev.AssetsOffered(name, message.assets)
+            case m.Ready():
+                event = ev.ReadyReceived(name, message)
+            case m.Fault():
+                event = ev.FaultReceived(name, message)
+            case m.Bye():
+                event = ev.ByeReceived(name, message.reason)
+            case _:
+                raise RunError(f"{name!r} sent {message}, which a run in one process has no use for")
+        self._events.append(event)
 
     def _skip_time(self) -> None:
         """Nobody has anything to do: to the next deadline."""

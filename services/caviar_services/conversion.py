@@ -1,0 +1,211 @@
+"""Between the messages of the protocol and what a `Service` gets and gives."""
+
+from __future__ import annotations
+
+import logging
+import time
+import traceback
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from caviar_protocol import messages as m
+from caviar_protocol.arrays import Payload
+from caviar_protocol.digest import payload_digest
+from caviar_protocol.errors import CaviarError, PayloadError, ProductError
+from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.topics import PAYLOADS, Carrier
+from caviar_protocol.validation import ContentCheck, ContentRules
+from caviar_services.service import (
+    Encoded,
+    Frame,
+    FrameInput,
+    Progress,
+    RunInfo,
+    Service,
+    StepResult,
+    decoded,
+    encoded,
+)
+
+_log = logging.getLogger("caviar.service")
+
+MAX_MESSAGE = 2000
+"""[characters] of a FAULT's message."""
+MAX_DETAIL = 20000
+"""[characters] of a FAULT's traceback."""
+
+
+def run_info(name: str, welcome: m.Welcome, progress: Progress) -> RunInfo:
+    """What WELCOME tells about the run."""
+    told = welcome.scenario
+    return RunInfo(
+        name=name,
+        run=welcome.run,
+        again=welcome.epoch > 1 or welcome.attempt > 1,
+        seed=welcome.seed,
+        sampling_period_ns=int(told.get("sampling_period_ns", 1)),
+        frames=int(told.get("frames", 1)),
+        carriers=msgspec.convert(told.get("carriers", ()), tuple[Carrier, ...]),
+        devices=msgspec.convert(told.get("devices", ()), tuple[DeviceSpec, ...]),
+        scenario=told.get("resolved", {}),
+        directory=Path(str(told.get("directory", "."))),
+        progress=progress,
+    )
+
+
+def is_needed(service: Service[Any], order: m.Prepare) -> bool:
+    """Whether anybody wants what the service makes, or it is there for its own sake."""
+    return bool(order.demand) or service.role in ("agent", "recorder") or not service.outputs
+
+
+def content_rules_of(service: Service[Any], order: m.Prepare) -> ContentRules:
+    """What WELCOME and PREPARE say about the products that a service is going to get."""
+    run = service.run
+    worlds = order.producers.get("scene", ())
+    devices: dict[str, list[DeviceSpec]] = {world: [] for world in worlds}
+    for device in run.devices:
+        world = device.world or (worlds[0] if len(worlds) == 1 else "")
+        devices.setdefault(world, []).append(device)
+    return ContentRules(
+        prefixes=order.prefixes,
+        devices={world: tuple(specs) for world, specs in devices.items()},
+        assets=frozenset(asset.name for asset in order.assets) if order.prefixes else None,
+        carriers=run.carriers,
+        parts=service.parts,
+    )
+
+
+def frame_of(service: Service[Any], reset: m.Reset, grant: m.Grant, inputs: tuple[FrameInput, ...]) -> Frame:
+    """The frame that GRANT grants, in the episode that RESET began."""
+    return Frame(
+        episode=grant.episode,
+        number=grant.frame,
+        t_ns=grant.t_ns,
+        previous=grant.previous_frame,
+        final=grant.final,
+        budget_ns=grant.budget_ns,
+        inputs=inputs,
+        imposed=grant.decisions,
+        reports=grant.reports,
+        service=service.run.name,
+        seed=reset.seed,
+        seed_episode=reset.seed_episode,
+    )
+
+
+def frame_inputs(
+    grant: m.Grant, parts: Sequence[Any], check: ContentCheck, *, encoded: bool
+) -> tuple[FrameInput, ...]:
+    """Inputs of a grant.
+
+    Args:
+        grant: The grant.
+        parts: Of each input that is present, header and body where products are encoded, else the payload.
+        check: Looks at products before the service does.
+        encoded: Whether products are encoded.
+    """
+    left = iter(parts)
+    # A list, not a generator: the embedded run does little else in a frame.
+    return tuple(
+        [
+            FrameInput(entry)
+            if entry.status is m.Status.ABSENT
+            else FrameInput(entry, next(left), next(left), check=check)
+            if encoded
+            else FrameInput(entry, payload=next(left), check=check)
+            for entry in grant.inputs
+        ]
+    )
+
+
+def done_of(
+    identity: dict[str, int], use: str, grant: m.Grant, result: StepResult, step_ns: int
+) -> tuple[m.Done, list[Any]]:
+    """DONE, and header and body of each product behind it; ``step_ns`` is what the step took.
+
+    Raises `PayloadError` for a product that is not its topic's.
+    """
+    started = time.monotonic_ns()
+    headers, parts = [], list[Any]()
+    for topic, payload in _products(use, result):
+        header, body = encoded(payload)
+        fidelity = payload.fidelity if isinstance(payload, Encoded) else result.fidelity
+        headers.append(m.ProductHeader(topic=topic, digest=payload_digest(header, body), fidelity=fidelity))
+        parts += [header, body]
+    done = m.Done(
+        **identity,
+        episode=grant.episode,
+        frame=grant.frame,
+        products=tuple(headers),
+        decisions=dict(result.decisions),
+        measured={**result.measured, "step": step_ns, "encode": time.monotonic_ns() - started},
+        counts=dict(result.counts),
+        end_episode=result.end_episode,
+        seed=result.seed,
+    )
+    return done, parts
+
+
+def plain_done_of(
+    identity: dict[str, int], use: str, grant: m.Grant, result: StepResult
+) -> tuple[m.Done, tuple[Payload, ...]]:
+    """DONE without digests, and the products as they are, for a consumer in this process.
+
+    What a recorder would be told beside them is left out: there is none. Raises `PayloadError` for a
+    product that is not its topic's.
+    """
+    products = _products(use, result)
+    done = m.Done(
+        epoch=identity["epoch"],
+        attempt=identity["attempt"],
+        episode=grant.episode,
+        frame=grant.frame,
+        products=tuple([m.ProductHeader(topic=t, digest="", fidelity=result.fidelity) for t, _ in products]),
+        end_episode=result.end_episode,
+        seed=result.seed,
+    )
+    return done, tuple([decoded(payload) for _, payload in products])
+
+
+def _products(use: str, result: StepResult) -> list[tuple[str, Payload]]:
+    products = sorted(result.products.items()) if len(result.products) > 1 else [*result.products.items()]
+    for topic, payload in products:
+        if type(payload) is not PAYLOADS.get(topic) and not isinstance(payload, Encoded):
+            raise PayloadError(f"{use} made a payload {type(payload).__name__} for the topic {topic!r}")
+    return products
+
+
+_log = logging.getLogger("caviar.service")
+
+KEPT_BYTES = 64 << 20
+"""[B] of answers that are kept, beyond the newest two."""
+MAX_MESSAGE = 2000
+MAX_DETAIL = 20000
+"""[characters] of a FAULT's texts."""
+
+
+def fault_of(
+    error: Exception, identity: Mapping[str, int], phase: str, episode: int = 0, frame: int = -1
+) -> m.Fault:
+    """FAULT that says what an exception says, with a traceback where it is no `CaviarError`."""
+    known = isinstance(error, CaviarError)
+    text = str(error) if known else f"{type(error).__name__}: {error}"
+    detail = "" if known else "".join(traceback.format_exception(error))
+    _log.error(detail or text)
+    return m.Fault(
+        **identity,
+        episode=episode,
+        frame=frame,
+        phase=phase,
+        message=_sendable(text[:MAX_MESSAGE]),
+        detail=_sendable(detail[-MAX_DETAIL:]),
+        culprit=error.source if isinstance(error, ProductError) else "",
+    )
+
+
+def _sendable(text: str) -> str:
+    """The text without what UTF-8 cannot say: names of files may hold such."""
+    return text.encode(errors="backslashreplace").decode()
