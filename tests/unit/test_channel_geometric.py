@@ -14,7 +14,7 @@ from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Channel, Panel, Scene
-from caviar_services.channel.propagation.occlusion import Boxes
+from caviar_services.channel.propagation.clearance import Boxes
 from caviar_services.channel.statistical.geometric import GeometricChannel
 from caviar_services.channel.statistical.waves import GeometricSettings
 from caviar_services.registry import load

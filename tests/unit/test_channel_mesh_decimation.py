@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from caviar_protocol.arrays import Float64Array
-from caviar_services.channel.mesh_detail.decimation import decimated, welded
+from caviar_services.channel.mesh_detail import decimated, welded
 from caviar_services.mesh.shapes import Mesh, box, unit_box
 
 

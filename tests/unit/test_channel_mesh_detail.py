@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from caviar_services.channel.mesh_detail.detail import DetailSettings, detailed, piece_numbers
+from caviar_services.channel.mesh_detail import DetailSettings, detailed, piece_numbers
 from caviar_services.mesh.shapes import Mesh, box
 
 

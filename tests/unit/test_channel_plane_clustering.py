@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from caviar_services.channel.sionna import plane_clustering
+from caviar_services.channel.sionna import planes
 from caviar_services.channel.sionna.planes import plane_numbers, plane_numbers_of
 from caviar_services.mesh.shapes import Mesh, unit_box
 
@@ -58,9 +58,9 @@ def test_planes_are_those_found_one_after_the_other(rough: float, seed: int) -> 
 def test_large_planes_are_claimed_one_by_one_as_long_as_that_pays(
     many: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(plane_clustering, "_LARGE", 10)
-    monkeypatch.setattr(plane_clustering, "_MANY", many)
-    monkeypatch.setattr(plane_clustering, "_AT_ONCE", 100)
+    monkeypatch.setattr(planes, "_LARGE", 10)
+    monkeypatch.setattr(planes, "_MANY", many)
+    monkeypatch.setattr(planes, "_AT_ONCE", 100)
     for rough in (0.0, 5e-5, 2e-4):
         mesh = terrain(16, rough, np.random.default_rng(3))
         assert plane_numbers(mesh).tolist() == one_after_the_other(mesh)

@@ -13,7 +13,6 @@ from caviar_clients.cli import stability as cli_stability
 from caviar_clients.cli.main import app
 from caviar_protocol.errors import AssetError, PayloadError
 from caviar_services.channel.stability import case as cases_module
-from caviar_services.channel.stability import case as run_module
 from caviar_services.channel.stability import formulas
 from caviar_services.channel.stability.bench import Bench
 from caviar_services.channel.stability.case import (
@@ -125,7 +124,7 @@ class TestCommand:
 
     def test_what_needs_the_ray_tracer_is_not_run_without_it(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """A missing extra is no wrong physics: the rest is judged, one line says what to install."""
-        monkeypatch.setattr(run_module, "has_extra", lambda _: False)
+        monkeypatch.setattr(cases_module, "has_extra", lambda _: False)
         result = CliRunner(env={"COLUMNS": "200"}).invoke(app, ["stability", "--group", "speed"])
         ran = sum(case.group == "speed" and not case.traced for case in cases())
         every = sum(case.group == "speed" for case in cases())
@@ -136,7 +135,7 @@ class TestCommand:
         assert "wrong" not in result.output
 
     def test_status_1_where_no_case_ran(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(run_module, "has_extra", lambda _: False)
+        monkeypatch.setattr(cases_module, "has_extra", lambda _: False)
         only = [case for case in cases() if case.traced][:1]
         monkeypatch.setattr(cli_stability, "cases", lambda: only)
         assert CliRunner().invoke(app, ["stability"]).exit_code == 1

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from caviar_protocol.errors import AssetError
-from caviar_services.channel.sionna.meshes import file_vertices
+from caviar_services.channel.sionna.scene_loading import file_vertices
 from caviar_services.mesh.scenery import ITU_MATERIALS, SceneryShape, find_scenery, read_scenery
 from caviar_services.world.assets import scenery_assets
 

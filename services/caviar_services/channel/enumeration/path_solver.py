@@ -31,7 +31,7 @@ from caviar_services.channel.enumeration.transmitted_paths import crossings
 from caviar_services.channel.sionna.candidate_visibility import Faces
 from caviar_services.channel.sionna.candidates import first_of_each
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
-from caviar_services.channel.sionna.path_buffer import Traced, joined, nothing
+from caviar_services.channel.sionna.path_table import Traced, joined, nothing
 from caviar_services.channel.sionna.ray_launcher import LaunchOptions
 from caviar_services.channel.sionna.scene import SionnaScene
 

@@ -22,9 +22,9 @@ from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_services.channel.paths import Antenna
 from caviar_services.channel.propagation.patterns import spherical_basis
 from caviar_services.channel.radio_map.measurement_surface import MeasurementSurface
-from caviar_services.channel.sionna.meshes import Shape, mi_mesh
 from caviar_services.channel.sionna.ray_launcher import spread_directions
 from caviar_services.channel.sionna.scene import SionnaScene
+from caviar_services.channel.sionna.scene_loading import Shape, mi_mesh
 from caviar_services.ray_tracing import aligned_columns, aligned_indices
 
 PART = 1_000_000

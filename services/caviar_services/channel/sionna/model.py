@@ -41,14 +41,12 @@ from caviar_services.channel.sionna.diffuse_paths import Element
 from caviar_services.channel.sionna.edge_range import EdgeRange
 from caviar_services.channel.sionna.materials import MaterialPolicy, OutsideUse
 from caviar_services.channel.sionna.object_materials import ObjectMaterials
-from caviar_services.channel.sionna.path_buffer import Traced
 from caviar_services.channel.sionna.path_solver import LANE_BYTES, Tracer
-from caviar_services.channel.sionna.path_table import Ends, path_ends, path_table
+from caviar_services.channel.sionna.path_table import Ends, Traced, path_ends, path_table, traced_surfaces
 from caviar_services.channel.sionna.ray_launcher import LaunchOptions, rays_within
 from caviar_services.channel.sionna.scene import SceneSettings, SionnaScene
 from caviar_services.channel.sionna.scene_sharing import scene_of
 from caviar_services.channel.sionna.settings import SionnaSettings
-from caviar_services.channel.sionna.traced_surfaces import traced_surfaces
 from caviar_services.channel.sionna.tracked_chains import Following, FollowingState
 from caviar_services.channel.sionna.warmup import compile_kernels
 from caviar_services.checkpoint import restored, saved

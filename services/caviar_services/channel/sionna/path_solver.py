@@ -27,7 +27,7 @@ from caviar_services.channel.sionna.candidates import Candidates, Offer, Planes,
 from caviar_services.channel.sionna.chains import MANY_RAYS, Met, met_by, united
 from caviar_services.channel.sionna.diffracting_edges import edge_generator
 from caviar_services.channel.sionna.diffuse_paths import Element, Points, Thinning
-from caviar_services.channel.sionna.path_buffer import (
+from caviar_services.channel.sionna.path_table import (
     Traced,
     edge_numbers,
     geometry,

@@ -5,7 +5,7 @@ shape for each material, and a table that says which triangles belong to what (`
 still name the single building and vehicle.
 
 The ray tracer counts in float32, whose step is 1 mm at 10 km. So it is given the scene relative to
-`SionnaScene.centre`, and what its paths meet is told to callers in float64 and in world coordinates: the
+`SionnaScene.centre`, and callers get what its paths meet in float64 and in world coordinates: the
 scenery's corners as they stand in the files, and those of moving bodies from their poses.
 """
 
@@ -24,7 +24,7 @@ from caviar_protocol.errors import PayloadError
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.space.scene import object_pose
 from caviar_protocol.topics import Scene
-from caviar_services.channel.mesh_detail.detail import DetailSettings
+from caviar_services.channel.mesh_detail import DetailSettings
 from caviar_services.channel.paths import Turning
 from caviar_services.channel.propagation.utd import Media
 from caviar_services.channel.sionna.contributing import SurfaceMaterial, UsedSurfaces
@@ -38,16 +38,18 @@ from caviar_services.channel.sionna.materials import (
     object_materials,
     set_materials,
 )
-from caviar_services.channel.sionna.meshes import (
+from caviar_services.channel.sionna.object_materials import Constants, ObjectMaterials, body_kind
+from caviar_services.channel.sionna.scene_loading import (
     Shape,
+    by_material,
     file_meshes,
     file_vertices,
     floats,
+    loaded,
     mi_mesh,
     unit_mesh,
+    with_detail,
 )
-from caviar_services.channel.sionna.object_materials import Constants, ObjectMaterials, body_kind
-from caviar_services.channel.sionna.scene_loading import by_material, loaded, with_detail
 from caviar_services.channel.sionna.triangle_numbering import Body, NumberedTriangles
 from caviar_services.mesh.scenery import find_scenery
 from caviar_services.mesh.shapes import BodyPool, Mesh, box, placed

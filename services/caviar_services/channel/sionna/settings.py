@@ -12,7 +12,7 @@ import msgspec
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import ScenarioError
 from caviar_services.channel.base import ChannelSettings
-from caviar_services.channel.mesh_detail.detail import DetailSettings
+from caviar_services.channel.mesh_detail import DetailSettings
 from caviar_services.channel.propagation.foliage import FoliageSettings
 from caviar_services.channel.sionna.materials import MaterialSettings, OutsideRange
 

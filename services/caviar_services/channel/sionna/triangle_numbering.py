@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
 from caviar_services.channel.propagation.clearance import Surfaces
 from caviar_services.channel.sionna.coplanar_faces import CoplanarFaces, JoinedFaces
-from caviar_services.channel.sionna.meshes import Shape
 from caviar_services.channel.sionna.planes import (
     PlaneTable,
     plane_numbers,
@@ -25,6 +24,7 @@ from caviar_services.channel.sionna.planes import (
     shared_planes,
     two_sided_planes,
 )
+from caviar_services.channel.sionna.scene_loading import Shape
 from caviar_services.mesh.shapes import Mesh
 
 Body = tuple[str, int]

@@ -129,13 +129,13 @@ def _number(value: float | complex) -> str:
 EXTRA = "channel"
 """Extra of the distribution that brings the ray tracer."""
 
-GROUPS = ("waves", "places", "counts", "motion", "meshes", "edges", "inputs")
+MODULES = ("waves", "places", "counts", "motion", "edges")
 """Modules with cases, in the order of the table."""
 
 
 def cases() -> Sequence[Case]:
     """All cases."""
-    for module in GROUPS:
+    for module in MODULES:
         import_module(f"caviar_services.channel.stability.{module}")
     return tuple(CASES)
 

@@ -57,7 +57,7 @@ from caviar_protocol.topics import AntennaDevice, Channel, ChannelMatrix, Channe
 from caviar_services.antenna_arrays import steering_vector
 from caviar_services.channel.base import ChannelModel, Modelled
 from caviar_services.channel.propagation.atmosphere import amplitude_factor
-from caviar_services.channel.propagation.occlusion import Boxes
+from caviar_services.channel.propagation.clearance import Boxes
 from caviar_services.channel.statistical.waves import (
     Draws,
     GeometricSettings,
