@@ -296,6 +296,7 @@ def _require_finite(value: Any, path: str) -> None:
             raise PayloadError(f"{path} is {value}: non-finite values may not leave a service")
     elif isinstance(value, msgspec.Struct):
         require_finite(value, path)
+    # Payloads hold tuples only, never lists: they are immutable and compare by value.
     elif isinstance(value, tuple):
         for index, item in enumerate(value):
             _require_finite(item, f"{path}[{index}]")

@@ -120,7 +120,9 @@ class AssetStore:
         Raises:
             AssetError: A file of the manifest is not in the store, or cannot be laid out.
         """
+        # Gone through twice below, and an iterator lasts once.
         manifest = list(assets)
+        # By digest, so that runs with the same scenery share the folder and others never touch it.
         folder = self.folder / "geometry" / (geometry_digest(manifest) or "none")
         for asset in manifest:
             _check_name(asset.name)

@@ -80,6 +80,7 @@ Role = Literal["world", "channel", "sensors", "link", "agent", "recorder"]
 Policy = Literal["wait", "hold", "drop", "abort"]
 
 
+# Members are strings, so that they stand on the wire and in texts as they are.
 class Status(StrEnum):
     """What became of a product (contract, clauses 9 to 12)."""
 

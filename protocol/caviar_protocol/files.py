@@ -42,7 +42,7 @@ def replace_file(
     mode: int = 0o666,
     concurrent: bool = False,
 ) -> None:
-    """Write a file in one step: a reader, and a machine that died, have the whole of it or what was before.
+    """Write a file atomically: a reader, and a machine that died, have the whole of it or what was before.
 
     Args:
         path: The file; its folder exists.

@@ -53,6 +53,7 @@ CAPABILITIES: tuple[str, ...] = ("assets", "checkpoint", "episodes", "parts")
 """Optional features that this package implements. Peers use what both of them list."""
 
 
+# Fields that equal their default are left out, so that a new field costs old messages nothing.
 class _Message(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, tag_field="type"):
     """Base of all messages: a map with a ``type`` and the fields that differ from their default."""
 

@@ -257,6 +257,7 @@ def _markdown(text: str) -> str:
 @cache
 def classes() -> dict[str, type[msgspec.Struct]]:
     """Every struct that may stand on the wire, by name, those inside others too."""
+    # Breadth first, so that structs come behind those that hold them.
     queue: list[Any] = [*get_args(messages.Message), *topics.PAYLOADS.values()]
     found: dict[str, type[msgspec.Struct]] = {}
     while queue:

@@ -98,6 +98,7 @@ def _open(data: bytes, position: int, byte: int) -> tuple[int, int]:
     return position + 1 + width, count * (1 if byte < 0xDE else 2)
 
 
+# msgspec raises one class for all that is wrong: only the text says which kind and where.
 _INVALID = re.compile(r"Invalid (?:enum )?value .* - at `\$(?P<path>.*)`", re.DOTALL)
 _STEP = re.compile(r"\.([A-Za-z0-9_]+)|\[(\d+)\]")
 
@@ -118,6 +119,7 @@ def choices(kind: Any, encoded: bytes | bytearray | memoryview, complaint: str) 
     except (msgspec.MsgspecError, ValueError, RecursionError):
         # The complaint was about these bytes, so they decode without a type; else no word can be named.
         return ()
+    # msgspec names the place as JSON Path does: `$.inputs[2].topic`.
     steps = [name or int(number) for name, number in _STEP.findall(found["path"])]
     return _words(_at(_type_info(kind), value, steps))
 

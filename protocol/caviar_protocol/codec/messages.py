@@ -120,6 +120,7 @@ def part_count(message: Message) -> int:
     match message:
         case Done():
             return 1 + 2 * len(message.products)
+        # An absent input has provenance and no bytes.
         case Grant():
             return 1 + 2 * sum([entry.status is not _ABSENT for entry in message.inputs])
         case AssetData() | Restore() | CheckpointDone():
@@ -176,6 +177,7 @@ def _check_opening(header: Buffer) -> None:
         opening = _opening_decoder.decode(header)
     except (msgspec.MsgspecError, ValueError, RecursionError):
         return
+    # No other message has a version, so no other can blame it.
     if opening.type in ("HELLO", "WELCOME"):
         check_version(opening.version)
 

@@ -273,6 +273,7 @@ def _struct(cls: type[msgspec.Struct]) -> Convert:
 
 
 def _converter(hint: Any) -> Convert:
+    # Converters are made once a type, so that no value is looked at by its type at run time.
     hint = _without_alias(hint)
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Annotated:
@@ -331,6 +332,7 @@ def _runtime_type(hint: Any) -> type:
 
 def _literal(allowed: frozenset[Any]) -> Convert:
     def convert(value: Any, _: BodyWriter) -> Any:
+        # msgspec checks literals when it decodes, not when it encodes.
         if value not in allowed:
             raise ValueError(f"expected one of {', '.join(sorted(map(str, allowed)))}")
         return value
@@ -370,6 +372,7 @@ def _float(value: Any, _: BodyWriter) -> float:
 
 
 def _flag(value: Any, _: BodyWriter) -> bool:
+    # `bool(2)` would be true: a number in a flag is a mistake of the producer.
     if not isinstance(value, bool | np.bool_):
         raise TypeError("expected true or false")
     return bool(value)

@@ -227,6 +227,7 @@ def recorded_until(path: Path) -> tuple[tuple[int, int] | None, tuple[str, ...]]
         found = RecordedSegments(path, trusted_before=(sys.maxsize, 0))
     except RecordingError as error:
         return None, (str(error),)
+    # Trusted segments have no gap: the manifest lists them as finished, one behind the other.
     last = found.trusted[-1].last if found.trusted else None
     for instant in found.instants:
         if last is not None and not follows(last, instant):
@@ -388,6 +389,7 @@ def _rehash(
     stored = {(message.channel, message.frame): message.data for message in segment.messages(chunk)}
     fresh, faults = [], []
     for item in entry.inputs:
+        # Only these are stored with the frame; a held product is checked in the frame it is of.
         if item.status not in (Status.FRESH, Status.LATE):
             continue
         data = stored.get((Channel(item.topic, item.source), item.frame))

@@ -73,13 +73,7 @@ class RecordingWarning(UserWarning):
 
 
 class RecordedProduct:
-    """One product of a frame; its payload is decoded on first use.
-
-    Args:
-        provenance: What the frame's record says about it.
-        data: Its bytes in the file: length of the header, header, body.
-        place: Recording, frame, topic and source, as errors name them.
-    """
+    """One product of a frame; its payload is decoded on first use."""
 
     def __init__(self, provenance: GrantInput, data: memoryview, place: str) -> None:
         self.provenance = provenance
@@ -129,12 +123,7 @@ class RecordedProduct:
 
 
 class RecordedFrame:
-    """One frame: the provenance of all its products, and the products, read on first use.
-
-    Args:
-        recording: The recording.
-        index: Place of the frame in it, from 0.
-    """
+    """One frame: the provenance of all its products, and the products, read on first use."""
 
     def __init__(self, recording: Recording, index: int) -> None:
         self._recording = recording

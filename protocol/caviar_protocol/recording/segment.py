@@ -156,6 +156,7 @@ class Segment:
             expected: CRC-32 of the file, where the manifest says it.
         """
         found, start, crc = [], 0, 0
+        # Each seal goes on from the one before, so that a change is placed between two of them.
         for place, recorded in self._seals:
             if zlib.crc32(self._data[start:place], crc) != recorded:
                 found.append((start, place))
@@ -359,6 +360,7 @@ class Segment:
 
 
 def _find(data: memoryview, pattern: bytes, start: int) -> int:
+    # A memoryview has no `find`, the map behind it does, without a copy.
     source = data.obj
     return source.find(pattern, start) if isinstance(source, mmap.mmap) else -1
 

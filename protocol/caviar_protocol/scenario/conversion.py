@@ -161,6 +161,7 @@ def _check(value: object, expected: inspect.Type, place: Place) -> None:
 def _check_struct(value: object, expected: inspect.StructType, place: Place) -> None:
     table = _table(value, place)
     fields = {field.encode_name: field for field in expected.fields}
+    # What the loader fills in is a field and no key.
     hidden: tuple[str, ...] = getattr(expected.cls, "not_in_file", ())
     known = [name for name in fields if name not in hidden]
     if expected.tag_field is not None:

@@ -120,6 +120,7 @@ def _with_device_names(source: Source, scenario: Scenario) -> Source:
 
 
 def _syntax_error(error: tomllib.TOMLDecodeError, text: str, file: str) -> ScenarioError:
+    # tomllib puts the place at the end of its text and nowhere else.
     found = re.fullmatch(r"(.*) \(at (?:line (\d+), column (\d+)|end of document)\)", str(error), re.DOTALL)
     if found is None:
         return ScenarioError(f"not TOML: {error}", file)

@@ -148,6 +148,7 @@ class _Scanner:
             path = (*path, key)
             if is_array and depth == len(keys):
                 self.elements[path] = self.elements.get(path, -1) + 1
+            # A table below an array of tables is in the last of them (TOML 1.0).
             if path in self.elements:
                 path = (*path, self.elements[path])
         self.note(path)

@@ -70,6 +70,7 @@ def beam_towards(array: AntennaArray, direction: Sequence[float], polarization: 
     if array.is_uniform:
         return _uniform_beam(array, direction)
     mine = subarrays(array)[polarization :: len(array.polarizations)]
+    # The panel whose boresight is nearest: the first coordinate is its cosine.
     faced = max(mine, key=lambda part: part.towards(direction)[0])
     return faced.first + _uniform_beam(faced.array, faced.towards(direction))
 

@@ -102,6 +102,7 @@ class LidarDevice(_Device, frozen=True, kw_only=True, omit_defaults=True, tag="l
 
     beams: Annotated[int, quantity("1", "beams (rows)", ge=1, le=1024)] = 64
     azimuth_steps: Annotated[int, quantity("1", "rays of a beam in a turn", ge=1, le=36000)] = 1800
+    # −25° and 3°, about the field of view of a Velodyne HDL-64E (−24.8° to 2°).
     elevation_min: Annotated[float, quantity("rad", "lowest beam")] = -0.4363323129985824
     elevation_max: Annotated[float, quantity("rad", "highest beam")] = 0.05235987755982989
     max_range: Annotated[float, quantity("m", "farther hits are dropped", gt=0)] = 100.0
