@@ -88,3 +88,16 @@ def test_a_frame_or_user_that_is_not_there_is_refused(tmp_path):
 def test_an_empty_recording_has_nothing_to_draw(tmp_path):
     with pytest.raises(RecordingError, match="holds nothing to draw"):
         plot_run(record(tmp_path, frames=0))
+
+
+@pytest.mark.usefixtures("maps_alone")
+def test_of_a_run_without_users_the_map_is_drawn(tmp_path):
+    made = recording_samples.recorder(tmp_path / "run")
+    for number in range(2):
+        items = (
+            recording_samples.product("scene", "world", recording_samples.scene(number, 1), number),
+            recording_samples.product("link", "link", recording_samples.link(number, 0), number),
+        )
+        made.step(recording_samples.frame(number, *items))
+    made.close()
+    assert [file.name for file in plot_run(tmp_path / "run", tmp_path / "out")] == ["map.png"]

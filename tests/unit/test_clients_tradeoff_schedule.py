@@ -15,7 +15,7 @@ from caviar_clients.tradeoff.ladder import (
     samples_of,
     spacing_settings,
 )
-from caviar_protocol.scenario.conversion import convert_settings
+from caviar_protocol.scenario.conversion import Place, convert_settings
 from caviar_services.channel.sionna.settings import SionnaSettings
 
 
@@ -117,7 +117,7 @@ def test_no_choice_of_the_scenario_keeps_a_setting_from_being_measured(chosen: d
     settings = (*LADDER, *spacing_settings(), *array_settings(), *convergence_settings(1))
     for setting in (setting for setting in settings if setting.use == "sionna-rt"):
         known = convert_settings(SionnaSettings, setting.over(chosen))
-        known.launched_samples("channel")
+        known.check(Place("settings"))
         assert known.rung == setting.settings.get("rung", "siso-rt")
         if setting.settings["diffraction"]:
             assert known.free_edges == chosen.get("free_edges", False)

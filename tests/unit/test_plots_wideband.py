@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
 from recording_samples import channel, frame, product, recorder
 
-from caviar_clients.plots.wideband import _gains_db, draw_dispersion, draw_frequency_response, user_paths
+from caviar_clients.plots.wideband import (
+    _gains_db,
+    _scale,
+    _why_empty,
+    draw_dispersion,
+    draw_frequency_response,
+    user_paths,
+)
 from caviar_protocol.recording import Recording
 
 pytest.importorskip("matplotlib")
@@ -56,3 +64,29 @@ def test_a_user_without_a_path_can_be_drawn(tmp_path: Path) -> None:
     draw_frequency_response(data, (1, 1), "frame 1", tmp_path / "response.png")
     assert (tmp_path / "dispersion.png").stat().st_size > 10_000
     assert (tmp_path / "response.png").stat().st_size > 10_000
+
+
+def drawn(values: list[float]) -> Any:
+    """The axes of a coherence that has these values."""
+    from matplotlib.figure import Figure
+
+    axes = Figure(figsize=(9.0, 2.0)).subplots()
+    axes.plot(values)
+    _scale(axes, np.array(values))
+    axes.figure.canvas.draw()
+    return axes
+
+
+@pytest.mark.parametrize("values", [[23.0, 48.0], [23.0, 480.0], [0.9, 7.0, 4000.0]])
+def test_the_axis_of_a_coherence_has_numbers(values: list[float]) -> None:
+    """Within a decade a logarithmic axis has one of them at most."""
+    axes = drawn(values)
+    low, high = axes.get_ylim()
+    shown = [t for t in axes.get_yticklabels() if t.get_text() and low <= t.get_position()[1] <= high]
+    assert len(shown) >= 2
+
+
+def test_a_panel_without_a_value_says_why() -> None:
+    assert _why_empty(np.array([np.nan, np.inf])) == "infinite: one path in each frame"
+    assert _why_empty(np.array([np.nan, -np.inf])) == "no direct path"
+    assert _why_empty(np.array([np.nan])) == "no path"

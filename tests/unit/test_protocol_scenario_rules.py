@@ -11,7 +11,15 @@ import pytest
 from caviar_broker.core.plan import plan_run
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import ScenarioError
-from caviar_protocol.scenario import DeviceSpec, Limits, Run, Scenario, ServiceSpec, parse_scenario
+from caviar_protocol.scenario import (
+    DeviceSpec,
+    Limits,
+    Run,
+    Scenario,
+    ServiceSpec,
+    load_scenario,
+    parse_scenario,
+)
 from caviar_protocol.scenario.conversion import Source, convert_settings
 from caviar_protocol.scenario.rules import (
     check_scenario,
@@ -255,6 +263,29 @@ def test_a_later_check_can_name_the_line() -> None:
     absent = scenario_error(loaded, "services.streets.policy[3].x", "…")
     assert absent.line == 7
     assert scenario_error(scenario(), "run.frames", "…").line is None
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("power_dbm = 30.0", "power_dbm = 400.0", "devices[0].power_dbm: is 400.0, write a number ≥ -200"),
+        (
+            "array = { rows = 4, columns = 8 }",
+            'array = { pattern = "tr38901", pattern_file = "file:a.csv" }',
+            "devices[0].array.pattern: and pattern_file both say how elements radiate; remove one",
+        ),
+    ],
+)
+def test_what_an_antenna_cannot_be_is_refused_where_it_is_read(
+    tmp_path: Path, old: str, new: str, says: str
+) -> None:
+    text = SMOKE.read_text()
+    assert old in text
+    (tmp_path / "a.csv").write_text("")
+    (tmp_path / "a.toml").write_text(text.replace(old, new, 1))
+    with pytest.raises(ScenarioError) as refused:
+        load_scenario(tmp_path / "a.toml")
+    assert says in str(refused.value)
 
 
 def test_users_are_matched_by_pattern() -> None:

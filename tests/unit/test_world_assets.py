@@ -161,7 +161,7 @@ def test_broken_xml_is_named_with_its_line(tmp_path: Path) -> None:
 def test_missing_scenery_and_nonsense_are_refused(tmp_path: Path) -> None:
     with pytest.raises(AssetError, match="is not there"):
         scenery_assets(str(tmp_path / "none.xml"))
-    with pytest.raises(ScenarioError, match='write "sionna:NAME"'):
+    with pytest.raises(AssetError, match='write "sionna:NAME"'):
         scenery_assets("munich")
 
 

@@ -162,7 +162,8 @@ def broker(
     from caviar_broker.security.access import check_bind
     from caviar_clients.cli.remote import RunInProgress, service_commands
     from caviar_clients.cli.run import run_directory
-    from caviar_clients.session.checks import checked_scenario, implausible_values
+    from caviar_clients.session.checks import checked_scenario
+    from caviar_clients.session.plausibility import implausible_values
 
     options = ["--bind", bind] + (["--keys", str(keys)] if keys else []) + ["--restarted"] * restarted
     options += ["--http", http] if http else []

@@ -11,7 +11,7 @@ import numpy as np
 
 from caviar_clients.files import make_folder_of
 from caviar_clients.plots.camera import CameraView, draw_view
-from caviar_clients.plots.fig8 import choose_user, draw_over_angle, draw_over_time, series
+from caviar_clients.plots.fig8 import choose_user, draw_over_angle, draw_over_time, has_users, series
 from caviar_clients.plots.lidar import draw_scan
 from caviar_clients.plots.map import MapData, draw_map
 from caviar_clients.plots.rays import Box, Footprints, footprints, with_boxes
@@ -68,7 +68,8 @@ def plot_run(
     folder = out or recording.directory
     make_folder_of(folder / "map.png")
     topics = recording.topics
-    chosen = choose_user(recording, user or "") if "link" in topics else None
+    with_users = user is not None or ("link" in topics and has_users(recording))
+    chosen = choose_user(recording, user or "") if "link" in topics and with_users else None
     files: list[Path] = []
     if "scene" in topics:
         files.append(folder / "map.png")

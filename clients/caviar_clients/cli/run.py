@@ -30,8 +30,9 @@ from caviar_clients.cli.remote import key_text, reachable, start_command, waitin
 from caviar_clients.cli.scenarios import require_extras
 from caviar_clients.cli.summary import recorded_figures, summary_of, summary_table
 from caviar_clients.files import printable, reason, write_file
-from caviar_clients.session.checks import checked_scenario, implausible_values
+from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.embedded import EmbeddedRun
+from caviar_clients.session.plausibility import implausible_values
 from caviar_protocol.errors import RecordingError, RunError, SetupError
 from caviar_protocol.recording import Recording
 from caviar_protocol.recording.integrity import declared_digest

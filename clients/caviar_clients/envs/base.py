@@ -17,8 +17,9 @@ from caviar_clients.envs.observations import Moment, Part, Users, part
 from caviar_clients.plots.map import MapData, chosen_beam, draw_antennas, draw_beam, draw_objects
 from caviar_clients.plots.style import GREY
 from caviar_clients.session.base import Frame, Session
-from caviar_clients.session.checks import checked_scenario, implausible_values
+from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.opening import agent_of, open_session
+from caviar_clients.session.plausibility import implausible_values
 from caviar_protocol.arrays import BoolArray, Float64Array, UInt8Array
 from caviar_protocol.errors import RunError, ScenarioError, SetupError
 from caviar_protocol.host import install_command

@@ -51,6 +51,11 @@ def link_source(recording: Recording) -> str:
     return sources[0]
 
 
+def has_users(recording: Recording) -> bool:
+    """Whether any frame of a link has a user."""
+    return any(link.rx for link in _links(recording))
+
+
 def choose_user(recording: Recording, user: str = "") -> tuple[str, str, str]:
     """(tx, rx, carrier) of the user that was there longest, or of the one whose receiver, or whose
     receiver's object, is named ``user``.

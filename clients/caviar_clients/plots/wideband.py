@@ -85,19 +85,22 @@ def draw_dispersion(data: UserPaths, file: Path) -> None:
     with np.errstate(divide="ignore"):
         k_db = 10 * np.log10(k_factor(data.a, data.tau, data.los))
     rows = (
-        ("RMS delay\nspread [ns]", sigma_tau * 1e9, "linear", BLUE),
-        ("K-factor [dB]", np.where(np.isfinite(k_db), k_db, np.nan), "linear", BLUE),
-        ("Coherence\nbandwidth [MHz]", _finite(coherence(sigma_tau)) * 1e-6, "log", VERMILION),
-        ("Coherence\ntime [ms]", _finite(coherence(sigma_nu)) * 1e3, "log", VERMILION),
+        ("RMS delay\nspread [ns]", sigma_tau * 1e9, BLUE),
+        ("K-factor [dB]", k_db, BLUE),
+        ("Coherence\nbandwidth [MHz]", coherence(sigma_tau) * 1e-6, VERMILION),
+        ("Coherence\ntime [ms]", coherence(sigma_nu) * 1e3, VERMILION),
     )
     with figure(file, 9.0, 8.0) as drawn:
         axes = drawn.subplots(len(rows), 1, sharex=True)
-        for place, (label, values, scale, color) in zip(axes, rows, strict=True):
-            place.plot(data.time, values, color=color, linewidth=1.6, marker=".", markersize=4)
+        for place, (label, values, color) in zip(axes, rows, strict=True):
+            finite = _finite(values)
+            place.plot(data.time, finite, color=color, linewidth=1.6, marker=".", markersize=4)
             place.set_ylabel(label)
-            if scale == "log" and np.isfinite(values).any():
-                place.set_yscale("log")
-                place.minorticks_off()
+            if label.startswith("Coherence"):
+                _scale(place, finite[np.isfinite(finite)])
+            if not np.isfinite(finite).any():
+                place.set_yticks([])
+                place.text(0.5, 0.5, _why_empty(values), transform=place.transAxes, ha="center", color=GREY)
             place.grid(color=LIGHT_GREY, linewidth=0.6)
             _shade(place, data)
         axes[0].set_title(
@@ -106,6 +109,28 @@ def draw_dispersion(data: UserPaths, file: Path) -> None:
         )
         axes[-1].set_xlabel("Time [s]")
         axes[-1].margins(x=0)
+
+
+def _scale(axes: Any, values: Float64Array) -> None:
+    """Make the y axis logarithmic where values span more than a decade, with numbers at 1, 2 and 5; within
+    one, such an axis has no number."""
+    if not len(values) or values.max() <= 10 * values.min():
+        return
+    from matplotlib.ticker import FuncFormatter, LogLocator
+
+    axes.set_yscale("log")
+    axes.minorticks_off()
+    axes.yaxis.set_major_locator(
+        LogLocator(subs=(1.0, 2.0, 5.0) if values.max() < 1e3 * values.min() else (1.0,))
+    )
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+
+
+def _why_empty(values: Float64Array) -> str:
+    """What to write where no value of a user can be drawn."""
+    if np.isposinf(values).any():
+        return "infinite: one path in each frame"
+    return "no direct path" if np.isneginf(values).any() else "no path"
 
 
 def draw_frequency_response(data: UserPaths, shown: tuple[int, int], moment: str, file: Path) -> None:

@@ -350,6 +350,10 @@ def _check_device(device: DeviceSpec, place: Place) -> None:
                 raise here.error(f"belongs to kind {kind!r}, this is {device.kind!r}, with: {others}")
     if device.kind == "antenna" and not device.role:
         raise place.error(f'antenna {device.name!r} lacks its role; write role = "tx", "rx" or "both"')
+    if device.array is not None and device.array.pattern_file:
+        here = place.at("array").at("pattern")
+        if device.array.pattern != type(device.array)().pattern or here.key in here.source.lines:
+            raise here.error("and pattern_file both say how elements radiate; remove one of both keys")
     if device.count > 1 and not any(sign in device.on for sign in "*?["):
         raise place.at("count").error(
             f'is {device.count}, but {device.on!r} is one object; write a pattern: on = "{device.on}*"'
@@ -414,13 +418,13 @@ def with_numerology(carrier: Carrier, sampling_period_ns: int | None, place: Pla
             the key.
     """
     count, spacing, bandwidth = carrier.subcarriers, carrier.subcarrier_spacing_hz, carrier.bandwidth_hz
+    if spacing > bandwidth * (1 + 1e-9):
+        raise place.at("subcarrier_spacing_hz").error(
+            f"is {spacing:g} Hz, wider than bandwidth_hz = {bandwidth:g}; write at most the bandwidth"
+        )
     if spacing and not count:
         # 100e6 / 120e3 and the like must not lose a subcarrier to rounding.
         count = math.floor(bandwidth / spacing * (1 + 1e-12))
-        if not count:
-            raise place.at("subcarrier_spacing_hz").error(
-                f"is {spacing:g} Hz, wider than bandwidth_hz = {bandwidth:g}; write at most the bandwidth"
-            )
     elif count and not spacing:
         spacing = bandwidth / count
     if count * spacing > bandwidth * (1 + 1e-9):

@@ -150,7 +150,7 @@ class DeviceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True
     """Antennas: transmits, receives, or both. Antennas need it."""
     array: AntennaArray | None = None
     """Antennas: the elements; absent: one isotropic element."""
-    power_dbm: Annotated[float, quantity("dBm", "transmit power")] = 0.0
+    power_dbm: Annotated[float, quantity("dBm", "transmit power", ge=-200, le=200)] = 0.0
     # lidar
     beams: Annotated[int, quantity("1", "beams of a lidar, one above the other", ge=1, le=1024)] = 64
     azimuth_steps: Annotated[int, quantity("1", "rays of a beam in a turn", ge=1, le=36000)] = 1800

@@ -32,16 +32,34 @@ def scenery_assets(scenery: str) -> dict[str, Path | bytes]:
     """
     if not scenery:
         return {}
-    xml = _bundled(scenery.removeprefix(_BUNDLED)) if scenery.startswith(_BUNDLED) else Path(scenery)
-    if not xml.is_absolute():
-        raise ScenarioError(
-            f'{scenery!r} is no scenery; write "sionna:NAME" or "file:PATH.xml"', key="settings.scenery"
-        )
-    if not xml.is_file():
-        raise AssetError(f"scenery {xml} is not there; mend the path in settings.scenery")
+    xml = scenery_file(scenery)
     named = _named_in(xml)
     read_scenery(xml)  # what is wrong with it is told with the user's file, not with a copy at its consumers
     return {f"scenery/{xml.name}": xml, **{f"scenery/{name}": xml.parent / name for name in named}}
+
+
+def scenery_file(scenery: str) -> Path:
+    """The XML that a world's ``scenery`` setting names.
+
+    Raises
+    ------
+    AssetError
+        There is no such file, or no such scene of sionna-rt.
+    SetupError
+        A scene of sionna-rt is asked for, and sionna-rt is not installed.
+    """
+    if scenery.startswith(_BUNDLED):
+        return _bundled(scenery.removeprefix(_BUNDLED))
+    xml = Path(scenery)
+    if not xml.is_absolute():
+        raise AssetError(f'{scenery!r} is no scenery; write "sionna:NAME" or "file:PATH.xml"')
+    if xml.is_dir():
+        inside = sorted(file.name for file in xml.glob("*.xml"))
+        hint = f"; there is {', '.join(inside[:5])}" if inside else ""
+        raise AssetError(f"{xml} is a folder; name the XML file of the scenery{hint}")
+    if not xml.is_file():
+        raise AssetError(f"scenery {xml} is not there; correct the path")
+    return xml
 
 
 def object_assets(classes: Iterable[str]) -> dict[str, Path | bytes]:

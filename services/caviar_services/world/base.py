@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, quantity
-from caviar_protocol.errors import PayloadError, ScenarioError
+from caviar_protocol.errors import AssetError, PayloadError, ScenarioError, SetupError
 from caviar_protocol.messages import Role
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.scenario.conversion import Place
@@ -27,7 +27,7 @@ from caviar_protocol.space.coordinates import UnitQuaternion, Vector
 from caviar_protocol.topics import Scene
 from caviar_protocol.topics.scene import WITHOUT_OBJECT_PREFIX, Device
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
-from caviar_services.world.assets import object_assets, pattern_assets, scenery_assets
+from caviar_services.world.assets import object_assets, pattern_assets, scenery_assets, scenery_file
 
 
 class ObjectState(NamedTuple):
@@ -70,6 +70,17 @@ class World(Service[W]):
     role: ClassVar[Role] = "world"
     Settings: ClassVar[type[msgspec.Struct]] = WorldSettings
     outputs: ClassVar[tuple[str, ...]] = ("scene",)
+
+    @classmethod
+    def check_settings(cls, settings: W, place: Place) -> None:
+        """Raise `ScenarioError` for scenery that is not there."""
+        try:
+            if settings.scenery:
+                scenery_file(settings.scenery)
+        except AssetError as error:
+            raise place.at("scenery").error(str(error)) from error
+        except SetupError:
+            pass  # the world says so where it runs, which may be another machine
 
     def __init__(self, settings: W, run: RunInfo) -> None:
         super().__init__(settings, run)

@@ -50,8 +50,8 @@ class MovingObject(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 class TrajectorySettings(WorldSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings of the world ``trajectory``."""
 
-    objects: tuple[MovingObject, ...]
-    """Objects along timed waypoints."""
+    objects: tuple[MovingObject, ...] = ()
+    """Objects along timed waypoints; none: a scene of what stands."""
 
 
 class TrajectoryWorld(World[TrajectorySettings]):

@@ -114,6 +114,7 @@ def models(settings: AdaptiveSettings, place: Place) -> list[tuple[type[ChannelM
         where = at.at("settings")
         try:
             own = convert_settings(cls.Settings, {**shared, **rung.settings}, where)
+            cls.check_settings(own, where)
         except ScenarioError as error:
             raise _where_it_stands(error, shared, where, place.at("common")) from error
         made.append((cls, own))

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 
+from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import ScenarioError, suggestion
 from caviar_protocol.scenario.conversion import Place
 from caviar_services.channel.sionna.object_materials import OTHER_MATERIALS, Constants, ObjectMaterials
@@ -27,16 +28,17 @@ constants of the nearest end of a range; or follow the power law of that range b
 class MaterialSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What to change about a material of the scenery; what is not given stays."""
 
-    relative_permittivity: float | None = None
-    """Real part of the relative permittivity."""
-    conductivity_s_per_m: float | None = None
-    """Conductivity [S/m]."""
-    scattering_coefficient: float | None = None
-    """Share of the reflected amplitude that is scattered, 0 to 1."""
-    xpd_coefficient: float | None = None
-    """Share of the scattered power in the other polarization, 0 to 1."""
-    thickness_m: float | None = None
-    """Thickness of walls [m]."""
+    relative_permittivity: Annotated[float, quantity("1", "its real part", ge=1, le=1e30)] | None = None
+    conductivity_s_per_m: Annotated[float, quantity("S/m", "its conductivity", ge=0, le=1e30)] | None = None
+    scattering_coefficient: (
+        Annotated[float, quantity("1", "share of the reflected amplitude that is scattered", ge=0, le=1)]
+        | None
+    ) = None
+    xpd_coefficient: (
+        Annotated[float, quantity("1", "share of the scattered power in the other polarization", ge=0, le=1)]
+        | None
+    ) = None
+    thickness_m: Annotated[float, quantity("m", "thickness of walls", gt=0)] | None = None
 
     @property
     def is_electric(self) -> bool:

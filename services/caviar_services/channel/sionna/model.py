@@ -70,10 +70,15 @@ class SionnaChannel(PathModel[SionnaSettings]):
     uses_scenery: ClassVar[bool] = True
     checkpoints: ClassVar[bool] = True
 
+    @classmethod
+    def check_settings(cls, settings: SionnaSettings, place: Place) -> None:
+        """See `SionnaSettings.check`."""
+        settings.check(place)
+
     def __init__(self, settings: SionnaSettings, run: RunInfo) -> None:
         super().__init__(settings, run)
         self.rung = settings.rung
-        self._samples = settings.launched_samples(run.name)
+        self._samples = settings.launched_samples()
         """Rays of each launch; where candidates are enumerated, of the scenery's."""
         self._variant = ""
         self._scene: SionnaScene
@@ -212,7 +217,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         self._launched, switched = contributing(self._asked, self._scene.used_surfaces(), frequencies)
         self._wavelengths = SPEED_OF_LIGHT / np.array(frequencies)
         enumerated = s.enumerates(self._moving(preparation)) and self._launched.reflection
-        self._samples = s.launched_samples(self.run.name, enumerated)
+        self._samples = s.launched_samples(enumerated)
         if enumerated:
             self._launched = replace(self._launched, samples=s.samples_per_frame)
         launched, samples = self._launched, self.settings.scattering_samples

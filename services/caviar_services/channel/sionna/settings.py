@@ -10,11 +10,14 @@ from typing import Annotated, Literal
 import msgspec
 
 from caviar_protocol.arrays import quantity
-from caviar_protocol.errors import ScenarioError
+from caviar_protocol.errors import ScenarioError, suggestion
+from caviar_protocol.scenario.conversion import Place
 from caviar_services.channel.base import ChannelSettings
 from caviar_services.channel.mesh_detail import DetailSettings
 from caviar_services.channel.propagation.foliage import FoliageSettings
 from caviar_services.channel.sionna.materials import MaterialSettings, OutsideRange
+from caviar_services.channel.sionna.object_materials import OTHER_MATERIALS
+from caviar_services.mesh.scenery import ITU_MATERIALS
 
 _SAMPLES = 100_000
 """Of a launch in each frame."""
@@ -161,17 +164,40 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
             return self.candidates == "enumerated"
         return moving and self.reflection and self.rung == "siso-rt" and self.follow is None
 
-    def launched_samples(self, service: str, enumerated: bool = False) -> int:
-        """Rays of a launch, however they were given. Raises `ScenarioError` where they were given twice."""
+    def check(self, place: Place) -> None:
+        """Raise `ScenarioError` for what is wrong between keys; ``place`` is where the settings stand."""
+        if self.ray_spacing_deg is not None and self.samples is not None:
+            raise place.at("ray_spacing_deg").error(
+                f"is {self.ray_spacing_deg:g}, and samples = {self.samples}: both say how many rays are "
+                "launched; leave one out"
+            )
+        for key, name in self.object_materials.items():
+            own = self.materials.get(name, MaterialSettings())
+            if name in ITU_MATERIALS or name in OTHER_MATERIALS or own.is_electric:
+                continue
+            if name not in self.materials:
+                known = {*ITU_MATERIALS, *OTHER_MATERIALS, *self.materials}
+                raise (
+                    place.at("object_materials")
+                    .at(key)
+                    .error(f"there is no material {name!r}; {suggestion(name, known)}")
+                )
+            constants = ("relative_permittivity", "conductivity_s_per_m")
+            lacking = next(constant for constant in constants if getattr(own, constant) is None)
+            raise (
+                place.at("materials")
+                .at(name)
+                .error(
+                    f"lacks {lacking}; {name!r} is no material of ITU-R P.2040, so it needs both "
+                    f"{' and '.join(constants)}"
+                )
+            )
+
+    def launched_samples(self, enumerated: bool = False) -> int:
+        """Rays of a launch, however they were given."""
         if self.ray_spacing_deg is None:
             absent = _SCENERY_SAMPLES if enumerated else _SAMPLES
             return absent if self.samples is None else self.samples
-        if self.samples is not None:
-            raise ScenarioError(
-                f"samples = {self.samples} and ray_spacing_deg = {self.ray_spacing_deg} both say "
-                "how many rays are launched; leave one out",
-                key=f"services.{service}.settings.ray_spacing_deg",
-            )
         return round(4 * math.pi / math.radians(self.ray_spacing_deg) ** 2)
 
     def pool_sizes(self, assets: Iterable[str], service: str) -> dict[str, int]:

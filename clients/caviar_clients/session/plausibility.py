@@ -1,0 +1,328 @@
+"""What of a scenario is allowed and yet hardly meant: a frequency of 28 Hz, a base station below the ground.
+
+It is warned of, and the run goes on.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from difflib import get_close_matches
+from fnmatch import fnmatchcase
+from typing import NamedTuple
+
+import numpy as np
+
+from caviar_protocol.arrays import Float64Array
+from caviar_protocol.errors import AssetError, ScenarioError, SetupError
+from caviar_protocol.multipath import TAPS_BEFORE
+from caviar_protocol.scenario import Scenario
+from caviar_protocol.scenario.conversion import convert_settings
+from caviar_protocol.scenario.rules import scenario_error, settings_place
+from caviar_protocol.space.coordinates import Vector
+from caviar_protocol.topics.scene import Panel
+from caviar_services.channel.adaptive.settings import AdaptiveSettings, models
+from caviar_services.channel.propagation.clearance import Surfaces
+from caviar_services.mesh.scenery import read_scenery
+from caviar_services.registry import load
+from caviar_services.world.assets import scenery_assets, scenery_file
+from caviar_services.world.base import World
+from caviar_services.world.obstacles import scenery_triangles
+
+FREQUENCY_HZ = (100e6, 1e12)
+"""The lower end of mobile radio; the upper end of Recommendation ITU-R P.676."""
+NARROWEST_HZ = 1e3
+"""Bandwidth below that of any carrier of NB-IoT (3.75 kHz)."""
+POWER_DBM = (-60.0, 90.0)
+"""From a femtocell's uplink to a long-range radar."""
+MOST_ELEMENTS = 2**16
+"""Elements of one device: the channel of a pair of such is 64 GiB for each subcarrier."""
+WIDEST = 100.0
+"""[wavelengths] between elements."""
+FARTHEST_PANEL_M = 100.0
+LOOKED_AT = 200
+"""Positions of one object at most, spread evenly over its way."""
+
+
+def implausible_values(scenario: Scenario) -> list[str]:
+    """A warning for each implausible value, with file, line, key and what may have been meant."""
+    found = [
+        *_carriers(scenario),
+        *_numerologies(scenario),
+        *_powers(scenario),
+        *_arrays(scenario),
+        *_ladders(scenario),
+        *_object_keys(scenario),
+        *_positions(scenario),
+    ]
+    return [str(scenario_error(scenario, key, text)) for key, text in found]
+
+
+_Warnings = Iterator[tuple[str, str]]
+"""Keys of the scenario, and what is implausible there."""
+
+
+def _carriers(scenario: Scenario) -> _Warnings:
+    low, high = FREQUENCY_HZ
+    for index, carrier in enumerate(scenario.carriers):
+        frequency, bandwidth = carrier.frequency_hz, carrier.bandwidth_hz
+        if not low <= frequency <= high:
+            usual = f"radio carriers are from {_si(low)} to {_si(high)}"
+            key = f"carriers[{index}].frequency_hz"
+            yield key, f"is {_si(frequency)}; {usual}{_meant(frequency, low, high)}"
+        elif bandwidth > frequency / 2:
+            yield (
+                f"carriers[{index}].bandwidth_hz",
+                f"is {_si(bandwidth)}, more than half of the frequency, {_si(frequency)}; write it in Hz",
+            )
+        if bandwidth < NARROWEST_HZ:
+            yield (
+                f"carriers[{index}].bandwidth_hz",
+                f"is {_si(bandwidth)}, narrower than any radio carrier; write it in Hz, as 100e6",
+            )
+
+
+def _numerologies(scenario: Scenario) -> _Warnings:
+    """Subcarriers, taps and slots in another unit than meant, or too few to hold a channel."""
+    frame_s = scenario.run.sampling_period_ns * 1e-9
+    for index, carrier in enumerate(scenario.carriers):
+        spacing, duration, slots = carrier.subcarrier_spacing_hz, carrier.slot_duration_s, carrier.slots
+        key = f"carriers[{index}]"
+        if carrier.subcarriers and spacing < NARROWEST_HZ:
+            meant = f"; {spacing:g} kHz is written {spacing:g}e3" if spacing >= 1 else ""
+            yield f"{key}.subcarrier_spacing_hz", f"is {_si(spacing)}; OFDM has 1.25 kHz and more{meant}"
+        if 0 < carrier.taps <= TAPS_BEFORE:
+            yield (
+                f"{key}.taps",
+                (
+                    f"is {carrier.taps}: taps begin {TAPS_BEFORE} samples before the first path, so that "
+                    f"these end before it; write {2 * TAPS_BEFORE + 1} or more"
+                ),
+            )
+        if slots > 1 and slots * duration > frame_s * (1 + 1e-9) and not scenario.run.instants_s:
+            yield (
+                f"{key}.slot_duration_s",
+                (
+                    f"is {duration:g} s: {slots} slots take {slots * duration:g} s, a frame {frame_s:g} s; "
+                    "shifts of Doppler hold within a frame, of which the next one has its own"
+                ),
+            )
+
+
+def _arrays(scenario: Scenario) -> _Warnings:
+    for index, device in enumerate(scenario.devices):
+        array, key = device.array, f"devices[{index}].array"
+        if array is None:
+            continue
+        if array.size > MOST_ELEMENTS:
+            yield (
+                key,
+                (
+                    f"has {array.size:,} elements ({array.rows} rows × {array.columns} columns × "
+                    f"{len(array.polarizations)} polarizations × {max(1, len(array.panels))} panels); with "
+                    f"more than {MOST_ELEMENTS:,} a frame may take minutes"
+                ),
+            )
+        for name in ("vertical_spacing", "horizontal_spacing"):
+            if getattr(array, name) > WIDEST:
+                yield f"{key}.{name}", f"is {getattr(array, name):g} wavelengths; write it in wavelengths"
+        seen: dict[Panel, int] = {}
+        for number, panel in enumerate(array.panels):
+            if math.hypot(*panel.position_m) > FARTHEST_PANEL_M:
+                yield (
+                    f"{key}.panels[{number}].position_m",
+                    f"is {math.hypot(*panel.position_m):g} m from the device; panels are parts of one device",
+                )
+            if seen.setdefault(panel, number) != number:
+                yield (
+                    f"{key}.panels[{number}]",
+                    f"is at the place and in the direction of panels[{seen[panel]}]; give it its own",
+                )
+
+
+def _ladders(scenario: Scenario) -> _Warnings:
+    """References of adaptive channels that know less than the rungs that they judge."""
+    for name, spec in scenario.services.items():
+        if spec.role != "channel" or spec.remote:
+            continue
+        place, cls = settings_place(scenario, name), load(spec.role, spec.use)
+        settings = convert_settings(cls.Settings, spec.settings, place)
+        if not isinstance(settings, AdaptiveSettings) or settings.reference is None:
+            continue
+        *rungs, (_, reference) = models(settings, place)
+        depth = getattr(reference, "max_depth", 0)
+        deeper = [
+            rung.label
+            for rung, (_, own) in zip(settings.ladder, rungs, strict=True)
+            if getattr(own, "max_depth", 0) > depth
+        ]
+        if deeper:
+            yield (
+                f"{place.key}.reference",
+                (
+                    f"has paths of {depth} interactions at most, fewer than {', '.join(deeper)}: what these "
+                    "find beyond counts as an error; give it a max_depth of theirs"
+                ),
+            )
+
+
+def _object_keys(scenario: Scenario) -> _Warnings:
+    """Keys of materials and foliage that no object and no piece of scenery of the run can have."""
+    known = _objects_and_pieces(scenario)
+    if known is None:
+        return
+    names, classes = known
+    for name, spec in scenario.services.items():
+        if spec.role != "channel" or spec.remote:
+            continue
+        place, cls = settings_place(scenario, name), load(spec.role, spec.use)
+        settings = convert_settings(cls.Settings, spec.settings, place)
+        for setting in ("object_materials", "foliage"):
+            for key in getattr(settings, setting, ()):
+                fits = key in classes or any(name == key or fnmatchcase(name, key) for name in names)
+                if not fits:
+                    near = get_close_matches(key, [*names, *classes], n=1)
+                    hint = f"; did you mean {near[0]!r}?" if near else ""
+                    at = place.at(setting).at(key).key
+                    yield at, f"is no object, class of objects or piece of scenery of the run{hint}"
+
+
+def _objects_and_pieces(scenario: Scenario) -> tuple[set[str], set[str]] | None:
+    """Names of all objects and pieces of scenery, and all classes; None where they are not known yet."""
+    names, classes = set[str](), set[str]()
+    for name, spec in scenario.services.items():
+        if spec.role != "world":
+            continue
+        world = None if spec.remote else load(spec.role, spec.use)
+        if world is None or not issubclass(world, World):
+            return None
+        try:
+            settings = convert_settings(world.Settings, spec.settings, settings_place(scenario, name))
+            objects = world.known_objects(settings)
+            scenery: str = settings.scenery  # type: ignore[attr-defined]  # of all worlds
+            pieces = read_scenery(scenery_file(scenery)).shapes if scenery else ()
+        except (AssetError, ScenarioError, SetupError):
+            return None  # the world says so itself
+        if objects is None:
+            return None
+        names.update(objects, (piece.name for piece in pieces))
+        classes.update(objects.values())
+    return names, classes
+
+
+def _powers(scenario: Scenario) -> _Warnings:
+    low, high = POWER_DBM
+    for index, device in enumerate(scenario.devices):
+        if device.role in ("tx", "both") and not low <= device.power_dbm <= high:
+            meant = ""
+            if device.power_dbm > high:
+                meant = f"; {device.power_dbm:g} mW would be {10 * math.log10(device.power_dbm):.1f} dBm"
+            yield (
+                f"devices[{index}].power_dbm",
+                f"is {device.power_dbm:g} dBm, beyond any transmitter's {low:g} to {high:g} dBm{meant}",
+            )
+
+
+class _Placed(NamedTuple):
+    """Something that stands at a place of its own in the world."""
+
+    key: str
+    name: str
+    position: Vector
+
+
+def _positions(scenario: Scenario) -> _Warnings:
+    placed = [*_placed_devices(scenario), *_placed_objects(scenario)]
+    ground = _Ground.of(scenario) if placed else None
+    if ground is None:
+        return
+    known: set[str] = set()
+    for thing in placed:
+        wrong = ground.implausible(np.array(thing.position)) if thing.name not in known else ""
+        if wrong:
+            known.add(thing.name)
+            at = ", ".join(f"{number:g}" for number in thing.position)
+            yield thing.key, f"{thing.name!r} stands at ({at}) m, {wrong}"
+
+
+def _placed_devices(scenario: Scenario) -> Iterator[_Placed]:
+    for index, device in enumerate(scenario.devices):
+        if not device.on:
+            yield _Placed(f"devices[{index}].position_m", device.name, device.position_m)
+
+
+def _placed_objects(scenario: Scenario) -> Iterator[_Placed]:
+    for name, spec in scenario.services.items():
+        if spec.role != "world" or spec.remote:
+            continue
+        world = load(spec.role, spec.use)
+        place = settings_place(scenario, name)
+        if not issubclass(world, World):
+            continue
+        try:
+            placements = list(world.placements(convert_settings(world.Settings, spec.settings, place)))
+        except ScenarioError:
+            continue  # the world says so itself, with what to write instead
+        for key, thing, positions in placements:
+            for position in positions[:: max(1, math.ceil(len(positions) / LOOKED_AT))]:
+                yield _Placed(f"{place.key}.{key}", thing, position)
+
+
+class _Ground:
+    """The scenery of a scenario: how far it reaches, and where it is above what."""
+
+    def __init__(self, triangles: Float64Array) -> None:
+        corners = triangles.reshape(-1, 3)
+        self._low, self._high = corners.min(0), corners.max(0)
+        self._surfaces = Surfaces(triangles, lambda triangle, normal: True)
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> _Ground | None:
+        """None where there is no scenery, or it cannot be read: its world says so, with the remedy."""
+        worlds = [spec for spec in scenario.services.values() if spec.role == "world"]
+        try:
+            found = [
+                scenery_triangles(scenery_assets(str(spec.settings.get("scenery") or ""))) for spec in worlds
+            ]
+        except (AssetError, ScenarioError, SetupError):
+            return None
+        triangles = np.concatenate(found) if found else np.zeros((0, 3, 3))
+        return cls(triangles) if len(triangles) else None
+
+    def implausible(self, position: Float64Array) -> str:
+        """What is wrong with a position [m], Shape ``[3]``; empty: nothing."""
+        if (position[:2] < self._low[:2]).any() or (position[:2] > self._high[:2]).any():
+            return f"outside the scenery, which reaches {_span(self._low, self._high)}"
+        above = np.array([*position[:2], self._high[2] + 1.0])
+        below = np.array([*position[:2], self._low[2] - 1.0])
+        if position[2] < self._low[2] or (
+            self._surfaces.between(position, above) and not self._surfaces.between(position, below)
+        ):
+            return "below the ground"
+        if position[2] > self._high[2] + float(np.linalg.norm(self._high - self._low)):
+            return f"far above the scenery, which reaches {_span(self._low, self._high)}"
+        return ""
+
+
+def _span(low: Sequence[float] | Float64Array, high: Sequence[float] | Float64Array) -> str:
+    axes = zip("xyz", low, high, strict=True)
+    return ", ".join(f"{axis} {a:.4g} to {b:.4g} m" for axis, a, b in axes)
+
+
+def _meant(value_hz: float, low: float, high: float) -> str:
+    """What a frequency may have been meant as, which was written in another unit."""
+    for exponent, unit in ((9, "GHz"), (6, "MHz"), (3, "kHz")):
+        if value_hz < _MOST_OF_A_UNIT and low <= value_hz * 10.0**exponent <= high:
+            return f"; {value_hz:g} {unit} is written {value_hz:g}e{exponent}"
+    return f"; is it {_si(value_hz / 1e3)}?" if low <= value_hz / 1e3 <= high else ""
+
+
+_MOST_OF_A_UNIT = 10_000
+"""Values beyond this are written in a larger unit: 2400 MHz, not 60,000 MHz."""
+
+
+def _si(value_hz: float) -> str:
+    for factor, unit in ((1e12, "THz"), (1e9, "GHz"), (1e6, "MHz"), (1e3, "kHz")):
+        if value_hz >= factor:
+            return f"{value_hz / factor:g} {unit}"
+    return f"{value_hz:g} Hz"
