@@ -112,7 +112,15 @@ def open_regular(path: Path, remedy: str = PUT_BACK) -> BufferedReader:
 
 
 def read_regular(path: Path, remedy: str = PUT_BACK) -> bytes:
-    """The content of a regular file. Raises `OSError` as `open_regular` does."""
+    """Read the content of a regular file, as `open_regular` opens it.
+
+    Args:
+        path: The file.
+        remedy: What an error says to do about what is no file.
+
+    Raises:
+        OSError: It cannot be read, or is no file; ``strerror`` says what it is and what mends it.
+    """
     with open_regular(path, remedy) as file:
         return file.read()
 

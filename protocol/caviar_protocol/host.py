@@ -109,7 +109,11 @@ _MODULES = {"channel": "sionna", "sensors": "mitsuba", "world": "libsumo", "plot
 
 
 def has_extra(extra: str) -> bool:
-    """Whether the libraries of an extra can be imported; they are not imported for that."""
+    """Whether the libraries of an extra can be imported; they are not imported for that.
+
+    Args:
+        extra: Name of an extra: ``channel``, ``sensors``, ``world`` or ``plot``.
+    """
     return importlib.util.find_spec(_MODULES[extra]) is not None
 
 

@@ -33,7 +33,13 @@ TAPS_BEFORE = 6
 
 
 def subcarrier_offsets(carrier: Carrier) -> Float64Array:
-    """Frequency of each subcarrier from the carrier's centre [Hz], Shape ``[K]``; that of index K//2 is 0."""
+    """Frequency of each subcarrier from the carrier's centre [Hz], Shape ``[K]``; that of index K//2 is 0.
+
+    Example:
+        >>> carrier = Carrier(name="n257", frequency_hz=28e9, subcarriers=4, subcarrier_spacing_hz=120e3)
+        >>> subcarrier_offsets(carrier).tolist()
+        [-240000.0, -120000.0, 0.0, 120000.0]
+    """
     # As in 3GPP TS 38.211, section 5.3, and `numpy.fft.fftshift`: one more below the centre for even K.
     steps = np.arange(carrier.subcarriers, dtype=np.float64) - carrier.subcarriers // 2
     offsets: Float64Array = steps * carrier.subcarrier_spacing_hz
@@ -41,7 +47,12 @@ def subcarrier_offsets(carrier: Carrier) -> Float64Array:
 
 
 def slot_offsets(carrier: Carrier) -> Float64Array:
-    """Begin of each slot from the frame's instant [s], Shape ``[S]``."""
+    """Begin of each slot from the frame's instant [s], Shape ``[S]``.
+
+    Example:
+        >>> slot_offsets(Carrier(name="n257", frequency_hz=28e9, slots=3, slot_duration_s=0.5)).tolist()
+        [0.0, 0.5, 1.0]
+    """
     offsets: Float64Array = np.arange(carrier.slots, dtype=np.float64) * carrier.slot_duration_s
     return offsets
 

@@ -111,12 +111,22 @@ def decode_message(header: Buffer) -> Message:
 
 
 def message_type(message: Message) -> str:
-    """The word that stands in the field ``type``: ``"GRANT"``."""
+    """The word that stands in the field ``type`` of a message.
+
+    Example:
+        >>> from caviar_protocol.messages import HeartbeatAck
+        >>> message_type(HeartbeatAck(sequence=3))
+        'HEARTBEAT_ACK'
+    """
     return str(type(message).__struct_config__.tag)
 
 
 def part_count(message: Message) -> int:
-    """Number of parts that a message has on the wire, its header included."""
+    """Number of parts that a message has on the wire.
+
+    Args:
+        message: The decoded header, which is the first part.
+    """
     match message:
         case Done():
             return 1 + 2 * len(message.products)

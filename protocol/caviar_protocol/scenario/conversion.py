@@ -29,7 +29,11 @@ class Source(msgspec.Struct, frozen=True, kw_only=True):
     """1-based line of each key, by its dotted path: ``devices[0].array.rows``."""
 
     def line(self, key: str) -> int | None:
-        """Line of a key, or of the nearest table around it that stands in the file."""
+        """Line of a key, or of the nearest table around it that stands in the file.
+
+        Args:
+            key: Dotted: ``devices[0].array.rows``.
+        """
         while key:
             if key in self.lines:
                 return self.lines[key]
@@ -43,13 +47,23 @@ class Source(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Place(msgspec.Struct, frozen=True):
-    """Where a value stands: a dotted key in a file that may be unknown."""
+    """Where a value stands: a dotted key in a file that may be unknown.
+
+    Example:
+        >>> source = Source(file="my.toml", lines={"devices[0].on": 12})
+        >>> print(Place("devices", source).at(0).at("on").error("is empty"))
+        my.toml:12: devices[0].on: is empty
+    """
 
     key: str = ""
     source: Source = Source()
 
     def at(self, name: str | int) -> Place:
-        """The place of an entry of the table or array at this place."""
+        """The place of an entry of the table or array at this place.
+
+        Args:
+            name: Key of a table, or index of an array.
+        """
         if isinstance(name, int):
             return Place(f"{self.key}[{name}]", self.source)
         # Quoted as TOML needs it, since a user copies the key from the error into the file.
@@ -57,7 +71,11 @@ class Place(msgspec.Struct, frozen=True):
         return Place(f"{self.key}.{bare}" if self.key else bare, self.source)
 
     def error(self, message: str) -> ScenarioError:
-        """A `ScenarioError` that names this place."""
+        """Make an error that names this place.
+
+        Args:
+            message: What is wrong, and what to write instead.
+        """
         return ScenarioError(message, self.source.file, self.key, self.source.line(self.key))
 
 

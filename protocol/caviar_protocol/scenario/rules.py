@@ -110,7 +110,15 @@ def devices_of(scenario: Scenario, world: str) -> tuple[DeviceSpec, ...]:
 
 
 def world_of(scenario: Scenario, index: int) -> str:
-    """Name of the world that publishes device ``index``; see `devices_of`."""
+    """Name of the world that publishes a device; see `devices_of`.
+
+    Args:
+        scenario: The scenario.
+        index: Place of the device in its ``devices``.
+
+    Raises:
+        ScenarioError: No world of this name, or several worlds are possible.
+    """
     device = scenario.devices[index]
     worlds = [name for name, service in scenario.services.items() if service.role == "world"]
     place = Place("devices", scenario.source).at(index)
@@ -187,7 +195,16 @@ def resolved(scenario: Scenario, settings: Mapping[str, msgspec.Struct] | None =
 
 
 def patterns_overlap(a: str, b: str) -> bool:
-    """Whether some name matches both patterns, in which ``*`` is any text and ``?`` any character."""
+    """Whether some name matches both patterns, in which ``*`` is any text and ``?`` any character.
+
+    Args:
+        a: A pattern.
+        b: Another pattern.
+
+    Example:
+        >>> patterns_overlap("car.*", "*/rx"), patterns_overlap("car.*", "uav.?")
+        (True, False)
+    """
     # Pairs of places in both patterns, each looked at once: no backtracking, whatever the patterns are.
     reachable = {(0, 0)}
     todo = [(0, 0)]
@@ -216,9 +233,18 @@ def _number_or_word(text: str) -> float | str:
 
 
 def plain(value: Any, *, defaults: bool = True) -> Any:
-    """Structs as built-in types, with every field, or only those that differ from their default.
+    """Structs as built-in types, with or without the fields that have their default.
 
-    `msgspec.to_builtins` leaves out defaults as the class says, not as the caller does.
+    `msgspec.to_builtins` leaves them out as the class says, not as the caller does.
+
+    Args:
+        value: A struct, or tables and lists of such.
+        defaults: Whether fields that have their default are there.
+
+    Example:
+        >>> from caviar_protocol.topics import Carrier
+        >>> plain(Carrier(name="n257", frequency_hz=28e9), defaults=False)
+        {'name': 'n257', 'frequency_hz': 28000000000.0}
     """
     if isinstance(value, msgspec.Struct):
         config = value.__struct_config__

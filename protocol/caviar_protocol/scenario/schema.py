@@ -235,7 +235,16 @@ _HEIGHT = {"centre": 0.0, "roof": 0.5, "floor": -0.5}
 
 
 def carries(spec: DeviceSpec, name: str) -> bool:
-    """Whether the device may be mounted on the object ``name``."""
+    """Whether a device may be mounted on an object.
+
+    Args:
+        spec: The device of the scenario.
+        name: Name of the object.
+
+    Example:
+        >>> carries(DeviceSpec(name="rx", kind="antenna", on="car.*"), "car.17")
+        True
+    """
     # The whole name comes first: names of objects may hold brackets, which are special in patterns.
     return name == spec.on or owned_by((spec.on,), name)
 
@@ -264,7 +273,12 @@ def mounted_device(spec: DeviceSpec, parent: str, dimensions: Vector) -> Device:
 
 
 def pattern_asset(path: str) -> str:
-    """Name of the asset that a pattern file of a scenario travels as."""
+    """Name of the asset that a pattern file of a scenario travels as.
+
+    Example:
+        >>> pattern_asset("/home/me/measured/horn.csv")
+        'patterns/horn.csv'
+    """
     return f"{PATTERNS}{PurePath(path).name}"
 
 
@@ -323,5 +337,14 @@ def _device(spec: DeviceSpec, name: str, parent: str, height: float) -> Device:
 
 
 def owned_by(patterns: Iterable[str], name: str) -> bool:
-    """Whether one of the patterns, with ``*`` and ``?``, matches a name (contract, clause 17)."""
+    """Whether one of the patterns matches a name (contract, clause 17).
+
+    Args:
+        patterns: Names with ``*`` and ``?``.
+        name: Name of an object, a receiver or an actuator.
+
+    Example:
+        >>> owned_by(("beam:car.*", "motion:uav"), "beam:car.17/rx")
+        True
+    """
     return any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)

@@ -75,7 +75,12 @@ _STRING = re.compile(
 
 
 def dotted(path: KeyPath) -> str:
-    """A key path as people write it: ``devices[0].array.rows``."""
+    """Write a key path as a dotted key.
+
+    Example:
+        >>> dotted(("devices", 0, "array", "rows"))
+        'devices[0].array.rows'
+    """
     text = ""
     for part in path:
         if isinstance(part, int):

@@ -116,7 +116,15 @@ def beam_gain(array: AntennaArray, beam: int, directions: Float64Array) -> Float
 
 
 def subarray_of(array: AntennaArray, beam: int) -> tuple[Subarray, int]:
-    """The subarray that a beam is of, and the beam's index in its codebook."""
+    """The subarray that a beam is of.
+
+    Args:
+        array: The array of a device.
+        beam: Index of a beam of the whole array.
+
+    Returns:
+        The subarray, and the beam's index in the subarray's own codebook.
+    """
     number, own = divmod(beam, array.rows * array.columns)
     return subarrays(array)[number], own
 
@@ -159,7 +167,15 @@ class Subarray:
 # Arrays are few and frozen; link, agent and channel ask for their parts in every frame.
 @lru_cache(maxsize=256)
 def subarrays(array: AntennaArray) -> tuple[Subarray, ...]:
-    """The subarrays of an array: panels in their order, within each the polarizations."""
+    """The subarrays of an array: panels in their order, within each the polarizations.
+
+    Args:
+        array: The array of a device.
+
+    Example:
+        >>> [part.first for part in subarrays(AntennaArray(rows=2, columns=4, polarization="VH"))]
+        [0, 8]
+    """
     found = []
     first = 0
     for panel in array.panels or (Panel(),):
@@ -175,10 +191,21 @@ def subarrays(array: AntennaArray) -> tuple[Subarray, ...]:
 
 @lru_cache(maxsize=64)
 def coupled_polarizations(transmit: AntennaArray, receive: AntennaArray) -> tuple[int, int]:
-    """Polarizations, by their indices, that couple best between upright devices that face each other.
+    """Polarizations that couple best between upright devices that face each other.
 
-    Of equal ones the first. A slant of +45° is one of −45° seen from the other side, so the first
-    elements of two ``cross`` arrays do not hear each other; those of two ``circular`` arrays do.
+    A slant of +45° is one of −45° seen from the other side, so the first elements of two ``cross`` arrays do
+    not hear each other; those of two ``circular`` arrays do.
+
+    Args:
+        transmit: Array of the transmitter.
+        receive: Array of the receiver.
+
+    Returns:
+        Index among the polarizations of each array; of equal ones the first.
+
+    Example:
+        >>> coupled_polarizations(AntennaArray(polarization="cross"), AntennaArray(polarization="cross"))
+        (0, 1)
     """
     pairs = [(t, r) for t in range(len(transmit.polarizations)) for r in range(len(receive.polarizations))]
 

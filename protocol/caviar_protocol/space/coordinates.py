@@ -52,7 +52,15 @@ def quaternion_from_euler(yaw: float, pitch: float = 0.0, roll: float = 0.0) -> 
 
 
 def euler_from_quaternion(q: Sequence[float]) -> Vector:
-    """Yaw, pitch and roll [rad] of a unit quaternion; the inverse of `quaternion_from_euler`."""
+    """Yaw, pitch and roll [rad] of a unit quaternion; the inverse of `quaternion_from_euler`.
+
+    Args:
+        q: Unit quaternion (w, x, y, z).
+
+    Example:
+        >>> [round(angle, 6) for angle in euler_from_quaternion(quaternion_from_euler(0.3, 0.2, 0.1))]
+        [0.3, 0.2, 0.1]
+    """
     w, x, y, z = q
     # Rounding takes the sine of a vertical nose out of asin's range.
     sin_pitch = max(-1.0, min(1.0, 2 * (w * y - z * x)))
@@ -64,7 +72,16 @@ def euler_from_quaternion(q: Sequence[float]) -> Vector:
 
 
 def rotation_matrix(q: Sequence[float]) -> Float64Array:
-    """3×3 matrix R of a unit quaternion: world = R · body."""
+    """Rotation matrix R of a unit quaternion, Shape ``[3, 3]``: world = R · body.
+
+    Args:
+        q: Unit quaternion (w, x, y, z).
+
+    Example:
+        >>> north = rotation_matrix(quaternion_from_euler(math.pi / 2)) @ (1.0, 0.0, 0.0)
+        >>> north.round(6).tolist()
+        [0.0, 1.0, 0.0]
+    """
     w, x, y, z = q
     return np.array(
         [
@@ -96,7 +113,12 @@ def rotated(q: Sequence[float], v: Sequence[float]) -> Vector:
 
 
 def unrotated(q: Sequence[float], v: Sequence[float]) -> Vector:
-    """Body components of one vector given in world axes: the inverse of `rotated`."""
+    """Body components of one vector given in world axes: the inverse of `rotated`, by the transposed matrix.
+
+    Args:
+        q: Unit quaternion (w, x, y, z) of the body.
+        v: Components in world axes.
+    """
     w, x, y, z = q
     a, b, c = v
     return (
@@ -107,7 +129,12 @@ def unrotated(q: Sequence[float], v: Sequence[float]) -> Vector:
 
 
 def multiply(p: Sequence[float], q: Sequence[float]) -> UnitQuaternion:
-    """Hamilton product p·q of two quaternions: the rotation q, followed by p."""
+    """Hamilton product p·q of two quaternions: the rotation q, followed by p.
+
+    Args:
+        p: Unit quaternion (w, x, y, z).
+        q: Unit quaternion (w, x, y, z).
+    """
     pw, px, py, pz = p
     qw, qx, qy, qz = q
     return (

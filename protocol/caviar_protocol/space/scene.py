@@ -69,7 +69,12 @@ def merge_scenes(scenes: Mapping[str, Scene]) -> Scene:
 
 
 def object_pose(scene: Scene, index: int) -> Pose:
-    """World pose of an object by index."""
+    """World pose of an object.
+
+    Args:
+        scene: The scene.
+        index: Place of the object in ``scene.names``.
+    """
     x, y, z = scene.position[index].tolist()
     w, qx, qy, qz = scene.orientation[index].tolist()
     return Pose((x, y, z), (w, qx, qy, qz))

@@ -243,7 +243,21 @@ class Channel(Payload, frozen=True, kw_only=True, omit_defaults=True):
             )
 
     def pair(self, tx: str, rx: str) -> slice:
-        """Slice of the path axis that belongs to one TX/RX pair; `ValueError` if unknown."""
+        """Slice of the path axis that belongs to one TX/RX pair.
+
+        Args:
+            tx: Name of the transmitting device.
+            rx: Name of the receiving device.
+
+        Raises:
+            ValueError: The channel has no such device.
+
+        Example:
+            >>> from caviar_protocol.recording import Recording
+            >>> channel = Recording("runs/smoke-20261122-101500")["channel"][0]
+            >>> channel.tau[channel.pair("bs", "car/rx")].shape  # paths
+            (1,)
+        """
         p = self.tx.index(tx) * len(self.rx) + self.rx.index(rx)
         return slice(int(self.offsets[p]), int(self.offsets[p + 1]))
 
