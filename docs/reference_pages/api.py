@@ -6,6 +6,7 @@ import ast
 import importlib.util
 import pkgutil
 import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, get_origin
@@ -77,7 +78,11 @@ def _summary(name: str) -> str:
 
 def hide_fields(app: Any, kind: str, name: str, member: Any, skip: bool, options: Any) -> bool | None:
     """Skip fields of structs, which `finish_docstring` tabulates, and types of fields, which SPEC.md has."""
-    field = _is_struct(getattr(member, "__objclass__", None))
+    document = app.env.current_document
+    owner: Any = sys.modules.get(document.autodoc_module or "")
+    for part in (document.autodoc_class or "").split(".") if kind == "class" else ():
+        owner = getattr(owner, part, None)
+    field = _is_struct(owner) and name in owner.__struct_fields__
     return True if field or get_origin(member) is Annotated else None
 
 

@@ -186,7 +186,7 @@ class Ready(_Message, frozen=True, kw_only=True, tag="READY"):
     actuators: tuple[NamePattern, ...] = ()
     """Agents: the actuators they own, as patterns with ``*``: ``beam:car.*``, ``motion:uav``."""
     notes: tuple[Text, ...] = ()
-    """What a user should know: the library chosen, the GPU used. One that begins with ``warning: `` is shown
+    """What a user should know: the library chosen, the GPU used. One that begins with ``warning:`` is shown
     as such; the others are logged."""
     seed: SeedOrNone = -1
     """Agents: seed of the first episode, instead of the run's."""

@@ -3,19 +3,22 @@
 A recording is a run directory with ``recording-0000.mcap``, ``recording-0001.mcap``, … and the scenery in
 ``assets/``. In a segment:
 
-* One channel a topic and source, MCAP topic ``<topic>/<source>``, schema ``caviar.<topic>/1``, message
-encoding ``caviar-product``: header length (8 bytes, little-endian), header, body, the wire bytes as they
-were. So SHA-256 of a message is the product's digest. ``sequence`` is the frame the product was computed
-for. * One channel ``frame``, schema ``caviar.frame/1``, message encoding ``msgpack``: a
-`caviar_protocol.recording.layout.FrameEntry` with the provenance of every product, absent ones too. A held
-product is not written again: it stands in the chunk of its own frame. * ``log_time`` is run time in
-nanoseconds: ``t_ns`` of the frame in the first episode; a later episode begins one sampling period after
-the end of the one before. ``publish_time`` is the same for the instant the product was computed for. * One
-chunk a frame, and behind it a seal with the CRC-32 of all bytes before it
-(`caviar_protocol.recording.segment`), handed to the operating system before DONE, and on disk as the run's
-``durability`` says (`persistence`). MCAP's index and statistics are written when a segment is full or the
-run ends; then the manifest ``recording.json`` lists it as finished (`caviar_protocol.recording.layout`). *
-Metadata record ``caviar``: `caviar_protocol.recording.layout.RecordingMetadata`, a JSON text a field.
+* One channel a topic and source, MCAP topic ``<topic>/<source>``, schema ``caviar.<topic>/1``,
+  message encoding ``caviar-product``: header length (8 bytes, little-endian), header, body, the
+  wire bytes as they were. So SHA-256 of a message is the product's digest. ``sequence`` is the
+  frame the product was computed for.
+* One channel ``frame``, schema ``caviar.frame/1``, message encoding ``msgpack``: a
+  `caviar_protocol.recording.layout.FrameEntry` with the provenance of every product, absent ones too. A
+  held product is not written again: it stands in the chunk of its own frame.
+* ``log_time`` is run time in nanoseconds: ``t_ns`` of the frame in the first episode; a later
+  episode begins one sampling period after the end of the one before. ``publish_time`` is the
+  same for the instant the product was computed for.
+* One chunk a frame, and behind it a seal with the CRC-32 of all bytes before it
+  (`caviar_protocol.recording.segment`), handed to the operating system before DONE, and on disk as the
+  run's ``durability`` says (`persistence`). MCAP's index and statistics are written when a segment is full
+  or the run ends; then the manifest ``recording.json`` lists it as finished
+  (`caviar_protocol.recording.layout`).
+* Metadata record ``caviar``: `caviar_protocol.recording.layout.RecordingMetadata`, a JSON text a field.
 """
 
 from __future__ import annotations
