@@ -75,6 +75,10 @@ def test_the_colour_bar_leaves_out_what_is_rare() -> None:
         (("--metric", "gian"), "--metric 'gian' does not exist; did you mean 'gain'?"),
         (("--cell", "0"), "--cell 0: write the side of a cell in metres, above 0"),
         (("--height", "nan"), "--height nan: write a height in metres"),
+        (("--height", "1e300"), "--height 1e+300: write a height in metres, at most 1,000,000"),
+        (("--cell", "1e300"), "--cell 1e+300: write the side of a cell in metres"),
+        (("--memory-gib", "inf"), "--memory-gib inf: write GiB, above 0"),
+        (("--beam", "7" * 5000), "write best, wide, or the number"),
         (("--area", "0", "0", "0", "1"), "--area 0 0 0 1: write lowest x and y"),
         (("--beam", "widest"), "--beam 'widest': write best, wide, or the number"),
         (("--out", "map.jpg"), "--out map.jpg: a radio map is a PNG"),
@@ -230,7 +234,7 @@ def _surface(tmp_path: Path, **wanted: object) -> tuple[str, ...]:
 def test_what_is_unusual_about_the_cells_is_said(tmp_path: Path) -> None:
     rising, buried = _surface(tmp_path, cell=1.0, height=15.0)
     assert rising == "the ground rises by 30 m, --surface ground follows it"
-    assert buried == "50.0% of the cells are below the ground, and have no signal"
+    assert buried == "50.0% of the cells are below what is taken as ground"
     beside = _surface(tmp_path, area=(1000.0, 1000.0, 1100.0, 1100.0))[0]
     assert beside == ("warning: the area is beside the scenery, which reaches x 0 to 100 m, y 0 to 50 m")
 

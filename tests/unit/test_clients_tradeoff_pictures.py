@@ -5,11 +5,22 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
+from caviar_clients.cli.tradeoff import _other_reference
 from caviar_clients.tradeoff.campaign import Skipped
-from caviar_clients.tradeoff.plot import Box, draw_convergence, draw_pareto, pareto_front, place, spots
-from caviar_clients.tradeoff.report import Point, Report
+from caviar_clients.tradeoff.ladder import REFERENCES
+from caviar_clients.tradeoff.plot import (
+    Box,
+    comparable_times,
+    draw_convergence,
+    draw_pareto,
+    pareto_front,
+    place,
+    spots,
+)
+from caviar_clients.tradeoff.report import Options, Point, Report
 from caviar_clients.tradeoff.rows import Row, error_fields
 from caviar_clients.tradeoff.tables import level, markdown, significant
 
@@ -95,6 +106,24 @@ def test_factors_stand_beside_the_papers() -> None:
     assert "| 64 | 8 | – | 2.2 |" in text
     assert "RTX 2070" in text
     assert "abacus" in text
+
+
+def test_a_picture_has_the_order_of_the_factors() -> None:
+    """One of two settings was measured while the machine was five times as slow, as its baseline was."""
+    rows = (row("siso-rt 1e5", 100.0, -10.0), row("siso-rt d2", 310.0, -12.0, factor=0.62))
+    made = msgspec.structs.replace(report(), rows=rows)
+    assert [entry.time_ms_median for entry in comparable_times(made)] == [100.0, pytest.approx(62.0)]
+
+
+def test_another_reference_than_the_finest_is_warned_of() -> None:
+    finest = REFERENCES[0]
+    skipped = (Skipped(setting=finest, block="ladder", reason="no answer"),)
+    coarser = msgspec.structs.replace(report(), reference="siso-rt 1e6 d3", skipped=skipped)
+    assert _other_reference(Options(), coarser) == (
+        f"warning: errors are against 'siso-rt 1e6 d3', since '{finest}' was not measured: no answer"
+    )
+    assert _other_reference(Options(), report()) == ""
+    assert _other_reference(Options(reference="siso-rt 1e6 d3"), coarser) == ""
 
 
 def test_the_text_says_what_was_not_measured_and_why() -> None:

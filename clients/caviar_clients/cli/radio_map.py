@@ -102,6 +102,9 @@ METRICS = {
 
 
 _FEW_RAYS = 10
+_FARTHEST_M = 1e6
+"""[m]; farther away, positions in the ray tracer, which are float32, are decimetres apart."""
+_MOST_GIB = 1e6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,23 +127,30 @@ def options_of(metrics: Sequence[str] | None, cells: Wanted, beam: str, **others
     for metric in chosen:
         if metric not in METRICS:
             raise RunError(f"--metric {metric!r} does not exist; {suggestion(metric, METRICS)}")
-    if not math.isfinite(cells.height):
-        raise RunError(f"--height {cells.height}: write a height in metres")
-    if not (math.isfinite(cells.cell) and cells.cell > 0):
-        raise RunError(f"--cell {cells.cell:g}: write the side of a cell in metres, above 0")
+    if not abs(cells.height) <= _FARTHEST_M:
+        raise RunError(f"--height {cells.height:g}: write a height in metres, at most {_FARTHEST_M:,.0f}")
+    if not 0 < cells.cell <= _FARTHEST_M:
+        raise RunError(
+            f"--cell {cells.cell:g}: write the side of a cell in metres, above 0, at most {_FARTHEST_M:,.0f}"
+        )
     if cells.area is not None:
         x0, y0, x1, y1 = cells.area
         if not (x0 < x1 and y0 < y1 and all(map(math.isfinite, cells.area))):
             given = " ".join(f"{value:g}" for value in cells.area)
             raise RunError(f"--area {given}: write lowest x and y, then highest x and y, in metres")
-    return MapOptions(metrics=chosen, cells=cells, beam=_beam(beam), **others)
+    options = MapOptions(metrics=chosen, cells=cells, beam=_beam(beam), **others)
+    if not 0 < options.memory_gib <= _MOST_GIB:
+        raise RunError(
+            f"--memory-gib {options.memory_gib:g}: write GiB, above 0 and at most {_MOST_GIB:,.0f}"
+        )
+    return options
 
 
 def _beam(text: str) -> BeamChoice:
     if text == "best" or text == "wide":
         return "best" if text == "best" else "wide"
-    if not text.isdecimal():
-        raise RunError(f"--beam {text!r}: write best, wide, or the number of a beam of the codebook")
+    if not (text.isdecimal() and len(text) < 10):
+        raise RunError(f"--beam {text!r:.40}: write best, wide, or the number of a beam of the codebook")
     return int(text)
 
 
@@ -272,6 +282,14 @@ def _summary(mapped: _Mapped) -> Iterator[str]:
     yield f"noise {10 * math.log10(coverage.noise_w) + 30:.1f} dBm: {mapped.metadata['noise']}"
     yield from mapped.notes
     yield f"{share:.1%} of the cells have a signal"
+    if not reached.any():
+        heights = ", ".join(
+            f"{name!r} at z = {at[2]:g} m" for name, at in zip(found.names, found.positions, strict=True)
+        )
+        yield (
+            f"warning: no ray passed through a cell, with {heights}; see whether a transmitter stands below "
+            "the ground or inside of something, and whether --height and --area are where its waves go"
+        )
     few = np.count_nonzero(found.rays.max(axis=0)[reached] < _FEW_RAYS) / max(int(reached.sum()), 1)
     if few > 0.1:
         yield (

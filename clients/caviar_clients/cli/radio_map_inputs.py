@@ -200,7 +200,7 @@ def _plane(
         x, y = surface.centres[0, :, 0], surface.centres[:, 0, 1]
         buried = np.count_nonzero(heights(triangles, x, y) > surface.z[0, 0]) / (len(x) * len(y))
         if buried:
-            notes.append(f"{buried:.1%} of the cells are below the ground, and have no signal")
+            notes.append(f"{buried:.1%} of the cells are below what is taken as ground")
     return surface, tuple(notes)
 
 

@@ -60,6 +60,9 @@ def trade(
     files = [file for file in (json, out and out / "tradeoff.md") if file is not None]
     with reserved(*files):
         report = _compared(source, frames, options, console)
+    warning = _other_reference(options, report)
+    if warning:
+        console.print(warning, markup=False, highlight=False, soft_wrap=True, style="yellow")
     console.print(screen_table(report))
     for reason, labels in by_reason(report.skipped).items():
         console.print(f"not measured: {', '.join(labels)}: {reason}", markup=False, highlight=False)
@@ -74,6 +77,17 @@ def trade(
         for file in files:
             console.print(str(file), markup=False, highlight=False, soft_wrap=True)
     return report
+
+
+def _other_reference(options: Options, report: Report) -> str:
+    """A warning where errors are against a coarser setting than the finest; empty where they are not."""
+    finest = options.reference or ladder.REFERENCES[0]
+    reasons = [entry.reason for entry in report.skipped if entry.setting == finest]
+    if report.reference == finest or not reasons:
+        return ""
+    return (
+        f"warning: errors are against {report.reference!r}, since {finest!r} was not measured: {reasons[0]}"
+    )
 
 
 def _require_extras(source: Path, options: Options, with_pictures: bool) -> None:
@@ -108,9 +122,8 @@ def _compared(source: Path, frames: int, options: Options, console: Console) -> 
 
         def told(news: Told) -> None:
             minutes, seconds = divmod(round(news.left_s), 60)
-            bar.update(
-                task, description=news.text, completed=news.done, left=f"at most {minutes}:{seconds:02d} left"
-            )
+            left = f"{minutes}:{seconds:02d} left" if news.left_s > 0 else "time is up: ending what began"
+            bar.update(task, description=news.text, completed=news.done, left=left)
 
         scenes = scenes_of(source, frames)
         return compare(scenes, options, machine(), told)
