@@ -81,8 +81,8 @@ class Connection:
         self._socket.setsockopt(zmq.MAXMSGSIZE, limits.MAX_BODY)
         self._heartbeat: HeartbeatThread | None = None
         self._rejoin_s = 0.0
+        # Calls off the end of the process that the broker's silence brings about.
         self._end: threading.Event | None = None
-        """Calls off the end of the process that the broker's silence brings about."""
         self._handshake = Handshake(self._context, self._socket, endpoint, credentials is not None)
         try:
             dress(self._socket, endpoint, credentials)

@@ -42,21 +42,21 @@ FIELD = ("theta_deg", "phi_deg", "e_theta_re", "e_theta_im", "e_phi_re", "e_phi_
 
 _MARKS = {codecs.BOM_UTF8: "utf-8", codecs.BOM_UTF16_LE: "utf-16-le", codecs.BOM_UTF16_BE: "utf-16-be"}
 
+# [dBi]; a pattern whose gain has a higher mean over the sphere is refused. An antenna has 0 dBi less its
+# losses; cuts that are summed may miss that by some decibels.
 _IMPOSSIBLE_DBI = 10.0
-"""[dBi]; a pattern whose gain has a higher mean over the sphere is refused. An antenna has 0 dBi less its
-losses; cuts that are summed may miss that by some decibels."""
 
+# [dB] by which a direction of a cut may exceed the stated gain, which is rounded, or of another tilt.
 _BEYOND_MAXIMUM_DB = 3.0
-"""[dB] by which a direction of a cut may exceed the stated gain, which is rounded, or of another tilt."""
 
+# Lines of a cut at most.
 _MOST_ANGLES = 3600
-"""Lines of a cut at most."""
 
+# Between two neighbouring angles of a cut.
 _WIDEST_GAP_DEG = 90.0
-"""Between two neighbouring angles of a cut."""
 
+# Gain of a half-wave dipole, which dBd refer to [dBi].
 _DIPOLE_DBI = 2.15
-"""Gain of a half-wave dipole, which dBd refer to [dBi]."""
 
 _CUTS = {"HORIZONTAL": "horizontal", "VERTICAL": "vertical"}
 

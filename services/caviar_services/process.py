@@ -89,12 +89,9 @@ class SignalTermination(Termination):
 def restart_status(status: int, ended: str) -> int:
     """Status 0 where the work is done or nobody wants it any more; 1 where another run may follow.
 
-    Parameters
-    ----------
-    status
-        What the runner returned.
-    ended
-        Why the broker ended the run; "" where it did not.
+    Args:
+        status: What the runner returned.
+        ended: Why the broker ended the run; "" where it did not.
     """
     if status == TERMINATED:
         return 0

@@ -73,20 +73,14 @@ def choose_llvm(
 ) -> LlvmLibrary:
     """The library that Dr.Jit shall use: an explicit one first, else the newest that is new enough.
 
-    Parameters
-    ----------
-    environment
-        Where `ENVIRONMENT` may name one explicitly.
-    folders
-        Patterns of folders to look in.
-    listed
-        Further candidates; by default those in the linker's cache.
+    Args:
+        environment: Where `ENVIRONMENT` may name one explicitly.
+        folders: Patterns of folders to look in.
+        listed: Further candidates; by default those in the linker's cache.
 
-    Raises
-    ------
-    SetupError
-        The explicit one does not exist or is too old, or there is none; ends with the command that
-        mends it.
+    Raises:
+        SetupError: The explicit one does not exist or is too old, or there is none; ends with the command
+            that mends it.
     """
     explicit = environment.get(ENVIRONMENT, "")
     if explicit:

@@ -101,16 +101,11 @@ class Prepared:
 class FrameInput:
     """One input of a frame: its provenance, and its payload, decoded and checked on first use.
 
-    Parameters
-    ----------
-    provenance
-        Where it comes from.
-    header, body
-        The product as it travels; empty where it never did.
-    payload
-        The product as it is, of a producer in this process.
-    check
-        Looks at what the payload says, before the service does; None: it is trusted.
+    Args:
+        provenance: Where it comes from.
+        header, body: The product as it travels; empty where it never did.
+        payload: The product as it is, of a producer in this process.
+        check: Looks at what the payload says, before the service does; None: it is trusted.
     """
 
     __slots__ = ("_check", "_payload", "body", "header", "provenance")

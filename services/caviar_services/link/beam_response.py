@@ -29,28 +29,20 @@ def beam_responses(
 ) -> list[Complex128Array]:
     """y of each user's beam pair on the subcarriers and in the slots of its carrier.
 
-    Parameters
-    ----------
-    channel
-        With its paths; on the rungs ``spherical`` and ``mimo-rt``, where an array does not see plane waves,
-        with part ``hf``; so for arrays of dual polarization or several panels.
-    scene
-        Of the same frame.
-    users
-        Of that scene.
-    beams
-        TX and RX beam of each user; a pair with −1 is not served.
+    Args:
+        channel: With its paths; on the rungs ``spherical`` and ``mimo-rt``, where an array does not see
+            plane waves, with part ``hf``; so for arrays of dual polarization or several panels.
+        scene: Of the same frame.
+        users: Of that scene.
+        beams: TX and RX beam of each user; a pair with −1 is not served.
 
-    Returns
-    -------
-    list of Complex128Array
+    Returns:
         Of each user, Shape ``[S, K]`` with S slots and K subcarriers; zeros for a user that is not served,
         has no path, or is not in ``channel``.
 
-    Raises
-    ------
-    PayloadError
-        Naming the user, for a beam that its codebook does not have, or where part ``hf`` is missing.
+    Raises:
+        PayloadError: Naming the user, for a beam that its codebook does not have, or where part ``hf`` is
+            missing.
     """
     matrices = {(response.carrier, response.tx, response.rx): response.h for response in channel.hf}
     rotations: dict[str, Float64Array] = {}

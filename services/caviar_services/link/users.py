@@ -123,8 +123,8 @@ def _checked(user: User, h: Complex128Array | None) -> Complex128Array:
     return h
 
 
+# Names that an error message lists at most.
 _LISTED = 8
-"""Names that an error message lists at most."""
 
 
 class Choices(msgspec.Struct, frozen=True):
@@ -143,12 +143,10 @@ def choices_of(frame: Frame, users: Users) -> Choices:
     agent schedules a receiver, the transmitter's other receivers are not served. A held action may name
     users that left since; those commands are counted.
 
-    Raises
-    ------
-    ProductError
-        An agent names a user that does not exist or a beam outside the codebook, or contradicts itself.
-    PayloadError
-        The commands of two agents concern one user; both are named.
+    Raises:
+        ProductError: An agent names a user that does not exist or a beam outside the codebook, or
+            contradicts itself.
+        PayloadError: The commands of two agents concern one user; both are named.
     """
     book = _Book(users)
     for action, command in _commands(frame):

@@ -107,8 +107,8 @@ def read_scenery(file: Path, called: str = "") -> Scenery:
     return Scenery(file, tuple(shapes.values()))
 
 
+# Line of each element's start tag, from 1.
 _Lines = Mapping[ElementTree.Element, int]
-"""Line of each element's start tag, from 1."""
 
 
 def _parse(file: Path, called: str) -> tuple[ElementTree.Element, _Lines]:

@@ -73,12 +73,9 @@ class Stored:
 class Continuation:
     """What an earlier process recorded, up to the frame that is granted next.
 
-    Parameters
-    ----------
-    folder
-        Directory of the run.
-    runtime, stored
-        Brought to where they were.
+    Args:
+        folder: Directory of the run.
+        runtime, stored: Brought to where they were.
     """
 
     folder: Path

@@ -52,9 +52,9 @@ from caviar_services.recorder.continuation import Continuation, RunTime, Stored
 from caviar_services.recorder.segment_writer import Persistence, SegmentWriter
 from caviar_services.service import Frame, FrameInput, Preparation, Prepared, RunInfo, StepResult
 
+# Topics that may have no other consumer: a data set needs no agent. All others have one that checks them,
+# but for parts that are asked for by the recorder alone.
 _LOOKED_INTO = frozenset({"scene", "lidar", "camera", "depth", "segmentation"})
-"""Topics that may have no other consumer: a data set needs no agent. All others have one that checks them,
-but for parts that are asked for by the recorder alone."""
 
 
 class McapSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -88,8 +88,8 @@ class McapRecorder(Recorder[McapSettings]):
         self._failure: RunError | None = None
         self._runtime = RunTime(run.sampling_period_ns)
         self._stored = Stored()
+        # Whether frames that another process recorded are still to be taken over.
         self._goes_on = False
-        """Whether frames that another process recorded are still to be taken over."""
 
     def prepare(self, preparation: Preparation) -> Prepared:
         """Open the first segment. `RunError` where the directory is not writable or holds a run."""

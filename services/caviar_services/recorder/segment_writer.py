@@ -70,14 +70,10 @@ class _ChecksummedStream:
 class SegmentWriter:
     """A segment that is being written. All methods raise `OSError` where the system refuses.
 
-    Parameters
-    ----------
-    path
-        The file; there must be none yet.
-    metadata
-        Texts of the metadata record.
-    compression
-        ``none``, ``lz4`` or ``zstd``.
+    Args:
+        path: The file; there must be none yet.
+        metadata: Texts of the metadata record.
+        compression: ``none``, ``lz4`` or ``zstd``.
     """
 
     def __init__(self, path: Path, metadata: dict[str, str], compression: str) -> None:
@@ -191,8 +187,8 @@ class SegmentWriter:
         return self._schemas[topic]
 
 
+# [s] between two syncs under ``periodic``, so that one that takes a while is done within the period.
 _PAUSE_S = SYNC_PERIOD_S / 2
-"""[s] between two syncs under ``periodic``, so that one that takes a while is done within the period."""
 
 
 class Persistence:
@@ -200,16 +196,11 @@ class Persistence:
 
     All methods raise `OSError` where the system refuses, under ``periodic`` with the frame that follows.
 
-    Parameters
-    ----------
-    folder
-        Directory of the run.
-    durability
-        When what is written has to be on disk.
-    run, seed
-        Of the run, for the manifest.
-    earlier
-        Segments that are there already, all of them finished.
+    Args:
+        folder: Directory of the run.
+        durability: When what is written has to be on disk.
+        run, seed: Of the run, for the manifest.
+        earlier: Segments that are there already, all of them finished.
     """
 
     def __init__(
@@ -217,8 +208,8 @@ class Persistence:
     ) -> None:
         self._folder, self._run, self._seed = folder, run, seed
         self._durability = durability
+        # Of the manifest.
         self._lock = threading.Lock()
-        """Of the manifest."""
         self._records = {record.name: record for record in earlier}
         self._periodic = _PeriodicSync(folder, self._list) if durability == "periodic" else None
 
@@ -272,8 +263,8 @@ class _PeriodicSync:
     def __init__(self, folder: Path, synced: Callable[[SegmentRecord], None]) -> None:
         self._folder, self._synced = folder, synced
         self._lock = threading.Lock()
+        # Segments with what is not on disk yet; those with a record are finished.
         self._dirty: dict[SegmentWriter, SegmentRecord | None] = {}
-        """Segments with what is not on disk yet; those with a record are finished."""
         self._failure: OSError | None = None
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._run, name="recording-sync", daemon=True)

@@ -59,20 +59,17 @@ class Sensors(Service[S]):
     """The scene for rays; None where nothing is asked for."""
     shapes: tuple[SceneryShape, ...] = ()
     """Shapes of the scenery, in the order of their owners in `traced`."""
+    # Objects that may be in the scene at once, by asset name.
     _capacity: Mapping[str, int]
-    """Objects that may be in the scene at once, by asset name."""
 
     def prepare(self, preparation: Preparation) -> Prepared:
         """Load the scenery and the objects' meshes, and compile what `observe` needs.
 
         Nothing is loaded where nobody asks for an output (contract, clause 5).
 
-        Raises
-        ------
-        AssetError
-            The scene description or a mesh is broken or missing.
-        SetupError
-            Mitsuba is not installed, or there is no library to compile kernels with.
+        Raises:
+            AssetError: The scene description or a mesh is broken or missing.
+            SetupError: Mitsuba is not installed, or there is no library to compile kernels with.
         """
         if not preparation.demand.keys() & set(self.outputs):
             return Prepared(notes=("nobody asks for what these sensors see: not run",))

@@ -83,8 +83,8 @@ class LidarSensors(Sensors[LidarSettings]):
 
     _with_grid = False
     _with_points = True
+    # Of the last frame; those of the next are mostly the same.
     _rays: _Rays | None = None
-    """Of the last frame; those of the next are mostly the same."""
     outputs: ClassVar[tuple[str, ...]] = ("lidar",)
     uses_scenery: ClassVar[bool] = True
     Settings: ClassVar[type[msgspec.Struct]] = LidarSettings
@@ -352,15 +352,11 @@ def occupancy(
 ) -> OccupancyGrid:
     """The grid of one scan.
 
-    Parameters
-    ----------
-    points
-        Hits in world coordinates [m], Shape ``[N, 3]``.
-    distance
-        Their distances from the sensor [m], Shape ``[N]``.
-    tx, rx
-        Positions [m] of transmitters and receivers. They stand over obstacles, receivers over
-        transmitters.
+    Args:
+        points: Hits in world coordinates [m], Shape ``[N, 3]``.
+        distance: Their distances from the sensor [m], Shape ``[N]``.
+        tx, rx: Positions [m] of transmitters and receivers. They stand over obstacles, receivers over
+            transmitters.
     """
     grid = np.full(settings.shape, FREE, dtype=np.int8)
     kept = (points[:, 2] > settings.min_height_m) & (distance < settings.max_range_m)

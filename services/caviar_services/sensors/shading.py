@@ -58,12 +58,9 @@ class View:
 class Painter:
     """Draws pictures of a scene. Use it under `active_variant`, after `TracedScene.update`.
 
-    Parameters
-    ----------
-    albedo
-        Linear sRGB of each owner, Shape ``[owners, 3]``.
-    sun
-        Unit vector towards the sun, world axes.
+    Args:
+        albedo: Linear sRGB of each owner, Shape ``[owners, 3]``.
+        sun: Unit vector towards the sun, world axes.
     """
 
     def __init__(self, mi: Any, traced: TracedScene, albedo: Float64Array, sun: Float64Array) -> None:

@@ -146,14 +146,10 @@ class _Part:
 class TracedScene:
     """Scenery and the bodies of moving objects, for rays. Build and use it under `active_variant`.
 
-    Parameters
-    ----------
-    names, meshes
-        The scenery's shapes, in world coordinates.
-    bodies
-        Unit mesh of each asset that moving objects may have, by asset name.
-    capacity
-        How many objects of each asset may be in the scene at once.
+    Args:
+        names, meshes: The scenery's shapes, in world coordinates.
+        bodies: Unit mesh of each asset that moving objects may have, by asset name.
+        capacity: How many objects of each asset may be in the scene at once.
     """
 
     def __init__(
@@ -213,12 +209,9 @@ class TracedScene:
     def trace(self, mi: Any, origin: Float64Array, direction: Float64Array, reach: Float64Array) -> Hits:
         """First hit of each ray.
 
-        Parameters
-        ----------
-        origin, direction
-            World coordinates [m] and unit vectors, Shape ``[3, N]``.
-        reach
-            [m], Shape ``[N]``; what is farther is not looked for.
+        Args:
+            origin, direction: World coordinates [m] and unit vectors, Shape ``[3, N]``.
+            reach: [m], Shape ``[N]``; what is farther is not looked for.
         """
         import drjit as dr
 

@@ -36,8 +36,8 @@ from caviar_services.testing.base import EPISODE_SEED, FRAMES, Played, ServiceCo
 
 P = TypeVar("P", bound=Payload)
 
+# Field with the pixels of each kind of image.
 _PIXELS = {"camera": "rgb", "depth": "depth", "segmentation": "object"}
-"""Field with the pixels of each kind of image."""
 
 
 def _products(played: Played, topic: str, cls: type[P]) -> Iterator[P]:

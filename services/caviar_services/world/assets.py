@@ -23,12 +23,10 @@ _BUNDLED = "sionna:"
 def scenery_assets(scenery: str) -> dict[str, Path | bytes]:
     """Asset name to file of a world's ``scenery`` setting; empty for an empty setting.
 
-    Raises
-    ------
-    AssetError
-        The XML, or a file that it names, is missing or cannot travel, or the XML is wrong (`read_scenery`).
-    SetupError
-        A scene of sionna-rt is asked for, and sionna-rt is not installed.
+    Raises:
+        AssetError: The XML, or a file that it names, is missing or cannot travel, or the XML is wrong
+            (`read_scenery`).
+        SetupError: A scene of sionna-rt is asked for, and sionna-rt is not installed.
     """
     if not scenery:
         return {}

@@ -241,8 +241,8 @@ class Mounts:
         self._objects: Sequence[tuple[str, Vector]] | None = None
         self.without_object: tuple[str, ...] = ()
         """Devices that found no object to stand on in the last frame."""
+        # Of the objects of the frame before, which mostly are those of the next one.
         self._devices: tuple[Device, ...] = ()
-        """Of the objects of the frame before, which mostly are those of the next one."""
 
     @property
     def fixed_names(self) -> tuple[str, ...]:
@@ -282,13 +282,13 @@ class Mounts:
         return self._devices
 
 
+# [rad/s]; slower is the rounding of a straight line.
 _TURNS = 1e-9
-"""[rad/s]; slower is the rounding of a straight line."""
 
+# [m]; a course that bends with a smaller radius is a vehicle that backs, or that stands and is measured with
+# noise, and no turn: the rate, which grows without bounds as such a vehicle slows down, would move its
+# antennas by kilometres a second.
 _TIGHTEST_M = 0.1
-"""[m]; a course that bends with a smaller radius is a vehicle that backs, or that stands and is measured
-with noise, and no turn: the rate, which grows without bounds as such a vehicle slows down, would move its
-antennas by kilometres a second."""
 
 
 def turning(rate: float) -> float:

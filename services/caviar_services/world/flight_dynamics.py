@@ -36,23 +36,23 @@ SLID_ALONG_OBSTACLE = "slid-along-obstacle"
 STOPPED_BY_GEOFENCE = "stopped-by-geofence"
 """A bound of the permitted box, or the ground, was in the way."""
 
+# Horizontal speed [m/s] below which an object keeps its yaw.
 _HOVERING = 0.05
-"""Horizontal speed [m/s] below which an object keeps its yaw."""
 
+# Share of the speed below which what is left along a surface counts as none.
 _STANDSTILL = 0.01
-"""Share of the speed below which what is left along a surface counts as none."""
 
+# [m] from its target at which an object is there.
 _ARRIVED = 1e-6
-"""[m] from its target at which an object is there."""
 
+# Sub-steps that are looked at together at most, while nothing is in the way.
 _AT_ONCE = 8
-"""Sub-steps that are looked at together at most, while nothing is in the way."""
 
+# Planes that a set-point is bent along at once; where three meet the object brakes.
 _CONTACTS = 3
-"""Planes that a set-point is bent along at once; where three meet the object brakes."""
 
+# Share of the greatest speed by which a command that is scaled to it may miss it.
 _ROUNDING = 1e-12
-"""Share of the greatest speed by which a command that is scaled to it may miss it."""
 
 _H = SUB_STEP_NS / 1e9
 _REST: Vector = (0.0, 0.0, 0.0)

@@ -18,23 +18,23 @@ from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.space.ply import read_ply
 from caviar_services.mesh.scenery import read_scenery
 
+# Side of a grid cell [m].
 _CELL = 10.0
-"""Side of a grid cell [m]."""
 
+# Wider scenery has larger cells.
 _MOST_CELLS = 1_000_000
-"""Wider scenery has larger cells."""
 
+# How far [m] beyond what a step needs is looked for triangles.
 _HORIZON = 20.0
-"""How far [m] beyond what a step needs is looked for triangles."""
 
+# Way [m] for which the triangles beside a wall are kept.
 _AROUND = 2.0
-"""Way [m] for which the triangles beside a wall are kept."""
 
+# Way [m] into a plane that counts as none.
 _ROUNDING = 1e-9
-"""Way [m] into a plane that counts as none."""
 
+# Clearance [m] that such ways may take away in all.
 _WORN = 1e-6
-"""Clearance [m] that such ways may take away in all."""
 
 _REST: Vector = (0.0, 0.0, 0.0)
 
@@ -49,8 +49,8 @@ class Obstacles:
         self._reach = -math.inf
         self._around: _Faces | None = None
         self._seen_from: Vector | None = None
+        # Distances and gaps from there: several ways are tried from one place.
         self._seen: tuple[Float64Array, Float64Array]
-        """Distances and gaps from there: several ways are tried from one place."""
 
     @classmethod
     def none(cls) -> Obstacles:

@@ -25,14 +25,14 @@ from caviar_services.world.base import ObjectState, World, WorldSettings, turnin
 from caviar_services.world.sumo_process import Simulation, check_file, load_libsumo
 
 _NS_PER_MS = 1_000_000
+# SUMO's car-following models are made for steps up to one second.
 _LONGEST_STEP_MS = 1000
-"""SUMO's car-following models are made for steps up to one second."""
 
+# A vehicle that turns by more in a step has not turned: SUMO has put it elsewhere.
 _JUMP_DEG = 90.0
-"""A vehicle that turns by more in a step has not turned: SUMO has put it elsewhere."""
 
+# Steps at which SUMO's way to an instant long before is told.
 _TOLD_EVERY = 1000
-"""Steps at which SUMO's way to an instant long before is told."""
 
 Files = str | tuple[str, ...]
 

@@ -29,6 +29,7 @@ _ROOTS = {
 }
 
 
+# Elements of traffic, and which attribute says when it begins.
 _DEPARTS = {
     "flow": "begin",
     "personFlow": "begin",
@@ -36,7 +37,6 @@ _DEPARTS = {
     "trip": "depart",
     "person": "depart",
 }
-"""Elements of traffic, and which attribute says when it begins."""
 
 
 def load_libsumo() -> ModuleType:

@@ -23,11 +23,11 @@ from caviar_services.world.base import ObjectState, World, WorldSettings, course
 COLUMNS = ("t_s", "x_m", "y_m", "z_m")
 YAW_COLUMN = "yaw_deg"
 
+# Horizontal speed [m/s] below which rounding would choose the course.
 _SLOW = 1e-6
-"""Horizontal speed [m/s] below which rounding would choose the course."""
 
+# [°]; a course that reverses by more at a waypoint turns the object round.
 _ROUND_DEG = 90.0
-"""[°]; a course that reverses by more at a waypoint turns the object round."""
 
 
 Length = Annotated[float, quantity("m", "side of a bounding box", gt=0)]
@@ -272,8 +272,8 @@ def read_waypoints(source: str | Sequence[Sequence[float]], key: str = "") -> li
     return _checked(rows)
 
 
+# Key, file, line, values: what an error names.
 _Row = tuple[str, str, int | None, list[float]]
-"""Key, file, line, values: what an error names."""
 
 
 def _from_csv(path: Path, key: str) -> list[Waypoint]:
@@ -338,12 +338,9 @@ class MonotoneCurve:
     constructing local monotone piecewise cubic interpolants", SIAM J. Sci. Stat. Comput. 5 (1984),
     eq. (5). Before the first and after the last point the curve stays where it is.
 
-    Parameters
-    ----------
-    times
-        Increasing instants [s], Shape ``[K]``, K ≥ 1.
-    points
-        Values there, Shape ``[K, D]``.
+    Args:
+        times: Increasing instants [s], Shape ``[K]``, K ≥ 1.
+        points: Values there, Shape ``[K, D]``.
     """
 
     def __init__(self, times: Float64Array, points: Float64Array) -> None:
