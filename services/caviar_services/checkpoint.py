@@ -52,9 +52,26 @@ class Packed(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields
 
 
 def saved(service: Service[Any], version: int, state: msgspec.Struct) -> bytes:
-    """A state as bytes.
+    """A state as bytes. Equal states give equal bytes.
 
-    ``version`` is that of the struct ``state``: it is raised whenever what its fields mean changes.
+    Args:
+        service: The service, of which implementation and circumstances are noted.
+        version: Version of the struct ``state``; raise it whenever what its fields mean changes.
+        state: The state, a frozen struct; arrays in it are `Packed`.
+
+    Returns:
+        What `Service.checkpoint` returns.
+
+    Example:
+        >>> import msgspec
+        >>> from caviar_services.agent.baselines import RandomAgent
+        >>> from caviar_services.agent.base import AgentSettings
+        >>> from caviar_services.service import RunInfo
+        >>> class State(msgspec.Struct, frozen=True):
+        ...     next: int
+        >>> agent = RandomAgent(AgentSettings(), RunInfo(name="agent"))
+        >>> restored(agent, 1, State, saved(agent, 1, State(3)))
+        State(next=3)
     """
     body = msgspec.msgpack.encode(state, order="deterministic")
     name = type(service).__qualname__
@@ -66,8 +83,15 @@ def saved(service: Service[Any], version: int, state: msgspec.Struct) -> bytes:
 def restored(service: Service[Any], version: int, cls: type[T], state: bytes) -> T:
     """The struct that `saved` was given.
 
-    Raises `RunError` where that was another implementation, another version of it, or the same in
-    other circumstances (settings, seed, sampling period, carriers, devices), and for all other bytes.
+    Args:
+        service: The service that takes the state over.
+        version: As for `saved`.
+        cls: Class of the struct.
+        state: The bytes.
+
+    Raises:
+        RunError: The bytes are of another implementation, of another version of it, of other circumstances
+            (settings, seed, sampling period, carriers, devices), or no state at all.
     """
     who = f"{service.run.name!r} cannot go on from a saved state"
     try:

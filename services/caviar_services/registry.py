@@ -46,7 +46,11 @@ ENTRY_POINT_GROUP = "caviar.services"
 def registered() -> dict[str, str]:
     """Everything registered, built in and by entry points.
 
-    Raises `DeclarationError` where two distributions register the same ``role:name``.
+    Returns:
+        ``module:Class`` by ``role:name``.
+
+    Raises:
+        DeclarationError: Two distributions register the same ``role:name``.
     """
     found = dict(BUILT_IN)
     for point in entry_points(group=ENTRY_POINT_GROUP):
@@ -60,10 +64,22 @@ def registered() -> dict[str, str]:
 
 
 def load(role: str, name: str) -> type[Service[Any]]:
-    """The class registered as ``role:name``, or at the place ``module:Class`` that ``name`` gives.
+    """Load the class of an implementation.
 
-    Raises `DeclarationError` with the known names, nearest first, where there is none, or saying
-    what is wrong with the class.
+    Args:
+        role: Role of the service.
+        name: Registered name, or the place ``module:Class``.
+
+    Returns:
+        The class, a `Service` of this role that defines all it has to.
+
+    Raises:
+        DeclarationError: There is none; the text has the known names, nearest first, or what is wrong with
+            the class.
+
+    Example:
+        >>> load("agent", "random").__name__
+        'RandomAgent'
     """
     target = name if ":" in name else _registered_target(role, name)
     module_name, _, class_name = target.partition(":")

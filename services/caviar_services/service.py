@@ -102,8 +102,9 @@ class FrameInput:
     """One input of a frame: its provenance, and its payload, decoded and checked on first use.
 
     Args:
-        provenance: Where it comes from.
-        header, body: The product as it travels; empty where it never did.
+        provenance: Topic, source, frame and status of the product.
+        header: Header of the product as it travels; empty where it never did.
+        body: Body of the product as it travels.
         payload: The product as it is, of a producer in this process.
         check: Looks at what the payload says, before the service does; None: it is trusted.
     """
@@ -133,8 +134,9 @@ class FrameInput:
     def payload(self) -> Payload:
         """The payload; its arrays are read-only.
 
-        `PayloadError` where absent, `ProductError` naming topic and source where it cannot be decoded or
-        says what its topic does not allow.
+        Raises:
+            PayloadError: The product is absent.
+            ProductError: It cannot be decoded, or says what its topic does not allow; names topic and source.
         """
         payload, check = self._payload, self._check
         if payload is not None and check is None:
@@ -150,7 +152,11 @@ class FrameInput:
         return payload
 
     def look(self) -> None:
-        """Have the payload checked where that is due, for a service that does not use it."""
+        """Check the payload where that is due, for a service that does not use it.
+
+        Raises:
+            ProductError: As for `payload`.
+        """
         if self._check is not None and self._check.is_due(self.provenance):
             self.payload  # noqa: B018 - decoded and checked on first use
 
@@ -165,7 +171,15 @@ class FrameInput:
 
 
 class Frame(msgspec.Struct, frozen=True, kw_only=True):
-    """One frame as a service sees it."""
+    """One frame as a service sees it.
+
+    Example:
+        >>> frame = Frame(episode=0, number=3, t_ns=300_000_000, service="agent", seed=7)
+        >>> frame.generator("noise").normal() == frame.generator("noise").normal()
+        True
+        >>> frame.only("channel", Payload) is None  # it is no input of this frame
+        True
+    """
 
     episode: int
     number: int
@@ -189,7 +203,18 @@ class Frame(msgspec.Struct, frozen=True, kw_only=True):
     """Episodes since the first one with this seed."""
 
     def payloads(self, topic: str, cls: type[P]) -> dict[str, P]:
-        """Payloads of a topic by source, those that are present."""
+        """Payloads of a topic that are present.
+
+        Args:
+            topic: Name of the topic.
+            cls: Payload class of the topic, for the type of the result.
+
+        Returns:
+            Payload by source, in the order of the inputs.
+
+        Raises:
+            ProductError: A payload cannot be decoded, or says what its topic does not allow.
+        """
         found: dict[str, P] = {}
         for item in self.inputs:
             entry = item.provenance
@@ -200,9 +225,18 @@ class Frame(msgspec.Struct, frozen=True, kw_only=True):
     of = payloads  # its earlier name
 
     def only(self, topic: str, cls: type[P]) -> P | None:
-        """Payload of a topic that has one source; None where absent.
+        """Payload of a topic that has one source.
 
-        Raises `PayloadError` naming the sources where there are several.
+        Args:
+            topic: Name of the topic.
+            cls: Payload class of the topic, for the type of the result.
+
+        Returns:
+            The payload; None where it is absent.
+
+        Raises:
+            PayloadError: There are several sources; the text names them.
+            ProductError: The payload cannot be decoded, or says what its topic does not allow.
         """
         found = self.payloads(topic, cls)
         if len(found) > 1:
@@ -213,14 +247,25 @@ class Frame(msgspec.Struct, frozen=True, kw_only=True):
         return next(iter(found.values()), None)
 
     def scene(self) -> Scene:
-        """The scenes of all worlds as one (contract, clause 3)."""
+        """The scenes of all worlds as one (contract, clause 3).
+
+        Raises:
+            PayloadError: There is none, or two worlds have an object of one name.
+        """
         scenes = self.payloads("scene", Scene)
         if not scenes:
             raise PayloadError(f"{self.service} was granted frame {self.number} without a scene")
         return merge_scenes(scenes)
 
     def generator(self, stream: str = "") -> np.random.Generator:
-        """Random generator of this service for this frame (contract, clause 19)."""
+        """Random generator of this service for this frame (contract, clause 19).
+
+        Args:
+            stream: Name of an independent sequence of numbers within the frame.
+
+        Returns:
+            A generator that depends on the seed, the episode, the service, the stream and the frame alone.
+        """
         return generator(self.seed, self.seed_episode, f"{self.service}/{stream}", self.number)
 
     def __iter__(self) -> Iterator[FrameInput]:
@@ -249,10 +294,27 @@ class NoSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
 
 class Service(ABC, Generic[S]):
-    """One service of a run.
+    """One service of a run. An implementation subclasses it, mostly through the base of its role.
 
-    Class attributes are the declaration; the broker builds the graph of the run from them.
-    Raise a `CaviarError` whose text names the value and the remedy for what a user can mend.
+    Class attributes are the declaration; the broker builds the graph of the run from them. Raise a
+    `CaviarError` whose text names the value and the remedy for what a user can mend; any exception becomes a
+    FAULT of this service, with a traceback where it is no `CaviarError`.
+
+    Args:
+        settings: The scenario's settings of this service, converted to `Settings`.
+        run: What the service knows about the run.
+
+    Example:
+        >>> from caviar_protocol.topics import Scene
+        >>> class Counter(Service[NoSettings]):
+        ...     role = "sensors"
+        ...     inputs = (Input(topic="scene"),)
+        ...
+        ...     def step(self, frame: Frame) -> StepResult:
+        ...         return StepResult(counts={"objects": len(frame.scene().names)})
+        >>> counter = Counter(NoSettings(), RunInfo(name="counter"))
+        >>> counter.prepare(Preparation(demand={})).notes
+        ()
     """
 
     role: ClassVar[Role]
@@ -271,9 +333,14 @@ class Service(ABC, Generic[S]):
 
     @classmethod
     def check_settings(cls, settings: S, place: Place) -> None:  # optional hook
-        """Raise `ScenarioError` for what is wrong with settings beyond what their types say.
+        """Check settings beyond what their types say, where the scenario is read, before anything starts.
 
-        Called before anything starts, where the scenario is read; ``place`` is where they stand in it.
+        Args:
+            settings: The settings.
+            place: Where they stand in the scenario; ``place.at("key").error(text)`` makes the error.
+
+        Raises:
+            ScenarioError: A value is wrong; the error names file, key and line.
         """
 
     def __init__(self, settings: S, run: RunInfo) -> None:
@@ -295,37 +362,80 @@ class Service(ABC, Generic[S]):
         return found
 
     def scenery(self) -> Mapping[str, Path | bytes]:
-        """Worlds: the files of scenery this world brings, by asset name (clause 4)."""
+        """Worlds: the scenery that this world brings (clause 4).
+
+        Returns:
+            File, or content, by asset name, for example ``{"scenery/town.xml": Path(...)}``.
+        """
         return {}
 
     def prepare(self, preparation: Preparation) -> Prepared:
-        """Load, compile, warm up: whatever would otherwise make frame 0 late."""
+        """Load, compile, warm up: whatever would otherwise make frame 0 late.
+
+        Args:
+            preparation: Parts in demand, files of the run's scenery, and who produces what.
+
+        Returns:
+            Names that the service owns, and notes for the user.
+
+        Raises:
+            SetupError: A library or a device is missing.
+            AssetError: A file of scenery is wrong.
+        """
         return Prepared()
 
     def reset(self, episode: int, seed: int, t0_ns: int) -> None:  # optional hook
         """Begin an episode. The same arguments lead to the same episode, bit by bit.
 
-        ``episode`` counts from the first one with this ``seed``: as agents choose seeds, it need not be
-        the `Frame.episode` of the frames that follow.
+        Args:
+            episode: Number of the episode from the first one with this ``seed``: as agents choose seeds, it
+                need not be the `Frame.episode` of the frames that follow.
+            seed: Of the episode.
+            t0_ns: Simulated time of frame 0 [ns].
         """
 
     @abstractmethod
     def step(self, frame: Frame) -> StepResult:
-        """Compute this service's part of a frame."""
+        """Compute this service's part of a frame.
+
+        Args:
+            frame: The frame, with its inputs.
+
+        Returns:
+            Products by topic, and what is reported beside them.
+
+        Raises:
+            CaviarError: The frame cannot be computed; the text names the value at fault and the remedy.
+        """
 
     def checkpoint(self) -> bytes:
-        """The state after the last frame, from which `restore` goes on as if nothing had happened."""
+        """The state after the last frame, from which `restore` goes on with the same bytes.
+
+        Returns:
+            Bytes, as `checkpoint.saved` makes them.
+        """
         raise NotImplementedError(f"{type(self).__name__} has no state to save")
 
     def restore(self, state: bytes) -> None:
-        """Take over a state that `checkpoint` gave. Called after `reset` of the same episode."""
+        """Take over a state that `checkpoint` gave. Called after `reset` of the same episode.
+
+        Args:
+            state: The bytes.
+
+        Raises:
+            RunError: They are another implementation's, or of another scenario (`checkpoint.restored`).
+        """
         raise NotImplementedError(f"{type(self).__name__} has no state to restore")
 
     def release_memory(self) -> None:  # optional hook
         """Give back buffers that are kept for reuse. Called now and then between frames."""
 
     def end_episode(self, frames: int) -> None:  # optional hook
-        """The episode is over; it had this many frames."""
+        """Note the end of an episode.
+
+        Args:
+            frames: Number of frames that it had.
+        """
 
     def close(self) -> None:  # optional hook
         """Release what is held. Called once, also after an error."""

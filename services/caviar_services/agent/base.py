@@ -43,9 +43,26 @@ S = TypeVar("S", bound=AgentSettings)
 class Agent(Service[S]):
     """Base of agents that choose a beam pair for each of their users, every frame.
 
-    Subclasses implement `choose`, and `other_actuators` with `other_commands` where they command more
-    than beams. The final grant of an episode takes no action (contract,
-    clause 16).
+    Subclasses implement `choose`, and `other_actuators` with `other_commands` where they command more than
+    beams. The final grant of an episode takes no action (contract, clause 16).
+
+    Args:
+        settings: Whom the agent serves.
+        run: What the agent knows about the run.
+
+    Raises:
+        ScenarioError: ``users`` names an actuator that this agent does not steer.
+
+    Example:
+        >>> from caviar_protocol.topics import BeamChoice
+        >>> class FirstBeams(Agent[AgentSettings]):
+        ...     def choose(self, frame, scene, pairs):
+        ...         return [
+        ...             BeamChoice(tx=pair.tx.name, rx=pair.rx.name, tx_beam=0, rx_beam=0) for pair in pairs
+        ...         ]
+        >>> agent = FirstBeams(AgentSettings(users=("car.*",)), RunInfo(name="agent"))
+        >>> agent.serves("car.1/rx"), agent.serves("bus.1/rx")
+        (True, False)
     """
 
     role: ClassVar[Role] = "agent"
@@ -80,7 +97,12 @@ class Agent(Service[S]):
         return ()
 
     def other_commands(self, frame: Frame, scene: Scene) -> Iterable[Command]:
-        """Commands for `other_actuators`, in their order; one without is left to itself."""
+        """Commands for `other_actuators`, in their order; an actuator without a command keeps its state.
+
+        Args:
+            frame: The frame.
+            scene: The scenes of all worlds as one.
+        """
         return ()
 
     def step(self, frame: Frame) -> StepResult:
@@ -96,12 +118,26 @@ class Agent(Service[S]):
         )
 
     def serves(self, rx: str) -> bool:
-        """Whether this agent serves the receiver of that name."""
+        """Whether this agent serves a receiver.
+
+        Args:
+            rx: Name of the receiver.
+        """
         return _matches(rx, self._owned) and not _matches(rx, self._others)
 
     @abstractmethod
     def choose(self, frame: Frame, scene: Scene, pairs: Sequence[Pair]) -> Iterable[BeamChoice]:
-        """Beam choices for these pairs, in any order; a pair without one is not served."""
+        """Choose beams for the users of this agent.
+
+        Args:
+            frame: The frame, with the link of the frame before among its inputs.
+            scene: The scenes of all worlds as one.
+            pairs: Transmitter and receiver of each user.
+
+        Returns:
+            Choices in any order. A pair without one is not served; a choice without a carrier holds for all
+            carriers.
+        """
 
 
 def _receivers(patterns: Iterable[str]) -> tuple[str, ...]:

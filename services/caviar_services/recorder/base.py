@@ -32,7 +32,23 @@ DISTRIBUTION = "caviar-sim"
 
 
 class Recorder(Service[S], Generic[S]):
-    """Base of the recorders: takes all topics, requires none, produces nothing."""
+    """Base of the recorders: takes all topics, requires none, produces nothing.
+
+    A subclass implements `Service.step`, which returns once every product of the frame, and its provenance,
+    is with the operating system (``frame.inputs`` are the products, ``frame.reports`` what services reported
+    beside them).
+
+    Example:
+        >>> from caviar_services.service import Frame, NoSettings, RunInfo, StepResult
+        >>> class Counting(Recorder[NoSettings]):
+        ...     products = 0
+        ...
+        ...     def step(self, frame: Frame) -> StepResult:
+        ...         self.products += sum(item.present for item in frame.inputs)
+        ...         return StepResult()
+        >>> Counting(NoSettings(), RunInfo(name="recorder")).step(Frame(episode=0, number=0, t_ns=0)).products
+        {}
+    """
 
     role: ClassVar[Role] = "recorder"
     inputs: ClassVar[tuple[Input, ...]] = (Input(topic="*", required=False),)

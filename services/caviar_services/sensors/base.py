@@ -47,7 +47,22 @@ S = TypeVar("S", bound=SensorSettings)
 class Sensors(Service[S]):
     """Base of sensor services.
 
-    An implementation sets ``outputs`` and implements `observe`.
+    An implementation sets ``outputs`` and implements `observe` and `example_devices`. Loading and moving of
+    meshes is done here, the same way for every sensor; rays are traced by Mitsuba.
+
+    Example:
+        >>> from caviar_protocol.topics import Depth
+        >>> class Range(Sensors[SensorSettings]):
+        ...     outputs = ("depth",)
+        ...     uses_scenery = True
+        ...
+        ...     def example_devices(self):
+        ...         return ()
+        ...
+        ...     def observe(self, mi, traced, scene):
+        ...         ray = mi.Ray3f(mi.Point3f(0, 0, 1), mi.Vector3f(1, 0, 0))
+        ...         distance, face = traced.intersect(mi, ray)
+        ...         return {"depth": Depth(images=())}
     """
 
     role: ClassVar[Role] = "sensors"
@@ -119,7 +134,19 @@ class Sensors(Service[S]):
 
     @abstractmethod
     def observe(self, mi: Any, traced: TracedScene, scene: Scene) -> dict[str, Payload]:
-        """Products by topic of the sensors in ``scene``, to which ``traced`` was brought."""
+        """What the sensors of a scene see.
+
+        Args:
+            mi: Mitsuba, with the variant that is active.
+            traced: The triangles of scenery and objects, moved to where ``scene`` has them.
+            scene: The scenes of all worlds as one.
+
+        Returns:
+            Product by topic, of the topics in demand alone (contract, clause 5).
+
+        Raises:
+            PayloadError: A sensor sits inside its carrier (`pose_outside`).
+        """
 
     @abstractmethod
     def example_devices(self) -> tuple[Device, ...]:
@@ -169,7 +196,13 @@ class Sensors(Service[S]):
 def pose_outside(traced: TracedScene, scene: Scene, device: Device) -> Pose:
     """World pose of a sensor, which must not sit inside the mesh that carries it.
 
-    Raises `PayloadError` naming both and the remedy where it does.
+    Args:
+        traced: The scene for rays.
+        scene: Where the carrier is.
+        device: The sensor.
+
+    Raises:
+        PayloadError: The sensor is inside its carrier; the text names both and the remedy.
     """
     if device.parent and device.parent in scene.names:
         parent = scene.names.index(device.parent)
@@ -183,7 +216,15 @@ def pose_outside(traced: TracedScene, scene: Scene, device: Device) -> Pose:
 
 
 def turned(pose: Pose, local: Float64Array) -> Float64Array:
-    """Vectors in a sensor's axes in world axes, Shape ``[3, N]``."""
+    """Vectors in a sensor's axes in world axes.
+
+    Args:
+        pose: World pose of the sensor.
+        local: Vectors in its axes, Shape ``[3, N]``.
+
+    Returns:
+        The same vectors in world axes, Shape ``[3, N]``.
+    """
     # Written out instead of a matrix product, whose rounding may depend on the BLAS and its threads.
     return np.stack(
         [

@@ -61,7 +61,23 @@ def encoded(result: StepResult) -> Encoded:
 
 
 class ServiceConformance:
-    """Tests of the contract in `caviar_services.service`; a subclass names ``service_class``."""
+    """Tests of the contract in `caviar_services.service`.
+
+    Subclass the class of the role (`caviar_services.testing.CONFORMANCE`) in a test file and set
+    ``service_class``; pytest runs the tests. A class without ``service_class`` is not collected.
+
+    Attributes:
+        service_class: The implementation.
+
+    Example:
+        >>> from caviar_services.agent.baselines import RandomAgent
+        >>> from caviar_services.testing import AgentConformance
+        >>> class TestRandomAgent(AgentConformance):
+        ...     service_class = RandomAgent
+        ...     settings = {"users": ["car.*"]}
+        >>> TestRandomAgent.__test__, AgentConformance.__test__
+        (True, False)
+    """
 
     __test__ = False
 
@@ -88,7 +104,14 @@ class ServiceConformance:
 
     @classmethod
     def build(cls, directory: Path) -> Service[Any]:
-        """The service in a run with the sample street's carriers and devices."""
+        """The service in a run with the sample street's carriers and devices.
+
+        Args:
+            directory: Where a recorder writes, in ``run`` below it.
+
+        Raises:
+            ScenarioError: `settings` are wrong.
+        """
         run = RunInfo(
             name=cls.service_class.role,
             run="conformance",
@@ -103,12 +126,23 @@ class ServiceConformance:
 
     @classmethod
     def street(cls, service: Service[Any], directory: Path) -> Mapping[str, Path]:
-        """Files of scenery by asset name, as the runner would have fetched them."""
+        """Files of scenery by asset name, as the runner would have fetched them.
+
+        Args:
+            service: The service that is tested.
+            directory: Where the files are written.
+        """
         return samples.scenery(directory)
 
     @classmethod
     def frames_of(cls, service: Service[Any], episode: int, count: int = FRAMES) -> list[Frame]:
-        """Grants of an episode. In the last one, whatever is not required is absent."""
+        """Grants of an episode. In the last one, whatever is not required is absent.
+
+        Args:
+            service: The service, whose declared inputs the frames have.
+            episode: Number of the episode.
+            count: Number of frames.
+        """
         optional = {i.topic: "left out" for i in service.inputs if not i.required and i.topic != "*"}
         return [
             Frame(
@@ -126,7 +160,15 @@ class ServiceConformance:
 
     @classmethod
     def prepared(cls, service: Service[Any], directory: Path) -> tuple[Prepared, Mapping[str, Path]]:
-        """Prepare a service with the sample street; what it answers, and the files of scenery."""
+        """Prepare a service with the sample street.
+
+        Args:
+            service: The service.
+            directory: Where the files of scenery are written.
+
+        Returns:
+            What the service answers, and the files of scenery by asset name.
+        """
         assets = cls.street(service, directory / "assets")
         demand = cls.demand or {topic: frozenset(PARTS.get(topic, ())) for topic in service.outputs}
         producers = {topic: (samples.source(topic),) for topic in PAYLOADS}

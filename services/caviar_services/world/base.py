@@ -63,8 +63,33 @@ W = TypeVar("W", bound=WorldSettings)
 class World(Service[W]):
     """Base of all worlds: turns object states into the frame's `Scene`.
 
-    A subclass implements `begin` and `objects_at`, and says with `prefixes` and
-    `mesh_classes` what it may bring.
+    A subclass implements `begin` and `objects_at`, and says with `prefixes` and `mesh_classes` what it may
+    bring.
+
+    Args:
+        settings: Prefix of object names, and the scenery.
+        run: What the world knows about the run; ``run.devices`` are those that it publishes.
+
+    Example:
+        >>> class Still(World[WorldSettings]):
+        ...     def prefixes(self):
+        ...         return ("car.",)
+        ...
+        ...     def mesh_classes(self):
+        ...         return ("car",)
+        ...
+        ...     def begin(self, episode, seed):
+        ...         pass
+        ...
+        ...     def objects_at(self, elapsed_ns):
+        ...         yield ObjectState(
+        ...             "car.1", "car", (0.0, 0.0, 0.75), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (4.6, 1.9,
+        1.5)
+        ...         )
+        >>> world = Still(WorldSettings(), RunInfo(name="world"))
+        >>> world.reset(0, 1, 0)
+        >>> world.step(Frame(episode=0, number=0, t_ns=0)).products["scene"].names
+        ('car.1',)
     """
 
     role: ClassVar[Role] = "world"
@@ -89,10 +114,14 @@ class World(Service[W]):
 
     @classmethod
     def placements(cls, settings: W) -> Iterable[tuple[str, str, Sequence[Vector]]]:
-        """Where settings put objects, so that what is implausible is warned of before the run.
+        """Where settings put objects, for a warning of implausible positions before the run.
 
-        Key within the settings, name of the object, positions [m] in world axes; none where the world learns
-        them from elsewhere.
+        Args:
+            settings: The settings of the world.
+
+        Returns:
+            Key within the settings, name of the object, and positions [m] in world axes, for each object;
+            nothing where the world learns positions from elsewhere.
         """
         return ()
 
@@ -103,7 +132,10 @@ class World(Service[W]):
 
     @abstractmethod
     def prefixes(self) -> tuple[str, ...]:
-        """What the names of this world's objects begin with; whole names where they are known."""
+        """What the names of this world's objects begin with; whole names where they are known.
+
+        The broker refuses a run in which two worlds share a prefix (contract, clause 3).
+        """
 
     @abstractmethod
     def mesh_classes(self) -> tuple[str, ...]:
@@ -111,13 +143,26 @@ class World(Service[W]):
 
     @abstractmethod
     def begin(self, episode: int, seed: int) -> None:
-        """Go to the state that objects have at the start of an episode."""
+        """Go to the state that objects have at the start of an episode.
+
+        Args:
+            episode: Number of the episode from the first one with this seed.
+            seed: Of the episode; equal arguments lead to equal scenes, bit by bit.
+        """
 
     @abstractmethod
     def objects_at(self, elapsed_ns: int) -> Iterable[ObjectState]:
-        """The objects [ns] after the episode's start, those that came first in front.
+        """The objects at an instant.
 
-        Instants never decrease within an episode; a world steps the whole way to the next one.
+        Args:
+            elapsed_ns: Time from the episode's start [ns]. It never decreases within an episode; a world
+                steps the whole way to it.
+
+        Returns:
+            One `ObjectState` an object, those that came first in front.
+
+        Raises:
+            RunError: The simulation behind the world has failed.
         """
 
     def scenery(self) -> Mapping[str, Path | bytes]:
