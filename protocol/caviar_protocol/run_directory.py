@@ -56,6 +56,11 @@ class RunDirectory:
         return self.path / "summary.json"
 
     @property
+    def summary_table(self) -> Path:
+        """The same figures as the table that ``caviar run`` prints."""
+        return self.path / "summary.txt"
+
+    @property
     def control_socket(self) -> Path:
         """Unix socket at which the broker takes commands, where the file system has such sockets."""
         return self.path / "control.sock"

@@ -282,7 +282,7 @@ def _write_summary(summary: Mapping[str, Any], directory: Path, json_file: Path 
     if summary["frames"]:
         table = StringIO()
         _show(Console(file=table, width=100), summary)
-        write_file(directory / "summary.txt", table.getvalue())
+        write_file(RunDirectory(directory).summary_table, table.getvalue())
 
 
 def _check_http(http: str, keys: Path | None, embedded: bool) -> None:
