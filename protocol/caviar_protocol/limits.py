@@ -19,3 +19,6 @@ MAX_ASSET_CHUNK = 4 << 20
 
 MAX_IN_FLIGHT = 64
 """Grants that a service may be asked to queue."""
+
+MAX_SUBCARRIERS = 65536
+"""Subcarriers of a carrier."""

@@ -162,9 +162,9 @@ def test_name_then_pattern_then_class_say_what_an_object_is_made_of() -> None:
             "has no material 'glas'",
         ),
         (
-            {"object_materials": {"car": "glass"}, "materials": {"glass": {"thickness_m": -1.0}}},
-            "materials.glass",
-            "material 'glass': .*correct it",
+            {"object_materials": {"car": "tin"}, "materials": {"tin": {"relative_permittivity": 1.0}}},
+            "object_materials.car",
+            "no ITU material 'tin'; write materials.tin.conductivity_s_per_m for one of your own, or ",
         ),
     ],
 )

@@ -197,6 +197,11 @@ class TestPreparing:
         with pytest.raises(AssetError, match=r"floor\.ply"):
             prepared(assets)
 
+    @pytest.mark.parametrize("count", [-3, 4097, 1_000_000])
+    def test_a_pool_has_the_limits_of_bodies(self, count: int) -> None:
+        with pytest.raises(msgspec.ValidationError, match=r"Expected `int` .*\$\.pool"):
+            model(pool={"box": count})
+
     def test_a_pool_for_a_mesh_that_is_not_there_is_named(self) -> None:
         with pytest.raises(ScenarioError, match=r"pool: there is no object mesh 'lorry'.*box"):
             prepared(pool={"lorry": 3})

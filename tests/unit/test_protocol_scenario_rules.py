@@ -198,6 +198,32 @@ def test_limits_are_read_and_the_others_keep_their_defaults() -> None:
     assert found == Limits(part_mib=8, waiting_mib=9, messages_per_s=4.0)
 
 
+@pytest.mark.parametrize(
+    ("keys", "told"),
+    [
+        (
+            "subcarrier_spacing_hz = 1.0",
+            "subcarrier_spacing_hz: is 1 Hz, .* more than 65536; write at least 1525.88",
+        ),
+        ("subcarrier_spacing_hz = 1e-300", "subcarrier_spacing_hz: is 1e-300 Hz"),
+        ("subcarrier_spacing_hz = 1e-310", "subcarrier_spacing_hz: is 1e-310 Hz"),
+        ("subcarrier_spacing_hz = 2e8", "subcarrier_spacing_hz: is 2e[+]08 Hz, wider than bandwidth_hz"),
+        ("bandwidth_hz = 1e300", r"bandwidth_hz: is 1e\+300 Hz, write 1 to 1e\+12"),
+        ("bandwidth_hz = 1e-300", r"bandwidth_hz: is 1e-300 Hz, write 1 to 1e\+12"),
+    ],
+)
+def test_a_numerology_that_cannot_be_is_refused_by_key_and_line(keys: str, told: str) -> None:
+    text = TEXT.replace("frequency_hz = 1e9", f"frequency_hz = 1e9\n{keys}")
+    with pytest.raises(ScenarioError, match=rf"x\.toml:\d+: carriers\[0\]\.{told}"):
+        parse_scenario(text, "x.toml")
+
+
+def test_the_finest_numerology_is_as_many_subcarriers_as_there_may_be() -> None:
+    spacing = 100e6 / 65536
+    text = TEXT.replace("frequency_hz = 1e9", f"frequency_hz = 1e9\nsubcarrier_spacing_hz = {spacing!r}")
+    assert parse_scenario(text, "x.toml").carriers[0].subcarriers == 65536
+
+
 class Inner(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     samples: Annotated[int, quantity("1", "rays", ge=1)] = 10
 

@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 
 from caviar_protocol.errors import ScenarioError, suggestion
+from caviar_protocol.limits import MAX_SUBCARRIERS
 from caviar_protocol.scenario.conversion import Place, convert_table
 from caviar_protocol.scenario.schema import DeviceSpec, Scenario, ServiceSpec
 from caviar_protocol.topics import PARTS, PAYLOADS
@@ -431,6 +432,10 @@ def _check_ascending(
         raise place.error(f"is [{low}, {high}], write two ascending numbers, at least {least}{upper}")
 
 
+_BANDWIDTHS_HZ = (1.0, 1e12)
+"""[Hz]; beyond, numbers of noise powers and of taps overflow."""
+
+
 def with_numerology(carrier: Carrier, sampling_period_ns: int | None, place: Place) -> Carrier:
     """The carrier with the spacing, number or slot duration that follows from its other keys.
 
@@ -440,15 +445,23 @@ def with_numerology(carrier: Carrier, sampling_period_ns: int | None, place: Pla
         place: Where the carrier stands in the scenario.
 
     Raises:
-        ScenarioError: Subcarriers do not fit into the bandwidth, or slots have no duration; the text names
-            the key.
+        ScenarioError: The bandwidth is no carrier's, subcarriers are too many or do not fit into
+            it, or slots have no duration; the text names the key.
     """
     count, spacing, bandwidth = carrier.subcarriers, carrier.subcarrier_spacing_hz, carrier.bandwidth_hz
+    least, most = _BANDWIDTHS_HZ
+    if not least <= bandwidth <= most:
+        raise place.at("bandwidth_hz").error(f"is {bandwidth:g} Hz, write {least:g} to {most:g}")
     if spacing > bandwidth * (1 + 1e-9):
         raise place.at("subcarrier_spacing_hz").error(
             f"is {spacing:g} Hz, wider than bandwidth_hz = {bandwidth:g}; write at most the bandwidth"
         )
     if spacing and not count:
+        if bandwidth / MAX_SUBCARRIERS > spacing:
+            raise place.at("subcarrier_spacing_hz").error(
+                f"is {spacing:g} Hz, of which bandwidth_hz = {bandwidth:g} has more than {MAX_SUBCARRIERS}; "
+                f"write at least {bandwidth / MAX_SUBCARRIERS:g}, or subcarriers"
+            )
         # 100e6 / 120e3 and the like must not lose a subcarrier to rounding.
         count = math.floor(bandwidth / spacing * (1 + 1e-12))
     elif count and not spacing:

@@ -21,6 +21,7 @@ from caviar_protocol.arrays import (
     quantity,
 )
 from caviar_protocol.errors import PayloadError
+from caviar_protocol.limits import MAX_SUBCARRIERS
 
 PLANE_WAVES = ("free-space", "geometric", "siso-rt")
 """Rungs on which arrays see plane waves: H follows from the paths between their reference points."""
@@ -48,7 +49,10 @@ class Carrier(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     frequency_hz: Annotated[float, quantity("Hz", "centre frequency", gt=0)]
     bandwidth_hz: Annotated[float, quantity("Hz", "noise and rate bandwidth", gt=0)] = 100e6
     subcarriers: Annotated[
-        int, quantity("1", "subcarriers K of part `hf`; 0: the carrier has no part `hf`", ge=0, le=65536)
+        int,
+        quantity(
+            "1", "subcarriers K of part `hf`; 0: the carrier has no part `hf`", ge=0, le=MAX_SUBCARRIERS
+        ),
     ] = 0
     subcarrier_spacing_hz: Annotated[
         float, quantity("Hz", "between neighbouring subcarriers; above 0 where there are any", ge=0)

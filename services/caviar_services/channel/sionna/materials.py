@@ -45,6 +45,13 @@ class MaterialSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
         """Whether both electric constants are given, so that no ITU material is needed."""
         return self.relative_permittivity is not None and self.conductivity_s_per_m is not None
 
+    def missing(self, name: str) -> str:
+        """What a material of the user's own, of this name, lacks; empty where neither constant is given."""
+        lacking = [
+            key for key in ("relative_permittivity", "conductivity_s_per_m") if getattr(self, key) is None
+        ]
+        return f"write materials.{name}.{lacking[0]} for one of your own, or " if len(lacking) == 1 else ""
+
     def applied(self, constants: Constants) -> Constants:
         """These constants with the changes."""
         permittivity, conductivity = constants
@@ -145,7 +152,8 @@ def itu_material(
     if table is None:
         known = sorted({*ITU_MATERIALS_PROPERTIES, *OTHER_MATERIALS})
         raise ScenarioError(
-            f"there is no ITU material {itu_type!r}; {suggestion(itu_type, known)}",
+            f"there is no ITU material {itu_type!r}; {policy.of(itu_type).missing(itu_type)}"
+            f"{suggestion(itu_type, known)}",
             key=f"{policy.key}.{name}" if remedy else f"{policy.key}.materials.{name}",
         )
     gigahertz, label = frequency_hz / 1e9, itu_type if other else f"ITU {itu_type}"

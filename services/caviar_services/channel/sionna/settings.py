@@ -26,6 +26,9 @@ _SCENERY_SAMPLES = 10_000_000
 """Of a launch before the first one."""
 
 
+BodyCount = Annotated[int, quantity("1", "moving objects of one mesh at most", ge=0, le=4096)]
+
+
 class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     """What is modelled, and how finely."""
 
@@ -105,8 +108,8 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
         float, quantity("GiB", "for rays, and element pairs, looked at or traced together", gt=0, le=1024)
     ] = 4.0
     """Rays are launched in parts of a million at most, and of fewer where this asks for it."""
-    bodies: Annotated[int, quantity("1", "moving objects of one mesh at most", ge=0, le=4096)] = 32
-    pool: dict[str, int] = msgspec.field(default_factory=dict)
+    bodies: BodyCount = 32
+    pool: dict[str, BodyCount] = msgspec.field(default_factory=dict)
     """Bodies of single meshes where ``bodies`` does not fit, by file name without ending: ``car = 64``;
     ``box`` for objects without a mesh."""
     without_body: tuple[str, ...] = ()
