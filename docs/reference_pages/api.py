@@ -99,7 +99,7 @@ def hide_signature(app: Any, kind: str, name: str, member: Any, *_: Any) -> tupl
 
 def finish_docstring(app: Any, kind: str, name: str, member: Any, options: Any, lines: list[str]) -> None:
     """Make reStructuredText of a docstring: sections of parameters, and the fields of a struct as a table."""
-    text = [_escaped(line) for line in lines]
+    text = list(_with_plain_characters(lines))
     if kind not in ("attribute", "data", "property"):  # there Napoleon reads «x: y» as a type
         for style in (NumpyDocstring, GoogleDocstring):
             text = style(text, app.config, app, kind, name, member, options).lines()
@@ -125,6 +125,16 @@ def _field_table(cls: type[msgspec.Struct]) -> Iterator[str]:
 
 _MARKED = re.compile(r"(``.*?``|`[^`]*`|\*\*[^*]+\*\*|(?<![\w*])\*[^\s*](?:[^*]*[^\s*])?\*(?![\w*]))")
 """Code, bold words and emphasis."""
+
+
+def _with_plain_characters(lines: list[str]) -> Iterator[str]:
+    """Lines with stars and bars as characters; those of examples and literal blocks stay as they are."""
+    literal = False
+    for line in lines:
+        example = line.lstrip().startswith((">>> ", "... "))
+        literal = literal and (not line or line.startswith(" "))
+        yield line if example or literal else _escaped(line)
+        literal = literal or line.endswith("::")
 
 
 def _escaped(line: str) -> str:

@@ -81,5 +81,8 @@ def test_the_path_of_a_frame_goes_through_every_role(reference: ModuleType) -> N
 
 def test_stars_and_bars_in_docstrings_are_characters(reference: ModuleType) -> None:
     lines = ["|y| of ``a | b``", "* a bullet with w* H f", "*emphasis*, **bold** and 2*3"]
-    reference.api.finish_docstring(None, "data", "x", 0, None, lines)
-    assert lines == [r"\|y\| of ``a | b``", r"* a bullet with w\* H f", r"*emphasis*, **bold** and 2\*3"]
+    code = [">>> f(*a)", "as in::", "", "    2*3", ""]
+    text = [*lines, *code, "2*3"]
+    reference.api.finish_docstring(None, "data", "x", 0, None, text)
+    expected = [r"\|y\| of ``a | b``", r"* a bullet with w\* H f", r"*emphasis*, **bold** and 2\*3"]
+    assert text == [*expected, *code, r"2\*3"]
