@@ -82,10 +82,8 @@ class World(Service[W]):
         ...         pass
         ...
         ...     def objects_at(self, elapsed_ns):
-        ...         yield ObjectState(
-        ...             "car.1", "car", (0.0, 0.0, 0.75), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (4.6, 1.9,
-        1.5)
-        ...         )
+        ...         at, level, still = (0.0, 0.0, 0.75), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+        ...         yield ObjectState("car.1", "car", at, level, still, (4.6, 1.9, 1.5))
         >>> world = Still(WorldSettings(), RunInfo(name="world"))
         >>> world.reset(0, 1, 0)
         >>> world.step(Frame(episode=0, number=0, t_ns=0)).products["scene"].names
