@@ -50,6 +50,11 @@ _MADE_OF_SCENES = frozenset({"channel", "link", "lidar", "camera", "depth", "seg
 FIRST_LOOKS = 16
 """Products of each source that every consumer looks at, and of which it compares the digest."""
 
+_MAX_AMPLITUDE = 1e9
+"""Of paths and channels; antennas of 60 dBi each make 1e6 of a path without any loss."""
+_MAX_TAP = 2**53
+"""Of the first tap: doubles hold whole numbers up to here."""
+
 
 class ContentRules(SceneRules, frozen=True, kw_only=True):
     """What the run says about products, beside scenes; what is not known is not checked."""
@@ -199,11 +204,38 @@ def _wrong_channel(channel: Channel) -> str:
     if not found and channel.tau.size and not channel.tau.min() >= 0:
         index = int(np.argmin(channel.tau))
         found = f"tau[{index}] is {channel.tau[index]:g} s: a delay is at least 0"
+    if not found and not math.isfinite(channel.expected_error_db or 0.0):
+        found = f"expected_error_db is {channel.expected_error_db}: leave it out where it is not known"
     parts = {"h": channel.h, "hf": channel.hf, "taps": channel.taps}
-    return found or next(
-        (f"{n}[{i}]: {f}" for n, part in parts.items() for i, m in enumerate(part) if (f := _not_finite(m))),
-        "",
+    entries = ((f"{name}[{i}]: ", entry) for name, part in parts.items() for i, entry in enumerate(part))
+    return (
+        found
+        or _wrong_gains(channel, "a")
+        or next((place + f for place, entry in entries if (f := _wrong_gains(entry, "h"))), "")
+        or _wrong_first_tap(channel.taps)
     )
+
+
+def _wrong_gains(payload: Payload, field: str) -> str:
+    """What is wrong with amplitude gains: numbers that are none, or that no antennas have."""
+    values = getattr(payload, field)
+    # A sum of squares bounds every term of it; of large responses one look is enough.
+    with np.errstate(over="ignore", invalid="ignore"):
+        if np.vdot(values, values).real <= _MAX_AMPLITUDE**2:
+            return ""
+    if found := _not_finite(payload):
+        return found
+    strongest = float(np.abs(values.astype(np.complex128)).max())
+    if strongest <= _MAX_AMPLITUDE:
+        return ""
+    return f"{field} has an amplitude gain of {strongest:g}: at most {_MAX_AMPLITUDE:g} is possible"
+
+
+def _wrong_first_tap(taps: Sequence[ChannelTaps]) -> str:
+    for index, entry in enumerate(taps):
+        if abs(entry.first) > _MAX_TAP:
+            return f"taps[{index}].first is {entry.first}: it is a sample, at most {_MAX_TAP} from delay 0"
+    return ""
 
 
 def _wrong_link(link: Link) -> str:

@@ -25,6 +25,8 @@ from caviar_protocol.topics import (
     AntennaDevice,
     CameraDevice,
     Channel,
+    ChannelResponse,
+    ChannelTaps,
     Lidar,
     Link,
     Scene,
@@ -259,11 +261,28 @@ def matrix(value: complex) -> Channel:
     return replace(channel, h=(replace(channel.h[0], h=h),))
 
 
+def wideband(part: str, value: float, first: int = 0) -> Payload:
+    h = np.full((1, 1, 1, 1), value, np.complex64)
+    response = ChannelResponse(carrier=0, tx=0, rx=0, h=h)
+    taps = ChannelTaps(carrier=0, tx=0, rx=0, first=first, h=h)
+    return made("channel", **{part: (response if part == "hf" else taps,)})
+
+
 VALUES: dict[str, tuple[Callable[[], Payload], str]] = {
     "delay": (lambda: made("channel", tau=np.array([-1e-9])), r"tau\[0\] is -1e-09 s"),
     "nan delay": (lambda: made("channel", tau=np.array([np.nan])), r"Channel.tau\[0\] is nan"),
     "gain": (lambda: made("channel", a=np.array([[complex(np.inf, 0)]])), r"Channel.a\[0, 0\] is"),
     "h": (lambda: matrix(complex(0, np.nan)), r"h\[0\]: ChannelMatrix.h\[1, 2\] is"),
+    "strong path": (
+        lambda: made("channel", a=np.array([[1e200 + 0j]])),
+        "a has an amplitude gain of 1e.200",
+    ),
+    "strong h": (lambda: matrix(1e204 + 0j), r"h\[0\]: h has an amplitude gain of 1e[+]204: at most 1e[+]09"),
+    "strong hf": (lambda: wideband("hf", 1e30), r"hf\[0\]: h has an amplitude gain of 1e[+]30"),
+    "hf": (lambda: wideband("hf", np.nan), r"hf\[0\]: ChannelResponse.h\[0, 0, 0, 0\] is"),
+    "taps": (lambda: wideband("taps", np.inf), r"taps\[0\]: ChannelTaps.h\[0, 0, 0, 0\] is"),
+    "first tap": (lambda: wideband("taps", 1.0, 2**63), r"taps\[0\].first is 9223372036854775808"),
+    "expected error": (lambda: made("channel", expected_error_db=np.nan), "expected_error_db is nan: leave"),
     "|y|": (lambda: made("link", abs_y=np.array([-0.5])), "abs_y is -0.5"),
     "snr": (lambda: made("link", snr=np.array([np.nan])), r"Link.snr\[0\] is nan"),
     "range": (lambda: scan(range=np.array([1.0, -3.0], "<f4")), "scan of 'car.1/lidar': range is -3 m"),
