@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
-PACKAGES = ("caviar_protocol", "caviar_broker", "caviar_services", "caviar_clients")
+PACKAGES = ("caviar_protocol", "caviar_broker", "caviar_services", "caviar_clients", "caviar")
 HEAVY = (
     "mitsuba", "drjit", "sionna", "torch", "libsumo", "sumolib", "traci", "sumo", "matplotlib",
     "scipy", "pytest", "hypothesis",

@@ -78,7 +78,7 @@ def test_a_service_that_is_not_run_stands_on_the_screen_and_in_the_summary(
         end = text.index("\n\n", begin)
         text = text[:begin] + text[begin:end].replace("# ", "") + text[end:]
     path.write_text(text)
-    assert run_scenario(path, tmp_path / "runs", Console(width=300), frames=2, embedded=True) == 0
+    assert run_scenario(path, tmp_path / "runs", Console(width=300), frames=2, embedded=True).status == 0
     said = 'no service takes its lidar, so it is not run; add "lidar" to run.record'
     assert f"idle: lidar: {said}" in capsys.readouterr().out
     (directory,) = (tmp_path / "runs").iterdir()

@@ -297,7 +297,8 @@ def test_a_run_with_a_warning_prints_it_keeps_it_and_ends_with_status_0(tmp_path
     path = scenario(tmp_path, ("28e9", "28"))
     console = Console(record=True, width=300)
     report = tmp_path / "summary.json"
-    assert run_scenario(path, tmp_path / "runs", console, frames=3, json_file=report, embedded=True) == 0
+    ended = run_scenario(path, tmp_path / "runs", console, frames=3, json_file=report, embedded=True)
+    assert ended.status == 0
     summary = json.loads(report.read_text())
     (warning,) = summary["warnings"]
     assert "carriers[0].frequency_hz: is 28 Hz" in warning

@@ -94,14 +94,13 @@ def run(
 
     if resume is not None:
         _nothing_else(scenario, frames, seed, embedded or None, pace)
-        raise typer.Exit(resume_run(resume, _console, json, bind, keys, http, force=force))
+        raise typer.Exit(resume_run(resume, _console, json, bind, keys, http, force=force).status)
     if scenario is None:
         raise RunError(
             "give a scenario, by name (caviar scenarios) or file, or --resume with the directory of a run"
         )
-    raise typer.Exit(
-        run_scenario(scenario, out, _console, frames, seed, json, bind, embedded, keys, http, pace)
-    )
+    ended = run_scenario(scenario, out, _console, frames, seed, json, bind, embedded, keys, http, pace)
+    raise typer.Exit(ended.status)
 
 
 @app.command(rich_help_panel=RUN)

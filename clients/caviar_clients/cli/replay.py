@@ -53,10 +53,10 @@ def replay_run(
     with tempfile.TemporaryDirectory(prefix="caviar-replay-") as folder:
         scenario, figures = Path(folder) / f"{plan.scenario.run.name}.toml", Path(folder) / "summary.json"
         scenario.write_text(scenario_text(plan.scenario))
-        status = run_scenario(
+        ended = run_scenario(
             scenario, out, console, plan.frames, json_file=json_file or figures, embedded=embedded
         )
-        return status or _compared(plan, json_file or figures, console)
+        return ended.status or _compared(plan, json_file or figures, console)
 
 
 def _tell(plan: ReplayPlan, run: RecordedRun, console: Console) -> None:

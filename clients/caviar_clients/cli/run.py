@@ -14,7 +14,7 @@ from datetime import datetime
 from io import StringIO
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 from rich.console import Console
@@ -168,6 +168,15 @@ def run_directory(root: Path, name: str) -> Path:
     raise RunError(f"{root} has a thousand runs named {stem}; choose another directory with --out")
 
 
+class RunOutcome(NamedTuple):
+    """How a run ended."""
+
+    directory: Path
+    status: int
+    """Exit status: 0 exactly if the run came to its end, 130 after Ctrl-C."""
+    error: str
+
+
 def run_scenario(
     path: Path,
     out: Path,
@@ -180,8 +189,8 @@ def run_scenario(
     keys: Path | None = None,
     http: str = "",
     pace: str | None = None,
-) -> int:
-    """Run a scenario; the exit status: 0 exactly if it came to its end."""
+) -> RunOutcome:
+    """Run a scenario."""
     scenario = checked_scenario(path, frames, seed, pace)
     if bind:
         check_bind(bind, keys=keys is not None)
@@ -216,8 +225,8 @@ def resume_run(
     http: str = "",
     *,
     force: bool = False,
-) -> int:
-    """Go on with a run whose broker died; the exit status: 0 exactly if it came to its end."""
+) -> RunOutcome:
+    """Resume a run whose broker died."""
     scenario = read_record(directory).scenario
     if json_file is not None:
         write_file(json_file)
@@ -238,7 +247,7 @@ def _follow(
     warnings: Sequence[str] = (),
     *,
     new: bool = False,
-) -> int:
+) -> RunOutcome:
     """Show a run to its end, and sum it up; ``warnings`` are those of its scenario.
 
     The directory of a ``new`` run that the user stops before its first frame is removed.
@@ -254,7 +263,7 @@ def _follow(
     if outcome.get("disk"):
         words = f"{outcome['error']}; there is no summary, since {outcome['disk']}"
         console.print(Text.assemble(("the run ended early:", "red"), f" {words}"), soft_wrap=True)
-        return 130 if interrupted.came else 1
+        return RunOutcome(directory, 130 if interrupted.came else 1, outcome["error"])
     outcome = with_recording_checked(directory, scenario, outcome)
     recorded = recorded_figures(directory) if outcome["frames"] else None
     told = [*warnings, *watcher.warnings, *watcher.idle.values()]
@@ -271,7 +280,8 @@ def _follow(
     if new and interrupted.came and not outcome["frames"]:
         shutil.rmtree(directory, ignore_errors=True)
         console.print(Text(f"no frame was simulated; {directory} is removed"), soft_wrap=True)
-    return 130 if interrupted.came else 1 if outcome["error"] else 0
+    status = 130 if interrupted.came else 1 if outcome["error"] else 0
+    return RunOutcome(directory, status, outcome["error"])
 
 
 def _write_summary(summary: Mapping[str, Any], directory: Path, json_file: Path | None) -> None:

@@ -1,0 +1,95 @@
+"""CAVIAR from a program or a notebook: run a scenario, open its recording, make an environment.
+
+>>> import caviar
+>>> run = caviar.run("smoke", frames=100, out="results")
+>>> recording = caviar.open(run)
+>>> recording["channel"].h.shape  # frames × users × Nr × Nt
+(100, 2, 4, 32)
+
+Importing this package registers the environments, so that ``gymnasium.make("caviar:caviar/BeamSelection-v0",
+scenario="geometric")`` needs no other import. Ray tracer, SUMO and broker are loaded when a run needs them.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import caviar_clients.envs as _registered  # noqa: F401
+
+if TYPE_CHECKING:
+    from caviar_protocol.recording import Recording
+    from caviar_protocol.scenario import Scenario
+
+__all__ = ["load_scenario", "open", "run"]
+
+
+def load_scenario(scenario: str | Path) -> Scenario:
+    """Read and check a scenario.
+
+    Args:
+        scenario: Name of a scenario that ships (``caviar scenarios``), or a TOML file.
+
+    Raises:
+        ScenarioError: A key or value is wrong; the text has file, line and remedy.
+
+    Example:
+        >>> caviar.load_scenario("smoke").run.sampling_period_ns
+        100000000
+    """
+    from caviar_protocol.scenario import find_scenario
+    from caviar_protocol.scenario import load_scenario as load
+
+    return load(find_scenario(Path(scenario)))
+
+
+def run(
+    scenario: str | Path,
+    *,
+    frames: int | None = None,
+    seed: int | None = None,
+    out: str | Path = "runs",
+    embedded: bool = False,
+    progress: bool = False,
+) -> Path:
+    """Run a scenario to its end, as ``caviar run`` does; only the main thread of a program can.
+
+    Args:
+        scenario: Name of a scenario that ships, or a TOML file.
+        frames: Frames of each episode; None for those of the scenario.
+        seed: Of all random numbers; None for that of the scenario.
+        out: Directory in which the run's own is made.
+        embedded: Whether all services run in this process, without sockets; the digest is the same.
+        progress: Whether to print what ``caviar run`` prints.
+
+    Returns:
+        The directory of the run: recording, summary, logs.
+
+    Raises:
+        ScenarioError: A key or value of the scenario is wrong.
+        RunError: The run did not come to its end; the text has the cause and the directory.
+    """
+    from rich.console import Console
+
+    from caviar_clients.cli.run import run_scenario
+    from caviar_protocol.errors import RunError
+
+    console = Console(quiet=not progress)
+    outcome = run_scenario(Path(scenario), Path(out), console, frames, seed, embedded=embedded)
+    if outcome.status:
+        raise RunError(f"the run in {outcome.directory} ended early: {outcome.error}")
+    return outcome.directory
+
+
+def open(run: str | Path | None = None) -> Recording:  # noqa: A001 - read as caviar.open
+    """Open the recording of a run.
+
+    Args:
+        run: Directory of the run; None for the newest one below ``runs``.
+
+    Raises:
+        RecordingError: There is no recording, or it is damaged; the text has the place and the remedy.
+    """
+    from caviar_protocol.recording import Recording, newest_run
+
+    return Recording(newest_run() if run is None else run)

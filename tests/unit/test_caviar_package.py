@@ -1,0 +1,55 @@
+"""`caviar`, the package that users import: runs, recordings, scenarios, environments."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import caviar
+from caviar_protocol.errors import RecordingError, RunError, ScenarioError
+
+
+def test_a_run_gives_its_directory_and_open_reads_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(RecordingError, match="no run with a recording"):
+        caviar.open()
+    run = caviar.run("smoke", frames=3, seed=7, embedded=True)
+    assert capsys.readouterr().out == ""
+    assert (len(caviar.open(run)), caviar.open().directory.name) == (3, run.name)
+    assert json.loads((run / "summary.json").read_text())["seed"] == 7
+
+
+def test_a_run_that_ends_early_raises_its_cause(tmp_path: Path) -> None:
+    path = tmp_path / "sick.toml"
+    text = Path(__file__).parents[2].joinpath("deploy/caviar_scenarios/smoke.toml").read_text()
+    sick = """
+[services.sick]
+role = "sensors"
+use = "runner_services:Sensors"
+budget_ms = 50
+settings = { wrong = "step" }
+"""
+    path.write_text(text.replace("record = [", 'record = ["lidar", ') + sick)
+    with pytest.raises(RunError, match=r"the run in .*smoke-.* ended early: .*nothing to divide in step"):
+        caviar.run(path, frames=3, out=tmp_path, embedded=True)
+
+
+def test_a_scenario_is_loaded_by_name_and_by_file(tmp_path: Path) -> None:
+    assert caviar.load_scenario("smoke").run.name == "smoke"
+    with pytest.raises(ScenarioError, match="did you mean 'smoke'"):
+        caviar.load_scenario("smokee")
+
+
+def test_an_environment_needs_no_other_import() -> None:
+    code = (
+        "import gymnasium; env = gymnasium.make('caviar:caviar/BeamSelection-v0', scenario='geometric'); "
+        "print(env.reset(seed=1)[1].keys() is not None); env.close()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout.strip()) == (0, "True"), done.stderr[-2000:]
