@@ -427,35 +427,6 @@ class ServiceSession:
         self._send(m.Error(code="unexpected", of=kind, message=f"{kind} is not used: {why}"), ())
 
 
-class OutsideSession(ServiceSession):
-    """A session whose frames are answered from outside of the run, by `answer`, and not by the service."""
-
-    frame: Frame | None = None
-    """The frame that is granted and not answered."""
-    _granted: m.Grant | None = None
-
-    def answer(self, result: StepResult) -> None:
-        """Answer `frame`.
-
-        Raises:
-            RunError: No frame is granted.
-            PayloadError: A product is not its topic's.
-        """
-        grant, self._granted, self.frame = self._granted, None, None
-        if grant is None:
-            raise RunError(f"{self.name!r} was granted no frame that could be answered")
-        self._send(*self._done(grant, result, 0))
-
-    def _step(self, reset: m.Reset, grant: m.Grant, parts: Sequence[Any]) -> Answer | None:
-        with self._reporting("step", grant.episode, grant.frame):
-            frame = self._frame(reset, grant, parts)
-            for item in frame.inputs:
-                if item.present:
-                    item.payload  # noqa: B018 - checked here, where a wrong one ends the run with blame
-            self._granted, self.frame = grant, frame
-        return None
-
-
 @dataclass
 class _Fetch:
     """Scenery on its way from the broker."""

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 import pytest
 
+from caviar_clients.session.embedded import OutsideSession
 from caviar_protocol import messages as m
 from caviar_protocol.assets import AssetStore
 from caviar_protocol.errors import RunError
@@ -17,7 +18,7 @@ from caviar_protocol.validation import ContentCheck
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.conversion import frame_of
 from caviar_services.service import Frame, NoSettings, RunInfo, Service, StepResult
-from caviar_services.session import OutsideSession, ServiceSession
+from caviar_services.session import ServiceSession
 
 SERVICE = FreeSpaceChannel(
     FreeSpaceSettings(), RunInfo(name="channel", carriers=(Carrier(name="c", frequency_hz=1e9),))
