@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 from caviar_clients.cli.scenarios import new_scenario
-from caviar_clients.session.checks import checked_scenario
+from caviar_clients.session.checks import checked_scenario, module_folders
 from caviar_protocol.errors import ScenarioError
+from caviar_protocol.scenario import parse_scenario
 
 
 @pytest.mark.parametrize(
@@ -30,3 +31,28 @@ def test_an_unknown_setting_names_the_implementation_and_what_it_has(
     path.write_text(path.read_text().replace(old, new, 1))
     with pytest.raises(ScenarioError, match=rf"^{path}:\d+: services\.channel\.settings\.{words}"):
         checked_scenario(path)
+
+
+def test_modules_of_rungs_are_looked_for_beside_the_scenario_too(tmp_path: Path) -> None:
+    text = """
+[run]
+name = "x"
+frames = 1
+[[carriers]]
+name = "c"
+frequency_hz = 1e9
+[services.world]
+role = "world"
+use = "trajectory"
+budget_ms = 5
+[services.channel]
+role = "channel"
+use = "adaptive"
+budget_ms = 5
+[[services.channel.settings.ladder]]
+label = "one"
+use = "mine:Channel"
+"""
+    file = str(tmp_path / "x.toml")
+    assert module_folders(parse_scenario(text, file)) == (tmp_path, Path.cwd())
+    assert module_folders(parse_scenario(text.replace("mine:Channel", "free-space"), file)) == ()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -45,12 +45,24 @@ def checked_scenario(
 def module_folders(scenario: Scenario) -> tuple[Path, ...]:
     """Where modules of services that are named ``module:Class`` may lie: beside the scenario, and here.
 
-    Empty where no service is named so.
+    Empty where no service is named so, and no rung of a service's settings.
     """
-    if not any(":" in spec.use for spec in scenario.services.values()):
+    named = (name for spec in scenario.services.values() for name in (spec.use, *_used_by(spec.settings)))
+    if not any(":" in name for name in named):
         return ()
     beside = (Path(scenario.source.file).resolve().parent,) if scenario.source.file else ()
     return (*beside, Path.cwd())
+
+
+def _used_by(settings: object) -> Iterator[str]:
+    """Implementations that tables within settings name with ``use``, as the rungs of ``adaptive`` do."""
+    if isinstance(settings, Mapping):
+        if isinstance(name := settings.get("use"), str):
+            yield name
+        settings = settings.values()
+    if isinstance(settings, Iterable) and not isinstance(settings, str):
+        for value in settings:
+            yield from _used_by(value)
 
 
 def _check_keys(spec: ServiceSpec, implementation: type[Service[Any]], place: Place) -> None:
