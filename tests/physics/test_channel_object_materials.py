@@ -29,7 +29,7 @@ from channel_lab import (
 
 from caviar_protocol.errors import AssetError, ScenarioError
 from caviar_protocol.topics import Channel, Interaction, Scene
-from caviar_services.channel.sionna.object_materials import OTHER_MATERIALS, ObjectMaterials, body_kind
+from caviar_services.channel.sionna.materials import OTHER_MATERIALS, ObjectMaterials, body_kind
 
 pytestmark = pytest.mark.channel
 

@@ -7,9 +7,9 @@ import itertools
 import numpy as np
 import pytest
 
-from caviar_services.channel.enumeration import chain_tree
-from caviar_services.channel.enumeration.chain_tree import ChainTree
+from caviar_services.channel.enumeration import scenery_chains
 from caviar_services.channel.enumeration.face_rectangles import FaceRectangles, narrowest_sides
+from caviar_services.channel.enumeration.scenery_chains import ChainTree
 
 SIGHTS = np.array([[2, 5], [2, 7], [5, 2], [7, 2]])
 
@@ -87,7 +87,7 @@ def test_nothing_that_is_reflected_is_left_out() -> None:
 
 
 def test_of_too_many_sequences_there_is_no_tree(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(chain_tree, "MOST_CHAINS", 12)
+    monkeypatch.setattr(scenery_chains, "MOST_CHAINS", 12)
     faces = walls(SOUTH, NORTH, AWAY)
     assert ChainTree.of(faces, SIGHTS, 3) is None
     assert ChainTree.of(faces, SIGHTS, 2) is not None

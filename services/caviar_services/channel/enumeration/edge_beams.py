@@ -26,15 +26,18 @@ from caviar_services.channel.enumeration.image_beams import (
     Beams,
     Targets,
     by_scenery,
+    filtered,
     first_beams,
+    gathered,
     lights_corner,
     lit_bodies,
     longer_beams,
     next_beams,
+    numbers,
+    pairs,
     reflected_beams,
     scenery_beams,
 )
-from caviar_services.channel.enumeration.lane_pairs import filtered, gathered, numbers, pairs
 from caviar_services.channel.sionna.candidates import positions
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.scene import SionnaScene

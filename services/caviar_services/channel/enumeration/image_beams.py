@@ -7,12 +7,13 @@ Catedra et al., "Efficient ray-tracing techniques for three-dimensional analyses
 communications", IEEE Antennas Propag. Mag. 40(2), 1998, cull by such beams). Nothing that a beam lights is
 left out, and some that it does not light is kept: the image method decides, in float64, which is a path.
 
-Everything here counts in float32, with a slack that is more than its rounding.
+Everything here counts in float32, with a slack that is more than its rounding. Pairs of many by many that
+pass a test are the lanes of a kernel.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -21,9 +22,67 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_services.channel.enumeration.face_rectangles import FaceRectangles
-from caviar_services.channel.enumeration.lane_pairs import filtered, gathered, numbers, opaque, pairs
 from caviar_services.channel.sionna.candidates import positions
 from caviar_services.ray_tracing import aligned_columns, aligned_indices, several
+
+_LANES = 1 << 23
+"""Pairs that are looked at together at most."""
+
+
+def pairs(first: int, second: int, test: Callable[[Any, Any], Any]) -> tuple[Any, Any]:
+    """Which pairs of numbers below ``first`` and below ``second`` pass a test, as `mitsuba.UInt`."""
+    import drjit as dr
+    import mitsuba as mi
+
+    parts = []
+    at_once = max(1, _LANES // max(second, 1))
+    many = dr.opaque(mi.UInt, second)
+    for begin in range(0, first if second else 0, at_once):
+        count = min(at_once, first - begin)
+        lane = dr.arange(mi.UInt, count * second)
+        start = dr.opaque(mi.UInt, begin)
+        kept: Any = dr.compress(test(start + lane // many, lane % many))
+        if dr.width(kept):
+            parts.append((start + kept // many, kept % many))
+    if not parts:
+        return mi.UInt(), mi.UInt()
+    if len(parts) == 1:
+        return parts[0]
+    return dr.concat([one for one, _ in parts]), dr.concat([other for _, other in parts])
+
+
+def filtered(test: Callable[[Any, Any], Any], numbers: tuple[Any, Any]) -> tuple[Any, Any]:
+    """Those of pairs of numbers that pass a test."""
+    import drjit as dr
+
+    if not dr.width(numbers[0]):
+        return numbers
+    kept = dr.compress(test(*numbers))
+    found = gathered(numbers[0], kept), gathered(numbers[1], kept)
+    dr.eval(found)
+    return found
+
+
+def gathered(column: Any, index: Any) -> Any:
+    """Elements of a column of the ray tracer, by index."""
+    import drjit as dr
+
+    return dr.gather(type(column), column, index)
+
+
+def opaque(number: int) -> Any:
+    """A number that a kernel reads: as a constant of the kernel, each would be another kernel."""
+    import drjit as dr
+    import mitsuba as mi
+
+    return dr.opaque(mi.UInt, number)
+
+
+def numbers(indices: Any) -> Int64Array:
+    """Indices of the ray tracer for NumPy, Shape ``[N]``."""
+    found: Int64Array = indices.numpy().astype(np.int64)
+    return found
+
 
 _SLACK = 5e-3
 """[m] around everything that is looked for."""

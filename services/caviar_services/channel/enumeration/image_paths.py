@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
-from caviar_services.channel.enumeration.body_chains import ChainPairs
+from caviar_services.channel.enumeration.beam_ends import ChainPairs
 from caviar_services.channel.enumeration.face_rectangles import FaceRectangles
 from caviar_services.channel.sionna.candidate_visibility import Faces
 from caviar_services.channel.sionna.coplanar_faces import COPLANAR, COPLANAR_RELATIVE

@@ -16,17 +16,15 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt8Array
 from caviar_protocol.topics import Interaction
-from caviar_services.channel.enumeration.beam_ends import SceneryViews
-from caviar_services.channel.enumeration.body_chains import chain_pairs
+from caviar_services.channel.enumeration.beam_ends import SceneryViews, chain_pairs
 from caviar_services.channel.enumeration.edge_beams import EdgeTargets, edge_chains, enumerated_scenery
 from caviar_services.channel.enumeration.edge_paths import EdgePaths, edge_paths, unhidden_over_edges
 from caviar_services.channel.enumeration.face_rectangles import FaceRectangles
 from caviar_services.channel.enumeration.image_beams import Targets
 from caviar_services.channel.enumeration.image_paths import ImagePaths, image_paths, unhidden
-from caviar_services.channel.enumeration.plane_visibility import seen_planes
 from caviar_services.channel.enumeration.reflection_fields import reflection_fields
 from caviar_services.channel.enumeration.scene_faces import SceneFaces
-from caviar_services.channel.enumeration.scenery_chains import KnownScenery
+from caviar_services.channel.enumeration.scenery_chains import KnownScenery, seen_planes
 from caviar_services.channel.enumeration.transmitted_paths import crossings
 from caviar_services.channel.sionna.candidate_visibility import Faces
 from caviar_services.channel.sionna.candidates import first_of_each

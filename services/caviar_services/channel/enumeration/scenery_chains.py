@@ -1,31 +1,236 @@
-"""Chains of planes of scenery that waves from a place go along, found by launching many rays.
+"""Chains of planes of scenery that waves from a place go along: launched, or enumerated where faces are few.
 
 One launch misses what its rays pass by: of 84 chains of the street canyon it finds 77, whether with 1e5
 rays or with 1e7, and the others only where the rays point elsewhere. So several launches, each turned a
 little, are united, and a launch is traced in parts, whose memory is bounded.
 
 Where scenery has few faces, a transmitter that moves needs no launch: every sequence of faces that see one
-another is a chain, from wherever it is.
+another is a chain, from wherever it is. From a place, the beams of its images leave most of them dark
+(`image_beams` has the same beams for the faces of a frame, on the ray tracer's side).
+
+Of a thousand planes in a town each sees some thirty. Rays in all directions from points of each plane tell
+which; planes that are hidden but for less than one ray meets count as hidden.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import astuple, dataclass, replace
-from functools import reduce
+from functools import lru_cache, reduce
+from itertools import pairwise
 
 import numpy as np
 
-from caviar_protocol.arrays import Float64Array, Int32Array, Int64Array
+from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
 from caviar_services.channel.enumeration.chain_cache import ChainCache, cache_key
-from caviar_services.channel.enumeration.chain_tree import ChainTree
-from caviar_services.channel.enumeration.plane_visibility import seen_planes, visible_pairs
+from caviar_services.channel.enumeration.face_rectangles import FaceRectangles, ranges
 from caviar_services.channel.enumeration.scene_faces import SceneFaces
 from caviar_services.channel.sionna.candidate_visibility import Faces
 from caviar_services.channel.sionna.candidates import positions
 from caviar_services.channel.sionna.chains import chains_of
 from caviar_services.channel.sionna.ray_launcher import Launch, Launcher, LaunchOptions, PartedLauncher
 from caviar_services.channel.sionna.scene import SionnaScene
+
+_OFF_PLANE = 1e-3
+"""[m] from its plane that a ray starts."""
+
+_PART = 1_000_000
+"""Rays that are traced together."""
+
+
+def visible_pairs(look: Faces, faces: FaceRectangles, rays: int, seed: int) -> Int64Array:
+    """Both planes of each pair that see one another, each pair in both orders, sorted, Shape ``[M, 2]``.
+
+    Parameters
+    ----------
+    look
+        Asks the scene, in which nothing that moves should stand.
+    faces
+        Of the planes.
+    rays
+        From each of them.
+    seed
+        Of the points and directions that are drawn.
+    """
+    rng = np.random.default_rng(seed)
+    at_once = max(1, _PART // rays)
+    found = [np.zeros((0, 2), np.int64)]
+    for begin in range(0, len(faces), at_once):
+        some = np.arange(begin, min(begin + at_once, len(faces)))
+        face = np.repeat(some, rays)
+        start = _points(faces.take(some), rays, rng)
+        direction = rng.standard_normal((len(face), 3))
+        direction /= np.sqrt((direction**2).sum(1))[:, None]
+        off = np.sign((direction * faces.normal[face]).sum(1))[:, None] * faces.normal[face] * _OFF_PLANE
+        behind, plane = look.nearest(start + off, start + off + direction)
+        hit = np.isfinite(behind)
+        found.append(np.unique(np.column_stack([faces.plane[face], plane])[hit], axis=0))
+    pairs = np.concatenate(found)
+    pairs = pairs[np.isin(pairs[:, 1], faces.plane) & (pairs[:, 0] != pairs[:, 1])]
+    return np.unique(np.concatenate([pairs, pairs[:, ::-1]]), axis=0)
+
+
+def seen_planes(look: Faces, points: Float64Array, planes: Int64Array, rays: int) -> BoolArray:
+    """Which of some planes, in ascending order, each of some points [m], Shape ``[R, 3]``, sees, Shape
+    ``[R, U]``: those that rays in all directions meet first."""
+    seen = np.zeros((len(points), len(planes) + 1), np.bool_)
+    start = np.repeat(points, rays, axis=0)
+    behind, plane = look.nearest(start, start + np.tile(_directions(rays), (len(points), 1)))
+    place = np.searchsorted(planes, plane)
+    known = np.isfinite(behind) & (np.append(planes, -1)[place] == plane)
+    seen[np.repeat(np.arange(len(points)), rays), np.where(known, place, len(planes))] = True
+    return seen[:, :-1]
+
+
+@lru_cache(maxsize=4)
+def _directions(rays: int) -> Float64Array:
+    """Unit vectors that are spread evenly, Shape ``[N, 3]``."""
+    number = np.arange(rays) + 0.5
+    z, turn = 1 - 2 * number / rays, np.pi * (1 + math.sqrt(5.0)) * number
+    flat = np.sqrt(1 - z**2)
+    return np.column_stack([flat * np.cos(turn), flat * np.sin(turn), z])
+
+
+def _points(faces: FaceRectangles, count: int, rng: np.random.Generator) -> Float64Array:
+    """So many points of each face [m], evenly spread over its triangles, face after face."""
+    corners = faces.triangles
+    one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = np.abs(one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0])
+    ends = np.cumsum(area)
+    last = np.cumsum(faces.sizes) - 1
+    begin, whole = ends[last] - np.add.reduceat(area, last + 1 - faces.sizes), ends[last]
+    drawn = begin[:, None] + rng.random((len(faces), count)) * (whole - begin)[:, None]
+    triangle = np.clip(np.searchsorted(ends, drawn), (last + 1 - faces.sizes)[:, None], last[:, None])
+    triangle = triangle.ravel()
+    weights = rng.random((len(triangle), 2))
+    weights = np.where((weights.sum(1) > 1)[:, None], 1 - weights, weights)
+    flat = corners[triangle, 0] + weights[:, :1] * one[triangle] + weights[:, 1:] * other[triangle]
+    face = np.repeat(np.arange(len(faces)), count)
+    points: Float64Array = faces.centre[face] + np.einsum("na,nac->nc", flat, faces.axes[face])
+    return points
+
+
+MOST_CHAINS = 20_000
+"""Sequences of which all are taken, at most."""
+
+_SLACK = 1e-3
+"""[m] around pyramids; more than the rim of triangles."""
+
+_IN_FRONT = 1e-6
+"""[m]; walls of a building that meet at a corner do not show one another."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Level:
+    """Sequences of one length."""
+
+    parent: Int64Array
+    """Number of the sequence of one face less that each goes on from, Shape ``[K]``."""
+    face: Int64Array
+    """Its last face, Shape ``[K]``."""
+    planes: Int32Array
+    """Its planes, −1 behind the last, Shape ``[K, D]``."""
+
+
+class ChainTree:
+    """Sequences of faces, each of which sees the next one.
+
+    Parameters
+    ----------
+    faces
+        Of scenery, in ascending order of their planes.
+    levels
+        Sequences of one face, of two faces, and so on.
+    """
+
+    def __init__(self, faces: FaceRectangles, levels: list[_Level]) -> None:
+        self._faces, self._levels = faces, levels
+        u, v = (faces.axes[:, i] * faces.half[:, i, None] for i in (0, 1))
+        around = np.stack([-u - v, u - v, u + v, v - u], axis=1)
+        self._corners: Float64Array = faces.centre[:, None] + around
+
+    @property
+    def planes(self) -> Int64Array:
+        """Of the faces, in ascending order, Shape ``[U]``."""
+        return self._faces.plane
+
+    @classmethod
+    def of(cls, faces: FaceRectangles, sights: Int64Array, depth: int) -> ChainTree | None:
+        """Up to so many faces; None where there are more than `MOST_CHAINS`.
+
+        ``sights`` are planes that see one another, in both orders and sorted, Shape ``[M, 2]``.
+        """
+        seen = np.searchsorted(faces.plane, sights)
+        parent, face = np.zeros(len(faces), np.int64), np.arange(len(faces))
+        planes = np.full((len(faces), depth), -1, np.int32)
+        levels: list[_Level] = []
+        for length in range(depth):
+            planes[:, length] = faces.plane[face]
+            levels.append(_Level(parent, face, planes))
+            if sum(len(level.face) for level in levels) > MOST_CHAINS:
+                return None
+            begin, end = (np.searchsorted(seen[:, 0], face, side) for side in ("left", "right"))
+            parent, behind = ranges(begin, end - begin)
+            face, planes = seen[behind, 1], planes[parent]
+        return cls(faces, levels)
+
+    def chains(self, source: Float64Array, seen: BoolArray) -> Int32Array:
+        """Planes of the sequences that a source can light, those of fewer planes first, with the beginnings
+        of each, −1 behind the last, Shape ``[K, D]``.
+
+        Parameters
+        ----------
+        source
+            [m], Shape ``[3]``.
+        seen
+            Faces that the source may see, Shape ``[U]``.
+        """
+        faces, level = self._faces, self._levels[0]
+        rows = last = np.flatnonzero(seen)
+        image = faces.mirrored(np.broadcast_to(source, (len(rows), 3)), last)
+        through: Float64Array | None = None
+        found = [level.planes[rows]]
+        for shorter, level in pairwise(self._levels):
+            place = np.full(len(shorter.face), -1)
+            place[rows] = np.arange(len(rows))
+            rows = np.flatnonzero(place[level.parent] >= 0)
+            parent, face = place[level.parent[rows]], level.face[rows]
+            target = self._corners[face]
+            lit = self._in_front(image[parent], last[parent], target)
+            lit &= ~_beyond(image[parent], self._corners[last[parent]], target)
+            if through is not None:
+                lit &= ~_beyond(image[parent], through[parent], target)
+            rows, parent, face = rows[lit], parent[lit], face[lit]
+            through = self._mirrored(last[parent], face)
+            image, last = faces.mirrored(image[parent], face), face
+            found.append(level.planes[rows])
+        return np.concatenate(found)
+
+    def _in_front(self, image: Float64Array, last: Int64Array, target: Float64Array) -> BoolArray:
+        """Whether rectangles reach to the side of the planes of last faces that images are behind."""
+        away = np.where(self._faces.height(image, last) > 0, -1.0, 1.0)[:, None]
+        height = np.einsum("nkc,nc->nk", target, self._faces.normal[last]) - self._faces.offset[last, None]
+        in_front: BoolArray = (away * height > _IN_FRONT).any(1)
+        return in_front
+
+    def _mirrored(self, faces: Int64Array, mirrors: Int64Array) -> Float64Array:
+        """Corners of faces, mirrored in others, Shape ``[N, 4, 3]``."""
+        flat = self._corners[faces].reshape(-1, 3)
+        return self._faces.mirrored(flat, np.repeat(mirrors, 4)).reshape(-1, 4, 3)
+
+
+def _beyond(apex: Float64Array, corners: Float64Array, target: Float64Array) -> BoolArray:
+    """Whether N rectangles lie beyond a side of the pyramids from apexes around other rectangles."""
+    edges = corners - apex[:, None]
+    normal = np.cross(edges, np.roll(edges, -1, axis=1))
+    length = np.sqrt(np.einsum("nsc,nsc->ns", normal, normal))
+    inwards = np.sign(np.einsum("nsc,nc->ns", normal, edges.sum(1)))
+    normal *= (inwards / np.where(length > 0, length, 1.0))[..., None]
+    height = np.einsum("nsc,nkc->nsk", normal, target - apex[:, None])
+    beyond: BoolArray = (height < -_SLACK).all(2).any(1)
+    return beyond
+
 
 _SIGHT_RAYS, _SIGHT_RAYS_PER_FRAME = 4096, 64
 """From each plane, to find which others it sees: before the first frame, and in each."""

@@ -23,7 +23,7 @@ from caviar_protocol.topics import Carrier, Scene
 from caviar_services.channel.paths import PathTable
 from caviar_services.channel.propagation.geometry import path_corners
 from caviar_services.channel.propagation.mesh_volumes import MeshVolumes, lengths_inside, outward
-from caviar_services.channel.sionna.object_materials import ObjectMaterials
+from caviar_services.channel.sionna.materials import ObjectMaterials
 from caviar_services.mesh.shapes import Mesh, placed, unit_box
 
 _TABLE_1 = np.array(

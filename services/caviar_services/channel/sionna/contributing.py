@@ -15,7 +15,7 @@ import numpy as np
 from caviar_protocol.arrays import Complex128Array, Float64Array
 from caviar_protocol.messages import WARNING
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
-from caviar_services.channel.sionna.object_materials import Constants
+from caviar_services.channel.sionna.materials import Constants
 from caviar_services.channel.sionna.ray_launcher import LaunchOptions
 
 _EPSILON_0 = 8.8541878128e-12

@@ -39,8 +39,7 @@ from caviar_services.channel.sionna.candidate_visibility import Corners
 from caviar_services.channel.sionna.contributing import contributing
 from caviar_services.channel.sionna.diffuse_paths import Element
 from caviar_services.channel.sionna.edge_range import EdgeRange
-from caviar_services.channel.sionna.materials import MaterialPolicy, OutsideUse
-from caviar_services.channel.sionna.object_materials import ObjectMaterials
+from caviar_services.channel.sionna.materials import MaterialPolicy, ObjectMaterials, OutsideUse
 from caviar_services.channel.sionna.path_solver import LANE_BYTES, Tracer
 from caviar_services.channel.sionna.path_table import Ends, Traced, path_ends, path_table, traced_surfaces
 from caviar_services.channel.sionna.ray_launcher import LaunchOptions, rays_within

@@ -31,14 +31,16 @@ from caviar_services.channel.sionna.contributing import SurfaceMaterial, UsedSur
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.materials import (
     OBJECT_MATERIAL,
+    Constants,
     MaterialPolicy,
+    ObjectMaterials,
     OutsideUse,
+    body_kind,
     itu_material,
     itu_materials,
     object_materials,
     set_materials,
 )
-from caviar_services.channel.sionna.object_materials import Constants, ObjectMaterials, body_kind
 from caviar_services.channel.sionna.scene_loading import (
     Shape,
     by_material,

@@ -15,8 +15,7 @@ from caviar_protocol.scenario.conversion import Place
 from caviar_services.channel.base import ChannelSettings
 from caviar_services.channel.mesh_detail import DetailSettings
 from caviar_services.channel.propagation.foliage import FoliageSettings
-from caviar_services.channel.sionna.materials import MaterialSettings, OutsideRange
-from caviar_services.channel.sionna.object_materials import OTHER_MATERIALS
+from caviar_services.channel.sionna.materials import OTHER_MATERIALS, MaterialSettings, OutsideRange
 from caviar_services.mesh.scenery import ITU_MATERIALS
 
 _SAMPLES = 100_000
