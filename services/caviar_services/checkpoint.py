@@ -28,7 +28,7 @@ class _Envelope(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fie
     implementation: str
     version: int
     circumstances: bytes
-    """Digest of the settings, and of what the run told the service."""
+    """Digest of the settings, and of the parts of `RunInfo` that a state depends on."""
     digest: bytes
     """Of the body."""
     body: bytes
@@ -121,8 +121,8 @@ def restored(service: Service[Any], version: int, cls: type[T], state: bytes) ->
 
 def _circumstances(service: Service[Any]) -> bytes:
     run = service.run
-    told = (run.name, run.seed, run.sampling_period_ns, run.carriers, run.devices)
-    return _digest(msgspec.msgpack.encode((service.settings, told), order="deterministic"))
+    known = (run.name, run.seed, run.sampling_period_ns, run.carriers, run.devices)
+    return _digest(msgspec.msgpack.encode((service.settings, known), order="deterministic"))
 
 
 def _digest(data: bytes) -> bytes:

@@ -328,7 +328,7 @@ class HeartbeatThread(threading.Thread):
             os.close(self._halt)
 
     def run(self) -> None:
-        """Send heartbeats until told to stop, or until the broker is silent for too long."""
+        """Send heartbeats until `stop`, or until the broker is silent for too long."""
         with self._context.socket(zmq.DEALER) as socket:
             socket.linger = 0
             dress(socket, self._endpoint, self._credentials)
@@ -356,7 +356,7 @@ class HeartbeatThread(threading.Thread):
                 answered, silence = sequence, 0.0
                 self._sign.touch()
                 continue
-            # Only time in which this thread really listened counts as silence: while somebody else
+            # Only time in which this thread really listened counts as silence: while another thread
             # holds the interpreter's lock, answers wait in the socket.
             silence += min(time.monotonic() - began, self._interval)
             if silence > self._liveness and sequence - answered >= 2:

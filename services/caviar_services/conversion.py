@@ -40,18 +40,18 @@ MAX_DETAIL = 20000
 
 def run_info(name: str, welcome: m.Welcome, progress: Progress) -> RunInfo:
     """What WELCOME tells about the run."""
-    told = welcome.scenario
+    scenario = welcome.scenario
     return RunInfo(
         name=name,
         run=welcome.run,
         again=welcome.epoch > 1 or welcome.attempt > 1,
         seed=welcome.seed,
-        sampling_period_ns=int(told.get("sampling_period_ns", 1)),
-        frames=int(told.get("frames", 1)),
-        carriers=msgspec.convert(told.get("carriers", ()), tuple[Carrier, ...]),
-        devices=msgspec.convert(told.get("devices", ()), tuple[DeviceSpec, ...]),
-        scenario=told.get("resolved", {}),
-        directory=Path(str(told.get("directory", "."))),
+        sampling_period_ns=int(scenario.get("sampling_period_ns", 1)),
+        frames=int(scenario.get("frames", 1)),
+        carriers=msgspec.convert(scenario.get("carriers", ()), tuple[Carrier, ...]),
+        devices=msgspec.convert(scenario.get("devices", ()), tuple[DeviceSpec, ...]),
+        scenario=scenario.get("resolved", {}),
+        directory=Path(str(scenario.get("directory", "."))),
         progress=progress,
     )
 
@@ -154,7 +154,8 @@ def plain_done_of(
 ) -> tuple[m.Done, tuple[Payload, ...]]:
     """DONE without digests, and the products as they are, for a consumer in this process.
 
-    What a recorder would be told beside them is left out: there is none. Raises `PayloadError` for a
+    Decisions, counts and times are left out: only a recorder gets them, and there is none. Raises
+        `PayloadError` for a
     product that is not its topic's.
     """
     products = _products(use, result)

@@ -14,7 +14,7 @@ TERMINATION_GRACE_S = 1.5
 """[s] from SIGTERM until the process is ended by force, so that it is gone within 2 s."""
 
 TERMINATED = 128 + signal.SIGTERM
-"""Exit status of a service that was told to end by a signal."""
+"""Exit status of a service that a signal ended."""
 
 
 class Termination:
@@ -54,7 +54,7 @@ class SignalTermination(Termination):
     A Python signal handler does not run while the main thread is inside a compiled call, so a
     thread of its own hears of the signal through ``set_wakeup_fd``, and ends the process when the
     main thread has not done so in time. Against a call that holds the interpreter's lock not even
-    that helps: then the process ends as soon as the lock is free, or is killed by whoever started it.
+    that helps: then the process ends as soon as the lock is free, or its parent kills it.
     ``status`` is that of a process that ends so.
     """
 
@@ -87,7 +87,7 @@ class SignalTermination(Termination):
 
 
 def restart_status(status: int, ended: str) -> int:
-    """Status 0 where the work is done or nobody wants it any more; 1 where another run may follow.
+    """Status 0 where the work is done or was called off; 1 where another run may follow.
 
     Args:
         status: What the runner returned.

@@ -123,7 +123,7 @@ def activate_llvm() -> str:
 
 
 def _held_by_drjit() -> tuple[int, ...] | None:
-    """Version of the library that Dr.Jit loaded; None where it is not imported or was told which."""
+    """Version of the library that Dr.Jit loaded; None if not imported, or if the environment names one."""
     drjit = sys.modules.get("drjit")
     if drjit is None or os.environ.get(ENVIRONMENT):
         return None

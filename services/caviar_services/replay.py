@@ -31,16 +31,16 @@ class ReplaySettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     recording: Annotated[str, Meta(min_length=1)]
     """Directory of the recorded run."""
     users: tuple[str, ...] = ()
-    """Agents: whom they served; nothing follows from it here."""
+    """Agents: users that they served; without effect here."""
     except_users: tuple[str, ...] = ()
-    """Agents: whom they left to others; nothing follows from it here."""
+    """Agents: users that they left to others; without effect here."""
 
 
 class Replayer(Service[ReplaySettings]):
     """One recorded service: its products, decisions and counts, and where an agent, the ends of episodes.
 
     Frames are found by episode and number, so that a run which leaves some out gets the others as they
-    were. What was held or absent is told by the broker (`caviar_broker.recordings`), with the recorded cause.
+    were. The broker reports what was held or absent (`caviar_broker.recordings`), with the recorded cause.
     """
 
     Settings = ReplaySettings

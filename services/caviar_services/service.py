@@ -370,7 +370,7 @@ class Service(ABC, Generic[S]):
         return {}
 
     def prepare(self, preparation: Preparation) -> Prepared:
-        """Load, compile, warm up: whatever would otherwise make frame 0 late.
+        """Load, compile and warm up, so that frame 0 is not late.
 
         Args:
             preparation: Parts in demand, files of the run's scenery, and who produces what.

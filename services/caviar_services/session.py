@@ -72,7 +72,7 @@ class ServiceSession:
         cls: The implementation.
         send: Takes the answers. An exception of it that is an `Exception` counts as the service's fault.
         store: Where the files of scenery are.
-        progress: Is told what the service does. No progress is reported by default.
+        progress: Called with what the service does. No progress is reported by default.
         check: Check of products that all services of one process share: it looks at each product once, and a
             frame that is granted twice is computed twice. None: the service has a process of its own.
         encodes: Whether products travel as bytes, with digests; else parts of GRANT and DONE are payloads.

@@ -49,7 +49,7 @@ class Session(ABC):
             self._frame = self._granted()
             if _begins(self._frame, seed):
                 return self._frame
-            # Whoever had the place before left the run in the middle of an episode.
+            # The agent that had the place before left the run in the middle of an episode.
         if self._frame.final:
             self._answer(StepResult(seed=chosen))
         else:
@@ -103,7 +103,7 @@ at what was learned."""
 
 
 class OutsideSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Whom the agent serves (contract, clause 17)."""
+    """Users that the agent serves (contract, clause 17)."""
 
     users: tuple[str, ...] = ("*",)
     except_users: tuple[str, ...] = ()

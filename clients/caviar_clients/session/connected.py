@@ -34,7 +34,7 @@ class ConnectedSession(Session):
     broker
         ZeroMQ address.
     agent
-        Name of a service of the run that nobody else fills (``use = "remote"``).
+        Name of a service of the run that no process fills yet (``use = "remote"``).
     inputs
         What it consumes.
     connect_timeout_s
@@ -88,7 +88,7 @@ class ConnectedSession(Session):
         self._thread.join(LEAVE_S)
 
     def leave(self, error: CaviarError | None = None) -> None:
-        """Make the thread end, and whoever waits for a grant know."""
+        """End the thread, and pass the reason to a caller that waits for a grant."""
         self._termination.requested = True
         if error is not None:
             self._grants.put(error)

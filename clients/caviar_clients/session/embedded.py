@@ -81,7 +81,7 @@ class EmbeddedRun:
         products go from service to service as they are, so that the outcome has no digest and `statistics`
         stay empty.
     on_notice, on_frame
-        Told what the user should know, and of each finished frame.
+        Called with each notice to the user, and with each finished frame.
     seats
         By name, services that decide outside of the run (`OutsideSession`), and classes that declare them.
     imposed
@@ -101,13 +101,13 @@ class EmbeddedRun:
         if directory is None:
             scenario = _without_recorders(scenario)
         for name in seats or {}:
-            # Settings of the implementation whose place is taken are not for whoever takes it.
+            # Settings of the implementation whose place is taken are not for the service outside.
             seated = replace_field(scenario.services[name], settings={})
             scenario = replace_field(scenario, services={**scenario.services, name: seated})
         scenario = with_ownership(scenario)
         folder = (directory or Path()).resolve()
         plan = plan_run(scenario, folder.name, briefings(scenario, folder))
-        # Whoever runs ahead gains nothing in one process, and works in vain where an agent ends the episode.
+        # A service that runs ahead gains nothing in one process, and in vain where an agent ends the episode.
         plan = with_replay(plan, scenario.replay)
         imposed = plan.imposed if imposed is None else imposed
         store = AssetStore()
@@ -154,7 +154,7 @@ class EmbeddedRun:
         return self.outcome
 
     def steps(self) -> Generator[None, None, None]:
-        """Run to the end, and come back behind whatever a service did.
+        """Run to the end, and yield after each step of a service or of the clock.
 
         Do not go on while a seat has a frame that is not answered. However the loop is left, every service
         is closed.
@@ -212,10 +212,10 @@ class EmbeddedRun:
         self._events.append(event)
 
     def _skip_time(self) -> None:
-        """Nobody has anything to do: to the next deadline."""
+        """No service has work left: move the clock to its next deadline."""
         deadline = self._clock.next_deadline()
         if deadline is None:
-            raise RunError("nobody has anything to do, and the run is not over")
+            raise RunError("no service has work left, and the run is not over")
         self._now = max(self._now, deadline)
         self._clock.expire(self._now)
         self._perform()
@@ -263,7 +263,7 @@ def _without_recorders(scenario: Scenario) -> Scenario:
 
 ENDLESS = 2**53
 """Episodes of a run that goes on until it is closed."""
-TOLD = 100
+KEPT_NOTICES = 100
 """Notices that are kept."""
 
 
@@ -293,8 +293,8 @@ class EmbeddedSession(Session):
         with_scenery: bool = False,
     ) -> None:
         super().__init__()
-        self.notices: deque[str] = deque(maxlen=TOLD)
-        """What the run told last."""
+        self.notices: deque[str] = deque(maxlen=KEPT_NOTICES)
+        """Notices of the run, the newest last."""
         if directory is not None:
             directory.mkdir(parents=True, exist_ok=True)
         endless = replace_field(scenario, run=replace_field(scenario.run, episodes=ENDLESS))

@@ -1,4 +1,4 @@
-"""What every beam-selecting agent is: whom it serves, and what it hears.
+"""Base of the agents that select beams: the users they serve, and what they consume.
 
 Some command more than beams, the motion of an object for instance (`Agent.other_actuators`).
 """
@@ -23,11 +23,11 @@ from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Servi
 _OTHER_ACTUATORS = ("motion:", "schedule:")
 
 WITHOUT_USERS = "frames-without-users"
-"""Count of the frames in which an agent had nobody to serve."""
+"""Count of the frames in which an agent had no user to serve."""
 
 
 class AgentSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Whom an agent serves. A default agent serves everybody whom no other agent owns."""
+    """Users that an agent serves. A default agent serves all users that no other agent owns."""
 
     users: tuple[str, ...] = ("*",)
     """Receivers this agent owns, as names with ``*`` for any text and ``?`` for any character
@@ -47,7 +47,7 @@ class Agent(Service[S]):
     beams. The final grant of an episode takes no action (contract, clause 16).
 
     Args:
-        settings: Whom the agent serves.
+        settings: Users that the agent serves.
         run: What the agent knows about the run.
 
     Raises:

@@ -88,7 +88,7 @@ def failure(path: Path, error: OSError) -> RunError:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python, of this distribution and of whatever it depends on and is installed."""
+    """Versions of Python, of this distribution, and of its dependencies that are installed."""
     found = {"python": platform.python_version()}
     try:
         requirements = [DISTRIBUTION, *(metadata.requires(DISTRIBUTION) or ())]

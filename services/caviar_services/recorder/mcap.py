@@ -264,7 +264,7 @@ def _with_digest(item: FrameInput) -> GrantInput:
 
 
 def _encoded(item: FrameInput) -> FrameInput:
-    """The input as it came; in a run without sockets nobody has encoded it yet."""
+    """The input as it came; in a run without sockets no producer has encoded it yet."""
     if len(item.header) or not item.present:
         return item
     return FrameInput(item.provenance, *encode_payload(item.payload))

@@ -80,7 +80,7 @@ class Sensors(Service[S]):
     def prepare(self, preparation: Preparation) -> Prepared:
         """Load the scenery and the objects' meshes, and compile what `observe` needs.
 
-        Nothing is loaded where nobody asks for an output (contract, clause 5).
+        Nothing is loaded where no output is in demand (contract, clause 5).
 
         Raises:
             AssetError: The scene description or a mesh is broken or missing.

@@ -301,7 +301,7 @@ OTHER: Colour = (0.62, 0.60, 0.62)
 """Where neither material nor class is known."""
 
 SHAPE_SHADES, OBJECT_SHADES = 0.2, 0.45
-"""Things of one colour differ by up to this share, so that neighbours can be told apart."""
+"""Things of one colour differ by up to this share, so that neighbours look different."""
 
 
 def linear(colour: Colour) -> Float64Array:

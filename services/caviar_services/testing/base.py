@@ -136,7 +136,7 @@ class ServiceConformance:
 
     @classmethod
     def frames_of(cls, service: Service[Any], episode: int, count: int = FRAMES) -> list[Frame]:
-        """Grants of an episode. In the last one, whatever is not required is absent.
+        """Grants of an episode. In the last one, inputs that are not required are absent.
 
         Args:
             service: The service, whose declared inputs the frames have.
@@ -211,7 +211,7 @@ class ServiceConformance:
     # --- what it declares ------------------------------------------------------------------------
 
     def test_role_inputs_and_outputs_are_those_of_the_protocol(self) -> None:
-        """A topic or part that nobody else knows would never be granted."""
+        """A topic or part that no other service knows would never be granted."""
         cls = self.service_class
         assert cls.role in get_args(Role)
         assert set(cls.outputs) <= set(PAYLOADS)
@@ -244,7 +244,7 @@ class ServiceConformance:
             convert_settings(self.service_class.Settings, {**self.settings, "no_such_setting": 1})
 
     def test_without_settings_it_starts_or_says_what_it_lacks(self, tmp_path: Path) -> None:
-        """Nobody meets a traceback for a setting not given."""
+        """A setting that is not given leads to no traceback."""
         run = RunInfo(name="service", carriers=self.carriers, devices=self.devices, directory=tmp_path)
         try:
             self.service_class(convert_settings(self.service_class.Settings, {}), run).close()
@@ -288,7 +288,7 @@ class ServiceConformance:
             msgspec.msgpack.encode([result.fidelity, dict(result.counts), dict(result.measured)])
 
     def test_the_same_seed_gives_the_same_bytes_in_another_life(self, played: Played, tmp_path: Path) -> None:
-        """Clause 20, and clause 19 for whatever is random."""
+        """Clause 20, and clause 19 for random numbers."""
         again = self.play(tmp_path)
         for episode in range(len(self.episodes)):
             assert again.encoded(episode) == played.encoded(episode)
@@ -328,7 +328,7 @@ class ServiceConformance:
             assert service.checkpoint() == service.checkpoint()
 
     def test_what_is_no_state_is_refused(self, tmp_path: Path) -> None:
-        """With an error that is told to the user, not a traceback."""
+        """With an error for the user, not a traceback."""
         if not self.service_class.checkpoints:
             pytest.skip("keeps no state from frame to frame")
         with self.at_start(tmp_path) as service:

@@ -54,7 +54,7 @@ def _sorted(names: Iterable[str]) -> bool:
 
 
 class WorldConformance(ServiceConformance):
-    """Worlds: whatever moves, one `Scene` a frame."""
+    """Worlds: objects and devices, one `Scene` a frame."""
 
     @classmethod
     def street(cls, service: Service[Any], directory: Path) -> Mapping[str, Path]:
@@ -344,7 +344,7 @@ def _held(item: FrameInput) -> FrameInput:
 
 
 class RecorderConformance(ServiceConformance):
-    """Recorders: whatever a frame had is on disk, as it was."""
+    """Recorders: every product of a frame is on disk, byte for byte."""
 
     episodes: ClassVar[tuple[int, ...]] = (0, 1)
 

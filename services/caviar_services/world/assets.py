@@ -32,7 +32,7 @@ def scenery_assets(scenery: str) -> dict[str, Path | bytes]:
         return {}
     xml = scenery_file(scenery)
     named = _named_in(xml)
-    read_scenery(xml)  # what is wrong with it is told with the user's file, not with a copy at its consumers
+    read_scenery(xml)  # so that an error names the user's file, not a copy at its consumers
     return {f"scenery/{xml.name}": xml, **{f"scenery/{name}": xml.parent / name for name in named}}
 
 

@@ -187,7 +187,7 @@ class FlightWorld(TrajectoryWorld):
             flyer.go_on(was.flyers[name])
 
     def _motions(self, frame: Frame) -> dict[str, Motion]:
-        """What each flown object is told to do; beams and schedules are not for worlds."""
+        """Commands for each flown object; beams and schedules are not for worlds."""
         found: dict[str, tuple[str, Motion]] = {}
         for agent, action in frame.payloads("action", Action).items():
             for command in action.commands:

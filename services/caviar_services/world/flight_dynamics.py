@@ -79,7 +79,7 @@ class Limits:
 
 
 class Motion(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What an object is told: a velocity, or a target and the speed with which to go there."""
+    """Commanded motion: a velocity, or a target and the speed with which to go there."""
 
     velocity: Vector = (0.0, 0.0, 0.0)
     target: Vector | None = None

@@ -31,7 +31,7 @@ _LONGEST_STEP_MS = 1000
 # A vehicle that turns by more in a step has not turned: SUMO has put it elsewhere.
 _JUMP_DEG = 90.0
 
-# Steps at which SUMO's way to an instant long before is told.
+# Steps between two reports of progress on the way to a distant instant.
 _TOLD_EVERY = 1000
 
 Files = str | tuple[str, ...]
@@ -386,7 +386,7 @@ _CLASS_OF: dict[str, str] = {
 def object_class(type_id: str, vehicle_class: str, chosen: dict[str, str]) -> str:
     """Our class of a SUMO vehicle type: as chosen for its id or its vClass, else by its vClass.
 
-    Whatever is not in the table drives on roads and is a ``car``.
+    A class that is not in the table drives on roads and is a ``car``.
     """
     base_type = type_id.partition("@")[0]  # SUMO appends @VEHICLE to a type changed for one vehicle
     for key in (base_type, vehicle_class):
