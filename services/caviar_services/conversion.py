@@ -61,7 +61,7 @@ def is_needed(service: Service[Any], order: m.Prepare) -> bool:
     return bool(order.demand) or service.role in ("agent", "recorder") or not service.outputs
 
 
-def content_rules_of(service: Service[Any], order: m.Prepare) -> ContentRules:
+def content_rules(service: Service[Any], order: m.Prepare) -> ContentRules:
     """What WELCOME and PREPARE say about the products that a service is going to get."""
     run = service.run
     worlds = order.producers.get("scene", ())
@@ -78,7 +78,9 @@ def content_rules_of(service: Service[Any], order: m.Prepare) -> ContentRules:
     )
 
 
-def frame_of(service: Service[Any], reset: m.Reset, grant: m.Grant, inputs: tuple[FrameInput, ...]) -> Frame:
+def granted_frame(
+    service: Service[Any], reset: m.Reset, grant: m.Grant, inputs: tuple[FrameInput, ...]
+) -> Frame:
     """The frame that GRANT grants, in the episode that RESET began."""
     return Frame(
         episode=grant.episode,
@@ -121,7 +123,7 @@ def frame_inputs(
     )
 
 
-def done_of(
+def encoded_done(
     identity: dict[str, int], use: str, grant: m.Grant, result: StepResult, step_ns: int
 ) -> tuple[m.Done, list[Any]]:
     """DONE, and header and body of each product behind it; ``step_ns`` is what the step took.
@@ -149,7 +151,7 @@ def done_of(
     return done, parts
 
 
-def plain_done_of(
+def plain_done(
     identity: dict[str, int], use: str, grant: m.Grant, result: StepResult
 ) -> tuple[m.Done, tuple[Payload, ...]]:
     """DONE without digests, and the products as they are, for a consumer in this process.
@@ -188,7 +190,7 @@ MAX_DETAIL = 20000
 """[characters] of a FAULT's texts."""
 
 
-def fault_of(
+def fault_from(
     error: Exception, identity: Mapping[str, int], phase: str, episode: int = 0, frame: int = -1
 ) -> m.Fault:
     """FAULT that says what an exception says, with a traceback where it is no `CaviarError`."""

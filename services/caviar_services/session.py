@@ -30,13 +30,13 @@ from caviar_protocol.host import trim_memory
 from caviar_protocol.scenario.conversion import convert_settings
 from caviar_protocol.validation import ContentCheck
 from caviar_services.conversion import (
-    content_rules_of,
-    done_of,
-    fault_of,
+    content_rules,
+    encoded_done,
+    fault_from,
     frame_inputs,
-    frame_of,
+    granted_frame,
     is_needed,
-    plain_done_of,
+    plain_done,
     run_info,
 )
 from caviar_services.service import (
@@ -236,7 +236,7 @@ class ServiceSession:
             service = self._running
             # Worlds are prepared before anything is known about scenes, and a shared check is for all.
             if self._answers is not None or service.role != "world":
-                self._check.adopt(content_rules_of(service, order))
+                self._check.adopt(content_rules(service, order))
             if not is_needed(service, order):
                 self._ready(m.Ready(**self._identity))
                 return
@@ -359,18 +359,18 @@ class ServiceSession:
             answer: Answer = self._done(grant, result, step_ns)
             self._send(*answer)
         except Exception as error:
-            answer = fault_of(error, self._identity, phase, grant.episode, grant.frame), ()
+            answer = fault_from(error, self._identity, phase, grant.episode, grant.frame), ()
             self._send(*answer)
         return answer
 
     def _frame(self, reset: m.Reset, grant: m.Grant, parts: Sequence[Any]) -> Frame:
         inputs = frame_inputs(grant, parts, self._check, encoded=self._encodes)
-        return frame_of(self._running, reset, grant, inputs)
+        return granted_frame(self._running, reset, grant, inputs)
 
     def _done(self, grant: m.Grant, result: StepResult, step_ns: int) -> tuple[m.Done, Sequence[Any]]:
         if self._encodes:
-            return done_of(self._identity, self.use, grant, result, step_ns)
-        return plain_done_of(self._identity, self.use, grant, result)
+            return encoded_done(self._identity, self.use, grant, result, step_ns)
+        return plain_done(self._identity, self.use, grant, result)
 
     def _episode_end(self, end: m.EpisodeEnd, _: Sequence[Any], __: float) -> None:
         with self._reporting("end of episode", end.episode):
@@ -420,7 +420,7 @@ class ServiceSession:
         try:
             yield
         except Exception as error:
-            self._send(fault_of(error, self._identity, phase, episode, frame), ())
+            self._send(fault_from(error, self._identity, phase, episode, frame), ())
 
     def _unexpected(self, message: m.Message, why: str) -> None:
         kind = message_type(message)

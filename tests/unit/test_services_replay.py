@@ -14,7 +14,7 @@ from caviar_protocol.digest import payload_digest
 from caviar_protocol.errors import DeclarationError, RecordingError, ScenarioError
 from caviar_protocol.messages import GrantInput, Report, Status
 from caviar_protocol.scenario.conversion import Place
-from caviar_services.conversion import done_of, plain_done_of
+from caviar_services.conversion import encoded_done, plain_done
 from caviar_services.recorder.mcap import McapRecorder, McapSettings
 from caviar_services.registry import load
 from caviar_services.replay import Replayer, ReplaySettings, use_of
@@ -98,7 +98,7 @@ def test_its_class_says_role_and_topics() -> None:
 def test_bytes_are_served_as_they_were_not_as_this_encoder_writes_them(recording: Path) -> None:
     service = replayer(recording)
     service.prepare(Preparation(demand={"scene": frozenset()}))
-    done, parts = done_of(IDENTITY, service.run.name, GRANT, step(service, 3), 0)
+    done, parts = encoded_done(IDENTITY, service.run.name, GRANT, step(service, 3), 0)
     assert tuple(parts) == foreign(3)
     (header,) = done.products
     assert header == m.ProductHeader(topic="scene", digest=payload_digest(*foreign(3)), fidelity="f3")
@@ -115,7 +115,7 @@ def test_held_products_are_sent_again_and_absent_ones_are_not(recording: Path) -
 
 
 def test_a_consumer_in_the_same_process_gets_the_payload(recording: Path) -> None:
-    _, (payload,) = plain_done_of(IDENTITY, "w", GRANT, step(replayer(recording), 3))
+    _, (payload,) = plain_done(IDENTITY, "w", GRANT, step(replayer(recording), 3))
     assert encode_payload(payload) == encode_payload(scene(3))
 
 
