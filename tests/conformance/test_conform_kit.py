@@ -178,7 +178,7 @@ def test_a_world_that_brings_scenery_is_asked_for_all_of_it(tmp_path: Path) -> N
     names = ["ready", "scenery", "frames", "no-demand"]
     verdicts = conform(ANY, command=command, names=names, rules=Rules(name="mine", settings=settings))
     assert failures(verdicts) == {}
-    assert next(v.got for v in verdicts if v.case == "scenery").startswith("offers 4 files")
+    assert next(v.got for v in verdicts if v.case == "scenery").startswith("offers 5 files")
 
 
 def test_a_right_client_that_speaks_websocket_fails_nothing(tmp_path: Path) -> None:

@@ -35,9 +35,17 @@ NEWEST_ALONE = [
 """The others are left to the long form; all run `smoke`."""
 """The newest requirements on this Python are those of the tests at large."""
 CACHE = ROOT / ".venvs"
-GENERATED = ("codec", "keys", "messages", "paths", "recording")
+GENERATED = ("codec", "keys", "messages", "multipath_changes", "recording_reader")
 """Modules of the protocol whose tests generate inputs for most of a minute."""
-WIRE = ("arrays", "content", "digest", "nesting", "scenario_loader", "scene", "tables")
+WIRE = (
+    "arrays",
+    "codec_nesting",
+    "digest",
+    "scenario_conversion",
+    "scenario_loader",
+    "space_scene",
+    "validation",
+)
 """Modules of the protocol that lean most on the Python and the libraries at hand."""
 TEST_TOOLS = ("hypothesis", "psutil", "pytest", "pytest-timeout")
 

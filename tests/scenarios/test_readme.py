@@ -35,14 +35,17 @@ def test_the_first_half_is_followed_from_top_to_bottom_in_an_empty_folder(tmp_pa
         run_as_printed(["bash", "-e", "-c", block], tmp_path)
     assert (tmp_path / "crossing.toml").is_file()
     assert len(list(tmp_path.glob("runs/crossing-*/summary.json"))) == 1
-    _, read, _ = blocks("python")
+    program, _, read, _ = blocks("python")
+    run_as_printed(
+        script(program.replace(".shape ", ".shape == (100, 2, 4, 32) or 1 / 0 "), tmp_path), tmp_path
+    )
     printed = run_as_printed(script(read, tmp_path), tmp_path)
     assert "(100, 2, 4, 32)" in printed
     assert re.search(r"\|y\| of the agent: (100\.0|99\.\d)%", printed), printed
 
 
 def test_a_class_beside_the_scenario_takes_part(tmp_path: Path) -> None:
-    agent, _, _ = blocks("python")
+    _, agent, _, _ = blocks("python")
     (tmp_path / "my_agent.py").write_text(agent)
     run_as_printed(["caviar", "new", "crossing"], tmp_path)
     file = tmp_path / "crossing.toml"
@@ -73,7 +76,7 @@ def test_a_mistake_is_told_as_the_readme_shows(tmp_path: Path) -> None:
 @pytest.mark.parametrize("steps", [300, pytest.param(2000, marks=pytest.mark.exhaustive)])
 def test_the_learning_script_trains_and_compares(steps: int, tmp_path: Path) -> None:
     pytest.importorskip("stable_baselines3", reason="needs the extra `learning`")
-    _, _, train = blocks("python")
+    _, _, _, train = blocks("python")
     assert "agent.learn(2000)" in train
     shorter = train.replace("agent.learn(2000)", f"agent.learn({steps})")
     out = run_as_printed(script(shorter, tmp_path), tmp_path)
