@@ -36,9 +36,8 @@ def test_the_first_half_is_followed_from_top_to_bottom_in_an_empty_folder(tmp_pa
     assert (tmp_path / "crossing.toml").is_file()
     assert len(list(tmp_path.glob("runs/crossing-*/summary.json"))) == 1
     program, _, read, _ = blocks("python")
-    run_as_printed(
-        script(program.replace(".shape ", ".shape == (100, 2, 4, 32) or 1 / 0 "), tmp_path), tmp_path
-    )
+    checked = f"{program}assert recording['channel'].h.shape == (100, 2, 4, 32)\n"
+    run_as_printed(script(checked, tmp_path), tmp_path)
     printed = run_as_printed(script(read, tmp_path), tmp_path)
     assert "(100, 2, 4, 32)" in printed
     assert re.search(r"\|y\| of the agent: (100\.0|99\.\d)%", printed), printed

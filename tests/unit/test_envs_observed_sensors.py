@@ -173,7 +173,7 @@ def test_sensors_are_seen_to_the_last_frame_and_what_is_not_known_is_zeros_hande
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("mitsuba", reason="Mitsuba is not installed")
-    # As with a world whose objects come and go; that of `smoke` refuses a device on an object that cannot come.
+    # As a world whose objects come and go: that of `smoke` refuses a device on an object that cannot come.
     monkeypatch.setattr(TrajectoryWorld, "known_objects", classmethod(lambda *_: None))
     path = tmp_path / "scenario.toml"
     path.write_text((SCENARIOS / "smoke.toml").read_text().replace("frames = 100", "frames = 4") + SENSORS)
