@@ -21,6 +21,7 @@ def test_the_slope_is_that_of_the_last_frames() -> None:
     assert Growth("steep", instants, steps).slope(finished_ns) == pytest.approx(3.0)
 
 
+@pytest.mark.exhaustive
 def test_smoke_grows_by_less_than_a_kilobyte_a_frame(tmp_path: Path) -> None:
     measured = measure(find_scenario("smoke"), 3000, ["channel"], tmp_path)
     assert len(measured.finished_ns) == 3000

@@ -353,6 +353,7 @@ def memory_slope(yard: dict[str, Path], frames: int) -> float:
     return float(np.polyfit(np.arange(len(late)) * TRIM_EVERY, late, 1)[0])
 
 
+@pytest.mark.exhaustive
 def test_memory_stays_flat_over_a_thousand_frames(yard: dict[str, Path]) -> None:
     """Less than 1 KB a frame; in a process of its own, where no other test frees or fills memory."""
     assert float(in_a_fresh_process("memory_slope", yard, 1000)) < 1024

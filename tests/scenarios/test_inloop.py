@@ -82,6 +82,7 @@ def test_it_is_lost_and_found_again_on_the_shipped_flight(tmp_path: Path) -> Non
     assert all(x.abs_y[0] > 0 for x, los in zip(link, seen, strict=True) if los)
 
 
+@pytest.mark.exhaustive
 def test_in_one_process_or_many_it_is_the_same_flight(tmp_path: Path) -> None:
     scenario = SCENARIOS / "uav-path.toml"
     runs = [
