@@ -110,7 +110,7 @@ class AssetExchange:
         delivery = self._deliveries.get(service)
         incoming = delivery.coming.get(message.digest) if delivery is not None else None
         if delivery is None or incoming is None:
-            text = f"sent wrong scenery: nobody asked for asset {message.digest[:12]}…"
+            text = f"sent wrong scenery: the broker did not ask for asset {message.digest[:12]}…"
             self.feed(ev.Violated(service, text))
             return
         try:

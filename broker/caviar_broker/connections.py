@@ -217,7 +217,9 @@ class Connections:
         if reason:
             connection = self.known.get(route)
             service = connection.service if connection else ""
-            self.note_rarely(f"reply {service}", f"{message_type(message)} reached nobody: {reason}", service)
+            self.note_rarely(
+                f"reply {service}", f"{message_type(message)} was not delivered: {reason}", service
+            )
 
     def note_rarely(self, kind: str, text: str, service: str = "") -> None:
         """Note something that may come often: the same kind is noted once in a while."""

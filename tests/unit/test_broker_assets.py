@@ -147,7 +147,7 @@ def test_an_unknown_asset_is_an_error_with_its_digest(tmp_path: Path) -> None:
 
 
 WRONG = {
-    "another digest": ({"digest": "1" * 64}, b"plaza", "nobody asked"),
+    "another digest": ({"digest": "1" * 64}, b"plaza", "the broker did not ask for asset 111111111111"),
     "another offset": ({"offset": 1}, b"laza", "expected them at 0"),
     "another size": ({"size": 7}, b"plaza", "expected them at 0 of 5 B"),
     "other content": ({}, b"plazA", "announced was"),

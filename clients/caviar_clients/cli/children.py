@@ -89,7 +89,7 @@ class BorrowedKey:
         self._keys = keys
         self._folder: Path | None = None
         self.public = ""
-        """What the broker is told; "" without keys."""
+        """Public key of the lent pair, which the broker gets as ``--local-key``; "" before it is made."""
 
     def environment(self) -> Mapping[str, str]:
         """Environment of a service that is started here."""

@@ -58,7 +58,7 @@ class EmbeddedLauncher:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Nothing is left: whoever leaves the loop over `events` ends the run."""
+        """Nothing is left to end: a caller that leaves the loop over `events` ends the run."""
 
     def events(self) -> Iterator[Mapping[str, Any]]:
         """What happens, until the run is over."""

@@ -148,7 +148,7 @@ class Timing:
     """Median, for frames that it had no part in."""
     p99: int
     exact: bool
-    """Whether each latency could be told to its frame."""
+    """Whether each latency could be assigned to its frame."""
 
     def at(self, episode: int, frame: int) -> int:
         """What a frame took; where it did not happen, the median."""

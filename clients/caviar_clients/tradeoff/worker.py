@@ -1,8 +1,8 @@
 """A channel model in a process of its own: prepared, warmed up, timed scene by scene.
 
 Models of one process are not independent: Dr.Jit compiles calls of shapes and materials for all scenes that
-are alive, so that a second scene changes the kernels and the time of the first; memory of one cannot be told
-from that of the other; and a model that takes too long could not be ended.
+are alive, so that a second scene changes the kernels and the time of the first; memory of one cannot be
+distinguished from that of the other; and a model that takes too long could not be ended.
 """
 
 from __future__ import annotations

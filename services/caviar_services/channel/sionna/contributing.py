@@ -81,7 +81,7 @@ def contributing(
             off["diffraction"] = "no two faces meet at an edge"
     off = {name: reason for name, reason in off.items() if getattr(options, name)}
     left = replace(options, **dict.fromkeys(off, False))
-    # What is on by default, or is off by a setting, surprises nobody who did not ask for it.
+    # An effect that is on by default, or off by a setting, needs no note: the user did not ask for it.
     asked = frozenset() if options.max_depth == 0 else _ASKED_FOR
     notes = tuple(
         f"{WARNING * (name in asked)}{name} is switched off: {reason}" for name, reason in off.items()

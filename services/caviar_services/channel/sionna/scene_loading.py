@@ -139,7 +139,7 @@ def loaded(description: Path | None) -> Any:
     """
     from sionna.rt import load_scene
 
-    # A scene refers to itself. Until one that nobody has any more is collected, kernels branch over what is
+    # A scene refers to itself. Until one without other references is collected, kernels branch over what is
     # in it too, and are compiled anew.
     gc.collect()
     try:
