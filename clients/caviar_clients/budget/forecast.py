@@ -51,16 +51,12 @@ class Played:
 class VirtualRun:
     """One run of a plan, from HELLO to BYE; nothing is computed, and no time passes.
 
-    Parameters
-    ----------
-    plan
-        The run.
-    hellos
-        What each service declares.
-    lengths
-        Frames of each episode, for agents to end it; of an episode not among these, those of the plan.
-    takes
-        How long services take.
+    Args:
+        plan: The run.
+        hellos: What each service declares.
+        lengths: Frames of each episode, for agents to end it; of an episode not among these, those of the
+            plan.
+        takes: How long services take.
     """
 
     def __init__(

@@ -79,10 +79,8 @@ def wait(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> None:
 class BorrowedKey:
     """A key pair in a folder that only this user can read, removed by `close`.
 
-    Parameters
-    ----------
-    keys
-        Keys directory of the broker; None: a run without keys, which needs none.
+    Args:
+        keys: Keys directory of the broker; None: a run without keys, which needs none.
     """
 
     def __init__(self, keys: Path | None) -> None:

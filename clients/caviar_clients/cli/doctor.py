@@ -40,13 +40,13 @@ MINIMUM_FILES = 1024
 
 SUMO_LIBRARIES = "sudo apt-get install -y libx11-6 libxext6 libxrender1 libgl1 libatomic1 libexpat1"
 
+# A kernel with a floating-point maximum, the instruction that LLVM before 16 cannot select.
 _KERNEL = """
 import drjit as dr
 from drjit.llvm import Float
 x = dr.arange(Float, 64)
 print(dr.sum(dr.maximum(dr.sin(x), 0.5))[0])
 """
-"""A kernel with a floating-point maximum, the instruction that LLVM before 16 cannot select."""
 
 FRAME_DIGESTS = {
     "bcc5e9da09faa7a27a118a76526a9713645f14428dca010e48b8de901d7f33ed": "AVX-512",

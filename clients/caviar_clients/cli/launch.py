@@ -34,8 +34,8 @@ MAX_RESTARTS = 5
 LISTEN_S = 120.0
 """[s] from its start until the broker listens: one that goes on with a run reads its journal before."""
 ANY_PORT = "tcp://127.0.0.1:0"
+# Of services that trace rays, or may.
 _TRACING_ROLES = ("channel", "sensors")
-"""Of services that trace rays, or may."""
 LOOK_S = 0.05
 """[s] between looks at whether the broker's process is stopped; its death shows at once."""
 
@@ -67,37 +67,37 @@ class Launcher:
     pace: str | None = None
     endpoint: str = ""
     _key: BorrowedKey = field(init=False)
+    # Where the socket file of the broker is; None where it listens elsewhere.
     _socket_folder: tempfile.TemporaryDirectory[str] | None = None
-    """Where the socket file of the broker is; None where it listens elsewhere."""
     _children: dict[str, Child] = field(default_factory=dict)
     _broker: subprocess.Popen[bytes] | None = None
+    # Why the broker was ended by force; "" if it was not.
     _verdict: str = ""
-    """Why the broker was ended by force; "" if it was not."""
     _selector: selectors.BaseSelector = field(default_factory=selectors.DefaultSelector)
     _rest: bytes = b""
+    # Services that died and that the broker waits for.
     _awaited: set[str] = field(default_factory=set)
-    """Services that died and that the broker waits for."""
+    # That were started after others that died, since frames were last finished.
     _brokers: int = 0
-    """That were started after others that died, since frames were last finished."""
+    # Services that the broker gave up: no SHUTDOWN reaches them.
     _lost: set[str] = field(default_factory=set)
-    """Services that the broker gave up: no SHUTDOWN reaches them."""
+    # Processes that were started since a service was last there.
     _restarts: dict[str, int] = field(default_factory=dict)
-    """Processes that were started since a service was last there."""
+    # Whether the broker told how the run ended.
     _over: bool = False
-    """Whether the broker told how the run ended."""
+    # Frames that the run had, once it is over.
     _frames: int = 0
-    """Frames that the run had, once it is over."""
+    # Why the run is to end by the user's wish; "" where it is not.
     _stopping: str = ""
-    """Why the run is to end by the user's wish; "" where it is not."""
+    # Whether the broker's output has ended.
     _finished: bool = False
-    """Whether the broker's output has ended."""
+    # Why processes of the run may not end; "" where the disk answers.
     _disk: str = ""
-    """Why processes of the run may not end; "" where the disk answers."""
+    # When a broker that all services have left must have ended [s]; None while one is left.
     _give_up_at: float | None = None
-    """When a broker that all services have left must have ended [s]; None while one is left."""
 
+    # When a broker that was started must listen [s]; None once it does.
     _listen_until: float | None = None
-    """When a broker that was started must listen [s]; None once it does."""
 
     def __post_init__(self) -> None:
         self._key = BorrowedKey(self.keys)

@@ -37,32 +37,23 @@ def plot_run(
     """Draw what a recording holds: map, |y| over time and angle of arrival, a user's delay spread, K-factor,
     coherence and frequency response, LIDAR scan, a camera's images.
 
-    Parameters
-    ----------
-    run
-        Run directory or segment.
-    out
-        Folder of the pictures; the run directory by default.
-    frame
-        Frame of the first episode for map, scan and images; by default the middle of those that have
-        most to show.
-    user
-        Receiver, or its object, for |y|, the beam and its paths; by default the one that was there longest.
-    camera
-        Camera whose images are drawn, in files with its name; by default the first, of those that are fixed
-        if there are any.
+    Args:
+        run: Run directory or segment.
+        out: Folder of the pictures; the run directory by default.
+        frame: Frame of the first episode for map, scan and images; by default the middle of those that have
+            most to show.
+        user: Receiver, or its object, for |y|, the beam and its paths; by default the one that was there
+            longest.
+        camera: Camera whose images are drawn, in files with its name; by default the first, of those that
+            are fixed if there are any.
 
-    Returns
-    -------
-    list of Path
+    Returns:
         The files, in the order map, |y|, dispersion, LIDAR, camera. What was not recorded is not drawn.
 
-    Raises
-    ------
-    RecordingError
-        It is not a recording, it holds nothing to draw, or frame, user or camera are not in it.
-    SetupError
-        Matplotlib is missing; names the command that installs it.
+    Raises:
+        RecordingError: It is not a recording, it holds nothing to draw, or frame, user or camera are not in
+            it.
+        SetupError: Matplotlib is missing; names the command that installs it.
     """
     recording = Recording(run)
     folder = out or recording.directory

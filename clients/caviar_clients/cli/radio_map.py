@@ -102,8 +102,8 @@ METRICS = {
 
 
 _FEW_RAYS = 10
+# [m]; farther away, positions in the ray tracer, which are float32, are decimetres apart.
 _FARTHEST_M = 1e6
-"""[m]; farther away, positions in the ray tracer, which are float32, are decimetres apart."""
 _MOST_GIB = 1e6
 
 

@@ -39,14 +39,14 @@ from caviar_services.registry import load
 from caviar_services.service import RunInfo
 
 _MOST_CELLS = 20_000_000
+# [m] around devices and objects where there is no scenery.
 _AROUND = 100.0
-"""[m] around devices and objects where there is no scenery."""
 
+# Pieces of scenery that an error names.
 _SHOWN_NAMES = 20
-"""Pieces of scenery that an error names."""
 
+# [m] between lowest and highest ground; beyond, a level plane is hardly meant.
 _RELIEF = 2.0
-"""[m] between lowest and highest ground; beyond, a level plane is hardly meant."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -157,12 +157,12 @@ def _frames(count: int) -> str:
     return f"{count} frame" if count == 1 else f"{count} frames"
 
 
+# What a count means that every frame of a run has, by the count's name or what that begins with.
 _NEVER: Mapping[str, str] = {
     "frames-without-users": "{source} had nobody to serve in any frame; see its `users`, and `on` of the "
     "receivers",
     WITHOUT_OBJECT_PREFIX: "device {rest!r} stood on no object of {source} in any frame; see its `on`",
 }
-"""What a count means that every frame of a run has, by the count's name or what that begins with."""
 
 
 class Unserved:
@@ -369,8 +369,8 @@ class _LinkTotals:
 
     def __init__(self) -> None:
         self.users = self.served = 0
+        # Of |y|, best and baseline |y|, SNR, best SNR, bit rate.
         self._sums = np.zeros(6)
-        """Of |y|, best and baseline |y|, SNR, best SNR, bit rate."""
 
     def add(self, link: Link) -> None:
         with_path = link.has_path

@@ -53,15 +53,11 @@ class Part(msgspec.Struct, kw_only=True):
 def rescue_run(run: Path, console: Console) -> int:
     """Say what of a run can be read, and save it where a part of it is damaged.
 
-    Returns
-    -------
-    status
+    Returns:
         0: all is whole; 1: a part is damaged, and the rest is saved; 2: of a part nothing can be read.
 
-    Raises
-    ------
-    RunError
-        It is no directory, or the copy cannot be written.
+    Raises:
+        RunError: It is no directory, or the copy cannot be written.
     """
     if not run.is_dir():
         raise RunError(f"{run} is no directory; give the directory of a run")

@@ -27,8 +27,8 @@ from caviar_protocol.topics import Camera
 SLOWEST, FASTEST = 5.0, 30.0
 """Frames a second where none are asked for: simulated time, within these."""
 _WIDTHS = {".mp4": 1280, ".gif": 960}
+# Pictures whose colours become a GIF's palette.
 _SAMPLES = 6
-"""Pictures whose colours become a GIF's palette."""
 
 User = tuple[str, str, str]
 
@@ -58,35 +58,23 @@ def film_run(
 ) -> Film:
     """Make a video of a recording: the map, |y| of one user, and what a camera saw.
 
-    Parameters
-    ----------
-    run
-        Run directory or segment.
-    out
-        File, whose suffix says the format: ``.mp4``, which needs ffmpeg, or ``.gif``. By default
-        ``video.mp4`` in the run directory where there is ffmpeg, ``video.gif`` where not.
-    fps
-        Frames shown a second; by default as fast as simulated time, but from 5 to 30.
-    frames
-        ``A:B``, frames A to B − 1 of the first episode, either may be left out; by default all frames
-        of all episodes. Frames without a scene are left out.
-    camera
-        Camera whose pictures are shown; by default the first, of those that are fixed if there are any.
-    width
-        Pixels, even; by default 1280, and 960 of a GIF.
-    user
-        Receiver, or its object, for |y| and the beam; by default the one that was there longest.
-    console
-        Where progress is shown; by default nowhere.
+    Args:
+        run: Run directory or segment.
+        out: File, whose suffix says the format: ``.mp4``, which needs ffmpeg, or ``.gif``. By default
+            ``video.mp4`` in the run directory where there is ffmpeg, ``video.gif`` where not.
+        fps: Frames shown a second; by default as fast as simulated time, but from 5 to 30.
+        frames: ``A:B``, frames A to B − 1 of the first episode, either may be left out; by default all
+            frames of all episodes. Frames without a scene are left out.
+        camera: Camera whose pictures are shown; by default the first, of those that are fixed if there are
+            any.
+        width: Pixels, even; by default 1280, and 960 of a GIF.
+        user: Receiver, or its object, for |y| and the beam; by default the one that was there longest.
+        console: Where progress is shown; by default nowhere.
 
-    Raises
-    ------
-    RecordingError
-        It is not a recording, or frames, camera or user are not in it.
-    SetupError
-        Matplotlib or ffmpeg is missing, or format, speed and width do not go together.
-    RunError
-        The file cannot be written; there is none then, not even half of one.
+    Raises:
+        RecordingError: It is not a recording, or frames, camera or user are not in it.
+        SetupError: Matplotlib or ffmpeg is missing, or format, speed and width do not go together.
+        RunError: The file cannot be written; there is none then, not even half of one.
     """
     recording = Recording(run)
     file = out or recording.directory / ("video.mp4" if find_ffmpeg() else "video.gif")

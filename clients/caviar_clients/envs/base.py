@@ -143,28 +143,18 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
     and returns its observation with the reward of link(k). An episode ends by truncation behind its
     last frame; the last observation has the scene of the last frame and its link.
 
-    Parameters
-    ----------
-    scenario
-        Scenario file.
-    broker
-        ZeroMQ address of a broker that runs the scenario, with the agent's ``use = "remote"``; None: the
-        run takes place in this process.
-    agent
-        Name of the agent whose place is taken; None: the remote one, or the only one.
-    users
-        Receivers served, as names with ``*`` and ``?``.
-    observe
-        Names of the parts of the observation: `caviar_clients.envs.observations.PARTS`.
-    reward
-        What the reward is: `caviar_clients.envs.base.Reward`.
-    directory
-        Where an embedded run records; None: it does not, which is faster.
-    render_mode
-        ``rgb_array``: a map of the scene.
-    key, broker_key
-        For a broker with keys: files with the agent's secret key and with the broker's public one. By default
-        those that CAVIAR_KEY and CAVIAR_BROKER_KEY name.
+    Args:
+        scenario: Scenario file.
+        broker: ZeroMQ address of a broker that runs the scenario, with the agent's ``use = "remote"``; None:
+            the run takes place in this process.
+        agent: Name of the agent whose place is taken; None: the remote one, or the only one.
+        users: Receivers served, as names with ``*`` and ``?``.
+        observe: Names of the parts of the observation: `caviar_clients.envs.observations.PARTS`.
+        reward: What the reward is: `caviar_clients.envs.base.Reward`.
+        directory: Where an embedded run records; None: it does not, which is faster.
+        render_mode: ``rgb_array``: a map of the scene.
+        key, broker_key: For a broker with keys: files with the agent's secret key and with the broker's
+            public one. By default those that CAVIAR_KEY and CAVIAR_BROKER_KEY name.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012  # as gymnasium has it

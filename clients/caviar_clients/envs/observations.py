@@ -46,12 +46,9 @@ class Users:
     A device on a pattern (``on = "car.*"``, ``count = 10``) has ``count`` places; the pairs that are there
     fill them in the order of their names, and what is left stays empty.
 
-    Parameters
-    ----------
-    scenario
-        Names the devices.
-    patterns
-        Receivers that are served, as names with ``*`` and ``?``.
+    Args:
+        scenario: Names the devices.
+        patterns: Receivers that are served, as names with ``*`` and ``?``.
     """
 
     def __init__(self, scenario: Scenario, patterns: Sequence[str]) -> None:

@@ -113,15 +113,11 @@ class UavPathEnv(FlightEnv):
 
     Parameters as `FlightEnv`, and:
 
-    Parameters
-    ----------
-    goal_m
-        Where to fly [m]; the episode terminates when it is reached. The observation has ``goal`` then, the
-        way that is left [m], Shape ``[3]``. None: there is none.
-    reach_m
-        Distance at which the goal is reached [m].
-    progress_weight
-        Reward for each metre that the goal has come nearer, beside that of the link.
+    Args:
+        goal_m: Where to fly [m]; the episode terminates when it is reached. The observation has ``goal``
+            then, the way that is left [m], Shape ``[3]``. None: there is none.
+        reach_m: Distance at which the goal is reached [m].
+        progress_weight: Reward for each metre that the goal has come nearer, beside that of the link.
     """
 
     def __init__(

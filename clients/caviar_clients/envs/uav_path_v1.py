@@ -31,8 +31,8 @@ SHARE_OF_WAY = (0.1, 0.5)
 
 GREATEST_DB = 300.0
 """[dB] Greatest ratio that an argument may be."""
+# [m] beyond the clearance that the world asks for.
 _MARGIN = 0.01
-"""[m] beyond the clearance that the world asks for."""
 
 
 class Weights(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -91,31 +91,20 @@ class UavPathV1Env(FlightEnv):
 
     Parameters as `SessionEnv` but for ``reward``, and:
 
-    Parameters
-    ----------
-    vehicle
-        Name of the flown object; None: the only one.
-    reach_m
-        Distance at which the goal is reached [m].
-    box_m
-        Two corners [m] within which start and goal are drawn; None: the object's bounds.
-    distance_m
-        Least and greatest distance [m] of a drawn goal from the start; None: `SHARE_OF_WAY` of the way that
-        the object can fly in an episode.
-    efficiency_bit_s_hz
-        Spectral efficiency that is a radio part of 0: the best one that counts.
-    outage_snr_db
-        A user with a lower SNR [dB] is in outage.
-    weights
-        Of the parts: `Weights`, by name.
-    observe
-        Further parts: `caviar_clients.envs.observations.PARTS`; their bounds are their own.
+    Args:
+        vehicle: Name of the flown object; None: the only one.
+        reach_m: Distance at which the goal is reached [m].
+        box_m: Two corners [m] within which start and goal are drawn; None: the object's bounds.
+        distance_m: Least and greatest distance [m] of a drawn goal from the start; None: `SHARE_OF_WAY` of
+            the way that the object can fly in an episode.
+        efficiency_bit_s_hz: Spectral efficiency that is a radio part of 0: the best one that counts.
+        outage_snr_db: A user with a lower SNR [dB] is in outage.
+        weights: Of the parts: `Weights`, by name.
+        observe: Further parts: `caviar_clients.envs.observations.PARTS`; their bounds are their own.
 
-    Raises
-    ------
-    ScenarioError
-        The object has no bounds (``minimum_m``, ``maximum_m``), the scenario fewer than two frames, or an
-        argument or an option is out of its range.
+    Raises:
+        ScenarioError: The object has no bounds (``minimum_m``, ``maximum_m``), the scenario fewer than two
+            frames, or an argument or an option is out of its range.
     """
 
     reset_options = ("start", "goal")

@@ -128,14 +128,10 @@ TRIES = 10_000
 class Airspace:
     """Points that are free for an object.
 
-    Parameters
-    ----------
-    low, high
-        Corners [m] of the box that it keeps within.
-    clearance
-        Least distance [m] of its centre from scenery.
-    scenery
-        Files of the run's scenery, by asset name.
+    Args:
+        low, high: Corners [m] of the box that it keeps within.
+        clearance: Least distance [m] of its centre from scenery.
+        scenery: Files of the run's scenery, by asset name.
     """
 
     def __init__(self, low: Vector, high: Vector, clearance: float, scenery: Mapping[str, Path]) -> None:

@@ -20,8 +20,8 @@ from caviar_services.service import StepResult
 IMPLEMENTATION = "gymnasium"
 LEAVE_S = 5.0
 """[s] that leaving a run may take."""
+# [s] between looks at whether the runner still lives.
 _POLL_S = 0.2
-"""[s] between looks at whether the runner still lives."""
 
 
 class ConnectedSession(Session):
@@ -29,20 +29,13 @@ class ConnectedSession(Session):
 
     It joins at once and gets ready at the first `reset`, whose seed becomes that of the first episode.
 
-    Parameters
-    ----------
-    broker
-        ZeroMQ address.
-    agent
-        Name of a service of the run that no process fills yet (``use = "remote"``).
-    inputs
-        What it consumes.
-    connect_timeout_s
-        Until the broker has to answer [s].
-    credentials
-        For a broker with keys; None: what the environment says.
-    with_scenery
-        Whether `Session.scenery` is fetched.
+    Args:
+        broker: ZeroMQ address.
+        agent: Name of a service of the run that no process fills yet (``use = "remote"``).
+        inputs: What it consumes.
+        connect_timeout_s: Until the broker has to answer [s].
+        credentials: For a broker with keys; None: what the environment says.
+        with_scenery: Whether `Session.scenery` is fetched.
     """
 
     def __init__(
@@ -58,10 +51,10 @@ class ConnectedSession(Session):
         self._grants: SimpleQueue[Frame | CaviarError] = SimpleQueue()
         self._results: SimpleQueue[StepResult | None] = SimpleQueue()
         self._seeds: SimpleQueue[int | None] = SimpleQueue()
+        # Of the first episode, once it is known.
         self._seed: int | None = None
-        """Of the first episode, once it is known."""
+        # The newest, by episode and frame: a broker that lost the connection may ask for them again.
         self._decisions: OrderedDict[tuple[int, int], StepResult] = OrderedDict()
-        """The newest, by episode and frame: a broker that lost the connection may ask for them again."""
         self._termination = _Leaving(self)
         scenery_here = self._take_scenery if with_scenery else None
         cls = declared(inputs, self._first_seed, self._decided, scenery_here)

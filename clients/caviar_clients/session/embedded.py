@@ -72,21 +72,16 @@ class OutsideSession(ServiceSession):
 class EmbeddedRun:
     """One run of a scenario in this process.
 
-    Parameters
-    ----------
-    scenario
-        Checked, as `caviar_protocol.scenario.loader.load_scenario` returns it.
-    directory
-        Where the recorder and the journal write. None: nothing is written, recorders are left out, and
-        products go from service to service as they are, so that the outcome has no digest and `statistics`
-        stay empty.
-    on_notice, on_frame
-        Called with each notice to the user, and with each finished frame.
-    seats
-        By name, services that decide outside of the run (`OutsideSession`), and classes that declare them.
-    imposed
-        Decisions that services take over in place of their own, as
-        `caviar_protocol.recording.reader.recorded_decisions` finds them.
+    Args:
+        scenario: Checked, as `caviar_protocol.scenario.loader.load_scenario` returns it.
+        directory: Where the recorder and the journal write. None: nothing is written, recorders are left
+            out, and products go from service to service as they are, so that the outcome has no digest and
+            `statistics` stay empty.
+        on_notice, on_frame: Called with each notice to the user, and with each finished frame.
+        seats: By name, services that decide outside of the run (`OutsideSession`), and classes that declare
+            them.
+        imposed: Decisions that services take over in place of their own, as
+            `caviar_protocol.recording.reader.recorded_decisions` finds them.
     """
 
     def __init__(
@@ -270,18 +265,12 @@ KEPT_NOTICES = 100
 class EmbeddedSession(Session):
     """A run in this process that plays as many episodes as are asked for.
 
-    Parameters
-    ----------
-    scenario
-        Checked, as `caviar_protocol.scenario.loader.load_scenario` returns it.
-    agent
-        Name of the agent whose place is taken.
-    inputs
-        What it consumes.
-    directory
-        Where recorder and journal write; None: nothing is written, which is a lot faster.
-    with_scenery
-        Whether `Session.scenery` is looked up.
+    Args:
+        scenario: Checked, as `caviar_protocol.scenario.loader.load_scenario` returns it.
+        agent: Name of the agent whose place is taken.
+        inputs: What it consumes.
+        directory: Where recorder and journal write; None: nothing is written, which is a lot faster.
+        with_scenery: Whether `Session.scenery` is looked up.
     """
 
     def __init__(

@@ -58,8 +58,8 @@ def implausible_values(scenario: Scenario) -> list[str]:
     return [str(scenario_error(scenario, key, text)) for key, text in found]
 
 
+# Keys of the scenario, and what is implausible there.
 _Warnings = Iterator[tuple[str, str]]
-"""Keys of the scenario, and what is implausible there."""
 
 
 def _carriers(scenario: Scenario) -> _Warnings:
@@ -317,8 +317,8 @@ def _meant(value_hz: float, low: float, high: float) -> str:
     return f"; is it {_si(value_hz / 1e3)}?" if low <= value_hz / 1e3 <= high else ""
 
 
+# Values beyond this are written in a larger unit: 2400 MHz, not 60,000 MHz.
 _MOST_OF_A_UNIT = 10_000
-"""Values beyond this are written in a larger unit: 2400 MHz, not 60,000 MHz."""
 
 
 def _si(value_hz: float) -> str:
