@@ -10,14 +10,12 @@ from pathlib import Path
 from caviar_broker.core.plan import RunPlan
 from caviar_broker.journal_format import run_of_journal
 from caviar_protocol.errors import RecordingError, RunError
-from caviar_protocol.files import PUT_BACK, refuse_other_kinds, sync_file
+from caviar_protocol.files import PUT_BACK, RunDirectory, refuse_other_kinds, sync_file
 from caviar_protocol.messages import GrantInput, Status
-from caviar_protocol.recording import Recording
+from caviar_protocol.recording import Recording, read_manifest
 from caviar_protocol.recording.integrity import metadata_of, recorded_until
-from caviar_protocol.recording.layout import read_manifest
 from caviar_protocol.recording.reader import recorded_decisions
 from caviar_protocol.recording.segment import Segment
-from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import ReplaySpec, Scenario
 
 

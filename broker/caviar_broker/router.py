@@ -10,8 +10,8 @@ import zmq
 
 from caviar_broker.security.access import Access, check_bind
 from caviar_broker.security.limits import FRAMING, PeerGuard, PeerLimits
-from caviar_protocol import limits
 from caviar_protocol.errors import RunError
+from caviar_protocol.fields import MAX_PARTS
 
 # Plain integers: pyzmq's flags are enumerations, and combining those costs more than a small send.
 _NOBLOCK = int(zmq.NOBLOCK)
@@ -151,7 +151,7 @@ class Router:
             part = receive(_NOBLOCK, False)
             more = part.more
             size += len(part)
-            if len(parts) <= limits.MAX_PARTS:
+            if len(parts) <= MAX_PARTS:
                 parts.append(part)
         return (route, parts) if self.guard.admits(route, parts, size) else None
 

@@ -14,9 +14,8 @@ from typing import Any
 import msgspec
 
 from caviar_protocol.errors import RecordingError, RunError
-from caviar_protocol.files import read_regular, replace_file
+from caviar_protocol.files import RunDirectory, read_regular, replace_file
 from caviar_protocol.messages import PROTOCOL_VERSION
-from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario.conversion import Source
 

@@ -13,9 +13,8 @@ import msgspec
 
 from caviar_protocol.digest import geometry_digest
 from caviar_protocol.errors import AssetError, SetupError
-from caviar_protocol.fields import AssetName
+from caviar_protocol.fields import MAX_ASSET_CHUNK, MAX_BODY, AssetName
 from caviar_protocol.files import replace_file
-from caviar_protocol.limits import MAX_ASSET_CHUNK, MAX_BODY
 from caviar_protocol.messages import Asset
 
 MAX_ASSET = MAX_BODY
@@ -90,7 +89,7 @@ class AssetStore:
             offset: First byte wanted.
 
         Returns:
-            Up to `limits.MAX_ASSET_CHUNK` bytes, and the file's size [B].
+            Up to `MAX_ASSET_CHUNK` bytes, and the file's size [B].
 
         Raises:
             AssetError: There is no such file, or it ends before ``offset``.

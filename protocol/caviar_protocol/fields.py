@@ -1,9 +1,15 @@
-"""Types that fields of several messages share, and the objects that stand inside messages."""
+"""Fields of messages: their types and limits, the objects inside messages, and the version that brought each.
+
+A reader of an earlier minor version skips most of what a later one brought. It cannot skip values of closed
+fields, and fields that change what others mean: a scenario that has them needs services of the version that
+brought them (SPEC.md, section Versions). `required_knowledge` finds these.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from enum import StrEnum
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 
@@ -11,6 +17,31 @@ from caviar_protocol.arrays import described, quantity
 
 MAX_INTEGER = 2**63 - 1
 """Every integer of the protocol fits into a signed 64-bit one."""
+
+# --- limits, the same on both sides (SPEC.md, section Limits) ---------------------------------------------
+
+MAX_HEADER = 1 << 20
+"""Bytes of a message header or payload header."""
+
+MAX_BODY = 1 << 30
+"""Bytes of the body of one product."""
+
+MAX_PARTS = 513
+"""Parts of a message without its routing part: a header and 256 products."""
+
+MAX_NESTING = 32
+"""Depth of maps and arrays in a header."""
+
+MAX_ASSET_CHUNK = 4 << 20
+"""Bytes of the data part of an ASSET_DATA."""
+
+MAX_IN_FLIGHT = 64
+"""Grants that a service may be asked to queue."""
+
+MAX_SUBCARRIERS = 65536
+"""Subcarriers of a carrier."""
+
+# --- types ------------------------------------------------------------------------------------------------
 
 # ``$`` alone would let a line feed pass at the end, which breaks a log line.
 _PRINTABLE = r"^[^\x00-\x1f\x7f]+$(?!\n)"
@@ -94,6 +125,9 @@ class Status(StrEnum):
     """Came after its deadline; only a recorder sees it, under its true frame."""
 
 
+# --- objects inside messages ------------------------------------------------------------------------------
+
+
 class Input(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """One declared input of a service (contract, clause 3)."""
 
@@ -169,3 +203,69 @@ class ProductHeader(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=Tru
     """Product digest (`caviar_protocol.digest.payload_digest`) of the two parts."""
     fidelity: Text = ""
     """Rung or quality, for the provenance that consumers see."""
+
+
+# --- versions ---------------------------------------------------------------------------------------------
+
+SINCE: dict[str, str] = {
+    "Ready.seed": "1.1",
+    "Done.seed": "1.1",
+    "Reset.seed_episode": "1.1",
+    "ChannelOptions.materials_outside": "1.1",
+    "ChannelOptions.absorption_db_per_km": "1.1",
+    "ChannelOptions.detail": "1.1",
+    "ChannelOptions.foliage": "1.4",
+    "Welcome.rejoin_ns": "1.3",
+    "Prepare.prefixes": "1.3",
+    "Fault.culprit": "1.3",
+    "WaypointCommand.at_once": "1.3",
+    "Scene.angular_velocity": "1.4",
+    "Carrier.subcarriers": "1.4",
+    "Carrier.subcarrier_spacing_hz": "1.4",
+    "Carrier.taps": "1.4",
+    "Carrier.slots": "1.4",
+    "Carrier.slot_duration_s": "1.4",
+    "ChannelResponse": "1.4",
+    "ChannelTaps": "1.4",
+    "Channel.hf": "1.4",
+    "Channel.taps": "1.4",
+    "AntennaArray.pattern_file": "1.4",
+    "AntennaArray.panels": "1.4",
+    "Panel": "1.4",
+    "Channel.error_bound_db": "1.4",
+    "Channel.error_reference": "1.4",
+}
+"""Minor version that brought a field (``Grant.reports``) or a class (``Grant``); 1.0 unless said here."""
+
+
+VALUES_SINCE: dict[str, dict[str, str]] = {
+    "AntennaArray.polarization": dict.fromkeys(
+        ("-45", "+45", "RHCP", "LHCP", "VH", "cross", "circular"), "1.4"
+    ),
+}
+"""Minor version that brought a value of a closed field; that of the field unless said here."""
+
+PARTS_SINCE: dict[str, str] = {"channel.hf": "1.4", "channel.taps": "1.4"}
+"""Minor version that brought a part of a topic; 1.0 unless said here."""
+
+CHANGES_OTHERS = frozenset({"AntennaArray.pattern_file", "AntennaArray.panels"})
+"""Fields that change what others mean, or what has to be delivered: the elements of an array, an asset."""
+
+
+def parse_version(since: str) -> Version:
+    """``1.4`` as a version."""
+    major, _, minor = since.partition(".")
+    return int(major), int(minor)
+
+
+def required_knowledge(value: msgspec.Struct) -> Iterator[tuple[str, Any, Version]]:
+    """Field, value and version of what a reader of this struct has to know and 1.0 does not have."""
+    cls = type(value)
+    defaults = {field.name: field.default for field in msgspec.structs.fields(cls)}
+    for name in value.__struct_fields__:
+        key, got = f"{cls.__name__}.{name}", getattr(value, name)
+        since = VALUES_SINCE.get(key, {}).get(got) if isinstance(got, str) else None
+        if since is None and key in CHANGES_OTHERS and got != defaults[name]:
+            since = SINCE[key]
+        if since is not None:
+            yield name, got, parse_version(since)

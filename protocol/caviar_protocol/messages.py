@@ -160,7 +160,7 @@ class AssetGet(_Message, frozen=True, kw_only=True, tag="ASSET_GET"):
 
 
 class AssetData(_Message, frozen=True, kw_only=True, tag="ASSET_DATA"):
-    """Either way: bytes of an asset, in one further message part of at most `limits.MAX_ASSET_CHUNK`."""
+    """Either way: bytes of an asset, in one further message part of at most `MAX_ASSET_CHUNK`."""
 
     digest: Digest
     """Of the whole asset."""

@@ -21,10 +21,10 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 import msgspec
 import numpy as np
 
-from caviar_protocol import arrays, fields, limits, messages, topics
+from caviar_protocol import arrays, fields, messages, topics
 from caviar_protocol.arrays import WIRE_DTYPES, ArrayField
+from caviar_protocol.fields import PARTS_SINCE, SINCE, VALUES_SINCE
 from caviar_protocol.topics import PARTS
-from caviar_protocol.versions import PARTS_SINCE, SINCE, VALUES_SINCE
 
 _MARKER = re.compile(r"(<!-- (\w+)(?:: ([\w ]+))? -->\n).*?(<!-- end -->)", re.DOTALL)
 
@@ -199,8 +199,10 @@ def _shared_bounds(meta: msgspec.Meta) -> list[str]:
 
 
 def _limits_block(_: str) -> str:
-    docs = _module_docs(limits)
-    found = [(name, f"{getattr(limits, name):,}", text) for name, text in docs.items()]
+    limits = {name: text for name, text in _module_docs(fields).items() if name.startswith("MAX_")}
+    # A bound of every integer field, which stands in the sentence on integers.
+    del limits["MAX_INTEGER"]
+    found = [(name, f"{getattr(fields, name):,}", text) for name, text in limits.items()]
     return _table(("limit", "value", "of what"), found)
 
 

@@ -18,10 +18,10 @@ from typing import Any
 
 import zmq
 
-from caviar_protocol import limits
 from caviar_protocol import messages as m
 from caviar_protocol.codec import check_parts, decode_message, encode_message, message_type
 from caviar_protocol.errors import ProtocolError, RunError, VersionError
+from caviar_protocol.fields import MAX_BODY
 from caviar_protocol.host import SignOfLife
 from caviar_protocol.keys import BROKER_KEY_VARIABLE, KEY_VARIABLE, Credentials
 from caviar_protocol.messages import Attach, Heartbeat, HeartbeatAck, Welcome
@@ -78,7 +78,7 @@ class Connection:
         self._socket.linger = LINGER_MS
         self._socket.rcvtimeo = POLL_MS
         self._socket.sndtimeo = SEND_TIMEOUT_MS
-        self._socket.setsockopt(zmq.MAXMSGSIZE, limits.MAX_BODY)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_BODY)
         self._heartbeat: HeartbeatThread | None = None
         self._rejoin_s = 0.0
         # Calls off the end of the process that the broker's silence brings about.

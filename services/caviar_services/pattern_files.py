@@ -32,8 +32,8 @@ import numpy as np
 
 from caviar_protocol.arrays import Complex128Array, Float64Array, Int64Array
 from caviar_protocol.errors import AssetError
+from caviar_protocol.fields import MAX_BODY
 from caviar_protocol.files import open_regular
-from caviar_protocol.limits import MAX_BODY
 
 SUFFIXES = (".csv", ".msi", ".pln")
 

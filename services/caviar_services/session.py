@@ -16,7 +16,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-from caviar_protocol import limits
 from caviar_protocol import messages as m
 from caviar_protocol.assets import AssetStore, IncomingAsset
 from caviar_protocol.codec import message_type
@@ -26,6 +25,7 @@ from caviar_protocol.errors import (
     ProtocolError,
     RunError,
 )
+from caviar_protocol.fields import MAX_IN_FLIGHT
 from caviar_protocol.host import trim_memory
 from caviar_protocol.scenario.conversion import convert_settings
 from caviar_protocol.validation import ContentCheck
@@ -168,7 +168,7 @@ class ServiceSession:
             outputs=cls.outputs,
             capabilities=tuple(c for c in m.CAPABILITIES if c != "checkpoint" or cls.checkpoints),
             implementation=self.use,
-            max_in_flight=limits.MAX_IN_FLIGHT,
+            max_in_flight=MAX_IN_FLIGHT,
             host=host,
             pid=pid,
         )
@@ -474,9 +474,7 @@ class Answers:
         """Keep an answer, and forget the oldest where they get too many or too large."""
         self._answers[frame], self._newest = answer, frame
         self._bytes += _size(answer)
-        while len(self._answers) > 2 and (
-            len(self._answers) > limits.MAX_IN_FLIGHT or self._bytes > KEPT_BYTES
-        ):
+        while len(self._answers) > 2 and (len(self._answers) > MAX_IN_FLIGHT or self._bytes > KEPT_BYTES):
             self._bytes -= _size(self._answers.popitem(last=False)[1])
 
 

@@ -12,9 +12,9 @@ from pathlib import Path
 import decoder_fuzzer
 import pytest
 
-from caviar_protocol import limits
 from caviar_protocol.codec import decode_message, decode_payload
 from caviar_protocol.errors import DecodeError, LimitError, ProtocolError
+from caviar_protocol.fields import MAX_HEADER
 
 SEED = 6
 
@@ -126,6 +126,6 @@ def test_deep_nesting_is_survived_on_the_small_stack_of_a_thread() -> None:
 
 def test_a_header_beyond_the_limit_is_refused_unread() -> None:
     with pytest.raises(LimitError, match="1048577 B"):
-        decode_message(bytes(limits.MAX_HEADER + 1))
+        decode_message(bytes(MAX_HEADER + 1))
     with pytest.raises(LimitError, match="1048577 B"):
-        decode_payload("scene", bytes(limits.MAX_HEADER + 1), b"")
+        decode_payload("scene", bytes(MAX_HEADER + 1), b"")

@@ -20,8 +20,7 @@ from scenarios_support import (
 )
 
 from caviar_protocol.recording import Recording
-from caviar_protocol.scenario import load_scenario
-from caviar_protocol.scenario.loader import instants_ns
+from caviar_protocol.scenario import instants_ns, load_scenario
 
 SICK = """
 [services.sick]

@@ -42,7 +42,7 @@ WIRE = (
     "codec_nesting",
     "digest",
     "scenario_conversion",
-    "scenario_loader",
+    "scenario",
     "space_scene",
     "validation",
 )

@@ -14,7 +14,7 @@ from broker_harness import MS, Client, Serving, plan, serving
 from caviar_broker.assets import FILES_AT_ONCE
 from caviar_protocol import messages as m
 from caviar_protocol.digest import geometry_digest
-from caviar_protocol.limits import MAX_ASSET_CHUNK
+from caviar_protocol.fields import MAX_ASSET_CHUNK
 
 Files = dict[str, bytes]
 

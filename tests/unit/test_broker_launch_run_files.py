@@ -16,7 +16,7 @@ from caviar_broker.launch import parser, serve
 from caviar_broker.run_record import RunRecord, versions_of
 from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.errors import CaviarError, RunError
-from caviar_protocol.recording.layout import read_manifest
+from caviar_protocol.recording import read_manifest
 from caviar_protocol.scenario import load_scenario
 from caviar_protocol.scenario.rules import with_overrides
 

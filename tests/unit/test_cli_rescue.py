@@ -15,8 +15,7 @@ from caviar_broker.run_record import RunRecord
 from caviar_clients.cli.inspect import inspect_command
 from caviar_clients.cli.rescue import rescue_run
 from caviar_protocol.errors import RunError
-from caviar_protocol.recording import Recording
-from caviar_protocol.recording.layout import Manifest, SegmentRecord
+from caviar_protocol.recording import Manifest, Recording, SegmentRecord
 from caviar_protocol.recording.segment import Segment
 from caviar_protocol.scenario import load_scenario
 

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from typing_extensions import TypeAliasType, TypeVar
 
-from caviar_protocol import limits
 from caviar_protocol.arrays import (
     MAX_DIMENSIONS,
     WIRE_DTYPES,
@@ -26,6 +25,7 @@ from caviar_protocol.arrays import (
 )
 from caviar_protocol.codec.payloads import BodyReader, BodyWriter, plain
 from caviar_protocol.errors import DecodeError, LimitError, PayloadError, ProtocolError
+from caviar_protocol.fields import MAX_BODY
 
 
 class Inner(Payload, frozen=True, kw_only=True, omit_defaults=True):
@@ -200,7 +200,7 @@ def test_a_reference_is_served_from_within_the_body_or_refused(
         {"dtype": "<f8", "shape": [1.0], "offset": 0},
         {"dtype": "<f8", "shape": [1], "offset": 0.0},
         {"dtype": "<f8", "shape": [1], "offset": False},
-        {"dtype": "<f8", "shape": [0, limits.MAX_BODY, limits.MAX_BODY], "offset": 0},
+        {"dtype": "<f8", "shape": [0, MAX_BODY, MAX_BODY], "offset": 0},
     ],
     ids=repr,
 )

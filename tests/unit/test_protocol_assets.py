@@ -11,7 +11,7 @@ import pytest
 
 from caviar_protocol.assets import MAX_ASSET, AssetStore, IncomingAsset, default_folder
 from caviar_protocol.errors import AssetError, SetupError
-from caviar_protocol.limits import MAX_ASSET_CHUNK
+from caviar_protocol.fields import MAX_ASSET_CHUNK
 from caviar_protocol.messages import Asset
 
 

@@ -13,7 +13,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from caviar_protocol import limits
 from caviar_protocol.codec import (
     check_parts,
     check_version,
@@ -25,6 +24,7 @@ from caviar_protocol.codec import (
     part_count,
 )
 from caviar_protocol.errors import DecodeError, LimitError, PayloadError, VersionError
+from caviar_protocol.fields import MAX_BODY, MAX_HEADER
 from caviar_protocol.messages import (
     PROTOCOL_VERSION,
     AssetData,
@@ -258,9 +258,9 @@ def test_settings_that_other_languages_lack_do_not_leave() -> None:
 
 def test_a_header_that_is_too_large_does_not_leave() -> None:
     with pytest.raises(LimitError, match="BYE header has"):
-        encode_message(Bye(epoch=1, attempt=1, reason="x" * limits.MAX_HEADER))
+        encode_message(Bye(epoch=1, attempt=1, reason="x" * MAX_HEADER))
     with pytest.raises(LimitError, match="payload header has"):
-        encode_payload(scene(CameraDevice(name="x" * limits.MAX_HEADER)))
+        encode_payload(scene(CameraDevice(name="x" * MAX_HEADER)))
 
 
 # --- parts and versions ---------------------------------------------------------------------------
@@ -307,15 +307,15 @@ class Sized:
 
 def test_parts_are_measured_before_they_are_used() -> None:
     message = grant(Status.FRESH)
-    check_parts(message, [b"", Sized(limits.MAX_HEADER), Sized(limits.MAX_BODY)])
+    check_parts(message, [b"", Sized(MAX_HEADER), Sized(MAX_BODY)])
     with pytest.raises(LimitError, match="part 1 of GRANT has 1048577 B"):
-        check_parts(message, [b"", Sized(limits.MAX_HEADER + 1), b""])
+        check_parts(message, [b"", Sized(MAX_HEADER + 1), b""])
     with pytest.raises(LimitError, match="part 2 of GRANT"):
-        check_parts(message, [b"", b"", Sized(limits.MAX_BODY + 1)])
+        check_parts(message, [b"", b"", Sized(MAX_BODY + 1)])
     restore = Restore(epoch=1, attempt=1, episode=0, frame=0)
-    check_parts(restore, [b"", Sized(limits.MAX_BODY)])
+    check_parts(restore, [b"", Sized(MAX_BODY)])
     with pytest.raises(LimitError, match="part 1 of RESTORE"):
-        check_parts(restore, [b"", Sized(limits.MAX_BODY + 1)])
+        check_parts(restore, [b"", Sized(MAX_BODY + 1)])
 
 
 @given(st.integers(0, 1000), st.integers(0, 1000), st.integers(0, 1000))

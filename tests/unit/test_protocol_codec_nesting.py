@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from caviar_protocol import limits
 from caviar_protocol.codec import decode_message
 from caviar_protocol.codec.decoding import HARMLESS, _deeper_than, check_nesting
 from caviar_protocol.errors import LimitError
+from caviar_protocol.fields import MAX_NESTING
 
 SCALARS = (
     st.none()
@@ -56,9 +56,9 @@ def nested(levels: int, siblings: int) -> bytes:
 
 
 def test_depth_counts_and_not_number() -> None:
-    check_nesting(nested(limits.MAX_NESTING, 2000), "header")
+    check_nesting(nested(MAX_NESTING, 2000), "header")
     with pytest.raises(LimitError, match="header nests deeper than 32"):
-        check_nesting(nested(limits.MAX_NESTING + 1, 2000), "header")
+        check_nesting(nested(MAX_NESTING + 1, 2000), "header")
 
 
 @pytest.mark.parametrize("kind", [bytes, bytearray, memoryview])

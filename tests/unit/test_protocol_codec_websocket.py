@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from caviar_protocol.codec import join_parts, split_frame
 from caviar_protocol.errors import DecodeError, LimitError, ProtocolError
-from caviar_protocol.limits import MAX_PARTS
+from caviar_protocol.fields import MAX_PARTS
 
 VECTORS = Path(__file__).parents[2] / "protocol" / "vectors"
 FRAMES = sorted(VECTORS.glob("*.frame"))

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from caviar_protocol import fields, limits
+from caviar_protocol import fields
+from caviar_protocol.fields import MAX_PARTS
 from caviar_protocol.messages import Asset, Message, Status
 
 DIGEST = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
@@ -106,7 +107,7 @@ def test_shared_types_hold_their_bounds(hint: Any, good: list[Any], bad: list[An
 
 def test_the_longest_list_of_products_fills_the_largest_message() -> None:
     assert fields.few.max_length is not None
-    assert 1 + 2 * fields.few.max_length == limits.MAX_PARTS
+    assert 1 + 2 * fields.few.max_length == MAX_PARTS
 
 
 def test_statuses_are_words() -> None:

@@ -15,9 +15,15 @@ from mcap.writer import CompressionType, Writer
 from recording_samples import SCENARIO, frame, link, product, record, recorder
 
 from caviar_protocol.errors import RecordingError
-from caviar_protocol.recording import Recording, RecordingWarning, integrity
+from caviar_protocol.recording import (
+    METADATA_NAME,
+    PROFILE,
+    Recording,
+    RecordingWarning,
+    integrity,
+    read_manifest,
+)
 from caviar_protocol.recording.integrity import declared_digest, recorded_until
-from caviar_protocol.recording.layout import METADATA_NAME, PROFILE, read_manifest
 from caviar_protocol.recording.segment import Segment, expand, may_expand
 from caviar_protocol.topics import Link
 

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from caviar_broker.core.plan import plan_run
 from caviar_protocol.errors import ScenarioError
-from caviar_protocol.scenario import Scenario, parse_scenario
-from caviar_protocol.scenario.loader import instants_ns
+from caviar_protocol.scenario import Scenario, instants_ns, parse_scenario
 from caviar_protocol.scenario.rules import resolved, with_overrides
 
 TEXT = """\

@@ -11,13 +11,13 @@ import msgspec
 import numpy as np
 import pytest
 
+from caviar_protocol.fields import CHANGES_OTHERS, PARTS_SINCE, VALUES_SINCE
 from caviar_protocol.host import host_identity
 from caviar_protocol.keys import Pair, read_pair
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.space.coordinates import rotated, rotation_matrix
 from caviar_protocol.space.ply import read_ply
 from caviar_protocol.topics import Interaction
-from caviar_protocol.versions import CHANGES_OTHERS, PARTS_SINCE, VALUES_SINCE
 from caviar_services.mesh.scenery import find_scenery, read_scenery
 
 SPEC = (Path(__file__).parents[2] / "protocol" / "SPEC.md").read_text("utf-8")

@@ -10,8 +10,7 @@ from recording_samples import PERIOD_NS, SCENARIO, absent, frame, link, product
 
 from caviar_protocol.errors import RunError
 from caviar_protocol.messages import Status
-from caviar_protocol.recording import Recording, integrity
-from caviar_protocol.recording.layout import Manifest, read_manifest
+from caviar_protocol.recording import Manifest, Recording, integrity, read_manifest
 from caviar_services.recorder.mcap import McapRecorder, McapSettings
 from caviar_services.service import Frame, Preparation, RunInfo
 

@@ -20,8 +20,7 @@ from caviar_protocol.codec import decode_payload
 from caviar_protocol.digest import payload_digest
 from caviar_protocol.errors import AssetError, RunError
 from caviar_protocol.messages import GrantInput, Status
-from caviar_protocol.recording import Recording
-from caviar_protocol.recording.layout import FrameEntry
+from caviar_protocol.recording import FrameEntry, Recording
 from caviar_services.recorder.base import copy_assets
 from caviar_services.recorder.mcap import McapRecorder
 from caviar_services.registry import load

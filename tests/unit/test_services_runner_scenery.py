@@ -14,7 +14,7 @@ from runner_harness import Broker, ends, played_broker, service
 
 from caviar_protocol import messages as m
 from caviar_protocol.digest import geometry_digest
-from caviar_protocol.limits import MAX_ASSET_CHUNK
+from caviar_protocol.fields import MAX_ASSET_CHUNK
 
 __all__ = ["played_broker"]
 

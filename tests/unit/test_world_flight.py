@@ -15,7 +15,7 @@ from caviar_protocol.errors import PayloadError, RunError, ScenarioError
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.space.coordinates import Vector, euler_from_quaternion
 from caviar_protocol.topics import Action, BeamChoice, Scene, VelocityCommand, WaypointCommand
-from caviar_protocol.topics.action import Command
+from caviar_protocol.topics.link import Command
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo, StepResult
 from caviar_services.world.flight import FlightSettings, FlightWorld, FlownObject
 from caviar_services.world.trajectory import MovingObject

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from caviar_protocol.errors import DeclarationError
+from caviar_protocol.fields import PARTS_SINCE, parse_version
 from caviar_protocol.messages import Demand, Hello
 from caviar_protocol.scenario.rules import patterns_overlap
-from caviar_protocol.versions import PARTS_SINCE, parsed
 
 WILDCARD = "*"
 """Topic of an input that takes every topic (recorders)."""
@@ -244,7 +244,7 @@ def _check_parts(
     for name, entries in demand.items():
         for topic, part in [(entry.topic, part) for entry in entries for part in entry.parts]:
             since = PARTS_SINCE.get(f"{topic}.{part}", "1.0")
-            if hellos[name].version >= parsed(since):
+            if hellos[name].version >= parse_version(since):
                 continue
             askers = [
                 f"{hellos[consumer].role} {consumer!r}"

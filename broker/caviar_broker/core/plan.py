@@ -9,13 +9,11 @@ from typing import Any
 
 import msgspec
 
-from caviar_protocol.fields import Version
+from caviar_protocol.fields import Version, required_knowledge
 from caviar_protocol.messages import Asset, GrantInput, Policy, Role
-from caviar_protocol.scenario import REMOTE_REJOIN_S, Scenario, ServiceSpec
+from caviar_protocol.scenario import REMOTE_REJOIN_S, Scenario, ServiceSpec, instants_ns
 from caviar_protocol.scenario.conversion import Source
-from caviar_protocol.scenario.loader import instants_ns
 from caviar_protocol.scenario.rules import resolved, world_of
-from caviar_protocol.versions import required_knowledge
 
 SECOND = 1_000_000_000
 """[ns]"""

@@ -14,7 +14,7 @@ import zmq
 from caviar_broker.event_loop import EventLoop
 from caviar_broker.security.access import BAR_NS, Access, answer, is_local
 from caviar_broker.security.tcp import TcpConnection, TcpConnections, plain
-from caviar_protocol.limits import MAX_BODY
+from caviar_protocol.fields import MAX_BODY
 from caviar_protocol.scenario import Limits
 
 PERIOD_NS = 10_000_000_000

@@ -20,8 +20,7 @@ from caviar_broker.supervision import describe_exit, describe_stop, is_stopped
 from caviar_clients.cli.children import BorrowedKey, Child, end, wait
 from caviar_clients.session.checks import module_folders
 from caviar_protocol.errors import RunError
-from caviar_protocol.files import file_system_of, open_to_append
-from caviar_protocol.run_directory import RunDirectory
+from caviar_protocol.files import RunDirectory, file_system_of, open_to_append
 from caviar_protocol.scenario import Scenario, ServiceSpec
 from caviar_services.ray_tracing import THREADS_VARIABLE, share_of_each
 

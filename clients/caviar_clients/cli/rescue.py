@@ -22,11 +22,10 @@ from caviar_broker.journal_format import JournalReader, run_of_journal
 from caviar_broker.run_record import RunRecord, read_record
 from caviar_clients.cli.recording_summary import resume_hint
 from caviar_protocol.errors import RecordingError, RunError
+from caviar_protocol.files import RunDirectory
 from caviar_protocol.messages import Status
-from caviar_protocol.recording import Recording, RecordingWarning
-from caviar_protocol.recording.layout import frame_name
+from caviar_protocol.recording import Recording, RecordingWarning, frame_name
 from caviar_protocol.recording.segment import Segment
-from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario
 from caviar_services.recorder.base import failure
 from caviar_services.recorder.continuation import stored_products

@@ -34,9 +34,9 @@ from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.embedded import EmbeddedRun
 from caviar_clients.session.plausibility import implausible_values
 from caviar_protocol.errors import RecordingError, RunError, SetupError
+from caviar_protocol.files import RunDirectory
 from caviar_protocol.recording import Recording
 from caviar_protocol.recording.integrity import declared_digest
-from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario, find_scenario
 from caviar_protocol.scenario.rules import refuse_remote
 

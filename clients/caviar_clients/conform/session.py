@@ -15,8 +15,8 @@ from caviar_clients.conform.case import Failed
 from caviar_clients.conform.client import BY_HAND_S, Client, End
 from caviar_clients.conform.street import Inputs
 from caviar_clients.conform.wire import Fields, Received, Wire, in_order
+from caviar_protocol.fields import PARTS_SINCE, parse_version
 from caviar_protocol.topics import PARTS
-from caviar_protocol.versions import PARTS_SINCE, parsed
 
 CHUNK = 700
 """[B] of an ASSET_DATA from the kit, so that even small files take several."""
@@ -26,7 +26,9 @@ def known_parts(topic: str, hello: Fields) -> list[str]:
     """Parts of a topic that the version of a client has."""
     spoken = tuple(hello["version"])
     return [
-        part for part in PARTS.get(topic, ()) if spoken >= parsed(PARTS_SINCE.get(f"{topic}.{part}", "1.0"))
+        part
+        for part in PARTS.get(topic, ())
+        if spoken >= parse_version(PARTS_SINCE.get(f"{topic}.{part}", "1.0"))
     ]
 
 

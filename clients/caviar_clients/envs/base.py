@@ -28,7 +28,7 @@ from caviar_protocol.messages import Input
 from caviar_protocol.space.beams import beam_gain
 from caviar_protocol.space.scene import Pair, device_pose
 from caviar_protocol.topics import Action, Link, Scene
-from caviar_protocol.topics.action import Command
+from caviar_protocol.topics.link import Command
 
 SIZE_IN, DPI = (6.4, 4.8), 100
 """640×480 pixels."""

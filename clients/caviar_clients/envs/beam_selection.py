@@ -14,7 +14,7 @@ from caviar_clients.envs.base import SessionEnv
 from caviar_clients.envs.observations import Moment
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.topics import BeamChoice
-from caviar_protocol.topics.action import Command
+from caviar_protocol.topics.link import Command
 
 
 class BeamSelectionEnv(SessionEnv[np.int64 | NDArray[np.int64]]):

@@ -22,7 +22,7 @@ from caviar_protocol.space.beams import straight_beams
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.space.scene import directions
 from caviar_protocol.topics import BeamChoice, VelocityCommand
-from caviar_protocol.topics.action import Command
+from caviar_protocol.topics.link import Command
 
 MOTION = "motion:"
 

@@ -8,7 +8,7 @@ from caviar_protocol.scenario.toml import toml_text
 
 
 def scenario_text(scenario: Scenario) -> str:
-    """What `caviar_protocol.scenario.loader.load_scenario` reads as this scenario."""
+    """What `caviar_protocol.scenario.load_scenario` reads as this scenario."""
     table = plain(scenario, defaults=False)
     table.pop("source", None)
     if table["run"].get("instants_s"):  # which tell the others

@@ -9,8 +9,8 @@ from queue import Empty, SimpleQueue
 
 from caviar_clients.session.base import Frame, Session, declared
 from caviar_protocol.errors import CaviarError, RunError
+from caviar_protocol.fields import MAX_IN_FLIGHT
 from caviar_protocol.keys import Credentials
-from caviar_protocol.limits import MAX_IN_FLIGHT
 from caviar_protocol.messages import Input
 from caviar_services.connection import Terminated
 from caviar_services.process import Termination

@@ -28,9 +28,9 @@ from caviar_clients.session.base import Frame, Session, declared
 from caviar_protocol import messages as m
 from caviar_protocol.assets import AssetStore
 from caviar_protocol.errors import RunError
+from caviar_protocol.files import RunDirectory
 from caviar_protocol.messages import Input
 from caviar_protocol.recording.reader import Imposed
-from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.validation import ContentCheck
 from caviar_services.registry import load
@@ -73,7 +73,7 @@ class EmbeddedRun:
     """One run of a scenario in this process.
 
     Args:
-        scenario: Checked, as `caviar_protocol.scenario.loader.load_scenario` returns it.
+        scenario: Checked, as `caviar_protocol.scenario.load_scenario` returns it.
         directory: Where the recorder and the journal write. None: nothing is written, recorders are left
             out, and products go from service to service as they are, so that the outcome has no digest and
             `statistics` stay empty.
@@ -266,7 +266,7 @@ class EmbeddedSession(Session):
     """A run in this process that plays as many episodes as are asked for.
 
     Args:
-        scenario: Checked, as `caviar_protocol.scenario.loader.load_scenario` returns it.
+        scenario: Checked, as `caviar_protocol.scenario.load_scenario` returns it.
         agent: Name of the agent whose place is taken.
         inputs: What it consumes.
         directory: Where recorder and journal write; None: nothing is written, which is a lot faster.

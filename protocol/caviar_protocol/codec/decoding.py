@@ -13,8 +13,8 @@ from typing import Any, TypeVar
 import msgspec
 from msgspec import inspect
 
-from caviar_protocol import limits
 from caviar_protocol.errors import DecodeError, LimitError, PayloadError
+from caviar_protocol.fields import MAX_HEADER, MAX_NESTING
 
 Buffer = bytes | bytearray | memoryview
 
@@ -45,21 +45,21 @@ def check_nesting(header: bytes | bytearray | memoryview, what: str) -> None:
     """Refuse a header that nests so deep that decoding it could exhaust a stack.
 
     Up to `HARMLESS` maps and arrays in all are let pass unseen; with more, a depth beyond
-    `limits.MAX_NESTING` is refused. Bytes that are not msgpack are left to the decoder.
+    `MAX_NESTING` is refused. Bytes that are not msgpack are left to the decoder.
 
     Args:
         header: MessagePack bytes from a peer.
         what: What the error calls them.
 
     Raises:
-        LimitError: Maps and arrays are nested in more than `limits.MAX_NESTING` levels.
+        LimitError: Maps and arrays are nested in more than `MAX_NESTING` levels.
     """
     # A pass in C counts the bytes that may open a container, text included: few mean shallow.
     data = header if isinstance(header, bytes) else bytes(header)
     if len(data) <= HARMLESS or len(data.translate(None, _OTHERS)) <= HARMLESS:
         return
-    if _deeper_than(data, limits.MAX_NESTING):
-        raise LimitError(f"{what} nests deeper than {limits.MAX_NESTING} levels")
+    if _deeper_than(data, MAX_NESTING):
+        raise LimitError(f"{what} nests deeper than {MAX_NESTING} levels")
 
 
 def _deeper_than(data: bytes, limit: int) -> bool:
@@ -196,17 +196,17 @@ def decode_bounded(decoder: msgspec.msgpack.Decoder[_T], header: Buffer, what: s
         what: What an error calls them: ``"message header"``.
 
     Raises:
-        LimitError: They are larger than `limits.MAX_HEADER`, or nest deeper than `limits.MAX_NESTING`.
+        LimitError: They are larger than `MAX_HEADER`, or nest deeper than `MAX_NESTING`.
         DecodeError: They are not of the expected type; the text lists what is accepted where that is known.
     """
-    if len(header) > limits.MAX_HEADER:
-        raise LimitError(f"{what} has {len(header)} B, at most {limits.MAX_HEADER} are accepted")
+    if len(header) > MAX_HEADER:
+        raise LimitError(f"{what} has {len(header)} B, at most {MAX_HEADER} are accepted")
     check_nesting(header, what)
     try:
         return decoder.decode(header)
     # What the walk let pass (few containers) may still be deeper than a small thread's stack.
     except RecursionError as error:
-        raise LimitError(f"{what} nests deeper than {limits.MAX_NESTING} levels") from error
+        raise LimitError(f"{what} nests deeper than {MAX_NESTING} levels") from error
     except (PayloadError, msgspec.MsgspecError, ValueError, TypeError, OverflowError) as error:
         possible = choices(decoder.type, header, str(error))
         hint = f"; write one of {', '.join(possible)}" if possible else ""

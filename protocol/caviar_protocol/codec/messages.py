@@ -19,10 +19,9 @@ from typing import Any
 
 import msgspec
 
-from caviar_protocol import limits
 from caviar_protocol.codec.decoding import Buffer, decode_bounded
 from caviar_protocol.errors import DecodeError, LimitError, PayloadError, VersionError
-from caviar_protocol.fields import Version
+from caviar_protocol.fields import MAX_ASSET_CHUNK, MAX_BODY, MAX_HEADER, MAX_NESTING, MAX_PARTS, Version
 from caviar_protocol.messages import (
     PROTOCOL_VERSION,
     AssetData,
@@ -62,7 +61,7 @@ def encode_message(message: Message) -> bytes:
 
     Raises:
         PayloadError: A field holds a value that cannot travel.
-        LimitError: The header is larger than `limits.MAX_HEADER`.
+        LimitError: The header is larger than `MAX_HEADER`.
 
     Example:
         >>> from caviar_protocol.messages import HeartbeatAck
@@ -76,9 +75,9 @@ def encode_message(message: Message) -> bytes:
         header = _message_encoder.encode(message)
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
         raise PayloadError(f"{message_type(message)} holds a value that cannot travel: {error}") from error
-    if len(header) > limits.MAX_HEADER:
+    if len(header) > MAX_HEADER:
         raise LimitError(
-            f"{message_type(message)} header has {len(header)} B, at most {limits.MAX_HEADER} may travel"
+            f"{message_type(message)} header has {len(header)} B, at most {MAX_HEADER} may travel"
         )
     return header
 
@@ -90,7 +89,7 @@ def decode_message(header: Buffer) -> Message:
         header: First part of the message, without the routing part.
 
     Raises:
-        LimitError: The header is larger than `limits.MAX_HEADER` or nested too deeply.
+        LimitError: The header is larger than `MAX_HEADER` or nested too deeply.
         VersionError: It is a HELLO or WELCOME of another major version, which this one cannot read.
         DecodeError: The bytes are not a message of this protocol.
     """
@@ -157,9 +156,9 @@ def check_parts(message: Message, parts: Sequence[Any]) -> None:
         _check_chunk(message, len(parts[1]))
         return
     # The only part of RESTORE and CHECKPOINT_DONE is a state, which is as large as a body.
-    payload_header = limits.MAX_HEADER if isinstance(message, (Grant, Done)) else limits.MAX_BODY
+    payload_header = MAX_HEADER if isinstance(message, (Grant, Done)) else MAX_BODY
     for index, part in enumerate(parts[1:], 1):
-        limit = payload_header if index % 2 else limits.MAX_BODY
+        limit = payload_header if index % 2 else MAX_BODY
         if len(part) > limit:
             raise LimitError(
                 f"part {index} of {message_type(message)} has {len(part)} B, at most {limit} are accepted"
@@ -193,8 +192,8 @@ def _check_opening(header: Buffer) -> None:
 
 
 def _check_chunk(message: AssetData, length: int) -> None:
-    if length > limits.MAX_ASSET_CHUNK:
-        raise LimitError(f"ASSET_DATA carries {length} B, at most {limits.MAX_ASSET_CHUNK} are accepted")
+    if length > MAX_ASSET_CHUNK:
+        raise LimitError(f"ASSET_DATA carries {length} B, at most {MAX_ASSET_CHUNK} are accepted")
     # A peer that sends more than it announced would fill the memory of the other.
     if message.offset + length > message.size:
         raise DecodeError(
@@ -215,8 +214,8 @@ _PLAIN = (str, int, float, bool, NoneType)
 def _check_plain(value: Any, path: str, depth: int, error: type[PayloadError] | type[DecodeError]) -> None:
     if isinstance(value, _PLAIN):
         return
-    if depth > limits.MAX_NESTING:
-        raise LimitError(f"{path} nests deeper than {limits.MAX_NESTING} levels")
+    if depth > MAX_NESTING:
+        raise LimitError(f"{path} nests deeper than {MAX_NESTING} levels")
     if isinstance(value, dict):
         for key, item in value.items():
             if not isinstance(key, str):
@@ -274,10 +273,10 @@ def split_frame(frame: Buffer) -> list[memoryview]:
     if len(view) < _COUNT.size:
         raise DecodeError(f"a frame has {len(view)} B, it begins with the number of its parts in 4 B")
     (count,) = _COUNT.unpack_from(view)
-    if not 1 <= count <= limits.MAX_PARTS:
+    if not 1 <= count <= MAX_PARTS:
         # JavaScript's DataView writes big-endian by default: the most frequent mistake.
-        swapped = 1 <= int.from_bytes(view[: _COUNT.size], "big") <= limits.MAX_PARTS
-        text = f"a frame announces {count} parts, a message has 1 to {limits.MAX_PARTS}"
+        swapped = 1 <= int.from_bytes(view[: _COUNT.size], "big") <= MAX_PARTS
+        text = f"a frame announces {count} parts, a message has 1 to {MAX_PARTS}"
         raise LimitError(text + BIG_ENDIAN * swapped)
     place = _COUNT.size * (1 + count)
     if len(view) < place:

@@ -22,10 +22,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from caviar_protocol import limits
 from caviar_protocol.arrays import MAX_DIMENSIONS, WIRE_DTYPES, Payload, require_finite
 from caviar_protocol.codec.decoding import Buffer, decode_bounded
 from caviar_protocol.errors import DecodeError, LimitError, PayloadError
+from caviar_protocol.fields import MAX_BODY, MAX_HEADER
 from caviar_protocol.topics import PAYLOADS
 
 ALIGNMENT = 8
@@ -103,7 +103,7 @@ class BodyReader:
         for size in shape:
             count *= size
             room *= size or 1
-        if room > limits.MAX_BODY:
+        if room > MAX_BODY:
             raise DecodeError(f"array shape {shape} is larger than any body")
         end = offset + count * dtype.itemsize
         if end > len(self._body):
@@ -133,7 +133,7 @@ def _reference(reference: Any) -> tuple[str, list[int], int]:
     if type(shape) is not list:
         raise DecodeError(f"array shape {shape!r:.80} is not a list of sizes")
     for size in shape:
-        if type(size) is not int or not 0 <= size <= limits.MAX_BODY:
+        if type(size) is not int or not 0 <= size <= MAX_BODY:
             raise DecodeError(f"array shape {shape!r:.80} is not a list of sizes")
     if len(shape) > MAX_DIMENSIONS:
         raise LimitError(f"array has {len(shape)} dimensions, at most {MAX_DIMENSIONS} are accepted")
@@ -171,10 +171,10 @@ def encode_payload(payload: Payload) -> tuple[bytes, bytes]:
         header = _payload_encoder.encode(fields)
     except (TypeError, ValueError, OverflowError) as error:
         raise PayloadError(f"{type(payload).__name__} holds a value that cannot travel: {error}") from error
-    if len(header) > limits.MAX_HEADER:
-        raise LimitError(f"payload header has {len(header)} B, at most {limits.MAX_HEADER} may travel")
-    if writer.length > limits.MAX_BODY:
-        raise LimitError(f"payload body has {writer.length} B, at most {limits.MAX_BODY} may travel")
+    if len(header) > MAX_HEADER:
+        raise LimitError(f"payload header has {len(header)} B, at most {MAX_HEADER} may travel")
+    if writer.length > MAX_BODY:
+        raise LimitError(f"payload body has {writer.length} B, at most {MAX_BODY} may travel")
     return header, writer.body()
 
 
@@ -212,8 +212,8 @@ def decode_payload(topic: str, header: Buffer, body: Buffer) -> Payload:
     if cls is None:
         raise DecodeError(f"unknown topic {topic!r}; one of {', '.join(PAYLOADS)}")
     view = memoryview(body).toreadonly().cast("B")
-    if len(view) > limits.MAX_BODY:
-        raise LimitError(f"payload body has {len(view)} B, at most {limits.MAX_BODY} are accepted")
+    if len(view) > MAX_BODY:
+        raise LimitError(f"payload body has {len(view)} B, at most {MAX_BODY} are accepted")
     _reading.reader = BodyReader(view)
     try:
         return decode_bounded(_payload_decoder(cls), header, f"{topic} payload")

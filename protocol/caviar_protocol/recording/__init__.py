@@ -9,25 +9,189 @@
 
 `newest_run` gives the directory of the newest run, `Recording.__getitem__` a topic as arrays over all frames,
 `Recording.frames` the products frame by frame; docs/reference/recordings.md has more.
+
+This module has the records and names that the writer and the readers of a recording share. `Recording` and
+the other names of `caviar_protocol.recording.reader` are loaded when they are first used.
+
+``recording.json``, the *manifest*, says which segments a recording has, and what each finished one is. A
+segment that is removed, exchanged or cut leaves no trace in the other segments; the manifest shows it. It is
+replaced as a whole: when a segment has its first frame (and then is listed as open), when a segment is
+finished (once it is on disk, where the run's ``durability`` wants that), and when the recording is closed. So
+what it says of a finished segment holds after a loss of power too. A segment that is not listed was begun
+later. A recording without a manifest was made by an earlier version, and is read without one.
 """
 
 from __future__ import annotations
 
+import zlib
 from importlib import import_module
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import msgspec
+
+from caviar_protocol.arrays import quantity
+from caviar_protocol.errors import RecordingError
+from caviar_protocol.files import RunDirectory, newest_run, read_regular, replace_file
+from caviar_protocol.messages import Asset, GrantInput, Report
 
 if TYPE_CHECKING:
     from caviar_protocol.recording.reader import RecordedFrame, RecordedProduct, Recording, RecordingWarning
-    from caviar_protocol.run_directory import newest_run
 
-_PLACES = dict.fromkeys(
-    ("RecordedFrame", "RecordedProduct", "Recording", "RecordingWarning"), "recording.reader"
-)
-_PLACES["newest_run"] = "run_directory"
+FORMAT = 1
+"""Version of the layout of a recording; a reader refuses any other."""
+
+PROFILE = "caviar"
+"""MCAP profile of a segment."""
+
+FRAME_TOPIC = "frame"
+"""MCAP topic of the `FrameEntry` of each frame, the first message of its chunk."""
+
+METADATA_NAME = "caviar"
+"""Name of the MCAP metadata record that holds `RecordingMetadata`, a JSON text a field."""
+
+
+class RecordingMetadata(msgspec.Struct, frozen=True, kw_only=True):
+    """What stands once in every segment: how the run was made."""
+
+    format: int = FORMAT
+    segment: int = 0
+    """Number of the segment, from 0."""
+    run: str = ""
+    seed: int = 0
+    sampling_period_ns: Annotated[int, quantity("ns", "T_sam")] = 0
+    frames: Annotated[int, quantity("frame", "of an episode, as planned")] = 0
+    scenario: dict[str, Any] = {}
+    """The scenario as resolved: every default in its place."""
+    versions: dict[str, str] = {}
+    """Version of Python and of each installed package that the run may use."""
+    machine: dict[str, str] = {}
+    """``platform``, ``cpu``, ``cpu_count``, ``gpu`` where there is one."""
+    started: str = ""
+    """Start of the recording, ISO 8601, UTC."""
+    assets: tuple[Asset, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Name of the scenario."""
+        run = self.scenario.get("run")
+        return str(run.get("name", "")) if isinstance(run, dict) else ""
+
+
+class FrameEntry(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What a recording says about one frame beside its products; msgpack on the wire."""
+
+    episode: Annotated[int, quantity("1", "episode number, from 0", ge=0)]
+    frame: Annotated[int, quantity("1", "frame number in the episode, from 0", ge=0)]
+    t_ns: Annotated[int, quantity("ns", "simulated time of the frame in the episode")]
+    seed: Annotated[int, quantity("1", "seed of the episode")] = 0
+    inputs: tuple[GrantInput, ...] = ()
+    """Provenance of every product, sorted by (topic, source, frame). Fresh and late products
+    stand in the frame's chunk, a held one in the chunk of the frame it was computed for."""
+    reports: tuple[Report, ...] = ()
+    """What services reported beside their products: decisions that a replay imposes, counts of what
+    was dropped, and wall times, which no digest covers."""
+
+
+class SegmentRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One segment in the manifest."""
+
+    name: str
+    first: tuple[int, int] | None = None
+    """(episode, frame) of its first frame; None where it was closed without one."""
+    finished: bool = False
+    """Whether it was closed; an open one has only a name and a first frame here."""
+    last: tuple[int, int] | None = None
+    """(episode, frame) of its last frame."""
+    frames: int = 0
+    size: int = 0
+    """[B]"""
+    crc: int = 0
+    """CRC-32 of the whole file."""
+
+    @property
+    def extent(self) -> str:
+        """Its frames for people."""
+        if self.first is None:
+            return "no frame"
+        if self.last is None:
+            return f"{frame_name(self.first)} and later"
+        return f"{frame_name(self.first)} to {frame_name(self.last)}"
+
+
+class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The segments of a recording, in order."""
+
+    run: str = ""
+    seed: int = 0
+    segments: tuple[SegmentRecord, ...] = ()
+    closed: bool = False
+    """Whether the recorder came to its end and closed the recording."""
+
+    def save(self, folder: Path, *, sync: bool) -> None:
+        """Write the manifest to a run directory, in one step.
+
+        Args:
+            folder: The run directory.
+            sync: Whether it is on the disk when this returns.
+
+        Raises:
+            OSError: It cannot be written.
+        """
+        content = msgspec.json.encode(self)
+        replace_file(RunDirectory(folder).manifest, _sealed(content), durable=sync)
+
+
+class _Envelope(msgspec.Struct):
+    crc: int
+    """CRC-32 of the bytes of ``manifest``."""
+    manifest: msgspec.Raw
+
+
+def read_manifest(folder: Path) -> Manifest | None:
+    """Read the manifest in a run directory.
+
+    Args:
+        folder: The run directory.
+
+    Returns:
+        The manifest; None where there is none.
+
+    Raises:
+        RecordingError: It cannot be read, or a byte of it differs from what was written.
+    """
+    path = RunDirectory(folder).manifest
+    try:
+        data = read_regular(path)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read: {error.strerror} (errno {error.errno})") from error
+    try:
+        content = bytes(msgspec.json.decode(data, type=_Envelope).manifest)
+        # Bytes are compared, and not the CRC alone: what stands around the manifest is covered too.
+        if data != _sealed(content):
+            raise RecordingError(f"{path} is damaged: its content does not have its CRC-32")
+        return msgspec.json.decode(content, type=Manifest)
+    except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:
+        raise RecordingError(f"{path} is damaged: {error}") from error
+
+
+def frame_name(instant: tuple[int, int]) -> str:
+    """(episode, frame) for people."""
+    return f"frame {instant[1]} of episode {instant[0]}"
+
+
+def _sealed(content: bytes) -> bytes:
+    return b'{"crc":%d,"manifest":%s}\n' % (zlib.crc32(content), content)
+
+
+_READER = ("RecordedFrame", "RecordedProduct", "Recording", "RecordingWarning")
 
 
 def __getattr__(name: str) -> object:
     # A recorder writes segments and reads none: it need not load the arrays of every topic.
-    if name not in _PLACES:
+    if name not in _READER:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"caviar_protocol.{_PLACES[name]}"), name)
+    return getattr(import_module("caviar_protocol.recording.reader"), name)

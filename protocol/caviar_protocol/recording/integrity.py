@@ -13,9 +13,9 @@ import msgspec
 
 from caviar_protocol.digest import RunDigest
 from caviar_protocol.errors import RecordingError
-from caviar_protocol.files import open_regular
+from caviar_protocol.files import SEGMENT_PATTERN, RunDirectory, open_regular
 from caviar_protocol.messages import Status
-from caviar_protocol.recording.layout import (
+from caviar_protocol.recording import (
     FORMAT,
     FrameEntry,
     Manifest,
@@ -25,7 +25,6 @@ from caviar_protocol.recording.layout import (
     read_manifest,
 )
 from caviar_protocol.recording.segment import Channel, Chunk, Segment
-from caviar_protocol.run_directory import SEGMENT_PATTERN, RunDirectory
 
 # A recorder replaces the manifest a few times while it goes on with a recording, then once a segment.
 _READINGS = 8

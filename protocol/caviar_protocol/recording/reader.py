@@ -22,7 +22,9 @@ import numpy as np
 from caviar_protocol.arrays import Payload
 from caviar_protocol.codec.payloads import decode_payload
 from caviar_protocol.errors import ProtocolError, RecordingError, suggestion
+from caviar_protocol.files import RunDirectory
 from caviar_protocol.messages import GrantInput, Status
+from caviar_protocol.recording import FrameEntry, RecordingMetadata
 from caviar_protocol.recording.arrays import TopicArrays
 from caviar_protocol.recording.integrity import (
     RecordedSegments,
@@ -30,11 +32,9 @@ from caviar_protocol.recording.integrity import (
     metadata_of,
     recorded_digest,
 )
-from caviar_protocol.recording.layout import FrameEntry, RecordingMetadata
 from caviar_protocol.recording.segment import Channel, Segment
 from caviar_protocol.recording.sensors import CameraArrays, DepthArrays, LidarArrays, SegmentationArrays
 from caviar_protocol.recording.topics import ActionArrays, ChannelArrays, LinkArrays, SceneArrays
-from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.space.scene import merge_scenes
 from caviar_protocol.topics import PAYLOADS, Scene
 

@@ -8,7 +8,7 @@ killed process or a power loss left it, and what is damaged must be named with i
 Behind the metadata, and behind the chunk and the index of every frame, stands a *seal*: a private MCAP record
 (opcode `SEAL_OPCODE`, which other MCAP readers skip) with the CRC-32 of all bytes of the file before it. So
 every byte up to the last seal is covered. The summary behind it is covered by MCAP's own CRC, and by
-the manifest (`caviar_protocol.recording.layout`), which has the CRC-32 of every finished segment.
+the manifest (`caviar_protocol.recording`), which has the CRC-32 of every finished segment.
 A segment that was not finished is checked as it is opened, and is read up to its last good seal.
 Segments of earlier versions have no seals, but MCAP's CRC of the data section.
 """
@@ -29,7 +29,7 @@ import msgspec
 
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.files import open_regular
-from caviar_protocol.recording.layout import FRAME_TOPIC, METADATA_NAME, PROFILE, FrameEntry, SegmentRecord
+from caviar_protocol.recording import FRAME_TOPIC, METADATA_NAME, PROFILE, FrameEntry, SegmentRecord
 
 MAGIC = b"\x89MCAP0\r\n"
 SEAL_OPCODE = 0xCA

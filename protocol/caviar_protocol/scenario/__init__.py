@@ -1,11 +1,31 @@
-"""Scenario files: their types, their rules, and reading them.
+"""Scenario files: finding, reading and checking them.
 
 >>> from caviar_protocol.scenario import load_scenario
 >>> load_scenario("smoke").run.frames
 100
+
+`schema` has the types of the tables, `rules` what holds between keys, `conversion` the errors about a value,
+and `toml` the lines of keys.
 """
 
-from caviar_protocol.scenario.loader import find_scenario, load_scenario, parse_scenario, shipped_scenarios
+from __future__ import annotations
+
+import difflib
+import math
+import re
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from decimal import Decimal, InvalidOperation
+from importlib import resources
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from caviar_protocol.errors import ScenarioError
+from caviar_protocol.scenario.conversion import Place, Source, convert_table
+from caviar_protocol.scenario.rules import check_scenario, settings_place, with_numerology
 from caviar_protocol.scenario.schema import (
     REMOTE,
     REMOTE_REJOIN_S,
@@ -16,4 +36,332 @@ from caviar_protocol.scenario.schema import (
     Scenario,
     ServiceSpec,
     Timeouts,
+    pattern_asset,
 )
+from caviar_protocol.scenario.toml import MAX_SIZE, dotted, key_lines, parse_toml
+
+FILE = "file:"
+"""Before a path that is relative to the folder of the scenario."""
+
+
+def shipped_scenarios() -> dict[str, Path]:
+    """Files of the scenarios that ship with this installation, by their names, in order of name."""
+    folder = Path(str(resources.files("caviar_scenarios")))
+    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+
+
+def find_scenario(scenario: Path | str) -> Path:
+    """File of a scenario that is given as a path, or as the name of one that ships.
+
+    Args:
+        scenario: ``"my/scenario.toml"`` or ``"smoke"``. A file of that path comes first.
+
+    Returns:
+        The file. What is neither is returned as it is; reading it says what is wrong.
+    """
+    # A file beside the user is meant before one that ships under the same name.
+    path = Path(scenario)
+    if path.is_file() or path.name != str(scenario):
+        return path
+    return shipped_scenarios().get(str(scenario), path)
+
+
+def load_scenario(path: Path | str) -> Scenario:
+    """Read and check a scenario.
+
+    Strings that begin with ``file:`` in settings of services, and in the ``pattern_file`` of antennas, are
+    paths relative to the file's folder; they come out as absolute paths.
+
+    Args:
+        path: A file, or the name of a scenario that ships, as of `find_scenario`.
+
+    Raises:
+        ScenarioError: The file cannot be read or breaks a rule; the text has file, line, key, value and what
+            to write instead.
+
+    Example:
+        >>> scenario = load_scenario("smoke")
+        >>> scenario.services["channel"].use
+        'free-space'
+    """
+    path = find_scenario(path)
+    try:
+        with path.open("rb") as stream:  # no more than that shows that it is too large
+            text = stream.read(4 * MAX_SIZE + 1).decode("utf-8-sig")  # some editors put a mark first
+    except OSError as error:
+        raise ScenarioError(f"cannot be read: {error.strerror}{_beside(path)}", str(path)) from error
+    except UnicodeDecodeError as error:
+        line = error.object.count(b"\n", 0, error.start) + 1
+        raise ScenarioError("is not UTF-8 text here; save it as UTF-8", str(path), line=line) from error
+    return parse_scenario(text, str(path), path.parent)
+
+
+def parse_scenario(text: str, file: str = "", folder: Path | None = None) -> Scenario:
+    """Check a scenario given as text.
+
+    Args:
+        text: TOML.
+        file: What errors call it.
+        folder: What its ``file:`` paths are relative to; by default the working directory.
+
+    Raises:
+        ScenarioError: The text breaks a rule, as of `load_scenario`.
+    """
+    try:
+        table = parse_toml(text)
+    except tomllib.TOMLDecodeError as error:
+        raise _syntax_error(error, text, file) from error
+    # tomllib counts CR LF as one line end, and so must the scanner.
+    lines = {dotted(path): line for path, line in key_lines(text.replace("\r\n", "\n")).items()}
+    source = Source(file=file, lines=lines)
+    if isinstance(table.get("run"), dict):
+        table["run"] = with_instants(table["run"], Place("run", source), folder or Path())
+    scenario = convert_table(Scenario, table, Place("", source))
+    scenario = msgspec.structs.replace(scenario, source=_with_device_names(source, scenario))
+    check_scenario(scenario)
+    # After the rules: what follows from keys is never what an error is about.
+    scenario = _with_numerologies(scenario)
+    return _with_files(scenario, folder or Path())
+
+
+def _with_device_names(source: Source, scenario: Scenario) -> Source:
+    """The source with the lines of ``devices[2].on`` under ``devices.rx.on`` too.
+
+    A world is given its own devices only and does not know their places in the file: its errors name them.
+    """
+    root = Place("devices")
+    named: dict[str, int] = {}
+    for index, device in enumerate(scenario.devices):
+        place, by_name = root.at(index).key, root.at(device.name).key
+        for key, line in source.lines.items():
+            if key == place or key.startswith((f"{place}.", f"{place}[")):
+                named.setdefault(by_name + key.removeprefix(place), line)
+    return msgspec.structs.replace(source, lines=named | source.lines)
+
+
+def _syntax_error(error: tomllib.TOMLDecodeError, text: str, file: str) -> ScenarioError:
+    # tomllib puts the place at the end of its text and nowhere else.
+    found = re.fullmatch(r"(.*) \(at (?:line (\d+), column (\d+)|end of document)\)", str(error), re.DOTALL)
+    if found is None:
+        return ScenarioError(f"not TOML: {error}", file)
+    message, line, column = found.groups()
+    if line is None:
+        return ScenarioError(f"not TOML: {message}, at the end of the file", file, line=text.count("\n") + 1)
+    return ScenarioError(f"not TOML: {message}, at column {column}", file, line=int(line))
+
+
+def _beside(path: Path) -> str:
+    """The scenarios that stand where one was looked for, or those that ship."""
+    shipped = shipped_scenarios()
+    file = path.with_name(path.name + ".toml")
+    if file.is_file():
+        return f"; there is a {file}"
+    if not path.exists() and path.stem in shipped and path.suffix in ("", ".toml"):
+        return f"; the scenario that ships is called by its name: {path.stem}"
+    if path.name == str(path) and not path.suffix:
+        close = difflib.get_close_matches(path.name, shipped, n=1)
+        meant = f"; did you mean {close[0]!r}?" if close else ""
+        return f"{meant}; scenarios that ship: {', '.join(shipped)}"
+    if not path.parent.is_dir():
+        return ""
+    if path.is_dir():
+        path /= "SCENARIO.toml"
+    names = sorted(other.name for other in path.parent.glob("*.toml"))
+    return f"; {path.parent.resolve()} has {', '.join(names)}" if names and not path.is_file() else ""
+
+
+def _with_numerologies(scenario: Scenario) -> Scenario:
+    """The scenario with all that follows from the keys of its carriers written out."""
+    run, place = scenario.run, Place("carriers", scenario.source)
+    period = None if run.instants_s else run.sampling_period_ns
+    carriers = tuple(
+        with_numerology(carrier, period, place.at(index)) for index, carrier in enumerate(scenario.carriers)
+    )
+    return msgspec.structs.replace(scenario, carriers=carriers)
+
+
+def _with_files(scenario: Scenario, folder: Path) -> Scenario:
+    services = {
+        name: msgspec.structs.replace(
+            service, settings=_absolute(service.settings, folder, settings_place(scenario, name))
+        )
+        for name, service in scenario.services.items()
+    }
+    devices = tuple(
+        _with_pattern(device, folder, Place("devices", scenario.source).at(index).at("array"))
+        for index, device in enumerate(scenario.devices)
+    )
+    _check_patterns(devices, scenario.source)
+    return msgspec.structs.replace(scenario, services=services, devices=devices)
+
+
+def _with_pattern(device: DeviceSpec, folder: Path, array: Place) -> DeviceSpec:
+    """A device with the path of its pattern file made absolute."""
+    if device.array is None or not device.array.pattern_file:
+        return device
+    name, place = device.array.pattern_file, array.at("pattern_file")
+    if not name.startswith(FILE) and not Path(name).is_absolute():
+        raise place.error(f'is {name!r}, write "file:" and a path relative to the folder of the scenario')
+    path = Path(_absolute(name, folder, place))
+    if name.startswith(FILE):
+        # A link keeps its own name: its ending says what the file holds.
+        link = folder / name.removeprefix(FILE)
+        path = link.parent.resolve() / link.name
+    found = msgspec.structs.replace(device.array, pattern_file=str(path))
+    return msgspec.structs.replace(device, array=found)
+
+
+def _check_patterns(devices: Sequence[DeviceSpec], source: Source) -> None:
+    """Refuse different pattern files of one name, by which they travel."""
+    first: dict[str, str] = {}
+    for index, device in enumerate(devices):
+        file = device.array.pattern_file if device.array is not None else ""
+        # A pattern travels as ``patterns/FILE``: its folder is no part of the asset's name.
+        if file and first.setdefault(pattern_asset(file), file) != file:
+            place = Place("devices", source).at(index).at("array").at("pattern_file")
+            raise place.error(
+                f"{file} has the name of {first[pattern_asset(file)]}, which is another file; rename one"
+            )
+
+
+def _absolute(value: Any, folder: Path, place: Place) -> Any:
+    if isinstance(value, dict):
+        return {name: _absolute(item, folder, place.at(name)) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_absolute(item, folder, place.at(index)) for index, item in enumerate(value)]
+    if not (isinstance(value, str) and value.startswith(FILE)):
+        return value
+    path = (folder / value.removeprefix(FILE)).resolve()
+    if not path.exists():
+        raise place.error(f"there is no {path}; {value!r} is relative to the folder of the scenario")
+    return str(path)
+
+
+KEY = "instants_s"
+NANOSECONDS = "instants_ns"
+"""The same as whole nanoseconds; read into `KEY`."""
+COLUMN = "t_s"
+REPLACED = ("frames", "sampling_period_ns")
+"""Keys that follow from the instants."""
+
+_LATEST_S = 2**63 // 10**9
+
+
+def instants_ns(instants_s: Iterable[float]) -> tuple[int, ...]:
+    """Instants [ns] of decimal numbers of seconds, without the error of binary fractions."""
+    return tuple(int(_nanoseconds(value)) for value in instants_s)
+
+
+def with_instants(table: Mapping[str, Any], place: Place, folder: Path = Path()) -> dict[str, Any]:
+    """The table ``run`` of a scenario with ``frames`` and ``sampling_period_ns`` from its instants.
+
+    Instants stand in ``instants_s``, or as whole numbers in ``instants_ns``, or one a line in a CSV file
+    with the header ``t_s`` that ``instants_s = "file:PATH.csv"`` names. The period is their greatest common
+    divisor, so that each is a multiple of it.
+
+    Args:
+        table: As it stands in the file. Without instants, or with ones of a wrong type, it comes back as it
+            is.
+        place: Where it stands.
+        folder: What the path of the CSV file is relative to.
+
+    Raises:
+        ScenarioError: Instants are no strictly increasing whole nanoseconds, or stand beside a key that they
+            replace.
+    """
+    if NANOSECONDS in table:
+        return with_instants(_in_seconds(table, place), place, folder)
+    values = table.get(KEY)
+    if values is None:
+        return dict(table)
+    for key in REPLACED:
+        if key in table:
+            raise place.at(key).error(f"follows from {KEY}; remove one of both keys")
+    if isinstance(values, str) and values.startswith(FILE):
+        values = _from_file(folder / values.removeprefix(FILE), place.at(KEY))
+        table = {**table, KEY: values}
+    if not isinstance(values, list) or not all(type(value) in (int, float) for value in values):
+        return {**table, "frames": 1}  # so that its own type is what is found wrong
+    here = place.at(KEY)
+    # An empty list would be a run without a frame, which nothing downstream expects.
+    if not values:
+        raise here.error("is empty, write the instant of each frame: [0.0, 0.1, 0.35]")
+    for index, value in enumerate(values):
+        if not 0 <= value < _LATEST_S or _nanoseconds(value) % 1:
+            raise here.at(index).error(f"is {value}, write seconds ≥ 0 with at most 9 decimals")
+    for index, (before, value) in enumerate(pairwise(values), 1):
+        if value <= before:
+            raise here.at(index).error(f"{value} does not come after {before}; order the instants by time")
+    # By their shortest decimal form, as it stands in the file: 0.1 s is 100,000,000 ns and not a bit more.
+    instants = instants_ns(values)
+    period = math.gcd(*instants)
+    return {**table, "frames": len(instants), **({"sampling_period_ns": period} if period else {})}
+
+
+def _in_seconds(table: Mapping[str, Any], place: Place) -> dict[str, Any]:
+    """The table with `KEY` for `NANOSECONDS`, checked for what seconds would not show."""
+    here, values = place.at(NANOSECONDS), table[NANOSECONDS]
+    for key in (KEY, *REPLACED):
+        if key in table:
+            raise place.at(key).error(f"follows from {NANOSECONDS}; remove one of both keys")
+    if not isinstance(values, list) or not values:
+        raise here.error(f"is {values!r}, write the instant of each frame: [0, 100_000_000, 350_000_000]")
+    for index, value in enumerate(values):
+        if type(value) is not int or value < 0:
+            raise here.at(index).error(f"is {value!r}, write whole nanoseconds ≥ 0")
+        if value >= 2**63 or instants_ns([value / 1e9]) != (value,):
+            raise here.at(index).error(
+                f"is {value}, so late that nanoseconds are not distinguished; write at most {10**15}"
+            )
+        if index and value <= values[index - 1]:
+            raise here.at(index).error(
+                f"{value} does not come after {values[index - 1]}; order the instants by time"
+            )
+    rest = {key: value for key, value in table.items() if key != NANOSECONDS}
+    return {**rest, KEY: [value / 1e9 for value in values]}
+
+
+def _from_file(path: Path, place: Place) -> list[float]:
+    """Instants [s] of a CSV file, one a line; errors name file and line."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise place.error(f"{path} cannot be read: {why}; name a CSV file") from error
+    found: list[float] = []
+    header = ""
+    for number, text in enumerate(map(str.strip, lines), 1):
+        if not text or text.startswith("#"):
+            continue
+        if not header:
+            header = text
+            if header != COLUMN:
+                raise ScenarioError(f"the first line is {text!r}; write {COLUMN}", str(path), line=number)
+            continue
+        found.append(_instant(text, str(path), number))
+        if len(found) > 1 and found[-1] <= found[-2]:
+            raise ScenarioError(
+                f"{found[-1]} does not come after {found[-2]}; order the instants by time",
+                str(path),
+                line=number,
+            )
+    if not found:
+        raise ScenarioError(f"holds no instant; write {COLUMN}, then one a line", str(path), place.key)
+    return found
+
+
+def _instant(text: str, file: str, line: int) -> float:
+    try:
+        exact = Decimal(text)
+    except InvalidOperation as error:
+        raise ScenarioError(f"{text!r} is no number; write seconds", file, line=line) from error
+    is_whole = exact.is_finite() and 0 <= exact < _LATEST_S and not exact.scaleb(9) % 1
+    if not is_whole or instants_ns([float(exact)])[0] != exact.scaleb(9):
+        raise ScenarioError(
+            f"{text} is no instant; write seconds ≥ 0 with at most 9 decimals", file, line=line
+        )
+    return float(exact)
+
+
+def _nanoseconds(seconds: float) -> Decimal:
+    return Decimal(repr(seconds)).scaleb(9)

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from caviar_protocol.errors import ScenarioError, suggestion
-from caviar_protocol.limits import MAX_SUBCARRIERS
+from caviar_protocol.fields import MAX_SUBCARRIERS
 from caviar_protocol.scenario.conversion import Place, convert_table
 from caviar_protocol.scenario.schema import DeviceSpec, Scenario, ServiceSpec
 from caviar_protocol.topics import PARTS, PAYLOADS

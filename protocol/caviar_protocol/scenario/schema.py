@@ -1,8 +1,8 @@
 """The types of a scenario file: what a run consists of, and the devices that it mounts.
 
 TOML, validated as a whole before anything starts. A key that is not known here is an error that names the
-file, the line and the key that was probably meant. `scenario.loader` reads files, `scenario.rules` holds the
-rules between keys.
+file, the line and the key that was probably meant. `caviar_protocol.scenario` reads files,
+`caviar_protocol.scenario.rules` holds the rules between keys.
 """
 
 from __future__ import annotations

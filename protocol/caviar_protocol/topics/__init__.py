@@ -9,7 +9,6 @@ time.
 from __future__ import annotations
 
 from caviar_protocol.arrays import Payload
-from caviar_protocol.topics.action import Action, BeamChoice, UserSchedule, VelocityCommand, WaypointCommand
 from caviar_protocol.topics.channel import (
     Carrier,
     Channel,
@@ -19,7 +18,14 @@ from caviar_protocol.topics.channel import (
     ChannelTaps,
     Interaction,
 )
-from caviar_protocol.topics.link import Link
+from caviar_protocol.topics.link import (
+    Action,
+    BeamChoice,
+    Link,
+    UserSchedule,
+    VelocityCommand,
+    WaypointCommand,
+)
 from caviar_protocol.topics.scene import AntennaArray, AntennaDevice, CameraDevice, LidarDevice, Panel, Scene
 from caviar_protocol.topics.sensors import (
     Camera,

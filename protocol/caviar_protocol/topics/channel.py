@@ -21,7 +21,7 @@ from caviar_protocol.arrays import (
     quantity,
 )
 from caviar_protocol.errors import PayloadError
-from caviar_protocol.limits import MAX_SUBCARRIERS
+from caviar_protocol.fields import MAX_SUBCARRIERS
 
 PLANE_WAVES = ("free-space", "geometric", "siso-rt")
 """Rungs on which arrays see plane waves: H follows from the paths between their reference points."""

@@ -17,7 +17,7 @@ from caviar_protocol.messages import Input, Role
 from caviar_protocol.scenario.rules import BEAM
 from caviar_protocol.space.scene import Pair, pairs_of
 from caviar_protocol.topics import Action, BeamChoice, Scene
-from caviar_protocol.topics.action import Command
+from caviar_protocol.topics.link import Command
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
 
 _OTHER_ACTUATORS = ("motion:", "schedule:")

@@ -18,7 +18,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Complex64Array, Complex128Array, Float64Array, Int64Array
 from caviar_protocol.errors import ScenarioError
-from caviar_protocol.limits import MAX_BODY
+from caviar_protocol.fields import MAX_BODY
 from caviar_protocol.multipath import first_tap, subcarrier_weights, tap_weights
 from caviar_protocol.scenario.rules import undefined_part
 from caviar_protocol.topics import Carrier, ChannelResponse, ChannelTaps

@@ -11,12 +11,11 @@ from typing import TypeAlias
 import msgspec
 
 from caviar_protocol.errors import RecordingError, RunError
-from caviar_protocol.files import sync_file
+from caviar_protocol.files import RunDirectory, sync_file
 from caviar_protocol.messages import GrantInput, Status
+from caviar_protocol.recording import Manifest, SegmentRecord, frame_name
 from caviar_protocol.recording.integrity import RecordedSegments, follows
-from caviar_protocol.recording.layout import Manifest, SegmentRecord, frame_name
 from caviar_protocol.recording.segment import Channel, Segment
-from caviar_protocol.run_directory import RunDirectory
 from caviar_services.recorder.segment_writer import SegmentWriter
 from caviar_services.service import FrameInput
 

@@ -8,7 +8,7 @@ A recording is a run directory with ``recording-0000.mcap``, ``recording-0001.mc
   wire bytes as they were. So SHA-256 of a message is the product's digest. ``sequence`` is the
   frame the product was computed for.
 * One channel ``frame``, schema ``caviar.frame/1``, message encoding ``msgpack``: a
-  `caviar_protocol.recording.layout.FrameEntry` with the provenance of every product, absent ones too. A
+  `caviar_protocol.recording.FrameEntry` with the provenance of every product, absent ones too. A
   held product is not written again: it stands in the chunk of its own frame.
 * ``log_time`` is run time in nanoseconds: ``t_ns`` of the frame in the first episode; a later
   episode begins one sampling period after the end of the one before. ``publish_time`` is the
@@ -17,8 +17,8 @@ A recording is a run directory with ``recording-0000.mcap``, ``recording-0001.mc
   (`caviar_protocol.recording.segment`), handed to the operating system before DONE, and on disk as the
   run's ``durability`` says (`persistence`). MCAP's index and statistics are written when a segment is full
   or the run ends; then the manifest ``recording.json`` lists it as finished
-  (`caviar_protocol.recording.layout`).
-* Metadata record ``caviar``: `caviar_protocol.recording.layout.RecordingMetadata`, a JSON text a field.
+  (`caviar_protocol.recording`).
+* Metadata record ``caviar``: `caviar_protocol.recording.RecordingMetadata`, a JSON text a field.
 """
 
 from __future__ import annotations
@@ -37,15 +37,14 @@ from caviar_protocol.arrays import quantity
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.digest import payload_digest
 from caviar_protocol.errors import CaviarError, RunError
-from caviar_protocol.files import Durability, sync_file
+from caviar_protocol.files import Durability, RunDirectory, sync_file
 from caviar_protocol.messages import GrantInput
-from caviar_protocol.recording.layout import (
+from caviar_protocol.recording import (
     FrameEntry,
     RecordingMetadata,
     SegmentRecord,
 )
 from caviar_protocol.recording.segment import Segment
-from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.validation import check_digest
 from caviar_services.recorder.base import Recorder, copy_assets, failure, machine, versions
 from caviar_services.recorder.continuation import Continuation, RunTime, Stored

@@ -20,7 +20,7 @@ from typing import BinaryIO
 import msgspec
 
 from caviar_protocol.files import SYNC_PERIOD_S, Durability, sync_file
-from caviar_protocol.recording.layout import (
+from caviar_protocol.recording import (
     FRAME_TOPIC,
     METADATA_NAME,
     PROFILE,
