@@ -40,12 +40,12 @@ lint: setup ## Style, types and the imports that the architecture allows
 	@$(BIN)/lint-imports
 
 test: lint ## Everything that CI checks; TESTS=tests/unit runs a part, in WORKERS processes
-	@$(BIN)/pytest --numprocesses=$(WORKERS) --dist=loadfile --durations=10 $(TESTS)
+	@$(BIN)/pytest --numprocesses=$(WORKERS) --dist=loadfile --no-loadscope-reorder --durations=10 $(TESTS)
 
 test-all: lint ## The same and the long forms: the documentation, a million fuzzed inputs, the whole fault matrix, containers
 	@if docker info >/dev/null 2>&1 && command -v docker-compose >/dev/null; then \
 	  (cd deploy && docker-compose build --quiet) || echo "the images of deploy/ were not built"; fi
-	@$(BIN)/pytest --all --numprocesses=$(WORKERS) --dist=loadfile --durations=20 $(TESTS)
+	@$(BIN)/pytest --all --numprocesses=$(WORKERS) --dist=loadfile --no-loadscope-reorder --durations=20 $(TESTS)
 
 docs: setup ## Render the documentation; build/docs/index.html opens without a server
 	@$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going --jobs=auto -c docs . build/docs

@@ -41,7 +41,15 @@ def leaving(frame: int) -> Scene:
     return street(frame, leaving=frame // 3)
 
 
-@pytest.mark.parametrize("scene", [street, leaving, standing, to_and_fro])
+@pytest.mark.parametrize(
+    "scene",
+    [
+        pytest.param(street, marks=pytest.mark.exhaustive),
+        leaving,
+        pytest.param(standing, marks=pytest.mark.exhaustive),
+        to_and_fro,
+    ],
+)
 def test_another_channel_goes_on_bit_by_bit(scene: Callable[[int], Scene]) -> None:
     settings = {"follow": FOLLOW, "samples": SAMPLES}
     first, second = model(CANYON, **settings), model(CANYON, **settings)

@@ -98,7 +98,7 @@ def test_batches_make_no_difference() -> None:
     assert len(products) == 1
 
 
-@pytest.mark.parametrize("settings", ["specular", "everything"])
+@pytest.mark.parametrize("settings", [pytest.param("specular", marks=pytest.mark.exhaustive), "everything"])
 def test_another_process_makes_no_difference(settings: str, everything: ChannelModel[Any]) -> None:
     """The product's digest is that of a process of its own; here, other frames came before."""
     name = "simple_street_canyon_with_cars"

@@ -14,7 +14,10 @@ DOCUMENT = Path(__file__).parents[2] / "docs" / "topics" / "channel-stability.md
 GROUPS = sorted({case.group for case in cases() if case.traced})
 
 
-@pytest.mark.parametrize("group", GROUPS)
+@pytest.mark.parametrize(
+    "group",
+    [pytest.param(group, marks=() if group != "mesh" else pytest.mark.exhaustive) for group in GROUPS],
+)
 def test_cases_that_trace_are_right(group: str) -> None:
     results = run([case for case in cases() if case.group == group and case.traced])
     assert [result for result in results if result.verdict != "right"] == []

@@ -143,7 +143,13 @@ def test_under_wait_the_frame_waits_and_misses_are_counted(tmp_path: Path) -> No
     assert re.search(r"missed deadlines(:\s\d+|,) decided", (late.directory / "summary.txt").read_text())
 
 
-@pytest.mark.parametrize("service", sorted(VICTIMS))
+@pytest.mark.parametrize(
+    "service",
+    [
+        pytest.param(name, marks=() if name in ("channel", "link") else pytest.mark.exhaustive)
+        for name in sorted(VICTIMS)
+    ],
+)
 def test_under_abort_the_run_ends_at_the_deadline_with_blame(tmp_path: Path, service: str) -> None:
     finished = run(scenario(tmp_path, "abort", 30.0, only=service), tmp_path / "out", timeout=120)
     assert finished.status == 1
@@ -166,7 +172,7 @@ def test_worlds_and_recorders_cannot_be_done_without(
     assert 'write "wait" or "abort"' in str(caught.value)
 
 
-@pytest.mark.parametrize("pace", ["realtime", "2", "0.5"])
+@pytest.mark.parametrize("pace", ["realtime", "2", pytest.param("0.5", marks=pytest.mark.exhaustive)])
 def test_frames_come_at_the_pace_that_was_asked_for(tmp_path: Path, pace: str) -> None:
     finished = run(scenario_file(tmp_path), tmp_path / "out", "--frames", "8", "--pace", pace)
     assert finished.status == 0, finished.output

@@ -45,7 +45,7 @@ def digest(scenario: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
         ("caviar_services channel", signal.SIGKILL),
         pytest.param("caviar_services agent", signal.SIGKILL, marks=pytest.mark.exhaustive),
         pytest.param("caviar_services recorder", signal.SIGKILL, marks=pytest.mark.exhaustive),
-        ("caviar_broker", signal.SIGKILL),
+        pytest.param("caviar_broker", signal.SIGKILL, marks=pytest.mark.exhaustive),
         pytest.param("caviar_services channel", signal.SIGSTOP, marks=pytest.mark.exhaustive),
     ],
 )

@@ -175,7 +175,13 @@ def test_without_rejoining_a_broker_that_dies_is_named(nursery: Nursery, tmp_pat
     assert directory.is_dir()
 
 
-@pytest.mark.parametrize("victim", SERVICES)
+@pytest.mark.parametrize(
+    "victim",
+    [
+        pytest.param(service, marks=() if service in ("world", "link") else pytest.mark.exhaustive)
+        for service in SERVICES
+    ],
+)
 def test_a_service_that_is_stopped_is_named_within_100_ms(
     nursery: Nursery, tmp_path: Path, victim: str
 ) -> None:

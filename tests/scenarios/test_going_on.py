@@ -68,8 +68,8 @@ def assert_same(out: Path, output: str, status: int, digest: str) -> Path:
     ("service", "number"),
     [
         ("adder", signal.SIGKILL),
-        ("recorder", signal.SIGKILL),
-        ("world", signal.SIGKILL),
+        pytest.param("recorder", signal.SIGKILL, marks=pytest.mark.exhaustive),
+        pytest.param("world", signal.SIGKILL, marks=pytest.mark.exhaustive),
         ("agent", signal.SIGSTOP),
     ],
 )

@@ -133,7 +133,7 @@ def test_an_environment_that_closes_behind_the_last_episode_lets_the_run_end_wel
     assert len(recording) == 40, "and every frame is recorded"
 
 
-@pytest.mark.parametrize("steps", [0, 7, FRAMES])
+@pytest.mark.parametrize("steps", [0, pytest.param(7, marks=pytest.mark.exhaustive), FRAMES])
 def test_an_environment_takes_over_a_place_that_was_left_and_begins_an_episode_of_its_own(
     tmp_path: Path, steps: int
 ) -> None:
@@ -284,6 +284,13 @@ def flight(scenario: Path = SCENARIOS / "uav-path.toml", **options: Any) -> Iter
         yield env
 
 
+@pytest.fixture(scope="module")
+def flown() -> Iterator[UavPathEnv]:
+    """One environment for all tests that take it as it is: Munich is loaded once."""
+    with flight() as env:
+        yield env
+
+
 def towards(observation: dict[str, Any], point: tuple[float, float, float]) -> tuple[Any, float]:
     """An action that leads to a point and brakes near to it, and the way that is left [m]."""
     way = np.array(point) - observation["position"]
@@ -319,18 +326,17 @@ def test_flying_into_a_street_loses_the_line_of_sight_and_ends_at_the_goal() -> 
 
 
 @pathfinding
-def test_staying_keeps_the_line_of_sight_and_no_goal_never_terminates() -> None:
-    with flight() as env:
-        observation, _ = env.reset(seed=1)
-        assert "goal" not in observation
-        assert observation["position"] == pytest.approx(START, abs=1e-4)
-        for _ in range(20):
-            observation, reward, terminated, truncated, info = env.step(np.zeros(3, np.float32))
-            assert info["los"].tolist() == [True]
-            assert not terminated
-            assert not truncated
-            assert reward == info["abs_y"][0] > 0
-        assert observation["position"] == pytest.approx(START, abs=1e-4)
+def test_staying_keeps_the_line_of_sight_and_no_goal_never_terminates(flown: UavPathEnv) -> None:
+    observation, _ = flown.reset(seed=1)
+    assert "goal" not in observation
+    assert observation["position"] == pytest.approx(START, abs=1e-4)
+    for _ in range(20):
+        observation, reward, terminated, truncated, info = flown.step(np.zeros(3, np.float32))
+        assert info["los"].tolist() == [True]
+        assert not terminated
+        assert not truncated
+        assert reward == info["abs_y"][0] > 0
+    assert observation["position"] == pytest.approx(START, abs=1e-4)
 
 
 @pathfinding
@@ -353,21 +359,19 @@ def test_an_action_longer_than_1_is_shortened_to_the_greatest_speed(tmp_path: Pa
 
 @pathfinding
 @pytest.mark.parametrize("action", [[np.nan, 0, 0], [np.inf, 0, 0]])
-def test_an_action_that_is_no_number_is_refused(action: list[float]) -> None:
-    with flight() as env:
-        env.reset(seed=1)
-        with pytest.raises(PayloadError, match="write three numbers within -1 and 1"):
-            env.step(np.array(action, np.float32))
-        env.step(np.zeros(3, np.float32))
+def test_an_action_that_is_no_number_is_refused(flown: UavPathEnv, action: list[float]) -> None:
+    flown.reset(seed=1)
+    with pytest.raises(PayloadError, match="write three numbers within -1 and 1"):
+        flown.step(np.array(action, np.float32))
+    flown.step(np.zeros(3, np.float32))
 
 
 @pathfinding
-def test_the_same_seed_and_the_same_flight_give_the_same_channel() -> None:
-    with flight() as env:
-        found = []
-        for _ in range(2):
-            env.reset(seed=3)
-            found.append([env.step(np.array([0.2, 0.9, -0.1], np.float32))[1] for _ in range(8)])
+def test_the_same_seed_and_the_same_flight_give_the_same_channel(flown: UavPathEnv) -> None:
+    found = []
+    for _ in range(2):
+        flown.reset(seed=3)
+        found.append([flown.step(np.array([0.2, 0.9, -0.1], np.float32))[1] for _ in range(8)])
     assert found[0] == found[1]
     assert len(set(found[0])) == 8
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 import threading
@@ -17,12 +18,19 @@ from caviar_protocol import keys as k
 AGENT = ROOT / "clients" / "minimal" / "agent.py"
 
 
-@pytest.fixture
-def keys(tmp_path: Path) -> Path:
-    directory = tmp_path / "keys"
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Keys of a broker, an agent that is authorized, and a stranger."""
+    directory = tmp_path_factory.mktemp("made") / "keys"
     for arguments in (["new", "broker"], ["new", "agent", "--role", "agent"], ["new", "stranger"]):
         assert caviar("keys", *arguments, "--directory", directory).status == 0
     return directory
+
+
+@pytest.fixture
+def keys(made: Path, tmp_path: Path) -> Path:
+    """A copy of them for one test."""
+    return Path(shutil.copytree(made, tmp_path / "keys"))
 
 
 def texts_below(*folders: Path) -> bytes:

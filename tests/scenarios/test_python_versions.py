@@ -32,7 +32,7 @@ NEWEST_ALONE = [
     pytest.param(label, marks=() if label == ENVIRONMENTS[-1] else pytest.mark.exhaustive)
     for label in ENVIRONMENTS
 ]
-"""The others are left to the long form; all run `smoke`."""
+"""The others are left to the long form."""
 """The newest requirements on this Python are those of the tests at large."""
 CACHE = ROOT / ".venvs"
 GENERATED = ("codec", "keys", "messages", "multipath_changes", "recording_reader")
@@ -118,12 +118,15 @@ def _run(command: list[str | Path], folder: Path = ROOT, **extra: str) -> str:
 
 
 @pytest.fixture(scope="module")
-def environments(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Environment]:
-    """All environments whose Python is here, made at the same time."""
+def environments(
+    tmp_path_factory: pytest.TempPathFactory, pytestconfig: pytest.Config
+) -> dict[str, Environment]:
+    """The environments of the tests that are run, as far as their Python is here, made at the same time."""
+    labels = ENVIRONMENTS if pytestconfig.getoption("--all") else ENVIRONMENTS[-1:]
     dist = tmp_path_factory.mktemp("dist")
     _run([sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(dist)])
     (wheel,) = dist.glob("*.whl")
-    pythons = {label: interpreter(THIS if label == OLDEST else label) for label in ENVIRONMENTS}
+    pythons = {label: interpreter(THIS if label == OLDEST else label) for label in labels}
     with ThreadPoolExecutor(2) as pool:
         made = {
             label: pool.submit(prepare, label, python, wheel)
@@ -148,7 +151,7 @@ def digest_of_smoke(caviar: list[str | Path], folder: Path) -> str:
 
 
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize("label", ENVIRONMENTS)
+@pytest.mark.parametrize("label", NEWEST_ALONE)
 def test_the_wheel_runs_smoke_by_name_with_the_same_digest(
     label: str, environments: dict[str, Environment], smoke_digest: str, tmp_path: Path
 ) -> None:

@@ -39,7 +39,7 @@ Agent = Callable[[str, str], list[str]]
 """Command line of an agent, from endpoint and name."""
 
 
-@pytest.fixture(scope="module", params=["python", "node"])
+@pytest.fixture(scope="module", params=["python", pytest.param("node", marks=pytest.mark.exhaustive)])
 def agent(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, pytestconfig: pytest.Config
 ) -> Agent:

@@ -103,7 +103,14 @@ def flyer(obstacles: Obstacles, speed: float, acceleration: float, clearance: fl
 
 
 @pytest.mark.parametrize(
-    ("speed", "step_s"), [(1.0, 0.25), (30.0, 0.01), (30.0, 0.25), (1000.0, 0.01), (1000.0, 0.25)]
+    ("speed", "step_s"),
+    [
+        pytest.param(1.0, 0.25, marks=pytest.mark.exhaustive),
+        pytest.param(30.0, 0.01, marks=pytest.mark.exhaustive),
+        (30.0, 0.25),
+        (1000.0, 0.01),
+        (1000.0, 0.25),
+    ],
 )
 def test_no_flight_comes_too_near_to_boxes(speed: float, step_s: float) -> None:
     """Also where one sub-step is longer than walls are thick; watched along the whole way."""
