@@ -8,13 +8,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from recording_builders import record_run
 
 from caviar_broker.control.launcher import LogFile
 from caviar_broker.control.socket import ControlSocket
 from caviar_broker.journal_format import read_journal, run_of_journal
 from caviar_broker.launch import parser, serve
 from caviar_broker.run_record import RunRecord, versions_of
-from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.recording import read_manifest
 from caviar_protocol.scenario import load_scenario
@@ -30,8 +30,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two runs, ``a`` and ``b``."""
     folder = tmp_path_factory.mktemp("runs")
     for name in ("a", "b"):
-        (folder / name).mkdir()
-        assert EmbeddedRun(SMOKE, folder / name).run().error == ""
+        record_run(folder / name, SMOKE)
         record = RunRecord(
             run=name, epoch=1, endpoint="tcp://127.0.0.1:0", scenario=SMOKE, versions=versions_of(SMOKE)
         )

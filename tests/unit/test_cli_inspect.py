@@ -6,7 +6,7 @@ import json
 import sys
 
 import pytest
-from recording_samples import absent, frame, link, product, record, recorder, scene
+from recording_builders import absent, frame, link, product, record, recorder, scene
 
 from caviar_clients.cli.inspect import inspect_command
 from caviar_clients.cli.main import main
@@ -55,18 +55,19 @@ def test_a_recording_that_breaks_off_has_a_digest_and_a_note(tmp_path, capsys):
 
 
 def test_the_summary_counts_every_status_and_leaves_users_without_path_out_of_means(tmp_path):
-    made = recorder(tmp_path)
-    made.step(frame(0, product("scene", "world", scene(0), 0), absent("link", "link", "late")))
     late = product("link", "link", link(0), 0, Status.LATE, used_in=1)
-    made.step(
-        frame(
-            1,
-            product("scene", "world", scene(0), 0, Status.HELD, used_in=1),
-            late,
-            product("link", "link", link(1, without_path=(2,)), 1),
-        )
+    record(
+        tmp_path,
+        [
+            frame(0, product("scene", "world", scene(0), 0), absent("link", "link", "late")),
+            frame(
+                1,
+                product("scene", "world", scene(0), 0, Status.HELD, used_in=1),
+                late,
+                product("link", "link", link(1, without_path=(2,)), 1),
+            ),
+        ],
     )
-    made.close()
     summary = summarise(Recording(tmp_path))
     assert [(s.topic, s.fresh, s.held, s.absent, s.late) for s in summary.sources] == [
         ("link", 1, 0, 1, 1),

@@ -7,10 +7,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from recording_builders import record_run
 
 from caviar_clients.cli import main as command
-from caviar_clients.session.embedded import EmbeddedRun
-from caviar_protocol.scenario import load_scenario
 
 SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
 
@@ -80,11 +79,7 @@ def test_a_summary_that_cannot_be_written_ends_the_command_before_the_run(monkey
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     """A recorded run of `smoke`."""
-    folder = tmp_path_factory.mktemp("run")
-    run = EmbeddedRun(load_scenario(SMOKE), folder)
-    run.run()
-    run.statistics.save(folder / "latency.npz")
-    return folder
+    return record_run(tmp_path_factory.mktemp("run"))
 
 
 @pytest.mark.parametrize(

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from msgspec.structs import replace
-from recording_samples import frame, link, product, recorder, scene
+from recording_builders import frame, frame_of, link, record, scene
 
 from caviar_clients.cli.recording_summary import (
     SHOWN_INSIDE,
@@ -75,9 +74,7 @@ def test_a_key_that_is_for_nothing_in_any_frame_is_warned_of() -> None:
 
 
 def test_a_recording_warns_of_paths_that_were_dropped(tmp_path: Path) -> None:
-    made = recorder(tmp_path)
-    made.step(replace(frame(0), reports=(channel(dropped=2, no_path__not_finite=1),)))
-    made.close()
+    record(tmp_path, [frame(0, reports=(channel(dropped=2, no_path__not_finite=1),))])
     summary = summarise(Recording(tmp_path))
     assert [warning.partition(" with")[0] for warning in summary.warnings] == ["channel dropped 2 paths"]
 
@@ -87,15 +84,8 @@ def test_where_all_users_had_a_path_nothing_is_said() -> None:
 
 
 def test_a_recording_tells_snr_rate_and_users_without_a_path(tmp_path: Path) -> None:
-    made = recorder(tmp_path)
-    for number in range(2):
-        sources = (
-            product("scene", "world", scene(number), number),
-            product("link", "link", link(number, without_path=(2,)), number),
-        )
-        made.step(frame(number, *sources))
-    made.close()
     links = [link(number, without_path=(2,)) for number in range(2)]
+    record(tmp_path, [frame_of(number, scene=scene(number), link=one) for number, one in enumerate(links)])
     rates = [rate for one in links for rate in one.bit_rate[one.has_path].tolist()]
     summary = summarise(Recording(tmp_path))
     assert summary.link is not None

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import recording_samples
-from recording_samples import channel, frame, lidar, link, product, record, recorder, scene
+import recording_builders
+from recording_builders import channel, frame_of, lidar, link, record, scene
 
 from caviar_clients.cli.plot import plot_run, scenery
 from caviar_protocol.errors import RecordingError
@@ -16,12 +16,11 @@ pytest.importorskip("matplotlib")
 
 
 def full(folder: Path, frames: int = 4) -> Path:
-    made = recorder(folder)
-    for n in range(frames):
-        payloads = {"scene": scene(n), "channel": channel(n), "link": link(n), "lidar": lidar(n)}
-        made.step(frame(n, *(product(topic, "s", payload, n) for topic, payload in payloads.items())))
-    made.close()
-    return folder
+    numbers = range(frames)
+    return record(
+        folder,
+        [frame_of(n, scene=scene(n), channel=channel(n), link=link(n), lidar=lidar(n)) for n in numbers],
+    )
 
 
 @pytest.fixture
@@ -70,7 +69,7 @@ def test_boxes_that_block_a_drawn_channel_are_on_the_map(tmp_path, monkeypatch):
     box = {"minimum_m": [20.0, 20.0, 0.0], "maximum_m": [35.0, 30.0, 25.0]}
     drawn_channel = {"role": "channel", "use": "geometric", "settings": {"obstacles": [box]}}
     services = {"channel": drawn_channel, "link": {"role": "link", "use": "beams"}}
-    monkeypatch.setattr(recording_samples, "SCENARIO", recording_samples.SCENARIO | {"services": services})
+    monkeypatch.setattr(recording_builders, "SCENARIO", recording_builders.SCENARIO | {"services": services})
     drawn = scenery(Recording(record(tmp_path / "with")))
     assert drawn is not None
     assert drawn.faces.min(axis=(0, 1)).tolist() == [20.0, 20.0]
@@ -92,12 +91,12 @@ def test_an_empty_recording_has_nothing_to_draw(tmp_path):
 
 @pytest.mark.usefixtures("maps_alone")
 def test_of_a_run_without_users_the_map_is_drawn(tmp_path):
-    made = recording_samples.recorder(tmp_path / "run")
+    made = recording_builders.recorder(tmp_path / "run")
     for number in range(2):
         items = (
-            recording_samples.product("scene", "world", recording_samples.scene(number, 1), number),
-            recording_samples.product("link", "link", recording_samples.link(number, 0), number),
+            recording_builders.product("scene", "world", recording_builders.scene(number, 1), number),
+            recording_builders.product("link", "link", recording_builders.link(number, 0), number),
         )
-        made.step(recording_samples.frame(number, *items))
+        made.step(recording_builders.frame(number, *items))
     made.close()
     assert [file.name for file in plot_run(tmp_path / "run", tmp_path / "out")] == ["map.png"]

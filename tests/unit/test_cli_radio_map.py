@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import msgspec
 import numpy as np
 import pytest
-from recording_samples import record, scene
+from recording_builders import record, scene
 from rich.console import Console
 
 from caviar_clients.cli import main as command

@@ -7,7 +7,7 @@ from io import StringIO
 from pathlib import Path
 
 import pytest
-from recording_samples import frame, record, recorder
+from recording_builders import frame, record, recorder
 from rich.console import Console
 
 from caviar_broker.journal_format import MAGIC

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from recording_samples import record
+from recording_builders import record
 from rich.console import Console
 
 from caviar_clients.cli.run import run_scenario

@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from recording_samples import channel, frame, lidar, link, product, record, recorder, scene
+from recording_builders import channel, frame, frame_of, lidar, link, product, record, scene
 
 from caviar_clients.cli import main as command
 from caviar_clients.cli.video import film_run
@@ -31,14 +31,13 @@ def filmed(
     folder: Path, frames: int = 4, cameras: tuple[str, ...] = (), missing: tuple[int, ...] = ()
 ) -> Path:
     """A recording with rays and links, and cameras whose whole picture is of a frame's own red."""
-    made = recorder(folder)
+    made = []
     for n in range(frames):
         payloads = {"scene": scene(n), "channel": channel(n), "link": link(n)}
         if cameras and n not in missing:
             payloads["camera"] = Camera(images=tuple(image(name, n, k) for k, name in enumerate(cameras)))
-        made.step(frame(n, *(product(topic, "s", payload, n) for topic, payload in payloads.items())))
-    made.close()
-    return folder
+        made.append(frame_of(n, **payloads))
+    return record(folder, made)
 
 
 def image(name: str, number: int, which: int) -> CameraImage:
@@ -129,10 +128,7 @@ def test_before_its_first_picture_a_camera_says_so(tmp_path):
 
 
 def test_a_recording_without_channel_and_link_gives_the_map_alone(tmp_path):
-    made = recorder(tmp_path / "run")
-    for n in range(2):
-        made.step(frame(n, product("scene", "s", scene(n), n)))
-    made.close()
+    record(tmp_path / "run", [frame(n, product("scene", "s", scene(n), n)) for n in range(2)])
     with_link = film_run(record(tmp_path / "other", 2), tmp_path / "a.gif", width=320)
     assert film_run(tmp_path / "run", tmp_path / "b.gif", width=320).size[1] < with_link.size[1]
 
@@ -228,9 +224,7 @@ def test_a_camera_of_a_run_without_any_is_refused(tmp_path):
 
 
 def test_a_run_without_a_scene_is_refused(tmp_path):
-    made = recorder(tmp_path / "run")
-    made.step(frame(0, product("lidar", "s", lidar(0), 0)))
-    made.close()
+    record(tmp_path / "run", [frame(0, product("lidar", "s", lidar(0), 0))])
     with pytest.raises(RecordingError, match="holds no scene"):
         film_run(tmp_path / "run", tmp_path / "a.gif")
 

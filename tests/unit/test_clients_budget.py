@@ -9,17 +9,16 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from recording_builders import record_run
 from rich.console import Console
 
 from caviar_clients.budget.forecast import forecast, rounded_up
 from caviar_clients.cli import budget as cli_budget
 from caviar_clients.cli.budget import budget_run, lines
 from caviar_clients.replay.recorded import RecordedRun, Timing, measured_rate, outcomes_of, timings_of
-from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.recording import Recording
-from caviar_protocol.scenario import load_scenario
 
 SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
 FRAMES = 40
@@ -29,13 +28,7 @@ MS = 1_000_000
 @pytest.fixture(scope="module")
 def smoke(tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:
     """A run of world, channel, link, agent and recorder; budgets are 20 ms, of the recorder 100 ms."""
-    directory = tmp_path_factory.mktemp("runs") / "smoke"
-    directory.mkdir()
-    scenario = load_scenario(SMOKE)
-    scenario = msgspec.structs.replace(scenario, run=msgspec.structs.replace(scenario.run, frames=FRAMES))
-    run = EmbeddedRun(scenario, directory)
-    assert not run.run().error
-    return RecordedRun(Recording(directory))
+    return RecordedRun(Recording(record_run(tmp_path_factory.mktemp("runs") / "smoke", frames=FRAMES)))
 
 
 def timed(run: RecordedRun, **milliseconds: float | Mapping[int, float]) -> RecordedRun:

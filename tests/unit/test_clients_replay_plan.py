@@ -7,12 +7,12 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from recording_builders import record_run
 
 from caviar_clients.replay.plan import ReplayPlan, plan_replay
 from caviar_clients.replay.recorded import RecordedRun
 from caviar_clients.replay.request import request_of
 from caviar_clients.replay.toml import scenario_text
-from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.errors import CaviarError, RecordingError, RunError
 from caviar_protocol.recording import Recording, RecordingWarning
 from caviar_protocol.scenario import Scenario, load_scenario, parse_scenario
@@ -29,10 +29,7 @@ def shipped(name: str = "smoke", **changes: object) -> Scenario:
 
 
 def recorded(scenario: Scenario, directory: Path) -> RecordedRun:
-    directory.mkdir()
-    outcome = EmbeddedRun(scenario, directory).run()
-    assert not outcome.error
-    return RecordedRun(Recording(directory))
+    return RecordedRun(Recording(record_run(directory, scenario)))
 
 
 @pytest.fixture(scope="module")

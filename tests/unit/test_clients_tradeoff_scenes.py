@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from recording_samples import frame, link, product, recorder, scene
+from recording_builders import frame, link, product, record, scene
 
 from caviar_clients.tradeoff.scenes import KEEPER, scenes_of, worlds_only
 from caviar_protocol.errors import RecordingError
@@ -15,17 +15,13 @@ SCENARIOS = Path(__file__).parents[2] / "deploy" / "caviar_scenarios"
 
 
 def test_a_recording_without_scenes_says_what_to_record(tmp_path: Path) -> None:
-    made = recorder(tmp_path)
-    made.step(frame(0, product("link", "s", link(0), 0)))
-    made.close()
+    record(tmp_path, [frame(0, product("link", "s", link(0), 0))])
     with pytest.raises(RecordingError, match='record = \\["scene"'):
         scenes_of(tmp_path, 2)
 
 
 def test_a_recording_whose_scenario_cannot_be_read_is_refused(tmp_path: Path) -> None:
-    made = recorder(tmp_path)
-    made.step(frame(0, product("scene", "s", scene(0), 0)))
-    made.close()
+    record(tmp_path, [frame(0, product("scene", "s", scene(0), 0))])
     with pytest.raises(RecordingError, match="scenario in its metadata"):
         scenes_of(tmp_path, 2)
 

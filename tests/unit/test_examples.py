@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from recording_builders import record_run
 
-from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.recording import Recording
-from caviar_protocol.scenario import find_scenario, load_scenario, parse_scenario
+from caviar_protocol.scenario import find_scenario, parse_scenario
 from caviar_services.link.users import users_of
 
 PACKAGES = ("caviar_protocol", "caviar_broker", "caviar_services", "caviar_clients")
@@ -49,7 +49,7 @@ def _clock() -> dict[str, Any]:
 
 def _keyframes() -> dict[str, Any]:
     """Free space between a base station and a car, at 0 s, 0.2 s and 0.5 s."""
-    from recording_samples import channel, scene
+    from recording_builders import channel, scene
 
     return {
         "channel_0": channel(0, 2),
@@ -74,8 +74,7 @@ def _wideband() -> dict[str, Any]:
     text = re.sub(r"(?m)^frames = .*", "frames = 2", text)
     text = re.sub(r"(?m)^record = .*", 'record = ["scene", "channel.hf", "channel.taps"]', text)
     run = Path("runs/smoke-wideband")
-    run.mkdir(parents=True)
-    EmbeddedRun(parse_scenario(text, folder=find_scenario("smoke").parent), run).run()
+    record_run(run, parse_scenario(text, folder=find_scenario("smoke").parent))
     scene = Recording(run)["scene"][0]
     assert scene is not None
     users = users_of(scene, tuple(Recording(run)["channel"].carriers.values()))
@@ -95,8 +94,7 @@ GIVEN: dict[str, Callable[[], dict[str, Any]]] = {
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a recorded run of `smoke`."""
     place = tmp_path_factory.mktemp("examples")
-    (place / RUN).mkdir(parents=True)
-    EmbeddedRun(load_scenario("smoke"), place / RUN).run()
+    record_run(place / RUN)
     return place
 
 

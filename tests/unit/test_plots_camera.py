@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recording_samples import frame, product, recorder, scene
+from recording_builders import frame_of, record, scene
 
 from caviar_clients.cli.plot import plot_run
 from caviar_clients.plots.camera import CameraView, draw_view, largest, object_colours
@@ -98,7 +98,7 @@ def test_the_legend_names_the_largest_and_leaves_room_for_scenery() -> None:
 
 def recorded(folder: Path) -> Path:
     """Two frames with a fixed camera and one on a car."""
-    made = recorder(folder)
+    made = []
     for n in range(2):
         optics = {
             "intrinsics": Intrinsics(fx=4.0, fy=4.0, cx=4.0, cy=3.0),
@@ -118,9 +118,8 @@ def recorded(folder: Path) -> Path:
                 object_names=("road",), images=tuple(SegmentationImage(**s, object=ids) for s in sensors)
             ),
         }
-        made.step(frame(n, *(product(topic, "s", payload, n) for topic, payload in payloads.items())))
-    made.close()
-    return folder
+        made.append(frame_of(n, **payloads))
+    return record(folder, made)
 
 
 def test_plot_draws_the_fixed_camera_of_a_recording_or_the_one_asked_for(tmp_path: Path) -> None:

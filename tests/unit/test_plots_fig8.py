@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recording_samples import absent, frame, link, product, record, recorder
+from recording_builders import absent, frame, frame_of, link, product, record
 
 from caviar_clients.plots.fig8 import (
     _without_jumps,
@@ -27,13 +27,12 @@ USER = ("bs", "car.1/rx", "c0")
 
 def with_links(folder: Path, users: list[int], without_path: tuple[int, ...] = ()) -> Recording:
     """A recording with as many users in each frame as ``users`` says; 0: the link is absent."""
-    made = recorder(folder)
+    frames = []
     for number, count in enumerate(users):
         payload = link(number, count, tuple(u for u in without_path if u < count))
         item = product("link", "link", payload, number) if count else absent("link", "link", "late")
-        made.step(frame(number, item))
-    made.close()
-    return Recording(folder)
+        frames.append(frame(number, item))
+    return Recording(record(folder, frames))
 
 
 def test_the_user_that_was_there_longest_is_shown(tmp_path):
@@ -77,12 +76,7 @@ def test_a_user_without_a_path_is_present_but_has_none(tmp_path):
 
 
 def test_time_goes_on_over_episodes(tmp_path):
-    made = recorder(tmp_path)
-    for episode in (0, 1):
-        made.reset(episode, 7, 0)
-        for number in range(2):
-            made.step(frame(number, product("link", "link", link(number), number), episode=episode))
-    made.close()
+    record(tmp_path, [frame_of(number, link=link(number), episode=e) for e in (0, 1) for number in range(2)])
     assert series(Recording(tmp_path), USER).time.tolist() == pytest.approx([0.0, 0.1, 0.2, 0.3])
 
 

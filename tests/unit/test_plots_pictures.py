@@ -7,7 +7,7 @@ import math
 import msgspec
 import numpy as np
 import pytest
-from recording_samples import channel, lidar, link, scene
+from recording_builders import channel, lidar, link, scene
 
 from caviar_clients.cli.plot import beam_gain
 from caviar_clients.plots.lidar import draw_scan, range_image

@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from recording_samples import channel, frame, product, recorder
+from recording_builders import channel, frame_of, record
 
 from caviar_clients.plots.wideband import (
     _gains_db,
@@ -25,12 +25,8 @@ pytest.importorskip("matplotlib")
 
 def recorded(folder: Path) -> Recording:
     """Two episodes of three frames with two users, of which the second has no path."""
-    made = recorder(folder)
-    for episode in range(2):
-        for number in range(3):
-            made.step(frame(number, product("channel", "rt", channel(number, 2), number), episode=episode))
-    made.close()
-    return Recording(folder)
+    frames = [frame_of(k, channel=channel(k, 2), episode=episode) for episode in range(2) for k in range(3)]
+    return Recording(record(folder, frames))
 
 
 def test_a_user_s_paths_go_on_over_episodes(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from recording_samples import absent, channel, frame, lidar, link, product, record, recorder, scene
+from recording_builders import absent, channel, frame, lidar, link, product, record, recorder, scene
 
 from caviar_protocol.errors import ProductError, RecordingError
 from caviar_protocol.messages import Status
@@ -40,11 +40,11 @@ from caviar_services.service import FrameInput
 @pytest.fixture
 def street(tmp_path: Path) -> Path:
     """Two episodes of three frames, a segment each two; a third car joins in frame 2 of both."""
-    made = recorder(tmp_path / "run", segment_frames=2)
+    frames = []
     for episode in range(2):
         for number in range(3):
             cars = 3 if number == 2 else 2
-            made.step(
+            frames.append(
                 frame(
                     number,
                     product("channel", "rt", with_h(channel(number, cars)), number),
@@ -53,8 +53,7 @@ def street(tmp_path: Path) -> Path:
                     episode=episode,
                 )
             )
-    made.close()
-    return tmp_path / "run"
+    return record(tmp_path / "run", frames, segment_frames=2)
 
 
 def with_h(paths: Channel, two_carriers: bool = False) -> Channel:
@@ -110,9 +109,7 @@ def test_wideband_parts_are_there_for_carriers_that_have_them(tmp_path: Path) ->
         hf=tuple(ChannelResponse(carrier=0, tx=0, rx=r, h=(r + 1) * h) for r in range(2)),
         taps=tuple(ChannelTaps(carrier=0, tx=0, rx=r, first=7 - r, h=(r + 1j) * h[:, :2]) for r in range(2)),
     )
-    made = recorder(tmp_path)
-    made.step(frame(0, product("channel", "rt", rays, 0)))
-    made.close()
+    record(tmp_path, [frame(0, product("channel", "rt", rays, 0))])
     read = Recording(tmp_path)["channel"]
     assert (read.hf.shape, read.hf.dtype) == ((1, 4, 2, 3, 1, 4), np.complex64)
     np.testing.assert_array_equal(read.select(carrier="wide").hf[0, 1], 2 * h)
@@ -132,9 +129,7 @@ def test_a_wideband_part_that_was_not_recorded_is_asked_for_by_name(street: Path
 
 
 def test_several_carriers_are_users_of_their_own(tmp_path: Path) -> None:
-    made = recorder(tmp_path)
-    made.step(frame(0, product("channel", "rt", with_h(channel(0, 2), two_carriers=True), 0)))
-    made.close()
+    record(tmp_path, [frame(0, product("channel", "rt", with_h(channel(0, 2), two_carriers=True), 0))])
     rays = Recording(tmp_path)["channel"]
     assert rays.carrier == ("wide", "wide", "low", "low")
     assert rays.rx == ("car.0/rx", "car.1/rx") * 2
@@ -175,11 +170,14 @@ def test_objects_and_devices_are_rows_by_name(street: Path) -> None:
 
 
 def test_the_scenes_of_several_worlds_are_one(tmp_path: Path) -> None:
-    made = recorder(tmp_path)
     uav = msgspec.structs.replace(scene(0, 1), names=("uav",), devices=())
-    made.step(frame(0, product("scene", "air", uav, 0), product("scene", "road", scene(0, 1), 0)))
-    made.step(frame(1, absent("scene", "air", "air died"), product("scene", "road", scene(1, 1), 1)))
-    made.close()
+    record(
+        tmp_path,
+        [
+            frame(0, product("scene", "air", uav, 0), product("scene", "road", scene(0, 1), 0)),
+            frame(1, absent("scene", "air", "air died"), product("scene", "road", scene(1, 1), 1)),
+        ],
+    )
     both = Recording(tmp_path)["scene"]
     assert both.names == ("car.0", "uav")
     assert both.present.tolist() == [[True, True], [True, False]]
@@ -189,12 +187,15 @@ def test_the_scenes_of_several_worlds_are_one(tmp_path: Path) -> None:
 
 
 def test_held_and_absent_products_have_a_status_and_an_age(tmp_path: Path) -> None:
-    made = recorder(tmp_path)
-    made.step(frame(0, absent("link", "link", "the first is late")))
-    made.step(frame(1, product("link", "link", link(1), 1)))
     late = product("link", "link", link(0), 0, Status.LATE, used_in=2)
-    made.step(frame(2, late, product("link", "link", link(1), 1, Status.HELD, used_in=2)))
-    made.close()
+    record(
+        tmp_path,
+        [
+            frame(0, absent("link", "link", "the first is late")),
+            frame(1, product("link", "link", link(1), 1)),
+            frame(2, late, product("link", "link", link(1), 1, Status.HELD, used_in=2)),
+        ],
+    )
     links = Recording(tmp_path)["link"]
     assert links.status.tolist() == ["absent", "fresh", "held"]
     assert links.age.tolist() == [-1, 0, 1]
@@ -245,11 +246,10 @@ def test_a_segment_is_read_alone(street: Path) -> None:
 
 
 def test_a_held_product_of_another_segment_says_what_to_open(tmp_path: Path) -> None:
-    made = recorder(tmp_path, segment_frames=2)
-    for number in range(4):
-        held = product("link", "link", link(1), 1, Status.HELD, used_in=2)
-        made.step(frame(number, held if number == 2 else product("link", "link", link(number), number)))
-    made.close()
+    fresh = [product("link", "link", link(number), number) for number in range(4)]
+    held = product("link", "link", link(1), 1, Status.HELD, used_in=2)
+    inputs = [*fresh[:2], held, fresh[3]]
+    record(tmp_path, [frame(number, item) for number, item in enumerate(inputs)], segment_frames=2)
     links = Recording(tmp_path / "recording-0001.mcap")["link"]
     assert links.status.tolist() == ["held", "fresh"]
     np.testing.assert_array_equal(links[1:].abs_y, [link(3).abs_y])
@@ -271,7 +271,6 @@ def test_a_damaged_product_is_named_and_those_beside_it_are_read(street: Path) -
 
 
 def test_lidar_scans_are_padded_and_objects_renumbered(tmp_path: Path) -> None:
-    made = recorder(tmp_path)
     other = lidar(1)
     fewer = {
         name: getattr(other.scans[0], name)[:5]
@@ -279,9 +278,13 @@ def test_lidar_scans_are_padded_and_objects_renumbered(tmp_path: Path) -> None:
     }
     scan = msgspec.structs.replace(other.scans[0], **fewer)
     second = msgspec.structs.replace(other, object_names=("wall", "tree"), scans=(scan,))
-    made.step(frame(0, product("lidar", "front", lidar(0), 0), product("lidar", "rear", lidar(0), 0)))
-    made.step(frame(1, product("lidar", "front", second, 1), product("lidar", "rear", lidar(1), 1)))
-    made.close()
+    record(
+        tmp_path,
+        [
+            frame(0, product("lidar", "front", lidar(0), 0), product("lidar", "rear", lidar(0), 0)),
+            frame(1, product("lidar", "front", second, 1), product("lidar", "rear", lidar(1), 1)),
+        ],
+    )
     scans = Recording(tmp_path)["lidar", "front"]
     assert (scans.names, scans.object_names) == (("car.0/top",), ("car.1", "tree", "wall"))
     assert scans.hits.tolist() == [[480], [5]]
@@ -298,11 +301,9 @@ def test_lidar_scans_are_padded_and_objects_renumbered(tmp_path: Path) -> None:
 
 
 def test_points_in_world_axes_are_computed_where_they_were_left_out(tmp_path: Path) -> None:
-    made = recorder(tmp_path)
     whole = lidar(1)
     scan = msgspec.structs.replace(whole.scans[0], points_world=None)
-    made.step(frame(1, product("lidar", "lidar", msgspec.structs.replace(whole, scans=(scan,)), 1)))
-    made.close()
+    record(tmp_path, [frame(1, product("lidar", "lidar", msgspec.structs.replace(whole, scans=(scan,)), 1))])
     world = Recording(tmp_path)["lidar"].points_world[0, 0]
     np.testing.assert_allclose(world, whole.scans[0].points_world, atol=1e-5)
     assert np.abs(world - scan.points).max() > 1
@@ -315,17 +316,18 @@ def test_images_are_stacked(tmp_path: Path) -> None:
     parts = SegmentationImage(
         **optics, object=np.array([[0, -1]], np.int32), material=np.array([[1, 0]], np.int32)
     )
-    made = recorder(tmp_path)
     names = {"object_names": ("tree",), "material_names": ("wood", "leaf")}
-    made.step(
-        frame(
-            0,
-            product("depth", "eye", Depth(images=(depth,)), 0),
-            product("segmentation", "eye", Segmentation(**names, images=(parts,)), 0),
-        )
+    record(
+        tmp_path,
+        [
+            frame(
+                0,
+                product("depth", "eye", Depth(images=(depth,)), 0),
+                product("segmentation", "eye", Segmentation(**names, images=(parts,)), 0),
+            ),
+            frame(1, absent("depth", "eye", "late"), absent("segmentation", "eye", "late")),
+        ],
     )
-    made.step(frame(1, absent("depth", "eye", "late"), absent("segmentation", "eye", "late")))
-    made.close()
     recording = Recording(tmp_path)
     assert recording["depth"].depth.shape == (2, 1, 2, 3)
     assert recording["depth"].position[0, 0].tolist() == [1, 2, 3]
@@ -338,12 +340,15 @@ def test_images_are_stacked(tmp_path: Path) -> None:
 
 
 def test_actions_are_beams_by_user_and_motion_by_object(tmp_path: Path) -> None:
-    made = recorder(tmp_path)
     beam = BeamChoice(tx="bs", rx="uav/rx", tx_beam=5, rx_beam=1)
     flight = WaypointCommand(object="uav", position=(1.0, 2.0, 3.0), speed=4.0)
-    made.step(frame(0, product("action", "pilot", Action(commands=(beam, flight)), 0)))
-    made.step(frame(1, product("action", "pilot", Action(commands=(beam,)), 1)))
-    made.close()
+    record(
+        tmp_path,
+        [
+            frame(0, product("action", "pilot", Action(commands=(beam, flight)), 0)),
+            frame(1, product("action", "pilot", Action(commands=(beam,)), 1)),
+        ],
+    )
     actions = Recording(tmp_path)["action"]
     assert (actions.users, actions.tx_beam.tolist()) == ((User("bs", "uav/rx", ""),), [[5], [5]])
     assert actions.motion.names == ("uav",)
@@ -384,9 +389,7 @@ def test_a_mistake_is_told_with_what_is_there(street: Path, mistake: Any, messag
 
 
 def test_paths_without_h_say_how_to_record_it(tmp_path: Path) -> None:
-    made = recorder(tmp_path)
-    made.step(frame(0, product("channel", "rt", channel(0), 0)))
-    made.close()
+    record(tmp_path, [frame(0, product("channel", "rt", channel(0), 0))])
     rays = Recording(tmp_path)["channel"]
     assert rays.tau.shape == (1, 3, 2)
     with pytest.raises(
@@ -396,7 +399,7 @@ def test_paths_without_h_say_how_to_record_it(tmp_path: Path) -> None:
 
 
 def test_a_recorder_that_asks_for_a_part_refuses_a_channel_without_it(tmp_path: Path) -> None:
-    made = recorder(tmp_path, record=("channel.h",))
+    made = recorder(tmp_path, run={"record": ("channel.h",)})
     check = ContentCheck(ContentRules(parts=made.parts))
     bare = product("channel", "rt", channel(0), 0)
     with pytest.raises(ProductError, match="channel of 'rt', frame 0: part 'h' is in demand"):
@@ -405,9 +408,7 @@ def test_a_recorder_that_asks_for_a_part_refuses_a_channel_without_it(tmp_path: 
 
 
 def test_a_part_that_was_asked_for_and_not_delivered_is_laid_on_its_source(tmp_path: Path) -> None:
-    made = recorder(tmp_path, record=("channel.h",))
-    made.step(frame(0, product("channel", "rt", channel(0), 0)))
-    made.close()
+    record(tmp_path, [frame(0, product("channel", "rt", channel(0), 0))], run={"record": ("channel.h",)})
     with pytest.raises(RecordingError, match=r"has no channel\.h, which `record` .* asks for: 'rt' did not"):
         Recording(tmp_path)["channel"].h  # noqa: B018
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from mcap.writer import CompressionType, Writer
-from recording_samples import SCENARIO, frame, link, product, record, recorder
+from recording_builders import SCENARIO, frame, link, product, record, recorder
 
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.recording import (
@@ -50,10 +50,13 @@ def test_no_flipped_bit_of_a_closed_recording_is_unnoticed(tmp_path, compression
     """Anywhere in segments, manifest and scenery; the file is named."""
     mesh = tmp_path / "wall.ply"
     mesh.write_bytes(b"ply" * 50)
-    made = recorder(tmp_path / "run", {"scenery/wall.ply": mesh}, segment_frames=2, compression=compression)
-    for number in range(3):
-        made.step(frame(number, product("link", "link", link(number), number)))
-    made.close()
+    record(
+        tmp_path / "run",
+        [frame(number, product("link", "link", link(number), number)) for number in range(3)],
+        assets={"scenery/wall.ply": mesh},
+        segment_frames=2,
+        compression=compression,
+    )
     run = tmp_path / "run"
     assert noticed(run) == ""
     files = sorted(file for file in run.rglob("*") if file.is_file())

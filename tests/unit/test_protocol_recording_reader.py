@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from mcap.writer import CompressionType, Writer
-from recording_samples import absent, frame, link, product, record, recorder, scene
+from recording_builders import absent, frame, link, product, record, recorder, scene
 
 from caviar_protocol.digest import RunDigest
 from caviar_protocol.errors import RecordingError
@@ -73,7 +73,6 @@ def test_one_segment_can_be_read_alone(run):
 
 
 def test_the_digest_is_the_chain_over_fresh_products_of_the_bytes(tmp_path):
-    made = recorder(tmp_path)
     chain = RunDigest()
     late = product("link", "link", link(0), 0, Status.LATE, used_in=1)
     steps = [
@@ -81,11 +80,10 @@ def test_the_digest_is_the_chain_over_fresh_products_of_the_bytes(tmp_path):
         [product("scene", "world", scene(1), 1), product("link", "link", link(1), 1), late],
         [product("scene", "world", scene(1), 1, Status.HELD, used_in=2), product("link", "link", link(2), 2)],
     ]
+    record(tmp_path, [frame(number, *inputs) for number, inputs in enumerate(steps)])
     for number, inputs in enumerate(steps):
-        made.step(frame(number, *inputs))
         fresh = [i.provenance for i in inputs if i.provenance.status is Status.FRESH]
         chain.add_frame(0, number, [(p.topic, p.source, p.digest) for p in fresh])
-    made.close()
     report = Recording(tmp_path).run_digest()
     assert (report.digest, report.frames, report.damage) == (chain.hexdigest(), 3, ())
 
@@ -240,10 +238,14 @@ def test_a_run_before_its_end_can_be_read(tmp_path):
 
 
 def test_a_held_product_in_an_earlier_segment_needs_that_segment(tmp_path):
-    made = recorder(tmp_path, segment_frames=1)
-    made.step(frame(0, product("link", "link", link(0), 0)))
-    made.step(frame(1, product("link", "link", link(0), 0, Status.HELD, used_in=1)))
-    made.close()
+    record(
+        tmp_path,
+        [
+            frame(0, product("link", "link", link(0), 0)),
+            frame(1, product("link", "link", link(0), 0, Status.HELD, used_in=1)),
+        ],
+        segment_frames=1,
+    )
     assert Recording(tmp_path).product(0, 1, "link", "link") == link(0)
     with pytest.raises(RecordingError, match=r"its bytes, of frame 0, are not in .*recording-0001\.mcap"):
         Recording(tmp_path / "recording-0001.mcap").product(0, 1, "link", "link")

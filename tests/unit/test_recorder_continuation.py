@@ -6,29 +6,12 @@ from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
-from recording_samples import PERIOD_NS, SCENARIO, absent, frame, link, product
+from recording_builders import absent, frame, link, product, record, recorder
 
 from caviar_protocol.errors import RunError
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import Manifest, Recording, integrity, read_manifest
-from caviar_services.recorder.mcap import McapRecorder, McapSettings
-from caviar_services.service import Frame, Preparation, RunInfo
-
-
-def started(folder: Path, *, again: bool, durability: str = "periodic", **settings: object) -> McapRecorder:
-    run = RunInfo(
-        name="recorder",
-        run="sample-1",
-        seed=7,
-        sampling_period_ns=PERIOD_NS,
-        frames=10,
-        scenario=SCENARIO | {"run": {"durability": durability}},
-        directory=folder,
-        again=again,
-    )
-    made = McapRecorder(McapSettings(**settings), run)  # type: ignore[arg-type]
-    made.prepare(Preparation(demand={}))
-    return made
+from caviar_services.recorder.mcap import McapRecorder
 
 
 def killed(made: McapRecorder) -> None:
@@ -37,16 +20,6 @@ def killed(made: McapRecorder) -> None:
         made._persistence.abandon()
     if made._segment is not None:
         made._segment.abandon()
-
-
-def undisturbed(folder: Path, frames: list[Frame], **settings: object) -> Recording:
-    folder.mkdir()
-    made = started(folder, again=False, **settings)
-    for one in frames:
-        made.reset(one.episode, 7, 0)
-        made.step(one)
-    made.close()
-    return Recording(folder)
 
 
 def times(recording: Recording) -> list[tuple[str, int, int, int]]:
@@ -69,14 +42,14 @@ def test_the_recording_is_the_one_of_a_recorder_that_was_not_killed(
     tmp_path: Path, written: int, repeated: int, settings: dict[str, object]
 ) -> None:
     """``repeated`` frames were written, and are granted once more."""
-    expected = undisturbed(tmp_path / "whole", FRAMES, **settings)
+    expected = Recording(record(tmp_path / "whole", FRAMES, **settings))
     folder = tmp_path / "killed"
     folder.mkdir()
-    made = started(folder, again=False, **settings)
+    made = recorder(folder, **settings)
     for one in FRAMES[:written]:
         made.step(one)
     killed(made)
-    made = started(folder, again=True, **settings)
+    made = recorder(folder, again=True, **settings)
     for one in FRAMES[max(0, written - repeated) :]:
         made.step(one)
     made.close()
@@ -89,16 +62,16 @@ def test_the_recording_is_the_one_of_a_recorder_that_was_not_killed(
 
 @pytest.mark.parametrize("bytes_lost", [1, 50, 3000])
 def test_a_frame_that_was_half_written_is_written_anew(tmp_path: Path, bytes_lost: int) -> None:
-    expected = undisturbed(tmp_path / "whole", FRAMES)
+    expected = Recording(record(tmp_path / "whole", FRAMES))
     folder = tmp_path / "killed"
     folder.mkdir()
-    made = started(folder, again=False)
+    made = recorder(folder)
     for one in FRAMES[:4]:
         made.step(one)
     killed(made)
     file = folder / "recording-0000.mcap"
     file.write_bytes(file.read_bytes()[:-bytes_lost])
-    made = started(folder, again=True)
+    made = recorder(folder, again=True)
     for one in FRAMES[3 if bytes_lost < 3000 else 2 :]:
         made.step(one)
     made.close()
@@ -108,11 +81,11 @@ def test_a_frame_that_was_half_written_is_written_anew(tmp_path: Path, bytes_los
 def test_a_held_product_is_not_stored_again(tmp_path: Path) -> None:
     frames = [frame(0, product("link", "link", link(0), 0))]
     frames += [frame(k, product("link", "link", link(0), 0, Status.HELD, used_in=k)) for k in (1, 2)]
-    made = started(tmp_path, again=False)
+    made = recorder(tmp_path)
     made.step(frames[0])
     made.step(frames[1])
     killed(made)
-    made = started(tmp_path, again=True)
+    made = recorder(tmp_path, again=True)
     made.step(frames[2])
     made.close()
     recording = Recording(tmp_path)
@@ -121,40 +94,40 @@ def test_a_held_product_is_not_stored_again(tmp_path: Path) -> None:
 
 
 def test_one_that_is_granted_nothing_more_leaves_a_whole_recording(tmp_path: Path) -> None:
-    made = started(tmp_path, again=False)
+    made = recorder(tmp_path)
     made.step(FRAMES[0])
     killed(made)
     assert not Recording(tmp_path).complete
-    started(tmp_path, again=True).close()
+    recorder(tmp_path, again=True).close()
     assert Recording(tmp_path).complete
     assert len(Recording(tmp_path)) == 1
 
 
 def test_one_that_died_before_it_wrote_anything_begins_anew(tmp_path: Path) -> None:
     (tmp_path / "recording-0000.mcap").write_bytes(b"")
-    made = started(tmp_path, again=True)
+    made = recorder(tmp_path, again=True)
     made.step(frame(0, absent("link", "link", "late")))
     made.close()
     assert len(Recording(tmp_path)) == 1
 
 
 def test_a_recording_that_is_there_when_a_run_begins_is_not_touched(tmp_path: Path) -> None:
-    undisturbed(tmp_path / "whole", FRAMES)
+    record(tmp_path / "whole", FRAMES)
     before = (tmp_path / "whole" / "recording-0000.mcap").read_bytes()
     with pytest.raises(RunError, match="is there already"):
-        started(tmp_path / "whole", again=False)
+        recorder(tmp_path / "whole")
     assert (tmp_path / "whole" / "recording-0000.mcap").read_bytes() == before
 
 
 def killed_in_the_second_segment(folder: Path) -> None:
-    made = started(folder, again=False, segment_frames=3, durability="none")
+    made = recorder(folder, segment_frames=3, run={"durability": "none"})
     for one in FRAMES[:5]:
         made.step(one)
     killed(made)
 
 
 def go_back_to_frame_2(folder: Path) -> None:
-    made = started(folder, again=True, segment_frames=3, durability="none")
+    made = recorder(folder, again=True, segment_frames=3, run={"durability": "none"})
     made.step(FRAMES[2])
     killed(made)
 

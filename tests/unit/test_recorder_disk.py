@@ -11,15 +11,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from recording_samples import PERIOD_NS, SCENARIO, frame, recorder
+from recording_builders import frame, recorder
 
 from caviar_protocol.errors import RunError
-from caviar_protocol.files import Durability
 from caviar_protocol.recording import Recording
 from caviar_services.recorder import segment_writer
 from caviar_services.recorder.base import failure
-from caviar_services.recorder.mcap import McapRecorder, McapSettings
-from caviar_services.service import Preparation, RunInfo
+from caviar_services.recorder.mcap import McapRecorder
 
 
 @pytest.fixture
@@ -32,16 +30,6 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
         pytest.skip("this user may not mount a tmpfs")
     yield folder
     subprocess.run(["umount", "-l", str(folder)], check=True)
-
-
-def durable(folder: Path, durability: Durability, **settings: object) -> McapRecorder:
-    scenario = {**SCENARIO, "run": {"name": "sample", "durability": durability}}
-    run = RunInfo(
-        name="recorder", run="sample-1", sampling_period_ns=PERIOD_NS, scenario=scenario, directory=folder
-    )
-    made = McapRecorder(McapSettings(**settings), run)  # type: ignore[arg-type]
-    made.prepare(Preparation(demand={}))
-    return made
 
 
 def fill(made: McapRecorder, first: int = 0) -> tuple[int, str]:
@@ -82,17 +70,7 @@ def test_a_recording_goes_on_once_there_is_space(small_disk):
     made.close()
     ballast.unlink()
     subprocess.run(["mount", "-o", "remount,size=4m", str(small_disk)], check=True)
-    run = RunInfo(
-        name="recorder",
-        run="sample-1",
-        seed=7,
-        sampling_period_ns=PERIOD_NS,
-        scenario=SCENARIO,
-        directory=small_disk / "run",
-        again=True,
-    )
-    later = McapRecorder(McapSettings(), run)
-    later.prepare(Preparation(demand={}))
+    later = recorder(small_disk / "run", again=True)
     for one in range(number, number + 5):
         later.step(frame(one))
     later.close()
@@ -144,7 +122,7 @@ class Syncs:
 
 def test_with_frame_each_frame_is_on_disk_before_it_is_acknowledged(tmp_path, monkeypatch):
     syncs = Syncs(monkeypatch)
-    made = durable(tmp_path, "frame", segment_frames=2)
+    made = recorder(tmp_path, run={"durability": "frame"}, segment_frames=2)
     for number in range(4):
         segment = tmp_path / f"recording-{number // 2:04d}.mcap"
         before = len(syncs.sizes)
@@ -158,7 +136,7 @@ def test_with_frame_each_frame_is_on_disk_before_it_is_acknowledged(tmp_path, mo
 def test_with_periodic_a_thread_brings_frames_to_disk(tmp_path, monkeypatch):
     monkeypatch.setattr(segment_writer, "_PAUSE_S", 0.01)
     syncs = Syncs(monkeypatch)
-    made = durable(tmp_path, "periodic", segment_frames=2)
+    made = recorder(tmp_path, run={"durability": "periodic"}, segment_frames=2)
     for number in range(4):
         syncs.came.clear()
         made.step(frame(number))
@@ -176,7 +154,7 @@ def test_with_periodic_an_error_of_the_disk_ends_the_run(tmp_path, monkeypatch):
         raise OSError(errno.EIO, "Input/output error")
 
     monkeypatch.setattr(os, "fdatasync", fdatasync)
-    made = durable(tmp_path, "periodic")
+    made = recorder(tmp_path, run={"durability": "periodic"})
     made.step(frame(0))
     assert tried.wait(20)
     _, text = fill(made, 1)
@@ -186,7 +164,7 @@ def test_with_periodic_an_error_of_the_disk_ends_the_run(tmp_path, monkeypatch):
 
 def test_with_none_nothing_is_synced(tmp_path, monkeypatch):
     syncs = Syncs(monkeypatch)
-    made = durable(tmp_path, "none", segment_frames=2)
+    made = recorder(tmp_path, run={"durability": "none"}, segment_frames=2)
     for number in range(4):
         made.step(frame(number))
     made.close()

@@ -14,7 +14,7 @@ from pathlib import Path
 import msgspec
 import pytest
 from mcap.reader import make_reader
-from recording_samples import PERIOD_NS, absent, frame, link, product, record, recorder, scene
+from recording_builders import PERIOD_NS, absent, frame, link, product, record, recorder, scene
 
 from caviar_protocol.codec import decode_payload
 from caviar_protocol.digest import payload_digest
@@ -37,10 +37,8 @@ def test_it_is_registered_and_takes_every_topic_without_demanding_any():
 
 
 def test_the_mcap_package_reads_channels_schemas_and_unchanged_wire_bytes(tmp_path):
-    made = recorder(tmp_path)
     item = product("link", "link", link(0), 0)
-    made.step(frame(0, item))
-    made.close()
+    record(tmp_path, [frame(0, item)])
     with (tmp_path / "recording-0000.mcap").open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         found = {channel.topic: (schema, channel, m) for schema, channel, m in reader.iter_messages()}
@@ -77,15 +75,13 @@ def test_a_closed_segment_has_an_index_statistics_and_metadata(tmp_path):
 
 
 def test_the_provenance_of_every_input_is_recorded_in_canonical_order(tmp_path):
-    made = recorder(tmp_path)
     inputs = [
         product("scene", "world", scene(0), 0),
         absent("lidar", "sensors", "lidar did not answer frame 0"),
         product("link", "b", link(0), 0),
         product("link", "a", link(0), 0),
     ]
-    made.step(frame(0, *inputs))
-    made.close()
+    record(tmp_path, [frame(0, *inputs)])
     entries = Recording(tmp_path).frame(0, 0).inputs
     assert [(e.topic, e.source) for e in entries] == [
         ("lidar", "sensors"),
@@ -97,29 +93,30 @@ def test_the_provenance_of_every_input_is_recorded_in_canonical_order(tmp_path):
 
 
 def test_a_missing_digest_is_computed(tmp_path):
-    made = recorder(tmp_path)
     item = product("link", "link", link(0), 0)
     bare = msgspec.structs.replace(item.provenance, digest="")
-    made.step(frame(0, FrameInput(bare, item.header, item.body)))
-    made.close()
+    record(tmp_path, [frame(0, FrameInput(bare, item.header, item.body))])
     assert Recording(tmp_path).frame(0, 0).inputs[0].digest == item.provenance.digest
 
 
 def test_a_payload_that_was_never_encoded_is_written_as_its_wire_bytes(tmp_path):
-    made = recorder(tmp_path)
     item = product("link", "link", link(0), 0)
-    made.step(frame(0, FrameInput(item.provenance, payload=link(0))))
-    made.close()
+    record(tmp_path, [frame(0, FrameInput(item.provenance, payload=link(0)))])
     (stored,) = Recording(tmp_path).frame(0, 0).products
     assert (bytes(stored.header), bytes(stored.body)) == (bytes(item.header), bytes(item.body))
 
 
 def test_a_held_product_is_stored_once(tmp_path):
-    made = recorder(tmp_path)
-    made.step(frame(0, product("link", "link", link(0), 0)))
-    for number in (1, 2):
-        made.step(frame(number, product("link", "link", link(0), 0, Status.HELD, used_in=number)))
-    made.close()
+    record(
+        tmp_path,
+        [
+            frame(0, product("link", "link", link(0), 0)),
+            *(
+                frame(number, product("link", "link", link(0), 0, Status.HELD, used_in=number))
+                for number in (1, 2)
+            ),
+        ],
+    )
     with (tmp_path / "recording-0000.mcap").open("rb") as stream:
         counted = [channel.topic for _, channel, _ in make_reader(stream).iter_messages()]
     assert counted.count("link/link") == 1
@@ -127,20 +124,26 @@ def test_a_held_product_is_stored_once(tmp_path):
 
 
 def test_a_held_product_that_was_never_stored_is_stored_when_held(tmp_path):
-    made = recorder(tmp_path)
-    made.step(frame(0, absent("link", "link", "late")))
-    made.step(frame(1, product("link", "link", link(0), 0, Status.HELD, used_in=1)))
-    made.close()
+    record(
+        tmp_path,
+        [
+            frame(0, absent("link", "link", "late")),
+            frame(1, product("link", "link", link(0), 0, Status.HELD, used_in=1)),
+        ],
+    )
     assert Recording(tmp_path).product(0, 1, "link", "link") == link(0)
 
 
 def test_a_late_product_stands_under_its_true_frame_beside_the_fresh_one(tmp_path):
-    made = recorder(tmp_path)
-    made.step(frame(0, absent("link", "link", "late")))
     late = product("link", "link", link(0), 0, Status.LATE, used_in=1)
-    made.step(frame(1, product("link", "link", link(1), 1), late))
-    made.step(frame(2, product("link", "link", link(1), 1, Status.HELD, used_in=2)))
-    made.close()
+    record(
+        tmp_path,
+        [
+            frame(0, absent("link", "link", "late")),
+            frame(1, product("link", "link", link(1), 1), late),
+            frame(2, product("link", "link", link(1), 1, Status.HELD, used_in=2)),
+        ],
+    )
     recording = Recording(tmp_path)
     first, second = recording.frame(0, 1).products
     assert (first.provenance.frame, first.provenance.status) == (0, Status.LATE)
@@ -181,8 +184,7 @@ def test_scenery_is_copied_with_its_digest(tmp_path):
     mesh = tmp_path / "cache" / "abc"
     mesh.parent.mkdir()
     mesh.write_bytes(b"ply\n")
-    made = recorder(tmp_path / "run", assets={"scenery/meshes/wall.ply": mesh})
-    made.close()
+    record(tmp_path / "run", [], assets={"scenery/meshes/wall.ply": mesh})
     recording = Recording(tmp_path / "run")
     assert recording.assets["scenery/meshes/wall.ply"].read_bytes() == b"ply\n"
     assert recording.metadata.assets[0].digest == hashlib.sha256(b"ply\n").hexdigest()
@@ -220,7 +222,7 @@ _LIMITED = """
 import resource, sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
-from recording_samples import frame, recorder
+from recording_builders import frame, recorder
 from caviar_protocol.errors import RunError
 made = recorder(Path(sys.argv[1]))
 resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, 30_000))
@@ -261,7 +263,7 @@ import sys
 from itertools import count
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
-from recording_samples import frame, recorder
+from recording_builders import frame, recorder
 made = recorder(Path(sys.argv[1]), segment_frames=40)
 for number in count():
     made.step(frame(number))

@@ -6,16 +6,15 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from recording_samples import PERIOD_NS, SCENARIO, scene
+from recording_builders import PERIOD_NS, absent, frame, product, record, scene
 
 from caviar_protocol import messages as m
 from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.digest import payload_digest
 from caviar_protocol.errors import DeclarationError, RecordingError, ScenarioError
-from caviar_protocol.messages import GrantInput, Report, Status
+from caviar_protocol.messages import Report, Status
 from caviar_protocol.scenario.conversion import Place
 from caviar_services.conversion import encoded_done, plain_done
-from caviar_services.recorder.mcap import McapRecorder, McapSettings
 from caviar_services.registry import load
 from caviar_services.replay import Replayer, ReplaySettings, use_of
 from caviar_services.service import Encoded, Frame, FrameInput, Preparation, RunInfo, StepResult
@@ -35,45 +34,25 @@ def foreign(frame: int) -> tuple[bytes, bytes]:
 
 def item(frame: int, status: Status = Status.FRESH, of: int | None = None, source: str = "w") -> FrameInput:
     if status is Status.ABSENT:
-        return FrameInput(GrantInput(topic="scene", source=source, status=status, cause="w failed"))
+        return absent("scene", source, "w failed")
     of = frame if of is None else of
-    header, body = foreign(of)
-    provenance = GrantInput(
-        topic="scene",
-        source=source,
-        status=status,
-        frame=of,
-        t_ns=of * PERIOD_NS,
-        age=frame - of,
-        fidelity=f"f{of}",
-        digest=payload_digest(header, body),
-        cause="" if status is Status.FRESH else "w was late",
-    )
-    return FrameInput(provenance, header, body)
+    cause = "" if status is Status.FRESH else "w was late"
+    return product("scene", source, foreign(of), of, status, used_in=frame, fidelity=f"f{of}", cause=cause)
 
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two episodes of a world with fresh, held and absent scenes; the second has another seed."""
-    directory = tmp_path_factory.mktemp("runs") / "run"
-    run = RunInfo(name="recorder", run="run", seed=5, frames=4, scenario=SCENARIO, directory=directory)
-    recorder = McapRecorder(McapSettings(), run)
-    recorder.prepare(Preparation(demand={}))
+    frames = []
     for episode, seed, inputs in (
         (0, 6, [item(0), item(1, Status.HELD, of=0), item(2, Status.ABSENT), item(3)]),
         (1, 9, [item(0), item(1)]),
     ):
-        recorder.reset(0, seed, 0)
         for number, each in enumerate(inputs):
             report = Report(source="w", decisions={"rung": f"r{number}"}, counts={"skipped": number})
-            t_ns = number * PERIOD_NS
             other = item(number, source="other")
-            frame = Frame(
-                episode=episode, number=number, t_ns=t_ns, inputs=(each, other), reports=(report,), seed=seed
-            )
-            recorder.step(frame)
-    recorder.close()
-    return directory
+            frames.append(frame(number, each, other, episode=episode, reports=(report,), seed=seed))
+    return record(tmp_path_factory.mktemp("runs") / "run", frames)
 
 
 def replayer(recording: Path, role: str = "world", name: str = "w") -> Replayer:

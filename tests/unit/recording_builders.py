@@ -1,16 +1,26 @@
-"""Recordings made by hand, through the real recorder: a street with cars, rays, links and a LIDAR."""
+"""Recordings for tests, all through the real recorder.
+
+`record` writes frames that a test makes up: a street with cars, rays, links and a LIDAR. `record_run` runs a
+scenario in this process. `recorder` is for tests of what is on disk before a recording is closed.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
+from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.arrays import Payload
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.digest import payload_digest
-from caviar_protocol.messages import GrantInput, Status
+from caviar_protocol.files import RunDirectory
+from caviar_protocol.messages import GrantInput, Report, Status
+from caviar_protocol.scenario import Scenario, load_scenario
 from caviar_protocol.space.coordinates import quaternion_from_euler, rotation_matrix
 from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import (
@@ -154,14 +164,15 @@ def lidar(frame: int) -> Lidar:
 def product(
     topic: str,
     source: str,
-    payload: Payload,
+    payload: Payload | tuple[bytes, bytes],
     frame: int,
     status: Status = Status.FRESH,
     used_in: int | None = None,
+    **provenance: str,
 ) -> FrameInput:
-    """A product as a recorder is granted it."""
-    header, body = encode_payload(payload)
-    provenance = GrantInput(
+    """A product as a recorder is granted it; ``payload`` may be its header and body."""
+    header, body = payload if isinstance(payload, tuple) else encode_payload(payload)
+    entry = GrantInput(
         topic=topic,
         source=source,
         status=status,
@@ -169,8 +180,9 @@ def product(
         t_ns=frame * PERIOD_NS,
         age=(frame if used_in is None else used_in) - frame,
         digest=payload_digest(header, body),
+        **provenance,
     )
-    return FrameInput(provenance, memoryview(header), memoryview(body))
+    return FrameInput(entry, memoryview(header), memoryview(body))
 
 
 def absent(topic: str, source: str, cause: str) -> FrameInput:
@@ -178,40 +190,78 @@ def absent(topic: str, source: str, cause: str) -> FrameInput:
     return FrameInput(GrantInput(topic=topic, source=source, status=Status.ABSENT, cause=cause))
 
 
-def frame(number: int, *inputs: FrameInput, episode: int = 0) -> Frame:
+def frame(
+    number: int, *inputs: FrameInput, episode: int = 0, seed: int = 7, reports: tuple[Report, ...] = ()
+) -> Frame:
     """A frame as a recorder is granted it; by default with a scene and a link."""
     inputs = inputs or (
         product("scene", "world", scene(number), number),
         product("link", "link", link(number), number),
     )
     return Frame(
-        episode=episode, number=number, t_ns=number * PERIOD_NS, inputs=inputs, service="recorder", seed=7
+        episode=episode,
+        number=number,
+        t_ns=number * PERIOD_NS,
+        inputs=inputs,
+        reports=reports,
+        service="recorder",
+        seed=seed,
     )
 
 
+def frame_of(number: int, *, episode: int = 0, **payloads: Payload) -> Frame:
+    """A frame with these payloads, by topic, all of source ``s``."""
+    inputs = (product(topic, "s", payload, number) for topic, payload in payloads.items())
+    return frame(number, *inputs, episode=episode)
+
+
 def recorder(
-    folder: Path, assets: dict[str, Path] | None = None, record: tuple[str, ...] = (), **settings: object
+    folder: Path,
+    assets: Mapping[str, Path] | None = None,
+    *,
+    run: Mapping[str, object] | None = None,
+    again: bool = False,
+    **settings: object,
 ) -> McapRecorder:
-    """A prepared recorder that writes to ``folder``."""
-    run = RunInfo(
+    """A prepared recorder that writes to ``folder``.
+
+    ``run`` replaces keys of that table of the scenario; ``again`` says that the recorder died and was started
+    anew.
+    """
+    info = RunInfo(
         name="recorder",
         run="sample-1",
         seed=7,
         sampling_period_ns=PERIOD_NS,
         frames=10,
-        scenario=SCENARIO | ({"run": {"record": record}} if record else {}),
+        scenario=SCENARIO | {"run": {**SCENARIO["run"], **(run or {})}},
         directory=folder,
+        again=again,
     )
-    made = McapRecorder(McapSettings(**settings), run)
+    made = McapRecorder(McapSettings(**settings), info)
     made.prepare(Preparation(demand={}, assets=assets or {}))
-    made.reset(0, 7, 0)
     return made
 
 
-def record(folder: Path, frames: int = 5, **settings: object) -> Path:
-    """A whole recording of ``frames`` frames."""
-    made = recorder(folder, **settings)
-    for number in range(frames):
-        made.step(frame(number))
+def record(folder: Path, frames: int | Iterable[Frame] = 5, **how: Any) -> Path:
+    """A whole recording of these frames, or of so many that `frame` makes; ``how`` as for `recorder`."""
+    made = recorder(folder, **how)
+    episode = None
+    for one in (frame(number) for number in range(frames)) if isinstance(frames, int) else frames:
+        if one.episode != episode:
+            made.reset(one.episode, one.seed, 0)
+            episode = one.episode
+        made.step(one)
     made.close()
+    return folder
+
+
+def record_run(folder: Path, scenario: str | Path | Scenario = "smoke", **run: object) -> Path:
+    """A recording of a scenario that is run in this process; ``run`` replaces keys of its table ``[run]``."""
+    made = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
+    made = replace(made, run=replace(made.run, **run))
+    folder.mkdir(parents=True, exist_ok=True)
+    ended = EmbeddedRun(made, folder)
+    assert not ended.run().error
+    ended.statistics.save(RunDirectory(folder).latencies)
     return folder
