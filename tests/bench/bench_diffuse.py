@@ -25,10 +25,9 @@ from typing import Any
 
 import numpy as np
 
+from caviar_clients.tradeoff.errors import Key, UserChannel, differences, error_fields
 from caviar_clients.tradeoff.ladder import Setting
-from caviar_clients.tradeoff.rows import error_fields
 from caviar_clients.tradeoff.scenes import Scenes, scenes_of
-from caviar_clients.tradeoff.users import Key, Noise, UserChannel, differences
 from caviar_clients.tradeoff.worker import Rung
 
 SCENARIO = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "street-canyon.toml"
@@ -47,13 +46,11 @@ def rungs(scenes: Scenes, samples: int, paths: int, depth: int) -> dict[str, Run
         OTHER: {**plain, **rough, "scattering_samples": samples, "launch_seed": 2},
         RAYS: {**plain, **rough, "scattering_samples": round(samples * 1.07), "launch_seed": 2},
     }
-    noise = Noise.of(scenes)
     return {
         name: Rung(
             Setting(label=name, use="sionna-rt", settings=own, scattering="scattering_samples" in own),
             scenes,
             None,
-            noise,
         )
         for name, own in settings.items()
     }

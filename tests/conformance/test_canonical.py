@@ -17,7 +17,7 @@ from caviar_clients.conform.canonical import (
     unpack,
 )
 from caviar_clients.conform.case import Failed
-from caviar_clients.conform.wire import Received
+from caviar_clients.conform.client import Received
 
 HEADER, BODY = street.product("scene", "traffic", 3)
 POSITION = pack([0.0, -10.0, 9.0])

@@ -20,9 +20,8 @@ import zmq
 from caviar_clients.cli.main import app
 from caviar_clients.conform import Verdict, cases, conform, street
 from caviar_clients.conform.case import as_markdown, repeated
-from caviar_clients.conform.client import End, Started
-from caviar_clients.conform.session import Rules, Seen, Session
-from caviar_clients.conform.wire import Wire, unpack
+from caviar_clients.conform.client import End, Rules, Started, Wire, unpack
+from caviar_clients.conform.session import Seen, Session
 from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.errors import RunError, SetupError
 from caviar_protocol.topics import Scene

@@ -11,9 +11,9 @@ from caviar_broker.core import events as ev
 from caviar_broker.core.clock import FrameClock
 from caviar_broker.core.plan import briefings, plan_run, with_ownership
 from caviar_clients.conform import session as kit
-from caviar_clients.conform.session import Rules, Seen, Session
+from caviar_clients.conform.client import Rules, pack, unpack
+from caviar_clients.conform.session import Seen, Session
 from caviar_clients.conform.street import SCENARIO, scenario_of
-from caviar_clients.conform.wire import pack, unpack
 from caviar_protocol import messages as m
 from caviar_protocol.codec import encode_message
 from caviar_protocol.scenario import parse_scenario

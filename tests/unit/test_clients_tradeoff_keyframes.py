@@ -11,10 +11,10 @@ import pytest
 from link_builders import CARRIER, antenna, scene_of
 from msgspec.structs import replace
 
+from caviar_clients.tradeoff.errors import FLOOR_DB, Noise
 from caviar_clients.tradeoff.keyframes import Traced, keyframe_rows, spaced
 from caviar_clients.tradeoff.ladder import Setting
 from caviar_clients.tradeoff.scenes import CONSECUTIVE, Instant, Scenes, scenes_of
-from caviar_clients.tradeoff.users import FLOOR_DB, Noise
 from caviar_clients.tradeoff.worker import Rung
 from caviar_protocol.errors import RunError
 from caviar_protocol.topics import Channel
@@ -53,7 +53,7 @@ def driving(frames: int) -> Scenes:
 
 
 def rows(scenes: Scenes, setting: Setting = FREE_SPACE, **more: Any) -> Any:
-    return keyframe_rows(setting, scenes, None, NOISE, more.get("seconds", 60.0), lambda _: None)
+    return keyframe_rows(setting, scenes, None, more.get("seconds", 60.0), lambda _: None)
 
 
 def test_each_spacing_has_a_row_beside_that_of_all_frames() -> None:
@@ -74,7 +74,7 @@ def test_each_spacing_has_a_row_beside_that_of_all_frames() -> None:
 def test_a_scene_costs_its_share_of_the_keyframe_and_the_interpolation() -> None:
     """Keyframes that took 1 s, 5 frames apart, make a scene that took a little more than 0.2 s."""
     scenes = driving(6)
-    rung = Rung(FREE_SPACE, scenes, None, NOISE, products=True)
+    rung = Rung(FREE_SPACE, scenes, None, products=True)
     traced = []
     for instant in scenes.consecutive:
         sample = rung.sample(instant)

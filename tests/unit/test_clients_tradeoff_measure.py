@@ -11,18 +11,15 @@ import pytest
 from link_builders import CARRIER, antenna, scene_of
 from msgspec.structs import replace
 
+from caviar_clients.tradeoff.errors import FLOOR_DB, UserChannel, difference, differences, error_fields
 from caviar_clients.tradeoff.ladder import SCATTERING, Setting
 from caviar_clients.tradeoff.report import comparable
-from caviar_clients.tradeoff.rows import error_fields
 from caviar_clients.tradeoff.scenes import Instant, Scenes
-from caviar_clients.tradeoff.users import FLOOR_DB, Noise, UserChannel, difference, differences
 from caviar_clients.tradeoff.worker import Rung, peak_mib, reset_peak, scattering_materials, seen
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import AntennaArray
-
-NOISE = Noise(figure_db=9.0, temperature_k=290.0)
 
 
 def scenes() -> Scenes:
@@ -72,7 +69,7 @@ def test_every_material_scatters_unless_the_scenario_says_which(tmp_path: Path) 
 
 
 def test_a_sample_has_the_users_of_the_scene() -> None:
-    rung = Rung(Setting(label="f", use="free-space"), scenes(), None, NOISE)
+    rung = Rung(Setting(label="f", use="free-space"), scenes(), None)
     sample = rung.sample(scenes().instants[0])
     rung.close()
     assert (sample.rung, sample.receivers, sample.paths, sample.lost_paths) == ("free-space", 2, 2, False)
@@ -99,7 +96,7 @@ def test_patterns_of_files_reach_channels_that_know_no_scenery(tmp_path: Path) -
     given = dataclasses.replace(plain, instants=(weak,), devices=(spec,), assets={name: file})
     gains = []
     for at in (plain, given):
-        rung = Rung(Setting(label="f", use="free-space"), at, None, NOISE)
+        rung = Rung(Setting(label="f", use="free-space"), at, None)
         gains.append(rung.sample(at.instants[0]).users[5, "bs", "near", "mmwave"].path_gain_db)
         rung.close()
     assert gains[1] - gains[0] == pytest.approx(-10)
@@ -115,7 +112,7 @@ def test_free_space_is_no_reference_where_there_is_scenery(tmp_path: Path) -> No
 
 def test_a_setting_that_the_channel_does_not_know_is_refused() -> None:
     with pytest.raises(ScenarioError, match="unknown key 'rays'"):
-        Rung(Setting(label="f", use="free-space", settings={"rays": 3}), scenes(), None, NOISE)
+        Rung(Setting(label="f", use="free-space", settings={"rays": 3}), scenes(), None)
 
 
 def test_the_peak_of_memory_is_seen_and_forgotten() -> None:

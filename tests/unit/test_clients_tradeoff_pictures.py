@@ -10,6 +10,7 @@ import pytest
 
 from caviar_clients.cli.tradeoff import _other_reference
 from caviar_clients.tradeoff.campaign import Skipped
+from caviar_clients.tradeoff.errors import Row, error_fields
 from caviar_clients.tradeoff.ladder import REFERENCES
 from caviar_clients.tradeoff.plot import (
     Box,
@@ -21,7 +22,6 @@ from caviar_clients.tradeoff.plot import (
     spots,
 )
 from caviar_clients.tradeoff.report import Options, Point, Report
-from caviar_clients.tradeoff.rows import Row, error_fields
 from caviar_clients.tradeoff.tables import level, markdown, significant
 
 

@@ -12,11 +12,9 @@ from link_builders import CARRIER, antenna, scene_of
 
 from caviar_clients.tradeoff.ladder import Setting
 from caviar_clients.tradeoff.scenes import Instant, Scenes
-from caviar_clients.tradeoff.users import Noise
 from caviar_clients.tradeoff.worker import Worker
 from caviar_protocol.errors import RunError
 
-NOISE = Noise(figure_db=9.0, temperature_k=290.0)
 SCENES = Scenes(
     name="one",
     origin="made by hand",
@@ -35,7 +33,7 @@ SCENES = Scenes(
 
 @contextmanager
 def working() -> Iterator[Worker]:
-    worker = Worker(Setting(label="f", use="free-space"), SCENES, None, NOISE, 60.0)
+    worker = Worker(Setting(label="f", use="free-space"), SCENES, None, 60.0)
     try:
         yield worker
     finally:
@@ -53,7 +51,7 @@ def test_scenes_are_answered_by_their_index() -> None:
 
 def test_the_reason_why_it_cannot_be_loaded_is_told() -> None:
     with pytest.raises(RunError, match="no channel is named 'free-spaec'"):
-        Worker(Setting(label="f", use="free-spaec"), SCENES, None, NOISE, 60.0)
+        Worker(Setting(label="f", use="free-spaec"), SCENES, None, 60.0)
 
 
 def test_a_process_that_dies_is_told_by_its_signal() -> None:

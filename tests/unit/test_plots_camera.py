@@ -10,7 +10,7 @@ import pytest
 from recording_builders import frame_of, record, scene
 
 from caviar_clients.cli.plot import plot_run
-from caviar_clients.plots.camera import CameraView, draw_view, largest, object_colours
+from caviar_clients.plots.sensors import CameraView, draw_view, largest, object_colours
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.topics import (
     Camera,

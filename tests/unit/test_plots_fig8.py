@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from recording_builders import absent, frame, frame_of, link, product, record
 
-from caviar_clients.plots.fig8 import (
+from caviar_clients.plots.user_curves import (
     _without_jumps,
     choose_user,
     draw_over_angle,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from recording_builders import channel, frame_of, record
 
-from caviar_clients.plots.wideband import (
+from caviar_clients.plots.user_curves import (
     _gains_db,
     _scale,
     _why_empty,

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from caviar_clients.conform import Verdict, cases, conform
 from caviar_clients.conform.case import as_json, as_markdown, repeated, summary
-from caviar_clients.conform.session import Rules
+from caviar_clients.conform.client import Rules
 from caviar_clients.files import write_file
 from caviar_protocol.errors import SetupError
 from caviar_protocol.scenario.toml import MAX_SIZE, parse_toml

@@ -284,7 +284,7 @@ def conform(
 ) -> None:
     """Judge a client in any language against the protocol, clause by clause; status 1 where one fails."""
     from caviar_clients.cli import conform as kit
-    from caviar_clients.conform.session import Rules
+    from caviar_clients.conform.client import Rules
 
     if list_cases:
         kit.list_cases(_console)

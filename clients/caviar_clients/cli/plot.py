@@ -10,12 +10,19 @@ from typing import Any
 import numpy as np
 
 from caviar_clients.files import make_folder_of
-from caviar_clients.plots.camera import CameraView, draw_view
-from caviar_clients.plots.fig8 import choose_user, draw_over_angle, draw_over_time, has_users, series
-from caviar_clients.plots.lidar import draw_scan
 from caviar_clients.plots.map import MapData, draw_map
 from caviar_clients.plots.rays import Box, Footprints, footprints, with_boxes
-from caviar_clients.plots.wideband import draw_dispersion, draw_frequency_response, user_paths
+from caviar_clients.plots.sensors import CameraView, draw_scan, draw_view
+from caviar_clients.plots.user_curves import (
+    choose_user,
+    draw_dispersion,
+    draw_frequency_response,
+    draw_over_angle,
+    draw_over_time,
+    has_users,
+    series,
+    user_paths,
+)
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.recording import RecordedFrame, Recording

@@ -17,7 +17,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from caviar_clients.cli.radio_map_inputs import Wanted, carrier_of, channel_of, in_hertz, noise_of, surface_of
 from caviar_clients.files import reserved, writing
-from caviar_clients.plots.radio_map import RadioMapView, draw_servers, draw_values
+from caviar_clients.plots.map import RadioMapView, draw_servers, draw_values
 from caviar_clients.plots.rays import footprints
 from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.plausibility import implausible_values

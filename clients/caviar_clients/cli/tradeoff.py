@@ -15,7 +15,8 @@ from caviar_clients.cli.scenarios import extras_of
 from caviar_clients.files import reserved, write_file
 from caviar_clients.session.checks import checked_scenario
 from caviar_clients.tradeoff import ladder
-from caviar_clients.tradeoff.campaign import Told, candidates
+from caviar_clients.tradeoff.campaign import Progress as CampaignProgress
+from caviar_clients.tradeoff.campaign import candidates
 from caviar_clients.tradeoff.plot import draw_convergence, draw_pareto
 from caviar_clients.tradeoff.report import PARTS, Options, Report, compare
 from caviar_clients.tradeoff.scenes import is_recording, scenes_of, services_kept
@@ -120,13 +121,13 @@ def _compared(source: Path, frames: int, options: Options, console: Console) -> 
     with _progress(console) as bar:
         task = bar.add_task("scenes", total=1.0, left="")
 
-        def told(news: Told) -> None:
+        def show(news: CampaignProgress) -> None:
             minutes, seconds = divmod(round(news.left_s), 60)
             left = f"{minutes}:{seconds:02d} left" if news.left_s > 0 else "time is up: ending what began"
             bar.update(task, description=news.text, completed=news.done, left=left)
 
         scenes = scenes_of(source, frames)
-        return compare(scenes, options, machine(), told)
+        return compare(scenes, options, machine(), show)
 
 
 @contextmanager

@@ -13,11 +13,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 
 from caviar_clients.cli.plot import agent_names, choose_camera, map_data, scenery
 from caviar_clients.files import make_folder_of
-from caviar_clients.plots.fig8 import UserSeries, choose_user, series
 from caviar_clients.plots.film import GIF_FPS, WRITERS, Reel, find_ffmpeg, needed_ffmpeg
 from caviar_clients.plots.map import Mark, View, chosen_beam, common_prefix, receiver_mark, view_of
 from caviar_clients.plots.moving import MovingMap, Plan, key_colours
 from caviar_clients.plots.rays import rays, scale
+from caviar_clients.plots.user_curves import UserSeries, choose_user, series
 from caviar_protocol.arrays import UInt8Array
 from caviar_protocol.errors import RecordingError, SetupError
 from caviar_protocol.recording import RecordedFrame, Recording

@@ -1,6 +1,7 @@
 """Judgement of received messages: canonical MessagePack, header fields, parts, products.
 
-Reads with the plain ``msgpack`` package, so that a defect of the product's codec cannot hide itself.
+Reads with the plain ``msgpack`` package, so that a defect of the product's codec cannot hide itself. A header
+is canonical where encoding it again gives the same bytes; `first_difference` says in words where it is not.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Any
 import msgpack  # type: ignore[import-untyped]
 
 from caviar_clients.conform.case import Failed
-from caviar_clients.conform.wire import BROKEN, Fields, Received, pack, unpack
+from caviar_clients.conform.client import BROKEN, Fields, Received, pack, unpack
 from caviar_protocol.codec import (
     check_parts,
     decode_message,
@@ -38,7 +39,7 @@ class _Node:
 
     @property
     def shortest(self) -> bytes:
-        """How it has to be written."""
+        """Canonical form of a scalar, or of the head of a list or map."""
         packer = msgpack.Packer()
         if self.kind == "map":
             return bytes(packer.pack_map_header(len(self.value)))
@@ -48,20 +49,31 @@ class _Node:
 
     @property
     def keys(self) -> list[Any]:
-        """Of a map, as they stand."""
+        """Keys of a map, in the order in which they stand."""
         return [key.value for key, _ in self.value]
 
 
 def first_difference(got: bytes, right: bytes, ignored: frozenset[str] = frozenset()) -> str:
-    """The first field that is not written as in ``right``, the canonical form of the same header.
+    """Describe the first field that is not written as in the canonical form of the same header.
 
-    Fields of the outermost map that are ``ignored``, as those of a later version are, only have to be in
-    their shortest form. Empty where nothing differs.
+    Args:
+        got: The header as it came.
+        right: Its canonical form.
+        ignored: Fields of the outermost map, as those of a later version, that only have to be in their
+            shortest form.
+
+    Returns:
+        Place, form found and form needed; empty where nothing differs.
+
+    Example:
+        >>> first_difference(bytes.fromhex("81a166cd0001"), bytes.fromhex("81a16601"))
+        'f: an integer as `cd` (3 bytes), needs `01` (1 byte)'
     """
     return _walk(_read(got), _read(right), "", ignored)
 
 
 def _read(data: bytes) -> _Node:
+    # The unpacker reads one value after the other and states how far it is, which `unpackb` does not.
     unpacker = msgpack.Unpacker(raw=False, strict_map_key=False, max_buffer_size=0)
     unpacker.feed(data)
     return _node(unpacker, data)
@@ -69,6 +81,7 @@ def _read(data: bytes) -> _Node:
 
 def _node(unpacker: Any, data: bytes) -> _Node:
     start = unpacker.tell()
+    # Heads of maps: fixmap 0x80–0x8f, map 16, map 32; of lists: fixarray 0x90–0x9f, array 16, array 32.
     head = data[start]
     if head & 0xF0 == 0x80 or head in (0xDE, 0xDF):
         count = unpacker.read_map_header()
@@ -136,16 +149,21 @@ def _form(kind: str, raw: bytes) -> str:
     return f"{article}`{raw[0]:02x}` ({len(raw)} byte{'s' if len(raw) > 1 else ''})"
 
 
-ABSENT = "absent"
-
-
 def product_digest(header: bytes, body: bytes) -> str:
-    """As SPEC.md, section Digests, says."""
+    """Compute the digest of a product as SPEC.md says, section Digests.
+
+    SHA-256 of the length of the header (8 bytes, little-endian), the header and the body.
+    """
     return hashlib.sha256(len(header).to_bytes(8, "little") + header + body).hexdigest()
 
 
 def checked(received: Received) -> Fields:
-    """The header of a message that a client may send, or `Failed`."""
+    """Read the header of a message that a client may send.
+
+    Raises:
+        Failed: The header is no map of MessagePack, the message is none of the protocol, or its parts are
+            not those that its header announces.
+    """
     parts = received.parts
     try:
         fields = unpack(parts[0])
@@ -163,7 +181,7 @@ def checked(received: Received) -> Fields:
 
 
 def not_canonical(received: Received) -> str:
-    """Why the header of a message that `checked` let pass is not in canonical form; empty: it is."""
+    """Say why the header of a message that `checked` let pass is not in canonical form; empty: it is."""
     header = received.parts[0]
     fields = unpack(header)
     message = decode_message(header)
@@ -173,13 +191,27 @@ def not_canonical(received: Received) -> str:
     unknown = frozenset(fields).difference(("type", *message.__struct_fields__))
     known = {key: value for key, value in fields.items() if key not in unknown}
     right = encode_message(message)
+    # Two comparisons: all that came is in its shortest form, and of the fields that this version knows none
+    # equals its default or is out of order. Of those of a later version no default is known.
     if pack(fields) != header or pack(known) != right:
         return f"{kind}: {_difference(header, right, unknown)}"
     return ""
 
 
 def check_products(done: Fields, parts: list[bytes], outputs: list[str]) -> dict[str, bytes]:
-    """Header and body, joined, of each product of a DONE; `Failed` where one is wrong."""
+    """Check the products of a DONE.
+
+    Args:
+        done: Its header.
+        parts: All of its parts, the header first.
+        outputs: Topics that the client declared.
+
+    Returns:
+        Header and body, joined, of each product by its topic.
+
+    Raises:
+        Failed: A product was not declared, comes twice, has another digest, or is no canonical payload.
+    """
     found: dict[str, bytes] = {}
     for number, entry in enumerate(done.get("products", [])):
         topic, header, body = entry["topic"], parts[1 + 2 * number], parts[2 + 2 * number]

@@ -18,26 +18,33 @@ Outcome = Literal["pass", "fail", "not applicable"]
 
 
 class Verdict(msgspec.Struct, frozen=True, kw_only=True):
-    """How a client did in one case."""
+    """How a client did in one case.
+
+    Args:
+        case: Name of the case.
+        title: What it shows, in a sentence.
+        clauses: Clauses and sections of protocol/SPEC.md that say so.
+        outcome: ``pass``, ``fail`` or ``not applicable``.
+        expected: What should have come.
+        got: What came.
+        seconds: Time that the case took [s].
+    """
 
     case: str
     title: str
     clauses: str
-    """Where protocol/SPEC.md says so."""
     outcome: Outcome
     expected: str
     got: str
     seconds: float
-    """[s] that the case took."""
 
 
 class Failed(Exception):  # noqa: N818 - a verdict, not an error of this program
     """The client did something else than it should.
 
-    Parameters
-    ----------
-    expected, got
-        What should have come and what came, each as a phrase.
+    Args:
+        expected: What should have come, as a phrase.
+        got: What came, as a phrase.
     """
 
     def __init__(self, expected: str, got: str) -> None:
@@ -65,16 +72,35 @@ class Case:
 
 
 def case(name: str, clauses: str, expected: str) -> Callable[[Callable[[Kit], str]], Case]:
-    """Make a case of a script."""
+    """Make a case of a script that plays the broker.
+
+    Args:
+        name: Name for ``--case``.
+        clauses: Clauses and sections of protocol/SPEC.md that it is about.
+        expected: What should come, for the verdict.
+
+    Example:
+        >>> def hello_again(kit):
+        ...     'HELLO comes first.'
+        ...     return kit.at(0).hello["name"]
+        >>> case("hello-again", "clause 3", "HELLO")(hello_again).title
+        'HELLO comes first'
+    """
     return lambda run: Case(name, clauses, expected, run)
 
 
+# Numbers and digests differ from case to case where the cause is the same.
 _NUMBER = re.compile(r"\b[0-9a-f]{64}\b|\d+")
 OUTCOMES: tuple[Outcome, ...] = ("pass", "fail", "not applicable")
 
 
 def summary(verdicts: Sequence[Verdict]) -> str:
-    """Counts in one line."""
+    """Count the outcomes in one line.
+
+    Example:
+        >>> summary([])
+        '0 passed, 0 failed, 0 not applicable, in 0.0 s'
+    """
     counts = Counter(verdict.outcome for verdict in verdicts)
     seconds = sum(verdict.seconds for verdict in verdicts)
     words = [f"{counts[o]} {'failed' if o == 'fail' else 'passed' if o == 'pass' else o}" for o in OUTCOMES]
@@ -82,7 +108,7 @@ def summary(verdicts: Sequence[Verdict]) -> str:
 
 
 def repeated(verdicts: Sequence[Verdict]) -> list[str]:
-    """A line for cases in which the same came, but for numbers and digests: they may have one cause."""
+    """Make a line for each group of cases that failed with the same words: they may have one cause."""
     causes: dict[str, list[Verdict]] = {}
     for verdict in verdicts:
         if verdict.outcome == "fail":
@@ -96,7 +122,7 @@ def repeated(verdicts: Sequence[Verdict]) -> list[str]:
 
 
 def as_json(verdicts: Sequence[Verdict]) -> str:
-    """An object with ``verdicts`` and how many of each outcome there are."""
+    """Write verdicts as a JSON object with ``verdicts`` and the number of each outcome."""
     counts = Counter(verdict.outcome for verdict in verdicts)
     content: dict[str, object] = {outcome: counts[outcome] for outcome in OUTCOMES}
     content["verdicts"] = list(verdicts)
@@ -104,7 +130,7 @@ def as_json(verdicts: Sequence[Verdict]) -> str:
 
 
 def as_markdown(verdicts: Sequence[Verdict]) -> str:
-    """A table, with what failed alike and the summary below."""
+    """Write verdicts as a Markdown table, with what failed alike and the summary below."""
     lines = ["| case | clauses | verdict | expected | got |", "| --- | --- | --- | --- | --- |"]
     for verdict in verdicts:
         cells = (

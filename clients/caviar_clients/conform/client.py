@@ -1,4 +1,8 @@
-"""The client under test: a process that the kit starts for each life, or one that the user starts."""
+"""The client under test, and the socket that it comes to.
+
+`Wire` is one ROUTER with messages as plain MessagePack maps and a count of connections. `Started` is a client
+that the kit starts for each life, `ByHand` one that the user starts.
+"""
 
 from __future__ import annotations
 
@@ -10,37 +14,197 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
-from caviar_clients.conform.wire import Wire
+import msgpack  # type: ignore[import-untyped]
+import zmq
+from zmq.utils.monitor import recv_monitor_message
+
+from caviar_clients.conform.case import Failed
 from caviar_protocol.errors import RunError
+
+BROKEN = (ValueError, TypeError, RecursionError, msgpack.exceptions.UnpackException)
+"""What `unpack` raises for bytes that are no MessagePack."""
+
+
+def pack(value: Any) -> bytes:
+    """Encode a value as MessagePack, everything in its shortest form.
+
+    Example:
+        >>> pack({"frame": 300}).hex()
+        '81a56672616d65cd012c'
+    """
+    # The plain package, and not the product's codec: a defect of that must not judge itself. It writes every
+    # float in nine bytes, as the canonical form does.
+    packed: bytes = msgpack.packb(value)
+    return packed
+
+
+def unpack(data: bytes) -> Any:
+    """Decode all these bytes; raises one of `BROKEN`."""
+    return msgpack.unpackb(data, raw=False)
+
+
+def in_order(value: Any) -> Any:
+    """Sort the keys of all maps of a plain value as the canonical form does: by their UTF-8 bytes."""
+    if isinstance(value, dict):
+        return {key: in_order(value[key]) for key in sorted(value, key=str.encode)}
+    return [in_order(item) for item in value] if isinstance(value, list) else value
+
+
+MAX_PART = 1 << 30
+"""[B] of a part; a client that sends more is disconnected."""
+
+Fields = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Rules:
+    """What the user of the kit states about the client.
+
+    Args:
+        timeout_s: Time [s] that the client has for each answer.
+        name: Name that HELLO has to state; empty: any.
+        role: Role that HELLO has to state; empty: any.
+        settings: ``settings`` of WELCOME.
+        directory: Folder below which each life of a recorder gets one of its own; None: that for temporary
+            files.
+        mark: Text that makes the scenery of this run, and so its digests, unlike that of any other: no cache
+            of the client has it.
+
+    Example:
+        >>> Rules(role="agent", timeout_s=2.0).role
+        'agent'
+    """
+
+    timeout_s: float = 5.0
+    name: str = ""
+    role: str = ""
+    settings: Fields = field(default_factory=dict)
+    directory: str | None = None
+    mark: str = ""
+
+
+@dataclass(frozen=True)
+class Received:
+    """One multipart message, with the routing id of the connection that it came over."""
+
+    route: bytes
+    parts: list[bytes]
+
+    @property
+    def fields(self) -> Fields:
+        """The header, or an empty map where it is none."""
+        try:
+            header = unpack(self.parts[0])
+        except (*BROKEN, IndexError):
+            return {}
+        return header if isinstance(header, dict) else {}
+
+    @property
+    def kind(self) -> str:
+        """The field ``type``; empty where there is none."""
+        kind = self.fields.get("type", "")
+        return kind if isinstance(kind, str) else ""
+
+
+class Wire:
+    """The kit's ROUTER socket.
+
+    Args:
+        endpoint: ZeroMQ address to listen at; port 0 takes any.
+
+    Raises:
+        RunError: Nothing can listen there.
+    """
+
+    def __init__(self, endpoint: str) -> None:
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._socket = self._context.socket(zmq.ROUTER)
+        self._socket.linger = 0
+        self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_PART)
+        # A ROUTER does not say when a peer goes; its monitor does, by descriptors.
+        self._monitor = self._socket.get_monitor_socket(zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED)
+        self._open: set[int] = set()
+        try:
+            self._socket.bind(endpoint.removesuffix(":0") + ":*" if endpoint.endswith(":0") else endpoint)
+        except zmq.ZMQError as error:
+            self.close()
+            raise RunError(
+                f"cannot listen at {endpoint!r}: {error.strerror}; an address is like tcp://127.0.0.1:5590"
+            ) from error
+        self.endpoint = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
+
+    @property
+    def connections(self) -> int:
+        """Number of open connections."""
+        while self._monitor.poll(0):
+            event = recv_monitor_message(self._monitor, zmq.NOBLOCK)
+            change = self._open.add if event["event"] == zmq.EVENT_ACCEPTED else self._open.discard
+            change(event["value"])
+        return len(self._open)
+
+    def send(self, route: bytes, header: Fields, *parts: bytes) -> None:
+        """Send a message; one to a connection that is gone is lost."""
+        self.send_parts(route, [pack(header), *parts])
+
+    def send_parts(self, route: bytes, parts: list[bytes]) -> None:
+        """Send parts as they are; they need not be a message."""
+        self._socket.send_multipart([route, *parts])
+
+    def poll(self, seconds: float) -> Received | None:
+        """Return the message that comes within this time [s]; None where none does."""
+        if not self._socket.poll(max(0, round(seconds * 1000))):
+            return None
+        route, *parts = self._socket.recv_multipart()
+        return Received(route, parts)
+
+    def close(self) -> None:
+        """Close everything; what is not sent is lost."""
+        self._socket.disable_monitor()
+        self._monitor.close(0)
+        self._socket.close()
+        self._context.term()
+
 
 START_S = 30.0
 """[s] from its start until a process has said HELLO: interpreters and libraries take their time."""
 BY_HAND_S = 300.0
 """[s] that a user has to start a client."""
+# SIGTERM and SIGINT are missing: a client that they end obeys.
 CRASHES = (signal.SIGILL, signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGSEGV, signal.SIGKILL)
 
 
 @dataclass(frozen=True)
 class End:
-    """How a client ended; ``status`` is None where nobody can tell, for it was started by hand."""
+    """How a client ended.
+
+    Args:
+        status: Exit status as `subprocess` states it; None for a client that was started by hand.
+        output: All that it printed.
+    """
 
     status: int | None
     output: str = ""
-    """All that it printed."""
 
     @property
     def words(self) -> str:
-        """The last line of that."""
+        """Last line of the output that is not empty."""
         return next((line.strip() for line in reversed(self.output.split("\n")) if line.strip()), "")
 
     @property
     def crashed(self) -> bool:
-        """Whether a signal of the kind that nobody intends ended it, as the kernel or a shell tells it."""
+        """Whether a signal of `CRASHES` ended it."""
+        # A shell in between reports a signal n as status 128 + n.
         return self.status is not None and any(self.status in (-n, 128 + n) for n in CRASHES)
+
+    def check_failure(self, expected: str) -> str:
+        """Check that it says by its status that something was wrong; raises `Failed` otherwise."""
+        if self.crashed or self.status == 0:
+            raise Failed(expected, str(self))
+        return str(self)
 
     def __str__(self) -> str:
         status = "it ended" if self.status is None else f"it ended with status {self.status}"
@@ -48,34 +212,39 @@ class End:
 
 
 class Client(Protocol):
-    """What the kit can do with a client."""
+    """What the kit does with a client."""
 
     start_s: float
     """[s] until HELLO has to be there."""
 
     def start(self) -> None:
-        """See to it that a client comes."""
+        """Start a life of the client, or have the user start one."""
 
     def ended(self) -> End | None:
-        """How it ended; None while it is there."""
+        """Return how it ended; None while it is there."""
 
     def terminate(self) -> bool:
-        """Send SIGTERM; whether that can be done."""
+        """Send SIGTERM; False where the kit cannot."""
 
     def dispose(self) -> None:
-        """Have it gone, whatever it does."""
+        """End the client, whatever it does."""
 
     def memory(self) -> int | None:
-        """Its highest resident memory so far [B], where that can be told."""
-
-
-def _search_path() -> str:
-    """Folders of commands: ``python`` is the running interpreter, also where no environment is activated."""
-    return os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
+        """Return its highest resident memory so far [B]; None where the kit cannot see it."""
 
 
 class Started:
-    """A client that the kit starts with a command line; ``{endpoint}`` and ``{name}`` are filled in."""
+    """A client that the kit starts.
+
+    Args:
+        command: Command line; ``{endpoint}`` and ``{name}`` are filled in.
+        endpoint: Address that the client connects to.
+        name: Name of the client.
+        folder: Where its output goes.
+
+    Raises:
+        RunError: The command is empty.
+    """
 
     start_s = START_S
 
@@ -92,16 +261,20 @@ class Started:
     def start(self) -> None:
         """Start the process, in a process group of its own."""
         self.dispose()
+        # `python` in a command is the running interpreter, also where no environment is activated.
+        search = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
         handle, name = tempfile.mkstemp(dir=self._folder, suffix=".log")
         self._log = Path(name)
         try:
+            # A file and not a pipe takes the output: nothing reads while a case waits, and a full pipe would
+            # stop a talkative client.
             self._process = subprocess.Popen(  # noqa: S603 - the command is the user's own
                 self._words,
                 stdin=subprocess.DEVNULL,
                 stdout=handle,
                 stderr=handle,
                 start_new_session=True,
-                env=os.environ | {"PATH": _search_path()},
+                env=os.environ | {"PATH": search},
             )
         except OSError as error:
             raise RunError(f"cannot start {self._words[0]!r}: {error.strerror}; see --command") from error
@@ -109,16 +282,14 @@ class Started:
             os.close(handle)
 
     def ended(self) -> End | None:
-        """Its exit status, once it has one."""
+        """Return its exit status and output, once it has ended."""
         status = None if self._process is None else self._process.poll()
-        return (
-            None
-            if status is None
-            else End(status, self._log.read_text(errors="replace") if self._log else "")
-        )
+        if status is None or self._log is None:
+            return None
+        return End(status, self._log.read_text(errors="replace"))
 
     def terminate(self) -> bool:
-        """SIGTERM to the process."""
+        """Send SIGTERM to the process."""
         if self._process is not None:
             self._process.terminate()
         return True
@@ -133,7 +304,7 @@ class Started:
         self._process = None
 
     def memory(self) -> int | None:
-        """Its high-water mark as Linux tells it."""
+        """Return its high-water mark [B] as Linux states it in ``/proc/PID/status``."""
         try:
             status = Path(f"/proc/{self._process.pid if self._process else 0}/status").read_text()
         except OSError:
@@ -143,7 +314,14 @@ class Started:
 
 
 class ByHand:
-    """A client that the user starts when ``tell`` says so; it is gone when no connection is left."""
+    """A client that the user starts; it is gone when no connection is left.
+
+    Args:
+        wire: The kit's socket, which counts connections.
+        address: Address that the user is asked to connect the client to.
+        tell: Shows the user a text.
+        timeout_s: Time [s] that a client has to go, before the user is asked to end it.
+    """
 
     start_s = BY_HAND_S
 
@@ -152,30 +330,36 @@ class ByHand:
         self._started = False
 
     def start(self) -> None:
-        """Ask the user."""
+        """Ask the user for a life of the client."""
         again = "start your client again" if self._started else "start your client"
         self._tell(f"{again}, with the broker's address {self._address}")
         self._started = True
 
     def ended(self) -> End | None:
-        """Gone, with a status that nobody told."""
+        """Gone, with a status that the kit cannot see."""
         return End(None) if self._wire.connections == 0 else None
 
     def terminate(self) -> bool:
-        """Not the kit's to do."""
+        """False: the process is the user's."""
         return False
 
     def dispose(self) -> None:
-        """Wait until it is gone; ask the user where it stays."""
-        told, until = False, time.monotonic() + self._timeout_s
-        while self._wire.connections:
-            self._wire.poll(0.05)
-            if not told and time.monotonic() > until:
-                self._tell("your client is still connected: end it")
-                told, until = True, time.monotonic() + BY_HAND_S
-            elif told and time.monotonic() > until:
+        """Wait until it is gone; ask the user to end it where it stays."""
+        for seconds, request in (
+            (self._timeout_s, "your client is still connected: end it"),
+            (BY_HAND_S, ""),
+        ):
+            until = time.monotonic() + seconds
+            while self._wire.connections:
+                self._wire.poll(0.05)
+                if time.monotonic() > until:
+                    break
+            else:
+                return
+            if not request:
                 raise RunError("the client was not ended; the kit cannot go on with the next case")
+            self._tell(request)
 
     def memory(self) -> int | None:
-        """Not to be seen."""
+        """None: the kit does not know the process."""
         return None

@@ -11,7 +11,7 @@ import numpy as np
 
 from caviar_clients.conform import street
 from caviar_clients.conform.case import Case, Failed, NotApplicable, case
-from caviar_clients.conform.session import ACTIVE, Session, known_parts
+from caviar_clients.conform.session import ACTIVE, Session
 from caviar_protocol import scene_validation as scenes
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.codec import decode_payload
@@ -26,34 +26,35 @@ if TYPE_CHECKING:
     from caviar_clients.conform.kit import Kit
 
 FRAMES = 4
+# Between two frames [rad]: behind half a turn (π) the other way round is the shorter one, and the rotation
+# between two orientations does not say which of them the object took.
 AMBIGUOUS_RAD = 2.5
-"""Between two frames; behind half a turn the other way is the shorter one."""
+# Of an angular velocity, relative and [rad]: a world takes it between two frames, at one of them, or from its
+# engine, and an object that begins to turn has half of it on average.
 TURN_TOLERANCE, SLIGHT_RAD = 0.5, 0.01
-"""Of an angular velocity: worlds take it between two frames, at one of them, or of their engine."""
+# Of the norm of a matrix: far above single precision (6e-8), and above the paths that a model leaves out.
 PART_TOLERANCE = 1e-3
-"""Relative, of the norm of a matrix: far above single precision, and of what models leave out."""
 CLAUSES = "Content"
+"""Section of SPEC.md that all of these cases are of."""
 
 
 def _published(kit: Kit) -> tuple[Session, list[Scene]]:
-    """The scenes of some frames of a world."""
+    """Play some frames of a world and return its scenes."""
     session = kit.at(ACTIVE)
     if "scene" not in session.hello.get("outputs", []):
         raise NotApplicable("it publishes no scene")
     found = []
     for _ in range(FRAMES):
         answer = session.step()
-        topics = [entry["topic"] for entry in answer.fields.get("products", [])]
-        if "scene" not in topics:
+        product = answer.product("scene")
+        if product is None:
             raise Failed("a scene in each frame", f"none in frame {answer.fields['frame']}")
-        place = 1 + 2 * topics.index("scene")
-        payload = decode_payload("scene", *answer.parts[place : place + 2])
-        found.append(cast(Scene, payload))
+        found.append(cast(Scene, decode_payload("scene", *product)))
     return session, found
 
 
 def _rules(session: Session) -> SceneRules:
-    """What consumers of this world are told about it."""
+    """Rules that consumers of this world check its scenes by."""
     name = session.hello["name"]
     devices = msgspec.convert(street.briefing(session.hello)["devices"], tuple[DeviceSpec, ...])
     return SceneRules(
@@ -63,6 +64,8 @@ def _rules(session: Session) -> SceneRules:
     )
 
 
+# One case each, although one pass over the scenes would find everything: a verdict names its aspect, and a
+# world with two faults gets two verdicts.
 def _aspect(name: str, title: str, expected: str, wrong: Callable[[Scene, str, SceneRules], str]) -> Case:
     """A case that fails where ``wrong`` finds something in one of some scenes."""
 
@@ -152,6 +155,7 @@ def carriers(kit: Kit) -> str:
 @case("scene-turning", "Worlds", "`angular_velocity` in world axes [rad/s] by which orientations turn")
 def turning(kit: Kit) -> str:
     """Objects turn from frame to frame as their angular velocity says."""
+    # Added with protocol 1.4: the field is optional, so a world of before has nothing to check.
     _, found = _published(kit)
     compared = 0
     for before, after in pairwise(found):
@@ -178,6 +182,7 @@ def turning(kit: Kit) -> str:
 
 def _rotation(before: Float64Array, after: Float64Array) -> Float64Array:
     """Rotation vector [rad] in world axes that turns one orientation into another."""
+    # R = R₂·R₁ᵀ turns world axes; its angle is arccos((tr R − 1)/2), its axis the antisymmetric part.
     turn = rotation_matrix(after.tolist()) @ rotation_matrix(before.tolist()).T
     cosine = np.clip((np.trace(turn) - 1) / 2, -1, 1)
     angle = np.arccos(cosine)
@@ -200,7 +205,7 @@ def parts(kit: Kit) -> str:
     briefing = street.briefing(session.hello)
     carriers = msgspec.convert(briefing["carriers"], tuple[Carrier, ...])
     devices = msgspec.convert(briefing["devices"], tuple[DeviceSpec, ...])
-    asked = frozenset(known_parts("channel", session.hello))
+    asked = frozenset(street.known_parts("channel", session.hello))
     if problem := PartCheck({"channel": asked}, carriers, devices)("channel", channel):
         raise Failed(f"parts {', '.join(sorted(asked))}", problem)
     return ", ".join(f"{len(getattr(channel, part))} of {part}" for part in sorted(asked))
@@ -211,9 +216,11 @@ def parts(kit: Kit) -> str:
 )
 def consistency(kit: Kit) -> str:
     """The parts of a channel say the same as its paths, where arrays see plane waves."""
+    # The right answer is computed from the client's own paths: the kit does not know which paths are right.
     _, scene, channel = _channel(kit)
     whole = {(entry.carrier, entry.tx, entry.rx): entry.h for entry in channel.h}
     for entry in channel.hf:
+        # The middle subcarrier stands at the carrier's frequency, where the response is H itself.
         middle = entry.h[0, channel.carriers[entry.carrier].subcarriers // 2]
         _compare("hf of the middle subcarrier in slot 0", middle, whole[entry.carrier, entry.tx, entry.rx])
     if channel.rung not in PLANE_WAVES:
@@ -227,22 +234,17 @@ def consistency(kit: Kit) -> str:
 
 
 def _channel(kit: Kit) -> tuple[Session, Scene, Channel]:
-    """The channel of a frame of a client, and the scene that it is of."""
+    """Play a frame of a channel model; return its channel and the scene that it was given."""
     session = kit.at(ACTIVE)
     if "channel" not in session.hello.get("outputs", []):
         raise NotApplicable("it makes no channel")
     frame = session.frame
     answer = session.step()
-    topics = [entry["topic"] for entry in answer.fields.get("products", [])]
-    if "channel" not in topics:
+    product = answer.product("channel")
+    if product is None:
         raise Failed("a channel", f"none in frame {frame}")
-    place = 1 + 2 * topics.index("channel")
-    channel = cast(Channel, decode_payload("channel", *answer.parts[place : place + 2]))
-    return (
-        session,
-        cast(Scene, decode_payload("scene", *street.product("scene", street.WORLD, frame))),
-        channel,
-    )
+    scene = decode_payload("scene", *street.product("scene", street.WORLD, frame))
+    return session, cast(Scene, scene), cast(Channel, decode_payload("channel", *product))
 
 
 def _compare(what: str, got: Any, right: Any) -> None:

@@ -1,4 +1,7 @@
-"""Takes a client through the cases, one life after another, and collects the verdicts."""
+"""Takes a client through the cases, one life after another, and collects the verdicts.
+
+A life goes on from case to case as long as it can: a start of the client is what takes most of the time.
+"""
 
 from __future__ import annotations
 
@@ -11,45 +14,47 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from caviar_clients.conform import checkpoints, content, joining, leaving, stepping, wrong
+from caviar_clients.conform import content, frames, lifecycle, wrong
 from caviar_clients.conform.case import Case, Failed, NotApplicable, Outcome, Verdict
-from caviar_clients.conform.client import ByHand, Client, Started
-from caviar_clients.conform.session import CONNECTING, JOINED, PATIENCE, READY, Rules, Seen, Session
-from caviar_clients.conform.wire import Wire
+from caviar_clients.conform.client import ByHand, Client, Rules, Started, Wire
+from caviar_clients.conform.session import CONNECTING, JOINED, PATIENCE, READY, Seen, Session
 from caviar_protocol.errors import RunError, SetupError, suggestion
 from caviar_protocol.keys import ROLES
 
 LONGEST = 600
 """Characters of what came, in a verdict."""
 HOPELESS_AFTER = 2
-"""Lives in a row that do not get as far as a case needs, until the rest is not tried any more."""
+"""Lives in a row that may fail to get as far as a case needs, before all other cases fail without a try."""
 
 
 def cases() -> tuple[Case, ...]:
-    """All cases, in the order in which they need the fewest lives."""
+    """Return all cases.
+
+    Example:
+        >>> [case.name for case in cases()[:2]]
+        ['hello', 'attach']
+    """
+    # In the order in which they need the fewest lives: those that end one come last, and `canonical` judges
+    # what came in all others.
     return (
-        *joining.CASES,
-        *stepping.CASES,
+        *lifecycle.JOINING,
+        *frames.FRAMES_AND_EPISODES,
         *content.CASES,
         *wrong.CASES,
-        *checkpoints.CASES,
-        *leaving.CASES,
-        *stepping.AFTERWARDS,
-        leaving.canonical,
+        *frames.CHECKPOINTS,
+        *lifecycle.LEAVING,
+        *frames.AFTERWARDS,
+        lifecycle.canonical,
     )
 
 
 class Kit:
-    """What a case works with.
+    """What a case works with: the present life of the client, or a new one.
 
-    Parameters
-    ----------
-    wire
-        Where the client comes to.
-    client
-        How it is started.
-    rules
-        What the user told about it.
+    Args:
+        wire: Socket that the client comes to.
+        client: Starts it.
+        rules: What the user states about it.
     """
 
     def __init__(self, wire: Wire, client: Client, rules: Rules) -> None:
@@ -57,13 +62,22 @@ class Kit:
         self.seen = Seen()
         self._wire, self._client = wire, client
         self._session: Session | None = None
+        # Why lives did not get as far as a case needed, since the last one that did.
         self._unborn: list[str] = []
+        # Whether any life has sent anything: until then a status other than 0 is the command's own fault.
         self._heard = False
 
     # --- for the cases -----------------------------------------------------------------------------
 
     def at(self, stage: int) -> Session:
-        """A session in this state, the one that there is where it has not passed it."""
+        """Return a session in this stage: the present one where it has not passed it, else a new life.
+
+        Args:
+            stage: `CONNECTING`, `JOINED`, `READY` or `ACTIVE`.
+
+        Raises:
+            Failed: The client does not get there.
+        """
         session = self._session
         if session is None or session.stage > stage or session.client.ended() is not None:
             session = self.fresh()
@@ -81,7 +95,7 @@ class Kit:
         return session
 
     def fresh(self) -> Session:
-        """A new life of the client, which has said HELLO."""
+        """End the present life and return a new one, which has said HELLO."""
         self.discard()
         if len(self._unborn) >= HOPELESS_AFTER:
             raise Failed("a client that gets as far as this case", f"none: {self._unborn[-1]}")
@@ -96,7 +110,7 @@ class Kit:
         return self._session
 
     def _check_command(self, session: Session) -> None:
-        """`RunError` where the command fails by itself: no life of the client has sent anything."""
+        """Raise `RunError` where the command fails by itself: no life of the client has sent anything."""
         self._heard = self._heard or session.heard
         end = self._client.ended()
         if not self._heard and end is not None and end.status:
@@ -111,7 +125,7 @@ class Kit:
     # --- the run -----------------------------------------------------------------------------------
 
     def judge(self, case: Case) -> Verdict:
-        """Play one case."""
+        """Play one case; a client that goes wrong fails it, and only the kit's own errors are raised."""
         started = time.monotonic()
         self.seen.allow(PATIENCE * self.rules.timeout_s)
         expected = case.expected
@@ -142,7 +156,7 @@ class Kit:
 
 
 def chosen(names: Sequence[str]) -> list[Case]:
-    """The cases of these names, or all. `SetupError` for a name that no case has."""
+    """Return the cases of these names, or all; raises `SetupError` for a name that no case has."""
     known = {case.name: case for case in cases()}
     for name in names:
         if name not in known:
@@ -162,31 +176,39 @@ def conform(
     tell: Callable[[str], None] = lambda text: None,
     each: Callable[[Verdict], None] = lambda verdict: None,
 ) -> list[Verdict]:
-    """Listen at ``endpoint`` and judge a client; the verdicts in order of the cases.
+    """Listen at an address and judge a client.
 
-    Parameters
-    ----------
-    command
-        Starts the client, with ``{endpoint}`` and ``{name}`` filled in; empty: the user does, when
-        ``tell`` says so.
-    names
-        Cases to play; by default all.
-    rules
-        What is known of the client.
-    front
-        Serves clients in front of the kit's own endpoint, as a gateway does; yields the address that clients
-        are given.
-    each
-        Gets each verdict as soon as there is one.
+    Args:
+        endpoint: ZeroMQ address to listen at; port 0 takes any.
+        command: Starts the client, with ``{endpoint}`` and ``{name}`` filled in; empty: the user does, when
+            ``tell`` asks for it.
+        names: Cases to play; by default all.
+        rules: What is known of the client.
+        front: Serves clients in front of the kit's own endpoint, as a gateway does; yields the address that
+            clients are given.
+        tell: Shows the user a text.
+        each: Gets each verdict as soon as there is one.
 
-    Raises `SetupError` for an unknown case or role, `RunError` where the endpoint cannot be
-    listened at, or the command cannot be started or fails before its client sends anything.
+    Returns:
+        The verdicts, in the order of the cases.
+
+    Raises:
+        SetupError: A case or role is unknown.
+        RunError: The endpoint cannot be listened at, or the command cannot be started or fails before its
+            client sends anything.
+
+    Example:
+        >>> import sys
+        >>> client = f"{sys.executable} clients/minimal/agent.py {{endpoint}} {{name}}"
+        >>> [v.outcome for v in conform("tcp://127.0.0.1:0", command=client, names=["hello"])]
+        ['pass']
     """
     picked, given = chosen(names), rules or Rules()
     if given.role and given.role not in ROLES:
         raise SetupError(f"no client has the role {given.role!r}; {suggestion(given.role, ROLES)}")
     wire = Wire(endpoint)
     verdicts = []
+    # A client that was killed may still write: what it leaves is removed as far as it goes.
     temporary = TemporaryDirectory(prefix="caviar-conform-", ignore_cleanup_errors=True)
     with closing(wire), front(wire.endpoint) as address, temporary as folder:
         client: Client = ByHand(wire, address, tell, given.timeout_s)

@@ -1,6 +1,7 @@
 """Contents of the scripted run: a base station, a car, a UAV, one carrier; a product of every topic; GRANTs.
 
-Small, asymmetric, moving. Every product is the same bytes at each call with the same arguments.
+Everything is small, asymmetric and moving, so that a swapped axis, a wrong sign or a stale frame shows. A
+product has the same bytes at each call with the same arguments.
 """
 
 from __future__ import annotations
@@ -17,15 +18,17 @@ import numpy as np
 from msgspec.structs import replace
 
 from caviar_clients.conform.canonical import product_digest
-from caviar_clients.conform.wire import Fields, pack, unpack
+from caviar_clients.conform.client import Fields, pack, unpack
 from caviar_protocol.arrays import Complex64Array, Complex128Array, Float64Array, Payload
 from caviar_protocol.codec import encode_payload
+from caviar_protocol.fields import PARTS_SINCE, parse_version
 from caviar_protocol.multipath import first_tap, subcarrier_weights, tap_weights
 from caviar_protocol.scenario import parse_scenario
 from caviar_protocol.scenario.rules import resolved
 from caviar_protocol.space.coordinates import quaternion_from_euler, rotation_matrix
 from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import (
+    PARTS,
     Action,
     AntennaArray,
     AntennaDevice,
@@ -50,69 +53,13 @@ from caviar_protocol.topics import (
 )
 
 PERIOD_NS = 100_000_000
+"""[ns] between two frames."""
 FREQUENCY_HZ = 28e9
 C = 299_792_458.0
+"""Speed of light [m/s]."""
 
-SCENARIO = """
-[run]
-name = "conformance"
-frames = 1000
-
-[[carriers]]
-name = "mmwave"
-frequency_hz = 28e9
-subcarriers = 4
-subcarrier_spacing_hz = 480e3
-taps = 8
-
-[[devices]]
-name = "bs"
-kind = "antenna"
-role = "tx"
-position_m = [0.0, -10.0, 9.0]
-array = { columns = 4 }
-
-[[devices]]
-name = "rx"
-kind = "antenna"
-role = "rx"
-on = "*"
-count = 2
-mount = "roof"
-position_m = [0.2, 0.0, 0.15]
-array = { columns = 2 }
-
-[[devices]]
-name = "lidar"
-kind = "lidar"
-on = "*"
-mount = "floor"
-position_m = [0.0, 0.2, 1.3]
-beams = 2
-azimuth_steps = 12
-
-[[devices]]
-name = "camera"
-kind = "camera"
-on = "*"
-position_m = [2.0, 0.0, 0.5]
-yaw_deg = 70.0
-pitch_deg = 25.0
-roll_deg = -40.0
-size_px = [16, 8]
-
-[services]
-traffic = { role = "world", use = "remote", budget_ms = 1000 }
-propagation = { role = "channel", use = "remote", budget_ms = 1000 }
-eyes = { role = "sensors", use = "remote", budget_ms = 1000 }
-pilot = { role = "agent", use = "remote", budget_ms = 1000 }
-radio = { role = "link", use = "remote", budget_ms = 1000 }
-archive = { role = "recorder", use = "remote", budget_ms = 1000 }
-"""
-"""The scenario of which WELCOME tells each client its part, as a broker does that reads this file.
-
-The angles of the camera differ in size and sign, so that no wrong rotation equals the right one.
-"""
+SCENARIO = Path(__file__).with_name("street.toml").read_text("utf-8")
+"""Scenario of the run, as TOML."""
 SECTOR = f"""
 [[devices]]
 name = "sector"
@@ -130,7 +77,7 @@ polarization = "cross"
 pattern_file = "{Path(__file__).with_name("sector.csv").as_posix()}"
 panels = [{{ position_m = [0.0, 0.25, 0.0] }}, {{ position_m = [0.0, -0.25, 0.125], yaw_deg = 120.0 }}]
 """
-"""A device that worlds of protocol 1.4 and later publish too: all that 1.4 brought to arrays."""
+"""A device that worlds of protocol 1.4 and later publish too: everything that 1.4 added to arrays."""
 CAMERA_ORIENTATION = quaternion_from_euler(math.radians(70.0), math.radians(25.0), math.radians(-40.0))
 WORLD = "traffic"
 """The world that publishes the devices."""
@@ -145,42 +92,78 @@ SOURCES = {
     "action": ["pilot"],
     "link": ["radio"],
 }
-"""Who produces each topic."""
+"""Names of the services that produce each topic."""
 PREFIXES = {"air": ["uav."], "traffic": ["bs", "car."]}
-"""What the worlds of the kit declare of their names."""
+"""Prefixes of object names that the worlds of the kit declare."""
 DOUBLED = {**SOURCES, "scene": ["air", "traffic"], "action": ["copilot", "pilot"]}
 """The same with two worlds and two agents."""
 
 
+Product = tuple[bytes, bytes]
+"""Header and body of a payload."""
+
+
+# Cached: a client asks for the same frames in nearly every case, and a channel takes the longest to make.
 @cache
-def product(
-    topic: str, source: str, frame: int, parts: frozenset[str] = frozenset({"h"})
-) -> tuple[bytes, bytes]:
-    """Header and body of a product; a channel has these parts."""
+def product(topic: str, source: str, frame: int, parts: frozenset[str] = frozenset({"h"})) -> Product:
+    """Make the product of a topic.
+
+    Args:
+        topic: Name of the topic.
+        source: Service that produces it; two worlds or agents make different products.
+        frame: Number of the frame.
+        parts: Parts of a channel; other topics have none.
+
+    Returns:
+        Header and body, in canonical form.
+
+    Example:
+        >>> header, body = product("action", "pilot", 0)
+        >>> unpack(header)["commands"][0]["rx"]
+        'car.1/rx'
+    """
     return encode_payload(_payload(topic, source, frame, parts))
 
 
+def known_parts(topic: str, hello: Fields) -> list[str]:
+    """Parts of a topic that exist in the protocol version which a client states in HELLO."""
+    spoken = tuple(hello["version"])
+    return [
+        part
+        for part in PARTS.get(topic, ())
+        if spoken >= parse_version(PARTS_SINCE.get(f"{topic}.{part}", "1.0"))
+    ]
+
+
 def scenario_of(hello: Fields) -> str:
-    """The scenario that the client which said this HELLO takes part in."""
+    """Scenario, as TOML, that the client which said this HELLO takes part in."""
     return SCENARIO + (SECTOR if hello["role"] == "world" and tuple(hello["version"]) >= (1, 4) else "")
 
 
 def briefing(hello: Fields, directory: str = "") -> Fields:
-    """``scenario`` of WELCOME for the client that said this HELLO; ``directory`` is for recorders."""
+    """Make ``scenario`` of WELCOME for the client that said this HELLO; ``directory`` is for recorders."""
     plain = resolved(parse_scenario(scenario_of(hello)))
+    # A world under test is itself the one that publishes the devices, whatever its name.
     world = hello["name"] if hello["role"] == "world" else WORLD
-    told: Fields = {
+    fields: Fields = {
         "carriers": plain["carriers"],
         "devices": [device | {"world": world} for device in plain["devices"]],
         "episodes": plain["run"]["episodes"],
         "frames": plain["run"]["frames"],
         "sampling_period_ns": plain["run"]["sampling_period_ns"],
     }
-    return told | ({"directory": directory, "resolved": plain} if hello["role"] == "recorder" else {})
+    return fields | ({"directory": directory, "resolved": plain} if hello["role"] == "recorder" else {})
 
 
 def scenery(mark: str) -> dict[str, bytes]:
-    """Files of scenery by name; ``mark`` makes their bytes, and so their digests, unlike all others."""
+    """Make files of scenery by name.
+
+    Args:
+        mark: Text that makes their bytes, and so their digests, unlike all others.
+
+    Returns:
+        A Mitsuba scene with one mesh of ground, and a file without a byte, which needs no ASSET_DATA.
+    """
     ground = ((-60, -40), (80, -40), (80, 30), (-60, 30))
     vertices = "".join(f"{x} {y} 0\n" for x, y in ground)
     mesh = (
@@ -259,12 +242,18 @@ def _scene(source: str, frame: int) -> Scene:
 
 
 def channel_of(frame: int, parts: Collection[str]) -> Channel:
-    """Free space between ``bs`` and ``car.1/rx``, by the formulas of SPEC.md."""
+    """Make the channel of a frame: free space between ``bs`` and ``car.1/rx``, by the formulas of SPEC.md.
+
+    Args:
+        frame: Number of the frame.
+        parts: Which of ``h``, ``hf`` and ``taps`` it has.
+    """
     scene = _scene("traffic", frame)
     ends = {device.name: device_pose(scene, device).position for device in scene.devices}
     x, y, z = (a - b for a, b in zip(ends["car.1/rx"], ends["bs"], strict=True))
     distance = math.hypot(x, y, z)
     tau, zenith, azimuth = distance / C, math.acos(z / distance), math.atan2(y, x)
+    # a = λ/(4πd)·exp(−j2πfτ), f_D = −f·v·k̂/c, with k̂ from the transmitter to the receiver.
     gain = C / FREQUENCY_HZ / (4 * math.pi * distance) * cmath.exp(-2j * math.pi * FREQUENCY_HZ * tau)
     vx, vy, vz = scene.velocity[0].tolist()
     shift = -FREQUENCY_HZ * (vx * x + vy * y + vz * z) / distance / C
@@ -289,9 +278,14 @@ def channel_of(frame: int, parts: Collection[str]) -> Channel:
 
 
 def parts_of(channel: Channel, scene: Scene) -> dict[str, tuple[Any, ...]]:
-    """H, frequency responses and taps that follow from a channel's paths by plane waves, as SPEC.md says.
+    """Compute H, frequency responses and taps from a channel's paths by plane waves, as SPEC.md says.
 
-    Devices have one panel of one polarization.
+    Args:
+        channel: Its paths are read, not its parts.
+        scene: Poses and arrays of its devices, which have one panel of one polarization.
+
+    Returns:
+        Entries of ``h``, ``hf`` and ``taps`` by the name of the part.
     """
     found: dict[str, tuple[Any, ...]] = {"h": (), "hf": (), "taps": ()}
     devices = {device.name: device for device in scene.devices if isinstance(device, AntennaDevice)}
@@ -301,6 +295,7 @@ def parts_of(channel: Channel, scene: Scene) -> dict[str, tuple[Any, ...]]:
             paths = slice(*channel.offsets[p : p + 2].tolist())
             sent = _steering(scene, devices[channel.tx[t]], channel.aod[paths])
             taken = _steering(scene, devices[channel.rx[r]], channel.aoa[paths])
+            # Shape [P, N_r, N_t]: outer products of the steering vectors, weighted by the amplitudes.
             waves = channel.a[c, paths, None, None] * taken[:, :, None] * sent[:, None, :]
             tau, doppler = channel.tau[paths], channel.doppler[c, paths]
             found["h"] += (ChannelMatrix(carrier=c, tx=t, rx=r, h=waves.sum(0)),)
@@ -394,29 +389,37 @@ def _images(topic: str, frame: int) -> Payload:
     return Segmentation(object_names=("car.1", "ground"), images=(image,))
 
 
-Product = tuple[bytes, bytes]
 HELD_FOR = 2
 """Frames that a held product is older than a fresh one."""
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """How the inputs of a grant are to be."""
+    """How the inputs of a grant are to be.
+
+    Args:
+        sources: Services that produce each topic.
+        held: Whether a product is an older one, by `HELD_FOR` frames.
+        without_optional: Whether inputs that are not required are absent.
+        late: Whether beside each product stands one that came too late, of the frame before (recorders).
+        spoil: ``header`` or ``body`` of the first product is cut; empty: neither.
+        stranger: Whether payloads have a field, and an array, that this version does not know.
+    """
 
     sources: Mapping[str, Sequence[str]] = field(default_factory=lambda: SOURCES)
     held: bool = False
-    """Instead of the product of the frame there is an older one."""
     without_optional: bool = False
-    """What is not required is absent."""
     late: bool = False
-    """Beside each product there is one that came too late, of the frame before (recorders)."""
     spoil: str = ""
-    """``header`` or ``body``: what of the first product is cut."""
     stranger: bool = False
-    """Payloads have a field, and an array, that this version does not know."""
 
     def of(self, declared: Sequence[Fields], frame: int) -> tuple[list[Fields], list[bytes]]:
-        """Entries of ``inputs`` and the parts behind the header."""
+        """Make the entries of ``inputs`` and the parts behind the header.
+
+        Args:
+            declared: Inputs that the client declared in HELLO; topic ``*`` stands for all.
+            frame: Frame of the grant.
+        """
         entries: list[Fields] = []
         parts: list[bytes] = []
         for item in declared:
@@ -434,6 +437,7 @@ class Inputs:
         lag = int(item.get("lag", 0))
         computed, optional = frame - lag, not item.get("required", True)
         if computed < 0 or (self.without_optional and optional):
+            # Of a topic with lag there is nothing before the first frame, also where it is required.
             cause = "no frame before the first" if computed < 0 else f"{source} missed frame {computed}"
             return [({"topic": topic, "source": source, "status": "absent", "cause": cause}, ())]
         held = HELD_FOR if self.held and computed >= HELD_FOR else 0
@@ -464,14 +468,16 @@ class Inputs:
 
     def _spoiled(self, parts: list[bytes]) -> list[bytes]:
         if self.spoil and parts:
+            # The first product that has a body, so that both ways of cutting hit the same one.
             number = next((n for n in range(1, len(parts), 2) if parts[n]), 1) - (self.spoil == "header")
             parts[number] = parts[number][: len(parts[number]) // 2] if self.spoil == "body" else b"\xc1\xff"
         return parts
 
 
 def _with_stranger(header: bytes, body: bytes) -> Product:
-    """The product with a field more, whose array lies behind all others."""
+    """Add a field to a product, whose array lies behind all others."""
     fields = unpack(header)
+    # Arrays begin at multiples of 8 bytes (SPEC.md, Arrays).
     padded = body + bytes(-len(body) % 8)
     fields["strange"] = {"dtype": "<f8", "shape": [2], "offset": len(padded)}
     return pack(fields), padded + bytes(16)

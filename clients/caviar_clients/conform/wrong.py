@@ -1,4 +1,4 @@
-"""Cases of what a broker should never send: nobody may crash, hang, or take it for something else."""
+"""Cases of what a broker should never send: no client may crash, hang, or take it for something else."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
 from caviar_clients.conform.case import Failed, NotApplicable, case
-from caviar_clients.conform.client import End
-from caviar_clients.conform.joining import BEATS, attached_heart
+from caviar_clients.conform.client import End, Fields, pack
+from caviar_clients.conform.lifecycle import BEATS, FEWEST_BEATS, attached_heart
 from caviar_clients.conform.session import ACTIVE, ATTEMPT, EPOCH, Answer, Session
 from caviar_clients.conform.street import Inputs
-from caviar_clients.conform.wire import Fields, pack
 
 if TYPE_CHECKING:
     from caviar_clients.conform.kit import Kit
 
+# Written out rather than imported: the kit is a second reading of SPEC.md, section Limits.
 MAX_HEADER = 1 << 20
 MAX_GROWTH = 256 << 20
 """[B] of memory that a message of a few bytes may cost."""
@@ -24,17 +24,17 @@ GOES_ON = "ERROR malformed or limit and the next frame, or an end with a status 
 Variant = tuple[str, Callable[[Session], None]]
 
 
-def right_end(end: End, expected: str) -> str:
-    """An end that says that something was wrong, or `Failed`."""
-    if end.crashed or end.status == 0:
-        raise Failed(expected, str(end))
-    return str(end)
-
-
 def survive(kit: Kit, variants: Iterable[Variant], codes: tuple[str, ...], *, pardoned: bool = False) -> str:
     """Send each variant to a session in an episode, then a GRANT: the client answers both, or ends.
 
-    ``pardoned``: it may also let the variant pass without an answer.
+    Args:
+        kit: Brings the client into an episode, a new life where the last variant ended it.
+        variants: Name of each, and what sends it.
+        codes: Codes of ERROR that are right answers.
+        pardoned: Whether the client may also let a variant pass without an answer.
+
+    Returns:
+        The ways in which the client survived, each once.
     """
     ways: dict[str, None] = {}
     for name, send in variants:
@@ -45,23 +45,21 @@ def survive(kit: Kit, variants: Iterable[Variant], codes: tuple[str, ...], *, pa
 
 
 def _survived(session: Session, name: str, codes: tuple[str, ...], pardoned: bool) -> str:
-    probe = session.grant()
-    got = session.reaction()
-    if isinstance(got, Answer) and got.kind == "ERROR" and got.fields["code"] in codes:
-        way = f"ERROR {got.fields['code']}"
-        got = session.reaction()
-    elif isinstance(got, Answer) and got.kind == "DONE" and pardoned:
-        way = "passed over"
-        session.judge(got, probe)
-        got = session.reaction()
-    elif isinstance(got, Answer):
-        raise Failed(f"for {name}: {GOES_ON}", str(got))
-    else:
-        way = ""
-    if got is None:
-        raise Failed(f"for {name}: {GOES_ON}", f"nothing within {session.rules.timeout_s:g} s")
+    # The GRANT behind it shows that the client is still of use, and how far its answers are: without one, a
+    # client that ignores a variant and one that is about to refuse it look alike.
+    probe, expected, way = session.grant(), f"for {name}: {GOES_ON}", ""
+    got = session.reaction(expected)
+    if isinstance(got, Answer):
+        if got.kind == "ERROR" and got.fields["code"] in codes:
+            way = f"ERROR {got.fields['code']}"
+        elif got.kind == "DONE" and pardoned:
+            way = "passed over"
+            session.judge(got, probe)
+        else:
+            raise Failed(expected, str(got))
+        got = session.reaction(expected)
     if isinstance(got, End):
-        right_end(got, f"for {name}: {GOES_ON}")
+        got.check_failure(expected)
         return f"it ended with status {got.status}" if got.status is not None else "it ended"
     session.judge(got, probe)
     return way
@@ -74,7 +72,7 @@ def _bytes(*parts: bytes) -> Callable[[Session], None]:
 @case("garbage", "Wrong things and their answers", GOES_ON)
 def garbage(kit: Kit) -> str:
     """Bytes that are no message are refused."""
-    noise = random.Random(5).randbytes(64)  # noqa: S311 - the same at each time is what is wanted
+    noise = random.Random(5).randbytes(64)  # noqa: S311 - a failure has to repeat, so the seed is fixed
     return survive(
         kit,
         [
@@ -114,6 +112,7 @@ def truncated(kit: Kit) -> str:
 def lying_counts(kit: Kit) -> str:
     """A length that announces more than there is costs nothing."""
     huge = b"\xff\xff\xff\xff"
+    # A decoder that allocates a list of 2³² − 1 items ahead takes 32 GiB, or dies.
     before = kit.at(ACTIVE).client.memory()
 
     def header(tail: bytes) -> Callable[[Session], None]:
@@ -163,11 +162,12 @@ def oversized(kit: Kit) -> str:
     "the GRANT's answer or an ERROR, and the next frame, or an end with another status than 0",
 )
 def deep(kit: Kit) -> str:
-    """A field that nobody knows may nest to any depth: it is survived."""
+    """An unknown field may nest to any depth: it is survived."""
 
     def send(session: Session) -> None:
         fields, parts = session.granting(session.frame, Inputs())
         packed = pack({"type": "GRANT", **fields})
+        # One entry more in the head of the map (a fixmap, 0x8n), since no packer nests so deep.
         session.send_bytes(
             bytes([packed[0] + 1]) + packed[1:] + b"\xa3abc" + b"\x91" * 200_000 + b"\xc0", *parts
         )
@@ -177,7 +177,7 @@ def deep(kit: Kit) -> str:
 
 @case("undecodable-input", "Wrong things and their answers", "FAULT that names topic and source, or an end")
 def undecodable_input(kit: Kit) -> str:
-    """A product that cannot be decoded is told by FAULT."""
+    """A product that cannot be decoded is named in FAULT."""
     ways: dict[str, None] = {}
     for spoil in ("header", "body"):
         session = kit.at(ACTIVE)
@@ -200,13 +200,11 @@ def _victim(fields: Fields, parts: list[bytes]) -> list[str]:
 
 
 def _faulted(session: Session, frame: int, names: list[str]) -> str:
-    got = session.reaction()
     expected = "FAULT that names topic and source"
+    got = session.reaction(expected)
     if isinstance(got, End):
-        right_end(got, expected)
+        got.check_failure(expected)
         return "it ended" if got.status is None else f"it ended with status {got.status}"
-    if got is None:
-        raise Failed(expected, f"nothing within {session.rules.timeout_s:g} s")
     if got.kind == "DONE":
         session.judge(got, frame)
         return "DONE"
@@ -241,10 +239,8 @@ def other_episode(kit: Kit) -> str:
 
 
 def _unexpected(session: Session, what: str) -> None:
-    """ERROR unexpected comes, and the next frame is as if nothing had been."""
-    answer = session.receive(f"ERROR unexpected for {what}")
-    if (answer.kind, answer.fields.get("code")) != ("ERROR", "unexpected"):
-        raise Failed(f"ERROR unexpected for {what}", str(answer))
+    """Check that ERROR unexpected comes, and that the next frame is answered as without ``what``."""
+    session.expect_error("unexpected", f"ERROR unexpected for {what}")
     session.step()
 
 
@@ -265,21 +261,19 @@ def unexpected(kit: Kit) -> str:
     "no answer; the next frame, or an end with another status than 0",
 )
 def complaints(kit: Kit) -> str:
-    """STALE and ERROR are never answered, and a code that nobody knows is one."""
+    """STALE and ERROR are never answered, and an unknown code is a code."""
     ways: dict[str, None] = {}
     stale: Fields = {"of": "DONE", "epoch": EPOCH, "attempt": ATTEMPT, "episode": 0, "frame": 0}
     for kind, fields in (("STALE", stale), ("ERROR", {"code": "from-the-future", "message": "no"})):
         session = kit.at(ACTIVE)
         session.send(kind, fields)
         probe = session.grant()
-        got = session.reaction()
+        got = session.reaction("the next frame, or an end")
         if isinstance(got, Answer):
             session.judge(got, probe)
             ways["the next frame"] = None
-        elif got is None:
-            raise Failed("the next frame, or an end", f"nothing within {session.rules.timeout_s:g} s")
         else:
-            ways[right_end(got, f"an end with another status than 0 after {kind}")] = None
+            ways[got.check_failure(f"an end with another status than 0 after {kind}")] = None
     return "; ".join(ways)
 
 
@@ -293,13 +287,13 @@ def heartbeat_noise(kit: Kit) -> str:
     session = kit.at(ACTIVE)
     attached_heart(session)  # a slow client is active before its heart beats, and the noise would be lost
     since = len(session.pulse.beats)
-    session.wire.send(session.pulse.route or b"", b"\xc1noise")
+    session.wire.send_parts(session.pulse.route or b"", [b"\xc1noise"])
     session.listen(BEATS * session.heartbeat_s)
     end = session.client.ended()
     if end is not None:
-        return right_end(end, "heartbeats, or an end with a status other than 0")
+        return end.check_failure("heartbeats, or an end with a status other than 0")
     count = len(session.pulse.beats) - since
-    if count < BEATS // 3:
+    if count < FEWEST_BEATS:
         raise Failed(f"about {BEATS} HEARTBEATs after it, or an end", f"{count}, and it is still there")
     session.step()
     return "goes on"

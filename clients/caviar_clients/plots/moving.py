@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from caviar_clients.plots.camera import SKY_GREY
-from caviar_clients.plots.fig8 import UserSeries, curves, shade
 from caviar_clients.plots.map import (
     BEAM_ALPHA,
     RECEIVERS,
@@ -30,7 +28,9 @@ from caviar_clients.plots.map import (
     draw_scenery,
 )
 from caviar_clients.plots.rays import Footprints, rays
+from caviar_clients.plots.sensors import SKY_GREY
 from caviar_clients.plots.style import BLACK, BLUE, GREY, LIGHT_GREY, ORANGE, SKY, VERMILION, styled
+from caviar_clients.plots.user_curves import UserSeries, curves, shade
 from caviar_protocol.arrays import UInt8Array
 
 _WIDTH = 11.0

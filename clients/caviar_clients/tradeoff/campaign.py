@@ -1,4 +1,9 @@
-"""All settings over all scenes: order and number of measurements, what is loaded when, what is skipped."""
+"""All settings over all scenes: order and number of measurements, what is loaded when, what is skipped.
+
+Settings are measured in blocks, and a block in waves of `TOGETHER` settings that are loaded at once and take
+turns with the baseline scene by scene: noise of the machine then hits all of a wave alike, and factors to the
+baseline stay right where times do not.
+"""
 
 from __future__ import annotations
 
@@ -10,29 +15,42 @@ from dataclasses import dataclass, field
 import msgspec
 import numpy as np
 
+from caviar_clients.tradeoff.errors import Key, Row, UserChannel
 from caviar_clients.tradeoff.keyframes import keyframe_rows
 from caviar_clients.tradeoff.ladder import Block, Setting
-from caviar_clients.tradeoff.rows import Row
 from caviar_clients.tradeoff.scenes import Scenes
-from caviar_clients.tradeoff.users import Key, Noise, UserChannel
 from caviar_clients.tradeoff.worker import Sample, Worker
 from caviar_protocol.errors import CaviarError, RunError, suggestion
 
 
 def spread_order(count: int) -> list[int]:
-    """All indices below ``count``, such that the first few of them lie far apart.
+    """Order all indices below ``count`` such that the first few of them lie far apart.
 
     Sorted by their binary digits reversed (van der Corput 1935).
+
+    Example:
+        >>> spread_order(8)
+        [0, 4, 2, 6, 1, 5, 3, 7]
     """
     digits = max(1, (count - 1).bit_length())
     return sorted(range(count), key=lambda i: int(f"{i:0{digits}b}"[::-1], 2))
 
 
 def shares(costs_s: Sequence[float], most: Sequence[int], seconds: float) -> list[int]:
-    """How often each is measured within ``seconds`` in all: at least once, at most ``most`` times.
+    """Decide how often each setting is measured: at least once.
 
-    The time is shared out equally, and what the cheap ones leave goes to the dear ones.
+    The time is shared out equally, and what the cheap ones leave goes to the expensive ones.
+
+    Args:
+        costs_s: Time of one measurement of each [s].
+        most: Measurements of each at most.
+        seconds: Time for all of them [s].
+
+    Example:
+        >>> shares([1.0, 10.0], [9, 9], 40.0)
+        [9, 3]
     """
+    # From the cheapest on: each that needs less than its share leaves the rest to those behind it.
     counts, left = [0] * len(costs_s), seconds
     order = sorted(range(len(costs_s)), key=lambda i: costs_s[i] * most[i])
     for rank, i in enumerate(order):
@@ -44,17 +62,24 @@ def shares(costs_s: Sequence[float], most: Sequence[int], seconds: float) -> lis
 
 @dataclass(frozen=True)
 class Cost:
-    """What one scene of a setting took [s]."""
+    """Time that one scene of a setting took [s]."""
 
     setting: Setting
     seconds: float
 
 
 def predicted_s(setting: Setting, known: Sequence[Cost]) -> float | None:
-    """What a scene of a setting of a table will take [s], from others of the same table; None: unknown.
+    """Predict the time of a scene [s] from settings of the same table that were measured.
 
     From the row of its column that was measured last: as much longer as the same two rows differ in the
     first column, or as there are more pairs of elements, or more samples, whichever says most.
+
+    Args:
+        setting: The setting in question.
+        known: Costs of the table so far, in the order in which they were measured.
+
+    Returns:
+        The time [s]; None where nothing of its column was measured.
     """
     column = [cost for cost in known if setting.column and cost.setting.column == setting.column]
     if not column:
@@ -63,8 +88,8 @@ def predicted_s(setting: Setting, known: Sequence[Cost]) -> float | None:
     first = known[0].setting.column
     by_row = {cost.setting.row: cost.seconds for cost in known if cost.setting.column == first}
     ratios = [
-        _ratio(_pairs(setting), _pairs(last.setting)),
-        _ratio(_samples(setting), _samples(last.setting)),
+        _pairs(setting) / _pairs(last.setting),
+        _samples(setting) / _samples(last.setting),
     ]
     if by_row.get(last.setting.row) and setting.row in by_row:
         ratios.append(by_row[setting.row] / by_row[last.setting.row])
@@ -81,22 +106,17 @@ def _samples(setting: Setting) -> int:
     return samples if isinstance(samples, int) else 1
 
 
-def _ratio(more: int, less: int) -> float:
-    return more / less
-
-
 ROUNDS = 3
 """Times that each scene is measured, where time allows: for the 99th percentile."""
 TOGETHER = 3
 """Settings that are loaded at a time, beside the baseline: each holds a scene of its own in memory."""
 PATIENCE = 4.0
-"""What loads this many times longer than its share of the time left of its block, or measures longer than
-this many times that time, is ended: no setting can eat what the others of its block, or all blocks, need."""
+"""A setting that loads this many times longer than its share of the time left of its block, or measures
+longer than this many times that time, is ended, so that it does not use up what the others need."""
 AFFORDABLE = 0.5
 """Share of the time left of its block that one scene of a setting may be expected to take."""
 AT_LEAST_S = 20.0
-"""[s] that loading and a scene get, however little time is left: else a short comparison would measure
-nothing."""
+"""[s] for loading and a scene, however little time is left: else a short comparison would measure nothing."""
 WORTH_S = 5.0
 """[s] A scene that takes longer, and longer than there is time, is not measured again after the warm-up."""
 
@@ -131,8 +151,8 @@ class Measured:
     """Median time of the baseline, measured by turns with this one."""
     notes: list[str] = field(default_factory=list)
 
-    def take(self, frame: int, sample: Sample) -> None:
-        """Note a measurement; if its scene is new, what users got too."""
+    def add_sample(self, frame: int, sample: Sample) -> None:
+        """Add a measurement; the channels of its users only where the scene is new."""
         self.times_ms.append(sample.time_ms)
         self.lost += sample.lost_paths
         if sample.memory_mib is not None:
@@ -144,7 +164,7 @@ class Measured:
             self.users.update(sample.users)
 
     def absorb(self, other: Measured) -> None:
-        """Note what was measured of the same setting elsewhere."""
+        """Add the measurements of the same setting from another wave."""
         self.times_ms += other.times_ms
         self.memory_mib += other.memory_mib
         self.lost += other.lost
@@ -157,13 +177,13 @@ class Measured:
 
     @property
     def median_ms(self) -> float:
-        """Time of all measurements; 0 where there is none."""
+        """Median time of all measurements [ms]; 0 where there is none."""
         return float(np.median(self.times_ms)) if self.times_ms else 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Told:
-    """How a campaign is getting on."""
+class Progress:
+    """Progress of a campaign."""
 
     text: str
     done: float
@@ -178,8 +198,8 @@ class _Entry:
 
     worker: Worker
     measured: Measured
+    # Measurements that it gets.
     count: int = 0
-    """Measurements that it gets."""
 
     @property
     def cost_s(self) -> float:
@@ -189,20 +209,16 @@ class _Entry:
 class Campaign:
     """Measures blocks of settings over the same scenes, each setting by turns with the baseline.
 
-    Parameters
-    ----------
-    scenes
-        What is measured on.
-    baseline
-        What factors are against: the first of these that can be loaded.
-    whole
-        Labels of settings that see every scene, whatever that takes: the reference.
-    seconds
-        For everything.
-    receivers
-        Receivers of a scene at most; None: all.
-    told
-        Is told about progress.
+    Args:
+        scenes: What is measured on.
+        baseline: What factors are against: the first of these that can be loaded.
+        whole: Labels of settings that see every scene, whatever that takes: the reference.
+        seconds: Time for everything [s].
+        receivers: Receivers of a scene at most; None: all.
+        report: Called with the progress before each step.
+
+    Raises:
+        RunError: No baseline can be measured.
     """
 
     def __init__(
@@ -213,26 +229,37 @@ class Campaign:
         whole: Sequence[str],
         seconds: float,
         receivers: int | None,
-        told: Callable[[Told], None],
+        report: Callable[[Progress], None],
     ) -> None:
-        self._scenes, self._receivers, self._told, self._whole = scenes, receivers, told, whole
+        self._scenes, self._receivers, self._report, self._whole = scenes, receivers, report, whole
         self._seconds, self._begun = seconds, time.monotonic()
         self._order = spread_order(len(scenes.instants))
-        self._noise = Noise.of(scenes)
         self.skipped: list[Skipped] = []
         self._baseline = self._first_loaded(baseline)
 
     @property
     def baseline(self) -> Setting:
-        """What factors are against."""
+        """Setting that factors are against."""
         return self._baseline.setting
 
     def close(self) -> None:
-        """End what is loaded."""
+        """End the process of the baseline."""
         self._baseline.close()
 
     def block(self, name: Block, settings: Sequence[Setting], share: float) -> list[Measured]:
-        """Measure settings within a share of the time that is left."""
+        """Measure settings within a share of the time that is left.
+
+        Args:
+            name: Name of the block.
+            settings: Settings in the order of the table; the expensive ones come last.
+            share: Share of the time that is left.
+
+        Returns:
+            What was measured, in the order of ``settings``; what was not is in `skipped`.
+
+        Raises:
+            RunError: The baseline, which needs measuring anew in each wave, fails.
+        """
         begun = time.monotonic()
         until, costs, found = begun + share * self._left_s, list[Cost](), dict[Setting, Measured]()
         own = self._entry(self._baseline).measured
@@ -256,12 +283,10 @@ class Campaign:
         return [found[setting] for setting in settings if setting in found]
 
     def keyframes(self, share: float) -> list[Row]:
-        """The baseline's channels interpolated between keyframes, within a share of the time that is left."""
+        """Measure the baseline with channels interpolated between keyframes, in a share of the time left."""
         seconds = min(self._left_s, max(AT_LEAST_S, share * self._left_s))
         try:
-            return keyframe_rows(
-                self.baseline, self._scenes, self._receivers, self._noise, seconds, self._tell
-            )
+            return keyframe_rows(self.baseline, self._scenes, self._receivers, seconds, self._tell)
         except CaviarError as error:
             label = f"{self.baseline.label}, keyframes"
             self.skipped.append(Skipped(setting=label, block="keyframes", reason=str(error)))
@@ -284,7 +309,7 @@ class Campaign:
         )
 
     def _start(self, setting: Setting, seconds: float) -> Worker:
-        return Worker(setting, self._scenes, self._receivers, self._noise, seconds)
+        return Worker(setting, self._scenes, self._receivers, seconds)
 
     def _loaded(
         self,
@@ -296,6 +321,7 @@ class Campaign:
     ) -> list[_Entry]:
         """The baseline, and of a wave what can be loaded in time: until then, for so many settings."""
         until, to_come = time_for
+        # The baseline's process stays from wave to wave; its record starts anew, for this wave's factors.
         entries = [self._entry(self._baseline)]
         for number, setting in enumerate(wave):
             if setting == self.baseline:
@@ -319,7 +345,7 @@ class Campaign:
         return entries
 
     def _by_turns(self, name: Block, entries: Sequence[_Entry], until: float) -> None:
-        """Each as often as its share of the time allows; once at least."""
+        """Measure each as often as its share of the time allows; once at least."""
         seconds = max(0.0, until - time.monotonic())
         most = [ROUNDS * self._scenes_of(entry.measured.setting) for entry in entries]
         for entry, count in zip(entries, shares([e.cost_s for e in entries], most, seconds), strict=True):
@@ -337,7 +363,8 @@ class Campaign:
         if turn and not whole and time.monotonic() > until:
             return
         if not turn and not whole and entry.cost_s > max(WORTH_S, until - time.monotonic()):
-            measured.take(self._scenes.instants[0].frame, entry.worker.loaded.first)
+            # The warm-up's scene includes compilation, so its time is an upper bound; the note says so.
+            measured.add_sample(self._scenes.instants[0].frame, entry.worker.loaded.first)
             measured.notes.append("timed on the scene that warmed it up: another would take too long")
             entry.count = 0
             return
@@ -349,10 +376,10 @@ class Campaign:
             entry.count = 0
             measured.notes.append(f"ended early: {error}")
             return
-        measured.take(self._scenes.instants[index].frame, sample)
+        measured.add_sample(self._scenes.instants[index].frame, sample)
 
     def _is_of_use(self, measured: Measured, name: Block) -> bool:
-        """Whether it was measured at all; notes what a reader should know."""
+        """Whether it was measured at all; adds notes for the reader of the table."""
         if not measured.times_ms:
             self._skip(measured.setting, name, "; ".join(measured.notes))
             return False
@@ -374,7 +401,7 @@ class Campaign:
 
     def _tell(self, text: str) -> None:
         left = self._left_s
-        self._told(Told(text=text, done=1 - left / self._seconds, left_s=left))
+        self._report(Progress(text=text, done=1 - left / self._seconds, left_s=left))
 
     def _entry(self, worker: Worker) -> _Entry:
         loaded = worker.loaded
@@ -401,9 +428,16 @@ def _no_time(expected_s: float | None, left_s: float) -> str:
 def candidates(
     label: str | None, order: Sequence[str], known: Sequence[Setting], option: str
 ) -> list[Setting]:
-    """The setting with a label, or where there is none those of a list, in its order.
+    """Look up the setting with a label, or without one those of a list.
 
-    Raises `RunError` with near labels for a label that does not exist.
+    Args:
+        label: Label that the user gives; None: none is given.
+        order: Labels of the list, in order of preference.
+        known: All settings.
+        option: Option of the command line, for the error.
+
+    Raises:
+        RunError: No setting has the label; the error names near ones.
     """
     by_label = {setting.label: setting for setting in known}
     if label is None:

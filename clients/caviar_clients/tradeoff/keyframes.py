@@ -1,7 +1,7 @@
 """A setting that is traced at every few frames alone, with channels interpolated in between.
 
-Over consecutive frames: each is traced, and what interpolation makes of every second, fifth, tenth of these
-channels is held against the others.
+Over consecutive frames: each is traced, and the channels that interpolation makes of every second, fifth,
+tenth of these are compared with the traced ones.
 """
 
 from __future__ import annotations
@@ -13,19 +13,20 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from caviar_clients.tradeoff.ladder import Setting
-from caviar_clients.tradeoff.rows import Row, error_fields
-from caviar_clients.tradeoff.scenes import Instant, Scenes
-from caviar_clients.tradeoff.users import (
+from caviar_clients.tradeoff.errors import (
     FLOOR_DB,
     Key,
     Noise,
+    Row,
     UserChannel,
     decibel,
     differences,
+    error_fields,
     nmse,
     user_channels,
 )
+from caviar_clients.tradeoff.ladder import Setting
+from caviar_clients.tradeoff.scenes import Instant, Scenes
 from caviar_clients.tradeoff.worker import Sample, Worker, seen
 from caviar_protocol.errors import RunError
 from caviar_protocol.topics import Channel
@@ -45,47 +46,53 @@ class Traced:
     channel: Channel
 
     def keyframe(self) -> Keyframe:
-        """As the end of an interval."""
+        """Make the frame an end of an interval."""
         return Keyframe(self.instant.t_ns / 1e9, self.channel, self.instant.scene)
 
 
 @dataclass(eq=False)
 class _Found:
-    """What a spacing gave. Each interval counts its later keyframe and all between."""
+    """Findings of a spacing. Each interval counts its later keyframe and all frames between."""
 
+    # Of each frame: the time of its interval, shared out.
     times_ms: list[float] = field(default_factory=list)
-    """Of each frame: that of its interval, shared out."""
     users: dict[Key, UserChannel] = field(default_factory=dict)
     paths: list[int] = field(default_factory=list)
+    # Whether a channel's bound is finite, and of those channels, whether the error keeps within it.
     promised: list[bool] = field(default_factory=list)
-    """Whether a channel's bound is finite."""
     within: list[bool] = field(default_factory=list)
-    """Of those, whether the error keeps within it."""
 
 
 def keyframe_rows(
     setting: Setting,
     scenes: Scenes,
     receivers: int | None,
-    noise: Noise,
     seconds: float,
-    told: Callable[[str], None],
+    tell: Callable[[str], None],
 ) -> list[Row]:
-    """A row for tracing each of the consecutive frames, then one for each of `SPACINGS`.
+    """Make a row for tracing each of the consecutive frames, then one for each of `SPACINGS`.
 
-    Raises `RunError` with the reason where that cannot be measured, or not within ``seconds``.
+    Args:
+        setting: Setting that keyframes are traced with; its rung has plane waves.
+        scenes: Its consecutive scenes are measured on.
+        receivers: Receivers of a scene at most; None: all.
+        seconds: Time for everything [s].
+        tell: Called with a text about the progress.
+
+    Raises:
+        RunError: That cannot be measured, or not in time; the error says why.
     """
     instants = scenes.consecutive
     spacings = [spacing for spacing in SPACINGS if spacing < len(instants)]
     if not spacings:
         raise RunError(f"there are no {SPACINGS[0] + 1} consecutive frames with a transmitter and a receiver")
     until = time.monotonic() + seconds
-    told(f"keyframes: loading {setting.label}")
-    block = scenes.with_instants(instants)
-    with closing(Worker(setting, block, receivers, noise, seconds, products=True)) as worker:
+    tell(f"keyframes: loading {setting.label}")
+    block, noise = scenes.with_instants(instants), Noise.of(scenes)
+    with closing(Worker(setting, block, receivers, seconds, products=True)) as worker:
         traced = []
         for index, instant in enumerate(instants):
-            told(f"keyframes: {setting.label}")
+            tell(f"keyframes: {setting.label}")
             sample = worker.step(index, max(1.0, until - time.monotonic()))
             if sample.channel is None or sample.rung not in PLANE_WAVES:
                 raise RunError(f"H of {sample.rung} does not follow from paths; choose another --baseline")
@@ -103,7 +110,7 @@ def keyframe_rows(
     note = f"frames {first} to {last}, consecutive; errors against a trace of each of them"
     rows = [_row(setting.label, 1, every, truth, base, traced[0].sample, loaded.seconds, note)]
     for spacing in spacings:
-        told(f"keyframes: every {spacing}")
+        tell(f"keyframes: every {spacing}")
         found = spaced(traced, spacing, noise)
         label = f"{setting.label}, keyframes every {spacing}"
         rows.append(_row(label, spacing, found, truth, base, traced[0].sample, loaded.seconds, note))
@@ -111,7 +118,7 @@ def keyframe_rows(
 
 
 def spaced(traced: Sequence[Traced], spacing: int, noise: Noise) -> _Found:
-    """What interpolation makes of every ``spacing``-th of the frames."""
+    """Interpolate between every ``spacing``-th of the frames, and compare with the frames in between."""
     found = _Found()
     for first in range(0, len(traced) - spacing, spacing):
         last = first + spacing

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 from msgspec.structs import replace
 
 from caviar_clients.plots.style import BLACK, BLUE, GREY, LIGHT_GREY, ORANGE, SKY, VERMILION, figure
+from caviar_clients.tradeoff.errors import Row
 from caviar_clients.tradeoff.report import Point, Report
-from caviar_clients.tradeoff.rows import Row
 
 DISTANCES_PT = (9.0, 16.0, 26.0, 38.0, 52.0, 68.0)
 DIRECTIONS = 16

@@ -12,11 +12,10 @@ import msgspec
 import numpy as np
 
 from caviar_clients.tradeoff import ladder
-from caviar_clients.tradeoff.campaign import Campaign, Measured, Skipped, Told, candidates
+from caviar_clients.tradeoff.campaign import Campaign, Measured, Progress, Skipped, candidates
+from caviar_clients.tradeoff.errors import Key, Row, UserChannel, differences, error_fields
 from caviar_clients.tradeoff.ladder import TRUTH, Block, Setting
-from caviar_clients.tradeoff.rows import Row, error_fields
 from caviar_clients.tradeoff.scenes import Scenes
-from caviar_clients.tradeoff.users import Key, UserChannel, differences
 from caviar_clients.tradeoff.worker import is_known, seen
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import RunError
@@ -26,7 +25,7 @@ from caviar_services.registry import load
 
 
 class Point(msgspec.Struct, frozen=True, kw_only=True):
-    """All seeds with one number of samples. A pair is two of the seeds, over all users."""
+    """Measurements of all seeds with one number of samples. A pair is two of the seeds, over all users."""
 
     paths: str
     """``specular`` or ``diffuse``."""
@@ -42,7 +41,7 @@ class Point(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def points(measured: Sequence[Measured]) -> list[Point]:
-    """One point for each kind of path and number of samples."""
+    """Make a point for each kind of path and number of samples."""
     groups: dict[tuple[str, str], list[Measured]] = {}
     truth: dict[Key, UserChannel] = {}
     for entry in measured:
@@ -76,7 +75,7 @@ PARTS: tuple[Part, ...] = get_args(Part)
 
 
 class Report(msgspec.Struct, frozen=True, kw_only=True):
-    """What a comparison found."""
+    """Findings of a comparison, as ``caviar tradeoff --json`` writes them."""
 
     scenario: str
     origin: str
@@ -96,7 +95,20 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True):
-    """What can be chosen."""
+    """Options of a comparison.
+
+    Args:
+        reference: Label of the setting that errors are against; None: the finest that can be measured.
+        baseline: Label of the setting that factors of time are against; None: the default.
+        receivers: Receivers of a scene at most; None: all.
+        seeds: Seeds of each point of the convergence.
+        seconds: Time for everything [s].
+        parts: Parts that are measured.
+
+    Example:
+        >>> Options(parts=("ladder",), seconds=60.0).receivers is None
+        True
+    """
 
     reference: str | None = None
     baseline: str | None = None
@@ -114,17 +126,25 @@ _WEIGHTS: Mapping[Block, float] = {
     "convergence": 10,
     "diffuse convergence": 14,
 }
-"""Shares of the time."""
+# Shares of the time; a block that needs less leaves the rest to those behind it.
 
 
 def compare(
-    scenes: Scenes, options: Options, machine: Mapping[str, str], told: Callable[[Told], None]
+    scenes: Scenes, options: Options, machine: Mapping[str, str], report: Callable[[Progress], None]
 ) -> Report:
     """Measure every setting of the chosen parts.
 
-    Raises `RunError` for an unknown label, and where reference or baseline cannot be measured.
+    Args:
+        scenes: Scenes that are measured on.
+        options: Parts, time, reference and baseline.
+        machine: Facts about the machine, for the report.
+        report: Called with the progress.
+
+    Raises:
+        RunError: A label is unknown, or reference or baseline cannot be measured.
     """
     begun = time.monotonic()
+    # Measured before anything else and on every scene: all errors of the report are against it.
     known = (*ladder.LADDER, *ladder.spacing_settings())
     references = candidates(options.reference, ladder.REFERENCES, known, "--reference")
     references = comparable([s for s in references if is_known(s, scenes)], scenes) or references
@@ -135,7 +155,7 @@ def compare(
         whole=[references[0].label],
         seconds=options.seconds,
         receivers=options.receivers,
-        told=told,
+        report=report,
     )
     with closing(campaign):
         needed = references if "ladder" in options.parts else references[:1]
@@ -169,8 +189,10 @@ def compare(
 
 
 def comparable(references: Sequence[Setting], scenes: Scenes) -> list[Setting]:
-    """References without those that know no scenery, where there is some and others know it: against these,
-    what scenery does would count as an error."""
+    """Leave out references that know no scenery, where there is some and others know it.
+
+    Against those, the reflections of the scenery would count as errors.
+    """
     if find_scenery(scenes.assets) is None:
         return list(references)
     traced = [setting for setting in references if load("channel", setting.use).uses_scenery]
@@ -178,7 +200,7 @@ def comparable(references: Sequence[Setting], scenes: Scenes) -> list[Setting]:
 
 
 def _plan(options: Options, needed: Sequence[Setting]) -> list[tuple[Block, list[Setting]]]:
-    """Blocks in order; the first one has reference and baseline, which the others need."""
+    """Order the blocks; the first one has reference and baseline, which the others need."""
     first = [s for s in ladder.LADDER if "ladder" in options.parts or s in needed]
     plan: list[tuple[Block, list[Setting]]] = [("ladder", [*first, *(s for s in needed if s not in first)])]
     if "keyframes" in options.parts:

@@ -1,4 +1,7 @@
-"""The scenes that all settings are measured on: those of a scenario's worlds, or of a recording."""
+"""The scenes that all settings are measured on: those of a scenario's worlds, or of a recording.
+
+Of a scenario only the worlds run, and the agents that steer them, embedded in this process and free of pace.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,7 @@ from caviar_services.service import Preparation, Prepared, Service, StepResult
 T = TypeVar("T")
 
 CONSECUTIVE = 21
-"""Frames of the block that follow each other: ten, and ten, and the one before."""
+"""Consecutive frames that keyframes are measured on: two intervals of ten, and the frame before."""
 
 KEEPER = "tradeoff-scenes"
 """Name of the service that keeps the scenes."""
@@ -34,7 +37,7 @@ KEEPER = "tradeoff-scenes"
 
 @dataclass(frozen=True, eq=False)
 class Instant:
-    """A scene and when it was."""
+    """A scene, with number and simulated time of its frame."""
 
     frame: int
     t_ns: int
@@ -43,39 +46,58 @@ class Instant:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Scenes:
-    """Scenes, and what channel models need to know beside them."""
+    """Scenes, and what channel models need to know beside them.
+
+    Args:
+        name: Name of the scenario.
+        origin: Where the scenes are from, in words.
+        instants: The scenes, in the order of their frames.
+        carriers: Carriers of the scenario.
+        devices: Devices of the scenario.
+        assets: Files of scenery by asset name.
+        services: Services of the scenario, for the settings of its channel and link.
+        seed: Seed of the run.
+        sampling_period_ns: Time from frame to frame [ns].
+        consecutive: Scenes of frames that follow each other; empty where there are none.
+    """
 
     name: str
-    """Of the scenario."""
     origin: str
-    """Where they are from, for people."""
     instants: tuple[Instant, ...]
     carriers: tuple[Carrier, ...]
     devices: tuple[DeviceSpec, ...]
     assets: Mapping[str, Path]
-    """Files of scenery by asset name."""
     services: Mapping[str, ServiceSpec]
-    """The scenario's, for the settings of its channel and link."""
     seed: int
     sampling_period_ns: int
     consecutive: tuple[Instant, ...] = ()
-    """Scenes of frames that follow each other, for what depends on that; none where there are no such."""
 
     def with_instants(self, instants: tuple[Instant, ...]) -> Scenes:
-        """All else the same."""
+        """Return a copy with other instants."""
         return dataclasses.replace(self, instants=instants)
 
     def settings_of(self, role: Role, use: str) -> dict[str, Any]:
-        """Settings of the scenario's first service that is this implementation; else none."""
+        """Return the settings of the scenario's first service that is this implementation; {} without one."""
         found = (s.settings for s in self.services.values() if (s.role, s.use) == (role, use))
         return dict(next(found, {}))
 
 
 def scenes_of(path: Path, frames: int) -> Scenes:
-    """About ``frames`` scenes, spread evenly over the first episode of a scenario or a recording.
+    """Take scenes, spread evenly over the first episode of a scenario or a recording.
 
-    Raises `ScenarioError` or `RecordingError` for what is wrong with it, `RunError` where the worlds fail
-    or no scene has both a transmitter and a receiver.
+    Args:
+        path: Scenario file, run directory or segment.
+        frames: Number of scenes, about: those without a transmitter or a receiver are left out.
+
+    Raises:
+        ScenarioError: The scenario is wrong, or has no carrier.
+        RecordingError: The recording is wrong, or holds no scene.
+        RunError: The worlds fail, or no scene has both a transmitter and a receiver.
+
+    Example:
+        >>> scenes = scenes_of(Path("deploy/caviar_scenarios/smoke.toml"), 2)
+        >>> [instant.frame for instant in scenes.instants]
+        [0, 99]
     """
     found = _of_recording(path, frames) if is_recording(path) else _of_scenario(path, frames)
     if not found.carriers:
@@ -93,10 +115,16 @@ def scenes_of(path: Path, frames: int) -> Scenes:
 
 
 def scene_at(path: Path, frame: int = 0) -> Scenes:
-    """The scene of one frame of the first episode of a scenario or a recording, as the only instant.
+    """Take the scene of one frame of the first episode, as the only instant.
 
-    Raises `ScenarioError` or `RecordingError` for what is wrong with it or where there is no such frame,
-    `RunError` where the worlds fail.
+    Args:
+        path: Scenario file, run directory or segment.
+        frame: Number of the frame.
+
+    Raises:
+        ScenarioError: The scenario is wrong.
+        RecordingError: The recording is wrong, or has no scene in this frame.
+        RunError: There is no such frame, or the worlds fail.
     """
     if is_recording(path):
         recording = Recording(path)
@@ -110,13 +138,14 @@ def scene_at(path: Path, frame: int = 0) -> Scenes:
     if not 0 <= frame < scenario.run.frames:
         last = scenario.run.frames - 1
         raise RunError(f"--frame {frame}: scenario {scenario.run.name!r} has the frames 0 to {last}")
+    # A world's scene may depend on every frame before: the run is cut behind the frame, not begun at it.
     scenario = checked_scenario(path, frames=frame + 1)
     instants, assets = _simulated(scenario)
     return _planned(path, scenario, instants[-1:], assets)
 
 
 def is_recording(path: Path) -> bool:
-    """Whether it is a run directory or a segment, and not a scenario."""
+    """Whether a path is a run directory or a segment, and not a scenario."""
     return path.is_dir() or path.suffix == ".mcap"
 
 
@@ -171,7 +200,7 @@ def _of_scenario(path: Path, frames: int) -> Scenes:
 
 
 def _simulated(scenario: Scenario) -> tuple[list[Instant], Mapping[str, Path]]:
-    """What the worlds of a scenario make of each frame, and the files of their scenery."""
+    """Run the worlds of a scenario; their scene of each frame, and the files of their scenery."""
     prepared: list[Preparation] = []
     run = EmbeddedRun(worlds_only(scenario), None, seats={KEEPER: _keeper(prepared.append)})
     seat, instants = run.seats[KEEPER], list[Instant]()
@@ -206,72 +235,72 @@ def _planned(
 
 
 def worlds_only(scenario: Scenario) -> Scenario:
-    """One episode of the scenario's worlds and of the agents that need no channel, and who keeps the scenes.
+    """Reduce a scenario to one episode of its worlds and of the agents that need no channel.
 
-    An agent that takes a channel or sensors cannot decide here; what it steers stays as it starts.
+    An agent that takes a channel or sensors cannot decide here; what it steers stays as it starts. A service
+    that keeps the scenes takes the place of all others.
     """
     kept = services_kept(scenario)
     budget_ms = 1e3  # never reached: nothing is late in an embedded run
+    # It has the role of sensors, since these may take scenes without making anything of them.
     kept[KEEPER] = ServiceSpec(role="sensors", use=KEEPER, budget_ms=budget_ms)
     return replace(scenario, services=kept, run=replace(scenario.run, episodes=1, record=(), pace="free"))
 
 
 def services_kept(scenario: Scenario) -> dict[str, ServiceSpec]:
-    """The services that make the scenes: worlds, and agents that need no channel."""
-    return {name: spec for name, spec in scenario.services.items() if _is_kept(spec)}
+    """Select the services that make the scenes: worlds, and agents that need no channel."""
 
+    def is_kept(spec: ServiceSpec) -> bool:
+        if spec.role != "agent" or spec.remote:
+            return spec.role == "world"
+        return {given.topic for given in load("agent", spec.use).inputs if given.required} <= {"scene"}
 
-def _is_kept(spec: ServiceSpec) -> bool:
-    if spec.role == "world":
-        return True
-    if spec.role != "agent" or spec.remote:
-        return False
-    needs = {given.topic for given in load("agent", spec.use).inputs if given.required}
-    return needs <= {"scene"}
+    return {name: spec for name, spec in scenario.services.items() if is_kept(spec)}
 
 
 class KeeperSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """There is nothing to set."""
+    """The keeper has no settings."""
 
 
 class Keeper(Service[KeeperSettings]):
-    """Takes scenes and gives nothing."""
+    """Takes scenes and produces nothing; its seat in the embedded run keeps them."""
 
     role: ClassVar[Role] = "sensors"
     inputs: ClassVar[tuple[Input, ...]] = (Input(topic="scene"),)
     uses_scenery: ClassVar[bool] = True
     Settings = KeeperSettings
-    told: ClassVar[Callable[[Preparation], None]]
+    on_prepare: ClassVar[Callable[[Preparation], None]]
 
     def prepare(self, preparation: Preparation) -> Prepared:
-        type(self).told(preparation)
+        type(self).on_prepare(preparation)
         return Prepared()
 
     def step(self, frame: Any) -> StepResult:
-        """Its seat answers in its place."""
+        """Never called: the seat answers."""
         raise RunError(f"{KEEPER} is answered by its seat")
 
 
-def _keeper(told: Callable[[Preparation], None]) -> type[Keeper]:
-    """The class of a keeper that passes on what it is prepared with."""
-    return type("Keeper", (Keeper,), {"told": staticmethod(told)})
+def _keeper(on_prepare: Callable[[Preparation], None]) -> type[Keeper]:
+    """Make the class of a keeper that passes on what it is prepared with."""
+    # A class and not an object: an embedded run makes its services itself, as any other run does.
+    return type("Keeper", (Keeper,), {"on_prepare": staticmethod(on_prepare)})
 
 
 def _spread(entries: Sequence[T], count: int) -> list[T]:
-    """``count`` of them, evenly spread, the first and the last among them; all where there are fewer."""
+    """Take ``count`` entries, evenly spread, the first and the last among them; all where there are fewer."""
     if len(entries) <= count:
         return list(entries)
     return [entries[i] for i in np.unique(np.linspace(0, len(entries) - 1, count).round().astype(int))]
 
 
 def _middle(entries: Sequence[T]) -> list[T]:
-    """`CONSECUTIVE` of them from the middle; all where there are fewer."""
+    """Take `CONSECUTIVE` entries from the middle; all where there are fewer."""
     first = max(0, (len(entries) - CONSECUTIVE) // 2)
     return list(entries[first : first + CONSECUTIVE])
 
 
 def _run(instants: Sequence[Instant]) -> tuple[Instant, ...]:
-    """The longest run of frames with successive numbers that have a transmitter and a receiver."""
+    """Find the longest run of frames with successive numbers that have a transmitter and a receiver."""
     runs: list[list[Instant]] = [[]]
     for instant in instants:
         if runs[-1] and instant.frame != runs[-1][-1].frame + 1:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from rich.table import Table
 from rich.text import Text
 
 from caviar_clients.tradeoff.campaign import Skipped
+from caviar_clients.tradeoff.errors import FLOOR_DB, Row
 from caviar_clients.tradeoff.ladder import (
     CHOSEN_PATHS,
     CHOSEN_SAMPLES,
@@ -18,11 +19,10 @@ from caviar_clients.tradeoff.ladder import (
     SPACINGS_DEG,
     SPECULAR_BESIDE,
     TABLE_RUNGS,
+    Block,
     samples_of,
 )
 from caviar_clients.tradeoff.report import Report
-from caviar_clients.tradeoff.rows import Row
-from caviar_clients.tradeoff.users import FLOOR_DB
 
 PAPER_SPACING = {
     "1": (1.0, 0.7),
@@ -38,24 +38,6 @@ _PAPER = (
     "Oliveira et al., “Simulation of Machine Learning-Based 6G Systems in Virtual Worlds”, 2021: Wireless "
     "InSite on an NVIDIA RTX 2070, one scene of dataset s012 (Rosslyn, 60 GHz), 1 transmitter, 10 receivers"
 )
-_COLUMNS = (
-    "setting",
-    "time ms",
-    "p99 ms",
-    "factor",
-    "memory MiB",
-    "paths",
-    "gain dB",
-    "delay spread ns",
-    "az. spread ° dep. / arr.",
-    "NMSE dB",
-    "median",
-    "capacity bit/s/Hz",
-    "top-1",
-    "top-5",
-    "LOS",
-)
-NOTHING = "–"
 _BETWEEN = (
     "Traced at keyframes alone, interpolated path by path in between: the time of a scene is that of a "
     "keyframe and of the interpolation up to it, shared out over its scenes. Errors are over all scenes, "
@@ -64,37 +46,111 @@ _BETWEEN = (
 )
 
 
+NOTHING = "–"
+"""Cell of a figure that does not exist."""
+
+
+def significant(value: float | None) -> str:
+    """Write a figure with three significant digits (two below 1), without exponents.
+
+    Example:
+        >>> significant(0.01234), significant(3.456), significant(None)
+        ('0.012', '3.46', '–')
+    """
+    if value is None:
+        return NOTHING
+    if value == 0:
+        return "0"
+    if abs(value) >= 100:
+        return f"{value:.0f}"
+    return f"{value:.2g}" if abs(value) < 1 else f"{value:.3g}"
+
+
+def level(value: float | None) -> str:
+    """Write a ratio in dB to a tenth, with a minus sign where it is negative."""
+    return NOTHING if value is None else f"{value:.1f}".replace("-", "−")
+
+
+def percent(share: float | None) -> str:
+    """Write a share to a tenth of a percent."""
+    return NOTHING if share is None else f"{100 * share:.1f} %"
+
+
+Columns = Mapping[str, Callable[[Row], str]]
+"""Title of each column, and what a row has there."""
+
+
+def _figure(name: str, written: Callable[[float | None], str] = significant) -> Callable[[Row], str]:
+    """Cell of a column that shows one field of a row."""
+    return lambda row: written(getattr(row, name))
+
+
+_COST: Columns = {
+    "setting": lambda row: row.setting,
+    "time ms": _figure("time_ms_median"),
+    "p99 ms": _figure("time_ms_p99"),
+    "factor": _figure("factor"),
+}
+_QUALITY: Columns = {
+    "NMSE dB": _figure("nmse_db", level),
+    "median": _figure("nmse_db_median", level),
+    "capacity bit/s/Hz": _figure("capacity_error_bps_hz"),
+    "top-1": _figure("beam_top1", percent),
+    "top-5": _figure("beam_top5", percent),
+}
+_LADDER: Columns = {
+    **_COST,
+    "memory MiB": _figure("memory_mib"),
+    "paths": _figure("paths"),
+    "gain dB": _figure("path_gain_error_db"),
+    "delay spread ns": _figure("delay_spread_error_ns"),
+    "az. spread ° dep. / arr.": lambda row: (
+        f"{significant(row.aod_azimuth_spread_error_deg)} / {significant(row.aoa_azimuth_spread_error_deg)}"
+    ),
+    **_QUALITY,
+    "LOS": _figure("los_agreement", percent),
+}
+_KEYFRAMES: Columns = {
+    **_COST,
+    **_QUALITY,
+    "with a bound": _figure("with_bound", percent),
+    "within it": _figure("within_bound", percent),
+}
+# Fewer, with shorter titles: a terminal is narrower than a page.
+_SCREEN: Columns = {
+    "setting": _LADDER["setting"],
+    "time ms": _LADDER["time ms"],
+    "p99": _LADDER["p99 ms"],
+    "factor": _LADDER["factor"],
+    "gain dB": _LADDER["gain dB"],
+    "NMSE dB": _LADDER["NMSE dB"],
+    "top-1": _LADDER["top-1"],
+    "top-5": _LADDER["top-5"],
+    "bit/s/Hz": _LADDER["capacity bit/s/Hz"],
+}
+
+
 def screen_table(report: Report) -> Table:
-    """The ladder, as wide as a terminal."""
+    """Make the table of all rows for a terminal."""
     table = Table(title=Text(f"{report.scenario}: {report.origin}"), title_justify="left")
-    for name in ("setting", "time ms", "p99", "factor", "gain dB", "NMSE dB", "top-1", "top-5", "bit/s/Hz"):
+    for name in _SCREEN:
         table.add_column(name, justify="left" if name == "setting" else "right")
     for row in report.rows:
-        table.add_row(
-            Text(row.setting),
-            significant(row.time_ms_median),
-            significant(row.time_ms_p99),
-            significant(row.factor),
-            significant(row.path_gain_error_db),
-            level(row.nmse_db),
-            percent(row.beam_top1),
-            percent(row.beam_top5),
-            significant(row.capacity_error_bps_hz),
-        )
+        table.add_row(*(Text(cell(row)) for cell in _SCREEN.values()))
     table.caption_justify = "left"
     table.caption = Text(_against(report))
     return table
 
 
 def markdown(report: Report) -> str:
-    """All tables, with what differs from the paper's."""
+    """Write all tables as Markdown, beside the paper's figures and with what differs from them."""
     ladder = [row for row in report.rows if row.block == "ladder"]
     parts = [
         f"# Time and error of channel settings: {report.scenario}",
         _setting_of(report),
         "## The ladder",
         _meaning(),
-        _table(_COLUMNS, [_cells(row) for row in ladder]),
+        _table_of(_LADDER, ladder),
         _notes(ladder),
     ]
     parts += _keyframes(report) + _spacing(report) + _arrays(report) + _convergence(report) + _skipped(report)
@@ -124,27 +180,6 @@ def _meaning() -> str:
     )
 
 
-def _cells(row: Row) -> list[str]:
-    departure, arrival = row.aod_azimuth_spread_error_deg, row.aoa_azimuth_spread_error_deg
-    return [
-        row.setting,
-        significant(row.time_ms_median),
-        significant(row.time_ms_p99),
-        significant(row.factor),
-        significant(row.memory_mib),
-        significant(row.paths),
-        significant(row.path_gain_error_db),
-        significant(row.delay_spread_error_ns),
-        f"{significant(departure)} / {significant(arrival)}",
-        level(row.nmse_db),
-        level(row.nmse_db_median),
-        significant(row.capacity_error_bps_hz),
-        percent(row.beam_top1),
-        percent(row.beam_top5),
-        percent(row.los_agreement),
-    ]
-
-
 def _notes(rows: Sequence[Row]) -> str:
     return "\n".join(f"- {row.setting}: {row.note}." for row in rows if row.note)
 
@@ -153,24 +188,19 @@ def _keyframes(report: Report) -> list[str]:
     rows = [row for row in report.rows if row.block == "keyframes"]
     if not rows:
         return []
-    columns = (*_COLUMNS[:4], *_COLUMNS[9:14], "with a bound", "within it")
-    body = []
-    for row in rows:
-        cells = _cells(row)
-        body.append([*cells[:4], *cells[9:14], percent(row.with_bound), percent(row.within_bound)])
     return [
         "## Between keyframes",
         _BETWEEN,
-        _table(columns, body),
+        _table_of(_KEYFRAMES, rows),
         f"- {rows[0].note[0].upper()}{rows[0].note[1:]}.",
     ]
 
 
 def _spacing(report: Report) -> list[str]:
-    rows = {(row.column, row.row): row for row in report.rows if row.block == "ray spacing"}
+    rows = _by_cell(report, "ray spacing")
     if not rows:
         return []
-    columns = [rung for rung in TABLE_RUNGS if any(column == rung for column, _ in rows)]
+    columns = _rungs(rows)
     header = ["ray spacing °", "rays", *(f"{c} (NMSE)" for c in columns), "paper: SISO-RT", "paper: MIMO-RT"]
     body = []
     for spacing, label in [
@@ -205,6 +235,16 @@ def _spacing(report: Report) -> list[str]:
     ]
 
 
+def _by_cell(report: Report, block: Block) -> dict[tuple[str, str], Row]:
+    """Rows of one of the paper's tables by column and row."""
+    return {(row.column, row.row): row for row in report.rows if row.block == block}
+
+
+def _rungs(rows: Mapping[tuple[str, str], Row]) -> list[str]:
+    """Columns that were measured, in the order of the paper's tables."""
+    return [rung for rung in TABLE_RUNGS if any(column == rung for column, _ in rows)]
+
+
 def _relative(row: Row | None, base: Row | None) -> str:
     if row is None or base is None:
         return NOTHING
@@ -212,10 +252,10 @@ def _relative(row: Row | None, base: Row | None) -> str:
 
 
 def _arrays(report: Report) -> list[str]:
-    rows = {(row.column, row.row): row for row in report.rows if row.block == "arrays"}
+    rows = _by_cell(report, "arrays")
     if not rows:
         return []
-    columns = [rung for rung in TABLE_RUNGS if any(column == rung for column, _ in rows)]
+    columns = _rungs(rows)
     sizes = [f"{n}×{m}" for n, m in ELEMENTS]
     body = []
     for (nt, nr), size in zip(ELEMENTS, sizes, strict=True):
@@ -282,34 +322,17 @@ def _skipped(report: Report) -> list[str]:
 
 
 def by_reason(skipped: Sequence[Skipped]) -> dict[str, list[str]]:
-    """Labels of what was skipped, by the reason."""
+    """Group the labels of settings that were not measured by the reason."""
     found: dict[str, list[str]] = {}
     for entry in skipped:
         found.setdefault(entry.reason, []).append(entry.setting)
     return found
 
 
+def _table_of(columns: Columns, rows: Sequence[Row]) -> str:
+    return _table(tuple(columns), [[cell(row) for cell in columns.values()] for row in rows])
+
+
 def _table(header: Sequence[str], body: Sequence[Sequence[str]]) -> str:
     lines = [header, ["---"] + ["---:"] * (len(header) - 1), *body]
     return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
-
-
-def significant(value: float | None) -> str:
-    """Three significant digits, without exponents."""
-    if value is None:
-        return NOTHING
-    if value == 0:
-        return "0"
-    if abs(value) >= 100:
-        return f"{value:.0f}"
-    return f"{value:.2g}" if abs(value) < 1 else f"{value:.3g}"
-
-
-def level(value: float | None) -> str:
-    """A ratio in dB, to a tenth."""
-    return NOTHING if value is None else f"{value:.1f}".replace("-", "−")
-
-
-def percent(share: float | None) -> str:
-    """A share, to a tenth of a percent."""
-    return NOTHING if share is None else f"{100 * share:.1f} %"

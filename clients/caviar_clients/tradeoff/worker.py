@@ -20,14 +20,14 @@ from typing import Any
 
 from msgspec.structs import replace
 
+from caviar_clients.tradeoff.errors import Key, Noise, UserChannel, user_channels
 from caviar_clients.tradeoff.ladder import SCATTERING, Setting
 from caviar_clients.tradeoff.scenes import Instant, Scenes
-from caviar_clients.tradeoff.users import Key, Noise, UserChannel, user_channels
 from caviar_protocol.errors import CaviarError, RunError, ScenarioError
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.scenario.conversion import convert_settings
 from caviar_protocol.space.scene import antennas
-from caviar_protocol.topics import AntennaArray, AntennaDevice, Channel, Scene
+from caviar_protocol.topics import AntennaDevice, Channel, Scene
 from caviar_services.registry import load
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 
@@ -50,9 +50,16 @@ def is_known(setting: Setting, scenes: Scenes) -> bool:
 
 
 class Rung:
-    """A channel model with one setting, ready to be timed.
+    """A channel model with one setting, loaded and warmed up in this process.
 
-    Raises `CaviarError` where the setting is unknown to the model or it cannot be loaded.
+    Args:
+        setting: Model and settings.
+        scenes: The first of them warms the model up.
+        receivers: Receivers of a scene at most; None: all.
+        products: Whether samples hold the channels themselves.
+
+    Raises:
+        CaviarError: The setting is unknown to the model, or the model cannot be loaded.
     """
 
     def __init__(
@@ -60,11 +67,10 @@ class Rung:
         setting: Setting,
         scenes: Scenes,
         receivers: int | None,
-        noise: Noise,
         products: bool = False,
     ) -> None:
         self.setting, self._products = setting, products
-        self._noise = noise
+        self._noise = Noise.of(scenes)
         limits = [n for n in (receivers, setting.most_receivers) if n is not None]
         self._receivers = min(limits, default=None)
         cls = load("channel", setting.use)
@@ -97,7 +103,7 @@ class Rung:
         )
 
     def sample(self, instant: Instant) -> Sample:
-        """The channels of a scene, timed: what a run waits for, H included."""
+        """Compute the channels of a scene and time that: what a run waits for, H included."""
         scene = seen(instant.scene, self._receivers, self.setting.elements)
         entry = GrantInput(topic="scene", source="recorded", status=Status.FRESH, frame=instant.frame)
         frame = Frame(
@@ -108,7 +114,7 @@ class Rung:
             service=SERVICE,
             seed=self._seed,
         )
-        # What was traced before is not to be taken again, where a scene is timed that warmed the model up.
+        # Else a scene that warmed the model up would be timed with paths that were traced before.
         self._model.reset(0, self._seed, 0)
         self._model.release_memory()
         before = reset_peak()
@@ -136,7 +142,13 @@ class Rung:
 
 
 def seen(scene: Scene, receivers: int | None, elements: tuple[int, int] | None) -> Scene:
-    """The scene with its first receivers alone, and with horizontal linear arrays of (Nt, Nr) elements."""
+    """Reduce a scene to what a setting sees of it.
+
+    Args:
+        scene: The whole scene.
+        receivers: Receivers that stay, the first ones; None: all.
+        elements: (Nt, Nr) of horizontal linear arrays in place of the scene's; None: those of the scene.
+    """
     if receivers is None and elements is None:
         return scene
     kept = {device.name for device in antennas(scene, "rx")[:receivers]}
@@ -147,19 +159,17 @@ def seen(scene: Scene, receivers: int | None, elements: tuple[int, int] | None) 
                 continue
             if elements is not None:
                 columns = elements[1] if device.role == "rx" else elements[0]
-                device = replace(device, array=_line(device.array, columns))
+                device = replace(device, array=replace(device.array, rows=1, columns=columns))
         devices.append(device)
     return replace(scene, devices=tuple(devices))
 
 
-def _line(array: AntennaArray, columns: int) -> AntennaArray:
-    return replace(array, rows=1, columns=columns)
-
-
 def scattering_materials(given: Mapping[str, Any], assets: Mapping[str, Path]) -> dict[str, Any]:
-    """Settings of materials in which something scatters.
+    """Make settings of materials in which something scatters.
 
-    The scenario's own where one of them does; else each material of the scenery gets `SCATTERING`.
+    Args:
+        given: The scenario's own, which stay where one of them scatters.
+        assets: Files of scenery, each of whose materials gets `SCATTERING` otherwise.
     """
     if any(entry.get("scattering_coefficient") for entry in given.values()):
         return dict(given)
@@ -170,23 +180,25 @@ def scattering_materials(given: Mapping[str, Any], assets: Mapping[str, Path]) -
 
 def _materials(file: Path) -> list[str]:
     """Names of the materials in a scenery file, as Sionna RT calls them."""
+    # Mitsuba keeps the prefix of Blender's exporter, Sionna RT drops it.
     found = re.findall(r"<bsdf\b[^>]*\bid=\"([^\"]+)\"", file.read_text())
     return [name.removeprefix("mat-") for name in found]
 
 
 def resident_mib() -> float | None:
-    """Resident memory of this process [MiB]; None where the system does not tell."""
+    """Return the resident memory of this process [MiB]; None where the system does not state it."""
     return _status("VmRSS")
 
 
 def peak_mib() -> float | None:
-    """Its highest value since `reset_peak`."""
+    """Return its highest value since `reset_peak` [MiB]."""
     return _status("VmHWM")
 
 
 def reset_peak() -> float | None:
-    """Start looking for the highest value anew; the present one. None where that cannot be done."""
+    """Forget the highest value and return the present one [MiB]; None where that cannot be done."""
     try:
+        # 5 resets the peak of the resident set, VmHWM (proc(5), since Linux 4.0).
         _CLEAR.write_text("5")
     except OSError:
         return None
@@ -202,6 +214,7 @@ def _status(name: str) -> float | None:
     return int(found[1]) * 1024 / MEBIBYTE if found else None
 
 
+# [s] for a process to end by itself, before it is killed.
 _GOODBYE_S = 2.0
 
 
@@ -211,7 +224,7 @@ class Sample:
 
     time_ms: float
     memory_mib: float | None
-    """Growth of the resident memory at its peak; None where the system does not tell."""
+    """Growth of the resident memory at its peak; None where the system does not state it."""
     rung: str
     """As the product says."""
     receivers: int
@@ -225,7 +238,7 @@ class Sample:
 
 @dataclass(frozen=True, kw_only=True)
 class Loaded:
-    """What loading took, the first scene included."""
+    """Cost of loading, the first scene included."""
 
     seconds: float
     memory_mib: float | None
@@ -234,11 +247,17 @@ class Loaded:
 
 
 class Worker:
-    """A model that is loaded, and asked for one scene after the other.
+    """A `Rung` in a process of its own.
 
-    With ``products`` samples hold the products too.
+    Args:
+        setting: Model and settings.
+        scenes: Scenes that it is asked for by index.
+        receivers: Receivers of a scene at most; None: all.
+        seconds: Time for loading [s].
+        products: Whether samples hold the channels themselves.
 
-    Raises `RunError` with the reason where it cannot be loaded, or not within ``seconds``.
+    Raises:
+        RunError: The model cannot be loaded, or not in time; the error says why.
     """
 
     def __init__(
@@ -246,7 +265,6 @@ class Worker:
         setting: Setting,
         scenes: Scenes,
         receivers: int | None,
-        noise: Noise,
         seconds: float,
         products: bool = False,
     ) -> None:
@@ -254,7 +272,7 @@ class Worker:
         self.setting = setting
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(
-            target=_serve, args=(theirs, setting, scenes, receivers, noise, products), daemon=True
+            target=_serve, args=(theirs, setting, scenes, receivers, products), daemon=True
         )
         self._process.start()
         theirs.close()
@@ -262,18 +280,26 @@ class Worker:
 
     @property
     def pid(self) -> int:
-        """Of its process, which may have ended."""
+        """Id of its process, which may have ended."""
         return self._process.pid or 0
 
     def step(self, index: int, seconds: float) -> Sample:
-        """The scene with this index. Raises `RunError` with the reason where it fails or takes too long."""
+        """Measure the scene with this index.
+
+        Args:
+            index: Index among the scenes' instants.
+            seconds: Time for it [s].
+
+        Raises:
+            RunError: It fails or takes too long; the process has ended then.
+        """
         with suppress(OSError):  # a process that died before is named by the read of its answer
             self._pipe.send(index)
         sample: Sample = self._answer(seconds)
         return sample
 
     def close(self) -> None:
-        """End the process; again: nothing."""
+        """End the process; does nothing where it has ended."""
         with suppress(OSError):
             self._pipe.send(None)
         self._pipe.close()
@@ -306,16 +332,13 @@ def _serve(
     setting: Setting,
     scenes: Scenes,
     receivers: int | None,
-    noise: Noise,
     products: bool,
 ) -> None:
-    """Load, then answer until told to end or left alone; a text is the reason of a failure."""
-    from caviar_clients.tradeoff.worker import Rung
-
+    """Load, then answer until the parent asks for the end or has gone; a text is the reason of a failure."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
     with suppress(EOFError, BrokenPipeError):
         try:
-            rung = Rung(setting, scenes, receivers, noise, products)
+            rung = Rung(setting, scenes, receivers, products)
             pipe.send(rung.loaded)
             while (index := pipe.recv()) is not None:
                 pipe.send(rung.sample(scenes.instants[index]))

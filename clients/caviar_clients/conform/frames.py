@@ -1,4 +1,7 @@
-"""Cases of frames and episodes: GRANT, DONE, and what lies between."""
+"""Cases of frames and episodes (GRANT, DONE and what lies between), and of the capability ``checkpoint``.
+
+With that capability a life's state is saved, and the next life takes it over (clause 18).
+"""
 
 from __future__ import annotations
 
@@ -6,12 +9,14 @@ from typing import TYPE_CHECKING
 
 from caviar_clients.conform import canonical, street
 from caviar_clients.conform.case import Failed, NotApplicable, case
-from caviar_clients.conform.joining import BEATS, _check_beats
+from caviar_clients.conform.client import End
+from caviar_clients.conform.lifecycle import BEATS, check_beats
 from caviar_clients.conform.session import ACTIVE, Answer, Session
 from caviar_clients.conform.street import HELD_FOR, Inputs
 
 if TYPE_CHECKING:
     from caviar_clients.conform.kit import Kit
+
 
 FRAMES = 4
 
@@ -49,6 +54,7 @@ def repeated_grant(kit: Kit) -> str:
     return "the same bytes, of the newest frame and of the one before"
 
 
+# The GRANT of a frame that was answered before, as a broker that came back repeats it.
 def _again(session: Session, frame: int) -> tuple[dict[str, object], *tuple[bytes, ...]]:
     fields, parts = session.granting(frame, Inputs())
     if frame:
@@ -69,7 +75,7 @@ def heartbeats_in_frames(kit: Kit) -> str:
     for _ in range(BEATS):
         session.step()
         session.listen(period)
-    return _check_beats(session, since)
+    return check_beats(session, since)
 
 
 @case("cancel", "clause 7", "the DONE (or FAULT) that is due, and nothing for the CANCEL")
@@ -79,6 +85,7 @@ def cancel(kit: Kit) -> str:
     session.send("CANCEL", {**session.who, "episode": session.episode, "frame": 900})
     frame = session.grant()
     session.send("CANCEL", {**session.who, "episode": session.episode, "frame": frame})
+    # A client may take the advice and give the frame up, which FAULT says.
     answer = session.receive("DONE or FAULT")
     if answer.kind == "FAULT" and answer.fields.get("frame") == frame:
         session.frame += 1
@@ -120,11 +127,12 @@ def gap(kit: Kit) -> str:
     "ERROR unexpected or that frame's answer; then the next frame",
 )
 def reordered_grants(kit: Kit) -> str:
-    """A GRANT of a frame behind those that were answered harms nobody."""
+    """A GRANT of a frame behind those that were answered does no harm."""
     session = kit.at(ACTIVE)
     session.step()
     skipped = session.frame
     session.done(session.grant(skipped + 1))
+    # The late GRANT states the frame that was complete when a broker would have sent it.
     completed, session.completed = session.completed, skipped - 1
     session.grant(skipped)
     session.completed = completed
@@ -183,7 +191,7 @@ def unknown_fields(kit: Kit) -> str:
     return "DONE"
 
 
-@case("several-sources", "clause 3", "DONE, with inputs told apart by topic and source")
+@case("several-sources", "clause 3", "DONE, with inputs distinguished by topic and source")
 def several_sources(kit: Kit) -> str:
     """A topic may have several sources."""
     doubled = Inputs(sources=street.DOUBLED)
@@ -191,9 +199,7 @@ def several_sources(kit: Kit) -> str:
     topics = {item["topic"] for item in session.hello.get("inputs", [])}
     if not topics & {"scene", "action", "*"}:
         raise NotApplicable("none of its inputs has more than one source")
-    session.welcome()
-    session.prepare(inputs=doubled)
-    session.reset(0)
+    session.begin_episode(doubled)
     for _ in range(2):
         session.step(doubled)
     kit.discard()
@@ -233,7 +239,8 @@ def episodes(kit: Kit) -> str:
     if "episodes" not in session.hello.get("capabilities", []):
         raise NotApplicable("it did not name the capability `episodes`")
     played = []
-    if session.completed < 0:  # in a life of its own: RESET comes behind EPISODE_END, and that behind a frame
+    # In a life of its own there was no frame yet: RESET comes behind EPISODE_END, and that behind a frame.
+    if session.completed < 0:
         session.step()
     for _ in range(2):
         _end_episode(session)
@@ -247,7 +254,7 @@ def episodes(kit: Kit) -> str:
     return "two more episodes, equal byte by byte"
 
 
-CASES = (
+FRAMES_AND_EPISODES = (
     frames,
     repeated_grant,
     heartbeats_in_frames,
@@ -263,3 +270,93 @@ CASES = (
 )
 AFTERWARDS = (final_grant, several_sources)
 """Those that end a life."""
+
+
+BEFORE, AFTER = 3, 3
+"""Frames before the state is saved, and frames that are answered again behind it."""
+# Begins with the one byte that MessagePack never uses, so that no client reads it as a state.
+NO_STATE = b"\xc1no state of any service"
+
+
+@case("checkpoint", "clause 18", "CHECKPOINT_DONE of that frame, with the state in one part; the next frame")
+def checkpoint(kit: Kit) -> str:
+    """CHECKPOINT is answered with the client's state."""
+    session = _with_capability(kit)
+    session.step()
+    # Twice, since saving must not change the state. Equal bytes are not asked for: a state may hold a clock.
+    state = _saved(session)
+    again = _saved(session)
+    session.step()
+    return (
+        f"{len(state)} B of state, twice"
+        if state == again
+        else f"{len(state)} B of state, then {len(again)} B"
+    )
+
+
+@case(
+    "restore", "clauses 18, 19, 20", "READY, then the same products for the grants of before; the next frame"
+)
+def restore(kit: Kit) -> str:
+    """A client that comes back takes its state over, and repeats what it did since."""
+    _with_capability(kit)
+    session = kit.fresh()
+    session.begin_episode()
+    for _ in range(BEFORE):
+        session.step()
+    state, saved = _saved(session), session.completed
+    before = [_products(session, session.step()) for _ in range(AFTER)]
+    session = kit.fresh()
+    session.begin_episode()
+    _restore(session, state, saved)
+    for number, products in enumerate(before, start=saved + 1):
+        if _products(session, session.step()) != products:
+            raise Failed("the products of before, byte by byte", f"others in frame {number}")
+    session.step()
+    return f"the same products in {AFTER} frames behind the state of frame {saved}"
+
+
+@case("wrong-state", "clause 18; Wrong things", "FAULT, or an end with a status other than 0")
+def wrong_state(kit: Kit) -> str:
+    """A state that is none is refused."""
+    _with_capability(kit)
+    expected = "FAULT, or an end with a status other than 0"
+    session = kit.fresh()
+    session.begin_episode()
+    session.send("RESTORE", {**session.who, "episode": session.episode, "frame": 0}, NO_STATE)
+    got = session.reaction(expected)
+    kit.discard()
+    if isinstance(got, End):
+        return got.check_failure(expected)
+    if got.kind != "FAULT":
+        raise Failed(expected, str(got))
+    return f"FAULT: {got.fields['message'][:100]}"
+
+
+def _with_capability(kit: Kit) -> Session:
+    session = kit.at(ACTIVE)
+    if "checkpoint" not in session.hello.get("capabilities", []):
+        raise NotApplicable("it did not name the capability `checkpoint`")
+    return session
+
+
+def _saved(session: Session) -> bytes:
+    """Have the client save its state after the frame completed last."""
+    frame = session.completed
+    session.send("CHECKPOINT", {**session.who, "episode": session.episode, "frame": frame})
+    answer = session.expect("CHECKPOINT_DONE")
+    session.check_frame(answer, frame)
+    return answer.parts[1]
+
+
+def _restore(session: Session, state: bytes, frame: int) -> None:
+    session.send("RESTORE", {**session.who, "episode": session.episode, "frame": frame}, state)
+    session.expect("READY", "READY, in answer to RESTORE")
+    session.completed, session.frame = frame, frame + 1
+
+
+def _products(session: Session, answer: Answer) -> dict[str, bytes]:
+    return canonical.check_products(answer.fields, answer.parts, session.hello.get("outputs", []))
+
+
+CHECKPOINTS = (checkpoint, restore, wrong_state)

@@ -1,20 +1,27 @@
-"""Cases up to frame 0: HELLO, heartbeats, scenery, RESET."""
+"""Cases of joining and leaving: HELLO, heartbeats, scenery, RESET; SHUTDOWN, refusals, a silent broker.
+
+A case is a script that plays the broker. What it returns is shown as «got»; the first line of its docstring
+is the title that ``caviar conform --list`` prints.
+"""
 
 from __future__ import annotations
 
 import hashlib
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from caviar_clients.conform.case import Failed, NotApplicable, case
-from caviar_clients.conform.session import ACTIVE, ATTEMPT, CONNECTING, EPOCH, JOINED, READY, Session
-from caviar_clients.conform.wire import Fields
+from caviar_clients.conform.client import End, Fields
+from caviar_clients.conform.session import ACTIVE, ATTEMPT, CONNECTING, EPOCH, JOINED, READY, Answer, Session
 from caviar_protocol.topics import PAYLOADS
 
 if TYPE_CHECKING:
     from caviar_clients.conform.kit import Kit
 
+
 BEATS = 10
-"""Heartbeats that are due while they are counted; a third of them has to come on a busy machine."""
+"""Heartbeats that are due while they are counted."""
+# A third of them: a client, and the kit itself, lose time slices on a machine with more processes than cores.
+FEWEST_BEATS = BEATS // 3
 
 
 @case("hello", "clauses 1, 3; Versions", "HELLO of version 1.x, with a role, and topics that exist")
@@ -62,7 +69,7 @@ def attach(kit: Kit) -> str:
 
 
 def attached_heart(session: Session) -> Fields:
-    """ATTACH of this life, waited for; `Failed` where none comes."""
+    """Wait for ATTACH of this life and return its fields; raises `Failed` where none comes."""
     for _ in range(round(session.rules.timeout_s / 0.05)):
         if session.pulse.attached:
             return session.pulse.attached[0]
@@ -85,14 +92,15 @@ def heartbeats(kit: Kit) -> str:
     session.listen(BEATS / 2 * session.heartbeat_s)
     session.beat_back("HEARTBEAT_ACK", {"sequence": 0})
     session.listen(BEATS / 2 * session.heartbeat_s)
-    return _check_beats(session, 0)
+    return check_beats(session, 0)
 
 
-def _check_beats(session: Session, since: int) -> str:
-    beats = [fields for _, fields in session.pulse.beats]
+def check_beats(session: Session, since: int) -> str:
+    """Check all HEARTBEATs of a life, and that enough of them came behind the first ``since``."""
+    beats = session.pulse.beats
     if session.pulse.wrong:
         raise Failed("ATTACH, then only HEARTBEAT on the heartbeat connection", session.pulse.wrong[0])
-    if len(beats) - since < BEATS // 3:
+    if len(beats) - since < FEWEST_BEATS:
         raise Failed(
             f"about {BEATS} HEARTBEATs in {BEATS * session.heartbeat_s:g} s", f"{len(beats) - since}"
         )
@@ -113,6 +121,7 @@ def ready(kit: Kit) -> str:
     session = kit.at(READY)
     said, role = session.ready, session.hello["role"]
     geometry = said.get("geometry", "")
+    # Clause 4: the geometry is the digest of all names and digests, so that two services agree on every file.
     chain = "".join(
         f"{asset['name']}\0{asset['digest']}\0"
         for asset in sorted(session.assets, key=lambda asset: str(asset["name"]).encode())
@@ -144,15 +153,14 @@ def scenery(kit: Kit) -> str:
         raise NotApplicable("it uses no scenery")
     for asset in session.assets:
         if asset["size"] and asset["digest"] not in session.fetched:
-            raise Failed(f"ASSET_GET of {asset['name']}, which nobody can have", "READY without it")
+            # The kit marks its files anew in each run, so that no cache has them.
+            raise Failed(f"ASSET_GET of {asset['name']}, which no cache has", "READY without it")
     return f"{len(session.assets)} files, {sum(session.fetched.values())} B in pieces"
 
 
 def _world_scenery(session: Session) -> str:
     session.send("ASSET_GET", {"digest": "0" * 64})
-    answer = session.receive("ERROR unknown-asset")
-    if (answer.kind, answer.fields.get("code")) != ("ERROR", "unknown-asset"):
-        raise Failed("ERROR unknown-asset for a digest that it did not offer", str(answer))
+    session.expect_error("unknown-asset", "ERROR unknown-asset for a digest that it did not offer")
     if not session.offered:
         return "offers none, and says so when asked"
     name, data = max(session.offered.items(), key=lambda item: len(item[1]))
@@ -177,9 +185,7 @@ def early_grant(kit: Kit) -> str:
     session = kit.at(READY)
     session.episode = 0
     session.grant(0)
-    answer = session.receive("ERROR unexpected")
-    if (answer.kind, answer.fields.get("code")) != ("ERROR", "unexpected"):
-        raise Failed("ERROR unexpected", str(answer))
+    session.expect_error("unexpected")
     session.reset(0)
     return "ERROR unexpected, then RESET_DONE"
 
@@ -190,4 +196,140 @@ def reset(kit: Kit) -> str:
     return f"RESET_DONE of episode {kit.at(ACTIVE).episode}"
 
 
-CASES = (hello, attach, heartbeats, ready, scenery, early_grant, reset)
+JOINING = (hello, attach, heartbeats, ready, scenery, early_grant, reset)
+
+
+SILENCE_S = 0.5
+"""[s] of liveness where the broker falls silent."""
+TOLERANCE_S = 2.0
+"""[s] that an end may take beyond that: interpreters with many libraries take long to end."""
+SIGTERM_S = 2.0
+"""[s] that a service has after SIGTERM (SPEC.md, «Connections and states»)."""
+
+
+def _bye(session: Session, seconds: float) -> None:
+    """BYE comes, and nothing after it."""
+    while (answer := session.receive("BYE", seconds)).kind != "BYE":
+        # The answer to a frame that was granted before may be on its way.
+        if answer.kind not in ("DONE", "FAULT"):
+            raise Failed("BYE", str(answer))
+    session.check_identity(answer)
+
+
+def _gone(session: Session, seconds: float, expected: str) -> End:
+    end = session.ended(seconds, expected)
+    rest = session.poll(0.0)
+    if isinstance(rest, Answer):
+        raise Failed("nothing after BYE", str(rest))
+    return end
+
+
+def _leaves(session: Session) -> str:
+    grace_s = session.rules.timeout_s
+    session.send("SHUTDOWN", {"reason": "the case ends here", "grace_ns": round(grace_s * 1e9)})
+    _bye(session, grace_s)
+    end = _gone(session, grace_s, "its end within the grace of SHUTDOWN")
+    if end.status not in (0, None):
+        raise Failed("status 0", str(end))
+    return f"BYE, {end}"
+
+
+@case("shutdown", "Connections and states", "BYE within grace_ns, nothing after it, status 0")
+def shutdown(kit: Kit) -> str:
+    """SHUTDOWN is answered with BYE, and the process ends with status 0."""
+    return _leaves(kit.at(ACTIVE))
+
+
+@case("early-shutdown", "Connections and states", "BYE within grace_ns, status 0")
+def early_shutdown(kit: Kit) -> str:
+    """SHUTDOWN may come right after WELCOME."""
+    session = kit.fresh()
+    session.welcome()
+    return _leaves(session)
+
+
+@case("sigterm", "Connections and states", f"BYE, and an end within {SIGTERM_S:g} s")
+def sigterm(kit: Kit) -> str:
+    """SIGTERM makes a service say BYE and end."""
+    session = kit.at(ACTIVE)
+    session.step()
+    if not session.client.terminate():
+        raise NotApplicable("the kit did not start the client")
+    _bye(session, SIGTERM_S)
+    end = _gone(session, SIGTERM_S, f"its end within {SIGTERM_S:g} s of SIGTERM")
+    return f"BYE, {end}"
+
+
+@case("silence", "clause 15", "an end with a status other than 0, after liveness_ns and not before")
+def silence(kit: Kit) -> str:
+    """A client whose broker is silent ends by itself."""
+    session = kit.fresh()
+    # Twice the liveness with answers comes first: a client that counts from its start would pass otherwise.
+    session.welcome(heartbeat_s=SILENCE_S / 10, liveness_s=SILENCE_S)
+    session.prepare()
+    session.listen(2 * SILENCE_S)
+    early = session.client.ended()
+    if early is not None:
+        raise Failed("a client that stays while it is answered", str(early))
+    session.silent = True
+    end = session.ended(SILENCE_S + TOLERANCE_S, f"its end after {SILENCE_S:g} s of silence")
+    return end.check_failure("a status other than 0")
+
+
+@case("other-major", "Versions", "an end with a status other than 0")
+def other_major(kit: Kit) -> str:
+    """WELCOME of another major version, of which only type and version can be read, is the end."""
+    session = kit.fresh()
+    session.send("WELCOME", {"version": [2, 0], "era": "a later one"})
+    end = session.ended(session.rules.timeout_s, "an end with a status other than 0")
+    return end.check_failure("a status other than 0")
+
+
+@case("refused", "Wrong things and their answers", "the message of REFUSE printed, and a status other than 0")
+def refused(kit: Kit) -> str:
+    """REFUSE is printed and is the end."""
+    message = "another one of that name is here"
+    session = kit.fresh()
+    session.send("REFUSE", {"code": "name-taken", "message": message})
+    end = session.ended(session.rules.timeout_s, "an end with a status other than 0")
+    end.check_failure("a status other than 0")
+    if end.status is not None and message not in end.output:
+        raise Failed(f"{message!r} printed", str(end))
+    return str(end)
+
+
+@case("later-minor", "Versions", "a life as with the version that it knows")
+def later_minor(kit: Kit) -> str:
+    """A later minor version is accepted, and fields that are not known are ignored."""
+    session = kit.fresh()
+    strange: dict[str, Any] = {"colour": {"of": [1, 2.5, "a later version"]}}
+    session.welcome(version=[1, 99], **strange)
+    session.begin_episode(**strange)
+    session.step(None, **strange)
+    kit.discard()
+    return "ATTACH, READY, RESET_DONE, DONE"
+
+
+@case("no-demand", "clause 5", "READY all the same, and BYE after SHUTDOWN")
+def no_demand(kit: Kit) -> str:
+    """A service without a consumer is prepared, and neither reset nor granted."""
+    session = kit.fresh()
+    if session.hello["role"] in ("agent", "recorder") or not session.hello.get("outputs"):
+        raise NotApplicable("it is there for its own sake")
+    session.welcome()
+    session.prepare(demand=False)
+    return _leaves(session)
+
+
+@case("canonical", "Canonical form; clause 20", "headers in canonical form, in every message")
+def canonical(kit: Kit) -> str:
+    """Every header that came was in canonical form."""
+    # Last of all cases: it judges what came in the others, and none of them fails for form alone.
+    if not kit.seen.headers:
+        raise NotApplicable("no message came")
+    if kit.seen.odd:
+        raise Failed("headers in canonical form", "; ".join(kit.seen.odd[:3]))
+    return "all of them"
+
+
+LEAVING = (shutdown, early_shutdown, sigterm, silence, other_major, refused, later_minor, no_demand)
