@@ -1,7 +1,8 @@
 """Enumerated candidates beside launched ones: how near both come to all paths there are, and their times.
 
-    python tests/bench/bench_enumerated.py [--scene street-canyon|uav|munich|crowd] [--frames N] [--rays N]
-        [--launches N] [--own-rays N] [--own-launches N] [--json FILE]
+    python tests/bench/bench_enumerated.py [--frequency HZ] [--frames N] [--rays N] [--launches N]
+        [--scene street-canyon|uav|munich|crowd|static-canyon|static-munich]
+        [--own-rays N] [--own-launches N] [--json FILE]
 
 The reference is the union of ``--launches`` launches of ``--rays`` rays by Sionna RT's own solver and of
 ``--own-launches`` of ``--own-rays`` by this project (`path_reference`). Each path that the reference lacks,
@@ -9,8 +10,9 @@ and each that a channel lacks, is held against every triangle of the scene in fl
 ``real``, ``wrong``, or at a ``border``, none by less than 1 mm. ``missing_real_db`` is the strongest real
 path that the reference has and a channel has not, relative to all paths of its receiver; ``extra_real``
 counts real paths that the reference has not. The figures that begin with ``all`` are against real paths
-alone: those of the reference, and those that it lacks. A real path of more than 1 % of a receiver's power
-that one of two neighbouring frames lacks ``blinks``.
+alone: those of the reference, and those that it lacks; those that begin with ``common`` are over the paths
+that both have, so that fields are compared and not what was found. A real path of more than 1 % of a
+receiver's power that one of two neighbouring frames lacks ``blinks``.
 
 The two ways take turns frame by frame, and of each frame the shortest time counts. With rays a frame takes a
 minute, and Sionna RT's launches some GB for each million of rays.
@@ -39,7 +41,7 @@ from path_reference import Path as Ray
 
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.scenario import DeviceSpec
-from caviar_protocol.space.scene import antennas
+from caviar_protocol.space.scene import antennas, device_pose
 from caviar_protocol.topics import Carrier, Channel, Scene
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.sionna.settings import SionnaSettings
@@ -125,6 +127,42 @@ def _crowded(scene: Scene, frame: int) -> Scene:
     )
 
 
+def static_canyon(frames: int) -> Case:
+    """The street canyon without a body, its receivers where the vehicles carry them."""
+    return _emptied(street_canyon(frames))
+
+
+def static_munich(frames: int) -> Case:
+    """The same of Munich."""
+    return _emptied(munich(frames))
+
+
+def _emptied(case: Case) -> Case:
+    nothing = {"bodies": 0} if "bodies" in case.settings else {"pool": {}}
+    return replace(case, settings=case.settings | nothing, scenes=tuple(map(_without_bodies, case.scenes)))
+
+
+def _without_bodies(scene: Scene) -> Scene:
+    devices = []
+    for device in (*antennas(scene, "tx"), *antennas(scene, "rx")):
+        pose = device_pose(scene, device)
+        devices.append(
+            msgspec.structs.replace(
+                device, parent="", position=tuple(pose.position), orientation=tuple(pose.orientation)
+            )
+        )
+    return Scene(
+        names=(),
+        classes=(),
+        assets=(),
+        position=np.zeros((0, 3)),
+        orientation=np.zeros((0, 4)),
+        velocity=np.zeros((0, 3)),
+        dimensions=np.zeros((0, 3)),
+        devices=tuple(devices),
+    )
+
+
 def munich(frames: int) -> Case:
     """A street of Munich with 36 cars, ten of which carry receivers."""
     folder = Path("runs") / "bench-munich"
@@ -142,7 +180,14 @@ def munich(frames: int) -> Case:
     return Case(run, Preparation(demand={}, assets=assets), {"max_depth": 3, "bodies": 36}, scenes)
 
 
-CASES = {"street-canyon": street_canyon, "uav": uav, "munich": munich, "crowd": crowd}
+CASES = {
+    "street-canyon": street_canyon,
+    "uav": uav,
+    "munich": munich,
+    "crowd": crowd,
+    "static-canyon": static_canyon,
+    "static-munich": static_munich,
+}
 
 
 class Model:
@@ -194,6 +239,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--scene", choices=sorted(CASES), nargs="+", default=["street-canyon"])
     parser.add_argument("--frames", type=int, default=20)
+    parser.add_argument("--frequency", type=float, help="of the carrier [Hz], if not the scene's own")
     parser.add_argument(
         "--rays", type=int, default=10_000_000, help="of Sionna RT's launches; 0: times alone"
     )
@@ -206,11 +252,21 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     parser.add_argument("--markdown", type=Path, help="write the table of the documentation there")
     args = parser.parse_args()
-    figures = {name: measured(CASES[name](args.frames), args) for name in args.scene}
+    figures = {name: measured(at_frequency(CASES[name](args.frames), args), args) for name in args.scene}
     if args.json:
         args.json.write_text(json.dumps(figures, indent=1))
     if args.markdown:
         args.markdown.write_text(markdown(figures))
+
+
+def at_frequency(case: Case, args: argparse.Namespace) -> Case:
+    """The case with the carrier that was asked for."""
+    if args.frequency is None:
+        return case
+    carriers = tuple(
+        msgspec.structs.replace(carrier, frequency_hz=args.frequency) for carrier in case.run.carriers
+    )
+    return replace(case, run=replace(case.run, carriers=carriers))
 
 
 def measured(case: Case, args: argparse.Namespace) -> dict[str, dict[str, float]]:

@@ -14,6 +14,8 @@ from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import Scene
 from caviar_services.channel.sionna.scene import SionnaScene
 
+FIGURES = ("error", "gain", "beam")
+
 
 def compared(
     found: list[list[Ray]], reference: list[list[Ray]], check: PathCheck, notes: list[str]
@@ -49,7 +51,9 @@ def compared(
         real = [path for path, verdict in judged if verdict.word == "real"]
         unreal = [path for path, verdict in lost if verdict.word != "real"]
         whole = against(paths, [*absent(known, unreal), *real])
-        rows.append(row | {f"all_{name}": whole[name] for name in ("error", "gain", "beam")})
+        common = against(absent(paths, extra), absent(known, missing))
+        row |= {f"all_{name}": whole[name] for name in FIGURES}
+        rows.append(row | {f"common_{name}": common[name] for name in FIGURES})
     return rows
 
 
@@ -77,7 +81,7 @@ def described(rows: list[dict[str, float]]) -> dict[str, float]:
     """Figures of many receivers."""
     columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     told: dict[str, float] = {"receivers": len(rows)}
-    for kind in ("", "all_"):
+    for kind in ("", "all_", "common_"):
         error = columns[f"{kind}error"]
         told |= {
             f"{kind}nmse_db": _db(error.mean()),
