@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scenarios_support import SCENARIOS
 
-from caviar_clients.cli.recording_summary import Decided, summarise
+from caviar_clients.cli.summary import Decided, summarise
 from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.messages import GrantInput, Status

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from scenarios_support import SCENARIOS, caviar, pid_of, running, scenario_file
 
-from caviar_clients.envs.beam_selection import BeamSelectionEnv
+from caviar_clients.envs.base import BeamSelectionEnv
 from caviar_clients.envs.uav_path import UavPathEnv
 from caviar_clients.envs.uav_path_v1 import UavPathV1Env
 from caviar_clients.session.connected import ConnectedSession

@@ -11,8 +11,8 @@ import pytest
 from rich.console import Console
 from scenarios_support import SCENARIOS, caviar, run, scenario_file
 
-from caviar_clients.cli import scenarios, tradeoff
-from caviar_clients.cli.tradeoff import trade
+from caviar_clients.cli import measure, shared
+from caviar_clients.cli.measure import trade
 from caviar_clients.tradeoff import ladder
 from caviar_clients.tradeoff.ladder import Setting
 from caviar_clients.tradeoff.report import Options
@@ -155,7 +155,7 @@ def test_a_file_that_cannot_be_written_is_refused_at_once(tmp_path: Path) -> Non
 def test_all_extras_that_lack_are_named_at_once_and_nothing_is_left(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (scenarios, tradeoff):
+    for module in (measure, shared):
         monkeypatch.setattr(module, "has_extra", lambda _: False)
     with pytest.raises(
         SetupError, match=r"\(channel, plot, world\); run:.*'caviar-sim\[channel,plot,world\]'"
@@ -170,8 +170,8 @@ def test_a_comparison_that_fails_leaves_no_empty_files(
     def fails(*_: object) -> None:
         raise RunError("the worlds fail")
 
-    monkeypatch.setattr(tradeoff, "scenes_of", fails)
-    monkeypatch.setattr(tradeoff, "has_extra", lambda _: True)
+    monkeypatch.setattr("caviar_clients.tradeoff.scenes.scenes_of", fails)
+    monkeypatch.setattr(measure, "has_extra", lambda _: True)
     json_file, kept = tmp_path / "new" / "t.json", tmp_path / "trade" / "kept"
     kept.parent.mkdir()
     kept.touch()

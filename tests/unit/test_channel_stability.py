@@ -9,7 +9,6 @@ import msgspec
 import pytest
 from typer.testing import CliRunner
 
-from caviar_clients.cli import stability as cli_stability
 from caviar_clients.cli.main import app
 from caviar_protocol.errors import AssetError, PayloadError
 from caviar_services.channel.stability import case as cases_module
@@ -137,7 +136,7 @@ class TestCommand:
     def test_status_1_where_no_case_ran(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(cases_module, "has_extra", lambda _: False)
         only = [case for case in cases() if case.traced][:1]
-        monkeypatch.setattr(cli_stability, "cases", lambda: only)
+        monkeypatch.setattr(cases_module, "cases", lambda: only)
         assert CliRunner().invoke(app, ["stability"]).exit_code == 1
 
     def test_an_unknown_group_is_named(self) -> None:
@@ -148,7 +147,7 @@ class TestCommand:
     def test_a_file_that_cannot_be_written_is_named_before_the_first_case(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, option: str
     ) -> None:
-        monkeypatch.setattr(cli_stability, "run", lambda *_: pytest.fail("a case was run"))
+        monkeypatch.setattr(cases_module, "run", lambda *_: pytest.fail("a case was run"))
         with pytest.raises(Exception, match=r"cannot write .*Is a directory"):
             self.ask("--group", "speed", option, str(tmp_path))
 

@@ -8,9 +8,9 @@ import sys
 import pytest
 from recording_builders import absent, frame, link, product, record, recorder, scene
 
-from caviar_clients.cli.inspect import inspect_command
 from caviar_clients.cli.main import main
-from caviar_clients.cli.recording_summary import summarise
+from caviar_clients.cli.recordings import inspect_command
+from caviar_clients.cli.summary import summarise
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import Recording
 from caviar_protocol.recording.segment import Segment

@@ -15,8 +15,7 @@ import msgspec
 import pytest
 
 from caviar_clients.cli import launch
-from caviar_clients.cli.children import TAIL, Child
-from caviar_clients.cli.launch import Launcher
+from caviar_clients.cli.launch import TAIL, Child, Launcher
 from caviar_protocol.errors import RunError
 from caviar_protocol.scenario import load_scenario
 

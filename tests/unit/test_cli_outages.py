@@ -6,11 +6,9 @@ from pathlib import Path
 
 from recording_builders import frame, frame_of, link, record, scene
 
-from caviar_clients.cli.recording_summary import (
+from caviar_clients.cli.summary import (
     SHOWN_INSIDE,
-    Dropped,
-    Outages,
-    Unmatched,
+    ReportTally,
     outage_lines,
     summarise,
 )
@@ -24,10 +22,10 @@ def channel(**counts: int) -> Report:
 
 
 def test_causes_are_summed_over_frames_and_the_most_frequent_stands_first() -> None:
-    outages = Outages()
-    outages.add([channel(no_path__blocked=1, too_close=7), Report(source="link", counts={"x": 9})])
-    outages.add([channel(no_path__blocked=1, no_path__out_of_range=3)])
-    found = outages.summary(users=5)
+    outages = ReportTally()
+    outages.add(0, [channel(no_path__blocked=1, too_close=7), Report(source="link", counts={"x": 9})])
+    outages.add(0, [channel(no_path__blocked=1, no_path__out_of_range=3)])
+    found = outages.outage(users=5)
     assert found is not None
     assert list(found.causes.items()) == [("out of range", 3), ("blocked", 2)]
     assert found.unexplained == 0
@@ -35,19 +33,19 @@ def test_causes_are_summed_over_frames_and_the_most_frequent_stands_first() -> N
 
 
 def test_users_whose_channel_gave_no_cause_are_said_to_have_none() -> None:
-    outages = Outages()
-    outages.add([channel(no_path__blocked=2)])
-    found = outages.summary(users=6)
+    outages = ReportTally()
+    outages.add(0, [channel(no_path__blocked=2)])
+    found = outages.outage(users=6)
     assert found is not None
     assert outage_lines(found) == ["2 blocked, 4 for a cause that the channel did not report"]
 
 
 def test_what_stands_inside_of_what_is_named_and_the_list_is_bounded() -> None:
-    outages = Outages()
+    outages = ReportTally()
     names = [f"inside/car-{number}/rx in car-{number}" for number in range(SHOWN_INSIDE + 3)]
     for _ in range(2):
-        outages.add([Report(source="channel", counts=dict.fromkeys(names, 1))])
-    found = outages.summary(users=9)
+        outages.add(0, [Report(source="channel", counts=dict.fromkeys(names, 1))])
+    found = outages.outage(users=9)
     assert found is not None
     lines = outage_lines(found)
     assert lines[1] == "inside an object: car-0/rx in car-0, in 2 frames"
@@ -55,20 +53,20 @@ def test_what_stands_inside_of_what_is_named_and_the_list_is_bounded() -> None:
 
 
 def test_paths_that_were_dropped_are_warned_of() -> None:
-    dropped = Dropped()
+    dropped = ReportTally()
     for count in (0, 3, 4):
-        dropped.add([channel(dropped=count), Report(source="link", counts={"x": 9})])
+        dropped.add(0, [channel(dropped=count), Report(source="link", counts={"x": 9})])
     (warning,) = dropped.warnings()
     assert warning.startswith("channel dropped 7 paths with values that are not finite, in 2 frames: ")
-    assert Dropped().warnings() == []
+    assert ReportTally().warnings() == []
 
 
 def test_a_key_that_is_for_nothing_in_any_frame_is_warned_of() -> None:
-    unmatched = Unmatched()
+    unmatched = ReportTally()
     names = [{"unmatched/object_materials.sing": 1, "unmatched/object_materials.bus": 1},
              {"unmatched/object_materials.sing": 1}]  # fmt: skip
     for counts in names:
-        unmatched.add([Report(source="channel", counts=counts), Report(source="link")])
+        unmatched.add(0, [Report(source="channel", counts=counts), Report(source="link")])
     (warning,) = unmatched.warnings()
     assert warning.startswith("channel: object_materials.sing had no effect: no object, class or piece")
 
@@ -80,7 +78,7 @@ def test_a_recording_warns_of_paths_that_were_dropped(tmp_path: Path) -> None:
 
 
 def test_where_all_users_had_a_path_nothing_is_said() -> None:
-    assert Outages().summary(users=0) is None
+    assert ReportTally().outage(users=0) is None
 
 
 def test_a_recording_tells_snr_rate_and_users_without_a_path(tmp_path: Path) -> None:

@@ -12,8 +12,7 @@ from rich.console import Console
 
 from caviar_broker.journal_format import MAGIC
 from caviar_broker.run_record import RunRecord
-from caviar_clients.cli.inspect import inspect_command
-from caviar_clients.cli.rescue import rescue_run
+from caviar_clients.cli.recordings import inspect_command, rescue_run
 from caviar_protocol.errors import RunError
 from caviar_protocol.recording import Manifest, Recording, SegmentRecord
 from caviar_protocol.recording.segment import Segment

@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from caviar_clients.cli import scenarios
+from caviar_clients.cli import scenarios, shared
 from caviar_clients.cli.main import app
 from caviar_clients.session.checks import check_implementations, checked_scenario
 from caviar_clients.session.embedded import EmbeddedRun
@@ -76,7 +76,7 @@ def test_what_a_scenario_needs_follows_from_its_services(name: str, needed: tupl
 
 
 def test_a_run_without_its_extras_is_refused_with_one_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scenarios, "has_extra", lambda extra: extra == "world")
+    monkeypatch.setattr(shared, "has_extra", lambda extra: extra == "world")
     with pytest.raises(SetupError, match=re.escape("'caviar-sim[channel,sensors]'")):
         scenarios.require_extras(load_scenario("street-canyon"))
     scenarios.require_extras(load_scenario("smoke"))

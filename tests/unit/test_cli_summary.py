@@ -94,7 +94,7 @@ def test_a_full_disk_costs_the_summary_and_not_the_figures_on_the_screen(
     directory.mkdir()
     for name in ("events.jsonl", "summary.json"):
         (directory / name).symlink_to("/dev/full")
-    monkeypatch.setattr("caviar_clients.cli.run.run_directory", lambda root, name: directory)
+    monkeypatch.setattr("caviar_clients.cli.run.new_run_directory", lambda root, name: directory)
     with pytest.raises(
         RunError, match=r"cannot write .*summary\.json: No space left on device; free space there"
     ):

@@ -13,8 +13,7 @@ from recording_builders import record_run
 from rich.console import Console
 
 from caviar_clients.budget.forecast import forecast, rounded_up
-from caviar_clients.cli import budget as cli_budget
-from caviar_clients.cli.budget import budget_run, lines
+from caviar_clients.cli.measure import budget_run, forecast_lines
 from caviar_clients.replay.recorded import RecordedRun, Timing, measured_rate, outcomes_of, timings_of
 from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.messages import GrantInput, Status
@@ -78,7 +77,7 @@ def test_how_much_faster_a_service_has_to_be_for_real_time(smoke: RecordedRun) -
     assert found.bound.realtime_factor == pytest.approx(2.5, rel=1e-2)
     hopeless = forecast(timed(smoke, world=120, channel=250, link=3, agent=2, recorder=4))
     assert hopeless.bound.realtime_factor is None
-    assert "not enough" in " ".join(lines(hopeless))
+    assert "not enough" in " ".join(forecast_lines(hopeless))
 
 
 def test_policies_differ_where_a_frame_overruns_its_budget(smoke: RecordedRun) -> None:
@@ -178,7 +177,7 @@ def test_figures_are_written_as_json(smoke: RecordedRun, tmp_path: Path) -> None
 def test_a_file_that_cannot_be_written_is_named_before_anything_is_worked_out(
     smoke: RecordedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cli_budget, "forecast", lambda _: pytest.fail("worked out"))
+    monkeypatch.setattr("caviar_clients.budget.forecast.forecast", lambda _: pytest.fail("worked out"))
     with pytest.raises(RunError, match=r"cannot write .*: Is a directory; choose another file"):
         budget_run(smoke.recording.path, Console(), tmp_path)
 

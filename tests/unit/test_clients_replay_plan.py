@@ -9,10 +9,8 @@ import msgspec
 import pytest
 from recording_builders import record_run
 
-from caviar_clients.replay.plan import ReplayPlan, plan_replay
+from caviar_clients.replay.plan import ReplayPlan, plan_replay, request_of, scenario_text
 from caviar_clients.replay.recorded import RecordedRun
-from caviar_clients.replay.request import request_of
-from caviar_clients.replay.toml import scenario_text
 from caviar_protocol.errors import CaviarError, RecordingError, RunError
 from caviar_protocol.recording import Recording, RecordingWarning
 from caviar_protocol.scenario import Scenario, load_scenario, parse_scenario

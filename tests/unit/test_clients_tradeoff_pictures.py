@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from caviar_clients.cli.tradeoff import _other_reference
+from caviar_clients.cli.measure import _other_reference
 from caviar_clients.tradeoff.campaign import Skipped
 from caviar_clients.tradeoff.errors import Row, error_fields
 from caviar_clients.tradeoff.ladder import REFERENCES

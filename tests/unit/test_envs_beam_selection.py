@@ -16,7 +16,7 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
 import caviar_clients.envs  # noqa: F401  # registers the environments
-from caviar_clients.envs.beam_selection import BeamSelectionEnv
+from caviar_clients.envs.base import BeamSelectionEnv
 from caviar_protocol.errors import CaviarError, PayloadError, RunError, ScenarioError
 from caviar_protocol.recording import Recording
 from caviar_protocol.topics import Action, BeamChoice, Link

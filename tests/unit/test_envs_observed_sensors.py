@@ -18,7 +18,7 @@ from observation_builders import (
     scenario_of,
 )
 
-from caviar_clients.envs.beam_selection import BeamSelectionEnv
+from caviar_clients.envs.base import BeamSelectionEnv
 from caviar_clients.envs.observations import Users, part
 from caviar_protocol.errors import RunError, ScenarioError
 from caviar_protocol.scenario import DeviceSpec, Scenario

@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from caviar_clients.cli.run import run_scenario
-from caviar_clients.envs.beam_selection import BeamSelectionEnv
+from caviar_clients.envs.base import BeamSelectionEnv
 from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.plausibility import implausible_values
 from caviar_protocol.errors import ScenarioError

@@ -1,167 +1,26 @@
 """Frame rate that each late policy would sustain for a recorded run, and the service that bounds it.
 
-The product's own frame clock runs in virtual time between services that take as long as recorded.
+The broker's own frame clock runs in virtual time between services that take as long as recorded
+(`caviar_clients.session.virtual`).
 """
 
 from __future__ import annotations
 
-import heapq
-import itertools
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
 from typing import Annotated
 
 import msgspec
-from msgspec.structs import replace as replace_field
+from msgspec.structs import replace
 
-from caviar_broker.core import events as ev
-from caviar_broker.core.clock import FrameClock
-from caviar_broker.core.plan import RunPlan, ServicePlan, plan_run
-from caviar_broker.core.transitions import RunState
 from caviar_clients.replay.recorded import RecordedRun, Timing, measured_rate, timings_of
-from caviar_protocol import messages as m
+from caviar_clients.session.virtual import Played, VirtualRun, under_policy, virtual_plan
 from caviar_protocol.arrays import quantity
-from caviar_protocol.errors import RunError
 from caviar_protocol.messages import Hello, Policy
 
-NO_DIGEST = "0" * 64
-Takes = Callable[[str, int, int], int]
-"""``takes(service, episode, frame)``: how long a service takes [ns]."""
-
-
-@dataclass
-class Played:
-    """What became of a run in virtual time."""
-
-    finished_ns: list[int] = field(default_factory=list)
-    """When each frame was finished."""
-    misses: dict[str, int] = field(default_factory=dict)
-    substituted: dict[str, int] = field(default_factory=dict)
-    """Frames in which products of a service were held or absent."""
-
-    @property
-    def rate(self) -> float:
-        """Frames a second, behind the warm-up frames [1/s]; infinite where they take no time."""
-        first = min(10, len(self.finished_ns) // 10)
-        elapsed = self.finished_ns[-1] - self.finished_ns[first]
-        return (len(self.finished_ns) - 1 - first) / elapsed * 1e9 if elapsed else float("inf")
-
-
-class VirtualRun:
-    """One run of a plan, from HELLO to BYE; nothing is computed, and no time passes.
-
-    Args:
-        plan: The run.
-        hellos: What each service declares.
-        lengths: Frames of each episode, for agents to end it; of an episode not among these, those of the
-            plan.
-        takes: How long services take.
-    """
-
-    def __init__(
-        self, plan: RunPlan, hellos: Mapping[str, m.Hello], lengths: Mapping[int, int], takes: Takes
-    ) -> None:
-        self._plan, self._hellos, self._lengths, self._takes = plan, hellos, lengths, takes
-        self._now = 0
-        self._clock = FrameClock(plan, 0)
-        self._queue: list[tuple[int, int, ev.Event]] = []
-        self._ticket = itertools.count()
-        self._busy = dict.fromkeys(hellos, 0)
-        self._played = Played(misses=dict.fromkeys(hellos, 0), substituted=dict.fromkeys(hellos, 0))
-        self._error = ""
-
-    def run(self) -> Played:
-        """Play it to its end. `RunError` where the core ends it early."""
-        for hello in self._hellos.values():
-            self._feed(ev.Joined(hello))
-        while self._clock.state is not RunState.FINISHED:
-            deadline = self._clock.next_deadline()
-            event = self._queue[0][0] if self._queue else None
-            if event is not None and (deadline is None or event <= deadline):
-                self._now, _, what = heapq.heappop(self._queue)
-                self._feed(what)
-            elif deadline is not None:
-                self._now = max(self._now, deadline)
-                self._clock.expire(self._now)
-                self._perform()
-            else:
-                raise RunError("the run in virtual time stands still")
-        if self._error:
-            raise RunError(f"the run in virtual time ended early: {self._error}")
-        return self._played
-
-    def _feed(self, event: ev.Event) -> None:
-        self._clock.receive(event, self._now)
-        self._perform()
-
-    def _perform(self) -> None:
-        while actions := self._clock.actions():
-            for action in actions:
-                self._act(action)
-
-    def _act(self, action: ev.Action) -> None:
-        match action:
-            case ev.Send(service=name, message=message):
-                self._deliver(name, message)
-            case ev.Journal(number=number, outcome=outcome, service=name):
-                self._after(0, ev.Journaled(number))
-                if outcome in ("overdue", "skipped"):
-                    self._played.substituted[name] += 1
-            case ev.Latency(service=name, missed=missed):
-                self._played.misses[name] += missed
-            case ev.FrameFinished():
-                self._played.finished_ns.append(self._now)
-            case ev.Finished(error=error):
-                self._error = error
-            case ev.TurnAway(refusal=refusal):
-                raise RunError(f"the run in virtual time refuses {action.name!r}: {refusal.message}")
-            case _:
-                pass
-
-    def _deliver(self, name: str, message: m.Message) -> None:
-        epoch = self._plan.epoch
-        match message:
-            case m.Prepare():
-                self._after(0, ev.ReadyReceived(name, m.Ready(epoch=epoch, attempt=1)))
-            case m.Reset(episode=episode):
-                done = m.ResetDone(epoch=epoch, attempt=1, episode=episode)
-                self._after(0, ev.ResetDoneReceived(name, done))
-            case m.Grant():
-                self._granted(name, message)
-            case m.Shutdown():
-                self._after(0, ev.ByeReceived(name))
-            case _:
-                pass
-
-    def _granted(self, name: str, grant: m.Grant) -> None:
-        """A service does one thing after the other."""
-        takes = self._takes(name, grant.episode, grant.frame)
-        self._busy[name] = max(self._now, self._busy[name]) + takes
-        hello = self._hellos[name]
-        topics = () if grant.final else hello.outputs
-        last = self._lengths.get(grant.episode, self._plan.frames) - 1
-        done = m.Done(
-            epoch=grant.epoch,
-            attempt=grant.attempt,
-            episode=grant.episode,
-            frame=grant.frame,
-            products=tuple(m.ProductHeader(topic=topic, digest=NO_DIGEST) for topic in topics),
-            end_episode=hello.role == "agent" and grant.frame == last,
-        )
-        self._after(self._busy[name] - self._now, ev.DoneReceived(name, done, ((),) * len(topics)))
-
-    def _after(self, delay: int, event: ev.Event) -> None:
-        heapq.heappush(self._queue, (self._now + delay, next(self._ticket), event))
-
-
 POLICIES: tuple[Policy, ...] = ("wait", "hold", "drop")
-STRICT = ("world", "recorder")
-"""Roles for which there is no policy but to wait (clause 9)."""
 MARGIN = 0.2
 """Beyond the 99th percentile that a suggested budget leaves."""
-LONGEST = 1000
-"""Frames that are played at most."""
 TOLERANCE = 0.15
 """By which prediction and measurement may differ without a word."""
 FACTOR_STEPS = 12
@@ -266,24 +125,22 @@ class _Stage:
         self._run, self._timings = run, timings
         self._hellos = {name: self._served(name) for name in timings}
         self._lengths = run.lengths
-        self._plan = _plan(run, self._hellos)
+        self._plan = virtual_plan(run.scenario, self._hellos, run.lengths)
         self.frames = min(sum(run.lengths.values()), self._plan.frames * self._plan.episodes)
 
     def _served(self, name: str) -> Hello:
         """What it declares; parts are of no matter here, and grants queue as far as the scenario says."""
-        return replace_field(self._run.hellos[name], max_in_flight=64)
+        return replace(self._run.hellos[name], max_in_flight=64)
 
     def play(self, policy: Policy | None, factors: Mapping[str, float] | None = None) -> Played:
         """``policy``: of all services that may have it, or None for those of the scenario; ``factors``: by
         which a service's times are multiplied."""
         factors = factors or {}
-        services = tuple(_under(service, policy) for service in self._plan.services)
 
         def takes(name: str, episode: int, frame: int) -> int:
             return round(self._timings[name].at(episode, frame) * factors.get(name, 1.0))
 
-        plan = replace(self._plan, services=services)
-        return VirtualRun(plan, self._hellos, self._lengths, takes).run()
+        return VirtualRun(under_policy(self._plan, policy), self._hellos, self._lengths, takes).run()
 
     def factor(self, name: str, target: float, rate: float) -> float | None:
         """How many times as fast a service has to be for a frame rate; None: no factor suffices."""
@@ -301,15 +158,6 @@ class _Stage:
         return 1.0 / low if low else None
 
 
-def _under(service: ServicePlan, policy: Policy | None) -> ServicePlan:
-    """A service under a policy; only one that waits can have several grants."""
-    if policy is None:
-        return service
-    if service.role in STRICT or policy == "wait":
-        return replace(service, policy="wait")
-    return replace(service, policy=policy, max_in_flight=1)
-
-
 def _unexplained(run: RecordedRun, measured: float, predicted: float) -> list[str]:
     if (
         not measured
@@ -319,20 +167,6 @@ def _unexplained(run: RecordedRun, measured: float, predicted: float) -> list[st
         return []
     text = f"the recorded run had {measured:.1f} frames/s where its latencies lead to {predicted:.1f}"
     return [f"{text}: services did not overlap, as in one process, or what is between them took time too"]
-
-
-def _plan(run: RecordedRun, hellos: Mapping[str, Hello]) -> RunPlan:
-    """As the broker plans the scenario, at full speed, with its first frames where there are many."""
-    plan = plan_run(run.scenario, "virtual", {})
-    frames = min(max(run.lengths.values()), LONGEST)
-    return replace(
-        plan,
-        services=tuple(s for s in plan.services if s.name in hellos),
-        frames=frames,
-        episodes=max(1, min(len(run.lengths), LONGEST // frames)),
-        realtime=False,
-        limits=replace(plan.limits, stall=10**15, reset=10**15, ready=10**15),
-    )
 
 
 def _notes(run: RecordedRun, timings: Mapping[str, Timing], frames: int) -> list[str]:

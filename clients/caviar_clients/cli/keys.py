@@ -1,9 +1,13 @@
-"""`caviar keys`: making key pairs, and saying who may take part."""
+"""``caviar keys``: make key pairs and authorize them; the key that ``caviar run`` lends its processes."""
 
 from __future__ import annotations
 
 import hashlib
+import os
 import secrets
+import tempfile
+from collections.abc import Mapping
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, cast
 
@@ -143,3 +147,41 @@ def _add(directory: Path, entry: k.Authorization) -> None:
             )
     k.write_authorized(directory, [*entries, entry])
     typer.echo(f"{entry.name} may take part as {entry.role}")
+
+
+class BorrowedKey:
+    """The key pair of all services that a launcher starts, in a folder that only this user can read.
+
+    It is made when it is first needed, so that a run without keys has none, and removed by `close`.
+
+    Args:
+        keys: Keys directory of the broker; None: a run without keys.
+    """
+
+    def __init__(self, keys: Path | None) -> None:
+        self._keys = keys
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+
+    @cached_property
+    def _pair(self) -> tuple[str, Path]:
+        """The public key, and the file of the secret one."""
+        self._folder = tempfile.TemporaryDirectory(prefix="caviar-", ignore_cleanup_errors=True)
+        pair = k.Pair.new()
+        secret, _ = k.write_pair(Path(self._folder.name), "run", pair)
+        return pair.public, secret
+
+    def environment(self) -> Mapping[str, str]:
+        """Make the environment of a service that is started here."""
+        if self._keys is None:
+            return os.environ
+        broker = (self._keys / f"{k.BROKER}.pub").resolve()
+        return {**os.environ, k.KEY_VARIABLE: str(self._pair[1]), k.BROKER_KEY_VARIABLE: str(broker)}
+
+    def options(self) -> list[str]:
+        """Make the options of the broker's command line: its keys, and the lent key that it accepts."""
+        return [] if self._keys is None else ["--keys", str(self._keys), f"--local-key={self._pair[0]}"]
+
+    def close(self) -> None:
+        """Remove the key."""
+        if self._folder is not None:
+            self._folder.cleanup()

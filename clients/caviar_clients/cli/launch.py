@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import os
 import selectors
+import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from typing import Any
 import zmq
 
 from caviar_broker.supervision import describe_exit, describe_stop, is_stopped
-from caviar_clients.cli.children import BorrowedKey, Child, end, wait
+from caviar_clients.cli.keys import BorrowedKey
 from caviar_clients.session.checks import module_folders
 from caviar_protocol.errors import RunError
 from caviar_protocol.files import RunDirectory, file_system_of, open_to_append
@@ -37,6 +38,66 @@ ANY_PORT = "tcp://127.0.0.1:0"
 _TRACING_ROLES = ("channel", "sensors")
 LOOK_S = 0.05
 """[s] between looks at whether the broker's process is stopped; its death shows at once."""
+
+KILLED_S = 2.0
+"""[s] within which a process ends that is killed, unless it waits for a disk."""
+TAIL = 1 << 16
+"""[B] of a log that are looked at for its last line."""
+
+
+@dataclass
+class Child:
+    """The process of one service."""
+
+    name: str
+    process: subprocess.Popen[bytes]
+    log: Path
+    pidfd: int
+    """Readable once the process is dead."""
+
+    @classmethod
+    def start(cls, name: str, command: Sequence[str], log: Path, environment: Mapping[str, str]) -> Child:
+        """Start it; its log goes on where one before it ended."""
+        with open_to_append(log) as file:
+            process = subprocess.Popen(  # noqa: S603  # our own module with checked arguments
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=file,
+                start_new_session=True,
+                env=environment,
+            )
+        return cls(name, process, log, os.pidfd_open(process.pid))
+
+    def last_line(self) -> str:
+        """The last line it printed; empty if it printed nothing."""
+        with self.log.open("rb") as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL))
+            lines = file.read().decode(errors="replace").strip().splitlines()
+        return lines[-1] if lines else ""
+
+
+def end(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> list[int]:
+    """End all: SIGTERM, and after so long [s] SIGKILL; who waits for a disk and cannot be ended before."""
+    for process in processes:
+        if process.poll() is None:
+            process.send_signal(signal.SIGTERM)
+    wait(processes, seconds)
+    for process in processes:
+        if process.poll() is None:
+            process.kill()
+    wait(processes, KILLED_S)
+    return [process.pid for process in processes if process.poll() is None]
+
+
+def wait(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> None:
+    """Wait until all have ended, but no longer than that [s]."""
+    until = time.monotonic() + seconds
+    for process in processes:
+        try:
+            process.wait(max(0.0, until - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            continue
 
 
 @dataclass

@@ -6,15 +6,16 @@ import sys
 import warnings
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 from rich.console import Console
 from rich.text import Text
 
-from caviar_clients.cli import bench
 from caviar_clients.cli.keys import app as keys
-from caviar_clients.cli.scenarios import (
+from caviar_clients.cli.shared import (
+    Embedded,
+    FiguresFile,
     Force,
     Frames,
     Http,
@@ -23,9 +24,11 @@ from caviar_clients.cli.scenarios import (
     Restarted,
     Resume,
     RunDirectory,
+    RunsFolder,
     ScenarioOrNone,
+    ScenarioOrRun,
     Seed,
-    complete_scenario,
+    SummaryFile,
 )
 from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.host import DISTRIBUTION
@@ -38,14 +41,11 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
 )
-app.add_typer(bench.app, name="bench", rich_help_panel=MEASURE)
+bench = typer.Typer(no_args_is_help=True, help="Measure what the parts of a run cost on this machine.")
+app.add_typer(bench, name="bench", rich_help_panel=MEASURE)
 app.add_typer(keys, name="keys", rich_help_panel=OPERATE)
 _console = Console()
 _errors = Console(stderr=True)
-
-_WHAT_TO_RUN = (
-    "give a scenario, by its name (caviar scenarios) or a file, or --resume with the directory of a run"
-)
 
 
 def _show_version(wanted: bool) -> None:
@@ -64,9 +64,15 @@ def caviar(
     """Co-simulation of machine-learning-based 6G in virtual worlds."""
 
 
-def _nothing_else(*values: object) -> None:
-    if any(value is not None for value in values):
+def _started_anew(resume: Path | None, scenario: Path | None, *others: object) -> Path:
+    """The scenario of a run that is started anew; refuses what does not go together with ``--resume``."""
+    if resume is not None and any(value is not None for value in (scenario, *others)):
         raise RunError("a run goes on as it began: --resume takes no scenario, frames, seed or --embedded")
+    if resume is None and scenario is None:
+        raise RunError(
+            "give a scenario, by name (caviar scenarios) or file, or --resume with the directory of a run"
+        )
+    return scenario or Path()
 
 
 @app.command(rich_help_panel=RUN)
@@ -74,15 +80,13 @@ def run(
     scenario: ScenarioOrNone = None,
     frames: Frames = None,
     seed: Seed = None,
-    json: Annotated[Path | None, typer.Option(help="write the summary to this file too")] = None,
-    out: Annotated[Path, typer.Option(help="directory in which the run's own is made")] = Path("runs"),
+    json: SummaryFile = None,
+    out: RunsFolder = Path("runs"),
     bind: Annotated[
         str,
         typer.Option(help="address of the broker; port 0: any; default: a private socket, or any port"),
     ] = "",
-    embedded: Annotated[
-        bool, typer.Option("--embedded", help="all in this process, without sockets")
-    ] = False,
+    embedded: Embedded = False,
     pace: Pace = None,
     keys: Keys = None,
     http: Http = "",
@@ -92,14 +96,11 @@ def run(
     """Run a scenario: the broker and every service as processes of their own, or all in this one."""
     from caviar_clients.cli.run import resume_run, run_scenario
 
+    source = _started_anew(resume, scenario, frames, seed, embedded or None, pace)
     if resume is not None:
-        _nothing_else(scenario, frames, seed, embedded or None, pace)
-        raise typer.Exit(resume_run(resume, _console, json, bind, keys, http, force=force).status)
-    if scenario is None:
-        raise RunError(
-            "give a scenario, by name (caviar scenarios) or file, or --resume with the directory of a run"
-        )
-    ended = run_scenario(scenario, out, _console, frames, seed, json, bind, embedded, keys, http, pace)
+        ended = resume_run(resume, _console, json, bind, keys, http, force=force)
+    else:
+        ended = run_scenario(source, out, _console, frames, seed, json, bind, embedded, keys, http, pace)
     raise typer.Exit(ended.status)
 
 
@@ -148,7 +149,7 @@ def broker(
     ] = "",
     frames: Frames = None,
     seed: Seed = None,
-    out: Annotated[Path, typer.Option(help="directory in which the run's own is made")] = Path("runs"),
+    out: RunsFolder = Path("runs"),
     pace: Pace = None,
     keys: Keys = None,
     http: Http = "",
@@ -157,42 +158,14 @@ def broker(
     restarted: Restarted = False,
 ) -> None:
     """Run only the broker; start the services with `caviar service`, here or on other machines."""
-    from caviar_broker.launch import DEFAULT_BIND, parser, serve
-    from caviar_broker.security.access import check_bind
-    from caviar_clients.cli.remote import RunInProgress, service_commands
-    from caviar_clients.cli.run import run_directory
-    from caviar_clients.session.checks import checked_scenario
-    from caviar_clients.session.plausibility import implausible_values
+    from caviar_clients.cli.remote import resume_broker, serve_broker
 
+    source = _started_anew(resume, scenario, frames, seed, pace)
     options = ["--bind", bind] + (["--keys", str(keys)] if keys else []) + ["--restarted"] * restarted
-    options += ["--http", http] if http else []
-    options += ["--force"] if force else []
+    options += (["--http", http] if http else []) + ["--force"] * force
     if resume is not None:
-        _nothing_else(scenario, frames, seed, pace)
-        raise typer.Exit(serve(parser().parse_args(["--resume", str(resume), *options])))
-    if scenario is None:
-        raise RunError(
-            "give a scenario, by name (caviar scenarios) or file, or --resume with the directory of a run"
-        )
-    checked = checked_scenario(scenario, frames, seed, pace)
-    check_bind(bind or DEFAULT_BIND, keys=keys is not None)
-    current = RunInProgress(out, checked.run.name) if restarted else None
-    left = current.directory() if current else None
-    if current is not None and left is not None:
-        typer.echo(f"run {left}: its broker died, another one goes on with it")
-        resumed = parser().parse_args(["--resume", str(left), *options])
-        raise typer.Exit(current.serve(left, lambda: serve(resumed)))
-    directory = run_directory(out, checked.run.name)
-    for warning in implausible_values(checked):
-        typer.echo(f"warning: {warning}", err=True)
-    typer.echo(f"run {directory}; start its services; from elsewhere, with --broker and its address:")
-    for command in service_commands(checked.services, bind, keys):
-        typer.echo(f"  {command}")
-    options += [str(scenario), "--directory", str(directory)]
-    for name, value in (("--frames", frames), ("--seed", seed), ("--pace", pace)):
-        options += [] if value is None else [name, str(value)]
-    arguments = parser().parse_args(options)
-    raise typer.Exit(current.serve(directory, lambda: serve(arguments)) if current else serve(arguments))
+        raise typer.Exit(resume_broker(resume, options))
+    raise typer.Exit(serve_broker(source, out, frames, seed, pace, bind, keys, options))
 
 
 @app.command(rich_help_panel=RUN)
@@ -237,7 +210,7 @@ def doctor(
 ) -> None:
     """Check what this machine has, or say what of a damaged RUN can be read, and save that beside it."""
     if run is not None:
-        from caviar_clients.cli.rescue import rescue_run
+        from caviar_clients.cli.recordings import rescue_run
 
         raise typer.Exit(rescue_run(run, _console))
     from caviar_clients.cli import doctor as checks
@@ -255,9 +228,31 @@ def stability(
     traced: Annotated[bool, typer.Option(help="also the cases that need the ray tracer")] = True,
 ) -> None:
     """Ask the channel models at their extremes, and compare with formulas; status 1 where one is wrong."""
-    from caviar_clients.cli.stability import stability as ask
+    from caviar_clients.cli.measure import stability as ask
 
     raise typer.Exit(ask(_console, group or (), json, markdown, traced))
+
+
+@bench.callback()
+def _bench() -> None:
+    """Measure what the parts of a run cost on this machine."""
+
+
+@bench.command("broker")
+def bench_broker(
+    services: Annotated[int, typer.Option(min=2, max=256, help="services, each a process")] = 8,
+    payload: Annotated[int, typer.Option(min=1, max=1 << 28, help="bytes of a product")] = 100,
+    frames: Annotated[int, typer.Option(min=10, max=10_000_000, help="frames that are measured")] = 2000,
+    topology: Annotated[
+        Literal["hub", "all"], typer.Option(help="hub: one with all others; all: everyone with everyone")
+    ] = "hub",
+    curve: Annotated[bool, typer.Option("--curve", help="with keys, encrypted")] = False,
+    json: Annotated[Path | None, typer.Option(help="write the figures to this file")] = None,
+) -> None:
+    """A frame's way through the broker, with clients that do nothing but exchange products."""
+    from caviar_clients.cli.measure import measure_broker
+
+    measure_broker(_console, topology, services, payload, frames, curve, json)
 
 
 @app.command(rich_help_panel=OPERATE)
@@ -283,7 +278,7 @@ def conform(
     list_cases: Annotated[bool, typer.Option("--list", help="only list the cases")] = False,
 ) -> None:
     """Judge a client in any language against the protocol, clause by clause; status 1 where one fails."""
-    from caviar_clients.cli import conform as kit
+    from caviar_clients.cli import measure as kit
     from caviar_clients.conform.client import Rules
 
     if list_cases:
@@ -310,7 +305,7 @@ def inspect(
     json: Annotated[bool, typer.Option("--json", help="as JSON")] = False,
 ) -> None:
     """Say what a recording holds, or recompute its digest."""
-    from caviar_clients.cli.inspect import inspect_command
+    from caviar_clients.cli.recordings import inspect_command
 
     raise typer.Exit(inspect_command(run, digest, json))
 
@@ -335,14 +330,7 @@ def plot(
 
 @app.command("map", rich_help_panel=LOOK)
 def radio_map(
-    source: Annotated[
-        Path,
-        typer.Argument(
-            help="scenario, by name or file, or directory of a run that recorded `scene`",
-            show_default=False,
-            autocompletion=complete_scenario,
-        ),
-    ],
+    source: ScenarioOrRun,
     metric: Annotated[
         list[str] | None,
         typer.Option(help="gain, rss, sinr or best-server; by default gain; may be repeated"),
@@ -423,14 +411,12 @@ def replay(
     ] = None,
     again: Annotated[bool, typer.Option("--again", help="run everything again, decisions imposed")] = False,
     frames: Annotated[int | None, typer.Option(min=1, help="only the first frames of each episode")] = None,
-    json: Annotated[Path | None, typer.Option(help="write the summary to this file too")] = None,
-    out: Annotated[Path, typer.Option(help="directory in which the run's own is made")] = Path("runs"),
-    embedded: Annotated[
-        bool, typer.Option("--embedded", help="all in this process, without sockets")
-    ] = False,
+    json: SummaryFile = None,
+    out: RunsFolder = Path("runs"),
+    embedded: Embedded = False,
 ) -> None:
     """Run a recorded world again: products served as recorded, but of what is replaced and what follows."""
-    from caviar_clients.cli.replay import replay_run
+    from caviar_clients.cli.recordings import replay_run
 
     status = replay_run(
         run, out, _console, replace=replace or (), settings=set_ or (), keep=keep or (),
@@ -442,25 +428,18 @@ def replay(
 @app.command(rich_help_panel=MEASURE)
 def budget(
     run: RunDirectory,
-    json: Annotated[Path | None, typer.Option(help="write all figures to this file")] = None,
+    json: FiguresFile = None,
 ) -> None:
     """Tell from a recorded run the frame rate that each policy sustains, and which service bounds it."""
-    from caviar_clients.cli.budget import budget_run
+    from caviar_clients.cli.measure import budget_run
 
     budget_run(run, _console, json)
 
 
 @app.command(rich_help_panel=MEASURE)
 def tradeoff(
-    source: Annotated[
-        Path,
-        typer.Argument(
-            help="scenario, by name or file, or directory of a run that recorded `scene`",
-            show_default=False,
-            autocompletion=complete_scenario,
-        ),
-    ],
-    json: Annotated[Path | None, typer.Option(help="write all figures to this file")] = None,
+    source: ScenarioOrRun,
+    json: FiguresFile = None,
     out: Annotated[Path | None, typer.Option(help="directory for tables and pictures")] = None,
     frames: Annotated[int, typer.Option(min=1, max=10_000, help="scenes, spread over the episode")] = 12,
     receivers: Annotated[
@@ -478,9 +457,9 @@ def tradeoff(
     ] = None,
 ) -> None:
     """Compare channel settings: time and error of each over the same scenes."""
-    from caviar_clients.cli.tradeoff import options_of, trade
+    from caviar_clients.cli.measure import trade, tradeoff_options
 
-    options = options_of(reference, baseline, receivers, seeds, minutes, part)
+    options = tradeoff_options(reference, baseline, receivers, seeds, minutes, part)
     trade(source, frames, options, json, out, _console)
 
 
@@ -494,7 +473,8 @@ def main() -> None:
     try:
         app()
     except CaviarError as error:
+        # A message may hold what a user wrote, with brackets: assembled, it is no markup.
         _errors.print(Text.assemble(("caviar:", "red"), f" {error}"), soft_wrap=True)
         sys.exit(1)
     except KeyboardInterrupt:
-        sys.exit(130)
+        sys.exit(130)  # 128 + SIGINT, as a shell has it

@@ -10,7 +10,6 @@ import warnings
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
-from datetime import datetime
 from io import StringIO
 from pathlib import Path
 from types import FrameType
@@ -28,8 +27,9 @@ from caviar_broker.security.access import check_bind
 from caviar_clients.cli.launch import Launcher
 from caviar_clients.cli.remote import key_text, reachable, start_command, waiting_text
 from caviar_clients.cli.scenarios import require_extras
+from caviar_clients.cli.shared import new_run_directory, print_line, require_writable
 from caviar_clients.cli.summary import recorded_figures, summary_of, summary_table
-from caviar_clients.files import printable, reason, write_file
+from caviar_clients.files import printable, write_file
 from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.embedded import EmbeddedRun
 from caviar_clients.session.plausibility import implausible_values
@@ -148,26 +148,6 @@ REPEATED = frozenset({"warning", "lost", "away", "back", "restarted", "refused",
 """Kinds of notices that are shown every time, since what they ask of the user is always new."""
 
 
-def run_directory(root: Path, name: str) -> Path:
-    """A new directory ``root/<name>-<date>-<time>`` for a run, with a number where that is taken.
-
-    Raises `RunError` where none can be made.
-    """
-    stem = f"{name}-{datetime.now().astimezone():%Y%m%d-%H%M%S}"
-    for number in range(1, 1000):
-        directory = root / (stem if number == 1 else f"{stem}-{number}")
-        try:
-            directory.mkdir(parents=True)
-        except FileExistsError:
-            continue
-        except OSError as error:
-            raise RunError(
-                f"cannot make the run's directory {directory}: {reason(directory, error, 'folder')}"
-            ) from error
-        return directory
-    raise RunError(f"{root} has a thousand runs named {stem}; choose another directory with --out")
-
-
 class RunOutcome(NamedTuple):
     """How a run ended."""
 
@@ -199,13 +179,12 @@ def run_scenario(
         refuse_remote(scenario)
     if http:
         _check_http(http, keys, embedded)
-    if json_file is not None:
-        write_file(json_file)  # before the run, since after it an unwritable file would cost the figures
-    directory = run_directory(out, scenario.run.name)
-    console.print(Text(f"run {directory}"), soft_wrap=True)
+    require_writable(json_file)
+    directory = new_run_directory(out, scenario.run.name)
+    print_line(console, f"run {directory}")
     warnings = implausible_values(scenario)
     for warning in warnings:
-        console.print(Text(f"warning: {warning}", style="yellow"), soft_wrap=True)
+        print_line(console, f"warning: {warning}", "yellow")
     launcher: Launcher | EmbeddedLauncher
     if embedded:
         launcher = EmbeddedLauncher(scenario, directory)
@@ -228,9 +207,8 @@ def resume_run(
 ) -> RunOutcome:
     """Resume a run whose broker died."""
     scenario = read_record(directory).scenario
-    if json_file is not None:
-        write_file(json_file)
-    console.print(Text(f"run {directory}"), soft_wrap=True)
+    require_writable(json_file)
+    print_line(console, f"run {directory}")
     launcher = Launcher(
         scenario, directory, directory.resolve(), bind=bind, keys=keys, http=http, resume=True, force=force
     )
@@ -275,11 +253,11 @@ def _follow(
         console.print(ended, soft_wrap=True)
         log = launcher.log_of(outcome["culprit"])
         if log is not None:
-            console.print(Text(f"its log: {log}"), soft_wrap=True)
+            print_line(console, f"its log: {log}")
     _write_summary(summary, directory, json_file)  # last: a disk that is full leaves the screen
     if new and interrupted.came and not outcome["frames"]:
         shutil.rmtree(directory, ignore_errors=True)
-        console.print(Text(f"no frame was simulated; {directory} is removed"), soft_wrap=True)
+        print_line(console, f"no frame was simulated; {directory} is removed")
     status = 130 if interrupted.came else 1 if outcome["error"] else 0
     return RunOutcome(directory, status, outcome["error"])
 
@@ -397,7 +375,7 @@ class _Watcher:
         return f"; unless it comes back by itself, start it again with  {command}"
 
     def _tell(self, text: str, style: str) -> None:
-        self._console.print(printable(text), highlight=False, soft_wrap=True, style=style, markup=False)
+        print_line(self._console, printable(text), style)
 
 
 def _progress_bar(console: Console) -> Progress:
@@ -414,4 +392,4 @@ def _progress_bar(console: Console) -> Progress:
 
 def _show(console: Console, summary: Mapping[str, Any]) -> None:
     console.print(summary_table(summary))
-    console.print(f"digest {summary['digest']}", highlight=False, soft_wrap=True)
+    print_line(console, f"digest {summary['digest']}")

@@ -1,18 +1,17 @@
-"""``caviar scenarios`` and ``caviar new``; arguments that several commands share."""
+"""``caviar scenarios`` and ``caviar new``: the scenarios that ship, and the beginning of one's own."""
 
 from __future__ import annotations
 
 import re
 from importlib import resources
 from pathlib import Path
-from typing import Annotated
 
-import typer
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
-from caviar_protocol.errors import RunError, SetupError
+from caviar_clients.cli.shared import print_line, require_installed
+from caviar_protocol.errors import RunError
 from caviar_protocol.host import has_extra, install_command
 from caviar_protocol.scenario import Scenario, ServiceSpec, load_scenario, shipped_scenarios
 from caviar_services.registry import load
@@ -20,11 +19,23 @@ from caviar_services.registry import load
 TEMPLATE = "new/scenario.toml"
 """The scenario that `caviar new` writes, in the package of scenarios."""
 _TEMPLATE_NAME = 'name = "my-scenario"'
+# A name of a run becomes part of a directory's name and of ids on the wire.
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
 
 def description(text: str) -> str:
-    """What a scenario is: the first sentence of the comment at the head of its file."""
+    """Say what a scenario is.
+
+    Args:
+        text: The scenario's file.
+
+    Returns:
+        The first sentence of the comment at the head of the file, without its full stop.
+
+    Example:
+        >>> description("# Cars drive. They turn.\\n[run]")
+        'Cars drive'
+    """
     lines = []
     for line in text.splitlines():
         comment = line.removeprefix("#").strip()
@@ -35,7 +46,7 @@ def description(text: str) -> str:
 
 
 def extras_of(scenario: Scenario) -> tuple[str, ...]:
-    """Extras of the distribution that the services of a scenario need, in order of name.
+    """Name the extras of the distribution that the services of a scenario need, in alphabetical order.
 
     Remote services need theirs where they run.
     """
@@ -56,21 +67,23 @@ def _extras(spec: ServiceSpec) -> set[str]:
 
 
 def require_extras(scenario: Scenario) -> None:
-    """Raise `SetupError` with one command that installs every extra which a scenario needs and that lacks."""
-    missing = [extra for extra in extras_of(scenario) if not has_extra(extra)]
-    if missing:
-        raise SetupError(
-            f"scenario {scenario.run.name!r} needs what is not installed ({', '.join(missing)}); "
-            f"run: {install_command(*missing)}"
-        )
+    """Refuse a scenario for which an extra is not installed.
+
+    Raises:
+        SetupError: An extra is missing; the text has one command that installs all that are.
+    """
+    require_installed(f"scenario {scenario.run.name!r}", extras_of(scenario))
 
 
 def list_scenarios(console: Console) -> None:
     """Print the scenarios that ship, each with a line and the extras that it needs."""
-    table = Table(box=None, pad_edge=False)
-    table.add_column("name", no_wrap=True)
-    table.add_column("what it is", overflow="fold")
-    table.add_column("needs", overflow="fold")
+    table = Table(
+        Column("name", no_wrap=True),
+        Column("what it is", overflow="fold"),
+        Column("needs", overflow="fold"),
+        box=None,
+        pad_edge=False,
+    )
     lacking: set[str] = set()
     for name, path in shipped_scenarios().items():
         extras = extras_of(load_scenario(path))
@@ -80,32 +93,29 @@ def list_scenarios(console: Console) -> None:
     console.print("\ncaviar run NAME runs one; caviar new NAME writes one of your own to edit.")
     if lacking:
         console.print("[yellow]*[/] is not installed; what installs all of it:")
-        console.print(f"  {install_command(*sorted(lacking))}", soft_wrap=True, markup=False, highlight=False)
+        print_line(console, f"  {install_command(*sorted(lacking))}")
 
 
 def _needs(extras: tuple[str, ...]) -> Text:
     if not extras:
         return Text("base install")
-    marks = [(extra if has_extra(extra) else f"{extra}*") for extra in extras]
-    text = Text(", ".join(marks))
+    text = Text(", ".join(extra if has_extra(extra) else f"{extra}*" for extra in extras))
     text.highlight_regex(r"\*", "yellow")
     return text
 
 
-def complete_scenario(incomplete: str) -> list[tuple[str, str]]:
-    """Names of shipped scenarios that begin so, for completion in a shell, which adds files by itself."""
-    return [
-        (name, description(path.read_text()))
-        for name, path in shipped_scenarios().items()
-        if name.startswith(incomplete)
-    ]
-
-
 def new_scenario(name: str) -> Path:
-    """Write a commented scenario to edit: ``NAME.toml`` in this folder, or the path that ``name`` is.
+    """Write a commented scenario to edit.
 
-    Raises `RunError` where the file exists or cannot be written, or the name is none of a run or that of
-    another kind of file.
+    Args:
+        name: Of the scenario, for ``NAME.toml`` in this folder, or the path of a file ``….toml``.
+
+    Returns:
+        The file.
+
+    Raises:
+        RunError: The file exists or cannot be written, or the name is none of a run or that of another kind
+            of file.
     """
     path = Path(name if name.endswith(".toml") else f"{name}.toml")
     suffix = Path(name).suffix
@@ -116,6 +126,7 @@ def new_scenario(name: str) -> Path:
     text = (resources.files("caviar_scenarios") / TEMPLATE).read_text()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        # Mode x: a file that another process makes meanwhile is not overwritten either.
         with path.open("x", encoding="utf-8") as file:
             file.write(text.replace(_TEMPLATE_NAME, f'name = "{path.stem}"', 1))
     except OSError as error:
@@ -123,47 +134,3 @@ def new_scenario(name: str) -> Path:
             raise RunError(f"{path} is there already: choose another name, or remove it") from error
         raise RunError(f"cannot write {path}: {error.strerror}; choose another folder") from error
     return path
-
-
-def _newest_run() -> Path:
-    """The newest run below ``./runs``; says on standard error which it is."""
-    from caviar_protocol.recording import newest_run
-
-    directory = newest_run("runs")
-    typer.echo(f"run {directory}, the newest in ./runs", err=True)
-    return directory
-
-
-RunDirectory = Annotated[
-    Path,
-    typer.Argument(
-        help="directory of a run, or one segment of its recording",
-        default_factory=_newest_run,
-        show_default="the newest in ./runs",
-    ),
-]
-Frames = Annotated[int | None, typer.Option(min=1, help="frames of an episode, instead of the scenario's")]
-Seed = Annotated[int | None, typer.Option(min=0, max=2**63 - 1, help="seed, instead of the scenario's")]
-Pace = Annotated[
-    str | None, typer.Option(help="free, realtime or a number [times real time], instead of the scenario's")
-]
-Keys = Annotated[
-    Path | None, typer.Option(help="keys directory: only authorized keys take part (caviar keys)")
-]
-Http = Annotated[str, typer.Option(help="HOST:PORT: serve status, orders and WebSocket there")]
-Resume = Annotated[Path | None, typer.Option(help="go on with the run in this directory, whose broker died")]
-Force = Annotated[
-    bool, typer.Option("--force", help="with --resume: though code, libraries or files have changed")
-]
-ScenarioOrNone = Annotated[
-    Path | None,
-    typer.Argument(
-        help="scenario that ships, by name (caviar scenarios), or a file (TOML)",
-        show_default=False,
-        autocompletion=complete_scenario,
-    ),
-]
-Restarted = Annotated[
-    bool,
-    typer.Option("--restarted", help="for a container that is started again whenever this status is not 0"),
-]

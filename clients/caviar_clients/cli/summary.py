@@ -1,32 +1,380 @@
-"""Figures of a finished run: `caviar run --json`, and the table on the screen."""
+"""Figures of a run, from its recording: as a structure, as JSON (``caviar run --json``), and in words."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+import shlex
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, cast
 
 import msgspec
+import numpy as np
 from rich.markup import escape
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
-from caviar_clients.cli.recording_summary import (
-    Decided,
-    OutageSummary,
-    RunSummary,
-    counted,
-    decided_lines,
-    link_quality,
-    outage_lines,
-    summarise,
-)
+from caviar_clients.cli.shared import counted, scaled
+from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import RecordingError
-from caviar_protocol.recording import Recording
+from caviar_protocol.files import RunDirectory
+from caviar_protocol.messages import Report, Status
+from caviar_protocol.recording import RecordedFrame, Recording
+from caviar_protocol.topics import Link
+from caviar_protocol.topics.channel import INSIDE_PREFIX, UNMATCHED_PREFIX, Cause
+from caviar_protocol.topics.scene import WITHOUT_OBJECT_PREFIX
+
+STATE = "state:"
+"""Begins the name of a decision that is no choice, but what a service knew when the episode began."""
+SHOWN_INSIDE = 8
+"""Antennas inside an object that are named; of the others, the number."""
+SHOWN_DAMAGE = 20
+"""Lines about damage that are printed; of the others, the number."""
+
+_CAUSES = {cause.count_name: cause for cause in Cause}
+_DROPPED = "dropped"
+# What a count means that every frame of a run has, by the count's name or what that begins with.
+_NEVER: Mapping[str, str] = {
+    "frames-without-users": "{source} had nobody to serve in any frame; see its `users`, and `on` of the "
+    "receivers",
+    WITHOUT_OBJECT_PREFIX: "device {rest!r} stood on no object of {source} in any frame; see its `on`",
+}
+
+
+class Decided(msgspec.Struct, kw_only=True):
+    """One decision of one service over all frames: the rung of an adaptive channel, say."""
+
+    service: str
+    decision: str
+    frames: dict[str, int]
+    """How many had each value, the most frequent first."""
+    changes: int
+    """Frames whose value is not that of the frame before, in the same episode."""
+    error_checks: Annotated[int, quantity("1", "stated errors that were measured, of all pairs and frames")]
+    error_covered: Annotated[int, quantity("1", "of these, those that held")]
+
+
+class OutageSummary(msgspec.Struct, kw_only=True):
+    """Users without a path, summed over frames."""
+
+    users: int
+    causes: dict[str, int]
+    """Of these, how many for which `Cause`, the most frequent first."""
+    unexplained: int
+    """Of these, those for which the channel reported no cause: it was held, or is of another make."""
+    inside: dict[str, int]
+    """Frames in which an antenna without a path stood inside an object, by ``ANTENNA in OBJECT``."""
+
+
+class SourceSummary(msgspec.Struct, kw_only=True):
+    """What became of one source's products of one topic."""
+
+    topic: str
+    source: str
+    fresh: int = 0
+    held: int = 0
+    absent: int = 0
+    late: int = 0
+    bytes: Annotated[int, quantity("B", "stored")] = 0
+
+
+class LinkSummary(msgspec.Struct, kw_only=True):
+    """Means over frames and users that have a path; |y| of beams of unit norm."""
+
+    mean_abs_y: float | None
+    """None where no user ever had a path."""
+    mean_abs_y_best: float | None
+    mean_abs_y_baseline: float | None
+    mean_snr_db: Annotated[float | None, quantity("dB", "mean of the linear SNR of the chosen pairs")]
+    """None where no user had a path, or none was served."""
+    mean_snr_best_db: Annotated[float | None, quantity("dB", "the same of the best pairs")]
+    mean_bit_rate: Annotated[float | None, quantity("bit/s", "of a user with the chosen pair")]
+    no_path_share: float | None
+    """Share of users without a path; None where there was no user."""
+    users: int
+    """Users summed over frames."""
+
+
+class RunSummary(msgspec.Struct, kw_only=True):
+    """A recording at a glance."""
+
+    run: str
+    scenario: str
+    seed: int
+    started: str
+    complete: bool
+    """Whether the recorder closed the recording."""
+    segments: int
+    episodes: int
+    frames: int
+    frames_planned: int
+    simulated_s: Annotated[float, quantity("s", "up to a sampling period behind the last frames")]
+    bytes: Annotated[int, quantity("B", "size of the segments")]
+    sources: list[SourceSummary]
+    link: LinkSummary | None
+    outage: OutageSummary | None
+    """Why users had no path; None where all had one."""
+    decided: list[Decided]
+    warnings: list[str]
+    """What the user probably did not mean."""
+    versions: dict[str, str]
+    machine: dict[str, str]
+    notes: tuple[str, ...]
+    damage: list[str]
+
+
+class ReportTally:
+    """Counts what services reported of the frames of a run."""
+
+    def __init__(self) -> None:
+        self._frames = 0
+        self._reported: Counter[str] = Counter()
+        # By source and name of a count: its sum, and the frames in which it was not 0.
+        self._sums: Counter[tuple[str, str]] = Counter()
+        self._frames_with: Counter[tuple[str, str]] = Counter()
+        # By source and name of a decision: its values, the last one with its episode, and its changes.
+        self._values: dict[tuple[str, str], Counter[str]] = {}
+        self._last: dict[tuple[str, str], tuple[int, str]] = {}
+        self._changes: Counter[tuple[str, str]] = Counter()
+
+    def add(self, episode: int, reports: Iterable[Report]) -> None:
+        """Count the reports of a frame. Frames come in their order."""
+        self._frames += 1
+        for report in reports:
+            self._reported[report.source] += 1
+            for name, count in report.counts.items():
+                self._sums[report.source, name] += count
+                self._frames_with[report.source, name] += bool(count)
+            for name, value in report.decisions.items():
+                if name.startswith(STATE):
+                    continue
+                key = report.source, name
+                self._values.setdefault(key, Counter())[value] += 1
+                before, last = self._last.get(key, (episode, value))
+                # The first frame of an episode starts from what the service is set to: that is no change.
+                self._changes[key] += before == episode and last != value
+                self._last[key] = episode, value
+
+    def decisions(self) -> list[Decided]:
+        """Sum up the decisions, sorted by service and name."""
+        return [
+            Decided(
+                service=service,
+                decision=name,
+                frames=dict(values.most_common()),
+                changes=self._changes[service, name],
+                error_checks=self._sums[service, "error-checks"],
+                error_covered=self._sums[service, "error-covered"],
+            )
+            for (service, name), values in sorted(self._values.items())
+        ]
+
+    def outage(self, users: int) -> OutageSummary | None:
+        """Sum up why users had no path.
+
+        Args:
+            users: Users without a path, summed over frames.
+
+        Returns:
+            The causes; None where every user had a path.
+        """
+        if not users:
+            return None
+        causes, inside = Counter[str](), Counter[str]()
+        for (source, name), count in self._sums.items():
+            if name in _CAUSES:
+                causes[_CAUSES[name].value] += count
+            elif name.startswith(INSIDE_PREFIX):
+                inside[name.removeprefix(INSIDE_PREFIX)] += self._frames_with[source, name]
+        return OutageSummary(
+            users=users,
+            causes=dict(causes.most_common()),
+            unexplained=max(0, users - causes.total()),
+            inside=dict(inside.most_common()),
+        )
+
+    def warnings(self) -> list[str]:
+        """Warn of what the user probably did not mean: an agent without users in any frame, a device without
+        an object, paths that were dropped for values that are not finite, a key without effect."""
+        never, dropped, unmatched = [], [], []
+        for (source, name), frames in sorted(self._frames_with.items()):
+            prefix = next((prefix for prefix in _NEVER if name.startswith(prefix)), "")
+            if prefix and frames == self._frames:
+                never.append(_NEVER[prefix].format(source=source, rest=name.removeprefix(prefix)))
+            elif name == _DROPPED and frames:
+                paths = counted(self._sums[source, name], "path")
+                dropped.append(
+                    f"{source} dropped {paths} with values that are not finite, in "
+                    f"{counted(frames, 'frame')}: what its model computes is wrong there"
+                )
+            # A channel that joined late has reported of fewer frames than there are.
+            elif name.startswith(UNMATCHED_PREFIX) and frames == self._reported[source]:
+                unmatched.append(
+                    f"{source}: {name.removeprefix(UNMATCHED_PREFIX)} had no effect: no object, class or "
+                    "piece of scenery was called so in any frame"
+                )
+        return [*never, *dropped, *unmatched]
+
+
+class _LinkTotals:
+    """Sums over users that have a path, and how many users had none."""
+
+    def __init__(self) -> None:
+        self.users = self.served = 0
+        # Of |y|, best and baseline |y|, SNR, best SNR, bit rate.
+        self._sums = np.zeros(6)
+
+    def add(self, link: Link) -> None:
+        with_path = link.has_path
+        self.users += len(link.rx)
+        self.served += int(with_path.sum())
+        best = link.top_abs_y[:, :1].sum(axis=1)  # no column where there is no user
+        figures = (link.abs_y, best, link.baseline_abs_y, link.snr, link.snr_best, link.bit_rate)
+        self._sums += [values[with_path].sum() for values in figures]
+
+    def summary(self) -> LinkSummary | None:
+        if not self.users:
+            return None
+        means: list[float | None] = [None] * len(self._sums)
+        if self.served:
+            means = (self._sums / self.served).tolist()
+        abs_y, best, baseline, snr, snr_best, bit_rate = means
+        return LinkSummary(
+            mean_abs_y=abs_y,
+            mean_abs_y_best=best,
+            mean_abs_y_baseline=baseline,
+            mean_snr_db=_db(snr),
+            mean_snr_best_db=_db(snr_best),
+            mean_bit_rate=bit_rate,
+            no_path_share=1 - self.served / self.users,
+            users=self.users,
+        )
+
+
+def _db(ratio: float | None) -> float | None:
+    return 10 * math.log10(ratio) if ratio else None
+
+
+def _measure(
+    frame: RecordedFrame, sources: dict[tuple[str, str], SourceSummary], totals: _LinkTotals
+) -> None:
+    for product in frame.products:
+        entry = product.provenance
+        if entry.status in (Status.FRESH, Status.LATE):
+            sources[entry.topic, entry.source].bytes += product.size
+        if entry.topic == "link" and entry.status is Status.FRESH:
+            totals.add(cast(Link, product.payload))
+
+
+def _episodes_planned(scenario: dict[str, Any]) -> int:
+    run = scenario.get("run")
+    episodes = run.get("episodes", 1) if isinstance(run, dict) else 1
+    return episodes if isinstance(episodes, int) else 1
+
+
+def summarise(recording: Recording) -> RunSummary:
+    """Sum up a recording.
+
+    Damaged frames are listed, and count as if they had no products.
+
+    Example:
+        >>> summarise(Recording("runs/smoke-20261123-120000")).frames  # doctest: +SKIP
+        100
+    """
+    metadata, damage = recording.metadata, list(recording.damage)
+    sources: dict[tuple[str, str], SourceSummary] = {}
+    totals, reports = _LinkTotals(), ReportTally()
+    episodes: dict[int, int] = {}  # to the last instant [ns]
+    for frame in recording.frames():
+        episodes[frame.episode] = max(frame.t_ns, episodes.get(frame.episode, 0))
+        reports.add(frame.episode, frame.reports)
+        for entry in frame.inputs:
+            key = (entry.topic, entry.source)
+            source = sources.setdefault(key, SourceSummary(topic=entry.topic, source=entry.source))
+            setattr(source, entry.status.value, getattr(source, entry.status.value) + 1)
+        try:
+            _measure(frame, sources, totals)
+        except RecordingError as error:
+            damage.append(str(error))
+    return RunSummary(
+        run=metadata.run,
+        scenario=metadata.name,
+        seed=metadata.seed,
+        started=metadata.started,
+        complete=recording.complete,
+        segments=len(recording.files),
+        episodes=len(episodes),
+        frames=len(recording),
+        frames_planned=metadata.frames * _episodes_planned(metadata.scenario),
+        simulated_s=sum(last + metadata.sampling_period_ns for last in episodes.values()) / 1e9,
+        bytes=sum(file.stat().st_size for file in recording.files),
+        sources=[sources[key] for key in sorted(sources)],
+        link=totals.summary(),
+        outage=reports.outage(totals.users - totals.served),
+        decided=reports.decisions(),
+        warnings=reports.warnings(),
+        versions=metadata.versions,
+        machine=metadata.machine,
+        notes=metadata.notes,
+        damage=damage,
+    )
+
+
+def resume_hint(recording: Recording) -> str:
+    """Write the command that resumes a run which was killed; empty for one that ended or has no journal."""
+    directory, metadata = recording.directory, recording.metadata
+    planned = metadata.frames * _episodes_planned(metadata.scenario)
+    files = RunDirectory(directory)
+    # Where `caviar run` alone was killed, the recorder still closes its recording: no summary tells that.
+    ended = files.summary.is_file() or len(recording) >= planned
+    if not files.record.is_file() or (recording.complete and ended):
+        return ""
+    return (
+        f"unless the run still goes on, continue it with: caviar run --resume {shlex.quote(str(directory))}"
+    )
+
+
+def decided_lines(found: Sequence[Decided]) -> list[str]:
+    """Put decisions into words, one line each."""
+    lines = []
+    for entry in found:
+        total = sum(entry.frames.values())
+        shares = ", ".join(f"{value} {count / total:.0%}" for value, count in entry.frames.items())
+        line = f"{entry.service}: {entry.decision} {shares}; {counted(entry.changes, 'change')}"
+        if entry.error_checks:
+            line += f"; stated error held in {entry.error_covered} of {counted(entry.error_checks, 'check')}"
+        lines.append(line)
+    return lines
+
+
+def outage_lines(outage: OutageSummary) -> list[str]:
+    """Put the causes into one line, and into one each which antenna stands inside of which object."""
+    parts = [f"{count} {cause}" for cause, count in outage.causes.items()]
+    if outage.unexplained:
+        parts.append(f"{outage.unexplained} for a cause that the channel did not report")
+    lines = [", ".join(parts)]
+    shown = list(outage.inside.items())[:SHOWN_INSIDE]
+    lines += [f"inside an object: {name}, in {counted(frames, 'frame')}" for name, frames in shown]
+    if len(outage.inside) > len(shown):
+        lines.append(f"inside an object: {len(outage.inside) - len(shown)} more antennas")
+    return lines
+
+
+def link_quality(snr_db: float | None, snr_best_db: float | None, bit_rate: float) -> str:
+    """Put the SNR [dB] of the chosen and of the best beams, and a user's bit rate [bit/s], into words.
+
+    Example:
+        >>> link_quality(12.34, 15.0, 2.5e8)
+        '12.3 dB of 15.0 dB at best, mean rate 250 Mbit/s a user'
+    """
+    snr, best = ("none" if value is None else f"{value:.1f} dB" for value in (snr_db, snr_best_db))
+    rate, unit = scaled(bit_rate, ("bit/s", "kbit/s", "Mbit/s", "Gbit/s"))
+    return f"{snr} of {best} at best, mean rate {rate:.3g} {unit} a user"
 
 
 def recorded_figures(directory: Path) -> RunSummary | None:
-    """What a run's recording comes to; None where it has none."""
+    """Sum up the recording of a run; None where it has none that can be read."""
     try:
         return summarise(Recording(directory))
     except RecordingError:
@@ -41,10 +389,18 @@ def summary_of(
     seed: int,
     warnings: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Everything `--json` writes; ``warnings`` are those of the scenario, beside what the recording warns of.
+    """Collect what ``caviar run --json`` writes.
 
     Of a run that ended early ``frames_recorded`` may be one more than ``frames``: a frame that the recorder
-    had answered and that was not over for everybody. The digest is that of ``frames``.
+    had answered and other services had not. The digest is that of ``frames``.
+
+    Args:
+        outcome: The broker's report of the end, the event ``finished``.
+        recorded: Figures of the recording; None where there is none.
+        scenario: The scenario's name.
+        directory: The run's directory.
+        seed: The run's.
+        warnings: Of the scenario and its services, which stand before those of the recording.
     """
     figures = recorded.link if recorded else None
     return {
@@ -61,13 +417,7 @@ def summary_of(
         "deadlines": outcome["deadlines"],
         "pace": outcome["pace"],
         "digest": outcome["digest"],
-        "mean_abs_y": figures.mean_abs_y if figures else None,
-        "mean_abs_y_best": figures.mean_abs_y_best if figures else None,
-        "mean_abs_y_baseline": figures.mean_abs_y_baseline if figures else None,
-        "mean_snr_db": figures.mean_snr_db if figures else None,
-        "mean_snr_best_db": figures.mean_snr_best_db if figures else None,
-        "mean_bit_rate": figures.mean_bit_rate if figures else None,
-        "no_path_share": figures.no_path_share if figures else None,
+        **{name: getattr(figures, name, None) for name in LinkSummary.__struct_fields__ if name != "users"},
         "outage": msgspec.to_builtins(recorded.outage) if recorded else None,
         "decided": msgspec.to_builtins(recorded.decided) if recorded else [],
         "warnings": [*warnings, *(recorded.warnings if recorded else ())],
@@ -75,10 +425,14 @@ def summary_of(
 
 
 def summary_table(summary: Mapping[str, Any]) -> Table:
-    """p50 and p99 by service, misses, and |y| against the best."""
-    table = Table(title=Text(f"{summary['scenario']}: {summary['run']}"), title_justify="left")
-    for column in ("service", "p50 ms", "p99 ms", "budget ms", "misses"):
-        table.add_column(column, justify="left" if column == "service" else "right")
+    """Make the table of a finished run: latencies and misses by service; below, what else there is to say.
+
+    Args:
+        summary: As `summary_of` returns it.
+    """
+    figures_of = (Column(name, justify="right") for name in ("p50 ms", "p99 ms", "budget ms", "misses"))
+    title = Text(f"{summary['scenario']}: {summary['run']}")  # as Text: brackets in a name are no markup
+    table = Table("service", *figures_of, title=title, title_justify="left")
     for name, figures in summary["services"].items():
         table.add_row(
             escape(name),
@@ -125,11 +479,9 @@ def _caption(summary: Mapping[str, Any]) -> str:
 
 
 def _missed(misses: int, late: Mapping[str, Any]) -> str:
-    """Missed deadlines, and how promptly the broker saw those that passed before the answer came."""
-    seen, when = (
-        late["decisions"],
-        f"{late['p99_ms']:.2f} ms (p99) behind, {late['worst_ms']:.2f} ms at worst",
-    )
+    """Count missed deadlines, and say how promptly the broker decided those without an answer by then."""
+    seen = late["decisions"]
+    when = f"{late['p99_ms']:.2f} ms (p99) behind, {late['worst_ms']:.2f} ms at worst"
     if misses <= seen:
         return f"{counted(seen, 'missed deadline')}, decided {when}"
     return (

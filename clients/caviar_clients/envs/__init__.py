@@ -13,6 +13,6 @@ env = gymnasium.make("caviar/BeamSelection-v0", scenario="geometric")
 
 import gymnasium
 
-gymnasium.register("caviar/BeamSelection-v0", "caviar_clients.envs.beam_selection:BeamSelectionEnv")
+gymnasium.register("caviar/BeamSelection-v0", "caviar_clients.envs.base:BeamSelectionEnv")
 gymnasium.register("caviar/UavPath-v0", "caviar_clients.envs.uav_path:UavPathEnv")
 gymnasium.register("caviar/UavPath-v1", "caviar_clients.envs.uav_path_v1:UavPathV1Env")

@@ -1,4 +1,7 @@
-"""Base class of the environments: scenario, session, observation, reward, rendering."""
+"""Base class of the environments: scenario, session, observation, reward, rendering.
+
+``caviar/BeamSelection-v0``: choose a beam pair for each user, every frame.
+"""
 
 from __future__ import annotations
 
@@ -12,22 +15,23 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 from msgspec.structs import replace
+from numpy.typing import NDArray
 
 from caviar_clients.envs.observations import Moment, Part, Users, part
 from caviar_clients.plots.map import MapData, chosen_beam, draw_antennas, draw_beam, draw_objects
 from caviar_clients.plots.style import GREY
 from caviar_clients.session.base import Frame, Session
 from caviar_clients.session.checks import checked_scenario
-from caviar_clients.session.opening import agent_of, open_session
+from caviar_clients.session.connected import agent_of, open_session
 from caviar_clients.session.plausibility import implausible_values
 from caviar_protocol.arrays import BoolArray, Float64Array, UInt8Array
-from caviar_protocol.errors import RunError, ScenarioError, SetupError
+from caviar_protocol.errors import PayloadError, RunError, ScenarioError, SetupError
 from caviar_protocol.host import install_command
 from caviar_protocol.keys import credentials
 from caviar_protocol.messages import Input
 from caviar_protocol.space.beams import beam_gain
 from caviar_protocol.space.scene import Pair, device_pose
-from caviar_protocol.topics import Action, Link, Scene
+from caviar_protocol.topics import Action, BeamChoice, Link, Scene
 from caviar_protocol.topics.link import Command
 
 SIZE_IN, DPI = (6.4, 4.8), 100
@@ -315,3 +319,37 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
             known["abs_y"], known["best_abs_y"] = link.abs_y, link.top_abs_y[:, 0]
             known["baseline_abs_y"], known["los"] = link.baseline_abs_y, link.los
         return known
+
+
+class BeamSelectionEnv(SessionEnv[np.int64 | NDArray[np.int64]]):
+    """Beam selection (the paper, section 4).
+
+    The action is the index ``tx_beam·Nr + rx_beam`` of a pair of the two DFT codebooks: ``Discrete`` for one
+    place, ``MultiDiscrete`` with one entry for each place otherwise. Parameters as `SessionEnv`.
+    """
+
+    def __init__(self, scenario: str | Path, **options: Any) -> None:
+        super().__init__(scenario, **options)
+        self._sizes = sizes = [place.beam_pairs for place in self.users.places]
+        self.action_space = spaces.Discrete(sizes[0]) if len(sizes) == 1 else spaces.MultiDiscrete(sizes)
+
+    def _commands(self, action: np.int64 | NDArray[np.int64], moment: Moment) -> Sequence[Command]:
+        sizes = self._sizes
+        chosen = [int(action)] if isinstance(action, np.integer) else np.ravel(action).tolist()
+        if len(chosen) != len(sizes) or not all(
+            isinstance(index, int) and 0 <= index < size for index, size in zip(chosen, sizes, strict=True)
+        ):
+            highest = ", ".join(str(size - 1) for size in sizes)
+            raise PayloadError(
+                f"the action is {action!r}; write {len(sizes)} whole number(s), one a place, "
+                f"from 0 to at most {highest}"
+            )
+        commands = []
+        for place, pair in moment.users:
+            tx_beam, rx_beam = divmod(chosen[place], pair.rx.array.size)
+            commands.append(BeamChoice(tx=pair.tx.name, rx=pair.rx.name, tx_beam=tx_beam, rx_beam=rx_beam))
+        return sorted(commands, key=_order)
+
+
+def _order(choice: BeamChoice) -> tuple[str, str]:
+    return choice.rx, choice.tx

@@ -12,14 +12,13 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from caviar_broker.core.graph import Graph, build_graph
+from caviar_clients.session.checks import declared_hello, demanded
 from caviar_protocol.digest import RunDigest
 from caviar_protocol.errors import DeclarationError, RecordingError
 from caviar_protocol.files import RunDirectory, open_regular
 from caviar_protocol.messages import PROTOCOL_VERSION, GrantInput, Hello, Status
 from caviar_protocol.recording import FrameEntry, Recording
 from caviar_protocol.scenario import Scenario, ServiceSpec
-from caviar_services.registry import load
 
 
 class RecordedRun:
@@ -58,22 +57,14 @@ class RecordedRun:
 
     def _hello(self, name: str, spec: ServiceSpec) -> Hello:
         try:
-            return declared(name, spec)
+            return declared_hello(name, spec)
         except DeclarationError:
             return Hello(version=PROTOCOL_VERSION, name=name, role=spec.role, outputs=self.topics[name])
 
     @cached_property
-    def graph(self) -> Graph:
-        """Who got what from whom."""
-        return build_graph(self.hellos, self.scenario.run.record)
-
-    @cached_property
     def demand(self) -> tuple[str, ...]:
         """Topics that the run produced, and the parts asked of them, as entries of ``run.record``."""
-        found = set(self.scenario.run.record)
-        for demands in self.graph.demand.values():
-            for demand in demands:
-                found |= {demand.topic, *(f"{demand.topic}.{part}" for part in demand.parts)}
+        found = demanded(self.hellos, self.scenario.run.record)
         recorded = {topic for topics in self.topics.values() for topic in topics}
         return tuple(sorted(entry for entry in found | recorded if entry.partition(".")[0] in recorded))
 
@@ -120,14 +111,6 @@ class RecordedRun:
                 fresh = ((i.topic, i.source, i.digest) for i in entry.inputs if i.status is Status.FRESH)
                 chain.add_frame(entry.episode, entry.frame, fresh)
         return chain.hexdigest()
-
-
-def declared(name: str, spec: ServiceSpec) -> Hello:
-    """HELLO of an implementation that is here. Raises `DeclarationError` where there is none."""
-    if spec.remote:
-        raise DeclarationError(f"{name!r} is started by the user, and declares itself when it joins")
-    cls = load(spec.role, spec.use)
-    return Hello(version=PROTOCOL_VERSION, name=name, role=spec.role, inputs=cls.inputs, outputs=cls.outputs)
 
 
 At: TypeAlias = tuple[int, int]

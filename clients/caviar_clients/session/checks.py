@@ -1,17 +1,20 @@
-"""Checks of a scenario before its run: implementations and their settings, and free airspace."""
+"""What the implementations of a scenario declare and accept, checked before its run; free airspace."""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 
+from caviar_broker.core.graph import build_graph
 from caviar_protocol.errors import DeclarationError, suggestion
-from caviar_protocol.scenario import Scenario, ServiceSpec, load_scenario
+from caviar_protocol.messages import PROTOCOL_VERSION, Hello
+from caviar_protocol.scenario import REMOTE, Scenario, ServiceSpec, load_scenario
 from caviar_protocol.scenario.conversion import Place, convert_settings
 from caviar_protocol.scenario.rules import scenario_error, settings_place, with_overrides
 from caviar_protocol.space.coordinates import Vector
@@ -119,6 +122,64 @@ def check_implementations(scenario: Scenario) -> Scenario:
                 f"no service of the run produces {topic!r}; remove it, or add a service that does",
             )
     return scenario
+
+
+def settings_type(role: str, use: str) -> type[msgspec.Struct]:
+    """Find the type of an implementation's settings; of a remote service, which is not here, any.
+
+    Raises:
+        DeclarationError: There is no such implementation.
+    """
+    return msgspec.Struct if use == REMOTE else load(role, use).Settings
+
+
+def declared_hello(name: str, spec: ServiceSpec) -> Hello:
+    """Make the HELLO that a service's implementation would send.
+
+    Args:
+        name: Of the service.
+        spec: Of the service, from the scenario.
+
+    Raises:
+        DeclarationError: The service is remote, or its implementation is not here.
+    """
+    if spec.remote:
+        raise DeclarationError(f"{name!r} is started by the user, and declares itself when it joins")
+    cls = load(spec.role, spec.use)
+    return Hello(version=PROTOCOL_VERSION, name=name, role=spec.role, inputs=cls.inputs, outputs=cls.outputs)
+
+
+def demanded(hellos: Mapping[str, Hello], record: Sequence[str]) -> set[str]:
+    """Collect the topics that a run is asked for, and their parts, as entries of ``run.record``.
+
+    Args:
+        hellos: What each service of the run declares, by name.
+        record: ``run.record`` of the scenario.
+
+    Example:
+        >>> hello = Hello(version=PROTOCOL_VERSION, name="world", role="world", outputs=("scene",))
+        >>> demanded({"world": hello}, ["scene"])
+        {'scene'}
+    """
+    found = set(record)
+    for demands in build_graph(hellos, tuple(record)).demand.values():
+        for demand in demands:
+            found |= {demand.topic, *(f"{demand.topic}.{part}" for part in demand.parts)}
+    return found
+
+
+def served_from_recording(spec: ServiceSpec, topics: Iterable[str], directory: Path) -> ServiceSpec:
+    """Make a service into one that serves what it produced in a recorded run.
+
+    Args:
+        spec: Of the service, from the scenario.
+        topics: Recorded topics of the service.
+        directory: The recorded run's directory.
+    """
+    from caviar_services.replay import use_of  # only a replay needs it, and every run loads this module
+
+    settings = {"recording": str(directory.resolve())}
+    return replace(spec, use=use_of(spec.role, topics), settings=settings, max_in_flight=1)
 
 
 TRIES = 10_000

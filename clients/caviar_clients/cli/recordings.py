@@ -1,0 +1,464 @@
+"""Commands on a recorded run: ``caviar inspect``, ``caviar replay``, and ``caviar doctor RUN``.
+
+The last says what of a damaged run can be read. Nothing in the run's directory is changed: what can be read
+goes to a new directory, which is a run again. It can be inspected, replayed and, where its journal and its
+recording allow, resumed.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+import msgspec
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Column, Table
+from rich.text import Text
+
+from caviar_broker.journal_format import JournalReader, run_of_journal
+from caviar_broker.run_record import RunRecord, read_record
+from caviar_clients.cli.run import run_scenario
+from caviar_clients.cli.shared import counted, print_line, scaled
+from caviar_clients.cli.summary import (
+    SHOWN_DAMAGE,
+    RunSummary,
+    SourceSummary,
+    decided_lines,
+    link_quality,
+    outage_lines,
+    resume_hint,
+    summarise,
+)
+from caviar_clients.replay.plan import ReplayPlan, plan_replay, request_of, scenario_text
+from caviar_clients.replay.recorded import RecordedRun
+from caviar_clients.session.checks import check_implementations
+from caviar_protocol.errors import RecordingError, RunError
+from caviar_protocol.files import RunDirectory
+from caviar_protocol.messages import Status
+from caviar_protocol.recording import Recording, RecordingWarning, frame_name
+from caviar_protocol.recording.segment import Segment
+from caviar_protocol.scenario import Scenario
+from caviar_services.recorder.base import failure
+from caviar_services.recorder.continuation import stored_products
+from caviar_services.recorder.segment_writer import Persistence, SegmentWriter
+from caviar_services.registry import find_modules_in
+
+PARTS = {
+    "recorded": "as recorded",
+    "replaced": "replaced",
+    "again": "runs again",
+    "left out": "left out",
+}
+"""What becomes of a service in a replay, in words."""
+SHOWN = 10
+"""Lines about a part of a damaged run that are printed; of the others, the number."""
+
+State: TypeAlias = Literal["whole", "damaged", "lost", "none", "foreign"]
+
+
+# --- caviar inspect --------------------------------------------------------------------------------------
+
+
+def inspect_command(run: Path, digest: bool = False, as_json: bool = False) -> int:
+    """Print a summary of a recording, or its digest.
+
+    Args:
+        run: The run's directory, or a segment of its recording.
+        digest: Whether only the digest is printed, recomputed from the payloads.
+        as_json: Whether the summary is printed as JSON.
+
+    Returns:
+        The exit status: 1 where the recording is damaged.
+
+    Raises:
+        RecordingError: There is no recording.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RecordingWarning)  # its lines are printed as damage
+        recording = Recording(run)
+    if digest:
+        return _print_digest(recording)
+    return _print_summary(summarise(recording), as_json, resume_hint(recording))
+
+
+def _print_digest(recording: Recording) -> int:
+    report = recording.run_digest()
+    typer.echo(report.digest)
+    if not recording.complete:
+        last = recording.entry(len(recording) - 1) if len(recording) else None
+        behind = f" behind frame {last.frame} of episode {last.episode}" if last is not None else ""
+        note = f"note: the recording breaks off{behind}; the digest is that of {report.frames} frames"
+        typer.echo(note, err=True)
+    return _print_damage(report.damage)
+
+
+def _print_damage(damage: Sequence[str]) -> int:
+    for line in damage[:SHOWN_DAMAGE]:
+        typer.echo(f"damaged: {line}", err=True)
+    if len(damage) > SHOWN_DAMAGE:
+        typer.echo(f"damaged: and {len(damage) - SHOWN_DAMAGE} more", err=True)
+    return 1 if damage else 0
+
+
+def _print_summary(summary: RunSummary, as_json: bool, hint: str) -> int:
+    if as_json:
+        typer.echo(msgspec.json.format(msgspec.json.encode(summary), indent=2))
+    else:
+        console = Console()
+        console.print(_facts(summary))
+        console.print(_topics(summary.sources))
+        if hint:
+            print_line(console, hint)
+    return _print_damage(summary.damage)
+
+
+def _facts(summary: RunSummary) -> Table:
+    columns = (Column(style="bold", no_wrap=True), Column(overflow="fold"))
+    table = Table(*columns, show_header=False, box=None, pad_edge=False)
+    state = "complete" if summary.complete else "[red]breaks off[/red]: the recorder did not close it"
+    table.add_row("run", escape(f"{summary.run} (scenario {summary.scenario}, seed {summary.seed})"))
+    table.add_row("started", summary.started)
+    table.add_row("recording", f"{state}, {_size(summary.bytes)} in {counted(summary.segments, 'segment')}")
+    table.add_row(
+        "frames",
+        f"{summary.frames} of {summary.frames_planned} planned, {counted(summary.episodes, 'episode')}, "
+        f"{summary.simulated_s:g} s simulated",
+    )
+    link = summary.link
+    if link is not None and link.mean_abs_y is not None:
+        table.add_row(
+            "mean |y|",
+            f"{link.mean_abs_y:.4g}, best {link.mean_abs_y_best:.4g}, straight line "
+            f"{link.mean_abs_y_baseline:.4g} (over users with a path)",
+        )
+    if link is not None and link.mean_bit_rate is not None:
+        table.add_row("mean SNR", link_quality(link.mean_snr_db, link.mean_snr_best_db, link.mean_bit_rate))
+    if link is not None:
+        table.add_row("no path", f"{link.no_path_share:.2%} of {counted(link.users, 'user')} over all frames")
+    for line in [] if summary.outage is None else outage_lines(summary.outage):
+        table.add_row("no path", escape(line))
+    for line in decided_lines(summary.decided):
+        table.add_row("decided", escape(line))
+    for line in summary.warnings:
+        table.add_row("warning", escape(line), style="yellow")
+    machine = summary.machine
+    table.add_row("machine", escape(", ".join(f"{key} {value}" for key, value in sorted(machine.items()))))
+    table.add_row("versions", escape(", ".join(f"{k} {v}" for k, v in summary.versions.items())))
+    for note in summary.notes:
+        table.add_row("note", escape(note))
+    return table
+
+
+def _topics(sources: Iterable[SourceSummary]) -> Table:
+    counts_of = (Column(title, justify="right") for title in ("fresh", "held", "absent", "late", "size"))
+    table = Table("topic", "source", *counts_of)
+    for source in sources:
+        counts = (source.fresh, source.held, source.absent, source.late)
+        table.add_row(source.topic, escape(source.source), *map(str, counts), _size(source.bytes))
+    return table
+
+
+def _size(number: float) -> str:
+    value, unit = scaled(number, ("B", "KiB", "MiB", "GiB"), 1024.0)
+    return f"{value:.0f} B" if unit == "B" else f"{value:.1f} {unit}"
+
+
+# --- caviar replay ---------------------------------------------------------------------------------------
+
+
+def replay_run(
+    run: Path,
+    out: Path,
+    console: Console,
+    *,
+    replace: Sequence[str] = (),
+    settings: Sequence[str] = (),
+    keep: Sequence[str] = (),
+    recorded: Sequence[str] = (),
+    again: bool = False,
+    frames: int | None = None,
+    json_file: Path | None = None,
+    embedded: bool = False,
+) -> int:
+    """Run a recorded run again, with some of its services replaced.
+
+    Args:
+        run: The recorded run's directory, or a segment of its recording.
+        out: Folder in which the new run's directory is made.
+        console: Where plan, progress and summary are shown.
+        replace: Implementations in place of the recorded ones, as ``SERVICE=IMPLEMENTATION``.
+        settings: Settings in place of the recorded ones, as ``SERVICE.SETTING=VALUE``.
+        keep: Services that run again as recorded.
+        recorded: Services that are served as recorded, though what they take has changed.
+        again: Whether everything runs again, with the recorded decisions.
+        frames: Of each episode, at most; None: as many as were recorded.
+        json_file: Where the summary is written beside the run's own.
+        embedded: Whether all services run in this process.
+
+    Returns:
+        The exit status: 0 exactly if the run came to its end and, where nothing was replaced, has the digest
+        of the recorded one.
+
+    Raises:
+        RecordingError: There is no recording, or none that can be replayed.
+        RunError: An option names nothing, or a service needs what was not recorded.
+    """
+    find_modules_in(Path.cwd())  # of classes that --replace names as module:Class
+    found = RecordedRun(Recording(run))
+    request = request_of(found.scenario.services, replace, settings, keep, recorded, again)
+    plan = plan_replay(found, request, frames)
+    check_implementations(plan.scenario)
+    _print_plan(plan, found, console)
+    with tempfile.TemporaryDirectory(prefix="caviar-replay-") as folder:
+        scenario, figures = Path(folder) / f"{plan.scenario.run.name}.toml", Path(folder) / "summary.json"
+        scenario.write_text(scenario_text(plan.scenario))
+        written = json_file or figures
+        ended = run_scenario(scenario, out, console, plan.frames, json_file=written, embedded=embedded)
+        return ended.status or _compare_digests(plan, written, console)
+
+
+def _print_plan(plan: ReplayPlan, run: RecordedRun, console: Console) -> None:
+    recording = run.recording
+    print_line(console, f"replay of {recording.path}, {len(run.lengths)} × {plan.frames} frames")
+    table = Table("service", "", "implementation", "")
+    for role in plan.roles:
+        use = "" if role.part == "recorded" else role.use
+        table.add_row(*map(Text, (role.name, PARTS[role.part], use, role.why)))
+    console.print(table)
+    for note in plan.notes:
+        print_line(console, note, style="yellow")
+
+
+def _compare_digests(plan: ReplayPlan, figures: Path, console: Console) -> int:
+    """Compare the digest with that of the recorded run; status 1 where it has to be that, and is not."""
+    expected = plan.scenario.replay.digest if plan.scenario.replay else ""
+    equal = json.loads(figures.read_text())["digest"] == expected
+    if equal:
+        print_line(console, "every product is that of the recorded run, byte for byte")
+    elif plan.identical:
+        print_line(console, f"the recorded run has the digest {expected}: something differs", style="red")
+    return 1 if plan.identical and not equal else 0
+
+
+# --- caviar doctor RUN ------------------------------------------------------------------------------------
+
+
+class Part(msgspec.Struct, kw_only=True):
+    """One part of a run's directory."""
+
+    name: str
+    state: State
+    """Of a damaged part something can be read, of a lost one nothing; none: the run has no such part;
+    foreign: the parts are of several runs."""
+    lines: list[str]
+    run: str = ""
+    """Id of the run that it says it is of; empty where it does not."""
+
+
+def rescue_run(run: Path, console: Console) -> int:
+    """Say what of a run can be read, and save it where a part of it is damaged.
+
+    Returns:
+        0: all is whole; 1: a part is damaged, and the rest is saved; 2: of a part nothing can be read.
+
+    Raises:
+        RunError: It is no directory, or the copy cannot be written.
+    """
+    if not run.is_dir():
+        raise RunError(f"{run} is no directory; give the directory of a run")
+    recording, of_recording = _examine_recording(run)
+    journal, of_journal = _examine_journal(run)
+    record, of_record = _examine_record(run, recording, journal)
+    parts = [of_recording, of_record, of_journal]
+    _tell_runs_apart(parts)
+    console.print(_table(parts))
+    states = {part.state for part in parts}
+    if not states & {"damaged", "lost", "foreign"}:
+        if recording is not None and (hint := resume_hint(recording)):
+            print_line(console, hint)
+        return 0
+    if "foreign" in states:
+        print_line(
+            console, "nothing is saved: the parts are of several runs; put the files of one run together"
+        )
+        return 2
+    target = _free_name(run)
+    try:
+        _save(run, target, recording, record, journal)
+    except OSError as error:
+        raise failure(Path(error.filename or target), error) from error
+    if not any(target.iterdir()):
+        target.rmdir()
+        print_line(console, "nothing is saved, since nothing can be read")
+        return 2
+    print_line(console, f"{run} is as it was; what can be read of it is in {target}")
+    return 2 if "lost" in states else 1
+
+
+def _tell_runs_apart(parts: list[Part]) -> None:
+    """Note at each part of which run it is, where they are not all of one."""
+    named = [part for part in parts if part.run]
+    if len({part.run for part in named}) > 1:
+        for part in named:
+            part.state = "foreign"
+            part.lines.insert(0, f"of run {part.run!r}")
+
+
+def _examine_recording(run: Path) -> tuple[Recording | None, Part]:
+    part = Part(name="recording", state="whole", lines=[])
+    if not any(run.glob("recording*")):
+        part.state, part.lines = "none", ["there is none"]
+        return None, part
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RecordingWarning)
+            recording = Recording(run, past_gaps=True)
+        damage = list(recording.run_digest().damage)
+    except RecordingError as error:
+        part.state, part.lines = "lost", [str(error)]
+        return None, part
+    readable = sum(1 for _ in _readable_frames(recording)) if damage else len(recording)
+    last = recording.entry(len(recording) - 1) if len(recording) else None
+    up_to = f", up to {frame_name((last.episode, last.frame))}" if last else ""
+    ends = "" if recording.complete or damage else "; it breaks off there, as a killed recorder leaves it"
+    part.run = recording.metadata.run
+    part.lines = [f"{readable} frames can be read{up_to}{ends}", *damage]
+    if damage:
+        part.state = "damaged"
+    return recording, part
+
+
+def _examine_journal(run: Path) -> tuple[JournalReader | None, Part]:
+    part = Part(name="journal", state="whole", lines=[])
+    if not RunDirectory(run).journal.exists():
+        part.state, part.lines = "none", ["there is none: an embedded run has no journal"]
+        return None, part
+    try:
+        part.run = run_of_journal(RunDirectory(run).journal)
+        reader = JournalReader(RunDirectory(run).journal)
+        entries = sum(1 for _ in reader)
+    except RecordingError as error:
+        part.state, part.lines = "lost", [str(error)]
+        return None, part
+    part.lines = [f"{entries} entries can be read"]
+    if reader.problem:
+        part.state = "damaged"
+        part.lines.append(f"{reader.problem}: {reader.lost} B are lost")
+    return reader, part
+
+
+def _examine_record(
+    run: Path, recording: Recording | None, journal: JournalReader | None
+) -> tuple[RunRecord | None, Part]:
+    part = Part(name=RunDirectory(run).record.name, state="whole", lines=[])
+    if journal is None and not RunDirectory(run).record.exists() and not RunDirectory(run).journal.exists():
+        part.state, part.lines = "none", ["there is none: an embedded run has no record"]
+        return None, part
+    try:
+        record = read_record(run)
+    except RecordingError as error:
+        rebuilt = _rebuilt(recording, journal)
+        part.state = "damaged" if rebuilt is not None else "lost"
+        part.lines = [str(error).removeprefix(f"cannot go on with {run}: ")]
+        if rebuilt is not None:
+            part.lines.append("made anew from the recording's metadata and the journal")
+        return rebuilt, part
+    part.run = record.run
+    part.lines = [f"run {record.run}, epoch {record.epoch}"]
+    return record, part
+
+
+def _rebuilt(recording: Recording | None, journal: JournalReader | None) -> RunRecord | None:
+    """The record of a run whose recording has its scenario."""
+    if recording is None or journal is None:
+        return None
+    try:
+        scenario = msgspec.convert(recording.metadata.scenario, Scenario)
+    except msgspec.ValidationError:
+        return None
+    epoch = max((entry.epoch for entry in JournalReader(journal.path)), default=1)
+    run = recording.metadata.run
+    return RunRecord(run=run, epoch=epoch, endpoint="tcp://127.0.0.1:0", scenario=scenario)
+
+
+def _readable_frames(recording: Recording) -> Iterator[int]:
+    """Frames all of whose products have the bytes that were recorded."""
+    for index in range(len(recording)):
+        try:
+            products = recording.products_of(index)
+        except RecordingError:
+            continue
+        stored = (p for p in products if p.provenance.status in (Status.FRESH, Status.LATE))
+        if all(product.digest == product.provenance.digest for product in stored):
+            yield index
+
+
+def _save(
+    run: Path,
+    target: Path,
+    recording: Recording | None,
+    record: RunRecord | None,
+    journal: JournalReader | None,
+) -> None:
+    target.mkdir()
+    if recording is not None:
+        _save_recording(recording, target)
+    if record is not None:
+        record.save(target)
+    if journal is not None:
+        with journal.path.open("rb") as source:
+            RunDirectory(target).journal.write_bytes(source.read(journal.end))
+    for folder in (RunDirectory(run).assets, RunDirectory(run).checkpoints):
+        if folder.is_dir():
+            shutil.copytree(folder, target / folder.name)
+
+
+def _save_recording(recording: Recording, target: Path) -> None:
+    """Write the frames that can be read, segment by segment."""
+    metadata = recording.metadata
+    kept = Persistence(target, "none", metadata.run, metadata.seed, [])
+    writer: SegmentWriter | None = None
+    source: Segment | None = None
+    number = 0
+    for index in _readable_frames(recording):
+        segment, place = recording.segment_of(index)
+        if segment is not source:
+            if writer is not None:
+                kept.finished(writer)
+            file, source = RunDirectory(target).segment(number), segment
+            writer = SegmentWriter(file, segment.metadata, "none")
+            number += 1
+        if writer is not None:
+            entry = segment.entries[place]
+            writer.write(entry, list(stored_products(segment, place)), segment.base_of(place))
+            kept.written(writer)
+    if writer is not None:
+        kept.finished(writer)
+        kept.close()
+
+
+def _free_name(run: Path) -> Path:
+    run = run.resolve()
+    names = (run.with_name(f"{run.name}-rescued{n}") for n in ("", *(f"-{k}" for k in range(2, 1000))))
+    for name in names:
+        if not name.exists():
+            return name
+    raise RunError(f"{run.parent} has a thousand copies of {run.name}; remove some")
+
+
+def _table(parts: list[Part]) -> Table:
+    columns = (Column(no_wrap=True), Column(no_wrap=True), Column(overflow="fold"))
+    table = Table(*columns, box=None, pad_edge=False, show_header=False)
+    styles = {"whole": "green", "none": "", "damaged": "yellow", "lost": "bold red", "foreign": "bold red"}
+    for part in parts:
+        more = [f"and {len(part.lines) - SHOWN} more lines"] if len(part.lines) > SHOWN else []
+        text = "\n".join([*part.lines[:SHOWN], *more])
+        table.add_row(part.name, Text(part.state, style=styles[part.state]), Text(text))
+    return table
