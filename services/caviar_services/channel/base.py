@@ -105,8 +105,8 @@ class ChannelModel(Service[S]):
                 )
         self.absorption_db_per_km = self._absorption()
         """Specific attenuation of the air on each carrier, Shape ``[C]``; None: no atmosphere."""
+        # The devices of the last scene, which mostly are those of the next, and the sum of their numbers.
         self._summed: tuple[tuple[Device, ...], float] = ((), 0.0)
-        """The devices of the last scene, which mostly are those of the next, and the sum of their numbers."""
         self.with_h = False
         """Whether somebody asks for the matrices."""
         self.wideband: frozenset[str] = frozenset()

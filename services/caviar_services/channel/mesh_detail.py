@@ -26,12 +26,12 @@ from caviar_protocol.arrays import Float64Array, Int64Array, quantity
 from caviar_services.mesh.shapes import Mesh
 
 _Vector: TypeAlias = tuple[float, float, float]
+# Unit normal and offset: a point p is n·p + d off.
 _Plane: TypeAlias = tuple[float, float, float, float]
-"""Unit normal and offset: a point p is n·p + d off."""
 _Corners: TypeAlias = tuple[int, int, int]
 
+# Cosine of the largest turn of a triangle's normal by one move: it is not turned inside out.
 _TURN = 0.2
-"""Cosine of the largest turn of a triangle's normal by one move: it is not turned inside out."""
 
 
 def welded(mesh: Mesh) -> Mesh:

@@ -25,10 +25,10 @@ from caviar_protocol.topics import Carrier, ChannelResponse, ChannelTaps
 
 Part = Literal["hf", "taps"]
 
+# Products of elements in one product of matrices: OpenBLAS shares larger ones out to threads (`stacked`).
 _PRODUCTS = 1 << 15
-"""Products of elements in one product of matrices: OpenBLAS shares larger ones out to threads (`stacked`)."""
+# Paths of one product of matrices.
 _DEPTH = 32
-"""Paths of one product of matrices."""
 
 
 class Wideband(msgspec.Struct, frozen=True):

@@ -18,12 +18,12 @@ from caviar_services.channel.sionna.candidates import Candidates, Planes, positi
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.ray_tracing import aligned_indices, several
 
+# [m]; rays from face to face start this far from the first, whose points are known to some 1e-5 m. From and
+# to antennas rays start at the antenna, so that nothing is off.
 _OFF_SURFACE = 2e-4
-"""[m]; rays from face to face start this far from the first, whose points are known to some 1e-5 m. From and
-to antennas rays start at the antenna, so that nothing is off."""
 
+# [m]; a surface this near a segment's end is what stands there.
 _AT_END = 1e-2
-"""[m]; a surface this near a segment's end is what stands there."""
 
 
 class Faces:
@@ -143,16 +143,11 @@ def reached(
 ) -> BoolArray:
     """Whether chains of reflections are paths, Shape ``[P, L, K]``.
 
-    Parameters
-    ----------
-    chains
-        Plane at each interaction, −1 behind the last, Shape ``[P, D]``.
-    receiver
-        Of each chain, Shape ``[P]``.
-    sources
-        Corners of the transmitter's array [m], Shape ``[K, 3]``.
-    targets
-        Corners of the receivers' arrays [m], Shape ``[R, L, 3]``.
+    Args:
+        chains: Plane at each interaction, −1 behind the last, Shape ``[P, D]``.
+        receiver: Of each chain, Shape ``[P]``.
+        sources: Corners of the transmitter's array [m], Shape ``[K, 3]``.
+        targets: Corners of the receivers' arrays [m], Shape ``[R, L, 3]``.
     """
     import drjit as dr
     import mitsuba as mi

@@ -20,14 +20,14 @@ from caviar_services.channel.sionna.ray_launcher import Launch, LaunchOptions
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.ray_tracing import aligned_columns, aligned_indices
 
+# [m] that a point may lie outside the box of its plane: more than float32 and the planes' tolerance do.
 _SLACK = 0.1
-"""[m] that a point may lie outside the box of its plane: more than float32 and the planes' tolerance do."""
 
+# The same as a part of the largest coordinate.
 _RELATIVE_SLACK = 1e-5
-"""The same as a part of the largest coordinate."""
 
+# Sine of the angle to a plane below which the point in it is too uncertain to judge by.
 _GRAZING = 0.03
-"""Sine of the angle to a plane below which the point in it is too uncertain to judge by."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,18 +63,12 @@ class Candidates:
 class Offer:
     """What a launch offers to every receiver.
 
-    Parameters
-    ----------
-    scene
-        Where the rays went.
-    met
-        What its rays met.
-    source
-        Where they came from, a `mitsuba.Point3f` of width 1.
-    options
-        What is traced.
-    points
-        Of the launch, to choose diffuse paths from; None: all that were drawn are wanted.
+    Args:
+        scene: Where the rays went.
+        met: What its rays met.
+        source: Where they came from, a `mitsuba.Point3f` of width 1.
+        options: What is traced.
+        points: Of the launch, to choose diffuse paths from; None: all that were drawn are wanted.
     """
 
     def __init__(

@@ -18,8 +18,8 @@ from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_services.channel.sionna.materials import Constants
 from caviar_services.channel.sionna.ray_launcher import LaunchOptions
 
+# Permittivity of vacuum [F/m] (CODATA 2018).
 _EPSILON_0 = 8.8541878128e-12
-"""Permittivity of vacuum [F/m] (CODATA 2018)."""
 
 DRAWN = 2.0**-26
 """A ray is sent through a surface with a probability; below this one none ever is.
@@ -28,14 +28,14 @@ The ray tracer draws from multiples of 2⁻²³ below 1, and probabilities are f
 lost beside that of a reflection. The factor of two is a margin.
 """
 
+# Half of the smallest float32 above 0.
 _VANISHED = 2.0**-150
-"""Half of the smallest float32 above 0."""
 
+# Options that are on only where the user asked for them.
 _ASKED_FOR = frozenset({"refraction", "diffraction", "scattering"})
-"""Options that are on only where the user asked for them."""
 
+# Angles [rad] between ray and normal at which slabs are looked at.
 _INCIDENCE = np.radians(np.linspace(0.0, 89.9, 900))
-"""Angles [rad] between ray and normal at which slabs are looked at."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,11 +23,11 @@ apart. One that stands farther behind another is hidden by it where they overlap
 
 COPLANAR_RELATIVE = 1.2e-7
 
+# [rad]; between the normals of coplanar faces, at most.
 _ANGLE = 3e-5
-"""[rad]; between the normals of coplanar faces, at most."""
 
+# [m]; boxes around faces that are nearer touch.
 _TOUCHING = 1e-3
-"""[m]; boxes around faces that are nearer touch."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,17 +45,12 @@ class JoinedFaces:
 class CoplanarFaces:
     """Finds the faces of bodies that are one surface with others.
 
-    Parameters
-    ----------
-    table
-        Planes of scenery, and behind them those of bodies, body after body.
-    first
-        Number of the first plane of a body.
-    sizes
-        How many planes each body has, Shape ``[V]``.
-    two_sided
-        Of each plane of a body, whether both of its sides reflect, Shape ``[P − first]``; of others that face
-        away from each other one at most is seen.
+    Args:
+        table: Planes of scenery, and behind them those of bodies, body after body.
+        first: Number of the first plane of a body.
+        sizes: How many planes each body has, Shape ``[V]``.
+        two_sided: Of each plane of a body, whether both of its sides reflect, Shape ``[P − first]``; of
+            others that face away from each other one at most is seen.
     """
 
     def __init__(self, table: PlaneTable, first: int, sizes: Int64Array, two_sided: BoolArray) -> None:

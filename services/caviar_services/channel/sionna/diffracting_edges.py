@@ -19,33 +19,28 @@ from caviar_services.channel.sionna.triangle_numbering import NumberedTriangles
 from caviar_services.mesh.shapes import Mesh
 from caviar_services.ray_tracing import aligned_columns, aligned_indices
 
+# [m]; corners of scenery that are nearer to each other are one.
 _SAME_PLACE = 1e-3
-"""[m]; corners of scenery that are nearer to each other are one."""
 
+# The same for bodies, as a part of their extent.
 _SAME_IN_BODY = 1e-6
-"""The same for bodies, as a part of their extent."""
 
+# Part of the rays that are diffracted where they could be; Sionna RT's is 0.2, so that most are left for
+# reflections, for which there are other rays here.
 _DIFFRACTED = 0.5
-"""Part of the rays that are diffracted where they could be; Sionna RT's is 0.2, so that most are left for
-reflections, for which there are other rays here."""
 
+# [m] by which edges are longer for the ray tracer: what runs over their very ends is decided in float64.
 _BEYOND = 2e-3
-"""[m] by which edges are longer for the ray tracer: what runs over their very ends is decided in float64."""
 
 
 class SceneEdges:
     """All edges of a scene: first those of scenery, then those of each body.
 
-    Parameters
-    ----------
-    scene
-        Whose edges.
-    bodies
-        Unit meshes of the bodies, by asset.
-    leave_out
-        Piece of scenery that is not in the world.
-    free
-        Whether the rims of open surfaces are edges.
+    Args:
+        scene: Whose edges.
+        bodies: Unit meshes of the bodies, by asset.
+        leave_out: Piece of scenery that is not in the world.
+        free: Whether the rims of open surfaces are edges.
     """
 
     def __init__(
@@ -157,14 +152,10 @@ def _of_all_pieces(
 class DeviceEdges:
     """Edges in the ray tracer's arrays; `number` of them is in `WedgeGeometry.local_edge`.
 
-    Parameters
-    ----------
-    edges
-        Whose triangles are numbered through all shapes.
-    rows
-        See `SceneEdges`.
-    scene
-        Of the triangles.
+    Args:
+        edges: Whose triangles are numbered through all shapes.
+        rows: See `SceneEdges`.
+        scene: Of the triangles.
     """
 
     def __init__(self, edges: MeshEdges, rows: Float64Array, scene: NumberedTriangles) -> None:
@@ -197,19 +188,14 @@ class DeviceEdges:
     def drawn(self, hit: Any, came_from: Any, sample: Any, active: Any) -> tuple[Any, Any, Any]:
         """One of the edges of the triangles that rays hit, where rays came from outside of its wedge.
 
-        Parameters
-        ----------
-        hit
-            `mitsuba.SurfaceInteraction3f`.
-        came_from
-            `mitsuba.Point3f` [m].
-        sample
-            `mitsuba.Float` from 0 to 1, to draw by.
-        active
-            `mitsuba.Bool`.
+        Args:
+            hit: `mitsuba.SurfaceInteraction3f`.
+            came_from: `mitsuba.Point3f` [m].
+            sample: `mitsuba.Float` from 0 to 1, to draw by.
+            active: `mitsuba.Bool`.
 
-        Returns
-        -------
+        Returns:
+
         Whether there is one; the ray tracer's `WedgeGeometry`, its first face that which is lit more
         steeply; and its point nearest to where the ray hit.
         """

@@ -36,24 +36,24 @@ from caviar_services.channel.sionna.ray_launcher import (
 )
 from caviar_services.ray_tracing import aligned_columns, aligned_indices, several
 
+# What a factor of a weight is at least: factors leave out polarisation and the thickness of walls, and a
+# point that was chosen against all odds brings far too much.
 _LEAST = 0.01
-"""What a factor of a weight is at least: factors leave out polarisation and the thickness of walls, and a
-point that was chosen against all odds brings far too much."""
 
+# Permittivity of vacuum [F/m] (CODATA 2018).
 _EPSILON_0 = 8.8541878128e-12
-"""Permittivity of vacuum [F/m] (CODATA 2018)."""
 
+# Added to the cosine of Lambert's law: a point that is seen at a small angle is chosen now and then.
 _GRAZING = 0.1
-"""Added to the cosine of Lambert's law: a point that is seen at a small angle is chosen now and then."""
 
+# [m²]; added to the squared distance, for the same reason and so that weights have a limit.
 _NEAR = 1.0
-"""[m²]; added to the squared distance, for the same reason and so that weights have a limit."""
 
+# Weights are added up as multiples of its inverse: sums of integers do not depend on their order.
 _UNIT = 2.0**40
-"""Weights are added up as multiples of its inverse: sums of integers do not depend on their order."""
 
+# 2³² divided by the golden ratio: multiples of it, modulo 2³², are a sequence of low discrepancy.
 _GOLDEN = np.uint64(2654435769)
-"""2³² divided by the golden ratio: multiples of it, modulo 2³², are a sequence of low discrepancy."""
 
 _WORD = np.uint64(0xFFFFFFFF)
 
@@ -82,14 +82,10 @@ class Element:
 class Thinning:
     """Chooses the diffuse paths of launches.
 
-    Parameters
-    ----------
-    mi_scene
-        The Mitsuba scene, with its radio materials.
-    wanted
-        About how many of each receiver are chosen at most.
-    seed
-        Where the choice begins.
+    Args:
+        mi_scene: The Mitsuba scene, with its radio materials.
+        wanted: About how many of each receiver are chosen at most.
+        seed: Where the choice begins.
     """
 
     def __init__(self, mi_scene: Any, wanted: int, seed: int) -> None:
@@ -102,10 +98,10 @@ class Thinning:
         shapes: list[Any] = list(mi_scene.shapes())
         pointers: list[Any] = [dr.reinterpret_array(mi.UInt, mi.ShapePtr(shape)) for shape in shapes]
         numbers = [int(pointer[0]) for pointer in pointers]
+        # Squared scattering coefficient S² of each process-local shape.
         self._roughness = np.zeros(max(numbers, default=0) + 1)
-        """Squared scattering coefficient S² of each process-local shape."""
+        # Power that each reflects of a wave along its normal.
         self._mirror = np.zeros(len(self._roughness))
-        """Power that each reflects of a wave along its normal."""
         for number, shape in zip(numbers, shapes, strict=True):
             material = shape.bsdf()
             self._roughness[number] = float(material.scattering_coefficient[0]) ** 2

@@ -13,12 +13,9 @@ from caviar_services.channel.sionna.scene import SionnaScene
 class EdgeRange:
     """Which edges of a scene, as it stands, are within a distance of one end of a path at least.
 
-    Parameters
-    ----------
-    scene
-        Where the edges are.
-    within_m
-        How far they may be.
+    Args:
+        scene: Where the edges are.
+        within_m: How far they may be.
     """
 
     def __init__(self, scene: SionnaScene, within_m: float) -> None:

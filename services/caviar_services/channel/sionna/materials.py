@@ -22,8 +22,8 @@ from caviar_protocol.scenario.conversion import Place
 Constants = tuple[float, float]
 """Relative permittivity and conductivity [S/m]."""
 
+# Permittivity of vacuum [F/m] (CODATA 2018).
 _EPSILON_0 = 8.8541878128e-12
-"""Permittivity of vacuum [F/m] (CODATA 2018)."""
 
 
 @dataclass(frozen=True)
@@ -105,8 +105,8 @@ def body_kind(asset: str, material: str) -> str:
 OBJECT_MATERIAL = "caviar-object-"
 """What the ray tracer's names of materials begin with that objects are given."""
 
+# [m]; of walls of bodies, where a scenario does not say.
 _BODY_THICKNESS = 0.1
-"""[m]; of walls of bodies, where a scenario does not say."""
 
 OutsideRange = Literal["error", "nearest", "extrapolate"]
 """Where a carrier lies in none of the ranges that ITU-R P.2040 defines a material in: refuse it; take the

@@ -18,14 +18,14 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_services.channel.enumeration.face_rectangles import ranges
 
+# [rad]; faces that deviate less from one plane are one, as in `sionna_planes`.
 _FLAT_ANGLE = 2e-4
-"""[rad]; faces that deviate less from one plane are one, as in `sionna_planes`."""
 
+# Sine of the angle between two pieces of an edge below which they are one edge.
 _STRAIGHT = 1e-4
-"""Sine of the angle between two pieces of an edge below which they are one edge."""
 
+# Pairs of a border and a corner that are looked at together.
 _AT_ONCE = 1_000_000
-"""Pairs of a border and a corner that are looked at together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,18 +84,12 @@ def mesh_edges(
 ) -> MeshEdges:
     """The edges of triangles.
 
-    Parameters
-    ----------
-    vertices
-        [m], Shape ``[V, 3]``.
-    faces
-        Vertices of each triangle, Shape ``[F, 3]``.
-    face_of
-        Number of the plane face that each triangle is a part of, Shape ``[F]``.
-    tolerance
-        [m]; vertices that are nearer to each other are at one place.
-    free
-        Whether free edges are wanted too.
+    Args:
+        vertices: [m], Shape ``[V, 3]``.
+        faces: Vertices of each triangle, Shape ``[F, 3]``.
+        face_of: Number of the plane face that each triangle is a part of, Shape ``[F]``.
+        tolerance: [m]; vertices that are nearer to each other are at one place.
+        free: Whether free edges are wanted too.
     """
     wide = np.flatnonzero(_widths(vertices[faces]) > tolerance)
     if not len(wide):
@@ -208,10 +202,8 @@ def _on(
 ) -> tuple[Int64Array, Int64Array, Float64Array]:
     """Side and corner of each pair of which the corner is on the side, and how far along [m].
 
-    Parameters
-    ----------
-    sides, corners
-        [m], Shapes ``[S, 2, 3]`` and ``[C, 3]``.
+    Args:
+        sides, corners: [m], Shapes ``[S, 2, 3]`` and ``[C, 3]``.
     """
     low, high = sides.min(1) - tolerance, sides.max(1) + tolerance
     order = np.argsort(corners, axis=0, kind="stable")

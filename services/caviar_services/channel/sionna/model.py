@@ -77,24 +77,24 @@ class SionnaChannel(PathModel[SionnaSettings]):
     def __init__(self, settings: SionnaSettings, run: RunInfo) -> None:
         super().__init__(settings, run)
         self.rung = settings.rung
+        # Rays of each launch; where candidates are enumerated, of the scenery's.
         self._samples = settings.launched_samples()
-        """Rays of each launch; where candidates are enumerated, of the scenery's."""
         self._variant = ""
         self._scene: SionnaScene
         self._tracer: Tracer
+        # Traces diffuse paths where they have a launch of their own.
         self._diffuse: Tracer | None = None
-        """Traces diffuse paths where they have a launch of their own."""
         self._edge_range: EdgeRange | None = None
+        # Traces where no edge is in range.
         self._unbent: Tracer
-        """Traces where no edge is in range."""
+        # Transmitters of this frame that no edge is in range of.
         self._without_edge = 0
-        """Transmitters of this frame that no edge is in range of."""
+        # Finds reflected paths where they are enumerated.
         self._enumerated: EnumeratedTracer | None = None
-        """Finds reflected paths where they are enumerated."""
+        # What it knows of the scenery.
         self._scenery: SceneryChains
-        """What it knows of the scenery."""
+        # Whether rays are launched in each frame for the paths of all kinds.
         self._launches = True
-        """Whether rays are launched in each frame for the paths of all kinds."""
         self._following: Following | None = None
         self._outside: tuple[OutsideUse, ...] = ()
         self.foliage: Foliage | None = None
@@ -110,10 +110,10 @@ class SionnaChannel(PathModel[SionnaSettings]):
         self._room: dict[str, int] = {}
         self._names: tuple[str, ...] = ()
         self._keys: dict[str, ObjectMaterials] = {}
+        # Of the pieces of the scene in the last frame.
         self._known_unmatched: tuple[object, dict[str, int]] = (None, {})
-        """Of the pieces of the scene in the last frame."""
+        # Power that half of the rays would have missed in the last frame, Shape ``[T, R]``.
         self._missed = np.zeros((0, 0))
-        """Power that half of the rays would have missed in the last frame, Shape ``[T, R]``."""
         seed = settings.launch_seed
         self._asked = LaunchOptions(
             max_depth=settings.max_depth,

@@ -40,11 +40,11 @@ from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.channel.sionna.tracking import Followed, FollowedOffer, TableState
 from caviar_services.ray_tracing import aligned_columns, aligned_indices, several
 
+# Transmitters whose last launch is kept, in case nothing moves.
 _REMEMBERED = 4
-"""Transmitters whose last launch is kept, in case nothing moves."""
 
+# Candidates to be looked at together at most.
 _LANES = 8_000_000
-"""Candidates to be looked at together at most."""
 
 LANE_BYTES = 40
 """Memory for each of them, or each interaction of each ray."""
@@ -72,14 +72,10 @@ class Tracer:
     for each one. Rays that could be reflected, refracted or scattered choose by the materials at the
     first carrier.
 
-    Parameters
-    ----------
-    scene
-        The scene, tuned to the first carrier. Its ray tracer counts relative to ``scene.centre``.
-    wavelengths
-        Of the carriers [m].
-    options
-        What is traced.
+    Args:
+        scene: The scene, tuned to the first carrier. Its ray tracer counts relative to ``scene.centre``.
+        wavelengths: Of the carriers [m].
+        options: What is traced.
     """
 
     def __init__(self, scene: SionnaScene, wavelengths: Sequence[float], options: LaunchOptions) -> None:

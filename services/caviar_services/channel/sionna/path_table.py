@@ -20,8 +20,8 @@ from caviar_services.channel.propagation.utd import Bends, edge_fields
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.scene import SionnaScene
 
+# Below this horizontal part of a direction Sionna RT sets its azimuth to 0 (100 float32 epsilons).
 _POLE = 1.2e-5
-"""Below this horizontal part of a direction Sionna RT sets its azimuth to 0 (100 float32 epsilons)."""
 
 _TYPES = np.zeros(17, np.uint8)
 _TYPES[[1, 2, 4, 8]] = (
@@ -215,16 +215,11 @@ def path_table(
 ) -> PathTable:
     """What launches found between antennas.
 
-    Parameters
-    ----------
-    scene
-        Where they were.
-    parts
-        Of each launch, one at least, the pair that each path belongs to, and its paths.
-    names, velocity
-        What `SionnaScene.place` returned.
-    antennas, traced_from
-        Where they are, and where they were traced from.
+    Args:
+        scene: Where they were.
+        parts: Of each launch, one at least, the pair that each path belongs to, and its paths.
+        names, velocity: What `SionnaScene.place` returned.
+        antennas, traced_from: Where they are, and where they were traced from.
     """
     met = _Met.of(scene, parts)
     pair, types = met.pair, met.types

@@ -19,23 +19,23 @@ from caviar_services.channel.enumeration.face_rectangles import ranges
 from caviar_services.channel.propagation.geometry import cross
 from caviar_services.mesh.shapes import Mesh
 
+# Room for rounding beyond the tolerances, so that no pair within them falls into separate cells.
 _SLACK = 1.001
-"""Room for rounding beyond the tolerances, so that no pair within them falls into separate cells."""
 
+# Width of a cell in tolerances: narrow ones make many copies of a triangle, wide ones many comparisons.
 _CELL = 2.0
-"""Width of a cell in tolerances: narrow ones make many copies of a triangle, wide ones many comparisons."""
 
+# Meshes of more triangles than the first are searched for planes that hold one of so many of them.
 _LARGE, _MANY = 20_000, 50
-"""Meshes of more triangles than the first are searched for planes that hold one of so many of them."""
 
+# Comparisons at once, about.
 _AT_ONCE = 1_000_000
-"""Comparisons at once, about."""
 
 LieIn = Callable[[Int64Array, Int64Array], BoolArray]
 """Whether triangles lie in the planes of others, given by their numbers."""
 
+# Normals are turned to this side; along no axis, so that few of a scene are at its border.
 _HEMISPHERE = np.array([0.5377, 0.3071, 0.7852])
-"""Normals are turned to this side; along no axis, so that few of a scene are at its border."""
 
 
 def coplanar(
@@ -43,18 +43,13 @@ def coplanar(
 ) -> Int64Array:
     """For each triangle, the first of its mesh in whose plane it lies and that defines one, Shape ``[F]``.
 
-    Parameters
-    ----------
-    triangles
-        Corners [m], Shape ``[F, 3, 3]``, each with an area; the earlier one defines the plane of both.
-    normals
-        Unit normals, of either sense, Shape ``[F, 3]``.
-    mesh
-        Number of the mesh that each is of, Shape ``[F]``.
-    distance
-        Of corners from the plane at most [m], by mesh.
-    angle
-        [rad] between both normals at most.
+    Args:
+        triangles: Corners [m], Shape ``[F, 3, 3]``, each with an area; the earlier one defines the plane of
+            both.
+        normals: Unit normals, of either sense, Shape ``[F, 3]``.
+        mesh: Number of the mesh that each is of, Shape ``[F]``.
+        distance: Of corners from the plane at most [m], by mesh.
+        angle: [rad] between both normals at most.
     """
 
     def lie_in(these: Int64Array, others: Int64Array) -> BoolArray:
@@ -181,17 +176,17 @@ def _begins(values: Int64Array) -> BoolArray:
     return begins
 
 
+# Farthest corner from the plane, as a part of the mesh's extent; float32 corners are within 1e-7.
 _OFF_PLANE = 2e-5
-"""Farthest corner from the plane, as a part of the mesh's extent; float32 corners are within 1e-7."""
 
+# [rad] Largest angle between the normals of a plane's triangles.
 _ANGLE = 2e-4
-"""[rad] Largest angle between the normals of a plane's triangles."""
 
+# Corners this near, as a part of a mesh's extent, are one.
 _SAME_CORNER = 1e-6
-"""Corners this near, as a part of a mesh's extent, are one."""
 
+# [m]; a point this near a triangle is one of it.
 _RIM = 1e-3
-"""[m]; a point this near a triangle is one of it."""
 
 
 def plane_numbers(mesh: Mesh) -> Int32Array:
@@ -256,12 +251,9 @@ def shared_planes(table: PlaneTable, count: int) -> Int64Array:
 class PlaneTable:
     """Where the planes of many meshes are: a triangle of each, and the box around all of its triangles.
 
-    Parameters
-    ----------
-    numbers
-        Plane of each triangle, counted through all meshes from 0, Shape ``[F]``.
-    faces
-        Corners of each triangle, Shape ``[F, 3]``.
+    Args:
+        numbers: Plane of each triangle, counted through all meshes from 0, Shape ``[F]``.
+        faces: Corners of each triangle, Shape ``[F, 3]``.
     """
 
     def __init__(self, numbers: Int64Array, faces: Int64Array) -> None:

@@ -29,8 +29,8 @@ REFLECTED, SCATTERED, REFRACTED, DIFFRACTED = 1, 2, 4, 8
 RAYS_AT_ONCE = 1_000_000
 """More at once are no faster."""
 
+# Memory for each interaction of each ray while a part is launched and its chains are looked for.
 _INTERACTION_BYTES = 250
-"""Memory for each interaction of each ray while a part is launched and its chains are looked for."""
 
 
 def rays_within(memory_gib: float, max_depth: int) -> int:
@@ -164,14 +164,10 @@ def _concatenated(parts: Sequence[Any]) -> Any:
 class PartedLauncher:
     """Launches the rays in parts, so that memory is bounded whatever their number.
 
-    Parameters
-    ----------
-    mi_scene
-        Where they go, a `mitsuba.Scene`.
-    options
-        What is traced.
-    generator
-        See `Launcher`.
+    Args:
+        mi_scene: Where they go, a `mitsuba.Scene`.
+        options: What is traced.
+        generator: See `Launcher`.
     """
 
     def __init__(self, mi_scene: Any, options: LaunchOptions, generator: Any = None) -> None:
@@ -215,16 +211,11 @@ class PartedLauncher:
 class Launcher:
     """Launches the rays; one kernel serves every depth.
 
-    Parameters
-    ----------
-    mi_scene
-        Where they go, a `mitsuba.Scene`.
-    options
-        What is traced.
-    part
-        Numbers of the first ray and of the one behind the last; absent: all rays.
-    generator
-        What says how rays go on, a `SBCandidateGenerator` of Sionna RT; absent: that itself.
+    Args:
+        mi_scene: Where they go, a `mitsuba.Scene`.
+        options: What is traced.
+        part: Numbers of the first ray and of the one behind the last; absent: all rays.
+        generator: What says how rays go on, a `SBCandidateGenerator` of Sionna RT; absent: that itself.
     """
 
     def __init__(

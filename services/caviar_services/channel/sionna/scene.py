@@ -56,17 +56,17 @@ from caviar_services.channel.sionna.triangle_numbering import Body, NumberedTria
 from caviar_services.mesh.scenery import find_scenery
 from caviar_services.mesh.shapes import BodyPool, Mesh, box, placed
 
+# Frequency [Hz] of a carrier, and what is to be set at materials.
 _Tuning = tuple[float, list[tuple[Any, Constants]]]
-"""Frequency [Hz] of a carrier, and what is to be set at materials."""
 
 PARKING_DEPTH = 2000.0
 """Unused receivers stand this far [m] below the scenery, in a closed metal box of their own."""
 
+# [m]; more than the part of a shadow ray near its end that is not tested (9e-4 of its length).
 _HALF_BOX = 4.0
-"""[m]; more than the part of a shadow ray near its end that is not tested (9e-4 of its length)."""
 
+# [m]; the centre is a multiple of it, so that a scene about the origin stays as it is.
 _CENTRE_STEP = 128.0
-"""[m]; the centre is a multiple of it, so that a scene about the origin stays as it is."""
 
 _PARKING = "caviar-parking"
 _SKIN = "caviar-body"

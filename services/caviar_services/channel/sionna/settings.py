@@ -18,11 +18,11 @@ from caviar_services.channel.propagation.foliage import FoliageSettings
 from caviar_services.channel.sionna.materials import OTHER_MATERIALS, MaterialSettings, OutsideRange
 from caviar_services.mesh.scenery import ITU_MATERIALS
 
+# Of a launch in each frame.
 _SAMPLES = 100_000
-"""Of a launch in each frame."""
 
+# Of a launch before the first one.
 _SCENERY_SAMPLES = 10_000_000
-"""Of a launch before the first one."""
 
 
 BodyCount = Annotated[int, quantity("1", "moving objects of one mesh at most", ge=0, le=4096)]

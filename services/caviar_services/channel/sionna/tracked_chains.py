@@ -28,22 +28,18 @@ class FollowingState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 class Following:
     """The chains of all transmitters.
 
-    Parameters
-    ----------
-    parts
-        Launches until every ray was launched once.
-    scene, tracer
-        Of the channel. Other channels may move the bodies of the same scene.
-    without_body
-        Classes of objects that have no body.
+    Args:
+        parts: Launches until every ray was launched once.
+        scene, tracer: Of the channel. Other channels may move the bodies of the same scene.
+        without_body: Classes of objects that have no body.
     """
 
     def __init__(self, parts: int, scene: SionnaScene, tracer: Tracer, without_body: frozenset[str]) -> None:
         self._parts, self._scene, self._tracer = parts, scene, tracer
         self._without_body = without_body
         self._followed: dict[str, Followed] = {}
+        # What the bodies were moved to last, with the version that the scene then had.
         self._placed: tuple[Scene, int] | None = None
-        """What the bodies were moved to last, with the version that the scene then had."""
 
     def clear(self) -> None:
         """Know nothing, as at the beginning of an episode."""

@@ -30,14 +30,14 @@ from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.checkpoint import Packed
 from caviar_services.ray_tracing import aligned_columns, aligned_indices
 
+# [m] A transmitter that has moved farther since the frame before is looked for anew.
 _JUMP = 20.0
-"""[m] A transmitter that has moved farther since the frame before is looked for anew."""
 
+# Steps by which rays on moving objects are widened to both sides: seven rays beside each.
 _BESIDE = (1, 2, 4)
-"""Steps by which rays on moving objects are widened to both sides: seven rays beside each."""
 
+# Rounds of launches after which a chain that none of them met is forgotten.
 _KEPT = 5
-"""Rounds of launches after which a chain that none of them met is forgotten."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,10 +118,8 @@ class Followed:
     The first frame launches all rays, and so does one in which the transmitter has jumped. All others launch
     every ``parts``-th of them, in turn, and those on or beside moving objects: there paths come and go.
 
-    Parameters
-    ----------
-    parts
-        Launches until every ray was launched once.
+    Args:
+        parts: Launches until every ray was launched once.
     """
 
     def __init__(self, parts: int) -> None:
@@ -129,10 +127,10 @@ class Followed:
         self._number = 0
         self._known: _Table | None = None
         self._names: tuple[str, ...] = ()
+        # Where the last launch came from [m].
         self._from = np.zeros(3)
-        """Where the last launch came from [m]."""
+        # Which rays met a moving object when they were launched last.
         self._on_object: BoolArray = np.zeros(0, np.bool_)
-        """Which rays met a moving object when they were launched last."""
 
     @property
     def state(self) -> FollowedState:

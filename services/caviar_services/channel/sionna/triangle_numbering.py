@@ -33,27 +33,20 @@ Body = tuple[str, int]
 SurfaceNames = tuple[tuple[str, int], ...]
 """Objects, and planes of each, that surfaces of several objects are known by."""
 
+# Vertical part of the normal of grounds and roofs, at least.
 _LYING = 0.5
-"""Vertical part of the normal of grounds and roofs, at least."""
 
 
 class NumberedTriangles:
     """The triangles of shapes, of which the last ones may move; bodies are their last pieces.
 
-    Parameters
-    ----------
-    shapes
-        In world coordinates.
-    ids
-        Process-local number of each shape.
-    bodies
-        What may move, in the order of the pieces.
-    unit_meshes
-        Of the bodies, by asset.
-    centre
-        What the ray tracer's coordinates are relative to [m], Shape ``[3]``.
-    moving
-        How many shapes may move, one of each material of bodies.
+    Args:
+        shapes: In world coordinates.
+        ids: Process-local number of each shape.
+        bodies: What may move, in the order of the pieces.
+        unit_meshes: Of the bodies, by asset.
+        centre: What the ray tracer's coordinates are relative to [m], Shape ``[3]``.
+        moving: How many shapes may move, one of each material of bodies.
     """
 
     def __init__(

@@ -30,19 +30,14 @@ def compile_kernels(
 ) -> None:
     """Trace above the scene whatever finds paths in frames.
 
-    Parameters
-    ----------
-    scene, launched
-        What is traced in, and what is modelled there.
-    tracers, diffuse
-        Whose kernels are compiled: those of all paths, the first of them that of ``rung``, and that of
-        diffuse paths where they have a launch of their own.
-    rung
-        How arrays are treated.
-    followed_parts
-        Frames in which all rays are launched; None: nothing is followed.
-    enumerated
-        What enumerates paths by way of bodies; for it some are placed above the scene, and parked again.
+    Args:
+        scene, launched: What is traced in, and what is modelled there.
+        tracers, diffuse: Whose kernels are compiled: those of all paths, the first of them that of ``rung``,
+            and that of diffuse paths where they have a launch of their own.
+        rung: How arrays are treated.
+        followed_parts: Frames in which all rays are launched; None: nothing is followed.
+        enumerated: What enumerates paths by way of bodies; for it some are placed above the scene, and
+            parked again.
     """
     if launched.diffraction:
         importlib.import_module("scipy.special")  # which the first diffracted path would wait for
