@@ -286,3 +286,10 @@ def _aligned(rows: Float64Array, dtype: np.dtype[Any]) -> NDArray[Any]:
     columns = buffer[start : start + count * stride].reshape(count, stride)[:, :size]
     columns[...] = rows
     return columns
+
+
+def positions(points: Float64Array) -> Any:
+    """Positions [m], Shape ``[N, 3]``, as a `mitsuba.Point3f`."""
+    import mitsuba as mi
+
+    return mi.Point3f(*map(mi.Float, aligned_columns(points.T)))

@@ -73,6 +73,15 @@ class RunInfo:
     progress: Progress = no_progress
     again: bool = False
     """Whether another process of this name was in the run before, or may have been."""
+    settings_key: str = ""
+    """Dotted key of the service's settings in the scenario; empty: ``services.NAME.settings``."""
+
+    @property
+    def settings_place(self) -> Place:
+        """Where the service's settings stand, for errors; the broker adds file and line."""
+        return (
+            Place(self.settings_key) if self.settings_key else Place("services").at(self.name).at("settings")
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -33,7 +33,7 @@ from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import Scene
 from caviar_services.channel.adaptive.error_bounds import ErrorBound, errors_db, scores_db
 from caviar_services.channel.sionna.model import SionnaChannel
-from caviar_services.channel.sionna.scene_sharing import shared_scenes
+from caviar_services.channel.sionna.scene import shared_scenes
 from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.service import Frame, Preparation
 

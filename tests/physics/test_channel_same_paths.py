@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +15,7 @@ import pytest
 from same_paths import EVERYTHING, POSITIONS, SCENES, SPECULAR, asked, digest, model, of_receiver, places
 
 from caviar_services.channel.base import ChannelModel
-from caviar_services.channel.sionna.candidates import Planes
-from caviar_services.channel.sionna.chains import Chains
+from caviar_services.channel.sionna.candidate_visibility import Planes
 
 pytestmark = pytest.mark.channel
 
@@ -120,10 +118,9 @@ def test_no_path_is_ruled_out(traced: tuple[str, ChannelModel[Any]], monkeypatch
     judged = asked(channel, name, where, TEN, seed=6)
     seen: list[float] = []
 
-    def all_of_them(planes: Planes, chains: Chains, source: Any, targets: Any) -> tuple[Any, Any]:
-        some = possible(planes, chains, source, targets)
-        unsure = replace(chains, straight=np.zeros_like(chains.straight))
-        every = possible(planes, unsure, source, targets)
+    def all_of_them(planes: Planes, chains: Any, straight: Any, source: Any, targets: Any) -> tuple[Any, Any]:
+        some = possible(planes, chains, straight, source, targets)
+        every = possible(planes, chains, np.zeros_like(straight), source, targets)
         seen.append(len(every[0]) / len(some[0]))
         return every
 

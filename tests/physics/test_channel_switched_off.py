@@ -12,9 +12,13 @@ from channel_lab import Plate, Thing, antenna, carriers, measure, scene, sionna,
 
 from caviar_protocol.topics import Channel, Interaction
 from caviar_services.channel.sionna import model as sionna_model
-from caviar_services.channel.sionna.contributing import SurfaceMaterial, UsedSurfaces, contributing
 from caviar_services.channel.sionna.ray_launcher import LaunchOptions
-from caviar_services.channel.sionna.settings import SionnaSettings
+from caviar_services.channel.sionna.settings import (
+    SionnaSettings,
+    SurfaceMaterial,
+    UsedSurfaces,
+    contributing,
+)
 from caviar_services.service import Preparation, RunInfo
 
 pytestmark = pytest.mark.channel

@@ -7,14 +7,16 @@ from typing import Any
 
 import msgspec
 import pytest
-from adaptive_rungs import LADDER, MS, Time, adaptive, channel_of, frame, labels, rung
+from adaptive_rungs import LADDER, MS, Time, TimedRung, adaptive, channel_of, frame, labels, rung
 
 from caviar_clients.session.checks import checked_scenario
 from caviar_protocol.codec import encode_payload
-from caviar_protocol.errors import ScenarioError
+from caviar_protocol.errors import PayloadError, ScenarioError
+from caviar_protocol.scenario.conversion import convert_settings
+from caviar_protocol.topics import Carrier
 from caviar_services.channel.adaptive.channel import AdaptiveChannel
 from caviar_services.registry import load
-from caviar_services.service import Preparation, StepResult
+from caviar_services.service import Preparation, RunInfo, StepResult
 
 SCENARIO = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "adaptive.toml"
 
@@ -88,6 +90,23 @@ class TestLadder:
         ]
         made = adaptive(ladder=ladder, common={"takes_ms": 7.0})
         assert [getattr(r.model.settings, "takes_ms", None) for r in made.rungs] == [None, 5, 7]
+
+    def test_what_a_rung_refuses_names_its_key_in_the_ladder(self) -> None:
+        ladder = [rung("low", 1), {"label": "air", "use": "free-space", "settings": {"atmosphere": {}}}]
+        settings = convert_settings(AdaptiveChannel.Settings, {"ladder": ladder})
+        run = RunInfo(name="channel", carriers=(Carrier(name="c", frequency_hz=2e12),))
+        with pytest.raises(ScenarioError) as caught:
+            AdaptiveChannel(settings, run)
+        assert caught.value.key == "services.channel.settings.ladder[1].settings.atmosphere"
+
+    def test_an_error_in_a_frame_names_the_rung(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        def fail(self: TimedRung, *_: object) -> None:
+            raise PayloadError("settings.x: there is no way")
+
+        channel = adaptive()
+        monkeypatch.setattr(TimedRung, "model", fail)
+        with pytest.raises(PayloadError, match=r"^settings\.x: there is no way \(rung 'middle'\)$"):
+            channel.step(frame(0, 60))
 
     def test_it_is_registered(self) -> None:
         assert load("channel", "adaptive") is AdaptiveChannel

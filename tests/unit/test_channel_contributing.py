@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from caviar_services.channel.sionna.contributing import (
+from caviar_services.channel.sionna.ray_launcher import LaunchOptions
+from caviar_services.channel.sionna.settings import (
     SurfaceMaterial,
     UsedSurfaces,
     contributing,
     slab,
 )
-from caviar_services.channel.sionna.ray_launcher import LaunchOptions
 
 ASKED = LaunchOptions(
     max_depth=3,

@@ -203,7 +203,7 @@ class TestPreparing:
             model(pool={"box": count})
 
     def test_a_pool_for_a_mesh_that_is_not_there_is_named(self) -> None:
-        with pytest.raises(ScenarioError, match=r"pool: there is no object mesh 'lorry'.*box"):
+        with pytest.raises(ScenarioError, match=r"pool.lorry: the run has no object mesh 'lorry'.*box"):
             prepared(pool={"lorry": 3})
 
 
@@ -217,11 +217,12 @@ class TestFrames:
     """What a frame may and may not hold."""
 
     def test_more_objects_than_bodies_name_the_setting(self, channel: SionnaChannel) -> None:
-        with pytest.raises(PayloadError, match="pool size"):
+        text = r"^services\.channel\.settings\.bodies: object 'c' .*the pool has 2; write a larger number$"
+        with pytest.raises(PayloadError, match=text):
             step(channel, ("a", "b", "c"))
 
     def test_an_asset_that_is_not_there_is_named(self, channel: SionnaChannel) -> None:
-        with pytest.raises(PayloadError, match=r"objects/tank\.ply"):
+        with pytest.raises(PayloadError, match=r"the mesh 'objects/tank\.ply', which the run does not have"):
             step(channel, ("a",), asset="objects/tank.ply")
 
     def test_an_object_named_like_scenery_is_refused(self, tmp_path: Path) -> None:

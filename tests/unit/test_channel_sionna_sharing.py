@@ -7,10 +7,9 @@ from typing import Any
 
 import pytest
 
-from caviar_services.channel.sionna import scene_sharing
+from caviar_services.channel.sionna import scene
 from caviar_services.channel.sionna.materials import MaterialPolicy, MaterialSettings
-from caviar_services.channel.sionna.scene import SceneSettings
-from caviar_services.channel.sionna.scene_sharing import scene_of, shared_scenes
+from caviar_services.channel.sionna.scene import SceneSettings, scene_of, shared_scenes
 
 ASSETS = {"scenery/scene.xml": Path("/a/scene.xml")}
 
@@ -28,7 +27,7 @@ def settings(**changes: Any) -> SceneSettings:
 @pytest.fixture(autouse=True)
 def no_ray_tracer(monkeypatch: pytest.MonkeyPatch) -> None:
     """Scenes that are only what they were made of."""
-    monkeypatch.setattr(scene_sharing, "SionnaScene", lambda *made: [*made])
+    monkeypatch.setattr(scene, "SionnaScene", lambda *made: [*made])
 
 
 def test_equal_requests_get_one_scene() -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from caviar_services.channel.sionna.chains import MANY_RAYS, Chains, chains_of
+from caviar_services.channel.sionna.candidates import MANY_RAYS, Chains, chains_of
 from caviar_services.channel.sionna.ray_launcher import REFLECTED, Bounce, Launch
 
 

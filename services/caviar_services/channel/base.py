@@ -1,19 +1,24 @@
-"""What all channel models share: from a frame to its `Channel` product."""
+"""Base classes of channel models: from the scene of a frame to its `Channel` product.
+
+`PathModel` is for models that find paths, `ChannelModel` for all others. What both report beside the product,
+such as why users have no path (`outage_counts`), is made here as well.
+"""
 
 from __future__ import annotations
 
 import math
 import time
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import ClassVar, TypeVar
+from typing import ClassVar, Protocol, TypeVar
 
 import msgspec
 import numpy as np
 
-from caviar_protocol.arrays import BoolArray, Float64Array
+from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.host import keep_large_buffers
 from caviar_protocol.messages import Input, Role
@@ -21,12 +26,12 @@ from caviar_protocol.multipath import changes
 from caviar_protocol.scenario.schema import PATTERNS
 from caviar_protocol.scene_validation import too_fast
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
-from caviar_protocol.space.scene import antennas
+from caviar_protocol.space.scene import antennas, device_pose
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Channel, ChannelOptions, Scene
+from caviar_protocol.topics.channel import INSIDE_PREFIX, Cause
 from caviar_protocol.topics.scene import Device, Panel
 from caviar_services.channel.arrays.channel_matrices import Matrices
 from caviar_services.channel.assemble import Product, assemble
-from caviar_services.channel.outage import outage_counts
 from caviar_services.channel.paths import Antenna, PathTable
 from caviar_services.channel.propagation.atmosphere import Atmosphere, specific_attenuation
 from caviar_services.channel.propagation.patterns import Patterns
@@ -36,7 +41,14 @@ from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Servi
 
 
 class ChannelSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What can be set on every channel model."""
+    """Settings of every channel model; a model with more subclasses it.
+
+    Example:
+        >>> class ShadowedSettings(ChannelSettings, frozen=True, kw_only=True):
+        ...     shadowing_db: float = 0.0
+        >>> ShadowedSettings(shadowing_db=4.0)
+        ShadowedSettings(atmosphere=None, shadowing_db=4.0)
+    """
 
     atmosphere: Atmosphere | None = None
     """Air that absorbs along every path (ITU-R P.676); ``{}`` is that of the Recommendation's figures, and
@@ -48,12 +60,14 @@ S = TypeVar("S", bound=ChannelSettings)
 
 @dataclass(frozen=True, kw_only=True)
 class Found:
-    """What a model found in a frame."""
+    """What the `PathModel.paths` of a model found in a frame."""
 
     table: PathTable
+    """Paths of all pairs, in any order."""
     los: BoolArray
     """Whether the line of sight is free, Shape ``[T, R]``."""
     counts: dict[str, int] = field(default_factory=dict)
+    """What the report of the run adds up, by name."""
     matrices: Matrices | None = None
     """How H is made where it is not of plane waves."""
     split_nmse: Float64Array | None = None
@@ -63,10 +77,11 @@ class Found:
 
 @dataclass(frozen=True, kw_only=True)
 class Modelled:
-    """What a model made of a frame."""
+    """What the `ChannelModel.model` of a model made of a frame."""
 
     channel: Channel
     counts: dict[str, int] = field(default_factory=dict)
+    """See `Found.counts`."""
     measured: dict[str, int] = field(default_factory=dict)
     """Nanoseconds that named phases took."""
     split_nmse: Float64Array | None = None
@@ -79,7 +94,15 @@ class ChannelModel(Service[S]):
     """Base of channel models: from the scene of a frame to its `Channel` product.
 
     A model sets ``rung`` and implements `model`; it loads what it needs in `load` and says in
-    `options` what it models.
+    `options` what it models. One that finds paths subclasses `PathModel` instead.
+
+    Args:
+        settings: Of the model's ``Settings``, `ChannelSettings` or a subclass.
+        run: Carriers and devices of the run; one carrier at least.
+
+    Raises:
+        ScenarioError: There is no carrier, a frequency is not finite and above 0, or the atmosphere is not
+            defined at one; names the key.
     """
 
     role: ClassVar[Role] = "channel"
@@ -108,7 +131,7 @@ class ChannelModel(Service[S]):
         # The devices of the last scene, which mostly are those of the next, and the sum of their numbers.
         self._summed: tuple[tuple[Device, ...], float] = ((), 0.0)
         self.with_h = False
-        """Whether somebody asks for the matrices."""
+        """Whether the matrices are in demand."""
         self.wideband: frozenset[str] = frozenset()
         """Parts ``hf`` and ``taps`` that are in demand."""
         self.with_split = False
@@ -118,7 +141,7 @@ class ChannelModel(Service[S]):
 
     @property
     def needs_assets(self) -> bool:
-        """Pattern files are assets, too."""
+        """Whether files are read in `prepare`: scenery, meshes of objects, or pattern files of antennas."""
         arrays = [spec.array for spec in self.run.devices if spec.array is not None]
         return self.uses_scenery or any(array.pattern_file for array in arrays)
 
@@ -141,8 +164,14 @@ class ChannelModel(Service[S]):
         return None
 
     def enclosing(self, position: Float64Array) -> str:
-        """Name of the object of the last frame that a point [m], Shape ``[3]``, is inside; empty: none that
-        the model knows."""
+        """Name the object of the last frame that a point is inside.
+
+        Args:
+            position: Of the point [m], Shape ``[3]``.
+
+        Returns:
+            The name; empty where the model knows of none.
+        """
         return ""
 
     @property
@@ -152,7 +181,14 @@ class ChannelModel(Service[S]):
         return {}
 
     def load(self, preparation: Preparation) -> tuple[str, ...]:
-        """Load scenery, compile, warm up; notes for the user."""
+        """Load scenery, compile, warm up; `prepare` calls it once, before the first frame.
+
+        Args:
+            preparation: What is in demand, and the files of scenery, meshes and patterns.
+
+        Returns:
+            Notes for the user, such as what was switched off and why.
+        """
         return ()
 
     @abstractmethod
@@ -163,7 +199,14 @@ class ChannelModel(Service[S]):
         transmitters: Sequence[AntennaDevice],
         receivers: Sequence[AntennaDevice],
     ) -> Modelled:
-        """The channels of all TX/RX pairs of a frame."""
+        """Make the channels of all TX/RX pairs of a frame.
+
+        Args:
+            frame: The frame; its `Frame.generator` is the only source of randomness.
+            scene: The scene of the frame, whose numbers are finite.
+            transmitters: Antennas that send, in the order of `Channel.tx`.
+            receivers: Antennas that receive, in the order of `Channel.rx`.
+        """
 
     def prepare(self, preparation: Preparation) -> Prepared:
         demand = preparation.demand.get("channel", frozenset())
@@ -227,7 +270,7 @@ class ChannelModel(Service[S]):
                 [specific_attenuation(air, carrier.frequency_hz) for carrier in self.run.carriers]
             )
         except ScenarioError as error:
-            raise ScenarioError(str(error), key=f"services.{self.run.name}.settings.atmosphere") from error
+            raise ScenarioError(str(error), key=self.run.settings_place.at("atmosphere").key) from error
 
     def _absorption_notes(self) -> tuple[str, ...]:
         air = self.settings.atmosphere
@@ -303,13 +346,27 @@ def _refuse_amplified(channel: Channel) -> None:
 
 class PathModel(ChannelModel[S]):
     """Base of models that find the paths of a frame; antennas, carrier phase, order, ids and matrices
-    are applied here, in float64, the same way for every rung of the ladder."""
+    are applied here, in float64, the same way for every rung of the ladder.
 
+    The arguments are those of `ChannelModel`. `docs/howto/channel-models.md` has a whole model.
+    """
+
+    # Episode, frame and product of the last frame, for births and deaths of paths.
     _before: tuple[int, int, Channel] | None = None
 
     @abstractmethod
     def paths(self, scene: Scene, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]) -> Found:
-        """Paths of all TX/RX pairs of a scene, in any order."""
+        """Find the paths of all TX/RX pairs of a scene.
+
+        Args:
+            scene: The scene of the frame.
+            transmitters: T antennas where they are, in world axes.
+            receivers: R antennas; a device that also sends has no path to itself.
+
+        Returns:
+            The paths in any order, pair t·R + r for transmitter t and receiver r, without antennas and
+            without carrier phase.
+        """
 
     def model(
         self,
@@ -353,3 +410,98 @@ class PathModel(ChannelModel[S]):
             return {}
         turnover = changes(before[2], channel)
         return {"births": turnover.births, "deaths": turnover.deaths}
+
+
+class Surroundings(Protocol):
+    """What a channel model knows about places; in the state of the last frame."""
+
+    @property
+    def extent(self) -> tuple[Float64Array, Float64Array] | None:
+        """Lowest and highest corner [m] of the scenery, Shape ``[3]`` each; None: there is none."""
+
+    def enclosing(self, position: Float64Array) -> str:
+        """Name of the object that a point [m], Shape ``[3]``, is inside; empty: none."""
+
+
+def outage_counts(
+    channel: Channel, scene: Scene, surroundings: Surroundings, dropped_pairs: Collection[int] = ()
+) -> dict[str, int]:
+    """Users without a path by `Cause`, and the antennas that stand inside an object, for a report.
+
+    Args:
+        channel: The product of a frame.
+        scene: The scene that it was made of.
+        surroundings: What the model knows about places.
+        dropped_pairs: Pairs of which paths were dropped, for values that are not finite.
+    """
+    offsets = channel.offsets
+    if (offsets[1:] > offsets[:-1]).all() and channel.a.all():
+        return {}
+    users = _users_without_path(channel)
+    ends = _Ends(channel, scene, surroundings)
+    causes: Counter[Cause] = Counter()
+    for p in np.flatnonzero(users).tolist():
+        t, r = divmod(p, len(channel.rx))
+        if channel.tx[t] != channel.rx[r]:
+            cause = Cause.NOT_FINITE if p in dropped_pairs else ends.cause(t, r)
+            causes[cause] += int(users[p])
+    counts = {cause.count_name: number for cause, number in causes.items()}
+    return counts | {f"{INSIDE_PREFIX}{name} in {around}": 1 for name, around in ends.inside.items()}
+
+
+def _users_without_path(channel: Channel) -> Int64Array:
+    """For each pair, the carriers on which no path has an amplitude, Shape ``[T·R]``."""
+    paths = np.diff(channel.offsets)
+    reached: BoolArray = np.zeros((len(channel.carriers), len(paths)), np.bool_)
+    carrier, path = np.nonzero(channel.a)
+    reached[carrier, np.repeat(np.arange(len(paths)), paths)[path]] = True
+    lacking: Int64Array = np.count_nonzero(~reached, axis=0)
+    return lacking
+
+
+class _Ends:
+    """The antennas of a frame; each place is looked at once, whatever number of pairs it is in."""
+
+    def __init__(self, channel: Channel, scene: Scene, surroundings: Surroundings) -> None:
+        self._channel, self._scene, self._surroundings = channel, scene, surroundings
+        self._devices: Mapping[str, Device] = {device.name: device for device in scene.devices}
+        self._positions: dict[str, Float64Array] = {}
+        self._around: dict[str, str] = {}
+        lowest_hz = min((carrier.frequency_hz for carrier in channel.carriers), default=np.inf)
+        self._wavelength = SPEED_OF_LIGHT / lowest_hz
+
+    @property
+    def inside(self) -> dict[str, str]:
+        """Antennas that stand inside an object, and its name."""
+        return {name: around for name, around in sorted(self._around.items()) if around}
+
+    def cause(self, t: int, r: int) -> Cause:
+        """Why a pair has no path."""
+        channel = self._channel
+        names = channel.tx[t], channel.rx[r]
+        start, end = (self._position(name) for name in names)
+        around = [self._enclosing(name) for name in names]  # of both, since both are to be named
+        if any(around):
+            return Cause.INSIDE
+        if np.linalg.norm(end - start) < self._wavelength:
+            return Cause.TOO_CLOSE
+        if channel.los[t, r]:
+            return Cause.NOT_FOUND
+        return Cause.OUT_OF_RANGE if self._is_beside(start) or self._is_beside(end) else Cause.BLOCKED
+
+    def _position(self, name: str) -> Float64Array:
+        if name not in self._positions:
+            self._positions[name] = np.array(device_pose(self._scene, self._devices[name]).position)
+        return self._positions[name]
+
+    def _enclosing(self, name: str) -> str:
+        if name not in self._around:
+            self._around[name] = self._surroundings.enclosing(self._position(name))
+        return self._around[name]
+
+    def _is_beside(self, position: Float64Array) -> bool:
+        """Whether a place is beside the scenery or below it; above it, the sky goes on."""
+        if self._surroundings.extent is None:
+            return False
+        low, high = self._surroundings.extent
+        return bool((position < low).any() or (position[:2] > high[:2]).any())

@@ -6,15 +6,17 @@ street a ray tracer sees the large faces of a vehicle (flanks, roof, windscreen)
 in every frame.
 
 Ray tracers rebuild little when vertices change and much when bodies come or go, so the channel keeps a pool
-of bodies and parks the unused ones. Sensors need nothing of a body but its triangles, and hold those of the
-frame alone.
+of bodies, and shrinks those that stand for no object to a point. Sensors need nothing of a body but its
+triangles, and hold those of the frame alone.
 """
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 
@@ -25,15 +27,33 @@ from caviar_protocol.space.coordinates import Pose, rotation_matrix
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles: vertices [m], Shape ``[V, 3]``; faces, Shape ``[F, 3]``, outward normals by the
-    right-hand rule."""
+    """Triangles of a surface.
+
+    Args:
+        vertices: [m], Shape ``[V, 3]``.
+        faces: Vertices of each triangle, Shape ``[F, 3]``; outward normals by the right-hand rule.
+    """
 
     vertices: Float64Array
     faces: Int32Array
 
 
 def placed(mesh: Mesh, dimensions: Float64Array, pose: Pose) -> Float64Array:
-    """World vertices [m], Shape ``[V, 3]``, of a unit mesh scaled by ``dimensions`` [3] at a pose."""
+    """Scale, turn and move a unit mesh.
+
+    Args:
+        mesh: Its box is −½…½ on every axis.
+        dimensions: Length, width and height of the object [m], Shape ``[3]``.
+        pose: Of the object in the world.
+
+    Returns:
+        World vertices [m], Shape ``[V, 3]``.
+
+    Example:
+        >>> pose = Pose((10.0, 0.0, 0.75), (1.0, 0.0, 0.0, 0.0))
+        >>> placed(unit_box(), np.array([4.0, 2.0, 1.5]), pose).max(0)
+        array([12. ,  1. ,  1.5])
+    """
     world: Float64Array = (mesh.vertices * dimensions) @ rotation_matrix(pose.orientation).T + np.array(
         pose.position
     )
@@ -54,7 +74,15 @@ _BOX_FACES = np.array(
 
 
 def box(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float]) -> Mesh:
-    """Axis-aligned box between the given bounds [m]: 8 vertices, 12 faces."""
+    """Axis-aligned box between bounds [m]: 8 vertices, 12 faces.
+
+    Args:
+        x, y, z: Lowest and highest coordinate on each axis.
+
+    Example:
+        >>> box((0, 2), (0, 1), (0, 3)).vertices.max(0)
+        array([2, 1, 3])
+    """
     (x0, x1), (y0, y1), (z0, z1) = x, y, z
     corners = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
     return Mesh(
@@ -68,45 +96,60 @@ def unit_box() -> Mesh:
     return box((-0.5, 0.5), (-0.5, 0.5), (-0.5, 0.5))
 
 
-class BodyPool:
-    """Which body of a ray tracer stands for which object of the scene.
+def assign_bodies(
+    objects: Iterable[tuple[str, str]],
+    pool: Mapping[str, int],
+    keys: Mapping[str, str] = MappingProxyType({}),
+) -> dict[str, tuple[str, int]]:
+    """Choose the body of a ray tracer that stands for each object of a scene.
 
-    Every asset has ``capacity[asset]`` bodies. An object keeps its body as long as it is in the
-    scene; one that leaves frees it for the next. Names are assigned in sorted order, so that the
-    assignment depends only on the sequence of scenes.
+    Names are assigned in sorted order, so that the assignment follows from the scene alone, also after a
+    restart.
+
+    Args:
+        objects: Name and asset of each object; an empty asset is the box.
+        pool: How many bodies there are of each asset.
+        keys: Key of the scenario that says how many, by asset, for the error.
+
+    Returns:
+        Asset and slot, from 0, of each object's body, by name.
+
+    Raises:
+        PayloadError: There are more objects of an asset than bodies, or none of its bodies at all; names the
+            object, the asset, and the key or how to bring the mesh.
+
+    Example:
+        >>> assign_bodies([("car.2", ""), ("car.1", "")], {"": 2})
+        {'car.1': ('', 0), 'car.2': ('', 1)}
     """
-
-    def __init__(self, capacity: Mapping[str, int]) -> None:
-        self._free = {asset: list(range(count))[::-1] for asset, count in capacity.items()}
-        self._capacity = dict(capacity)
-        self._taken: dict[str, tuple[str, int]] = {}
-
-    def assign(self, objects: Iterable[tuple[str, str]]) -> dict[str, tuple[str, int]]:
-        """Body (asset, slot) of each (name, asset) in the scene.
-
-        Raises `PayloadError` naming the asset where there are more objects than bodies.
-        """
-        wanted = dict(objects)
-        for name in [n for n, (asset, _) in self._taken.items() if wanted.get(n) != asset]:
-            asset, slot = self._taken.pop(name)
-            self._free[asset].append(slot)
-            self._free[asset].sort(reverse=True)
-        for name in sorted(wanted.keys() - self._taken.keys()):
-            asset = wanted[name]
-            if not self._free.get(asset):
-                raise PayloadError(
-                    f"object {name!r} needs another body of {asset or 'the box'!r}, the pool has "
-                    f"{self._capacity.get(asset, 0)}; raise the pool size in the service's settings"
-                )
-            self._taken[name] = (asset, self._free[asset].pop())
-        return dict(self._taken)
+    taken: dict[str, tuple[str, int]] = {}
+    used: Counter[str] = Counter()
+    for name, asset in sorted(objects):
+        count = pool.get(asset)
+        if count is None:
+            raise PayloadError(
+                f"object {name!r} has the mesh {asset!r}, which the run does not have (it has: "
+                f"{', '.join(sorted(filter(None, pool))) or 'none'}); let the world bring it, or keep the "
+                "meshes of a recording beside it"
+            )
+        if used[asset] == count:
+            key = keys.get(asset, "")
+            remedy = "write a larger number" if key else "raise the pool size in the service's settings"
+            raise PayloadError(
+                f"{key}{': ' * bool(key)}object {name!r} needs another body of {asset or 'the box'!r}, the "
+                f"pool has {count}; {remedy}"
+            )
+        taken[name] = (asset, used[asset])
+        used[asset] += 1
+    return taken
 
 
 def loft(sections: Float64Array) -> Mesh:
-    """Closed surface through convex polygons, Shape ``[S, K, 3]``, with flat ends.
+    """Closed surface through convex polygons, with flat ends.
 
-    Seen from the last section towards the first, corners run counter-clockwise; then normals
-    point outwards.
+    Args:
+        sections: Corners of S polygons of K corners each, Shape ``[S, K, 3]``. Seen from the last section
+            towards the first, they run counter-clockwise; then normals point outwards.
     """
     count, corners = sections.shape[:2]
     faces: list[tuple[int, int, int]] = []
@@ -121,7 +164,11 @@ def loft(sections: Float64Array) -> Mesh:
 
 
 def joined(parts: Sequence[Mesh]) -> Mesh:
-    """Several closed meshes that do not touch, as one."""
+    """Several closed meshes that do not touch, as one.
+
+    Args:
+        parts: One at least.
+    """
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     return Mesh(
         np.concatenate([part.vertices for part in parts]),
@@ -254,7 +301,15 @@ SHAPES: dict[str, Callable[[], Mesh]] = {
 
 
 def ply(mesh: Mesh) -> bytes:
-    """A mesh as binary PLY: float32 vertices, faces as uint8 count and int32 indices."""
+    """Encode a mesh as binary PLY: float32 vertices, faces as uint8 count and int32 indices.
+
+    Args:
+        mesh: Of a unit mesh, the box of its vertices is −½…½ on every axis.
+
+    Example:
+        >>> ply(unit_box())[:3]
+        b'ply'
+    """
     header = (
         "ply\nformat binary_little_endian 1.0\n"
         f"element vertex {len(mesh.vertices)}\n"

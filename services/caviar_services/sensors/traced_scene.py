@@ -20,7 +20,7 @@ from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.space.scene import object_pose
 from caviar_protocol.topics import Scene
 from caviar_services.mesh.scenery import Scenery
-from caviar_services.mesh.shapes import BodyPool, Mesh, placed
+from caviar_services.mesh.shapes import Mesh, assign_bodies, placed
 from caviar_services.ray_tracing import aligned_columns, aligned_indices
 
 NO_HIT = -1
@@ -187,7 +187,7 @@ class TracedScene:
                 f"object {min(clash)!r} has the name of a shape of the scenery; give the world's objects "
                 "another prefix"
             )
-        BodyPool(self._capacity).assign(zip(scene.names, scene.assets, strict=True))
+        assign_bodies(zip(scene.names, scene.assets, strict=True), self._capacity)
         # Embree rebuilds all that is in the mesh, whether a ray can hit it or not: no body is parked there.
         meshes = [
             Mesh(placed(unit, scene.dimensions[index], object_pose(scene, index)), unit.faces)

@@ -32,10 +32,9 @@ from caviar_services.channel.adaptive.controller import (
     CostState,
     Workload,
 )
-from caviar_services.channel.adaptive.settings import AdaptiveSettings, Rung, built, models, rung_of
-from caviar_services.channel.base import Modelled
-from caviar_services.channel.outage import outage_counts
-from caviar_services.channel.sionna.scene_sharing import shared_scenes
+from caviar_services.channel.adaptive.settings import AdaptiveSettings, Rung, built, models, naming, rung_of
+from caviar_services.channel.base import Modelled, outage_counts
+from caviar_services.channel.sionna.scene import shared_scenes
 from caviar_services.checkpoint import restored, saved
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
 
@@ -98,7 +97,8 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
         notes: list[str] = []
         with shared_scenes():
             for rung in self._every:
-                told = rung.model.prepare(preparation).notes
+                with naming(rung.label):
+                    told = rung.model.prepare(preparation).notes
                 notes += [note for note in told if note not in notes]
         notes += self._time_rungs()
         return Prepared(notes=tuple(notes))
@@ -222,7 +222,8 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
         asked, model.with_h = model.with_h, model.with_h or with_h
         began = self.clock()
         try:
-            made = model.model(frame, scene, *devices)
+            with naming(rung.label):
+                made = model.model(frame, scene, *devices)
         finally:
             model.with_h = asked
         return made, self.clock() - began

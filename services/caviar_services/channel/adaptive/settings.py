@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import msgspec
@@ -73,14 +74,39 @@ class Rung:
     expected_error_db: float | None
 
 
+@contextmanager
+def naming(label: str) -> Iterator[None]:
+    """Errors raised within say of which rung they are; a key that they begin with stays in front.
+
+    Args:
+        label: Of the rung.
+    """
+    try:
+        yield
+    except Exception as error:
+        error.args = (f"{error} (rung {label!r})", *error.args[1:])
+        raise
+
+
 def built(settings: AdaptiveSettings, run: RunInfo) -> tuple[Rung, ...]:
     """The ladder of a scenario, and behind it the reference where that is no rung. Raises `ScenarioError`
     naming the key for whatever cannot be."""
-    place = Place("services").at(run.name).at("settings")
+    place = run.settings_place
+    every = zip(_every(settings), _places(settings, place), models(settings, place), strict=True)
     return tuple(
-        Rung(label=rung.label, model=cls(own, run), expected_error_db=rung.expected_error_db)
-        for rung, (cls, own) in zip(_every(settings), models(settings, place), strict=True)
+        Rung(
+            label=rung.label,
+            model=cls(own, replace(run, settings_key=at.at("settings").key)),
+            expected_error_db=rung.expected_error_db,
+        )
+        for rung, at, (cls, own) in every
     )
+
+
+def _places(settings: AdaptiveSettings, place: Place) -> list[Place]:
+    """Where each of the rungs, and the reference where it is none, stands."""
+    places = [place.at("ladder").at(index) for index in range(len(settings.ladder))]
+    return places if settings.reference is None else [*places, place.at("reference")]
 
 
 def _every(settings: AdaptiveSettings) -> tuple[LadderRung, ...]:
@@ -96,8 +122,7 @@ def models(settings: AdaptiveSettings, place: Place) -> list[tuple[type[ChannelM
     """
     _check(settings, place)
     every = _every(settings)
-    places = [place.at("ladder").at(index) for index in range(len(settings.ladder))]
-    places += [place.at("reference")] * (len(every) - len(places))
+    places = _places(settings, place)
     found = [_model(rung.use, where) for rung, where in zip(every, places, strict=True)]
     known = [frozenset(cls.Settings.__struct_fields__) for cls in found]
     for name in settings.common:

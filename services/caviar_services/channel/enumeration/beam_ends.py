@@ -31,8 +31,7 @@ from caviar_services.channel.enumeration.image_beams import (
     reflected_beams,
     scenery_beams,
 )
-from caviar_services.channel.sionna.candidates import positions
-from caviar_services.ray_tracing import aligned_indices, several
+from caviar_services.ray_tracing import aligned_indices, positions, several
 
 _BLOCK = 16
 """Beams of one group that are looked at together: groups are filled up to a multiple of it."""

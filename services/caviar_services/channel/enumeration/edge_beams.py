@@ -38,10 +38,9 @@ from caviar_services.channel.enumeration.image_beams import (
     reflected_beams,
     scenery_beams,
 )
-from caviar_services.channel.sionna.candidates import positions
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.scene import SionnaScene
-from caviar_services.ray_tracing import aligned_columns, aligned_indices, several
+from caviar_services.ray_tracing import aligned_columns, aligned_indices, positions, several
 
 _FEW = 512
 """Edges of scenery of which paths by way of bodies are enumerated; of more, rays find them."""

@@ -22,8 +22,7 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_services.channel.enumeration.face_rectangles import FaceRectangles
-from caviar_services.channel.sionna.candidates import positions
-from caviar_services.ray_tracing import aligned_columns, aligned_indices, several
+from caviar_services.ray_tracing import aligned_columns, aligned_indices, positions, several
 
 _LANES = 1 << 23
 """Pairs that are looked at together at most."""

@@ -28,7 +28,7 @@ class SceneFaces:
         first = scene.first_moving_plane
         triangles, sizes = table.triangles_of(np.arange(len(table.triangle)))
         piece = scene.piece_of(triangles)
-        self._scenery = _faces_of(scene, np.arange(first), ~scene.is_parking_piece(piece))
+        self._scenery = _faces_of(scene, np.arange(first), piece != scene.parking_piece)
         self._row = np.full(first, -1)
         self._row[self._scenery.plane] = np.arange(len(self._scenery))
         body_of = piece[np.cumsum(sizes) - sizes] - scene.first_body_piece

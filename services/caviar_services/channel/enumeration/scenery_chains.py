@@ -27,10 +27,10 @@ from caviar_services.channel.enumeration.chain_cache import ChainCache, cache_ke
 from caviar_services.channel.enumeration.face_rectangles import FaceRectangles, ranges
 from caviar_services.channel.enumeration.scene_faces import SceneFaces
 from caviar_services.channel.sionna.candidate_visibility import Faces
-from caviar_services.channel.sionna.candidates import positions
-from caviar_services.channel.sionna.chains import chains_of
+from caviar_services.channel.sionna.candidates import chains_of
 from caviar_services.channel.sionna.ray_launcher import Launch, Launcher, LaunchOptions, PartedLauncher
 from caviar_services.channel.sionna.scene import SionnaScene
+from caviar_services.ray_tracing import positions
 
 _OFF_PLANE = 1e-3
 """[m] from its plane that a ray starts."""

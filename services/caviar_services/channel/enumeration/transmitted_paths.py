@@ -16,7 +16,7 @@ from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_services.channel.enumeration.face_rectangles import FaceRectangles
 from caviar_services.channel.enumeration.image_paths import AT_END, OFF_SURFACE, ImagePaths
 from caviar_services.channel.sionna.candidate_visibility import Faces
-from caviar_services.channel.sionna.contributing import DRAWN, slab
+from caviar_services.channel.sionna.materials import DRAWN, slab
 from caviar_services.channel.sionna.scene import SionnaScene
 
 _PASSED_TWICE = 2

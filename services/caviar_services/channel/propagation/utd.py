@@ -36,7 +36,7 @@ from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.propagation.geometry import cross
-from caviar_services.channel.sionna.contributing import slab
+from caviar_services.channel.sionna.materials import slab
 
 IN_PLANE = 1e-8
 """[rad]; a ray this near the plane of a face is in it, and this near a shadow boundary on its lit side."""

@@ -7,16 +7,25 @@ known from the launch.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
-from caviar_services.channel.sionna.candidates import Candidates, Planes, positions
+from caviar_services.channel.sionna.planes import PlaneTable
 from caviar_services.channel.sionna.scene import SionnaScene
-from caviar_services.ray_tracing import aligned_indices, several
+from caviar_services.ray_tracing import aligned_columns, aligned_indices, positions, several
+
+# [m] that a point may lie outside the box of its plane: more than float32 and the planes' tolerance do.
+_SLACK = 0.1
+
+# The same as a part of the largest coordinate.
+_RELATIVE_SLACK = 1e-5
+
+# Sine of the angle to a plane below which the point in it is too uncertain to judge by.
+_GRAZING = 0.03
 
 # [m]; rays from face to face start this far from the first, whose points are known to some 1e-5 m. From and
 # to antennas rays start at the antenna, so that nothing is off.
@@ -24,6 +33,100 @@ _OFF_SURFACE = 2e-4
 
 # [m]; a surface this near a segment's end is what stands there.
 _AT_END = 1e-2
+
+
+class Planes:
+    """The planes of a frame on the ray tracer's side, to rule out chains by."""
+
+    def __init__(self, table: PlaneTable) -> None:
+        import mitsuba as mi
+
+        rows = np.concatenate([table.origin, table.normal, table.low, table.high], axis=1).T
+        reach = float(np.abs(rows).max(initial=0.0))
+        columns = [mi.Float(column) for column in aligned_columns(rows)]
+        self._slack = _SLACK + _RELATIVE_SLACK * reach
+        self._origin, self._normal = mi.Point3f(*columns[:3]), mi.Vector3f(*columns[3:6])
+        self._low, self._high = mi.Point3f(*columns[6:9]), mi.Point3f(*columns[9:12])
+
+    def possible(
+        self, chains: Int32Array, straight: BoolArray, source: Any, targets: Any
+    ) -> tuple[Int64Array, Int64Array]:
+        """Chain and target of each pair of them that could be a path.
+
+        The source is mirrored at one plane after the other; from the target, the line to the last image has
+        to meet the last plane between both ends and within the box around its triangles, and so on back.
+
+        Args:
+            chains: Plane at each interaction, −1 where any may be, Shape ``[C, D]``.
+            straight: Which chains have reflections and transmissions alone; of others nothing is known, so
+                that all could be, Shape ``[C]``.
+            source: A `mitsuba.Point3f` of width 1.
+            targets: A `mitsuba.Point3f`.
+
+        Returns:
+            Indices of chains and of targets.
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        count, receivers = len(chains), dr.width(targets)
+        if not count * receivers:
+            return np.zeros(0, np.int64), np.zeros(0, np.int64)
+        per_chain = dr.opaque(mi.UInt, receivers)
+        lane = dr.arange(mi.UInt, count * receivers)
+        chain, target = lane // per_chain, lane % per_chain
+        columns = [mi.UInt(aligned_indices(column + 1)) for column in chains.T.astype(np.int64)]
+        judged = dr.gather(mi.UInt, mi.UInt(aligned_indices(straight)), chain) != 0
+        plane = [dr.gather(mi.UInt, column, chain) for column in columns]
+        images = self.images(mi.Point3f(source), plane)
+        here, possible, unsure = dr.gather(mi.Point3f, targets, target), mi.Bool(True), ~judged
+        for number, image in zip(reversed(plane), reversed(images[1:]), strict=True):
+            met, grazing, meets = self._met(here, image, number)
+            unsure |= grazing & (number > 0)
+            possible &= meets | unsure | (number == 0)
+            here = dr.select(number > 0, met, here)
+        kept: Any = dr.compress(possible)
+        lanes = kept.numpy().astype(np.int64)
+        return lanes // receivers, lanes % receivers
+
+    def images(self, source: Any, numbers: Sequence[Any]) -> list[Any]:
+        """A source and its image in one plane after the other; numbers of planes count from 1, 0 is none."""
+        import drjit as dr
+
+        images = [source]
+        for number in numbers:
+            origin, normal = self.plane(number)
+            mirrored = images[-1] - 2 * dr.dot(images[-1] - origin, normal) * normal
+            images.append(dr.select(number > 0, mirrored, images[-1]))
+        return images
+
+    def plane(self, number: Any) -> tuple[Any, Any]:
+        """A point [m] and the unit normal of planes, counted from 1."""
+        import drjit as dr
+        import mitsuba as mi
+
+        used = number > 0
+        origin = dr.gather(mi.Point3f, self._origin, number - 1, used)
+        return origin, dr.gather(mi.Vector3f, self._normal, number - 1, used)
+
+    def _met(self, here: Any, image: Any, number: Any) -> tuple[Any, Any, Any]:
+        """Where the line to an image meets a plane; whether it does so at too small an angle to tell;
+        whether that may be a point of a path."""
+        import drjit as dr
+        import mitsuba as mi
+
+        used = number > 0
+        origin, normal = self.plane(number)
+        line = image - here
+        length, across = dr.norm(line), dr.dot(line, normal)
+        grazing = dr.abs(across) < _GRAZING * length
+        along = dr.dot(origin - here, normal) / dr.select(grazing, 1.0, across)
+        met = here + along * line
+        low = dr.gather(mi.Point3f, self._low, number - 1, used) - self._slack
+        high = dr.gather(mi.Point3f, self._high, number - 1, used) + self._slack
+        margin = self._slack / dr.maximum(dr.abs(across), 1e-9)
+        between = (along > -margin) & (along < 1.0 + margin)
+        return met, grazing, between & dr.all((met > low) & (met < high))
 
 
 class Faces:
@@ -112,22 +215,33 @@ class Corners:
 
 
 def at_corners(
-    faces: Faces, planes: Planes, candidates: Candidates, at_centres: BoolArray, corners: Corners | None
+    faces: Faces,
+    planes: Planes,
+    chains: Int32Array,
+    depth: Int64Array,
+    receiver: Int64Array,
+    at_centres: BoolArray,
+    corners: Corners | None,
 ) -> tuple[BoolArray, BoolArray]:
-    """Of all candidates, which only other elements than the centres have, and which all corners have."""
+    """Look at candidates from the corners of the arrays.
+
+    Args:
+        faces: Of the scene.
+        planes: Of the scene.
+        chains: Plane at each interaction of P candidates, −1 where any may be, Shape ``[P, D]``.
+        depth: Interactions of each, Shape ``[P]``.
+        receiver: Of each, Shape ``[P]``.
+        at_centres: Which of them the arrays' centres have, Shape ``[P]``.
+        corners: Of the arrays; None: only the centres count.
+
+    Returns:
+        Which only other elements than the centres have, and which all corners have, each of Shape ``[P]``.
+    """
     hidden, settled = np.zeros((2, len(at_centres)), np.bool_)
     if corners is not None:
-        place = np.arange(candidates.planes.shape[1])
-        mirrors = (candidates.planes >= 0) == (place < candidates.depth[:, None])
+        mirrors = (chains >= 0) == (np.arange(chains.shape[1]) < depth[:, None])
         some = np.flatnonzero(mirrors.all(1))
-        exist = reached(
-            faces,
-            planes,
-            candidates.planes[some],
-            candidates.receiver[some],
-            corners.transmitter,
-            corners.receivers,
-        )
+        exist = reached(faces, planes, chains[some], receiver[some], corners.transmitter, corners.receivers)
         hidden[some] = exist.any((1, 2))
         settled[some] = exist.all((1, 2))
     return hidden & ~at_centres, settled & at_centres
@@ -191,15 +305,10 @@ def _exists(faces: Faces, planes: Planes, number: list[Any], start: Any, end: An
     import mitsuba as mi
 
     here = end
-    images = [start]
-    surfaces = []
-    for plane in number:
-        origin, normal = planes.plane(plane)
-        surfaces.append((origin, normal))
-        mirrored = images[-1] - 2 * dr.dot(images[-1] - origin, normal) * normal
-        images.append(dr.select(plane > 0, mirrored, images[-1]))
+    images = planes.images(start, number)
     exists, lifted = mi.Bool(True), here
-    for plane, (origin, normal), image in zip(number[::-1], surfaces[::-1], images[:0:-1], strict=True):
+    for plane, image in zip(number[::-1], images[:0:-1], strict=True):
+        origin, normal = planes.plane(plane)
         used = exists & (plane > 0)
         line = image - here
         along = dr.dot(origin - here, normal) / dr.dot(line, normal)

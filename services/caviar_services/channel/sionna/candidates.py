@@ -3,31 +3,246 @@
 Every receiver is offered all of them: so its paths depend neither on which others are traced with it nor on
 whether a ray happened to pass near it. Most chains cannot be a path to most receivers, which the
 image method tells from the planes and the boxes around them before anything is traced.
+
+The chains of planes that the rays of a launch went along, and the points at which they were scattered.
+
+A chain is a sequence of planes that some ray went along. Chains come from the transmitter's launch alone.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
-from caviar_services.channel.sionna.chains import Chains, Met
-from caviar_services.channel.sionna.diffuse_paths import Points
-from caviar_services.channel.sionna.planes import PlaneTable
-from caviar_services.channel.sionna.ray_launcher import Launch, LaunchOptions
+from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array, UInt64Array
+from caviar_services.channel.sionna.candidate_visibility import Planes
+from caviar_services.channel.sionna.diffuse_paths import ChosenPoints, DrawnPoints, Scattered, scattered_of
+from caviar_services.channel.sionna.ray_launcher import (
+    DIFFRACTED,
+    REFLECTED,
+    REFRACTED,
+    SCATTERED,
+    Launch,
+    LaunchOptions,
+)
 from caviar_services.channel.sionna.scene import SionnaScene
-from caviar_services.ray_tracing import aligned_columns, aligned_indices
 
-# [m] that a point may lie outside the box of its plane: more than float32 and the planes' tolerance do.
-_SLACK = 0.1
+MANY_RAYS = 1000
+"""Of a chain that no half of a launch would miss."""
 
-# The same as a part of the largest coordinate.
-_RELATIVE_SLACK = 1e-5
 
-# Sine of the angle to a plane below which the point in it is too uncertain to judge by.
-_GRAZING = 0.03
+@dataclass(frozen=True, eq=False)
+class Chains:
+    """C specular chains, or specular ends behind a scattering point."""
+
+    ray: Int64Array
+    """The first ray that went along each, Shape ``[C]``."""
+    depth: Int64Array
+    """Interactions of each, Shape ``[C]``."""
+    planes: Int32Array
+    """Plane at each interaction that is a reflection, −1 elsewhere, Shape ``[C, D]``."""
+    straight: BoolArray
+    """Whether a chain has but reflections and transmissions, Shape ``[C]``."""
+    rays: Int64Array
+    """How many rays went along each, Shape ``[C]``."""
+
+    def take(self, which: BoolArray | Int64Array) -> Chains:
+        """These chains."""
+        return Chains(
+            self.ray[which], self.depth[which], self.planes[which], self.straight[which], self.rays[which]
+        )
+
+    def rays_of(self, planes: Int64Array, depth: Int64Array) -> Int64Array:
+        """Rays that went along the chains of paths with these planes, Shape ``[P, D]``, and depths, Shape
+        ``[P]``; chains that differ in other things than planes count together. ``MANY_RAYS`` for a path of
+        none of these chains.
+        """
+        known, which = np.unique(_chain_keys(self.planes, self.depth), return_inverse=True)
+        if not len(known):
+            return np.full(len(depth), MANY_RAYS)
+        rays = np.bincount(which.reshape(-1), weights=self.rays).astype(np.int64)
+        keys = _chain_keys(planes, depth)
+        place = np.minimum(np.searchsorted(known, keys), len(known) - 1)
+        return np.where(known[place] == keys, rays[place], MANY_RAYS)
+
+
+def _chain_keys(planes: Int32Array | Int64Array, depth: Int64Array) -> UInt64Array:
+    """A hash of each chain: planes are too many for a key that counts all sequences of them."""
+    key = depth.astype(np.uint64)
+    for column in planes.T:
+        key = key * np.uint64(1_000_003) + (column + 2).astype(np.uint64)
+    return key
+
+
+@dataclass(frozen=True, eq=False)
+class Met:
+    """What rays met, as far as paths may come of it."""
+
+    launch: Launch
+    """The rays that went along a chain first, or were scattered; of a launch in one part all of them."""
+    chains: Chains
+    """By rays of ``launch``."""
+    scattered: Scattered
+
+
+def met_by(
+    launch: Launch, scene: SionnaScene, max_depth: int, scattered: Scattered | None = None, part: bool = False
+) -> Met:
+    """What a launch met; ``scattered`` where points of diffuse paths are not those that were drawn.
+
+    Of a ``part`` of a larger launch only the rays that matter are kept."""
+    chains = chains_of(launch, scene, max_depth)
+    scattered = scattered or scattered_of(launch)
+    if not part:
+        return Met(launch, chains, scattered)
+    # One at least: Dr.Jit gathers nothing from arrays without elements, not even with no lane active.
+    rays = np.union1d(np.append(chains.ray, 0), scattered.ray)
+    return Met(
+        launch.take(rays),
+        replace(chains, ray=np.searchsorted(rays, chains.ray)),
+        replace(scattered, ray=np.searchsorted(rays, scattered.ray)),
+    )
+
+
+def united(parts: Sequence[Met], scene: SionnaScene) -> Met:
+    """What the parts of a launch, one at least, met together; each chain once, as `chains_of` sorts."""
+    if len(parts) == 1:
+        return parts[0]
+    launch = Launch.joined([part.launch for part in parts])
+    widths = np.array([part.launch.rays for part in parts])
+    first = np.cumsum(widths) - widths
+    chains = Chains(
+        np.concatenate([part.chains.ray + begin for part, begin in zip(parts, first, strict=True)]),
+        np.concatenate([part.chains.depth for part in parts]),
+        np.concatenate([part.chains.planes for part in parts]),
+        np.concatenate([part.chains.straight for part in parts]),
+        np.concatenate([part.chains.rays for part in parts]),
+    )
+    signature = np.column_stack([chains.depth, _signature(launch, chains, scene)])
+    _, kept, which = np.unique(signature, axis=0, return_index=True, return_inverse=True)
+    rays = np.bincount(which.reshape(-1), weights=chains.rays).astype(np.int64)
+    ray = np.concatenate([part.scattered.ray + begin for part, begin in zip(parts, first, strict=True)])
+    depth = np.concatenate([part.scattered.depth for part in parts])
+    order = np.argsort(depth, kind="stable")
+    rows = np.concatenate([part.scattered.rows for part in parts], axis=1)
+    return Met(
+        launch, replace(chains.take(kept), rays=rays), Scattered(ray[order], depth[order], rows[:, order])
+    )
+
+
+def chains_of(launch: Launch, scene: SionnaScene, max_depth: int) -> Chains:
+    """All chains that rays of a launch went along, shortest first, then in a stable order."""
+    ray = np.zeros(0, np.int64)
+    chain = np.zeros(0, np.int64)
+    planes, straight = np.full((1, max_depth), -1, np.int32), np.ones(1, np.bool_)
+    found: list[Chains] = []
+    for d, bounce in enumerate(launch.bounces):
+        kinds = bounce.kind.numpy()
+        if d == 0:
+            ray = np.flatnonzero(kinds)
+            chain = np.zeros(len(ray), np.int64)
+        else:
+            going = kinds[ray] != 0
+            ray, chain = ray[going], chain[going]
+        if not len(ray):
+            break
+        # Neighbouring rays mostly meet the same: only the first of each run is looked at.
+        begins = _begins(launch, d, ray, chain)
+        heads = np.flatnonzero(begins)
+        kind, plane, token, tokens = _tokens(launch, d, ray[heads], scene)
+        key = chain[heads] * tokens + token
+        _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
+        kind, plane, first = kind[first], plane[first], heads[first]
+        before = chain[first]
+        planes, straight = planes[before], straight[before] & ((kind == REFLECTED) | (kind == REFRACTED))
+        planes[:, d] = np.where(kind == REFLECTED, plane, -1)
+        run_lengths = np.diff(np.append(heads, len(ray)))
+        rays = np.bincount(inverse.reshape(-1), weights=run_lengths).astype(np.int64)
+        chain = inverse.reshape(-1)[np.cumsum(begins) - 1]
+        specular = kind != SCATTERED
+        found.append(
+            Chains(
+                ray[first][specular],
+                np.full(int(specular.sum()), d + 1, np.int64),
+                planes[specular],
+                straight[specular],
+                rays[specular],
+            )
+        )
+    return Chains(
+        _stacked([part.ray for part in found]),
+        _stacked([part.depth for part in found]),
+        np.concatenate([np.zeros((0, max_depth), np.int32), *(part.planes for part in found)]),
+        np.concatenate([np.zeros(0, np.bool_), *(part.straight for part in found)]),
+        _stacked([part.rays for part in found]),
+    )
+
+
+def _begins(launch: Launch, d: int, ray: Int64Array, chain: Int64Array) -> BoolArray:
+    """Which rays differ from those before them, in what they met or the chain that they come from."""
+    bounce = launch.bounces[d]
+    told_apart = [chain, *(column.numpy()[ray] for column in (bounce.kind, bounce.shape, bounce.primitive))]
+    if launch.wedges is not None:
+        told_apart.append(launch.wedges.local_edge.numpy()[ray])
+    begins = np.ones(len(ray), np.bool_)
+    begins[1:] = False
+    for column in told_apart:
+        begins[1:] |= column[1:] != column[:-1]
+    return begins
+
+
+def _tokens(
+    launch: Launch, d: int, ray: Int64Array, scene: SionnaScene
+) -> tuple[Int64Array, Int64Array, Int64Array, int]:
+    """Kind, plane, and what tells interactions of these rays apart: the plane of a reflection, the edge of a
+    diffraction, else the kind alone; and how many of these there can be."""
+    kind, plane, token = _met_at(launch, d, ray, scene)
+    first_edge = _first_edge(scene)
+    bent = np.flatnonzero(token >= first_edge)
+    edges = 0
+    if len(bent):
+        _, edge = np.unique(token[bent], return_inverse=True)
+        edges = int(edge.max()) + 1
+        token[bent] = first_edge + edge.reshape(-1)
+    return kind, plane, token, first_edge + edges
+
+
+def _signature(launch: Launch, chains: Chains, scene: SionnaScene) -> Int64Array:
+    """What tells each interaction of chains apart, −1 behind the last, Shape ``[C, D]``."""
+    signature = np.full(chains.planes.shape, -1, np.int64)
+    for d in range(len(launch.bounces)):
+        used = chains.depth > d
+        signature[used, d] = _met_at(launch, d, chains.ray[used], scene)[2]
+    return signature
+
+
+def _met_at(
+    launch: Launch, d: int, ray: Int64Array, scene: SionnaScene
+) -> tuple[Int64Array, Int64Array, Int64Array]:
+    """Kind and plane of an interaction of rays, and a number that tells it apart in all launches: the
+    plane, or one for each kind, or one for each edge."""
+    bounce = launch.bounces[d]
+    kind = bounce.kind.numpy()[ray].astype(np.int64)
+    shape = bounce.shape.numpy()[ray].astype(np.int64)
+    plane = scene.surface_of[scene.triangle_numbers(shape, bounce.primitive.numpy()[ray].astype(np.int64))]
+    token = np.where(kind == REFLECTED, plane, _first_edge(scene) - 16 + kind)
+    bent = kind == DIFFRACTED
+    if bent.any():
+        edge = launch.wedges.local_edge.numpy()[ray[bent]].astype(np.int64)
+        token[bent] = _first_edge(scene) + edge
+    return kind, plane, token
+
+
+def _first_edge(scene: SionnaScene) -> int:
+    """The first number of an edge: behind those of planes and kinds."""
+    return len(scene.plane_table.triangle) + 16
+
+
+def _stacked(parts: list[Int64Array]) -> Int64Array:
+    return np.concatenate([np.zeros(0, np.int64), *parts])
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +292,7 @@ class Offer:
         met: Met,
         source: Any,
         options: LaunchOptions,
-        points: Points | None = None,
+        points: ChosenPoints | None = None,
     ) -> None:
         self.launch = met.launch
         self._mi_scene = scene.mi_scene
@@ -90,7 +305,7 @@ class Offer:
         self._chains = met.chains
         if options.only_scattered:
             self._chains = self._chains.take(~self._chains.straight)
-        self._points = points
+        self._points = points or DrawnPoints(scene.mi_scene, met.launch, met.scattered)
         self._scattered = met.scattered
 
     def rays_of(self, planes: Int64Array, depth: Int64Array) -> Int64Array:
@@ -115,9 +330,8 @@ class Offer:
         if self.everywhere:
             every_target = np.arange(dr.width(targets))
             seen, direct = np.isin(every_target, direct), every_target
-        chain, receiver = self.planes.possible(chains, self._source, targets)
-        of_points = self._points.reached if self._points else self._reached
-        point, reached, probability = of_points(targets)
+        chain, receiver = self.planes.possible(chains.planes, chains.straight, self._source, targets)
+        point, reached, probability = self._points.reached(targets)
         none = np.zeros(len(direct), np.int64)
         any_plane = np.full((len(direct) + len(point), self._options.max_depth), -1, np.int32)
         every = Candidates(
@@ -144,117 +358,6 @@ class Offer:
         seen: Int64Array = np.flatnonzero(free.numpy())
         return seen
 
-    def _reached(self, targets: Any) -> tuple[Int64Array, Int64Array, Float64Array]:
-        """Scattering points and the receivers that each of them reaches, on the side that was lit; all with
-        the probability of what was drawn."""
-        import drjit as dr
-        import mitsuba as mi
-
-        ray, depth = self._scattered.ray, self._scattered.depth
-        if not len(ray):
-            return ray, ray, np.zeros(0)
-        parts: list[tuple[Int64Array, Int64Array]] = []
-        receivers = dr.width(targets)
-        per_point = dr.opaque(mi.UInt, receivers)
-        for d, bounce in enumerate(self.launch.bounces):
-            first = int(np.searchsorted(depth, d + 1))
-            rays = ray[first : int(np.searchsorted(depth, d + 1, side="right"))]
-            if not len(rays):
-                continue
-            lane = dr.arange(mi.UInt, len(rays) * receivers)
-            of_ray = dr.gather(mi.UInt, mi.UInt(aligned_indices(rays)), lane // per_point)
-            target = dr.gather(mi.Point3f, targets, lane % per_point)
-            hit = dr.zeros(mi.Interaction3f, len(rays) * receivers)
-            hit.p = dr.gather(mi.Point3f, bounce.point, of_ray)
-            hit.n = dr.gather(mi.Normal3f, bounce.normal, of_ray)
-            back = hit.spawn_ray_to(target)
-            lit = dr.dot(mi.Vector3f(hit.n), back.d) > 0.0
-            lit &= ~self._mi_scene.ray_test(back, active=lit)
-            kept: Any = dr.compress(lit)
-            lanes = kept.numpy().astype(np.int64)
-            parts.append((first + lanes // receivers, lanes % receivers))
-        points = np.concatenate([point for point, _ in parts])
-        return points, np.concatenate([rx for _, rx in parts]), np.zeros(len(points))
-
-
-class Planes:
-    """The planes of a frame on the ray tracer's side, to rule out chains by."""
-
-    def __init__(self, table: PlaneTable) -> None:
-        import mitsuba as mi
-
-        rows = np.concatenate([table.origin, table.normal, table.low, table.high], axis=1).T
-        reach = float(np.abs(rows).max(initial=0.0))
-        columns = [mi.Float(column) for column in aligned_columns(rows)]
-        self._slack = _SLACK + _RELATIVE_SLACK * reach
-        self._origin, self._normal = mi.Point3f(*columns[:3]), mi.Vector3f(*columns[3:6])
-        self._low, self._high = mi.Point3f(*columns[6:9]), mi.Point3f(*columns[9:12])
-
-    def possible(self, chains: Chains, source: Any, targets: Any) -> tuple[Int64Array, Int64Array]:
-        """Chain and target of each pair of them that could be a path.
-
-        The source is mirrored at one plane after the other; from the target, the line to the last image has
-        to meet the last plane between both ends and within the box around its triangles, and so on back.
-        """
-        import drjit as dr
-        import mitsuba as mi
-
-        count, receivers = len(chains.ray), dr.width(targets)
-        if not count * receivers:
-            return np.zeros(0, np.int64), np.zeros(0, np.int64)
-        per_chain = dr.opaque(mi.UInt, receivers)
-        lane = dr.arange(mi.UInt, count * receivers)
-        chain, target = lane // per_chain, lane % per_chain
-        columns = [mi.UInt(aligned_indices(column + 1)) for column in chains.planes.T.astype(np.int64)]
-        judged = dr.gather(mi.UInt, mi.UInt(aligned_indices(chains.straight)), chain) != 0
-        plane = [dr.gather(mi.UInt, column, chain) for column in columns]
-        images = [mi.Point3f(source)]
-        for number in plane:
-            images.append(dr.select(number > 0, self._mirrored(images[-1], number), images[-1]))
-        here, possible, unsure = dr.gather(mi.Point3f, targets, target), mi.Bool(True), ~judged
-        for number, image in zip(reversed(plane), reversed(images[1:]), strict=True):
-            met, grazing, meets = self._met(here, image, number)
-            unsure |= grazing & (number > 0)
-            possible &= meets | unsure | (number == 0)
-            here = dr.select(number > 0, met, here)
-        kept: Any = dr.compress(possible)
-        lanes = kept.numpy().astype(np.int64)
-        return lanes // receivers, lanes % receivers
-
-    def _mirrored(self, point: Any, number: Any) -> Any:
-        import drjit as dr
-
-        origin, normal = self.plane(number)
-        return point - 2 * dr.dot(point - origin, normal) * normal
-
-    def plane(self, number: Any) -> tuple[Any, Any]:
-        import drjit as dr
-        import mitsuba as mi
-
-        used = number > 0
-        return dr.gather(mi.Point3f, self._origin, number - 1, used), dr.gather(
-            mi.Vector3f, self._normal, number - 1, used
-        )
-
-    def _met(self, here: Any, image: Any, number: Any) -> tuple[Any, Any, Any]:
-        """Where the line to an image meets a plane; whether it does so at too small an angle to tell;
-        whether that may be a point of a path."""
-        import drjit as dr
-        import mitsuba as mi
-
-        used = number > 0
-        origin, normal = self.plane(number)
-        line = image - here
-        length, across = dr.norm(line), dr.dot(line, normal)
-        grazing = dr.abs(across) < _GRAZING * length
-        along = dr.dot(origin - here, normal) / dr.select(grazing, 1.0, across)
-        met = here + along * line
-        low = dr.gather(mi.Point3f, self._low, number - 1, used) - self._slack
-        high = dr.gather(mi.Point3f, self._high, number - 1, used) + self._slack
-        margin = self._slack / dr.maximum(dr.abs(across), 1e-9)
-        between = (along > -margin) & (along < 1.0 + margin)
-        return met, grazing, between & dr.all((met > low) & (met < high))
-
 
 def first_of_each(receiver: Int64Array, count: int) -> BoolArray:
     """Which of these receivers' candidates are among the first ``count`` of each."""
@@ -264,10 +367,3 @@ def first_of_each(receiver: Int64Array, count: int) -> BoolArray:
     place[order] = np.arange(len(receiver)) - np.searchsorted(ranked, ranked)
     kept: BoolArray = place < count
     return kept
-
-
-def positions(points: Float64Array) -> Any:
-    """Positions [m], Shape ``[N, 3]``, as a `mitsuba.Point3f`."""
-    import mitsuba as mi
-
-    return mi.Point3f(*map(mi.Float, aligned_columns(points.T)))

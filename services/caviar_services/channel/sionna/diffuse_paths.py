@@ -26,7 +26,6 @@ from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt64Ar
 from caviar_protocol.seeding import derive_seed
 from caviar_services.channel.paths import Antenna
 from caviar_services.channel.propagation.patterns import FormulaPattern
-from caviar_services.channel.sionna.chains import Scattered
 from caviar_services.channel.sionna.ray_launcher import (
     REFLECTED,
     REFRACTED,
@@ -56,6 +55,70 @@ _UNIT = 2.0**40
 _GOLDEN = np.uint64(2654435769)
 
 _WORD = np.uint64(0xFFFFFFFF)
+
+
+@dataclass(frozen=True, eq=False)
+class Scattered:
+    """P points of a launch from which waves go on diffusely, in the order of depth and ray."""
+
+    ray: Int64Array
+    """Shape ``[P]``."""
+    depth: Int64Array
+    """Which interaction of the ray, from 1, Shape ``[P]``."""
+    rows: Float64Array
+    """What a choice among them goes by (`Thinning.points`), Shape ``[K, P]``; K = 0 where all are taken."""
+
+
+def scattered_of(launch: Launch) -> Scattered:
+    """Every interaction of a launch that is a diffuse reflection."""
+    rays = [np.flatnonzero(bounce.kind.numpy() == SCATTERED) for bounce in launch.bounces]
+    depth = np.repeat(np.arange(1, len(rays) + 1), np.array([len(ray) for ray in rays], np.int64))
+    return Scattered(np.concatenate([np.zeros(0, np.int64), *rays]), depth, np.zeros((0, len(depth))))
+
+
+class DrawnPoints:
+    """The points of a launch at which a ray was drawn to be scattered.
+
+    Args:
+        mi_scene: The Mitsuba scene.
+        launch: What the rays met.
+        found: Its scattering points.
+    """
+
+    def __init__(self, mi_scene: Any, launch: Launch, found: Scattered) -> None:
+        self._mi_scene, self._launch, self._found = mi_scene, launch, found
+
+    def reached(self, targets: Any) -> tuple[Int64Array, Int64Array, Float64Array]:
+        """Scattering points and the receivers that each of them reaches, on the side that was lit; all with
+        the probability of what was drawn."""
+        import drjit as dr
+        import mitsuba as mi
+
+        ray, depth = self._found.ray, self._found.depth
+        if not len(ray):
+            return ray, ray, np.zeros(0)
+        parts: list[tuple[Int64Array, Int64Array]] = []
+        receivers = dr.width(targets)
+        per_point = dr.opaque(mi.UInt, receivers)
+        for d, bounce in enumerate(self._launch.bounces):
+            first = int(np.searchsorted(depth, d + 1))
+            rays = ray[first : int(np.searchsorted(depth, d + 1, side="right"))]
+            if not len(rays):
+                continue
+            lane = dr.arange(mi.UInt, len(rays) * receivers)
+            of_ray = dr.gather(mi.UInt, mi.UInt(aligned_indices(rays)), lane // per_point)
+            target = dr.gather(mi.Point3f, targets, lane % per_point)
+            hit = dr.zeros(mi.Interaction3f, len(rays) * receivers)
+            hit.p = dr.gather(mi.Point3f, bounce.point, of_ray)
+            hit.n = dr.gather(mi.Normal3f, bounce.normal, of_ray)
+            back = hit.spawn_ray_to(target)
+            lit = dr.dot(mi.Vector3f(hit.n), back.d) > 0.0
+            lit &= ~self._mi_scene.ray_test(back, active=lit)
+            kept: Any = dr.compress(lit)
+            lanes = kept.numpy().astype(np.int64)
+            parts.append((first + lanes // receivers, lanes % receivers))
+        points = np.concatenate([point for point, _ in parts])
+        return points, np.concatenate([rx for _, rx in parts]), np.zeros(len(points))
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +254,7 @@ def _turned(depth: Int64Array) -> UInt64Array:
     return depth.astype(np.uint64) * np.uint64(0x85EBCA6B)
 
 
-class Points:
+class ChosenPoints:
     """The points that `Thinning.points` found."""
 
     def __init__(self, thinning: Thinning, found: Scattered) -> None:

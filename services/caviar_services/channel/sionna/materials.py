@@ -14,16 +14,67 @@ from fnmatch import fnmatchcase
 from typing import Annotated, Any, Literal
 
 import msgspec
+import numpy as np
 
-from caviar_protocol.arrays import quantity
+from caviar_protocol.arrays import Complex128Array, Float64Array, quantity
 from caviar_protocol.errors import ScenarioError, suggestion
 from caviar_protocol.scenario.conversion import Place
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 
 Constants = tuple[float, float]
 """Relative permittivity and conductivity [S/m]."""
 
 # Permittivity of vacuum [F/m] (CODATA 2018).
 _EPSILON_0 = 8.8541878128e-12
+
+
+DRAWN = 2.0**-26
+"""A ray is sent through a surface with a probability; below this one none ever is.
+
+The ray tracer draws from multiples of 2⁻²³ below 1, and probabilities are float32: one below 2⁻²⁵ is
+lost beside that of a reflection. The factor of two is a margin.
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfaceMaterial:
+    """What a surface in use is made of."""
+
+    name: str
+    constants: tuple[Constants, ...]
+    """On each carrier."""
+    thickness_m: float
+    scattering_coefficient: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class UsedSurfaces:
+    """What waves can meet in a scene, at rest and moving."""
+
+    materials: tuple[SurfaceMaterial, ...]
+    """Of all surfaces; empty where there are none."""
+    has_edges: bool
+    """Whether anything diffracts (`mesh_edges`)."""
+
+
+def slab(
+    cosine: Float64Array,
+    constants: Constants | tuple[Float64Array, Float64Array],
+    thickness_m: float | Float64Array,
+    frequency_hz: float,
+) -> tuple[Complex128Array, Complex128Array]:
+    """Reflection and transmission coefficients of a slab in air for waves that come in at these angles.
+
+    Recommendation ITU-R P.2040-3, eqs. 37, 43 and 44; both of Shape ``[2, N]``, TE and TM. Slabs
+    may be one or N.
+    """
+    permittivity, conductivity = constants
+    eta = permittivity - 1j * conductivity / (2 * np.pi * frequency_hz * _EPSILON_0)
+    root = np.sqrt(eta - (1 - cosine**2))
+    single = np.stack([(cosine - root) / (cosine + root), (eta * cosine - root) / (eta * cosine + root)])
+    through = np.exp(-2j * np.pi * thickness_m * frequency_hz / SPEED_OF_LIGHT * root)
+    many = 1 - (single * through) ** 2
+    return single * (1 - through**2) / many, (1 - single**2) * through / many
 
 
 @dataclass(frozen=True)
@@ -157,7 +208,7 @@ class MaterialPolicy:
     changes: Mapping[str, MaterialSettings] = field(default_factory=dict)
     """By name of the material in the scenery."""
     outside: OutsideRange = "error"
-    key: str = "settings"
+    key: str = field(default="settings", compare=False)
     """Of the settings in the scenario, for messages."""
 
     def of(self, name: str) -> MaterialSettings:

@@ -22,11 +22,17 @@ from caviar_protocol.arrays import (
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.arrays.element_visibility import Look
 from caviar_services.channel.propagation.image_method import image_points, refined_points
-from caviar_services.channel.sionna.candidate_visibility import Corners, Faces, at_corners, reflected
-from caviar_services.channel.sionna.candidates import Candidates, Offer, Planes, positions
-from caviar_services.channel.sionna.chains import MANY_RAYS, Met, met_by, united
+from caviar_services.channel.sionna.candidate_visibility import Corners, Faces, Planes, at_corners, reflected
+from caviar_services.channel.sionna.candidates import (
+    MANY_RAYS,
+    Candidates,
+    Met,
+    Offer,
+    met_by,
+    united,
+)
 from caviar_services.channel.sionna.diffracting_edges import edge_generator
-from caviar_services.channel.sionna.diffuse_paths import Element, Points, Thinning
+from caviar_services.channel.sionna.diffuse_paths import ChosenPoints, Element, Thinning
 from caviar_services.channel.sionna.path_table import (
     Traced,
     edge_numbers,
@@ -38,7 +44,7 @@ from caviar_services.channel.sionna.path_table import (
 from caviar_services.channel.sionna.ray_launcher import SCATTERED, Launch, LaunchOptions, PartedLauncher
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.channel.sionna.tracking import Followed, FollowedOffer, TableState
-from caviar_services.ray_tracing import aligned_columns, aligned_indices, several
+from caviar_services.ray_tracing import aligned_columns, aligned_indices, positions, several
 
 # Transmitters whose last launch is kept, in case nothing moves.
 _REMEMBERED = 4
@@ -217,7 +223,7 @@ class Tracer:
             )
 
         met = united(self._launcher.each(look, source), self._scene)
-        points = None if self._thinning is None else Points(self._thinning, met.scattered)
+        points = None if self._thinning is None else ChosenPoints(self._thinning, met.scattered)
         return Offer(self._scene, met, source, self._options, points)
 
     def _since(
@@ -284,7 +290,8 @@ class Tracer:
                 diffraction_lit_region=True,
             )
         at_centres = buffer.valid.numpy()[: len(candidates.ray)]
-        hidden, settled = at_corners(self._faces, offer.planes, candidates, at_centres, corners)
+        chains, depth, receiver = candidates.planes, candidates.depth, candidates.receiver
+        hidden, settled = at_corners(self._faces, offer.planes, chains, depth, receiver, at_centres, corners)
         valid = np.flatnonzero(at_centres | hidden)
         if not len(valid):
             return nothing(len(self._wavelengths), self._options.max_depth, lost)

@@ -261,7 +261,7 @@ def path_table(
     shown = np.flatnonzero(~met.hidden & kept)
     kept &= met.hidden
     kept[shown] = distinct(pair[shown], types[shown], points[shown])
-    table = table.take(kept & ~(scene.is_parking(names, objects) & (types != 0)).any(1))
+    table = table.take(kept & ~((objects == scene.parking_piece) & (types != 0)).any(1))
     return _with_sights(table, scene, sights, antennas, traced_from) if sights else table
 
 

@@ -7,11 +7,16 @@ still name the single building and vehicle.
 The ray tracer counts in float32, whose step is 1 mm at 10 km. So it is given the scene relative to
 `SionnaScene.centre`, and callers get what its paths meet in float64 and in world coordinates: the
 scenery's corners as they stand in the files, and those of moving bodies from their poses.
+
+Models of one process that need equal scenes share one within `shared_scenes`: the ray-traced rungs of an
+adaptive ladder mostly do.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -19,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
+from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.space.scene import object_pose
@@ -27,7 +32,6 @@ from caviar_protocol.topics import Scene
 from caviar_services.channel.mesh_detail import DetailSettings
 from caviar_services.channel.paths import Turning
 from caviar_services.channel.propagation.utd import Media
-from caviar_services.channel.sionna.contributing import SurfaceMaterial, UsedSurfaces
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.materials import (
     OBJECT_MATERIAL,
@@ -35,6 +39,8 @@ from caviar_services.channel.sionna.materials import (
     MaterialPolicy,
     ObjectMaterials,
     OutsideUse,
+    SurfaceMaterial,
+    UsedSurfaces,
     body_kind,
     itu_material,
     itu_materials,
@@ -43,30 +49,29 @@ from caviar_services.channel.sionna.materials import (
 )
 from caviar_services.channel.sionna.scene_loading import (
     Shape,
+    bounds,
     by_material,
+    counting_centre,
     file_meshes,
     file_vertices,
     floats,
     loaded,
     mi_mesh,
+    near_middle,
     unit_mesh,
     with_detail,
 )
 from caviar_services.channel.sionna.triangle_numbering import Body, NumberedTriangles
 from caviar_services.mesh.scenery import find_scenery
-from caviar_services.mesh.shapes import BodyPool, Mesh, box, placed
+from caviar_services.mesh.shapes import Mesh, assign_bodies, box, placed
 
 # Frequency [Hz] of a carrier, and what is to be set at materials.
 _Tuning = tuple[float, list[tuple[Any, Constants]]]
 
-PARKING_DEPTH = 2000.0
-"""Unused receivers stand this far [m] below the scenery, in a closed metal box of their own."""
-
-# [m]; more than the part of a shadow ray near its end that is not tested (9e-4 of its length).
+# Sionna RT needs a shape where there is neither scenery nor a body: a closed metal box of 8 m, so far below
+# the scenery [m] that hardly a ray meets it. Paths by way of it are dropped.
+_PARKING_DEPTH = 2000.0
 _HALF_BOX = 4.0
-
-# [m]; the centre is a multiple of it, so that a scene about the origin stays as it is.
-_CENTRE_STEP = 128.0
 
 _PARKING = "caviar-parking"
 _SKIN = "caviar-body"
@@ -77,11 +82,12 @@ _OTHER_SKIN = "choose another body_material"
 
 @dataclass(frozen=True, kw_only=True)
 class SceneSettings:
-    """What the scene is made with."""
+    """What a scene is made with, beside its files; equal ones share a scene within `shared_scenes`."""
 
     frequencies_hz: tuple[float, ...]
     """Of the carriers. The scene is at the first one, unless it is tuned to another."""
     body_material: str
+    """ITU-R P.2040 material of bodies without one of their own."""
     materials: MaterialPolicy
     edges: bool
     """Look for the edges between faces (diffraction)."""
@@ -93,12 +99,23 @@ class SceneSettings:
     """Of what objects and pieces of scenery are made that differ from the others."""
     foliage: ObjectMaterials = field(default_factory=ObjectMaterials)
     """Which objects and pieces of scenery are foliage: waves do not meet them."""
+    pool_keys: Mapping[str, str] = field(default_factory=dict, compare=False)
+    """Key of the scenario that says how many bodies there are, by asset, for errors."""
 
 
 class SionnaScene(NumberedTriangles):
     """The triangles of a `sionna.rt.Scene` with a pool of bodies for moving objects.
 
     Bodies that stand for no object are shrunk to a point: a triangle without area is never hit.
+
+    Args:
+        assets: Files of the run by name: scene description, its meshes, and meshes of objects.
+        pool: How many bodies there are of each asset; an empty asset is the box.
+        settings: Materials, edges and detail.
+
+    Raises:
+        AssetError: A file is not what it should be.
+        ScenarioError: A material is not known, not defined at a carrier, or has a bad value.
     """
 
     def __init__(self, assets: Mapping[str, Path], pool: Mapping[str, int], settings: SceneSettings) -> None:
@@ -121,11 +138,12 @@ class SionnaScene(NumberedTriangles):
         full = by_material(self._scene, meshes, changed)
         key = f"{settings.materials.key}.detail"
         shapes, self.detail_effect = with_detail(full, settings.detail, key)
-        self.low, self.high = _bounds(shapes)
+        self.low, self.high = bounds(shapes)
         units = {asset: unit_mesh(asset, assets) for asset in pool}
         # Each material of bodies is a shape of its own, with a pool of its own.
         kinds = {(asset, m): body_kind(asset, m) for m in ("", *made) for asset in sorted(pool)}
         self._pool = {kind: pool[asset] for (asset, _), kind in kinds.items()}
+        self._pool_keys = {kind: settings.pool_keys.get(asset, "") for (asset, _), kind in kinds.items()}
         self._meshes = {kind: units[asset] for (asset, _), kind in kinds.items()}
         of_material = {
             m: [(kind, slot) for (asset, of), kind in kinds.items() if of == m for slot in range(pool[asset])]
@@ -139,17 +157,19 @@ class SionnaScene(NumberedTriangles):
         moving = self._moving_shapes(of_material[""], skins[0].constants if skins else None, is_metal)
         self._moving = [moving[-1]]
         if bodied:
-            self._moving += [self._body_shape(of_material[m], m, of.radio) for m, of in made.items()]
+            self._moving += [
+                self._body_shape(of_material[m], f"{_SKIN}-of-{m}", of.radio) for m, of in made.items()
+            ]
         self._shapes = [*shapes, *moving[:-1], *self._moving]
-        centre = _near_middle(self.low, self.high)
+        centre, self.far_note = counting_centre(shapes)
+        # Says which piece is so far from the others that the ray tracer is coarse there; mostly empty.
         super().__init__(
             self._shapes, self._replace_shapes(centre), bodies, self._meshes, centre, len(self._moving)
         )
         self.edges: SceneEdges | None = None
         """None where nothing is diffracted."""
         if settings.edges:
-            parking = self.names.index(_PARKING)
-            self.edges = SceneEdges(self, self.unit_meshes, parking, settings.free_edges)
+            self.edges = SceneEdges(self, self.unit_meshes, self.parking_piece, settings.free_edges)
         set_materials(self._scene, settings.frequencies_hz[0], settings.materials, made)
         self._carriers: list[_Tuning] = []
         outside: list[OutsideUse] = []
@@ -187,7 +207,11 @@ class SionnaScene(NumberedTriangles):
         return tuple(SPEED_OF_LIGHT / frequency for frequency, _ in self._carriers)
 
     def tune(self, carrier: int) -> None:
-        """Set frequency and materials to those of a carrier."""
+        """Set frequency and materials to those of a carrier.
+
+        Args:
+            carrier: Its index.
+        """
         frequency, constants = self._carriers[carrier]
         for material, (permittivity, conductivity) in constants:
             material.relative_permittivity, material.conductivity = permittivity, conductivity
@@ -241,24 +265,24 @@ class SionnaScene(NumberedTriangles):
         """Numbers of the bodies that stand for an object, in ascending order."""
         return tuple(number for number, body in enumerate(self._bodies) if body in self._standing)
 
-    def is_parking_piece(self, pieces: Int64Array) -> BoolArray:
-        """Which pieces are the box around parked receivers, which is not in the world."""
-        parking: BoolArray = pieces == self.names.index(_PARKING)
-        return parking
-
     @property
-    def parking(self) -> Float64Array:
-        """Where unused receivers stand [m], Shape ``[3]``."""
-        middle = (self.low + self.high) / 2
-        return np.array([middle[0], middle[1], self.low[2] - PARKING_DEPTH])
+    def parking_piece(self) -> int:
+        """Number of the piece that is not in the world: the box that the ray tracer has in an empty one."""
+        return self.names.index(_PARKING)
 
     def place(self, scene: Scene, without_body: frozenset[str]) -> tuple[tuple[str, ...], Float64Array]:
         """Move the bodies to the objects of a scene, in one update; foliage has none.
 
-        Returns the names that the indices of `object_index` stand for, and their velocities [m/s],
-        Shape ``[len(names), 3]``.
+        Args:
+            scene: The scene of a frame.
+            without_body: Classes of objects that waves pass through.
 
-        Raises `PayloadError` where the pool is too small, or an object has the name of a piece of scenery.
+        Returns:
+            The names that the indices of `object_index` stand for, and their velocities [m/s], Shape
+            ``[len(names), 3]``.
+
+        Raises:
+            PayloadError: The pool is too small, or an object has the name of a piece of scenery.
         """
         solid = [
             i
@@ -268,7 +292,12 @@ class SionnaScene(NumberedTriangles):
         return self.place_bodies(scene, {i: self._kind(scene, i) for i in solid})
 
     def place_bodies(self, scene: Scene, kinds: Mapping[int, str]) -> tuple[tuple[str, ...], Float64Array]:
-        """The same for the objects of these indices, each with a body of a kind (`body_kind`)."""
+        """Move bodies of given kinds to some objects; else as `place`.
+
+        Args:
+            scene: The scene of a frame.
+            kinds: Kind of the body of each object (`body_kind`), by the object's index in the scene.
+        """
         solid = list(kinds)
         index = {scene.names[i]: i for i in solid}
         clash = self._scenery & index.keys()
@@ -277,16 +306,16 @@ class SionnaScene(NumberedTriangles):
         if not self.has_scenery and solid:
             self._count_from_objects(scene.position[solid])
         # A new assignment each frame: the product follows from this frame alone, also after a restart.
-        taken = BodyPool(self._pool).assign((scene.names[i], kind) for i, kind in kinds.items())
+        objects = ((scene.names[i], kind) for i, kind in kinds.items())
+        taken = assign_bodies(objects, self._pool, self._pool_keys)
         standing = {body: index[name] for name, body in taken.items()}
         names, velocity = list(self.names), np.zeros((len(self.names), 3))
         turning = None
         if scene.angular_velocity is not None and scene.angular_velocity.any():
             turning = Turning(np.zeros_like(velocity), np.zeros_like(velocity))
-        first = len(names) - len(self._bodies)
         vertices = self.moving_vertices
         begin = len(vertices) - sum(len(self._meshes[asset].vertices) for asset, _ in self._bodies)
-        for number, body in enumerate(self._bodies, start=first):
+        for number, body in enumerate(self._bodies, start=self.first_body_piece):
             mesh = self._meshes[body[0]]
             rows = slice(begin, begin + len(mesh.vertices))
             begin = rows.stop
@@ -312,7 +341,7 @@ class SionnaScene(NumberedTriangles):
     def _count_from_objects(self, positions: Float64Array) -> None:
         """Let the ray tracer count from the middle of the objects [m], Shape ``[N, 3]``: nothing else says
         where a world without scenery is, and far from the origin its float32 is coarse."""
-        centre = _near_middle(positions.min(0), positions.max(0))
+        centre = near_middle(positions.min(0), positions.max(0))
         if (centre != self.centre).any():
             self.low, self.high = self.low + (centre - self.centre), self.high + (centre - self.centre)
             self.count_from(centre)
@@ -325,42 +354,30 @@ class SionnaScene(NumberedTriangles):
     def enclosing(self, position: Float64Array) -> int:
         """See `NumberedTriangles.enclosing`; below its lowest point, no scenery is around anything."""
         piece = super().enclosing(position)
-        is_body = piece >= len(self.names) - len(self._bodies)
-        return piece if is_body or position[2] >= self.low[2] else -1
-
-    def is_parking(self, names: tuple[str, ...], objects: Int32Array) -> BoolArray:
-        """Which of the objects of paths, Shape ``[P, D]``, are the box around parked receivers.
-
-        Paths by way of it are none: it is not in the world.
-        """
-        parking: BoolArray = objects == names.index(_PARKING)
-        return parking
+        return piece if piece >= self.first_body_piece or position[2] >= self.low[2] else -1
 
     @property
     def _middle(self) -> Float64Array:
         return (self.low + self.high) / 2
 
     def _moving_shapes(self, bodies: Sequence[Body], constants: Constants | None, metal: bool) -> list[Shape]:
-        """The box around the parked receivers, and last the moving bodies; one shape where both are metal."""
+        """The closed box below the world, and last the bodies; one shape where both are of metal."""
         from sionna.rt import RadioMaterial
 
-        x, y, z = self.parking
+        x, y, z = *self._middle[:2], self.low[2] - _PARKING_DEPTH
         h = _HALF_BOX
         walls = box((x - h, x + h), (y - h, y + h), (z - h, z + h))
-        names = [f"{_SKIN}-{asset or 'box'}-{slot}" for asset, slot in bodies]
-        points = [self._parked(kind) for kind, _ in bodies]
-        if constants is not None and metal:
-            skin = RadioMaterial(f"{_SKIN}-skin", 0.1, *constants)
-            return [Shape(_SKIN, skin, [_PARKING, *names], [walls, *points])]
-        closed = Shape(_PARKING, RadioMaterial(f"{_PARKING}-walls", conductivity=1e7), [_PARKING], [walls])
         if constants is None:
-            return [closed]
-        skin = RadioMaterial(f"{_SKIN}-skin", 0.1, *constants)
-        return [closed, Shape(_SKIN, skin, names, points)]
+            return [
+                Shape(_PARKING, RadioMaterial(f"{_PARKING}-walls", conductivity=1e7), [_PARKING], [walls])
+            ]
+        skin = self._body_shape(bodies, _SKIN, RadioMaterial(f"{_SKIN}-skin", 0.1, *constants))
+        if metal:
+            return [Shape(_SKIN, skin.material, [_PARKING, *skin.names], [walls, *skin.meshes])]
+        return [*self._moving_shapes(bodies, None, metal), skin]
 
-    def _body_shape(self, bodies: Sequence[Body], material: str, radio: Any) -> Shape:
+    def _body_shape(self, bodies: Sequence[Body], name: str, radio: Any) -> Shape:
         """Moving bodies of one material, none of which stands for anything yet."""
-        name = f"{_SKIN}-of-{material}"
         names = [f"{_SKIN}-{kind or 'box'}-{slot}" for kind, slot in bodies]
         return Shape(name, radio, names, [self._parked(kind) for kind, _ in bodies])
 
@@ -399,19 +416,42 @@ def _material_name(shape: Shape) -> str:
     return _SKIN_NAME if shape.id == _SKIN else name.removeprefix(OBJECT_MATERIAL)
 
 
-def _near_middle(low: Float64Array, high: Float64Array) -> Float64Array:
-    """Multiples of `_CENTRE_STEP` next to the middle of a box [m], Shape ``[3]``; no negative zeros."""
-    middle: Float64Array = np.round((low + high) / (2 * _CENTRE_STEP)) * _CENTRE_STEP + 0.0
-    return middle
-
-
-def _bounds(shapes: Sequence[Shape]) -> tuple[Float64Array, Float64Array]:
-    """Lowest and highest corner [m] of all shapes; the origin where there are none."""
-    if not shapes:
-        return np.zeros(3), np.zeros(3)
-    corners = np.concatenate([mesh.vertices for shape in shapes for mesh in shape.meshes])
-    return corners.min(0), corners.max(0)
-
-
 def _constants(material: Any) -> Constants:
     return float(material.relative_permittivity[0]), float(material.conductivity[0])
+
+
+# Scenes made within `shared_scenes`, with what they were made of.
+_made: ContextVar[list[tuple[tuple[Any, ...], SionnaScene]] | None] = ContextVar("made", default=None)
+
+
+@contextmanager
+def shared_scenes() -> Iterator[None]:
+    """Within, `scene_of` returns one scene for equal arguments.
+
+    Models that share a scene take turns: each frame of one places the bodies anew.
+
+    Example:
+        >>> with shared_scenes():
+        ...     pass  # prepare the models of a ladder
+    """
+    token = _made.set([])
+    try:
+        yield
+    finally:
+        _made.reset(token)
+
+
+def scene_of(assets: Mapping[str, Path], pool: Mapping[str, int], settings: SceneSettings) -> SionnaScene:
+    """Make a scene, or return an equal one that was made before within `shared_scenes`.
+
+    Args:
+        assets, pool, settings: As for `SionnaScene`.
+    """
+    made, wanted = _made.get(), (dict(assets), dict(pool), settings)
+    for known, scene in made or ():
+        if known == wanted:
+            return scene
+    scene = SionnaScene(assets, pool, settings)
+    if made is not None:
+        made.append((wanted, scene))
+    return scene

@@ -6,7 +6,7 @@ Faces are as the ray tracer has them, vertices as they stand in the files: it ke
 from __future__ import annotations
 
 import gc
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import AssetError, ScenarioError
+from caviar_protocol.messages import WARNING
 from caviar_protocol.space.ply import read_ply
 from caviar_services.channel.mesh_detail import DetailEffect, DetailSettings, detailed
 from caviar_services.channel.sionna.materials import any_frequency, freeze
@@ -187,3 +188,67 @@ def with_detail(
         for shape in shapes
         if (names := [name for name in shape.names if name in left])
     ], effect
+
+
+# [m]; the centre is a multiple of it, so that a scene about the origin stays as it is.
+_CENTRE_STEP = 128.0
+
+# [m]; float32 has a step of 8 mm at this distance: what is farther from the centre is traced too coarsely.
+_FARTHEST = 1e5
+
+
+def near_middle(low: Float64Array, high: Float64Array) -> Float64Array:
+    """Multiples of `_CENTRE_STEP` next to the middle of a box [m], Shape ``[3]``; no negative zeros."""
+    middle: Float64Array = np.round((low + high) / (2 * _CENTRE_STEP)) * _CENTRE_STEP + 0.0
+    return middle
+
+
+def bounds(shapes: Sequence[Shape]) -> tuple[Float64Array, Float64Array]:
+    """Lowest and highest corner [m] of all shapes, Shape ``[3]`` each; the origin where there are none."""
+    low, high = _boxes(shapes)
+    return (low.min(0), high.max(0)) if len(low) else (np.zeros(3), np.zeros(3))
+
+
+def _boxes(shapes: Sequence[Shape]) -> tuple[Float64Array, Float64Array]:
+    """Lowest and highest corner [m] of each piece, Shape ``[N, 3]`` each."""
+    vertices = [mesh.vertices for shape in shapes for mesh in shape.meshes if len(mesh.vertices)]
+    low = np.array([corners.min(0) for corners in vertices]).reshape(-1, 3)
+    return low, np.array([corners.max(0) for corners in vertices]).reshape(-1, 3)
+
+
+def counting_centre(shapes: Sequence[Shape]) -> tuple[Float64Array, str]:
+    """Choose where the ray tracer, which has float32 only, counts from.
+
+    It is the middle of the scenery, or of most of it where some pieces are so far away that all others would
+    be coarse: with one triangle at 1e8 m, a step of float32 is 4 m, and rays pass through vehicles.
+
+    Args:
+        shapes: The scenery.
+
+    Returns:
+        The centre [m], Shape ``[3]``, and a warning that names the farthest piece, empty where none is far.
+    """
+    low, high = _boxes(shapes)
+    if not len(low) or (high.max(0) - low.min(0)).max() <= 2 * _FARTHEST:
+        return near_middle(*bounds(shapes)), ""
+    most = np.median((low + high) / 2, axis=0)
+    reach = np.maximum(np.abs(low - most), np.abs(high - most)).max(1)
+    near = reach <= max(_FARTHEST, reach.min())
+    centre = near_middle(low[near].min(0), high[near].max(0))
+    names = [
+        name
+        for shape in shapes
+        for name, mesh in zip(shape.names, shape.meshes, strict=True)
+        if len(mesh.vertices)
+    ]
+    far = int(np.maximum(np.abs(low - centre), np.abs(high - centre)).max(1).argmax())
+    step = np.spacing(np.float32(reach[far]))
+    return centre, (
+        f"{WARNING}the piece {names[far]!r} of the scenery reaches from {_place(low[far])} to "
+        f"{_place(high[far])}, where the ray tracer counts in steps of {step:.2g} m: paths by way of it are "
+        "wrong by as much; move it nearer, or leave it out"
+    )
+
+
+def _place(corner: Float64Array) -> str:
+    return f"({', '.join(f'{c:g}' for c in corner)}) m"

@@ -1,35 +1,66 @@
-"""Settings of the channel ``sionna-rt``."""
+"""Settings of the channel ``sionna-rt``, and which of its options can contribute in a scene.
+
+Diffraction doubles the time of a frame, whether or not it finds a path, and a user who asks for an effect
+that a scene does not have wants to know. So options that cannot contribute are switched off, with a note. No
+path changes by it: an option is switched off only where the ray tracer could find none, which
+`tests/physics/test_channel_switched_off.py` checks by comparing both.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import PurePosixPath
 from typing import Annotated, Literal
 
 import msgspec
+import numpy as np
 
 from caviar_protocol.arrays import quantity
-from caviar_protocol.errors import ScenarioError, suggestion
+from caviar_protocol.errors import suggestion
+from caviar_protocol.messages import WARNING
 from caviar_protocol.scenario.conversion import Place
 from caviar_services.channel.base import ChannelSettings
 from caviar_services.channel.mesh_detail import DetailSettings
 from caviar_services.channel.propagation.foliage import FoliageSettings
-from caviar_services.channel.sionna.materials import OTHER_MATERIALS, MaterialSettings, OutsideRange
+from caviar_services.channel.sionna.materials import (
+    DRAWN,
+    OTHER_MATERIALS,
+    MaterialSettings,
+    OutsideRange,
+    SurfaceMaterial,
+    UsedSurfaces,
+    slab,
+)
+from caviar_services.channel.sionna.ray_launcher import LaunchOptions, rays_within
 from caviar_services.mesh.scenery import ITU_MATERIALS
 
-# Of a launch in each frame.
+# Half of the smallest float32 above 0.
+_VANISHED = 2.0**-150
+
+# Options that are on only where the user asked for them.
+_ASKED_FOR = frozenset({"refraction", "diffraction", "scattering"})
+
+# Angles [rad] between ray and normal at which slabs are looked at.
+_INCIDENCE = np.radians(np.linspace(0.0, 89.9, 900))
+
+# Rays of a launch in each frame.
 _SAMPLES = 100_000
 
-# Of a launch before the first one.
+# Rays of a launch of scenery, before the first frame.
 _SCENERY_SAMPLES = 10_000_000
-
 
 BodyCount = Annotated[int, quantity("1", "moving objects of one mesh at most", ge=0, le=4096)]
 
 
 class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
-    """What is modelled, and how finely."""
+    """What is modelled, and how finely.
+
+    Example:
+        >>> SionnaSettings(max_depth=2, ray_spacing_deg=1.0).launched_samples()
+        41253
+    """
 
     max_depth: Annotated[int, quantity("1", "interactions of a path at most", ge=0, le=16)] = 3
     rung: Literal["siso-rt", "spherical", "mimo-rt"] = "siso-rt"
@@ -161,13 +192,24 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
             )
 
     def enumerates(self, moving: bool) -> bool:
-        """Whether reflected paths are enumerated, in a run in which objects move or none do."""
+        """Whether reflected paths are enumerated.
+
+        Args:
+            moving: Whether objects move in the run.
+        """
         if self.candidates is not None:
             return self.candidates == "enumerated"
         return moving and self.reflection and self.rung == "siso-rt" and self.follow is None
 
     def check(self, place: Place) -> None:
-        """Raise `ScenarioError` for what is wrong between keys; ``place`` is where the settings stand."""
+        """Check what no single key shows.
+
+        Args:
+            place: Where the settings stand.
+
+        Raises:
+            ScenarioError: Two keys contradict each other, or a material is not defined.
+        """
         if self.ray_spacing_deg is not None and self.samples is not None:
             raise place.at("ray_spacing_deg").error(
                 f"is {self.ray_spacing_deg:g}, and samples = {self.samples}: both say how many rays are "
@@ -196,23 +238,122 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
             )
 
     def launched_samples(self, enumerated: bool = False) -> int:
-        """Rays of a launch, however they were given."""
+        """Rays of a launch, by ``samples`` or ``ray_spacing_deg``.
+
+        Args:
+            enumerated: Whether the launch is one of scenery, of which candidates are enumerated.
+        """
         if self.ray_spacing_deg is None:
             absent = _SCENERY_SAMPLES if enumerated else _SAMPLES
             return absent if self.samples is None else self.samples
         return round(4 * math.pi / math.radians(self.ray_spacing_deg) ** 2)
 
-    def pool_sizes(self, assets: Iterable[str], service: str) -> dict[str, int]:
-        """Bodies of each mesh: those among the assets, and the box.
+    def launch_options(self, seed: int) -> LaunchOptions:
+        """What a launch traces in each frame.
 
-        Raises `ScenarioError` where ``pool`` names another.
+        Args:
+            seed: Of the rays, where there is no ``launch_seed``.
+        """
+        return LaunchOptions(
+            max_depth=self.max_depth,
+            samples=self.launched_samples(),
+            max_paths=self.max_paths,
+            seed=seed if self.launch_seed is None else self.launch_seed,
+            reflection=self.reflection,
+            refraction=self.refraction,
+            diffraction=self.diffraction,
+            scattering=self.scattering,
+            rays_at_once=rays_within(self.memory_gib, self.max_depth),
+        )
+
+    def pool_sizes(self, assets: Iterable[str], place: Place) -> dict[str, int]:
+        """How many bodies there are of each mesh, by asset: those of the run, and the box, ``""``.
+
+        Args:
+            assets: Names of the run's files.
+            place: Where the settings stand.
+
+        Raises:
+            ScenarioError: ``pool`` names another mesh.
         """
         by_stem = {PurePosixPath(name).stem: name for name in assets if name.startswith("objects/")}
         by_stem["box"] = ""
-        unknown = sorted(self.pool.keys() - by_stem.keys())
-        if unknown:
-            raise ScenarioError(
-                f"there is no object mesh {unknown[0]!r}; the run has: {', '.join(sorted(by_stem))}",
-                key=f"services.{service}.settings.pool",
-            )
+        for stem in sorted(self.pool.keys() - by_stem.keys()):
+            known = ", ".join(sorted(by_stem))
+            raise place.at("pool").at(stem).error(f"the run has no object mesh {stem!r}; it has: {known}")
         return {name: self.pool.get(stem, self.bodies) for stem, name in by_stem.items()}
+
+    def pool_key(self, asset: str, place: Place) -> str:
+        """Key that says how many bodies there are of an asset.
+
+        Args:
+            asset: Empty for the box.
+            place: Where the settings stand.
+        """
+        stem = PurePosixPath(asset).stem or "box"
+        return (place.at("pool").at(stem) if stem in self.pool else place.at("bodies")).key
+
+
+def contributing(
+    options: LaunchOptions, surfaces: UsedSurfaces, frequencies_hz: Sequence[float]
+) -> tuple[LaunchOptions, tuple[str, ...]]:
+    """Switch off the options that cannot contribute.
+
+    Args:
+        options: As the user asked for.
+        surfaces: What waves can meet.
+        frequencies_hz: Of the carriers [Hz].
+
+    Returns:
+        The options that are left, and a note for each that was switched off.
+    """
+    off: dict[str, str] = {}
+    if options.max_depth == 0 or not surfaces.materials:
+        nothing = "there is neither scenery nor a body" if options.max_depth else "max_depth is 0"
+        off = dict.fromkeys(("reflection", "refraction", "diffraction", "scattering"), nothing)
+    else:
+        if not any(material.scattering_coefficient > 0 for material in surfaces.materials):
+            off["scattering"] = "no material has a scattering_coefficient above 0"
+        if options.refraction and not any(
+            _transmits(material, options, frequencies_hz) for material in surfaces.materials
+        ):
+            levels = ", ".join(_strongest(material, frequencies_hz) for material in surfaces.materials)
+            off["refraction"] = f"no ray is ever sent through a material ({levels} at most)"
+        if not surfaces.has_edges:
+            off["diffraction"] = "no two faces meet at an edge"
+    off = {name: reason for name, reason in off.items() if getattr(options, name)}
+    left = replace(options, **dict.fromkeys(off, False))
+    # An effect that is on by default, or off by a setting, needs no note: the user did not ask for it.
+    asked = frozenset() if options.max_depth == 0 else _ASKED_FOR
+    notes = tuple(
+        f"{WARNING * (name in asked)}{name} is switched off: {reason}" for name, reason in off.items()
+    )
+    if not (left.reflection or left.refraction or left.diffraction or left.scattering):
+        left = replace(left, max_depth=0)
+    return left, notes
+
+
+def _transmits(material: SurfaceMaterial, options: LaunchOptions, frequencies_hz: Sequence[float]) -> bool:
+    """Whether a ray can be sent through on any carrier at any incidence."""
+    rough = material.scattering_coefficient**2
+    returned = options.reflection * (1 - rough) + options.scattering * rough
+    for constants, frequency in zip(material.constants, frequencies_hz, strict=True):
+        back, through = (
+            (np.abs(part) ** 2).sum(0)
+            for part in slab(np.cos(_INCIDENCE), constants, material.thickness_m, frequency)
+        )
+        # Where nothing returns, what passes is not lost beside it: it has to vanish itself.
+        smallest = np.where(returned * back > 0, DRAWN * returned * back, _VANISHED)
+        if (through >= smallest).any():
+            return True
+    return False
+
+
+def _strongest(material: SurfaceMaterial, frequencies_hz: Sequence[float]) -> str:
+    """``concrete −93 dB``, of the carrier and incidence at which most passes."""
+    most = max(
+        float(np.abs(slab(np.cos(_INCIDENCE), constants, material.thickness_m, frequency)[1]).max())
+        for constants, frequency in zip(material.constants, frequencies_hz, strict=True)
+    )
+    level = "−∞" if most < 1e-30 else f"−{-20 * np.log10(most):.0f}"
+    return f"{material.name} {level} dB"

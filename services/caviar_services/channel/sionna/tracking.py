@@ -10,14 +10,23 @@ them would.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt64Array
-from caviar_services.channel.sionna.candidates import Candidates, Offer, positions
-from caviar_services.channel.sionna.chains import MANY_RAYS, Chains, Met, chains_of, scattered_of
+from caviar_protocol.codec import decode_payload, encode_payload
+from caviar_protocol.topics import Scene
+from caviar_services.channel.sionna.candidates import (
+    MANY_RAYS,
+    Candidates,
+    Chains,
+    Met,
+    Offer,
+    chains_of,
+)
+from caviar_services.channel.sionna.diffuse_paths import scattered_of
 from caviar_services.channel.sionna.ray_launcher import (
     REFLECTED,
     REFRACTED,
@@ -28,7 +37,7 @@ from caviar_services.channel.sionna.ray_launcher import (
 )
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.checkpoint import Packed
-from caviar_services.ray_tracing import aligned_columns, aligned_indices
+from caviar_services.ray_tracing import aligned_columns, aligned_indices, positions
 
 # [m] A transmitter that has moved farther since the frame before is looked for anew.
 _JUMP = 20.0
@@ -145,8 +154,8 @@ class Followed:
         )
 
     @classmethod
-    def going_on(cls, parts: int, state: FollowedState) -> Followed:
-        """One that is where another was."""
+    def resumed(cls, parts: int, state: FollowedState) -> Followed:
+        """The chains of a saved state."""
         made = cls(parts)
         made._number, made._names = state.number, state.names
         made._known = None if state.known is None else state.known.table()
@@ -291,3 +300,58 @@ def _keys(table: _Table, scene: SionnaScene) -> UInt64Array:
         keys = (keys ^ (keys >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
         keys += np.uint64(0x9E3779B97F4A7C15)
     return keys
+
+
+class FollowingState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What is followed; nothing where each frame stands on its own."""
+
+    followed: dict[str, FollowedState] = {}
+    """By transmitter."""
+    scene: tuple[bytes, bytes] | None = None
+    """That the bodies stand in, header and body; None: they have been moved since."""
+    offers: tuple[tuple[bytes, TableState], ...] = ()
+    """What is on offer while nothing moves, and the position that it was launched from; oldest first."""
+
+
+class Following:
+    """The chains of all transmitters of a channel.
+
+    Args:
+        parts: Launches until every ray was launched once.
+        scene: Of the channel. Other channels may move the bodies of the same scene.
+        without_body: Classes of objects that have no body.
+    """
+
+    def __init__(self, parts: int, scene: SionnaScene, without_body: frozenset[str]) -> None:
+        self._parts, self._scene, self._without_body = parts, scene, without_body
+        self._followed: dict[str, Followed] = {}
+        # What the bodies were moved to last, with the version that the scene then had.
+        self._placed: tuple[Scene, int] | None = None
+
+    def clear(self) -> None:
+        """Know nothing, as at the beginning of an episode."""
+        self._followed.clear()
+        self._placed = None
+
+    def of(self, transmitter: str) -> Followed:
+        """The chains of a transmitter."""
+        return self._followed.setdefault(transmitter, Followed(self._parts))
+
+    def place(self, scene: Scene) -> tuple[tuple[str, ...], Float64Array]:
+        """Move the bodies; see `SionnaScene.place`."""
+        placed = self._scene.place(scene, self._without_body)
+        self._placed = scene, self._scene.version
+        return placed
+
+    def state(self, offers: tuple[tuple[bytes, TableState], ...]) -> FollowingState:
+        """All that the next frame's chains follow from, beside its scene; ``offers`` are the tracer's."""
+        followed = {name: one.state for name, one in self._followed.items()}
+        if self._placed is None or self._placed[1] != self._scene.version:
+            return FollowingState(followed=followed)
+        return FollowingState(followed=followed, scene=encode_payload(self._placed[0]), offers=offers)
+
+    def resume(self, state: FollowingState) -> None:
+        """Take over a state; the tracer is then to offer what it says again."""
+        self._followed = {name: Followed.resumed(self._parts, one) for name, one in state.followed.items()}
+        if state.scene is not None:
+            self.place(cast(Scene, decode_payload("scene", *state.scene)))
