@@ -10,7 +10,7 @@ from typing import Any, get_args
 import msgspec
 
 from caviar_protocol.scenario.schema import Scenario
-from caviar_protocol.spec import rows
+from caviar_protocol.spec import prose, rows
 from caviar_services.registry import load
 from caviar_services.scenario_schema import settings_classes
 
@@ -95,7 +95,7 @@ def _nested(inner: Structs) -> Iterator[str]:
 
 
 def _meaning(cls: type[msgspec.Struct]) -> str:
-    return markdown.prose(cls.__doc__ or "")
+    return markdown.prose(prose(cls))
 
 
 def _structs_of(hint: Any) -> list[type[msgspec.Struct]]:

@@ -46,8 +46,15 @@ MAX_DIMENSIONS = 6
 class ArrayField(msgspec.Struct, frozen=True):
     """What an array field of a payload promises.
 
-    ``shape`` mixes fixed sizes with names; a name stands for one size throughout a payload
-    object. ``finite`` is checked by the producer (contract, clause 21).
+    Args:
+        dtype: Element type as it stands in a header, a key of `WIRE_DTYPES`.
+        shape: Fixed sizes and names; a name stands for one size throughout a payload object.
+        unit: Unit of the elements, ``"1"`` for pure numbers.
+
+    Example:
+        >>> from caviar_protocol.topics import Scene
+        >>> array_fields(Scene)["position"]
+        ArrayField(dtype='<f8', shape=('N', 3), unit='m')
     """
 
     dtype: str
@@ -69,6 +76,13 @@ def array(dtype: str, *shape: int | str, unit: str, doc: str) -> Any:
 
     Raises:
         ValueError: Elements of this type cannot travel.
+
+    Example:
+        >>> Positions = Annotated[Float64Array, array("<f8", "N", 3, unit="m", doc="position")]
+        >>> array("<f16", "N", unit="m", doc="position")
+        Traceback (most recent call last):
+            ...
+        ValueError: dtype '<f16' cannot travel; one of |b1, |u1, |i1, <u2, <i4, <i8, <u8, <f4, <f8, <c8, <c16
     """
     if dtype not in WIRE_DTYPES:
         raise ValueError(f"dtype {dtype!r} cannot travel; one of {', '.join(WIRE_DTYPES)}")
@@ -85,6 +99,15 @@ def quantity(unit: str, doc: str, **constraints: Any) -> Any:
 
     Returns:
         An annotation: ``Annotated[float, quantity("Hz", "centre frequency", gt=0)]``.
+
+    Example:
+        >>> Frequency = Annotated[float, quantity("Hz", "centre frequency", gt=0)]
+        >>> msgspec.convert(28e9, Frequency)
+        28000000000.0
+        >>> msgspec.convert(-1.0, Frequency)
+        Traceback (most recent call last):
+            ...
+        msgspec.ValidationError: Expected `float` > 0.0
     """
     return msgspec.Meta(description=doc, extra={"unit": unit}, **constraints)
 
@@ -98,6 +121,11 @@ def described(doc: str, **constraints: Any) -> Any:
 
     Returns:
         An annotation, as of `quantity`.
+
+    Example:
+        >>> Label = Annotated[str, described("name on the screen", max_length=8)]
+        >>> msgspec.convert("uav", Label)
+        'uav'
     """
     return msgspec.Meta(description=doc, extra={"unit": ""}, **constraints)
 
@@ -112,7 +140,16 @@ Quaternion = Annotated[
 # Type hints are evaluated anew at each call of `get_type_hints`, and payloads are made in every frame.
 @cache
 def array_fields(cls: type) -> dict[str, ArrayField]:
-    """The array fields of a payload class, by name, in wire order."""
+    """The array fields of a payload class, by name, in wire order.
+
+    Args:
+        cls: A payload class, or a class of an object in one.
+
+    Example:
+        >>> from caviar_protocol.topics import Scene
+        >>> [*array_fields(Scene)]
+        ['position', 'orientation', 'velocity', 'dimensions', 'angular_velocity']
+    """
     found: dict[str, ArrayField] = {}
     for name, hint in get_type_hints(cls, include_extras=True).items():
         for candidate in (hint, *(get_args(hint) if get_origin(hint) is not Annotated else ())):
@@ -277,6 +314,15 @@ def require_finite(payload: msgspec.Struct, path: str = "") -> None:
 
     Raises:
         PayloadError: It holds a NaN or an infinity; the text names the field and the element.
+
+    Example:
+        >>> from caviar_protocol.topics import WaypointCommand
+        >>> require_finite(WaypointCommand(object="uav", position=(0.0, 1.0, 3.0), speed=2.0))
+        >>> try:
+        ...     require_finite(WaypointCommand(object="uav", position=(0.0, math.nan, 3.0), speed=2.0))
+        ... except PayloadError as error:
+        ...     print(error)
+        WaypointCommand.position[1] is nan: non-finite values may not leave a service
     """
     path = path or type(payload).__name__
     for name in payload.__struct_fields__:

@@ -39,6 +39,13 @@ def geometry_digest(assets: Iterable[Asset]) -> str:
 
     Returns:
         64 lower-case hexadecimal digits; empty without assets.
+
+    Example:
+        >>> geometry_digest([])
+        ''
+        >>> wall = Asset(name="wall.ply", digest="00" * 32, size=0)
+        >>> geometry_digest([wall])[:16]
+        'd600750886a72caa'
     """
     ordered = sorted(assets, key=lambda asset: asset.name)
     if not ordered:
@@ -52,12 +59,19 @@ def geometry_digest(assets: Iterable[Asset]) -> str:
 class RunDigest:
     """The chain over (episode, frame, topic, source, payload) that identifies a run's results.
 
-    Starts from SHA-256 of ``caviar-run-1``; each fresh product sets
-    ``h ← SHA-256(h ‖ episode NUL frame NUL topic NUL source NUL ‖ payload digest)`` with decimal
-    numbers and raw digests, frames in order, within a frame sorted by (topic, source).
+    It starts from SHA-256 of ``caviar-run-1``. Each fresh product sets
+    ``h ← SHA-256(h ‖ episode NUL frame NUL topic NUL source NUL ‖ payload digest)``, with decimal numbers and
+    raw digests, frames in order, within a frame sorted by (topic, source).
 
     Args:
         begun: Digest of the frames before, to continue a chain; empty: begin one.
+
+    Example:
+        >>> chain = RunDigest()
+        >>> chain.add_frame(0, 0, [("scene", "world", payload_digest(b"header", b"body"))])
+        >>> rest = RunDigest(begun=chain.hexdigest())  # goes on where the other one is
+        >>> rest.hexdigest() == chain.hexdigest()
+        True
     """
 
     def __init__(self, begun: str = "") -> None:

@@ -27,7 +27,16 @@ from collections.abc import Iterable
 
 
 class CaviarError(Exception):
-    """Base of all errors raised on purpose; its text is meant for the user."""
+    """Base of all errors raised on purpose; its text is meant for the user.
+
+    Example:
+        >>> from caviar_protocol.scenario import load_scenario
+        >>> try:
+        ...     load_scenario("smok")
+        ... except CaviarError as error:
+        ...     print(f"{type(error).__name__}: {str(error).partition('; sc')[0]}")
+        ScenarioError: smok: cannot be read: No such file or directory; did you mean 'smoke'?
+    """
 
 
 class ProtocolError(CaviarError):
@@ -63,6 +72,10 @@ class ProductError(ProtocolError):
     Args:
         topic, source, frame: Which product: its topic, the service that made it, and the frame it is for.
         problem: What is wrong: object, field and value, and what would be right.
+
+    Example:
+        >>> print(ProductError("scene", "world", 7, "object 'car': dimensions (0, 2, 1) m are not above 0"))
+        scene of 'world', frame 7: object 'car': dimensions (0, 2, 1) m are not above 0
     """
 
     code = "product"
@@ -88,6 +101,10 @@ class ScenarioError(CaviarError):
         file: Path of the scenario file.
         key: Dotted key, for example ``services.channel.budget_ms``.
         line: 1-based line of that key, where known.
+
+    Example:
+        >>> print(ScenarioError("is 0, write a whole number ≥ 1", "my.toml", "run.frames", 3))
+        my.toml:3: run.frames: is 0, write a whole number ≥ 1
     """
 
     def __init__(self, message: str, file: str = "", key: str = "", line: int | None = None) -> None:

@@ -129,7 +129,12 @@ class Status(StrEnum):
 
 
 class Input(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """One declared input of a service (contract, clause 3)."""
+    """One declared input of a service (contract, clause 3).
+
+    Example:
+        >>> Input(topic="link", lag=1, required=False)  # of the frame before, where there is one
+        Input(topic='link', lag=1, required=False, parts=())
+    """
 
     topic: NewName
     """Topic, or ``*`` for every topic (recorders only)."""
@@ -150,7 +155,14 @@ class Demand(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class Asset(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """One file of scenery: a mesh, a scene description, a terrain (contract, clause 4)."""
+    """One file of scenery: a mesh, a scene description, a terrain (contract, clause 4).
+
+    Example:
+        >>> import hashlib
+        >>> mesh = b"ply"
+        >>> Asset(name="meshes/wall.ply", digest=hashlib.sha256(mesh).hexdigest(), size=len(mesh)).name
+        'meshes/wall.ply'
+    """
 
     name: AssetName
     """Unique in the run: ``scenery/scene.xml``."""
@@ -161,7 +173,13 @@ class Asset(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class GrantInput(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """Provenance of one input of a GRANT. Unless absent, two message parts hold the product."""
+    """Provenance of one input of a GRANT. Unless absent, two message parts hold the product.
+
+    Example:
+        >>> held = GrantInput(topic="channel", source="rt", status=Status.HELD, frame=5, age=2)
+        >>> held.frame + held.age  # the granted frame
+        7
+    """
 
     topic: Name
     source: Name
@@ -196,7 +214,14 @@ class Report(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class ProductHeader(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """One product of a DONE; two message parts hold it."""
+    """One product of a DONE; two message parts hold it.
+
+    Example:
+        >>> from caviar_protocol.digest import payload_digest
+        >>> header, body = b"fields", b"arrays"
+        >>> ProductHeader(topic="action", digest=payload_digest(header, body)).topic
+        'action'
+    """
 
     topic: Name
     digest: Digest
@@ -253,13 +278,33 @@ CHANGES_OTHERS = frozenset({"AntennaArray.pattern_file", "AntennaArray.panels"})
 
 
 def parse_version(since: str) -> Version:
-    """``1.4`` as a version."""
+    """Read a version that is written as text.
+
+    Args:
+        since: Major and minor number with a dot between them.
+
+    Example:
+        >>> parse_version("1.4")
+        (1, 4)
+    """
     major, _, minor = since.partition(".")
     return int(major), int(minor)
 
 
 def required_knowledge(value: msgspec.Struct) -> Iterator[tuple[str, Any, Version]]:
-    """Field, value and version of what a reader of this struct has to know and 1.0 does not have."""
+    """Find what a reader of a struct has to know that version 1.0 of the protocol does not have.
+
+    Args:
+        value: A struct that travels, such as the array of a device.
+
+    Returns:
+        Name of a field, its value, and the version that brought it; of each such field.
+
+    Example:
+        >>> from caviar_protocol.topics import AntennaArray
+        >>> list(required_knowledge(AntennaArray(polarization="VH")))
+        [('polarization', 'VH', (1, 4))]
+    """
     cls = type(value)
     defaults = {field.name: field.default for field in msgspec.structs.fields(cls)}
     for name in value.__struct_fields__:

@@ -55,7 +55,15 @@ class _Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 class Authorization(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """One key that may take part in runs."""
+    """One key that may take part in runs.
+
+    Example:
+        >>> key = Pair.new()
+        >>> entry = Authorization(name="agent", role="agent", public=key.public, topics=("action",))
+        >>> write_authorized(Path("keys"), [entry])
+        >>> read_authorized(Path("keys")) == (entry,)
+        True
+    """
 
     name: Name
     """Of the service that it may appear as, and of the key itself."""
@@ -66,7 +74,15 @@ class Authorization(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class Token(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """One token of the HTTP interface."""
+    """One token of the HTTP interface.
+
+    Example:
+        >>> import hashlib
+        >>> text = "of caviar keys token"
+        >>> viewer = Token(name="ann", role=VIEWER, sha256=hashlib.sha256(text.encode()).hexdigest())
+        >>> viewer.may(OPERATOR), viewer.of_service
+        (False, False)
+    """
 
     name: Name
     """Of the user that holds it, or of the service that it is for."""
@@ -77,7 +93,11 @@ class Token(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_
     """Of the token's text; the token itself is written nowhere."""
 
     def may(self, role: str) -> bool:
-        """Whether it is good for what a viewer or an operator does."""
+        """Whether the token is good for what a viewer or an operator does.
+
+        Args:
+            role: `VIEWER` or `OPERATOR`.
+        """
         return self.role == OPERATOR or self.role == role
 
     @property
@@ -87,7 +107,13 @@ class Token(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_
 
 
 class Pair(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """A secret key and its public one."""
+    """A secret key and its public one; its text leaves the secret out.
+
+    Example:
+        >>> key = Pair.new()
+        >>> len(key.public), key.secret in repr(key)
+        (40, False)
+    """
 
     public: Z85
     secret: Z85
@@ -121,8 +147,15 @@ T = TypeVar("T")
 def check_name(name: str) -> str:
     """Check that a key can have this name, and return it.
 
+    Args:
+        name: What a key shall be called.
+
     Raises:
         SetupError: It has other characters than letters, digits, ``_``, ``.`` and ``-``, or more than 64.
+
+    Example:
+        >>> check_name("agent-2")
+        'agent-2'
     """
     if not _NAME.fullmatch(name):
         raise SetupError(
@@ -145,6 +178,13 @@ def write_pair(directory: Path, name: str, pair: Pair) -> tuple[Path, Path]:
 
     Raises:
         SetupError: One of them exists, which stays as it is, or cannot be written.
+
+    Example:
+        >>> key, pub = write_pair(Path("keys"), "agent", Pair.new())
+        >>> key.name, pub.name, read_pair(key).public == read_public(pub)
+        ('agent.key', 'agent.pub', True)
+        >>> key.unlink(), pub.unlink()
+        (None, None)
     """
     check_name(name)
     key, pub = directory / f"{name}.key", directory / f"{name}.pub"
@@ -171,6 +211,9 @@ def write_pair(directory: Path, name: str, pair: Pair) -> tuple[Path, Path]:
 def read_pair(path: Path) -> Pair:
     """Read the key pair in a ``.key`` file.
 
+    Args:
+        path: A file ``NAME.key``, of mode 0600.
+
     Raises:
         SetupError: There is no such file, it is no key, or others on this machine can read it.
     """
@@ -188,6 +231,9 @@ def read_pair(path: Path) -> Pair:
 def read_public(path: Path) -> str:
     """Read the public key in a ``.pub`` file.
 
+    Args:
+        path: A file ``NAME.pub``.
+
     Raises:
         SetupError: There is no such file, it is no key, or it is a file of a secret key.
     """
@@ -200,6 +246,9 @@ def read_public(path: Path) -> str:
 
 def read_authorized(directory: Path) -> tuple[Authorization, ...]:
     """Read which keys may take part; none where the directory has no such file yet.
+
+    Args:
+        directory: Keys directory of the broker.
 
     Raises:
         SetupError: The file breaks a rule, or has a name or a key twice.
@@ -221,6 +270,10 @@ def read_authorized(directory: Path) -> tuple[Authorization, ...]:
 def write_authorized(directory: Path, entries: Sequence[Authorization]) -> None:
     """Write which keys may take part; a reader sees the old file or the new one, never half of it.
 
+    Args:
+        directory: Keys directory of the broker, made where it is missing.
+        entries: All keys that may take part.
+
     Raises:
         SetupError: The file cannot be written.
     """
@@ -232,6 +285,9 @@ def write_authorized(directory: Path, entries: Sequence[Authorization]) -> None:
 
 def read_tokens(directory: Path) -> tuple[Token, ...]:
     """Read the tokens of the HTTP interface; none where the directory has no such file yet.
+
+    Args:
+        directory: Keys directory of the broker.
 
     Raises:
         SetupError: The file breaks a rule; the text names file and line where a role is unknown.
@@ -264,6 +320,10 @@ def _line_of_role(path: Path, number: int) -> int:
 def write_tokens(directory: Path, entries: Sequence[Token]) -> None:
     """Write the tokens' digests.
 
+    Args:
+        directory: Keys directory of the broker, made where it is missing.
+        entries: All tokens.
+
     Raises:
         SetupError: The file cannot be written.
     """
@@ -272,7 +332,19 @@ def write_tokens(directory: Path, entries: Sequence[Token]) -> None:
 
 
 class Credentials(msgspec.Struct, frozen=True):
-    """What a service shows its broker, and by what it recognises it."""
+    """What a service shows its broker, and by what it recognises the broker.
+
+    Args:
+        pair: The service's own keys.
+        broker: Public key of the broker.
+
+    Example:
+        >>> own, broker = Pair.new(), Pair.new()
+        >>> with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
+        ...     Credentials(own, broker.public).apply_to(socket)
+        ...     socket.mechanism == zmq.CURVE
+        True
+    """
 
     pair: Pair
     broker: str
@@ -280,6 +352,9 @@ class Credentials(msgspec.Struct, frozen=True):
 
     def apply_to(self, socket: zmq.Socket[Any]) -> None:
         """Give a socket what it needs before it connects.
+
+        Args:
+            socket: Of the service, not connected yet.
 
         Raises:
             zmq.ZMQError: The keys are none of CurveZMQ.
@@ -304,6 +379,10 @@ def credentials(
 
     Raises:
         SetupError: Only one of the two is given, or a file is no key.
+
+    Example:
+        >>> credentials(environment={}) is None
+        True
     """
     own = key or _path(environment.get(KEY_VARIABLE))
     broker = broker_key or _path(environment.get(BROKER_KEY_VARIABLE))

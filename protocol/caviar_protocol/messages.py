@@ -62,7 +62,13 @@ class _Message(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, ta
 
 
 class Hello(_Message, frozen=True, kw_only=True, tag="HELLO"):
-    """Service to broker, first message on the ordered connection."""
+    """Service to broker, first message on the ordered connection.
+
+    Example:
+        >>> hello = Hello(version=PROTOCOL_VERSION, name="agent", role="agent", outputs=("action",))
+        >>> msgspec.to_builtins(hello)  # the map on the wire
+        {'type': 'HELLO', 'version': (1, 4), 'name': 'agent', 'role': 'agent', 'outputs': ('action',)}
+    """
 
     version: Version
     """That the service speaks."""
@@ -117,7 +123,13 @@ class Welcome(_Message, frozen=True, kw_only=True, tag="WELCOME"):
 
 class Refuse(_Message, frozen=True, kw_only=True, tag="REFUSE"):
     """Broker to service, answers HELLO or ATTACH: you cannot take part. The service exits with a status other
-    than 0."""
+    than 0.
+
+    Example:
+        >>> from caviar_protocol.codec import decode_message, encode_message
+        >>> decode_message(encode_message(Refuse(code="late", message="the run is complete"))).code
+        'late'
+    """
 
     code: Word
     """``version``, ``name-taken``, ``unknown-name``, ``unauthorized``, ``declaration``, ``late``."""
@@ -142,7 +154,15 @@ class Prepare(_Message, frozen=True, kw_only=True, tag="PREPARE"):
 
 class AssetOffer(_Message, frozen=True, kw_only=True, tag="ASSET_OFFER"):
     """World to broker, before READY: the scenery I bring. Answered by an ASSET_GET for each
-    digest that the broker does not hold."""
+    digest that the broker does not hold.
+
+    Example:
+        >>> import hashlib
+        >>> mesh = b"ply"
+        >>> wall = Asset(name="meshes/wall.ply", digest=hashlib.sha256(mesh).hexdigest(), size=len(mesh))
+        >>> AssetOffer(epoch=1, attempt=1, assets=(wall,)).assets[0].size
+        3
+    """
 
     epoch: Epoch
     attempt: Attempt
@@ -151,7 +171,12 @@ class AssetOffer(_Message, frozen=True, kw_only=True, tag="ASSET_OFFER"):
 
 
 class AssetGet(_Message, frozen=True, kw_only=True, tag="ASSET_GET"):
-    """Either way: send me these bytes. Answered by ASSET_DATA, or ERROR ``unknown-asset``."""
+    """Either way: send me these bytes. Answered by ASSET_DATA, or ERROR ``unknown-asset``.
+
+    Example:
+        >>> msgspec.to_builtins(AssetGet(digest="00" * 32, offset=4194304))["offset"]
+        4194304
+    """
 
     digest: Digest
     """Of the whole asset."""
@@ -160,7 +185,13 @@ class AssetGet(_Message, frozen=True, kw_only=True, tag="ASSET_GET"):
 
 
 class AssetData(_Message, frozen=True, kw_only=True, tag="ASSET_DATA"):
-    """Either way: bytes of an asset, in one further message part of at most `MAX_ASSET_CHUNK`."""
+    """Either way: bytes of an asset, in one further message part of at most `MAX_ASSET_CHUNK`.
+
+    Example:
+        >>> chunk = b"ply"  # the further part
+        >>> AssetData(digest="00" * 32, offset=0, size=len(chunk)).size
+        3
+    """
 
     digest: Digest
     """Of the whole asset."""
@@ -175,7 +206,13 @@ WARNING = "warning: "
 
 
 class Ready(_Message, frozen=True, kw_only=True, tag="READY"):
-    """Service to broker: loaded and warmed up."""
+    """Service to broker: loaded and warmed up.
+
+    Example:
+        >>> ready = Ready(epoch=1, attempt=1, actuators=("beam:car.*",), notes=(WARNING + "no GPU",))
+        >>> msgspec.to_builtins(ready)["notes"]
+        ('warning: no GPU',)
+    """
 
     epoch: Epoch
     attempt: Attempt
@@ -210,7 +247,12 @@ class Reset(_Message, frozen=True, kw_only=True, tag="RESET"):
 
 
 class ResetDone(_Message, frozen=True, kw_only=True, tag="RESET_DONE"):
-    """Service to broker: ready for frame 0 of the episode."""
+    """Service to broker: ready for frame 0 of the episode.
+
+    Example:
+        >>> msgspec.to_builtins(ResetDone(epoch=1, attempt=1, episode=0))
+        {'type': 'RESET_DONE', 'epoch': 1, 'attempt': 1, 'episode': 0}
+    """
 
     epoch: Epoch
     attempt: Attempt
@@ -218,7 +260,14 @@ class ResetDone(_Message, frozen=True, kw_only=True, tag="RESET_DONE"):
 
 
 class Grant(_Message, frozen=True, kw_only=True, tag="GRANT"):
-    """Broker to service: do your part of this frame. Answered by DONE or FAULT."""
+    """Broker to service: do your part of this frame. Answered by DONE or FAULT.
+
+    Example:
+        >>> scene = GrantInput(topic="scene", source="world", status=Status.ABSENT)
+        >>> grant = Grant(epoch=1, attempt=1, episode=0, frame=7, t_ns=700_000_000, inputs=(scene,))
+        >>> [entry.topic for entry in grant.inputs if entry.status is not Status.ABSENT]
+        []
+    """
 
     epoch: Epoch
     attempt: Attempt
@@ -241,7 +290,18 @@ class Grant(_Message, frozen=True, kw_only=True, tag="GRANT"):
 
 
 class Done(_Message, frozen=True, kw_only=True, tag="DONE"):
-    """Service to broker: my part of this frame is done."""
+    """Service to broker: my part of this frame is done.
+
+    Example:
+        >>> from caviar_protocol.codec import encode_payload
+        >>> from caviar_protocol.digest import payload_digest
+        >>> from caviar_protocol.topics import Action
+        >>> parts = encode_payload(Action(commands=()))  # header and body follow the message
+        >>> action = ProductHeader(topic="action", digest=payload_digest(*parts))
+        >>> done = Done(epoch=1, attempt=1, episode=0, frame=7, products=(action,))
+        >>> msgspec.to_builtins(done)["products"][0]["topic"]
+        'action'
+    """
 
     epoch: Epoch
     attempt: Attempt
@@ -263,7 +323,13 @@ class Done(_Message, frozen=True, kw_only=True, tag="DONE"):
 
 
 class Fault(_Message, frozen=True, kw_only=True, tag="FAULT"):
-    """Service to broker: I cannot."""
+    """Service to broker: I cannot.
+
+    Example:
+        >>> fault = Fault(epoch=1, attempt=1, phase="prepare", message="settings.speed: is -1, write m/s > 0")
+        >>> msgspec.to_builtins(fault)["phase"]  # fields that have their default do not travel
+        'prepare'
+    """
 
     epoch: Epoch
     attempt: Attempt
@@ -312,7 +378,13 @@ class Checkpoint(_Message, frozen=True, kw_only=True, tag="CHECKPOINT"):
 
 
 class CheckpointDone(_Message, frozen=True, kw_only=True, tag="CHECKPOINT_DONE"):
-    """Service to broker: my state after this frame, in one further part. Opaque to the broker."""
+    """Service to broker: my state after this frame, in one further part. Opaque to the broker.
+
+    Example:
+        >>> state = b"..."  # the further part
+        >>> CheckpointDone(epoch=1, attempt=1, episode=0, frame=19).frame
+        19
+    """
 
     epoch: Epoch
     attempt: Attempt
@@ -347,7 +419,12 @@ class Shutdown(_Message, frozen=True, kw_only=True, tag="SHUTDOWN"):
 
 
 class Bye(_Message, frozen=True, kw_only=True, tag="BYE"):
-    """Service to broker: I leave; nothing more comes from me."""
+    """Service to broker: I leave; nothing more comes from me.
+
+    Example:
+        >>> msgspec.to_builtins(Bye(epoch=1, attempt=1, reason=RUN_COMPLETE))["reason"]
+        'the run is complete'
+    """
 
     epoch: Epoch
     attempt: Attempt
@@ -369,7 +446,13 @@ class Stale(_Message, frozen=True, kw_only=True, tag="STALE"):
 
 
 class Error(_Message, frozen=True, kw_only=True, tag="ERROR"):
-    """Either way: I could not use what you sent. Never answered."""
+    """Either way: I could not use what you sent. Never answered.
+
+    Example:
+        >>> answer = Error(code="unknown-asset", message="no asset has this digest", of="ASSET_GET")
+        >>> msgspec.to_builtins(answer)["code"]
+        'unknown-asset'
+    """
 
     code: Word
     """``malformed``, ``limit``, ``version``, ``unexpected``, ``unknown-asset``, ``unknown-peer``."""
@@ -385,7 +468,12 @@ class Error(_Message, frozen=True, kw_only=True, tag="ERROR"):
 
 
 class Attach(_Message, frozen=True, kw_only=True, tag="ATTACH"):
-    """Service to broker, first message on the heartbeat connection (clause 2)."""
+    """Service to broker, first message on the heartbeat connection (clause 2).
+
+    Example:
+        >>> msgspec.to_builtins(Attach(epoch=1, attempt=1, name="agent"))
+        {'type': 'ATTACH', 'epoch': 1, 'attempt': 1, 'name': 'agent'}
+    """
 
     epoch: Epoch
     attempt: Attempt
@@ -394,7 +482,13 @@ class Attach(_Message, frozen=True, kw_only=True, tag="ATTACH"):
 
 
 class Heartbeat(_Message, frozen=True, kw_only=True, tag="HEARTBEAT"):
-    """Service to broker, every ``heartbeat_ns``: I live, and this far I have come."""
+    """Service to broker, every ``heartbeat_ns``: I live, and this far I have come.
+
+    Example:
+        >>> loading = Heartbeat(sequence=4, progress=2, phase="loading scene", grace_ns=60_000_000_000)
+        >>> msgspec.to_builtins(loading)["phase"]
+        'loading scene'
+    """
 
     sequence: Count
     """Counts heartbeats, from 0."""

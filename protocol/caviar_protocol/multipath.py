@@ -35,6 +35,9 @@ TAPS_BEFORE = 6
 def subcarrier_offsets(carrier: Carrier) -> Float64Array:
     """Frequency of each subcarrier from the carrier's centre [Hz], Shape ``[K]``; that of index K//2 is 0.
 
+    Args:
+        carrier: With its numerology.
+
     Example:
         >>> carrier = Carrier(name="n257", frequency_hz=28e9, subcarriers=4, subcarrier_spacing_hz=120e3)
         >>> subcarrier_offsets(carrier).tolist()
@@ -48,6 +51,9 @@ def subcarrier_offsets(carrier: Carrier) -> Float64Array:
 
 def slot_offsets(carrier: Carrier) -> Float64Array:
     """Begin of each slot from the frame's instant [s], Shape ``[S]``.
+
+    Args:
+        carrier: With its slots.
 
     Example:
         >>> slot_offsets(Carrier(name="n257", frequency_hz=28e9, slots=3, slot_duration_s=0.5)).tolist()
@@ -63,6 +69,11 @@ def first_tap(carrier: Carrier, tau: Float64Array) -> int:
     Args:
         carrier: With its bandwidth.
         tau: Delays [s] of the paths.
+
+    Example:
+        >>> carrier = Carrier(name="n257", frequency_hz=28e9, bandwidth_hz=100e6)
+        >>> first_tap(carrier, np.array([1e-6, 3e-6]))
+        94
     """
     return math.floor(carrier.bandwidth_hz * float(tau.min())) - TAPS_BEFORE if tau.size else 0
 
@@ -77,6 +88,11 @@ def subcarrier_weights(carrier: Carrier, tau: Float64Array, doppler: Float64Arra
 
     Returns:
         Shape ``[S, K, ...]``, each of magnitude 1.
+
+    Example:
+        >>> carrier = Carrier(name="n257", frequency_hz=28e9, subcarriers=264, subcarrier_spacing_hz=120e3)
+        >>> subcarrier_weights(carrier, np.array([1e-7, 3e-7]), np.zeros(2)).shape
+        (1, 264, 2)
     """
     count, ahead = carrier.subcarriers, carrier.subcarriers // 2
     drifting, turning = _in_slots(carrier, tau, doppler)
@@ -105,6 +121,12 @@ def tap_weights(
 
     Returns:
         Shape ``[S, L, ...]``.
+
+    Example:
+        >>> carrier = Carrier(name="n257", frequency_hz=28e9, bandwidth_hz=100e6, taps=16)
+        >>> weights = tap_weights(carrier, np.array([1e-6]), np.zeros(1), 94)
+        >>> int(abs(weights[0, :, 0]).argmax())  # tap 6 is at the delay of the path
+        6
     """
     drifting, turning = _in_slots(carrier, tau, doppler)
     samples = np.arange(carrier.taps).reshape(-1, *(1,) * tau.ndim) + first
@@ -164,6 +186,10 @@ def doppler_spread(a: Complex128Array, doppler: Float64Array) -> Float64Array:
 
     Returns:
         σ_ν [Hz], Shape ``[...]``; NaN without a path.
+
+    Example:
+        >>> float(doppler_spread(np.array([1.0, 1.0], complex), np.array([-50.0, 50.0])))
+        50.0
     """
     return _spread(a, doppler)
 
@@ -178,6 +204,11 @@ def k_factor(a: Complex128Array, tau: Float64Array, los: BoolArray) -> Float64Ar
 
     Returns:
         Shape ``[...]``; NaN without line of sight, infinite where there is no other path.
+
+    Example:
+        >>> a, tau = np.array([2.0, 1.0], complex), np.array([1e-7, 2e-7])
+        >>> float(k_factor(a, tau, np.array(True)))
+        4.0
     """
     # `np.put_along_axis` below writes into this copy, never into the caller's amplitudes.
     power = np.nan_to_num(np.abs(a) ** 2)
@@ -206,6 +237,10 @@ def coherence(spread: Float64Array, correlation: float = CORRELATION) -> Float64
 
     Returns:
         A bandwidth [Hz] of a delay spread, a time [s] of a Doppler spread; infinite for a spread of 0.
+
+    Example:
+        >>> float(coherence(np.array(1e-7)).round())  # [Hz], of a delay spread of 100 ns
+        1666667.0
     """
     with np.errstate(divide="ignore"):
         bound: Float64Array = np.arccos(correlation) / (2 * np.pi * np.asarray(spread, np.float64))
@@ -252,6 +287,13 @@ def changes(before: Channel, after: Channel) -> Changes:
     Args:
         before: The earlier product.
         after: The later product, of the same source.
+
+    Example:
+        >>> from caviar_protocol.recording import Recording
+        >>> recording = Recording("runs/smoke-20261122-101500")
+        >>> channel = recording["channel"]
+        >>> changes(channel[6], channel[7]).births
+        0
     """
     # Where no path changed, two comparisons take the place of a sort.
     same = before.tx == after.tx and before.rx == after.rx

@@ -38,6 +38,10 @@ def derive_seed(seed: int, episode: int, stream: str) -> int:
 
     Returns:
         A number of 31 bits, which every library takes as a signed integer.
+
+    Example:
+        >>> derive_seed(1, 0, "traffic")
+        206690939
     """
     key = hashlib.sha256(f"{seed}\0{episode}\0{stream}".encode()).digest()
     return int.from_bytes(key[:4], "little") & 0x7FFFFFFF

@@ -175,7 +175,16 @@ def _default_text(field: msgspec.structs.FieldInfo) -> str:
 def _fields_block(name: str) -> str:
     cls = classes()[name]
     table = _table(("field", "type", "unit", "default", "since", "meaning"), rows(cls))
-    return f"{_markdown(inspect.getdoc(cls) or '')}\n\n{table}"
+    return f"{_markdown(prose(cls))}\n\n{table}"
+
+
+def prose(cls: type) -> str:
+    """The docstring of a class up to its sections: what is written for users of Python stays out of pages.
+
+    Args:
+        cls: The class.
+    """
+    return re.split(r"\n\n(?:Args|Raises|Example):\n", inspect.getdoc(cls) or "", maxsplit=1)[0]
 
 
 def _types_block(_: str) -> str:

@@ -52,7 +52,14 @@ METADATA_NAME = "caviar"
 
 
 class RecordingMetadata(msgspec.Struct, frozen=True, kw_only=True):
-    """What stands once in every segment: how the run was made."""
+    """What stands once in every segment: how the run was made.
+
+    Example:
+        >>> from caviar_protocol.recording import Recording
+        >>> recording = Recording("runs/smoke-20261122-101500")
+        >>> recording.metadata.name, recording.metadata.seed, recording.metadata.sampling_period_ns
+        ('smoke', 1, 100000000)
+    """
 
     format: int = FORMAT
     segment: int = 0
@@ -80,7 +87,15 @@ class RecordingMetadata(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FrameEntry(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What a recording says about one frame beside its products; msgpack on the wire."""
+    """What a recording says about one frame beside its products; msgpack on the wire.
+
+    Example:
+        >>> from caviar_protocol.recording import Recording
+        >>> recording = Recording("runs/smoke-20261122-101500")
+        >>> entry = recording.frame(episode=0, frame=7).entry
+        >>> [(item.topic, item.source, item.status.value) for item in entry.inputs][0]
+        ('action', 'agent', 'fresh')
+    """
 
     episode: Annotated[int, quantity("1", "episode number, from 0", ge=0)]
     frame: Annotated[int, quantity("1", "frame number in the episode, from 0", ge=0)]
@@ -95,7 +110,13 @@ class FrameEntry(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class SegmentRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One segment in the manifest."""
+    """One segment in the manifest.
+
+    Example:
+        >>> manifest = read_manifest(Path("runs/smoke-20261122-101500"))
+        >>> manifest.segments[0].extent
+        'frame 0 of episode 0 to frame 99 of episode 0'
+    """
 
     name: str
     first: tuple[int, int] | None = None
@@ -121,7 +142,13 @@ class SegmentRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
 
 class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The segments of a recording, in order."""
+    """The segments of a recording, in order.
+
+    Example:
+        >>> manifest = read_manifest(Path("runs/smoke-20261122-101500"))
+        >>> manifest.closed, [segment.name for segment in manifest.segments]
+        (True, ['recording-0000.mcap'])
+    """
 
     run: str = ""
     seed: int = 0
@@ -179,7 +206,15 @@ def read_manifest(folder: Path) -> Manifest | None:
 
 
 def frame_name(instant: tuple[int, int]) -> str:
-    """(episode, frame) for people."""
+    """A frame as errors name it.
+
+    Args:
+        instant: (episode, frame).
+
+    Example:
+        >>> frame_name((0, 7))
+        'frame 7 of episode 0'
+    """
     return f"frame {instant[1]} of episode {instant[0]}"
 
 

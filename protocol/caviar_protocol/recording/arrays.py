@@ -60,6 +60,13 @@ class Column(Generic[S]):
         shape: Of one row: fixed sizes, or the name of one that differs between rows. Such an axis is as long
             as the longest row, and the others are padded with the missing value.
         rows: Rows of one product; by default the payload's field of this attribute's name.
+
+    Example:
+        >>> from caviar_protocol.recording import Recording
+        >>> recording = Recording("runs/smoke-20261122-101500")
+        >>> column = recording["link"].columns["abs_y"]
+        >>> column.unit, column.doc
+        ('1', '|y| of the chosen pair')
     """
 
     def __init__(
@@ -89,7 +96,12 @@ class Column(Generic[S]):
         return self if view is None else view.stack(self)
 
     def rows(self, view: TopicArrays[Any, Any], payload: Payload) -> Rows:
-        """Rows of one product, in the order of ``view.keys_of(payload)``."""
+        """Rows of one product, in the order of ``view.keys_of(payload)``.
+
+        Args:
+            view: The topic in some frames.
+            payload: One product of it.
+        """
         found: Rows = getattr(payload, self.name) if self._rows is None else self._rows(view, payload)
         return found
 
@@ -109,6 +121,12 @@ def payload_column(
         name: The field.
         axes: Leading axes of the field that count rows.
         rows: Rows of one product; by default those of the field along its first axis.
+
+    Example:
+        >>> from caviar_protocol.topics import Scene
+        >>> column = payload_column(np.float64, Scene, "position")
+        >>> column.shape, column.unit
+        ((3,), 'm')
     """
     spec, hint = array_fields(cls)[name], get_type_hints(cls, include_extras=True)[name]
     candidates = (hint, *get_args(hint))  # an optional field is a union with the annotated type
@@ -132,9 +150,22 @@ class TopicArrays(Generic[P, K]):
     integers, 0 for unsigned ones and false for booleans; `present` says which rows are there, `status` why.
     Axis F counts the frames.
 
+    Args:
+        recording: Of which the frames are.
+        topic: Name of the topic.
+        sources: Services that produced it; several only of ``scene``, whose worlds are merged.
+        indices: Places of the frames in the recording, Shape ``[F]``.
+
     Raises:
         RecordingError: On reading: the bytes of a product are damaged or not in this file; the message names
             frame and place.
+
+    Example:
+        >>> from caviar_protocol.recording import Recording
+        >>> recording = Recording("runs/smoke-20261122-101500")
+        >>> link = recording["link"]
+        >>> link[10:20].abs_y.shape, link[link.fresh].frame[:3].tolist(), type(link[7]).__name__
+        ((10, 2), [0, 1, 2], 'Link')
     """
 
     axis: ClassVar[str] = ""
@@ -161,7 +192,11 @@ class TopicArrays(Generic[P, K]):
         return f"{self._recording.path}: {self.topic}"
 
     def was_asked_for(self, part: str) -> bool:
-        """Whether ``record`` of the scenario names a part, as ``channel.h``."""
+        """Whether ``record`` of the scenario names a part, as ``channel.h``.
+
+        Args:
+            part: Topic and part: ``channel.h``.
+        """
         run = self._recording.metadata.scenario.get("run", {})
         return isinstance(run, Mapping) and part in run.get("record", ())
 
@@ -247,6 +282,12 @@ class TopicArrays(Generic[P, K]):
 
         Raises:
             RecordingError: An episode or a frame was not recorded; the text says what was.
+
+        Example:
+            >>> from caviar_protocol.recording import Recording
+            >>> recording = Recording("runs/smoke-20261122-101500")
+            >>> recording["scene"].select(episode=0, frames=[0, 50]).position.shape
+            (2, 2, 3)
         """
         chosen = np.ones(len(self), dtype=bool)
         if episode is not None:
@@ -278,7 +319,18 @@ class TopicArrays(Generic[P, K]):
             yield self[start : start + frames].like(self)
 
     def like(self, other: TopicArrays[Any, K]) -> Self:
-        """These frames with the rows of ``other``, in its order; of one topic, with its sizes, too."""
+        """These frames with the rows of another view, in its order; of one topic, with its sizes, too.
+
+        Args:
+            other: The view, such as that of all frames.
+
+        Example:
+            >>> from caviar_protocol.recording import Recording
+            >>> recording = Recording("runs/smoke-20261122-101500")
+            >>> link = recording["link"]
+            >>> link[:10].like(link).keys == link.keys
+            True
+        """
         view = self._view(self._indices)
         view._reference = other
         return view
@@ -309,7 +361,14 @@ class TopicArrays(Generic[P, K]):
         return found
 
     def stack(self, column: Column[S]) -> NDArray[S]:
-        """The array of a column, Shape ``[F, rows, …]``."""
+        """Read the array of a column.
+
+        Args:
+            column: One of `columns`.
+
+        Returns:
+            Shape ``[F, rows, …]``, with the missing value where a row is not there.
+        """
         shape = self._shape(column)
         # Padding comes first, so that rows and frames that are absent need no step of their own.
         out: NDArray[S] = np.full(shape, _MISSING[column.dtype.kind], dtype=column.dtype)
@@ -346,15 +405,27 @@ class TopicArrays(Generic[P, K]):
     # --- what a topic defines -------------------------------------------------------------------
 
     def keys_of(self, payload: P) -> Sequence[K]:
-        """Key of each row of one product."""
+        """Key of each row of one product.
+
+        Args:
+            payload: A product of the topic.
+        """
         raise NotImplementedError
 
     def sorted_keys(self, keys: Iterable[K]) -> Iterable[K]:
-        """All keys in the order of the second axis; ``keys`` come in the order in which they occurred."""
+        """All keys in the order of the second axis.
+
+        Args:
+            keys: Each once, in the order in which they occurred.
+        """
         raise NotImplementedError
 
     def merged(self, payloads: dict[str, P]) -> P:
-        """The payloads of several sources as one; only a topic that allows them defines it."""
+        """The payloads of several sources as one; only a topic that allows them defines it.
+
+        Args:
+            payloads: By source.
+        """
         raise NotImplementedError
 
     # --- reading --------------------------------------------------------------------------------

@@ -60,8 +60,17 @@ TOPIC_ARRAYS: dict[str, type[TopicArrays[Any, Any]]] = {
 def check_topic(topic: str) -> str:
     """Check that there is a topic of this name, and return it.
 
+    Args:
+        topic: What a caller asks for.
+
     Raises:
         RecordingError: There is none; the text suggests the one that was probably meant.
+
+    Example:
+        >>> check_topic("chanel")
+        Traceback (most recent call last):
+            ...
+        caviar_protocol.errors.RecordingError: there is no topic 'chanel'; did you mean 'channel'?
     """
     if topic not in PAYLOADS:
         raise RecordingError(f"there is no topic {topic!r}; {suggestion(topic, PAYLOADS)}")
@@ -73,7 +82,22 @@ class RecordingWarning(UserWarning):
 
 
 class RecordedProduct:
-    """One product of a frame; its payload is decoded on first use."""
+    """One product of a frame; its payload is decoded on first use.
+
+    Args:
+        provenance: Topic, source, status and digest, as the frame's record has them.
+        data: Header length (8 bytes, little-endian), header and body.
+        place: Recording, frame, topic and source, as errors name them.
+
+    Example:
+        >>> from caviar_protocol.recording import Recording
+        >>> recording = Recording("runs/smoke-20261122-101500")
+        >>> product = recording.frame(episode=0, frame=7).products[0]
+        >>> product.provenance.topic, product.digest == product.provenance.digest
+        ('action', True)
+        >>> type(product.payload).__name__
+        'Action'
+    """
 
     def __init__(self, provenance: GrantInput, data: memoryview, place: str) -> None:
         self.provenance = provenance
@@ -123,7 +147,19 @@ class RecordedProduct:
 
 
 class RecordedFrame:
-    """One frame: the provenance of all its products, and the products, read on first use."""
+    """One frame: the provenance of all its products, and the products, read on first use.
+
+    Args:
+        recording: Of which the frame is.
+        index: Place of the frame in it, from 0.
+
+    Example:
+        >>> from caviar_protocol.recording import Recording
+        >>> recording = Recording("runs/smoke-20261122-101500")
+        >>> frame = recording.frame(episode=0, frame=7)
+        >>> frame.t_ns, [product.provenance.topic for product in frame.products]
+        (700000000, ['action', 'channel', 'link', 'scene'])
+    """
 
     def __init__(self, recording: Recording, index: int) -> None:
         self._recording = recording
@@ -175,7 +211,14 @@ class RecordedFrame:
     of = payloads  # its earlier name
 
     def scene(self) -> Scene | None:
-        """The scenes of all worlds as one (contract, clause 3); None where there is none."""
+        """The scenes of all worlds as one (contract, clause 3); None where there is none.
+
+        Example:
+            >>> from caviar_protocol.recording import Recording
+            >>> recording = Recording("runs/smoke-20261122-101500")
+            >>> recording.frame(episode=0, frame=7).scene().names
+            ('car', 'uav')
+        """
         scenes = self.payloads("scene", Scene)
         return merge_scenes(scenes) if scenes else None
 
@@ -193,6 +236,15 @@ class Recording:
     Warns:
         RecordingWarning: It is damaged, or a segment is missing. What precedes can be read, and `damage`
             says what cannot. A last segment that breaks off, as a killed recorder leaves it, is no damage.
+
+    Example:
+        >>> recording = Recording("runs/smoke-20261122-101500")
+        >>> len(recording), recording.complete
+        (100, True)
+        >>> recording.topics
+        {'action': ('agent',), 'channel': ('channel',), 'link': ('link',), 'scene': ('world',)}
+        >>> recording["link"].abs_y.shape  # frames × users
+        (100, 2)
     """
 
     def __init__(self, path: str | Path, *, past_gaps: bool = False) -> None:
@@ -302,7 +354,13 @@ class Recording:
         return known
 
     def frames(self) -> Iterator[RecordedFrame]:
-        """All frames, in the order of (episode, frame)."""
+        """All frames, in the order of (episode, frame).
+
+        Example:
+            >>> recording = Recording("runs/smoke-20261122-101500")
+            >>> sum(frame.scene() is not None for frame in recording.frames())
+            100
+        """
         return (RecordedFrame(self, index) for index in range(len(self)))
 
     def frame(self, episode: int, frame: int) -> RecordedFrame:
@@ -314,6 +372,10 @@ class Recording:
 
         Raises:
             RecordingError: It was not recorded; the text says which frames are there.
+
+        Example:
+            >>> Recording("runs/smoke-20261122-101500").frame(episode=0, frame=7).t_ns
+            700000000
         """
         index = self._index.get((episode, frame))
         if index is None:
@@ -334,6 +396,11 @@ class Recording:
 
         Raises:
             RecordingError: The frame was not recorded, or the product is absent in it.
+
+        Example:
+            >>> recording = Recording("runs/smoke-20261122-101500")
+            >>> recording.product(episode=0, frame=7, topic="channel", source="channel").rung
+            'free-space'
         """
         check_topic(topic)
         for product in self.frame(episode, frame).products:
@@ -350,6 +417,11 @@ class Recording:
 
         Raises:
             RecordingError: There is no topic of this name.
+
+        Example:
+            >>> recording = Recording("runs/smoke-20261122-101500")
+            >>> max(product.size for frame, product in recording.products("action"))  # [B]
+            104
         """
         check_topic(topic)  # here, and not when the first product is asked for
         return (
@@ -365,22 +437,38 @@ class Recording:
         """The run's digest, recomputed from the payload bytes alone (contract, clause 20).
 
         It does not stop at damage: a changed payload gives another digest and is named.
+
+        Example:
+            >>> report = Recording("runs/smoke-20261122-101500").run_digest()
+            >>> report.frames, report.damage
+            (100, ())
         """
         return recorded_digest(self._found)
 
     def entry(self, index: int) -> FrameEntry:
-        """The frame record of the ``index``-th frame of the recording."""
+        """The frame record of the ``index``-th frame of the recording.
+
+        Args:
+            index: Place of a frame in the recording, from 0.
+        """
         segment, place = self.segment_of(index)
         return segment.entries[place]
 
     def segment_of(self, index: int) -> tuple[Segment, int]:
-        """The segment of the ``index``-th frame of the recording, and the frame's place in it."""
+        """The segment of the ``index``-th frame of the recording, and the frame's place in it.
+
+        Args:
+            index: Place of a frame in the recording, from 0.
+        """
         # Empty segments have the start of the next one: the last of equal starts has the frame.
         number = bisect_right(self._starts, index) - 1
         return self._segments[number], index - self._starts[number]
 
     def products_of(self, index: int) -> tuple[RecordedProduct, ...]:
         """The products of the ``index``-th frame, held ones fetched from where they stand.
+
+        Args:
+            index: Place of a frame in the recording, from 0.
 
         Raises:
             RecordingError: The frame's chunk is damaged, or the bytes of a product are missing.
@@ -396,6 +484,10 @@ class Recording:
         """One product of the ``index``-th frame, which is not absent, wherever it stands.
 
         Of the frame only this product's bytes are read.
+
+        Args:
+            index: Place of the frame in the recording, from 0.
+            item: Provenance of the product, one of the frame's inputs.
 
         Raises:
             RecordingError: The bytes are missing, or have another digest than the frame's record says.
@@ -487,6 +579,10 @@ def recorded_decisions(recording: Recording) -> Imposed:
 
     Returns:
         Decisions by (service, episode, frame).
+
+    Example:
+        >>> recorded_decisions(Recording("runs/smoke-20261122-101500"))  # no service of it decides anything
+        {}
     """
     return {
         (report.source, frame.episode, frame.number): report.decisions

@@ -33,7 +33,14 @@ P = TypeVar("P", bound=Payload)
 
 
 class User(NamedTuple):
-    """A receiver that a transmitter serves on a carrier, all by name."""
+    """A receiver that a transmitter serves on a carrier, all by name.
+
+    Example:
+        >>> from caviar_protocol.recording import Recording
+        >>> recording = Recording("runs/smoke-20261122-101500")
+        >>> recording["link"].users[0]
+        User(tx='bs', rx='car/rx', carrier='mmwave')
+    """
 
     tx: str
     rx: str
@@ -44,6 +51,11 @@ def recorded_part(
     view: TopicArrays[Any, Any], part: str, rows: Sequence[NDArray[Any] | None]
 ) -> list[NDArray[Any]]:
     """Rows of a part that is computed only where a consumer asks for it.
+
+    Args:
+        view: The topic in some frames.
+        part: Topic and part: ``channel.h``.
+        rows: Rows of one product; None where one lacks the part.
 
     Raises:
         RecordingError: A row is not there; the text says what to write into the scenario.
@@ -135,8 +147,20 @@ class NamedArrays(TopicArrays[P, str], Generic[P]):
     def index(self, names: Iterable[str]) -> Int64Array:
         """Place of each name on the second axis, to align arrays: ``position[:, devices.index(channel.rx)]``.
 
+        Args:
+            names: Names of rows.
+
+        Returns:
+            Shape as there are names.
+
         Raises:
             RecordingError: A name is not there.
+
+        Example:
+            >>> from caviar_protocol.recording import Recording
+            >>> recording = Recording("runs/smoke-20261122-101500")
+            >>> recording["scene"].index(["uav", "car"]).tolist()
+            [1, 0]
         """
         names = list(names)
         for name in names:
@@ -161,6 +185,12 @@ class NamedArrays(TopicArrays[P, str], Generic[P]):
 
         Raises:
             RecordingError: A frame, an episode or a name is not there; the text says what is.
+
+        Example:
+            >>> from caviar_protocol.recording import Recording
+            >>> recording = Recording("runs/smoke-20261122-101500")
+            >>> recording["scene"].select(names="uav").velocity.shape
+            (100, 1, 3)
         """
         return super().select(episode=episode, frames=frames)._narrowed([(0, "row named", names)])
 
@@ -172,7 +202,15 @@ class NamedArrays(TopicArrays[P, str], Generic[P]):
 
 
 class SceneArrays(NamedArrays[Scene]):
-    """Topic ``scene``: objects, of all worlds."""
+    """Topic ``scene``: objects, of all worlds.
+
+    Example:
+        >>> from caviar_protocol.recording import Recording
+        >>> recording = Recording("runs/smoke-20261122-101500")
+        >>> scene = recording["scene"]
+        >>> scene.names, scene.classes, scene.position.shape  # frames × objects × 3
+        (('car', 'uav'), ('car', 'uav'), (100, 2, 3))
+    """
 
     axis: ClassVar[str] = "N"
 
@@ -216,7 +254,15 @@ def _each_device(value: Callable[[Scene, Device], Any]) -> Callable[[Any, Scene]
 
 
 class DeviceArrays(NamedArrays[Scene]):
-    """Devices of topic ``scene``, fixed ones and those mounted on objects, in world axes."""
+    """Devices of topic ``scene``, fixed ones and those mounted on objects, in world axes.
+
+    Example:
+        >>> from caviar_protocol.recording import Recording
+        >>> recording = Recording("runs/smoke-20261122-101500")
+        >>> devices = recording["scene"].devices
+        >>> devices.position[0, devices.index(["bs"])].shape
+        (1, 3)
+    """
 
     axis: ClassVar[str] = "D"
 
@@ -245,7 +291,17 @@ class DeviceArrays(NamedArrays[Scene]):
         return {name: found[name] for name in self.keys if name in found}
 
     def antennas(self, role: str) -> tuple[str, ...]:
-        """Names of the antennas that transmit (``"tx"``) or receive (``"rx"``)."""
+        """Names of the antennas that transmit or receive.
+
+        Args:
+            role: ``"tx"`` for those that transmit, ``"rx"`` for those that receive.
+
+        Example:
+            >>> from caviar_protocol.recording import Recording
+            >>> recording = Recording("runs/smoke-20261122-101500")
+            >>> recording["scene"].devices.antennas("rx")
+            ('car/rx', 'uav/rx-uav')
+        """
         return tuple(
             name
             for name, device in self.devices.items()
@@ -316,6 +372,13 @@ class ChannelArrays(UserArrays[Channel]):
 
     A user without a path has zeros in ``h``. Axes Nr and Nt are as long as the largest receive and transmit
     array, P as the most paths of a user, D as the most interactions of a path.
+
+    Example:
+        >>> from caviar_protocol.recording import Recording
+        >>> recording = Recording("runs/smoke-20261122-101500")
+        >>> channel = recording["channel"]
+        >>> channel.h.shape, channel.tau.shape  # frames × users × Nr × Nt, frames × users × paths
+        ((100, 2, 4, 32), (100, 2, 1))
     """
 
     def _matrices(self, channel: Channel) -> Rows:
@@ -403,6 +466,13 @@ class LinkArrays(UserArrays[Link]):
     """Topic ``link``: chosen and best beams, |y|, SNR, rates and reward, by user.
 
     |y| = |w* H f| is the equivalent channel of a beam pair; axis K counts the best pairs, best first.
+
+    Example:
+        >>> from caviar_protocol.recording import Recording
+        >>> recording = Recording("runs/smoke-20261122-101500")
+        >>> link = recording["link"]
+        >>> bool((link.abs_y <= link.top_abs_y[..., 0]).all())  # no pair is better than the best
+        True
     """
 
     has_path = payload_column(np.bool_, Link, "has_path")
@@ -452,7 +522,14 @@ def _each_motion(field: str, missing: Any) -> Callable[[Any, Action], Rows]:
 
 
 class ActionArrays(UserArrays[Action]):
-    """Topic ``action``: the beams that an agent chose, by user; an empty carrier stands for all of them."""
+    """Topic ``action``: the beams that an agent chose, by user; an empty carrier stands for all of them.
+
+    Example:
+        >>> from caviar_protocol.recording import Recording
+        >>> recording = Recording("runs/smoke-20261122-101500")
+        >>> recording["action"].tx_beam.shape  # frames × users
+        (100, 2)
+    """
 
     tx_beam = Column(
         np.int32,

@@ -45,7 +45,12 @@ FILE = "file:"
 
 
 def shipped_scenarios() -> dict[str, Path]:
-    """Files of the scenarios that ship with this installation, by their names, in order of name."""
+    """Files of the scenarios that ship with this installation, by their names, in order of name.
+
+    Example:
+        >>> "smoke" in shipped_scenarios()
+        True
+    """
     folder = Path(str(resources.files("caviar_scenarios")))
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
@@ -58,6 +63,10 @@ def find_scenario(scenario: Path | str) -> Path:
 
     Returns:
         The file. What is neither is returned as it is; reading it says what is wrong.
+
+    Example:
+        >>> find_scenario("smoke").name, str(find_scenario("my/street.toml"))
+        ('smoke.toml', 'my/street.toml')
     """
     # A file beside the user is meant before one that ships under the same name.
     path = Path(scenario)
@@ -106,6 +115,13 @@ def parse_scenario(text: str, file: str = "", folder: Path | None = None) -> Sce
 
     Raises:
         ScenarioError: The text breaks a rule, as of `load_scenario`.
+
+    Example:
+        >>> text = find_scenario("smoke").read_text()
+        >>> parse_scenario(text.replace("frames = 100", "frames = 0"), "my.toml")
+        Traceback (most recent call last):
+            ...
+        caviar_protocol.errors.ScenarioError: my.toml:8: run.frames: is 0, write a whole number ≥ 1 [frame]
     """
     try:
         table = parse_toml(text)
@@ -248,7 +264,18 @@ _LATEST_S = 2**63 // 10**9
 
 
 def instants_ns(instants_s: Iterable[float]) -> tuple[int, ...]:
-    """Instants [ns] of decimal numbers of seconds, without the error of binary fractions."""
+    """Instants of decimal numbers of seconds, without the error of binary fractions.
+
+    Args:
+        instants_s: Seconds [s], each of at most 9 decimals.
+
+    Returns:
+        Whole nanoseconds [ns].
+
+    Example:
+        >>> instants_ns([0.1, 0.35]), int(0.35 * 1e9)
+        ((100000000, 350000000), 350000000)
+    """
     return tuple(int(_nanoseconds(value)) for value in instants_s)
 
 
@@ -268,6 +295,11 @@ def with_instants(table: Mapping[str, Any], place: Place, folder: Path = Path())
     Raises:
         ScenarioError: Instants are no strictly increasing whole nanoseconds, or stand beside a key that they
             replace.
+
+    Example:
+        >>> table = with_instants({"name": "mine", "instants_s": [0.0, 0.1, 0.35]}, Place("run"))
+        >>> table["frames"], table["sampling_period_ns"]
+        (3, 50000000)
     """
     if NANOSECONDS in table:
         return with_instants(_in_seconds(table, place), place, folder)

@@ -22,7 +22,12 @@ _ARRAYS = (inspect.VarTupleType, inspect.ListType, inspect.TupleType)
 
 
 class Source(msgspec.Struct, frozen=True, kw_only=True):
-    """The file a scenario was read from, and where its keys stand. Empty: built in Python."""
+    """The file a scenario was read from, and where its keys stand. Empty: built in Python.
+
+    Example:
+        >>> Source(file="my.toml", lines={"run": 1, "run.seed": 3}).line("run.frames")  # where to write it
+        1
+    """
 
     file: str = ""
     lines: dict[str, int] = {}
@@ -42,7 +47,11 @@ class Source(msgspec.Struct, frozen=True, kw_only=True):
         return None
 
     def holds(self, key: str) -> bool:
-        """Whether the file has this very key, or one below it."""
+        """Whether the file has this very key, or one below it.
+
+        Args:
+            key: Dotted: ``devices[0].array``.
+        """
         return any(line == key or line.startswith((f"{key}.", f"{key}[")) for line in self.lines)
 
 
@@ -89,6 +98,11 @@ def located(text: str, service: str, source: Source) -> str:
         text: ``KEY: message``. A text that begins with no key of the file comes back as it is.
         service: Name of the service.
         source: The file of the scenario.
+
+    Example:
+        >>> source = Source(file="my.toml", lines={"services.channel.settings.samples": 20})
+        >>> located("settings.samples: is 0, write a whole number ≥ 1", "channel", source)
+        'my.toml:20: services.channel.settings.samples: is 0, write a whole number ≥ 1'
     """
     key, separator, message = text.partition(": ")
     if not separator or _KEY.fullmatch(key) is None:
@@ -114,6 +128,16 @@ def convert_settings(cls: type[T], settings: Mapping[str, Any], place: Place | N
     Raises:
         ScenarioError: A setting is unknown, missing or out of range; the text has the key, file and line
             where they are known, the value and what to write instead.
+
+    Example:
+        >>> class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+        ...     users: int = 1
+        >>> convert_settings(Settings, {"users": 4}).users
+        4
+        >>> convert_settings(Settings, {"user": 4})
+        Traceback (most recent call last):
+            ...
+        caviar_protocol.errors.ScenarioError: settings.user: unknown key 'user'; did you mean 'users'?
     """
     return convert_table(cls, settings, place or Place("settings"))
 
@@ -314,7 +338,15 @@ def _example(field: inspect.Field, place: Place) -> str:
 
 
 def show(value: object) -> str:
-    """A value as it would stand in the file."""
+    """A value as it would stand in the file.
+
+    Args:
+        value: What `tomllib` read.
+
+    Example:
+        >>> show(True), show([1, 2]), show("x")
+        ('true', 'an array of 2', "'x'")
+    """
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, Mapping):

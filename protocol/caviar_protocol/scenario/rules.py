@@ -36,17 +36,36 @@ def scenario_error(scenario: Scenario, key: str, message: str) -> ScenarioError:
         scenario: The scenario.
         key: Dotted: ``services.channel.use``, ``devices[0].on``. The line is found from it.
         message: What is wrong, and what to write instead.
+
+    Example:
+        >>> from caviar_protocol.scenario import load_scenario
+        >>> error = scenario_error(load_scenario("smoke"), "services.channel.use", "is not installed")
+        >>> error.key, error.line is not None
+        ('services.channel.use', True)
     """
     return Place(key, scenario.source).error(message)
 
 
 def settings_place(scenario: Scenario, service: str) -> Place:
-    """Where the settings of a service stand, for `caviar_protocol.scenario.conversion.convert_settings`."""
+    """Where the settings of a service stand, for `caviar_protocol.scenario.conversion.convert_settings`.
+
+    Args:
+        scenario: The scenario.
+        service: Name of the service.
+
+    Example:
+        >>> from caviar_protocol.scenario import load_scenario
+        >>> settings_place(load_scenario("smoke"), "channel").key
+        'services.channel.settings'
+    """
     return Place("services", scenario.source).at(service).at("settings")
 
 
 def check_scenario(scenario: Scenario) -> None:
     """Check the rules that concern several keys of a scenario.
+
+    Args:
+        scenario: The scenario.
 
     Raises:
         ScenarioError: The first rule that the scenario breaks.
@@ -78,6 +97,9 @@ def _check_duration(scenario: Scenario, place: Place) -> None:
 
 def refuse_remote(scenario: Scenario) -> None:
     """Check that a scenario has no remote service, for a run that has no broker to connect to.
+
+    Args:
+        scenario: The scenario.
 
     Raises:
         ScenarioError: A service has ``use = "remote"``.
@@ -119,6 +141,11 @@ def world_of(scenario: Scenario, index: int) -> str:
 
     Raises:
         ScenarioError: No world of this name, or several worlds are possible.
+
+    Example:
+        >>> from caviar_protocol.scenario import load_scenario
+        >>> world_of(load_scenario("smoke"), 0)
+        'world'
     """
     device = scenario.devices[index]
     worlds = [name for name, service in scenario.services.items() if service.role == "world"]
@@ -187,6 +214,11 @@ def resolved(scenario: Scenario, settings: Mapping[str, msgspec.Struct] | None =
         scenario: The scenario.
         settings: Settings of services after conversion, by the service's name, so that their defaults show
             too.
+
+    Example:
+        >>> from caviar_protocol.scenario import load_scenario
+        >>> resolved(load_scenario("smoke"))["timeouts"]["connect_s"]
+        30.0
     """
     table = plain(scenario)
     del table["source"]
@@ -447,6 +479,11 @@ def with_numerology(carrier: Carrier, sampling_period_ns: int | None, place: Pla
     Raises:
         ScenarioError: The bandwidth is no carrier's, subcarriers are too many or do not fit into
             it, or slots have no duration; the text names the key.
+
+    Example:
+        >>> carrier = Carrier(name="n257", frequency_hz=28e9, subcarrier_spacing_hz=120e3)
+        >>> with_numerology(carrier, 100_000_000, Place("carriers[0]")).subcarriers
+        833
     """
     count, spacing, bandwidth = carrier.subcarriers, carrier.subcarrier_spacing_hz, carrier.bandwidth_hz
     least, most = _BANDWIDTHS_HZ
@@ -486,7 +523,19 @@ def with_numerology(carrier: Carrier, sampling_period_ns: int | None, place: Pla
 
 
 def undefined_part(part: str, carriers: Sequence[Carrier]) -> str:
-    """What to write where no carrier says what a wideband part consists of; empty: one does."""
+    """What to write where no carrier says what a wideband part of ``channel`` consists of.
+
+    Args:
+        part: Name of a part: ``hf``, ``taps``.
+        carriers: Carriers of the scenario.
+
+    Returns:
+        The remedy; empty: a carrier says it, or the part needs none.
+
+    Example:
+        >>> undefined_part("taps", [Carrier(name="n257", frequency_hz=28e9, taps=64)])
+        ''
+    """
     if part == "hf" and not any(c.subcarriers or c.subcarrier_spacing_hz for c in carriers):
         return (
             "channel.hf needs a carrier with subcarriers; write, for instance, subcarriers = 264 and "

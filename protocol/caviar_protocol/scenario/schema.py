@@ -127,6 +127,11 @@ class DeviceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True
     With ``on`` the device is mounted: on the object of that name, or with ``*`` on up to
     ``count`` of the matching objects, those that came first; when one leaves, the next gets a
     device. A mounted device is named ``<object>/<name>``.
+
+    Example:
+        >>> antenna = DeviceSpec(name="rx", kind="antenna", on="car.*", count=2, mount="roof", role="rx")
+        >>> mounted_device(antenna, "car.17", (4.5, 1.8, 1.5)).position
+        (0.0, 0.0, 0.75)
     """
 
     name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
@@ -162,7 +167,12 @@ class DeviceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 class ServiceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One service of the run."""
+    """One service of the run.
+
+    Example:
+        >>> ServiceSpec(role="agent", use="remote", budget_ms=20.0).remote
+        True
+    """
 
     unknown_key_hint: ClassVar[str] = "settings of the implementation stand in its table `settings`"
 
@@ -252,8 +262,16 @@ def carries(spec: DeviceSpec, name: str) -> bool:
 def fixed_device(spec: DeviceSpec) -> Device:
     """The device of a scenario that stands in the world, without ``on``.
 
+    Args:
+        spec: The device of the scenario.
+
     Raises:
         ScenarioError: An antenna has no role.
+
+    Example:
+        >>> mast = DeviceSpec(name="bs", kind="antenna", role="tx", position_m=(0.0, 0.0, 15.0))
+        >>> fixed_device(mast).position
+        (0.0, 0.0, 15.0)
     """
     return _device(spec, spec.name, "", 0.0)
 
@@ -274,6 +292,9 @@ def mounted_device(spec: DeviceSpec, parent: str, dimensions: Vector) -> Device:
 
 def pattern_asset(path: str) -> str:
     """Name of the asset that a pattern file of a scenario travels as.
+
+    Args:
+        path: File of the pattern, as it stands in the scenario.
 
     Example:
         >>> pattern_asset("/home/me/measured/horn.csv")

@@ -39,6 +39,11 @@ def straight_beams(
 
     Returns:
         TX beam and RX beam; of dual polarizations those that couple best between upright devices.
+
+    Example:
+        >>> ahead = (1.0, 0.0, 0.0)
+        >>> straight_beams(AntennaArray(columns=32), ahead, AntennaArray(columns=4), ahead)
+        (0, 0)
     """
     sent = taken = 0
     if not (transmit.is_uniform and receive.is_uniform):
@@ -103,6 +108,11 @@ def beam_gain(array: AntennaArray, beam: int, directions: Float64Array) -> Float
     Returns:
         The array factor ``|sin(πNv)| / (N·|sin πv|)`` of `beam_towards` over columns times that over rows,
         of the beam's own subarray, Shape ``[...]``.
+
+    Example:
+        >>> boresight = np.array([[1.0, 0.0, 0.0]])
+        >>> [beam_gain(AntennaArray(columns=8), beam, boresight).round(6).item() for beam in (0, 1)]
+        [1.0, 0.0]
     """
     if not array.is_uniform:
         part, beam = subarray_of(array, beam)
@@ -124,6 +134,11 @@ def subarray_of(array: AntennaArray, beam: int) -> tuple[Subarray, int]:
 
     Returns:
         The subarray, and the beam's index in the subarray's own codebook.
+
+    Example:
+        >>> part, own = subarray_of(AntennaArray(columns=8, polarization="VH"), 11)
+        >>> part.array.polarization, own
+        ('H', 3)
     """
     number, own = divmod(beam, array.rows * array.columns)
     return subarrays(array)[number], own
@@ -142,7 +157,13 @@ def _factor(size: int, v: Float64Array) -> Float64Array:
 
 @dataclass(frozen=True)
 class Subarray:
-    """All elements of one panel and one polarization."""
+    """All elements of one panel and one polarization.
+
+    Example:
+        >>> vertical, horizontal = subarrays(AntennaArray(columns=8, polarization="VH"))
+        >>> horizontal.elements
+        slice(8, 16, None)
+    """
 
     array: AntennaArray
     """A uniform array (`AntennaArray.is_uniform`)."""
@@ -159,7 +180,11 @@ class Subarray:
         return slice(self.first, self.first + self.array.size)
 
     def towards(self, direction: Sequence[float]) -> Vector:
-        """A direction in the device's axes, in those of the subarray."""
+        """A direction in the axes of the subarray.
+
+        Args:
+            direction: Unit vector in the device's axes.
+        """
         x, y, z = direction
         return unrotated(self.orientation, (x, y, z))
 
@@ -224,6 +249,10 @@ def jones(polarization: str) -> tuple[complex, complex]:
 
     Args:
         polarization: ``V``, ``H``, ``-45``, ``+45``, ``RHCP`` or ``LHCP``.
+
+    Example:
+        >>> jones("H")
+        (0.0, 1.0)
     """
     if polarization == "V":
         return 1.0, 0.0

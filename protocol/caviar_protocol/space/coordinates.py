@@ -22,7 +22,16 @@ SPEED_OF_LIGHT = 299_792_458.0
 
 
 class Pose(NamedTuple):
-    """Position [m] and orientation of a body in the world."""
+    """Position and orientation of a body in the world.
+
+    Args:
+        position: (x, y, z) [m].
+        orientation: Unit quaternion (w, x, y, z) that rotates body axes into world axes.
+
+    Example:
+        >>> Pose((10.0, 0.0, 1.5), quaternion_from_euler(0.0)).orientation
+        (1.0, 0.0, 0.0, 0.0)
+    """
 
     position: Vector
     orientation: UnitQuaternion
@@ -101,6 +110,10 @@ def rotated(q: Sequence[float], v: Sequence[float]) -> Vector:
 
     Returns:
         R·v with the `rotation_matrix` R.
+
+    Example:
+        >>> [round(x, 6) for x in rotated(quaternion_from_euler(math.pi / 2), (1.0, 0.0, 0.0))]
+        [0.0, 1.0, 0.0]
     """
     # Written out: for one vector a NumPy call costs more than all of these products.
     w, x, y, z = q
@@ -118,6 +131,10 @@ def unrotated(q: Sequence[float], v: Sequence[float]) -> Vector:
     Args:
         q: Unit quaternion (w, x, y, z) of the body.
         v: Components in world axes.
+
+    Example:
+        >>> [round(x, 6) for x in unrotated(quaternion_from_euler(math.pi / 2), (0.0, 1.0, 0.0))]
+        [1.0, 0.0, 0.0]
     """
     w, x, y, z = q
     a, b, c = v
@@ -134,6 +151,11 @@ def multiply(p: Sequence[float], q: Sequence[float]) -> UnitQuaternion:
     Args:
         p: Unit quaternion (w, x, y, z).
         q: Unit quaternion (w, x, y, z).
+
+    Example:
+        >>> eighth = quaternion_from_euler(math.pi / 4)
+        >>> [round(part, 6) for part in multiply(eighth, eighth)]  # a quarter turn
+        [0.707107, 0.0, 0.0, 0.707107]
     """
     pw, px, py, pz = p
     qw, qx, qy, qz = q
@@ -168,6 +190,10 @@ def direction(zenith: float, azimuth: float) -> Float64Array:
     Args:
         zenith: Angle from +z [rad].
         azimuth: Counter-clockwise from +x [rad].
+
+    Example:
+        >>> direction(math.pi / 2, math.pi).round(6).tolist()  # west
+        [-1.0, 0.0, 0.0]
     """
     return np.array(
         [
@@ -187,6 +213,10 @@ def angles(vectors: Float64Array) -> Float64Array:
     Returns:
         (zenith from +z, azimuth from +x), Shape ``[..., 2]``. Zenith is the atan2 of the horizontal part, so
         that directions near the poles keep their precision.
+
+    Example:
+        >>> angles(np.array([0.0, 2.0, 0.0])).round(6).tolist()  # north
+        [1.570796, 1.570796]
     """
     found = np.empty((*vectors.shape[:-1], 2))
     found[..., 0] = np.arctan2(np.hypot(vectors[..., 0], vectors[..., 1]), vectors[..., 2])

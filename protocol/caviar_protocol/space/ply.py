@@ -25,7 +25,7 @@ _BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": "
 
 
 def read_ply(file: Path, called: str = "") -> tuple[Float64Array, Int64Array]:
-    """Read the vertices and triangles of a PLY mesh.
+    r"""Read the vertices and triangles of a PLY mesh.
 
     Args:
         file: A PLY file with elements ``vertex`` and ``face``; polygons are cut into triangles.
@@ -37,6 +37,17 @@ def read_ply(file: Path, called: str = "") -> tuple[Float64Array, Int64Array]:
     Raises:
         AssetError: The file cannot be read, is no mesh, breaks off, has a vertex that is not finite, or a
             face that refers to a vertex that is not there.
+
+    Example:
+        >>> lines = ["ply", "format ascii 1.0", "element vertex 4"]
+        >>> lines += [f"property float {axis}" for axis in "xyz"]
+        >>> lines += ["element face 1", "property list uchar int vertex_indices", "end_header"]
+        >>> lines += ["0 0 0", "1 0 0", "1 1 0", "0 1 0", "4 0 1 2 3"]
+        >>> Path("square.ply").write_text("\n".join(lines))
+        187
+        >>> vertices, triangles = read_ply(Path("square.ply"))
+        >>> vertices.shape, triangles.tolist()
+        ((4, 3), [[0, 1, 2], [0, 2, 3]])
     """
     elements = _read(file, "face", called or str(file))
     return elements["vertex"], elements["face"]

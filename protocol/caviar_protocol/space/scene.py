@@ -26,6 +26,13 @@ def merge_scenes(scenes: Mapping[str, Scene]) -> Scene:
 
     Raises:
         PayloadError: A name occurs twice; the text names the object and both worlds.
+
+    Example:
+        >>> from caviar_protocol.recording import Recording
+        >>> recording = Recording("runs/smoke-20261122-101500")
+        >>> scene = recording.product(episode=0, frame=7, topic="scene", source="world")
+        >>> merge_scenes({"world": scene}) is scene  # of one world
+        True
     """
     # The usual case, in which nothing is copied.
     if len(scenes) == 1:
@@ -74,6 +81,12 @@ def object_pose(scene: Scene, index: int) -> Pose:
     Args:
         scene: The scene.
         index: Place of the object in ``scene.names``.
+
+    Example:
+        >>> from caviar_protocol.recording import Recording
+        >>> recording = Recording("runs/smoke-20261122-101500")
+        >>> object_pose(recording["scene"][0], 0).orientation
+        (1.0, 0.0, 0.0, 0.0)
     """
     x, y, z = scene.position[index].tolist()
     w, qx, qy, qz = scene.orientation[index].tolist()
@@ -89,6 +102,13 @@ def device_pose(scene: Scene, device: Device) -> Pose:
 
     Raises:
         PayloadError: The parent is not in the scene.
+
+    Example:
+        >>> from caviar_protocol.recording import Recording
+        >>> recording = Recording("runs/smoke-20261122-101500")
+        >>> scene = recording["scene"][0]
+        >>> [device_pose(scene, device).position for device in scene.devices if device.name == "bs"]
+        [(0.0, 0.0, 10.0)]
     """
     # Channel, link and agent ask for the same poses: what was composed is kept with the scene.
     known: dict[str, tuple[Device, Pose]] = scene.__dict__.setdefault("_poses", {})
@@ -132,6 +152,12 @@ def antennas(scene: Scene, role: str) -> Sequence[AntennaDevice]:
     Args:
         scene: The scene.
         role: ``"tx"`` for those that transmit, ``"rx"`` for those that receive.
+
+    Example:
+        >>> from caviar_protocol.recording import Recording
+        >>> recording = Recording("runs/smoke-20261122-101500")
+        >>> [device.name for device in antennas(recording["scene"][0], "tx")]
+        ['bs']
     """
     known = _antennas.get(role)
     if known is None or known[0] is not scene.devices:
@@ -164,6 +190,9 @@ class Pair:
 def pairs_of(scene: Scene) -> list[Pair]:
     """All pairs of a transmitting and a receiving device, sorted by TX, then RX.
 
+    Args:
+        scene: The scene.
+
     Example:
         >>> from caviar_protocol.recording import Recording
         >>> scene = Recording("runs/smoke-20261122-101500")["scene"][0]
@@ -184,6 +213,14 @@ def directions(scene: Scene, pairs: Sequence[Pair]) -> tuple[list[Vector], list[
     Returns:
         Unit vectors to RX from TX in the TX device's axes, and to TX from RX in the RX device's axes; a list
         of each, one vector a pair. Two devices at one point see each other at boresight.
+
+    Example:
+        >>> from caviar_protocol.recording import Recording
+        >>> recording = Recording("runs/smoke-20261122-101500")
+        >>> scene = recording["scene"][0]
+        >>> at_tx, at_rx = directions(scene, pairs_of(scene))
+        >>> len(at_tx), round(math.hypot(*at_tx[0]), 6)
+        (2, 1.0)
     """
     # Link and agent ask for the same pairs: what was computed is kept with the scene.
     known: dict[tuple[str, str], tuple[Pair, Vector, Vector]] = scene.__dict__.setdefault("_directions", {})

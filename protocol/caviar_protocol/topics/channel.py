@@ -42,6 +42,11 @@ class Carrier(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
     Subcarrier k of K is at ``frequency_hz + (k − ⌊K/2⌋)·subcarrier_spacing_hz``, slot s of a frame begins
     ``s·slot_duration_s`` after the frame's instant.
+
+    Example:
+        >>> carrier = Carrier(name="n257", frequency_hz=28e9, subcarriers=264, subcarrier_spacing_hz=120e3)
+        >>> carrier.subcarriers * carrier.subcarrier_spacing_hz <= carrier.bandwidth_hz
+        True
     """
 
     name: str
@@ -69,7 +74,12 @@ class Carrier(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class ChannelOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What a ray-traced product modelled. Defaults say: nothing but line of sight."""
+    """What a ray-traced product modelled. Defaults say: nothing but line of sight.
+
+    Example:
+        >>> ChannelOptions(reflection=True, max_depth=3, samples=1_000_000).diffraction
+        False
+    """
 
     los: bool = True
     """The direct path."""
@@ -108,6 +118,11 @@ class ChannelMatrix(Payload, frozen=True, kw_only=True, omit_defaults=True):
     the panel's own position_m is added, and its rotation applied. ``a`` and ``tau`` are those between the
     devices' reference points, also where no panel stands there. Between other subarrays than those of
     `Channel.a`, amplitudes differ by the elements' patterns and polarizations.
+
+    Example:
+        >>> import numpy as np
+        >>> ChannelMatrix(carrier=0, tx=0, rx=1, h=np.zeros((4, 32), np.complex128)).h.shape  # Nr × Nt
+        (4, 32)
     """
 
     carrier: Annotated[int, quantity("1", "index into `Channel.carriers`", ge=0)]
@@ -125,6 +140,12 @@ class ChannelResponse(Payload, frozen=True, kw_only=True, omit_defaults=True):
     With amplitudes a, delays τ and Doppler shifts ν of the paths, Δf from the carrier and Δt from the frame:
     H(Δf, Δt) = Σ a·exp(−j2π(Δf·(τ − Δt·ν/frequency_hz) − ν·Δt)), between elements as in ``h``, which it is
     at Δf = 0 and Δt = 0.
+
+    Example:
+        >>> import numpy as np
+        >>> response = np.zeros((14, 264, 4, 32), np.complex64)  # slots × subcarriers × Nr × Nt
+        >>> ChannelResponse(carrier=0, tx=0, rx=1, h=response).h.nbytes
+        3784704
     """
 
     carrier: Annotated[int, quantity("1", "index into `Channel.carriers`", ge=0)]
@@ -143,6 +164,12 @@ class ChannelTaps(Payload, frozen=True, kw_only=True, omit_defaults=True):
     low-pass filter: h = Σ a·sinc(first + l − W·(τ − Δt·ν/frequency_hz))·exp(j2πν·Δt), where
     sinc(x) = sin(πx)/(πx). ``first`` is ⌊W·τ⌋ − 6 with the delay τ of the pair's earliest path, which may be
     negative, and 0 without a path; what arrives behind the last tap is left out.
+
+    Example:
+        >>> import numpy as np
+        >>> taps = ChannelTaps(carrier=0, tx=0, rx=1, first=-6, h=np.zeros((1, 64, 4, 32), np.complex64))
+        >>> taps.first / 100e6  # [s] of the first tap at a bandwidth of 100 MHz
+        -6e-08
     """
 
     carrier: Annotated[int, quantity("1", "index into `Channel.carriers`", ge=0)]
@@ -170,6 +197,12 @@ class Channel(Payload, frozen=True, kw_only=True, omit_defaults=True):
     and, where a model knows them, the numbers of their faces, which are planes of an object; paths that agree
     in all that are numbered by their rank. So a path keeps its id while ends and objects move;
     `caviar_protocol.multipath.changes` says which were born and died between two products.
+
+    Example:
+        >>> from caviar_protocol.recording import Recording
+        >>> channel = Recording("runs/smoke-20261122-101500")["channel"][7]
+        >>> channel.rung, channel.tx, channel.rx, channel.a.shape  # carriers × paths
+        ('free-space', ('bs',), ('car/rx', 'uav/rx-uav'), (1, 2))
     """
 
     sizes_from: ClassVar[dict[str, tuple[str, ...]]] = {"C": ("carriers",), "T": ("tx",), "R": ("rx",)}

@@ -13,6 +13,10 @@ class BeamChoice(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, 
     """Use this pair of codebook beams between a transmitter and a receiver.
 
     `Link` defines the beams by their index. The actuator is ``beam:<rx>``.
+
+    Example:
+        >>> BeamChoice(tx="bs", rx="car/rx", tx_beam=3).rx_beam  # of a receiver with one element
+        0
     """
 
     tx: str
@@ -26,7 +30,12 @@ class BeamChoice(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, 
 
 
 class WaypointCommand(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, tag="waypoint"):
-    """Fly or drive an object to a point. The actuator is ``motion:<object>``."""
+    """Fly or drive an object to a point. The actuator is ``motion:<object>``.
+
+    Example:
+        >>> WaypointCommand(object="uav", position=(10.0, 0.0, 30.0), speed=5.0).at_once
+        False
+    """
 
     object: str
     """Object to be moved."""
@@ -38,7 +47,12 @@ class WaypointCommand(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=T
 
 
 class VelocityCommand(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, tag="velocity"):
-    """Give an object a velocity. The actuator is ``motion:<object>``."""
+    """Give an object a velocity. The actuator is ``motion:<object>``.
+
+    Example:
+        >>> VelocityCommand(object="uav", velocity=(0.0, 3.0, 0.0)).velocity  # to the north
+        (0.0, 3.0, 0.0)
+    """
 
     object: str
     """Object to be moved."""
@@ -46,7 +60,12 @@ class VelocityCommand(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=T
 
 
 class UserSchedule(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, tag="schedule"):
-    """Let a transmitter serve one receiver in this frame. The actuator is ``schedule:<tx>``."""
+    """Let a transmitter serve one receiver in this frame. The actuator is ``schedule:<tx>``.
+
+    Example:
+        >>> UserSchedule(tx="bs", rx="car/rx").rx
+        'car/rx'
+    """
 
     tx: str
     """Transmitting device."""
@@ -61,6 +80,13 @@ class Action(Payload, frozen=True, kw_only=True, omit_defaults=True):
     """All commands of one agent in a frame, sorted by actuator, TX and carrier.
 
     At most one per actuator; of beam choices, one per actuator, TX and carrier.
+
+    Example:
+        >>> from caviar_protocol.codec import decode_payload, encode_payload
+        >>> chosen = Action(commands=(BeamChoice(tx="bs", rx="car/rx", tx_beam=3),))
+        >>> header, body = encode_payload(chosen)
+        >>> decode_payload("action", header, body) == chosen
+        True
     """
 
     commands: tuple[Command, ...]
@@ -93,6 +119,14 @@ class Link(Payload, frozen=True, kw_only=True, omit_defaults=True):
     and |y| 0. The lists of best pairs end with beams −1 and |y| 0 where a user has no path or
     fewer pairs. Of pairs with equal |y| the one of lower TX, then RX beam stands first. Means
     over users leave out those without a path and state how many they were.
+
+    Example:
+        >>> from caviar_protocol.recording import Recording
+        >>> link = Recording("runs/smoke-20261122-101500")["link"][7]
+        >>> link.rx, link.top_abs_y.shape  # users, best pairs
+        (('car/rx', 'uav/rx-uav'), (2, 10))
+        >>> bool((link.abs_y <= link.top_abs_y[:, 0]).all())
+        True
     """
 
     sizes_from: ClassVar[dict[str, tuple[str, ...]]] = {"U": ("tx", "rx", "carrier")}

@@ -16,6 +16,10 @@ class Panel(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Where one panel of an array stands, and how it is turned.
 
     Angles are in degrees, as their names say: a world copies the map of the scenario as it is.
+
+    Example:
+        >>> AntennaArray(panels=(Panel(yaw_deg=90.0), Panel(yaw_deg=-90.0))).size  # to the left, to the right
+        2
     """
 
     position_m: Annotated[Vector3, quantity("m", "centre of the panel, in the device's axes")] = (
@@ -36,6 +40,10 @@ class AntennaArray(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
     ``i % rows`` of column ``i // rows``. An antenna of dual polarization has two elements at one place.
     Elements are in order of panels, then polarizations, then antennas: element
     ``(panel·ports + port)·rows·columns + i``, as in Sionna RT for one panel.
+
+    Example:
+        >>> AntennaArray(rows=4, columns=8, polarization="VH").size  # an antenna has two elements
+        64
     """
 
     rows: Annotated[int, quantity("1", "elements along z", ge=1, le=1024)] = 1
@@ -88,7 +96,13 @@ class _Device(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class AntennaDevice(_Device, frozen=True, kw_only=True, omit_defaults=True, tag="antenna"):
-    """A radio transmitter, receiver, or both, with one antenna array."""
+    """A radio transmitter, receiver, or both, with one antenna array.
+
+    Example:
+        >>> bs = AntennaDevice(name="bs", role="tx", array=AntennaArray(columns=32))
+        >>> bs.parent  # it stands in the world
+        ''
+    """
 
     role: Literal["tx", "rx", "both"]
     """Transmits, receives, or both."""
@@ -98,7 +112,13 @@ class AntennaDevice(_Device, frozen=True, kw_only=True, omit_defaults=True, tag=
 
 
 class LidarDevice(_Device, frozen=True, kw_only=True, omit_defaults=True, tag="lidar"):
-    """A spinning LIDAR. Beams fan over elevation, each turns once around the device's z axis."""
+    """A spinning LIDAR. Beams fan over elevation, each turns once around the device's z axis.
+
+    Example:
+        >>> lidar = LidarDevice(name="car/top", parent="car", position=(0.0, 0.0, 1.0), beams=32)
+        >>> lidar.beams * lidar.azimuth_steps  # rays of a turn
+        57600
+    """
 
     beams: Annotated[int, quantity("1", "beams (rows)", ge=1, le=1024)] = 64
     azimuth_steps: Annotated[int, quantity("1", "rays of a beam in a turn", ge=1, le=36000)] = 1800
@@ -110,7 +130,12 @@ class LidarDevice(_Device, frozen=True, kw_only=True, omit_defaults=True, tag="l
 
 
 class CameraDevice(_Device, frozen=True, kw_only=True, omit_defaults=True, tag="camera"):
-    """A pinhole camera that looks along the device's +x axis, +z up."""
+    """A pinhole camera that looks along the device's +x axis, +z up.
+
+    Example:
+        >>> CameraDevice(name="pole/eye", position=(0.0, 0.0, 5.0), width=1280, height=720).field_of_view
+        1.5707963267948966
+    """
 
     width: Annotated[int, quantity("px", "image width", ge=1, le=8192)] = 640
     height: Annotated[int, quantity("px", "image height", ge=1, le=8192)] = 480
@@ -125,6 +150,21 @@ class Scene(Payload, frozen=True, kw_only=True, omit_defaults=True, dict=True):
 
     Objects are sorted by name, devices too. A position is the centre of the object's bounding
     box; the box's axes are the body axes (x forward, y left, z up).
+
+    Example:
+        >>> import numpy as np
+        >>> scene = Scene(
+        ...     names=("car",),
+        ...     classes=("car",),
+        ...     assets=("",),
+        ...     position=np.array([[10.0, 0.0, 0.75]]),
+        ...     orientation=np.array([[1.0, 0.0, 0.0, 0.0]]),
+        ...     velocity=np.zeros((1, 3)),
+        ...     dimensions=np.array([[4.5, 1.8, 1.5]]),
+        ...     devices=(AntennaDevice(name="car/rx", role="rx", parent="car", position=(0.0, 0.0, 0.75)),),
+        ... )
+        >>> scene.position[scene.names.index("car")].tolist()
+        [10.0, 0.0, 0.75]
     """
 
     sizes_from: ClassVar[dict[str, tuple[str, ...]]] = {"N": ("names", "classes", "assets")}

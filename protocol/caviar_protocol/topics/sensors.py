@@ -25,6 +25,12 @@ class OccupancyGrid(Payload, frozen=True, kw_only=True, omit_defaults=True):
     """The paper's quantised point cloud, in world axes: 0 free, 1 obstacle, −1 TX, −2 RX.
 
     Cell (i, j, k) is that of a point with index round((v − origin)/cell), clipped.
+
+    Example:
+        >>> cells = np.zeros((20, 20, 4), np.int8)
+        >>> grid = OccupancyGrid(origin=(-10.0, -10.0, 0.0), cell=(1.0, 1.0, 2.0), occupancy=cells)
+        >>> np.round((np.array([0.0, 0.0, 4.0]) - grid.origin) / grid.cell).tolist()  # the cell of a point
+        [10.0, 10.0, 2.0]
     """
 
     origin: Vector3
@@ -41,6 +47,22 @@ class LidarScan(Payload, frozen=True, kw_only=True, omit_defaults=True):
     ``r % azimuth_steps`` (counter-clockwise from the device's +x axis). A LIDAR may be set to leave
     ``points_world`` out since 1.4; then they are the points turned by the orientation, at the position.
     Readers of earlier versions need it: where one is in the run, leave it in.
+
+    Example:
+        >>> hit = np.array([[5.0, 0.0, 0.0]], np.float32)  # 5 m ahead
+        >>> scan = LidarScan(
+        ...     sensor="car/top",
+        ...     position=(0.0, 0.0, 2.0),
+        ...     orientation=(1.0, 0.0, 0.0, 0.0),
+        ...     ray=np.array([0], np.int32),
+        ...     points=hit,
+        ...     range=np.array([5.0], np.float32),
+        ...     object=np.array([0], np.int32),
+        ... )
+        >>> scan.in_world().tolist()
+        [[5.0, 0.0, 2.0]]
+        >>> Lidar(object_names=("wall",), scans=(scan,)).object_names[scan.object[0]]
+        'wall'
     """
 
     sensor: str
@@ -64,7 +86,11 @@ class LidarScan(Payload, frozen=True, kw_only=True, omit_defaults=True):
     """Where part ``grid`` is in demand."""
 
     def in_world(self) -> Float32Array:
-        """Hits in world axes [m], Shape ``[N, 3]``: ``points_world``, or else of ``points`` and the pose."""
+        """Hits in world axes: ``points_world``, or else those of ``points`` and the pose.
+
+        Returns:
+            Coordinates [m], Shape ``[N, 3]``.
+        """
         if self.points_world is not None:
             return self.points_world
         # In double precision up to the sum, so that a point is rounded once.
@@ -84,7 +110,14 @@ class Lidar(Payload, frozen=True, kw_only=True, omit_defaults=True):
 
 class Intrinsics(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Pinhole intrinsics: a point (x, y, z) in camera axes (x right, y down, z forward) is at
-    pixel (fx·x/z + cx, fy·y/z + cy), pixel centres at +½."""
+    pixel (fx·x/z + cx, fy·y/z + cy), pixel centres at +½.
+
+    Example:
+        >>> eye = Intrinsics(fx=320.0, fy=320.0, cx=320.0, cy=240.0)
+        >>> x, y, z = 1.0, 0.0, 10.0  # 1 m to the right, 10 m ahead
+        >>> eye.fx * x / z + eye.cx, eye.fy * y / z + eye.cy
+        (352.0, 240.0)
+    """
 
     fx: Annotated[float, quantity("px", "focal length, horizontal")]
     fy: Annotated[float, quantity("px", "focal length, vertical")]
@@ -106,7 +139,16 @@ class _Image(Payload, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class CameraImage(_Image, frozen=True, kw_only=True, omit_defaults=True):
-    """One RGB image, top row first, sRGB."""
+    """One RGB image, top row first, sRGB.
+
+    Example:
+        >>> eye = Intrinsics(fx=320.0, fy=320.0, cx=320.0, cy=240.0)
+        >>> pose = {"position": (0.0, 0.0, 5.0), "orientation": (1.0, 0.0, 0.0, 0.0)}
+        >>> black = np.zeros((480, 640, 3), np.uint8)
+        >>> image = CameraImage(sensor="pole/eye", intrinsics=eye, **pose, rgb=black)
+        >>> Camera(images=(image,)).images[0].rgb.shape
+        (480, 640, 3)
+    """
 
     rgb: Annotated[UInt8Array, array("|u1", "H", "W", 3, unit="1", doc="red, green, blue")]
 
@@ -119,7 +161,16 @@ class Camera(Payload, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class DepthImage(_Image, frozen=True, kw_only=True, omit_defaults=True):
-    """One depth image, and the surface normals where computed."""
+    """One depth image, and the surface normals where computed.
+
+    Example:
+        >>> eye = Intrinsics(fx=320.0, fy=320.0, cx=320.0, cy=240.0)
+        >>> pose = {"position": (0.0, 0.0, 5.0), "orientation": (1.0, 0.0, 0.0, 0.0)}
+        >>> nothing = np.zeros((480, 640), np.float32)
+        >>> image = DepthImage(sensor="pole/eye", intrinsics=eye, **pose, depth=nothing)
+        >>> bool((image.depth == 0).all())  # no ray hit anything
+        True
+    """
 
     depth: Annotated[Float32Array, array("<f4", "H", "W", unit="m", doc="along the optical axis; 0: no hit")]
     normals: (
@@ -139,7 +190,16 @@ class Depth(Payload, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class SegmentationImage(_Image, frozen=True, kw_only=True, omit_defaults=True):
-    """One image of object ids, and of material ids where asked for."""
+    """One image of object ids, and of material ids where asked for.
+
+    Example:
+        >>> eye = Intrinsics(fx=320.0, fy=320.0, cx=320.0, cy=240.0)
+        >>> pose = {"position": (0.0, 0.0, 5.0), "orientation": (1.0, 0.0, 0.0, 0.0)}
+        >>> sky = np.full((480, 640), -1, np.int32)
+        >>> image = SegmentationImage(sensor="pole/eye", intrinsics=eye, **pose, object=sky)
+        >>> Segmentation(object_names=("road",), images=(image,)).images[0].object.max().item()
+        -1
+    """
 
     object: Annotated[Int32Array, array("<i4", "H", "W", unit="1", doc="index into object_names; −1: no hit")]
     material: (
