@@ -8,7 +8,8 @@ import subprocess
 import sys
 import threading
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -16,6 +17,7 @@ from unittest.mock import Mock
 import msgspec
 import pytest
 import zmq
+from client_nursery import Forked, Nursery
 
 from caviar_clients.cli.main import app
 from caviar_clients.conform import Verdict, cases, conform, street
@@ -69,23 +71,55 @@ RIGHT = {
 }
 
 
-@pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Scenery of the kit goes where the test's other files are."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+@pytest.fixture(scope="module", autouse=True)
+def nursery(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Clients in Python are forks of one process, and scenery of the kit goes to a folder of the tests."""
+    Forked.nursery = Nursery()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("caviar_clients.conform.kit.Started", Forked)
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
+    Forked.nursery.close()
+
+
+AT_ONCE = 4
+"""Clients that are judged side by side: kit and client mostly wait for each other, and for time-outs."""
+
+
+@pytest.fixture(scope="module")
+def judged(nursery: None, request: pytest.FixtureRequest) -> Iterator[dict[str, Future[list[Verdict]]]]:
+    """The verdicts that the tests of this session ask for, by the test's name, as they become known."""
+    with ThreadPoolExecutor(AT_ONCE) as pool:
+        found = {
+            item.name: pool.submit(play, **item.callspec.params)
+            for item in request.session.items
+            if isinstance(item, pytest.Function) and item.get_closest_marker("skip") is None
+            for play in [PLAYED.get(item.function)]
+            if play is not None and item.module is request.module
+        }
+        yield found
+        for future in found.values():
+            future.cancel()
 
 
 LONG_FORM = {"control", "control-recorder", "world:trajectory"}
 """Clients whose role another one has too."""
 
 
+def right(client: str) -> list[Verdict]:
+    """Verdicts on a client that is right."""
+    command, settings = RIGHT[client]
+    return conform(ANY, command=command, rules=Rules(name="mine", settings=settings))
+
+
 @pytest.mark.parametrize(
     "client",
     [pytest.param(name, marks=[pytest.mark.exhaustive] if name in LONG_FORM else []) for name in RIGHT],
 )
-def test_a_right_client_fails_nothing(client: str) -> None:
-    command, settings = RIGHT[client]
-    verdicts = conform(ANY, command=command, rules=Rules(name="mine", settings=settings))
+def test_a_right_client_fails_nothing(
+    client: str, judged: dict[str, Future[list[Verdict]]], request: pytest.FixtureRequest
+) -> None:
+    verdicts = judged[request.node.name].result()
     assert failures(verdicts) == {}
     assert [v.case for v in verdicts] == [case.name for case in cases()]
     assert sum(v.outcome == "pass" for v in verdicts) >= 25
@@ -358,10 +392,21 @@ def broken(fault: str, *names: str) -> list[Verdict]:
 @pytest.mark.parametrize(
     ("case", "fault"), [(case, fault) for case, faults in FAULTS.items() for fault in faults]
 )
-def test_each_fault_is_found_by_its_case(case: str, fault: str) -> None:
-    verdicts = broken(fault, *(["hello"] if case == "canonical" else []), case)
+def test_each_fault_is_found_by_its_case(
+    case: str, fault: str, judged: dict[str, Future[list[Verdict]]], request: pytest.FixtureRequest
+) -> None:
+    verdicts = judged[request.node.name].result()
     assert list(failures(verdicts)) == [case]
     assert verdicts[-1].got
+
+
+PLAYED: dict[Callable[..., None], Callable[..., list[Verdict]]] = {
+    test_a_right_client_fails_nothing: right,
+    test_each_fault_is_found_by_its_case: lambda case, fault: broken(
+        fault, *(["hello"] if case == "canonical" else []), case
+    ),
+}
+"""What the fixture `judged` plays for a test, with the same parameters."""
 
 
 def test_a_failed_case_is_not_blamed_on_the_next_one() -> None:
