@@ -20,7 +20,7 @@ def shown(*notices: tuple[str, str, str]) -> str:
     console = Console(file=io.StringIO(), width=200)
     watcher = _Watcher(Progress(console=console), console, load_scenario(SMOKE), None)
     for kind, service, text in notices:
-        watcher.take({"event": "notice", "kind": kind, "service": service, "frame": -1, "text": text})
+        watcher.show({"event": "notice", "kind": kind, "service": service, "frame": -1, "text": text})
     return console.file.getvalue()  # type: ignore[attr-defined, no-any-return]
 
 
@@ -41,7 +41,7 @@ def test_every_warning_of_a_service_is_shown_and_kept_for_the_summary() -> None:
     console = Console(file=io.StringIO(), width=200)
     watcher = _Watcher(Progress(console=console), console, load_scenario(SMOKE), None)
     for text in ("scattering is switched off: why", "a file is damaged"):
-        watcher.take({"event": "notice", "kind": "warning", "service": "channel", "frame": -1, "text": text})
+        watcher.show({"event": "notice", "kind": "warning", "service": "channel", "frame": -1, "text": text})
     assert watcher.warnings == ["channel: scattering is switched off: why", "channel: a file is damaged"]
     for text in watcher.warnings:
         assert f"warning: {text}\n" in console.file.getvalue()  # type: ignore[attr-defined]

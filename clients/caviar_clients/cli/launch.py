@@ -17,7 +17,6 @@ from typing import Any
 
 import zmq
 
-from caviar_broker.supervision import describe_exit, describe_stop, is_stopped
 from caviar_clients.cli.keys import BorrowedKey
 from caviar_clients.session.checks import module_folders
 from caviar_protocol.errors import RunError
@@ -57,28 +56,50 @@ class Child:
 
     @classmethod
     def start(cls, name: str, command: Sequence[str], log: Path, environment: Mapping[str, str]) -> Child:
-        """Start it; its log goes on where one before it ended."""
+        """Start a process.
+
+        Args:
+            name: Of the service.
+            command: Program and arguments.
+            log: Gets what the process prints, behind what a process before it printed.
+            environment: All of its environment.
+        """
         with open_to_append(log) as file:
             process = subprocess.Popen(  # noqa: S603  # our own module with checked arguments
                 command,
                 stdin=subprocess.DEVNULL,
                 stdout=file,
                 stderr=file,
-                start_new_session=True,
+                start_new_session=True,  # Ctrl-C is the launcher's, which ends the run in order
                 env=environment,
             )
+        # A process id may be another process's a moment later; the descriptor stays that of this one.
         return cls(name, process, log, os.pidfd_open(process.pid))
 
     def last_line(self) -> str:
-        """The last line it printed; empty if it printed nothing."""
+        """The last line that the process printed; empty if it printed nothing."""
         with self.log.open("rb") as file:
             file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL))
             lines = file.read().decode(errors="replace").strip().splitlines()
         return lines[-1] if lines else ""
 
 
+def _describe_exit(status: int) -> str:
+    from caviar_broker.supervision import describe_exit  # late, as in `Launcher._look_after_broker`
+
+    return describe_exit(status)
+
+
 def end(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> list[int]:
-    """End all: SIGTERM, and after so long [s] SIGKILL; who waits for a disk and cannot be ended before."""
+    """End processes: SIGTERM, and SIGKILL for those that are left later.
+
+    Args:
+        processes: Which; those that have ended already are left out.
+        seconds: Time between the two signals [s].
+
+    Returns:
+        Process ids of those that still live, since they wait for a disk.
+    """
     for process in processes:
         if process.poll() is None:
             process.send_signal(signal.SIGTERM)
@@ -86,12 +107,13 @@ def end(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> list[in
     for process in processes:
         if process.poll() is None:
             process.kill()
+    # A process in uninterruptible sleep takes no signal, SIGKILL neither: the launcher must not wait for it.
     wait(processes, KILLED_S)
     return [process.pid for process in processes if process.poll() is None]
 
 
 def wait(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> None:
-    """Wait until all have ended, but no longer than that [s]."""
+    """Wait until all processes have ended, but for ``seconds`` at most [s]."""
     until = time.monotonic() + seconds
     for process in processes:
         try:
@@ -104,9 +126,19 @@ def wait(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> None:
 class Launcher:
     """Runs one scenario as processes of this machine.
 
-    Use as a context manager: however the block is left, no process of the run survives it.
-    ``events()`` yields what the broker reports, until the run is over. Remote services are left to
-    the user, who learns from ``endpoint`` where they are awaited.
+    Use as a context manager: however the block is left, no process of the run survives it. `events` yields
+    what the broker reports, until the run is over. Remote services are started by the user, at ``endpoint``.
+
+    Args:
+        scenario: Checked, as `checked_scenario` returns it.
+        path: The scenario's file.
+        directory: The run's directory.
+        frames, seed, pace: What replaces the scenario's; None: nothing.
+        bind: Address of the broker; empty for a socket file of this user alone, where every service is local.
+        keys: Keys directory of the broker; None: a run without keys.
+        http: ``HOST:PORT`` at which the broker has HTTP served; empty: nowhere.
+        resume: Whether the run in the directory is resumed, whatever path, frames, seed and pace are.
+        force: Whether it is, though code, libraries or files have changed.
     """
 
     scenario: Scenario
@@ -114,18 +146,14 @@ class Launcher:
     directory: Path
     frames: int | None = None
     seed: int | None = None
-    bind: str = "tcp://127.0.0.1:0"
-    """Address of the broker; "" for a socket file of this user alone where every service is local."""
+    bind: str = ANY_PORT
     keys: Path | None = None
-    """Keys directory of the broker."""
     http: str = ""
-    """``HOST:PORT`` at which the broker has HTTP served; "" for none."""
     resume: bool = False
-    """Whether to go on with the run in the directory, whatever ``path``, ``frames`` and ``seed`` say."""
     force: bool = False
-    """Whether to do so though code, libraries or files have changed."""
     pace: str | None = None
     endpoint: str = ""
+    """Address at which the broker listens; empty before it does."""
     _key: BorrowedKey = field(init=False)
     # Where the socket file of the broker is; None where it listens elsewhere.
     _socket_folder: tempfile.TemporaryDirectory[str] | None = None
@@ -137,13 +165,13 @@ class Launcher:
     _rest: bytes = b""
     # Services that died and that the broker waits for.
     _awaited: set[str] = field(default_factory=set)
-    # That were started after others that died, since frames were last finished.
+    # Brokers that were started after others that died, since a frame was last finished.
     _brokers: int = 0
     # Services that the broker gave up: no SHUTDOWN reaches them.
     _lost: set[str] = field(default_factory=set)
     # Processes that were started since a service was last there.
     _restarts: dict[str, int] = field(default_factory=dict)
-    # Whether the broker told how the run ended.
+    # Whether the broker has reported how the run ended.
     _over: bool = False
     # Frames that the run had, once it is over.
     _frames: int = 0
@@ -155,7 +183,6 @@ class Launcher:
     _disk: str = ""
     # When a broker that all services have left must have ended [s]; None while one is left.
     _give_up_at: float | None = None
-
     # When a broker that was started must listen [s]; None once it does.
     _listen_until: float | None = None
 
@@ -168,6 +195,7 @@ class Launcher:
 
     def _private_address(self) -> str:
         """An ``ipc://`` address in a new directory of mode 0700; "" where its path is too long for one."""
+        # A socket file needs no port that another program may take, and no other user reaches it.
         folder = tempfile.TemporaryDirectory(prefix="caviar-", ignore_cleanup_errors=True)
         socket = Path(folder.name, "broker")
         if len(os.fsencode(socket)) > zmq.IPC_PATH_MAX_LEN:
@@ -187,9 +215,12 @@ class Launcher:
             self._socket_folder.cleanup()
 
     def events(self) -> Iterator[Mapping[str, Any]]:
-        """Start everything; what the broker tells, then what became of the processes.
+        """Start broker and services, and yield what the broker reports, then what became of its process.
 
-        Called again, it goes on where it was left. Raises `RunError` where the broker itself cannot start.
+        Called again, the iteration continues where it was left.
+
+        Raises:
+            RunError: The broker cannot start, does not answer, or died and cannot be followed by another.
         """
         if self._broker is None:
             self._start_broker()
@@ -213,12 +244,12 @@ class Launcher:
                 )
 
     def stop(self, reason: str) -> None:
-        """Ask for an orderly end."""
+        """Ask for an orderly end. May be called from a signal handler."""
         self._stopping = reason
         self._order({"stop": reason})
 
     def log_of(self, service: str) -> Path | None:
-        """Where a service's process printed; None for a service that has none."""
+        """Find the file to which a service prints; None for a service that has no process here."""
         child = self._children.get(service)
         return child.log if child else None
 
@@ -287,12 +318,12 @@ class Launcher:
 
     @property
     def _threads(self) -> Mapping[str, str]:
-        """What tells services that trace rays how many threads they share."""
+        """The environment that limits the threads of services that trace rays to their share of the cores."""
         tracers = [spec for spec in self._local.values() if spec.role in _TRACING_ROLES]
         return {THREADS_VARIABLE: str(share_of_each(len(tracers)))}
 
     def _start_again(self, name: str) -> None:
-        """Start a service that died and is waited for, unless that was in vain too often."""
+        """Start a service that died and that the broker waits for, `MAX_RESTARTS` times in a row at most."""
         self._restarts[name] = number = self._restarts.get(name, 0) + 1
         if number <= MAX_RESTARTS:
             self._start(name)
@@ -304,6 +335,7 @@ class Launcher:
         broker = self._broker
         if broker is None or broker.stdout is None:
             return
+        # Unbuffered: a reader's buffer could hold a line of which the selector would not know.
         data = os.read(broker.stdout.fileno(), 65536)
         if not data:
             self._selector.unregister(broker.stdout)
@@ -321,7 +353,7 @@ class Launcher:
                 if not self._children:  # else they were started beside a broker that goes on
                     self._start_services()
             if event["event"] == "notice" and event.get("service") in self._children:
-                self._heed(event["kind"], event["service"])
+                self._note(event["kind"], event["service"])
             if event["event"] == "frame":
                 self._brokers = 0
             if event["event"] == "finished":
@@ -333,7 +365,10 @@ class Launcher:
                 yield {"event": "ended", "status": 1}
 
     def _look_after_broker(self) -> None:
-        """End a broker that is stopped; that it has ended is then seen like any other end."""
+        """End a broker that is stopped (SIGSTOP, a debugger); its end is then handled like any other."""
+        # Imported here, with the frame clock, the module is loaded while the broker starts, and not before.
+        from caviar_broker.supervision import describe_stop, is_stopped
+
         broker = self._broker
         if not self._verdict and broker is not None and broker.poll() is None and is_stopped(broker.pid):
             self._verdict = describe_stop(broker.pid)
@@ -342,8 +377,8 @@ class Launcher:
     # --- another broker ----------------------------------------------------------------------------
 
     def _may_resume(self) -> bool:
-        """Whether a broker that died is followed by another: the run waits for who is lost, the broker
-        had begun, and those before it got somewhere."""
+        """Whether a broker that died is followed by another: services may rejoin the run, the broker had
+        begun, and those before it finished frames."""
         waits = (self.scenario.timeouts.rejoin_s or 0.0) > 0.0
         return (
             waits
@@ -354,8 +389,7 @@ class Launcher:
         )
 
     def _resume_broker(self, broker: subprocess.Popen[bytes]) -> None:
-        """Start a broker that goes on with the run, at the same address; services are started again
-        beside it, since none of them is known to it."""
+        """Start a broker that resumes the run, at the same address, and with it all services."""
         if broker.stdin is not None:
             broker.stdin.close()
         if broker.stdout is not None:
@@ -363,9 +397,9 @@ class Launcher:
         wait([broker], KILL_AFTER_S)
         if broker.poll() is None:
             broker.kill()
-        status = broker.wait()
-        verdict, self._verdict = self._verdict or describe_exit(status), ""
-        self._end_services()
+        status = broker.wait()  # it has closed its output and got SIGKILL, if it needed that
+        verdict, self._verdict = self._verdict or _describe_exit(status), ""
+        self._end_services()  # the new broker knows none of their connections
         self._brokers += 1
         self.resume, self.bind, self._rest = True, self.endpoint, b""
         self._awaited.clear()
@@ -392,13 +426,13 @@ class Launcher:
             raise RunError("the broker closed its output and does not end")
         if not self._over:
             log = self._log.read_text(errors="replace").strip()
-            last = self._verdict or (log.splitlines()[-1] if log else describe_exit(status))
-            told = last.startswith("caviar broker: ")
-            raise RunError(last.removeprefix("caviar broker: ") if told else f"the broker died: {last}")
+            last = self._verdict or (log.splitlines()[-1] if log else _describe_exit(status))
+            own = last.startswith("caviar broker: ")  # its own error, and no crash
+            raise RunError(last.removeprefix("caviar broker: ") if own else f"the broker died: {last}")
         return {"event": "ended", "status": status}
 
-    def _heed(self, kind: str, name: str) -> None:
-        """The broker waits for a service to come back (``timeouts.rejoin_s``), or it has come."""
+    def _note(self, kind: str, name: str) -> None:
+        """Note that the broker waits for a service (``timeouts.rejoin_s``), gave it up, or has it back."""
         if kind == "lost":
             self._lost.add(name)
         elif kind == "back":
@@ -410,11 +444,11 @@ class Launcher:
             process = self._children[name].process
             if process.poll() is None:
                 process.kill()  # stopped, or cut off; its end is seen like any other
-            elif name not in self._unseen():
+            elif name not in self._unhandled():
                 self._start_again(name)
 
     def _unseen(self) -> set[str]:
-        """Services whose end has not been seen to yet."""
+        """Names of services whose end has not been handled yet."""
         return {key.data.name for key in self._selector.get_map().values() if isinstance(key.data, Child)}
 
     def _child_died(self, child: Child) -> None:
@@ -423,7 +457,7 @@ class Launcher:
         if all(other.process.poll() is not None for other in self._children.values()):
             self._give_up_at = time.monotonic() + self.scenario.timeouts.shutdown_s + BROKER_S
         if not self._over:
-            verdict = describe_exit(status)
+            verdict = _describe_exit(status)
             tail = child.last_line()
             self._order({"lost": child.name, "verdict": f"{verdict}, saying: {tail}" if tail else verdict})
             if child.name in self._awaited:

@@ -13,7 +13,7 @@ import tempfile
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import msgspec
 import typer
@@ -24,7 +24,6 @@ from rich.text import Text
 
 from caviar_broker.journal_format import JournalReader, run_of_journal
 from caviar_broker.run_record import RunRecord, read_record
-from caviar_clients.cli.run import run_scenario
 from caviar_clients.cli.shared import counted, print_line, scaled
 from caviar_clients.cli.summary import (
     SHOWN_DAMAGE,
@@ -36,9 +35,6 @@ from caviar_clients.cli.summary import (
     resume_hint,
     summarise,
 )
-from caviar_clients.replay.plan import ReplayPlan, plan_replay, request_of, scenario_text
-from caviar_clients.replay.recorded import RecordedRun
-from caviar_clients.session.checks import check_implementations
 from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.files import RunDirectory
 from caviar_protocol.messages import Status
@@ -48,7 +44,11 @@ from caviar_protocol.scenario import Scenario
 from caviar_services.recorder.base import failure
 from caviar_services.recorder.continuation import stored_products
 from caviar_services.recorder.segment_writer import Persistence, SegmentWriter
-from caviar_services.registry import find_modules_in
+
+# A replay loads what runs a scenario, 0.2 s of imports that the other commands do without.
+if TYPE_CHECKING:
+    from caviar_clients.replay.plan import ReplayPlan
+    from caviar_clients.replay.recorded import RecordedRun
 
 PARTS = {
     "recorded": "as recorded",
@@ -210,6 +210,12 @@ def replay_run(
         RecordingError: There is no recording, or none that can be replayed.
         RunError: An option names nothing, or a service needs what was not recorded.
     """
+    from caviar_clients.cli.run import run_scenario
+    from caviar_clients.replay.plan import plan_replay, request_of, scenario_text
+    from caviar_clients.replay.recorded import RecordedRun
+    from caviar_clients.session.checks import check_implementations
+    from caviar_services.registry import find_modules_in
+
     find_modules_in(Path.cwd())  # of classes that --replace names as module:Class
     found = RecordedRun(Recording(run))
     request = request_of(found.scenario.services, replace, settings, keep, recorded, again)

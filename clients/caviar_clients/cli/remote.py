@@ -16,7 +16,6 @@ import typer
 from rich.console import Console
 
 import caviar_clients
-from caviar_broker.control.socket import ask
 from caviar_clients.cli.shared import new_run_directory, print_line
 from caviar_protocol.errors import RunError
 from caviar_protocol.files import RunDirectory, replace_file
@@ -143,6 +142,8 @@ def why_command(run: Path | None, console: Console) -> None:
     Raises:
         RunError: No broker runs there.
     """
+    from caviar_broker.control.socket import ask  # with asyncio, which `caviar run` does without
+
     directory = run if run is not None else newest_run(RUNS)
     for line in why_lines(ask(directory, do="why")["why"]):
         print_line(console, line)

@@ -13,44 +13,55 @@ from contextlib import closing
 from io import StringIO
 from pathlib import Path
 from types import FrameType
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
 from rich.text import Text
 
-from caviar_broker.core import events as ev
-from caviar_broker.http.auth import http_address
 from caviar_broker.run_record import read_record
 from caviar_broker.security.access import check_bind
 from caviar_clients.cli.launch import Launcher
 from caviar_clients.cli.remote import key_text, reachable, start_command, waiting_text
 from caviar_clients.cli.scenarios import require_extras
-from caviar_clients.cli.shared import new_run_directory, print_line, require_writable
-from caviar_clients.cli.summary import recorded_figures, summary_of, summary_table
+from caviar_clients.cli.shared import new_run_directory, print_line, progress_bar, require_writable
 from caviar_clients.files import printable, write_file
 from caviar_clients.session.checks import checked_scenario
-from caviar_clients.session.embedded import EmbeddedRun
 from caviar_clients.session.plausibility import implausible_values
 from caviar_protocol.errors import RecordingError, RunError, SetupError
 from caviar_protocol.files import RunDirectory
-from caviar_protocol.recording import Recording
-from caviar_protocol.recording.integrity import declared_digest
 from caviar_protocol.scenario import Scenario, find_scenario
 from caviar_protocol.scenario.rules import refuse_remote
 
+# What a run needs in one process, or behind its end, is imported there: what stands above is imported before
+# the broker starts.
+if TYPE_CHECKING:
+    from caviar_broker.core import events as ev
+
 REPORT_S = 0.1
 """[s] between ``frame`` events at least."""
+QUIET = frozenset({"stale", "note", "lag"})
+"""Kinds of notices that are logged, and only counted on the screen."""
+REPEATED = frozenset({"warning", "lost", "away", "back", "restarted", "refused", "disk"})
+"""Kinds of notices that are shown every time, since what they ask of the user is always new."""
 
 
 class EmbeddedLauncher:
-    """Has the interface of `caviar_clients.cli.launch.Launcher`, without processes."""
+    """A run in this process, with the interface of `caviar_clients.cli.launch.Launcher`.
+
+    Args:
+        scenario: Checked, as `checked_scenario` returns it.
+        directory: The run's directory.
+    """
 
     def __init__(self, scenario: Scenario, directory: Path) -> None:
+        from caviar_clients.session.embedded import EmbeddedRun
+
         self._directory = directory
-        self._told: deque[dict[str, Any]] = deque()
-        self._told_frame = 0.0
+        # The run calls back in the middle of a step; events are passed on between steps.
+        self._pending: deque[dict[str, Any]] = deque()
+        self._reported_at = 0.0
         self._log_error = ""
         self._run = EmbeddedRun(scenario, directory, self._notice, self._frame)
 
@@ -61,11 +72,11 @@ class EmbeddedLauncher:
         """Nothing is left to end: a caller that leaves the loop over `events` ends the run."""
 
     def events(self) -> Iterator[Mapping[str, Any]]:
-        """What happens, until the run is over."""
+        """Run, and yield what happens, in the words of the broker's events; the last one is ``finished``."""
         with closing(self._run.steps()) as steps:
             for _ in steps:
-                while self._told:
-                    event = self._told.popleft()
+                while self._pending:
+                    event = self._pending.popleft()
                     if event["event"] == "notice":
                         self._log(event)
                     yield event
@@ -94,11 +105,11 @@ class EmbeddedLauncher:
         self._run.stop(reason)
 
     def log_of(self, service: str) -> Path | None:
-        """Services have no logs of their own here."""
+        """Services have no logs of their own in one process."""
         return None
 
     def _log(self, event: Mapping[str, Any]) -> None:
-        """Keep a notice; a disk that is full costs the log, not the run."""
+        # A disk that is full costs the log, not the run: the error is a notice at the end.
         try:
             with RunDirectory(self._directory).events.open("a", encoding="utf-8") as log:
                 log.write(json.dumps(event, ensure_ascii=False) + "\n")
@@ -107,23 +118,32 @@ class EmbeddedLauncher:
 
     def _notice(self, notice: ev.Notice) -> None:
         fields = ("kind", "service", "episode", "frame", "text")
-        self._told.append({"event": "notice", **{field: getattr(notice, field) for field in fields}})
+        self._pending.append({"event": "notice", **{field: getattr(notice, field) for field in fields}})
 
     def _frame(self, frame: ev.FrameFinished) -> None:
         now = time.monotonic()
-        if now - self._told_frame >= REPORT_S:
-            self._told_frame = now
+        if now - self._reported_at >= REPORT_S:
+            self._reported_at = now
             frames = self._run.statistics.frames
-            self._told.append({"event": "frame", "episode": frame.episode, "frames": frames, "misses": 0})
+            self._pending.append({"event": "frame", "episode": frame.episode, "frames": frames, "misses": 0})
 
 
 def with_recording_checked(
     directory: Path, scenario: Scenario, outcome: Mapping[str, Any]
 ) -> Mapping[str, Any]:
-    """How a run ended; with an error where it came to its end and its recording is another run's.
+    """Compare the digest of a run with that of its recording, of which no product is read.
 
-    The digests that the recording has of its products are compared, and no product is read.
+    Args:
+        directory: The run's directory.
+        scenario: Of the run.
+        outcome: The event ``finished``.
+
+    Returns:
+        ``outcome``, with an error where the run came to its end and its recording is not of that run.
     """
+    from caviar_protocol.recording import Recording
+    from caviar_protocol.recording.integrity import declared_digest
+
     recorders = [spec for spec in scenario.services.values() if spec.role == "recorder" and not spec.remote]
     if outcome["error"] or not outcome["frames"] or not recorders:
         return outcome
@@ -170,15 +190,36 @@ def run_scenario(
     http: str = "",
     pace: str | None = None,
 ) -> RunOutcome:
-    """Run a scenario."""
+    """Run a scenario to its end, with progress and summary on the screen.
+
+    Args:
+        path: A scenario's file, or the name of one that ships.
+        out: Folder in which the run's own directory is made.
+        console: Where progress and summary are shown.
+        frames, seed, pace: What replaces the scenario's; None: nothing.
+        json_file: Where the summary is written beside the run's own; None: nowhere.
+        bind: Address of the broker; empty for a socket of this user alone, or a free port.
+        embedded: Whether all services run in this process.
+        keys: Keys directory; None: a run without keys.
+        http: ``HOST:PORT`` at which HTTP is served; empty: nowhere.
+
+    Raises:
+        ScenarioError: A key or value of the scenario is wrong.
+        SetupError: An extra is missing, or options do not go together.
+        RunError: A file cannot be written, or the broker cannot start.
+    """
     scenario = checked_scenario(path, frames, seed, pace)
     if bind:
         check_bind(bind, keys=keys is not None)
     require_extras(scenario)
     if embedded:
         refuse_remote(scenario)
+    if http and embedded:
+        raise SetupError("an embedded run has no broker process that HTTP could ask; leave out --http")
     if http:
-        _check_http(http, keys, embedded)
+        from caviar_broker.http.auth import http_address
+
+        http_address(http, keys)
     require_writable(json_file)
     directory = new_run_directory(out, scenario.run.name)
     print_line(console, f"run {directory}")
@@ -205,7 +246,17 @@ def resume_run(
     *,
     force: bool = False,
 ) -> RunOutcome:
-    """Resume a run whose broker died."""
+    """Resume a run whose broker died, from where its journal ends.
+
+    Args:
+        directory: The run's directory.
+        force: Whether to go on though code, libraries or files have changed since.
+        console, json_file, bind, keys, http: As of `run_scenario`; an empty ``bind`` is that of before.
+
+    Raises:
+        RecordingError: The directory has no record of a run, or one that cannot be read.
+        RunError: A file cannot be written, or the broker cannot start.
+    """
     scenario = read_record(directory).scenario
     require_writable(json_file)
     print_line(console, f"run {directory}")
@@ -226,26 +277,32 @@ def _follow(
     *,
     new: bool = False,
 ) -> RunOutcome:
-    """Show a run to its end, and sum it up; ``warnings`` are those of its scenario.
+    """Show a run to its end, and sum it up.
 
-    The directory of a ``new`` run that the user stops before its first frame is removed.
+    Args:
+        launcher: Runs it.
+        scenario, directory, console, json_file, keys: As of `run_scenario`.
+        warnings: Of the scenario.
+        new: Whether the directory is removed where the user stops the run before its first frame.
     """
+    from caviar_clients.cli.summary import recorded_figures, summary_of
+
     outcome: Mapping[str, Any] = {}
     interrupted = _Interruption(launcher)
-    with launcher, interrupted, _progress_bar(console) as bar:
+    with launcher, interrupted, _bar(console) as bar:
         watcher = _Watcher(bar, console, scenario, keys)
         for event in launcher.events():
-            watcher.take(event)
+            watcher.show(event)
             if event["event"] == "finished":
                 outcome = event
-    if outcome.get("disk"):
+    if outcome.get("disk"):  # the disk does not answer: whatever is read or written there would wait, too
         words = f"{outcome['error']}; there is no summary, since {outcome['disk']}"
         console.print(Text.assemble(("the run ended early:", "red"), f" {words}"), soft_wrap=True)
         return RunOutcome(directory, 130 if interrupted.came else 1, outcome["error"])
     outcome = with_recording_checked(directory, scenario, outcome)
     recorded = recorded_figures(directory) if outcome["frames"] else None
-    told = [*warnings, *watcher.warnings, *watcher.idle.values()]
-    summary = summary_of(outcome, recorded, scenario.run.name, directory, scenario.run.seed, told)
+    noted = [*warnings, *watcher.warnings, *watcher.idle.values()]
+    summary = summary_of(outcome, recorded, scenario.run.name, directory, scenario.run.seed, noted)
     if outcome["frames"]:
         _show(console, summary)
     if outcome["error"]:
@@ -273,14 +330,8 @@ def _write_summary(summary: Mapping[str, Any], directory: Path, json_file: Path 
         write_file(RunDirectory(directory).summary_table, table.getvalue())
 
 
-def _check_http(http: str, keys: Path | None, embedded: bool) -> None:
-    if embedded:
-        raise SetupError("an embedded run has no broker process that HTTP could ask; leave out --http")
-    http_address(http, keys)
-
-
 class _Interruption:
-    """Ctrl-C as an order to end the run; a second one ends without waiting."""
+    """Turns Ctrl-C, SIGTERM and SIGHUP into an order to end the run; a second one ends without waiting."""
 
     def __init__(self, launcher: Launcher | EmbeddedLauncher) -> None:
         self._launcher = launcher
@@ -303,7 +354,7 @@ class _Interruption:
 
 
 class _Watcher:
-    """Shows what the broker reports."""
+    """Shows the events of a run on the screen, and keeps what the summary says of them."""
 
     def __init__(self, bar: Progress, console: Console, scenario: Scenario, keys: Path | None) -> None:
         self._bar, self._console = bar, console
@@ -312,12 +363,11 @@ class _Watcher:
         self._first: tuple[float, int] | None = None
         self._shown: dict[tuple[str, str], int] = {}
         self._scenario, self._endpoint, self._keys = scenario, "", keys
+        # For the summary: services that are not run, with the reason, and warnings of services.
         self.idle: dict[str, str] = {}
-        """Services that are not run, with the reason, for the summary."""
         self.warnings: list[str] = []
-        """Of services, for the summary."""
 
-    def take(self, event: Mapping[str, Any]) -> None:
+    def show(self, event: Mapping[str, Any]) -> None:
         """Show one event."""
         match event["event"]:
             case "listening":
@@ -338,6 +388,7 @@ class _Watcher:
 
     def _frame(self, frames: int, misses: int) -> None:
         now = time.monotonic()
+        # From the first report on: a rate since the start would count what services load.
         self._first = self._first or (now, frames)
         elapsed, done = now - self._first[0], frames - self._first[1]
         rate = f"{done / elapsed:.1f} frames/s" if elapsed > 0.5 else ""
@@ -346,14 +397,14 @@ class _Watcher:
         )
 
     def _finished(self, event: Mapping[str, Any]) -> None:
-        """Show the final figures, which the last ``frame`` event need not have had."""
+        # The last `frame` event need not have had the final figures: there are ten a second at most.
         misses = sum(service["misses"] for service in event["services"].values())
         self._bar.update(self._task, completed=event["frames"], misses=f"{misses} misses")
         if not event["error"]:
             self._bar.update(self._task, description="done")
 
     def _notice(self, event: Mapping[str, Any]) -> None:
-        """Show the first of each kind and service; the rest is in events.jsonl."""
+        # The first of each kind and service; events.jsonl has all.
         key = (event["kind"], event["service"])
         if event["kind"] == "idle":
             self.idle[event["service"]] = f"{event['service']}: {event['text']}"
@@ -367,7 +418,7 @@ class _Watcher:
             self._tell(text + self._remedy(event), "yellow")
 
     def _remedy(self, event: Mapping[str, Any]) -> str:
-        """How to bring a remote service back."""
+        """The command that brings a remote service back; empty for other events."""
         spec = self._scenario.services.get(event["service"])
         if event["kind"] != "away" or spec is None or not spec.remote:
             return ""
@@ -378,18 +429,13 @@ class _Watcher:
         print_line(self._console, printable(text), style)
 
 
-def _progress_bar(console: Console) -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}"),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[misses]}"),
-        console=console,
-    )
+def _bar(console: Console) -> Progress:
+    columns = ("{task.fields[rate]}", TimeRemainingColumn(), "{task.fields[misses]}")
+    return progress_bar(console, MofNCompleteColumn(), *columns)
 
 
 def _show(console: Console, summary: Mapping[str, Any]) -> None:
+    from caviar_clients.cli.summary import summary_table
+
     console.print(summary_table(summary))
     print_line(console, f"digest {summary['digest']}")
