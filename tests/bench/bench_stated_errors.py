@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import Scene
-from caviar_services.channel.adaptive.error_bounds import ErrorBound, errors_db, scores_db
+from caviar_services.channel.adaptive.calibration import ErrorBound, errors_db, scores_db
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.sionna.scene import shared_scenes
 from caviar_services.channel.sionna.settings import SionnaSettings
@@ -56,7 +56,7 @@ ROW = np.dtype(
         ("score", "<f8"),
     ]
 )
-"""A receiver of a frame on a rung; error and score [dB] are those of `error_bounds`."""
+"""A receiver of a frame on a rung; error and score [dB] are those of `calibration`."""
 
 Rows = NDArray[Any]
 

@@ -73,7 +73,9 @@ def whole_grid(channel: Channel, scene: Scene) -> Channel:
     none = np.zeros((1, len(pair), 3, 3), np.complex128)
     located = Located(np.arange(len(pair)), pair, channel.offsets, geometry, channel.a, none, None)
     bins = bins_of({"hf"}, channel.carriers, channel.tau, channel.offsets)
-    made = wideband_parts(bins, PlaneWaves().responses(bins, tx, rx, located), len(rx))
+    waves = PlaneWaves(channel.carriers, tx, rx, located)
+    responses = (response for asked in bins for response in waves.responses(asked))
+    made = wideband_parts(bins, responses, len(rx))
     return msgspec.structs.replace(channel, hf=made.hf)
 
 

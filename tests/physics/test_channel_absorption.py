@@ -6,7 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from channel_lab import C, Plate, antenna, measure, scene, sionna, write_scenery
+
+from caviar_services.channel.stability.formulas import C
+from caviar_services.channel.stability.lab import Plate, antenna, measure, scene, sionna, write_scenery
 
 pytestmark = pytest.mark.channel
 

@@ -9,13 +9,14 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from channel_lab import Array, C, Thing, antenna, free_space, measure, scene, sionna, turn
 
 from caviar_protocol.multipath import subcarrier_offsets
 from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import AntennaArray, Carrier, Channel, Panel
 from caviar_services.channel.base import ChannelModel
 from caviar_services.channel.propagation.patterns import Patterns, element_amplitude
+from caviar_services.channel.stability.formulas import C, turn
+from caviar_services.channel.stability.lab import Array, Thing, antenna, free_space, measure, scene, sionna
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.pattern_files import read_pattern
 from caviar_services.service import Preparation, RunInfo

@@ -8,10 +8,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-from channel_lab import Array, C, Plate, Thing, antenna, measure, mirrored, scene, sionna, write_scenery
 
 from caviar_protocol.topics import Channel
 from caviar_services.channel.base import ChannelModel
+from caviar_services.channel.stability.formulas import C, mirrored
+from caviar_services.channel.stability.lab import (
+    Array,
+    Plate,
+    Thing,
+    antenna,
+    measure,
+    scene,
+    sionna,
+    write_scenery,
+)
 
 F = 28e9
 TX, RX = np.array([-7.0, -9.0, 2.0]), np.array([6.0, -7.0, 1.5])

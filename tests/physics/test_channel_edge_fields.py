@@ -7,26 +7,24 @@ from typing import Any
 
 import numpy as np
 import pytest
-from channel_lab import (
-    EPSILON_0,
+
+from caviar_protocol.space.coordinates import quaternion_from_euler
+from caviar_protocol.topics import Interaction
+from caviar_services.channel.propagation import utd as module
+from caviar_services.channel.propagation.fresnel import Media
+from caviar_services.channel.propagation.utd import edge_fields, faces_of
+from caviar_services.channel.sionna import path_table
+from caviar_services.channel.stability.formulas import EPSILON_0, C, turn, unit
+from caviar_services.channel.stability.lab import (
     Array,
-    C,
     Plate,
     Thing,
     antenna,
     measure,
     scene,
     sionna,
-    turn,
-    unit,
     write_scenery,
 )
-
-from caviar_protocol.space.coordinates import quaternion_from_euler
-from caviar_protocol.topics import Interaction
-from caviar_services.channel.propagation import utd as module
-from caviar_services.channel.propagation.utd import Media, edge_fields, faces_of
-from caviar_services.channel.sionna import path_table
 
 pytestmark = pytest.mark.channel
 

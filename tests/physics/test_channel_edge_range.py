@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from channel_lab import Plate, Thing, antenna, scene, sionna, write_scenery
 
 from caviar_protocol.errors import CaviarError
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.topics import Channel, Interaction
 from caviar_services.channel.base import ChannelModel
+from caviar_services.channel.stability.lab import Plate, Thing, antenna, scene, sionna, write_scenery
 from caviar_services.service import Frame, FrameInput
 
 pytestmark = pytest.mark.channel

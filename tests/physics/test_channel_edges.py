@@ -7,11 +7,22 @@ from typing import Any
 
 import numpy as np
 import pytest
-from channel_lab import Array, C, Plate, Thing, antenna, measure, scene, sionna, total, write_scenery
 
 from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import Channel, Interaction
 from caviar_services.channel.base import ChannelModel
+from caviar_services.channel.stability.formulas import C
+from caviar_services.channel.stability.lab import (
+    Array,
+    Plate,
+    Thing,
+    antenna,
+    measure,
+    pair_sums,
+    scene,
+    sionna,
+    write_scenery,
+)
 
 pytestmark = pytest.mark.channel
 
@@ -62,7 +73,7 @@ def test_a_corner_is_the_same_where_one_mesh_divides_the_border_and_the_other_do
     levels, shadow = [], 0
     for number, other in enumerate(([Plate("other", OTHER)], halved)):
         channel = along(corner(tmp_path / str(number), Plate("one", ONE), *other), around(24))
-        levels.append(20 * np.log10(np.abs(total(channel))))
+        levels.append(20 * np.log10(np.abs(pair_sums(channel))))
         over = (channel.interactions == DIFFRACTED).any(1)
         shadow += sum(paths.all() for paths in np.split(over, channel.offsets[1:-1]))
     assert shadow >= 6
@@ -79,7 +90,7 @@ def test_enumerated_paths_are_continuous_in_steps_of_a_micrometre(tmp_path: Path
         ground = onward * 10 + steps[:, None] * np.array([-onward[1], onward[0]])
         channel = along(model, np.column_stack([ground, np.full(len(steps), 2.0)]))
         free = C / F / (4 * np.pi * np.linalg.norm([*ground[0], 2.0] - np.array(STATION)))
-        assert np.abs(np.diff(total(channel))).max() < 0.03 * free
+        assert np.abs(np.diff(pair_sums(channel))).max() < 0.03 * free
         assert np.count_nonzero(np.diff(channel.los[0].astype(int))) == (image[0] > 0)
 
 

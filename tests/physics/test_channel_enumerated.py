@@ -10,20 +10,6 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from channel_lab import (
-    Array,
-    C,
-    Plate,
-    Thing,
-    antenna,
-    carriers,
-    measure,
-    mirrored,
-    permittivity,
-    scene,
-    spherical_wave,
-    write_scenery,
-)
 
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.digest import payload_digest
@@ -33,6 +19,17 @@ from caviar_services.channel.base import ChannelModel
 from caviar_services.channel.enumeration import scenery_chains
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.sionna.settings import SionnaSettings
+from caviar_services.channel.stability.formulas import C, itu_permittivity, mirrored, spherical_wave
+from caviar_services.channel.stability.lab import (
+    Array,
+    Plate,
+    Thing,
+    antenna,
+    carriers,
+    measure,
+    scene,
+    write_scenery,
+)
 from caviar_services.service import Preparation, RunInfo
 
 STATION = (-3.0, -8.3, 5.0)
@@ -406,7 +403,7 @@ def test_what_goes_through_a_body_has_the_field_of_two_slabs(tmp_path: Path) -> 
     channel = measure(model, scene(ends, [Thing("box", (1.0, 0.2, 2.0), (2.0, 4.0, 3.0))]))
     straight = (channel.interactions == Interaction.TRANSMISSION).all(1)
     assert straight.sum() == 1
-    eta = permittivity(2.73, 0.0, 0.0085, 0.9395, frequency)
+    eta = itu_permittivity(2.73, 0.0, 0.0085, 0.9395, frequency)
     index, back = np.sqrt(eta), (1 - np.sqrt(eta)) / (1 + np.sqrt(eta))
     within = np.exp(-2j * np.pi * thickness * frequency / C * index)
     through = (1 - back**2) * within / (1 - (back * within) ** 2)

@@ -16,17 +16,17 @@ from caviar_protocol.codec import encode_payload
 from caviar_protocol.errors import AssetError, ScenarioError
 from caviar_protocol.topics import AntennaArray, Channel, Interaction, Scene
 from caviar_services.channel.paths import Antenna
-from caviar_services.channel.stability.bench import (
-    Bench,
+from caviar_services.channel.stability.lab import (
+    Lab,
     Material,
     Plate,
     Point,
     Thing,
-    answer,
     antenna,
     link,
+    measure,
+    scene,
     square,
-    world,
 )
 from caviar_services.mesh.shapes import box
 
@@ -49,19 +49,20 @@ CROWNS: dict[str, Box] = {
     "crown.b": ((22.0, -5.0, 0.5), (28.0, 3.0, 7.0)),
 }
 """Two of one kind that overlap, and stand a little off the ground."""
-GROUND = Plate("ground", square(90.0))
+SURFACE = Material(5.0, 0.01, thickness=0.2)
+GROUND = Plate("ground", square(90.0), SURFACE)
 WALLS = [
-    Plate("wall", [(10.0, 11.0, 0.0), (40.0, 11.0, 0.0), (40.0, 11.0, 9.0), (10.0, 11.0, 9.0)]),
-    Plate("back", [(52.0, -30.0, 0.0), (52.0, 30.0, 0.0), (52.0, 30.0, 12.0), (52.0, -30.0, 12.0)]),
+    Plate("wall", [(10.0, 11.0, 0.0), (40.0, 11.0, 0.0), (40.0, 11.0, 9.0), (10.0, 11.0, 9.0)], SURFACE),
+    Plate("back", [(52.0, -30.0, 0.0), (52.0, 30.0, 0.0), (52.0, 30.0, 12.0), (52.0, -30.0, 12.0)], SURFACE),
 ]
-SURFACE = {"surface": Material(5.0, 0.01, thickness=0.2)}
 TX, RX = (0.3, 0.7, 5.1), (45.2, -1.3, 1.6)
 
 
 def crown(name: str, bounds: Box, faces: Any = None) -> Plate:
     """A piece of scenery that is a closed box."""
     mesh = box(*zip(*bounds, strict=True))  # type: ignore[arg-type]
-    return Plate(name, mesh.vertices.tolist(), faces=mesh.faces.tolist() if faces is None else faces)
+    of = mesh.faces.tolist() if faces is None else faces
+    return Plate(name, mesh.vertices.tolist(), SURFACE, faces=of)
 
 
 PLATES = [GROUND, *WALLS, *(crown(name, bounds) for name, bounds in CROWNS.items())]
@@ -99,15 +100,13 @@ def lost_db(channel: Channel, carrier: int) -> Float64Array:
 
 
 @pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
-    return Bench(tmp_path_factory.mktemp("foliage"))
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
+    return Lab(tmp_path_factory.mktemp("foliage"))
 
 
-def woods(bench: Bench, **settings: Any) -> Any:
+def woods(lab: Lab, **settings: Any) -> Any:
     foliage = {"crown.*": STATED, "bush": STATED | {"maximum_db": {}}}
-    return bench.traced(
-        CARRIERS, PLATES, SURFACE, foliage=foliage, **{"max_depth": 2, "bodies": 2, **settings}
-    )
+    return lab.traced(CARRIERS, PLATES, foliage=foliage, **{"max_depth": 2, "bodies": 2, **settings})
 
 
 @pytest.mark.parametrize(
@@ -119,10 +118,10 @@ def woods(bench: Bench, **settings: Any) -> Any:
         ),
     ],
 )
-def test_each_leg_of_each_path_loses_what_it_runs_inside(bench: Bench, settings: dict[str, Any]) -> None:
+def test_each_leg_of_each_path_loses_what_it_runs_inside(lab: Lab, settings: dict[str, Any]) -> None:
     """γ·d, and the saturating form with a maximum: line of sight, reflections by ground, walls, a lorry."""
     lorry = Thing("lorry", (20.0, 6.5, 3.0), size=(8.0, 1.0, 6.0))
-    channel = link(woods(bench, **settings), TX, RX, lorry)
+    channel = link(woods(lab, **settings), TX, RX, lorry)
     inside = np.array(
         [length_in(list(CROWNS.values()), corners_of(channel, path)) for path in range(len(channel.tau))]
     )
@@ -138,10 +137,10 @@ def test_each_leg_of_each_path_loses_what_it_runs_inside(bench: Bench, settings:
     assert lost_db(channel, 2) == pytest.approx(MOST * (1 - np.exp(-GAMMA * inside / MOST)), abs=1e-6)
 
 
-def test_without_it_all_else_is_as_if_it_were_not_there(bench: Bench) -> None:
+def test_without_it_all_else_is_as_if_it_were_not_there(lab: Lab) -> None:
     """Amplitudes on the carrier without loss, and all of the geometry, to the bit."""
-    with_it = link(woods(bench), TX, RX)
-    bare = link(bench.traced(CARRIERS, [GROUND, *WALLS], SURFACE, max_depth=2, bodies=2), TX, RX)
+    with_it = link(woods(lab), TX, RX)
+    bare = link(lab.traced(CARRIERS, [GROUND, *WALLS], max_depth=2, bodies=2), TX, RX)
     assert len(bare.tau) > 3
     assert np.array_equal(with_it.a[1], bare.a[1])
     for name in ("id", "tau", "aod", "aoa", "points", "doppler", "los"):
@@ -149,9 +148,9 @@ def test_without_it_all_else_is_as_if_it_were_not_there(bench: Bench) -> None:
     assert (np.abs(with_it.a[0]) < np.abs(bare.a[0])).any()
 
 
-def test_the_product_states_what_attenuates(bench: Bench) -> None:
+def test_the_product_states_what_attenuates(lab: Lab) -> None:
     """Kinds and carriers in the options, which its digest includes; 949 MHz has γ and A_m of table 1."""
-    channel = link(woods(bench), TX, RX)
+    channel = link(woods(lab), TX, RX)
     assert channel.options.foliage == (
         "crown.*@c0: 1.7 dB/m (measured)",
         "crown.*@c1: 0 dB/m (measured)",
@@ -162,7 +161,7 @@ def test_the_product_states_what_attenuates(bench: Bench) -> None:
         "bush@c2: 1.7 dB/m (measured)",
         "bush@c3: 0.17 dB/m, at most 26.5 dB (ITU-R P.833-10, table 1)",
     )
-    clear = link(bench.traced(CARRIERS, [GROUND, *WALLS], SURFACE, max_depth=2, bodies=2), TX, RX)
+    clear = link(lab.traced(CARRIERS, [GROUND, *WALLS], max_depth=2, bodies=2), TX, RX)
     assert clear.options.foliage == ()
     assert encode_payload(channel)[0] != encode_payload(clear)[0]
     inside = length_in(list(CROWNS.values()), np.array([TX, RX]))
@@ -174,21 +173,21 @@ def turned(yaw: float) -> Point:
     return (math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2))
 
 
-def of_class(scene: Scene, **classes: str) -> Scene:
-    return msgspec.structs.replace(scene, classes=tuple(classes.get(name, "car") for name in scene.names))
+def of_class(at: Scene, **classes: str) -> Scene:
+    return msgspec.structs.replace(at, classes=tuple(classes.get(name, "car") for name in at.names))
 
 
-def test_objects_are_foliage_within_their_bounding_boxes(bench: Bench) -> None:
+def test_objects_are_foliage_within_their_bounding_boxes(lab: Lab) -> None:
     """By class, turned by 30° and moved between frames: three, with a pool of two bodies, and an antenna in
     the middle of one. An overlap with the crowns, of another kind, counts for both."""
-    model = woods(bench, max_depth=0)
+    model = woods(lab, max_depth=0)
     yaw, size = math.radians(30), np.array([4.0, 6.0, 20.0])
     back = np.array([[math.cos(yaw), math.sin(yaw), 0], [-math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]])
     for number, x in enumerate((8.0, 21.0)):
         bushes = [Thing(f"b{i}", (x, 1.0, 3.0), tuple(size), turned(yaw)) for i in range(3)]
         devices = [antenna("t", "tx", TX), antenna("r", "rx", RX)]
-        scene = of_class(world(devices, bushes), b0="bush", b1="bush", b2="bush")
-        channel = answer(model, scene, number)
+        at = of_class(scene(devices, bushes), b0="bush", b1="bush", b2="bush")
+        channel = measure(model, at, number)
         line = (np.array([TX, RX]) - [x, 1.0, 3.0]) @ back.T
         bush = length_in([(tuple(-size / 2), tuple(size / 2))], line)
         crowns = length_in(list(CROWNS.values()), np.array([TX, RX]))
@@ -196,7 +195,7 @@ def test_objects_are_foliage_within_their_bounding_boxes(bench: Bench) -> None:
         assert lost_db(channel, 0) == pytest.approx([GAMMA * (bush + crowns)], abs=1e-6)
         assert channel.los.all()
     within_it = [antenna("t", "tx", TX), antenna("r", "rx", (0.0, 0.0, 0.0), parent="b0")]
-    channel = answer(model, of_class(world(within_it, bushes[:1]), b0="bush"), 2)
+    channel = measure(model, of_class(scene(within_it, bushes[:1]), b0="bush"), 2)
     line = np.array([TX, bushes[0].position])
     alone = length_in([(tuple(-size / 2), tuple(size / 2))], (line - line[1]) @ back.T)
     expected = GAMMA * (alone + length_in(list(CROWNS.values()), line))
@@ -204,16 +203,16 @@ def test_objects_are_foliage_within_their_bounding_boxes(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("rung", ["siso-rt", "spherical", "mimo-rt"])
-def test_matrices_on_every_rung(bench: Bench, rung: str) -> None:
+def test_matrices_on_every_rung(lab: Lab, rung: str) -> None:
     """H of the line of sight: on mimo-rt each pair of elements has a length of its own, elsewhere it is that
     between the arrays' centres. A hedge at 40° to the line."""
     stated = {"attenuation_db_per_m": {"c0": GAMMA, "c1": 0.0}, "source": "measured"}
-    model = bench.traced((1e9, 1e9), foliage={"hedge": stated}, rung=rung, max_depth=0)
+    model = lab.traced((1e9, 1e9), foliage={"hedge": stated}, rung=rung, max_depth=0)
     spacing, yaw = 4.0, math.radians(40)
     array = AntennaArray(rows=1, columns=2, horizontal_spacing=spacing)
     hedge = Thing("hedge", (20.0, 0.0, 2.0), (3.0, 90.0, 9.0), turned(yaw))
     devices = [antenna("t", "tx", (0, 0, 2), array), antenna("r", "rx", (41, 0, 2), array)]
-    channel = answer(model, world(devices, [hedge]))
+    channel = measure(model, scene(devices, [hedge]))
     got = -20 * np.log10(np.abs(channel.h[0].h / channel.h[1].h))
     y = np.array([-0.5, 0.5]) * spacing * 299_792_458.0 / 1e9
     rise = (y[:, None] - y) / 41.0  # of the line from element n to m
@@ -222,15 +221,15 @@ def test_matrices_on_every_rung(bench: Bench, rung: str) -> None:
     assert np.abs(got - expected).max() < 1e-6
 
 
-def test_what_half_of_the_rays_would_miss_is_weighed_with_what_is_left(bench: Bench) -> None:
+def test_what_half_of_the_rays_would_miss_is_weighed_with_what_is_left(lab: Lab) -> None:
     """A bush on the line of sight alone: of the power that arrives, the reflection is a larger part."""
-    model = bench.traced((F,), [GROUND], SURFACE, foliage={"bush": {**STATED, **ONE_CARRIER}}, samples=50)
+    model = lab.traced((F,), [GROUND], foliage={"bush": {**STATED, **ONE_CARRIER}}, samples=50)
     model.with_split = True
     ends = [antenna("t", "tx", (0.0, 0.0, 8.0)), antenna("r", "rx", (60.0, 0.0, 8.0))]
     bush = Thing("bush", (30.0, 0.0, 8.0), (5.0, 5.0, 5.0))
     clear, behind = (
         model.paths(at, [Antenna.of(at, ends[0])], [Antenna.of(at, ends[1])])
-        for at in (world(ends), world(ends, [bush]))
+        for at in (scene(ends), scene(ends, [bush]))
     )
     power = [(np.abs(found.table.transfer[0]) ** 2).sum((1, 2)) for found in (clear, behind)]
     assert len(power[0]) == len(power[1]) == 2
@@ -266,16 +265,16 @@ def test_what_half_of_the_rays_would_miss_is_weighed_with_what_is_left(bench: Be
         ({"van": STATED}, "van", "'van' is foliage here and stands in object_materials, too"),
     ],
 )
-def test_what_is_wrong_names_its_key(bench: Bench, foliage: dict[str, Any], key: str, says: str) -> None:
+def test_what_is_wrong_names_its_key(lab: Lab, foliage: dict[str, Any], key: str, says: str) -> None:
     with pytest.raises(ScenarioError, match=says) as refused:
-        bench.traced(F, foliage=foliage, without_body=["car"], object_materials={"van": "glass"})
+        lab.traced(F, foliage=foliage, without_body=["car"], object_materials={"van": "glass"})
     assert refused.value.key.endswith(f"settings.foliage.{key}")
 
 
-def test_an_open_piece_of_scenery_has_no_inside(bench: Bench) -> None:
+def test_an_open_piece_of_scenery_has_no_inside(lab: Lab) -> None:
     leaf = crown("crown.c", CROWNS["crown.a"], box(*[(0.0, 1.0)] * 3).faces[1:].tolist())
     stated = {"attenuation_db_per_m": {"c0": 1.0}, "source": "s"}
     with pytest.raises(
         AssetError, match=r"'crown.c' is foliage and has no inside: 3 of its 18 edges are open"
     ):
-        bench.traced(F, [GROUND, leaf], SURFACE, foliage={"crown.*": stated})
+        lab.traced(F, [GROUND, leaf], foliage={"crown.*": stated})

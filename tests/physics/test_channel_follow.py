@@ -8,7 +8,6 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from channel_lab import Thing, antenna, scene
 from same_paths import model
 
 from caviar_protocol.errors import PayloadError
@@ -16,6 +15,7 @@ from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.topics import AntennaArray, Channel, Scene
 from caviar_services.channel.base import ChannelModel
 from caviar_services.channel.sionna.settings import SionnaSettings
+from caviar_services.channel.stability.lab import Thing, antenna, scene
 from caviar_services.service import Frame, FrameInput
 
 CANYON = "simple_street_canyon_with_cars"

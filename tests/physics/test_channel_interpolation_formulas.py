@@ -6,12 +6,13 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from channel_lab import Array, C, Thing, antenna, carriers, mirrored, scene, spherical_wave
 
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.space.coordinates import angles
 from caviar_protocol.topics import AntennaArray, Channel, ChannelMatrix, Scene
 from caviar_services.channel.interpolation import Interpolation, Keyframe
+from caviar_services.channel.stability.formulas import C, mirrored, spherical_wave
+from caviar_services.channel.stability.lab import Array, Thing, antenna, carriers, scene
 
 FREQUENCY = 60e9
 TX = np.array([3.0, -7.0, 11.0])

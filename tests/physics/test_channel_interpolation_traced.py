@@ -8,10 +8,10 @@ from tempfile import mkdtemp
 
 import numpy as np
 import pytest
-from channel_lab import Thing, antenna, measure, scene, sionna
 
 from caviar_protocol.topics import AntennaArray, Channel, Scene
 from caviar_services.channel.interpolation import Interpolation, Keyframe
+from caviar_services.channel.stability.lab import Thing, antenna, measure, scene, sionna
 from caviar_services.world.assets import scenery_assets
 
 FRAME_S = 0.1

@@ -8,22 +8,6 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 import pytest
-from channel_lab import (
-    Array,
-    Plate,
-    antenna,
-    carriers,
-    measure,
-    mirrored,
-    permittivity,
-    reflected,
-    scene,
-    sionna,
-    spherical_wave,
-    unit,
-    vertical,
-    write_scenery,
-)
 
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.errors import AssetError, ScenarioError
@@ -32,6 +16,24 @@ from caviar_services.channel.base import ChannelModel
 from caviar_services.channel.sionna.materials import ItuMaterial, MaterialPolicy, itu_material
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.sionna.settings import SionnaSettings
+from caviar_services.channel.stability.formulas import (
+    itu_permittivity,
+    mirrored,
+    reflected,
+    spherical_wave,
+    unit,
+    vertical,
+)
+from caviar_services.channel.stability.lab import (
+    Array,
+    Plate,
+    antenna,
+    carriers,
+    measure,
+    scene,
+    sionna,
+    write_scenery,
+)
 from caviar_services.service import Preparation, RunInfo
 from caviar_services.world.assets import scenery_assets
 
@@ -161,7 +163,7 @@ def test_reflection_by_wet_ground_at_60_ghz(tmp_path: Path, outside: str, at_ghz
     k_out = unit(rx - image)
     k_in = k_out * [1, 1, -1]
     epsilon, sigma = 30 * at_ghz**-0.4, 0.15 * at_ghz**1.3
-    eta = permittivity(epsilon, 0.0, sigma, 0.0, 60e9)
+    eta = itu_permittivity(epsilon, 0.0, sigma, 0.0, 60e9)
     arrived = vertical(-k_out) @ reflected(vertical(k_in), k_in, up, eta)
     expected = spherical_wave(float(np.linalg.norm(rx - image)), 60e9) * arrived
     assert channel.a[1, 1] == pytest.approx(expected, rel=2e-3)

@@ -7,7 +7,6 @@ from typing import Any
 
 import msgspec
 import pytest
-from channel_lab import Plate, antenna, carriers, measure, scene, sionna, write_scenery
 from msgspec.structs import replace
 from same_paths import digest
 
@@ -15,6 +14,15 @@ from caviar_protocol.errors import ScenarioError
 from caviar_protocol.topics import Channel
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.sionna.settings import SionnaSettings
+from caviar_services.channel.stability.lab import (
+    Plate,
+    antenna,
+    carriers,
+    measure,
+    scene,
+    sionna,
+    write_scenery,
+)
 from caviar_services.service import Preparation, RunInfo
 
 pytestmark = pytest.mark.channel

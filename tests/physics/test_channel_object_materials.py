@@ -9,34 +9,36 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from channel_lab import (
+
+from caviar_protocol.errors import AssetError, ScenarioError
+from caviar_protocol.topics import Channel, Interaction, Scene
+from caviar_services.channel.sionna.materials import OTHER_MATERIALS, ObjectMaterials, body_kind
+from caviar_services.channel.stability.formulas import (
     EPSILON_0,
+    itu_permittivity,
+    mirrored,
+    reflected,
+    spherical_wave,
+    unit,
+    vertical,
+)
+from caviar_services.channel.stability.lab import (
     Array,
     Plate,
     Thing,
     antenna,
     measure,
-    mirrored,
-    permittivity,
-    reflected,
     scene,
     sionna,
-    spherical_wave,
-    unit,
-    vertical,
     write_scenery,
 )
-
-from caviar_protocol.errors import AssetError, ScenarioError
-from caviar_protocol.topics import Channel, Interaction, Scene
-from caviar_services.channel.sionna.materials import OTHER_MATERIALS, ObjectMaterials, body_kind
 
 pytestmark = pytest.mark.channel
 
 F = 28e9
 BOXES = {
-    "box.glass": permittivity(6.31, 0.0, 0.0036, 1.3394, F),
-    "box.wood": permittivity(1.99, 0.0, 0.0047, 1.0718, F),
+    "box.glass": itu_permittivity(6.31, 0.0, 0.0036, 1.3394, F),
+    "box.wood": itu_permittivity(1.99, 0.0, 0.0047, 1.0718, F),
     "person": 16.5516 - 25.8241j / (2 * np.pi * F * EPSILON_0),
     "case": 2.7 * (1 - 0.008j),
     "crate": 4.0 - 0.5j / (2 * np.pi * F * EPSILON_0),
@@ -122,7 +124,7 @@ def test_each_object_reflects_as_fresnel_has_it(seen: Channel, name: str) -> Non
 def test_a_piece_of_scenery_is_given_a_material_by_its_name(seen: Channel) -> None:
     """The wall of concrete is marble here."""
     receiver, rx = receiver_of("car")
-    expected = image(TX, rx, -60.0, permittivity(7.074, 0.0, 0.0055, 0.9262, F))
+    expected = image(TX, rx, -60.0, itu_permittivity(7.074, 0.0, 0.0055, 0.9262, F))
     assert abs(by_object(seen, receiver, "wall") / expected - 1) < 1e-3
 
 

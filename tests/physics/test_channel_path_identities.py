@@ -6,12 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from channel_lab import C, Plate, Thing, antenna, measure, scene, sionna, write_scenery
 from same_paths import SCENES, model
 
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.multipath import changes
 from caviar_protocol.topics import Channel, Scene
+from caviar_services.channel.stability.formulas import C
+from caviar_services.channel.stability.lab import Plate, Thing, antenna, measure, scene, sionna, write_scenery
 from caviar_services.service import Frame, FrameInput
 
 pytestmark = pytest.mark.channel
@@ -75,16 +76,9 @@ def strip(what: tuple[object, ...]) -> tuple[object, ...]:
 def test_both_walls_of_one_object_have_ids_of_their_own(tmp_path: Path) -> None:
     """Between two walls of one object, the reflection by the near one changes place with that by the far one
     in the order of delays, as the receiver crosses the middle: the ids do not."""
-    corners = [(-50, -6, 0), (50, -6, 0), (50, -6, 9), (-50, -6, 9)]
-    both = Plate("walls", corners)
+    near, far = ([(-50, y, 0), (50, y, 0), (50, y, 9), (-50, y, 9)] for y in (-6, 6))
+    both = Plate("walls", [*near, *far], faces=[(0, 1, 2), (0, 2, 3), (4, 5, 6), (4, 6, 7)])
     assets = write_scenery(tmp_path, [both])
-    mesh = assets["scenery/meshes/walls.ply"]
-    lines = mesh.read_text().replace("element vertex 4", "element vertex 8").replace("face 2", "face 4")
-    head, body = lines.split("end_header\n")
-    vertices, triangles = body.splitlines()[:4], body.splitlines()[4:]
-    vertices += [line.replace(" -6 ", " 6 ") for line in vertices]
-    triangles += ["3 4 5 6", "3 4 6 7"]
-    mesh.write_text(head + "end_header\n" + "\n".join([*vertices, *triangles]) + "\n")
     channel = sionna(28e9, assets, max_depth=1)
 
     def sides(y: float) -> dict[str, int]:

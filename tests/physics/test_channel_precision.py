@@ -11,23 +11,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-from channel_lab import (
+
+from caviar_protocol.space.coordinates import quaternion_from_euler
+from caviar_protocol.topics import Channel
+from caviar_services.channel.stability.formulas import C, mirrored, turn, unit
+from caviar_services.channel.stability.lab import (
     Array,
-    C,
     Plate,
     Thing,
     antenna,
     measure,
-    mirrored,
     scene,
     sionna,
-    turn,
-    unit,
     write_scenery,
 )
-
-from caviar_protocol.space.coordinates import quaternion_from_euler
-from caviar_protocol.topics import Channel
 
 pytestmark = pytest.mark.channel
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from channel_lab import Array, C, Plate, Thing, antenna, measure, scene, sionna, turn, write_scenery
 
 from caviar_protocol.errors import RunError
 from caviar_protocol.space.coordinates import quaternion_from_euler
@@ -22,6 +21,17 @@ from caviar_services.channel.radio_map.measurement_surface import (
     level_surface,
 )
 from caviar_services.channel.sionna.model import SionnaChannel
+from caviar_services.channel.stability.formulas import C, turn
+from caviar_services.channel.stability.lab import (
+    Array,
+    Plate,
+    Thing,
+    antenna,
+    measure,
+    scene,
+    sionna,
+    write_scenery,
+)
 
 pytestmark = pytest.mark.channel
 

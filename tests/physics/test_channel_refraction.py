@@ -7,10 +7,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from channel_lab import Array, Plate, Thing, antenna, measure, scene, sionna, write_scenery
 from same_paths import SCENES, things
 
 from caviar_protocol.topics import Channel, Interaction, Scene
+from caviar_services.channel.stability.lab import (
+    Array,
+    Plate,
+    Thing,
+    antenna,
+    measure,
+    scene,
+    sionna,
+    write_scenery,
+)
 from caviar_services.world.assets import scenery_assets
 
 pytestmark = pytest.mark.channel

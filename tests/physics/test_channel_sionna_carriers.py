@@ -7,24 +7,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from channel_lab import (
-    Plate,
-    Thing,
-    antenna,
-    measure,
-    mirrored,
-    permittivity,
-    reflected,
-    scene,
-    sionna,
-    spherical_wave,
-    unit,
-    vertical,
-    write_scenery,
-)
 
 from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import AntennaArray, Scene
+from caviar_services.channel.stability.formulas import (
+    itu_permittivity,
+    mirrored,
+    reflected,
+    spherical_wave,
+    unit,
+    vertical,
+)
+from caviar_services.channel.stability.lab import Plate, Thing, antenna, measure, scene, sionna, write_scenery
 
 pytestmark = pytest.mark.channel
 
@@ -94,7 +88,7 @@ def test_each_carrier_meets_the_ground_with_its_own_constants(tmp_path: Path) ->
     k_out = unit(rx - image)
     k_in = k_out * [1, 1, -1]
     for c, frequency in enumerate((1.5e9, 60e9)):
-        eta = permittivity(5.24, 0.0, 0.0462, 0.7822, frequency)
+        eta = itu_permittivity(5.24, 0.0, 0.0462, 0.7822, frequency)
         arrived = vertical(-k_out) @ reflected(vertical(k_in), k_in, up, eta)
         expected = spherical_wave(float(np.linalg.norm(rx - image)), frequency) * arrived
         assert channel.a[c, 1] == pytest.approx(expected, rel=2e-3)

@@ -9,18 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from channel_lab import (
-    C,
-    Plate,
-    Thing,
-    antenna,
-    measure,
-    mirrored,
-    scene,
-    sionna,
-    total,
-    write_scenery,
-)
 from msgspec.structs import replace
 
 from caviar_protocol.codec import encode_payload
@@ -28,6 +16,17 @@ from caviar_protocol.digest import payload_digest
 from caviar_protocol.space.coordinates import multiply, quaternion_from_euler
 from caviar_protocol.topics import AntennaArray, Channel, Interaction, Scene
 from caviar_services.channel.base import ChannelModel
+from caviar_services.channel.stability.formulas import C, mirrored
+from caviar_services.channel.stability.lab import (
+    Plate,
+    Thing,
+    antenna,
+    measure,
+    pair_sums,
+    scene,
+    sionna,
+    write_scenery,
+)
 
 pytestmark = pytest.mark.channel
 
@@ -244,14 +243,14 @@ def test_a_car_in_between_blocks_the_line_of_sight(street: ChannelModel[Any]) ->
     blocked = measure(street, scene(ends, [Thing("car", (3, -3, 0.8))]))
     assert free.los.all()
     assert not blocked.los.any()
-    assert (np.abs(total(blocked)) < np.abs(total(free))).all()
+    assert (np.abs(pair_sums(blocked)) < np.abs(pair_sums(free))).all()
 
 
 PROCESS = """
 import sys
 sys.path[:0] = [{here!r}]
 from pathlib import Path
-from channel_lab import measure, sionna, write_scenery
+from caviar_services.channel.stability.lab import measure, sionna, write_scenery
 from test_channel_sionna_motion import F, GROUND, WALL, digest, traffic
 assets = write_scenery(Path({folder!r}), [GROUND, WALL])
 model = sionna(F, assets, bodies=6, **{settings!r})

@@ -8,29 +8,31 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from channel_lab import (
-    Array,
-    C,
-    Plate,
-    Thing,
-    antenna,
-    measure,
-    mirrored,
-    permittivity,
-    reflected,
-    scene,
-    sionna,
-    spherical_wave,
-    turn,
-    unit,
-    vertical,
-    write_scenery,
-)
 
 from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import AntennaArray, Carrier, Channel
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.sionna.settings import SionnaSettings
+from caviar_services.channel.stability.formulas import (
+    C,
+    itu_permittivity,
+    mirrored,
+    reflected,
+    spherical_wave,
+    turn,
+    unit,
+    vertical,
+)
+from caviar_services.channel.stability.lab import (
+    Array,
+    Plate,
+    Thing,
+    antenna,
+    measure,
+    scene,
+    sionna,
+    write_scenery,
+)
 from caviar_services.service import Preparation, RunInfo
 
 pytestmark = pytest.mark.channel
@@ -109,7 +111,7 @@ def test_two_rays_over_ground_in_the_near_field(tmp_path: Path) -> None:
     channel = measure(model, scene(devices))
     assert channel.interactions.tolist() == [[0], [1]]
     transmit, receive = (places(a, c, g, frequency) for a, c, g in zip(arrays, (tx, rx), angles, strict=True))
-    eta = permittivity(5.24, 0.0, 0.0462, 0.7822, frequency)
+    eta = itu_permittivity(5.24, 0.0, 0.0462, 0.7822, frequency)
     expected = np.empty((len(receive), len(transmit)), complex)
     for m, n in np.ndindex(expected.shape):
         expected[m, n] = two_rays(transmit[n], receive[m], eta, frequency)

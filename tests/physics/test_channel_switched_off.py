@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from channel_lab import Plate, Thing, antenna, carriers, measure, scene, sionna, turn, write_scenery
 
 from caviar_protocol.topics import Channel, Interaction
 from caviar_services.channel.sionna import model as sionna_model
@@ -18,6 +17,17 @@ from caviar_services.channel.sionna.settings import (
     SurfaceMaterial,
     UsedSurfaces,
     contributing,
+)
+from caviar_services.channel.stability.formulas import turn
+from caviar_services.channel.stability.lab import (
+    Plate,
+    Thing,
+    antenna,
+    carriers,
+    measure,
+    scene,
+    sionna,
+    write_scenery,
 )
 from caviar_services.service import Preparation, RunInfo
 

@@ -21,7 +21,6 @@ import numpy as np
 import pytest
 from camera_world import prepared as cameras
 from camera_world import products, projected
-from channel_lab import measure, sionna
 from lidar_world import observed
 from lidar_world import prepared as lidars
 
@@ -38,6 +37,7 @@ from caviar_protocol.topics import (
     LidarScan,
     Scene,
 )
+from caviar_services.channel.stability.lab import measure, sionna
 from caviar_services.sensors.camera import CameraSettings
 from caviar_services.sensors.lidar import LidarSettings
 from caviar_services.world.assets import object_assets, scenery_assets

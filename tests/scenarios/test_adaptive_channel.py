@@ -22,8 +22,7 @@ from caviar_protocol.recording.reader import Imposed, recorded_decisions
 from caviar_protocol.scenario import Scenario, load_scenario
 from caviar_protocol.scenario.conversion import convert_settings
 from caviar_protocol.topics import Channel, Scene
-from caviar_services.channel.adaptive.calibration import rehearsal_scene
-from caviar_services.channel.adaptive.channel import TIMINGS, AdaptiveChannel
+from caviar_services.channel.adaptive.channel import TIMINGS, AdaptiveChannel, rehearsal_scene
 from caviar_services.channel.adaptive.controller import Workload
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo

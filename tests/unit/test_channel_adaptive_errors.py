@@ -11,7 +11,7 @@ import pytest
 
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.topics import Carrier, Channel, ChannelMatrix, ChannelOptions
-from caviar_services.channel.adaptive.error_bounds import (
+from caviar_services.channel.adaptive.calibration import (
     CEILING_DB,
     FLOOR_DB,
     WINDOW,

@@ -12,7 +12,7 @@ from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.space.coordinates import Vector, euler_from_quaternion
 from caviar_protocol.space.scene import antennas, device_pose
 from caviar_protocol.topics import AntennaArray
-from caviar_services.channel.adaptive.calibration import rehearsal_scene
+from caviar_services.channel.adaptive.channel import rehearsal_scene
 
 DEVICES = (
     DeviceSpec(

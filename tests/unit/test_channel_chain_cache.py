@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from caviar_services.channel.enumeration.chain_cache import ChainCache, cache_key
+from caviar_services.channel.enumeration.scenery_chains import ChainCache, cache_key
 
 TABLES = (np.array([[1, -1, -1], [1, 5, 2]], np.int32), np.array([[1, 2], [2, 1], [2, 5]], np.int32))
 KEY = cache_key(b"geometry", b"place")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from caviar_services.channel.enumeration import scenery_chains
-from caviar_services.channel.enumeration.face_rectangles import FaceRectangles, narrowest_sides
+from caviar_services.channel.enumeration.scene_faces import FaceRectangles, narrowest_sides
 from caviar_services.channel.enumeration.scenery_chains import ChainTree
 
 SIGHTS = np.array([[2, 5], [2, 7], [5, 2], [7, 2]])

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array
-from caviar_services.channel.enumeration.face_rectangles import RIM, FaceRectangles, narrowest_sides, ranges
+from caviar_services.channel.enumeration.scene_faces import RIM, FaceRectangles, narrowest_sides
+from caviar_services.channel.propagation.geometry import ranges
 from caviar_services.channel.sionna.planes import plane_numbers, two_sided_planes
 from caviar_services.mesh.shapes import Mesh, unit_box
 

@@ -13,7 +13,6 @@ from caviar_clients.cli.main import app
 from caviar_protocol.errors import AssetError, PayloadError
 from caviar_services.channel.stability import case as cases_module
 from caviar_services.channel.stability import formulas
-from caviar_services.channel.stability.bench import Bench
 from caviar_services.channel.stability.case import (
     Case,
     Outcome,
@@ -28,6 +27,7 @@ from caviar_services.channel.stability.case import (
     worst,
     wrong,
 )
+from caviar_services.channel.stability.lab import Lab
 
 QUICK = [case for case in cases() if not case.traced]
 
@@ -61,7 +61,7 @@ def test_a_wrong_speed_of_light_is_told(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_a_case_that_breaks_is_wrong_and_the_rest_goes_on() -> None:
-    def breaks(bench: Bench) -> Outcome:
+    def breaks(lab: Lab) -> Outcome:
         raise ZeroDivisionError("by hand")
 
     chosen = [Case(group="g", name="breaks", ask=breaks, traced=False), QUICK[0]]

@@ -86,12 +86,16 @@ def assemble(
     wideband = Wideband()
     if product.with_h or product.wideband:
         located = _located(product, row, table, offsets, geometry, a)
-        matrices = matrices or PlaneWaves()
+        made = (matrices or PlaneWaves)(product.carriers, transmitters, receivers, located)
         if product.with_h:
-            h = matrices(product.carriers, transmitters, receivers, located)
+            h = tuple(
+                ChannelMatrix(carrier=index, tx=pair // len(receivers), rx=pair % len(receivers), h=between)
+                for index in range(len(product.carriers))
+                for pair, between in enumerate(made.matrices(index))
+            )
         if product.wideband:
             bins = bins_of(product.wideband, product.carriers, geometry.tau, offsets)
-            responses = matrices.responses(bins, transmitters, receivers, located)
+            responses = (response for asked in bins for response in made.responses(asked))
             wideband = wideband_parts(bins, responses, len(receivers))
     if table.hidden is not None and table.hidden.any():
         shown = ~table.hidden

@@ -1,14 +1,29 @@
-"""When the rungs of a ladder are timed and their errors measured: before the first frame while frames run.
+"""A bound on the error of each pair on one rung, learned from frames that the reference computes too.
 
-Rehearsal scenes, which every rung is timed on before the first frame, have the scenario's antennas on bodies
-that drive. Errors are those against the reference; what a rung states follows from them.
+The error of a pair is the normalised mean square error of its matrices on all carriers against those of the
+reference, Σ‖H − Hᵣ‖² / Σ‖Hᵣ‖², in dB. Two things tell pairs apart before it is known:
+
+- the pair's error in the last check, since errors of successive frames are alike;
+- a score of its channel. Where rays were launched that is the split launch: the error of what half of the
+  rays would have found against what all of them did. Elsewhere it is the share of the power that arrives by
+  paths of the most interactions that the rung looks for: where these bring much, those of one more do.
+
+Stated is a quantile of the errors that were measured, each with a weight that falls with the distance of its
+score and last error from those of the pair: localized conformal prediction (L. Guan, "Localized conformal
+prediction: a generalized inference framework for conformal prediction", Biometrika 110, 2023). Errors of
+scenes that change are not exchangeable, so the quantile's level is tracked: raised by each error beyond its
+bound and lowered by each one within (I. Gibbs and E. Candès, "Adaptive conformal inference under distribution
+shift", NeurIPS 2021), which makes the share of errors within their bounds go to 0.9 however errors change.
+
+The level is tracked instead of an offset in dB, because errors in dB have two humps: a pair has all paths of
+the reference, or it lacks one.
 """
 
 from __future__ import annotations
 
+import base64
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import count, islice
+from collections.abc import Mapping, Sequence
 
 import msgspec
 import numpy as np
@@ -16,127 +31,227 @@ from msgspec.structs import replace
 
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import ScenarioError
-from caviar_protocol.scenario import DeviceSpec
-from caviar_protocol.scenario.schema import fixed_device, mounted_device
-from caviar_protocol.space.coordinates import Vector, quaternion_from_euler
-from caviar_protocol.topics import Channel, Scene
-from caviar_protocol.topics.scene import Device
-from caviar_services.channel.adaptive.error_bounds import (
-    BoundState,
-    ErrorBound,
-    errors_db,
-    pair_powers,
-    scores_db,
-)
+from caviar_protocol.topics import Channel
 from caviar_services.channel.adaptive.settings import Rung
 from caviar_services.channel.base import Modelled
 
-_NEAREST, _SPACING = 12.0, 3.0
-"""[m]: bodies stand about the first fixed antenna on a spiral."""
+SHARE = 0.9
+"""Of errors that bounds shall hold for."""
 
-_GOLDEN_ANGLE = 2.4
-"""[rad] from one to the next: never in line."""
+FLOOR_DB, CEILING_DB = -60.0, 20.0
+"""Errors and scores beyond are taken for these: below, matrices are equal for all that links do with them."""
 
-_TRIED = 20
-"""Places on the spiral that are looked at for each one that is needed."""
+STEP_DB = 0.5
+"""What is remembered is rounded to, so that it fits into a byte."""
 
-_DIMENSIONS = (4.5, 1.8, 1.6)
-"""Of a body [m]: a car's."""
+WINDOW = 200
+"""Errors that are remembered."""
 
-_HEIGHT = 1.5
-"""[m] above the ground, of antennas whose objects have no body."""
+# Errors of one check that are remembered: those of one frame are alike.
+_MOST_AT_ONCE = 50
 
-_STEP = 0.5
-"""[m] that bodies drive from one scene to the next: far enough that nothing is where it was."""
+# Errors that count as measured before the first check: twice as much power as there is, and four times.
+_ASSUMED_DB = (3.0, 6.0)
+# Behind it: that much above the largest one that was measured, where this is less.
+_ASSUMED_ABOVE_DB = (1.0, 3.0)
+# Measured errors up to which each of the assumed ones weighs as much as one of them; of n its weight is
+# (10/n)³, so that bounds are wide in the first frames alone.
+_ASSUMED_UNTIL = 10
 
-Free = Callable[[Vector], bool]
-"""Whether a body may stand at a place."""
+# Distance of scores, or of last errors, at which a measured error weighs exp(−1/2).
+_WIDTH_DB = 8.0
+# Of an error that was measured of quite another channel.
+_LEAST_WEIGHT = 0.02
+# Squared distance, in widths, to a last error that is not known.
+_UNKNOWN = 0.5
+
+# Change of the level by an error beyond its bound, over `SHARE`.
+_TRACKING = 0.04
+# Errors of one check that count: more of one frame, which are alike, would throw the level to and fro.
+_TRACKED_AT_ONCE = 10
+_LEVELS = (0.0, 1.2)
+# What a level of 2 would add to the largest error: levels above 1 are of errors larger than any measured.
+_BEYOND_DB = 100.0
+
+# Frames after which the last error says nothing any more.
+_LAST_FRAMES = 30
+
+_ROUNDING_DB = 1e-6
+_NOT_KNOWN = 255
+_LEVEL_STEPS = 10_000
 
 
-def rehearsal_scene(
-    devices: Sequence[DeviceSpec],
-    room: Mapping[str, int],
-    ground_m: float = 0.0,
-    is_free: Free = lambda place: True,
-    step: int = 0,
-) -> Scene:
-    """All antennas that a scenario announces, and traffic: bodies that carry them, and as many that do not.
+def errors_db(channel: Channel, reference: Channel) -> Float64Array:
+    """NMSE of each pair's matrices [dB], Shape ``[T·R]``; NaN where the reference has no path.
 
-    Parameters
-    ----------
-    devices
-        Of the scenario.
-    room
-        Bodies of each mesh that there may be, by asset; ``""`` is a box.
-    ground_m
-        Height of the ground [m].
-    is_free
-        Places where it is not true are left out, if there are enough others.
-    step
-        Scenes of successive steps are those of traffic that drives.
+    Both are of the same scene, with matrices.
     """
-    antennas = [spec for spec in devices if spec.kind == "antenna" and spec.role]
-    fixed = [spec for spec in antennas if not spec.on]
-    mounted = [spec for spec in antennas if spec.on for _ in range(spec.count)]
-    found: list[Device] = [fixed_device(spec) for spec in fixed]
-    middle = fixed[0].position_m if fixed else (0.0, 0.0, 0.0)
-    spiral = _places(middle, ground_m + _DIMENSIONS[2] / 2, is_free, 2 * len(mounted))
-    assets, names, position, orientation, velocity = _bodies(room), [], [], [], []
-    for number, (place, heading) in enumerate(spiral):
-        spec = mounted[number] if number < len(mounted) else None
-        name, asset = f"rehearsal-{number:04d}", next(assets, None)
-        along = np.array([math.cos(heading), math.sin(heading), 0.0])
-        here = np.array(place) + step * _STEP * along
-        carried = None if spec is None else mounted_device(spec, name, _DIMENSIONS)
-        # An antenna in the middle of its object would be inside a body: its object is to have none.
-        if carried is not None and (asset is None or carried.position == (0.0, 0.0, 0.0)):
-            x, y, _ = here.tolist()
-            found.append(_alone(carried, (x, y, ground_m + _HEIGHT + 0.1 * number)))
-        elif asset is not None:
-            found += [] if carried is None else [carried]
-            names.append((name, asset))
-            position.append(here)
-            orientation.append(quaternion_from_euler(heading))
-            velocity.append(_STEP * along)
-    size = len(names)
-    return Scene(
-        names=tuple(name for name, _ in names),
-        classes=("",) * size,
-        assets=tuple(asset for _, asset in names),
-        position=np.array(position).reshape(-1, 3),
-        orientation=np.array(orientation).reshape(-1, 4),
-        velocity=np.array(velocity).reshape(-1, 3),
-        dimensions=np.tile(_DIMENSIONS, (size, 1)),
-        devices=tuple(sorted(found, key=lambda device: device.name)),
-    )
+    error, power = np.zeros((2, len(channel.tx) * len(channel.rx)))
+    for mine, true in zip(channel.h, reference.h, strict=True):
+        pair = mine.tx * len(channel.rx) + mine.rx
+        error[pair] += (np.abs(mine.h - true.h) ** 2).sum()
+        power[pair] += (np.abs(true.h) ** 2).sum()
+    known = power > 0
+    return np.where(known, in_db(error / np.where(known, power, 1.0)), np.nan)
 
 
-def _places(middle: Vector, height: float, is_free: Free, wanted: int) -> list[tuple[Vector, float]]:
-    """Places on the spiral, free ones first, and headings along it [rad]."""
-
-    def place(number: int) -> tuple[Vector, float]:
-        radius, angle = _NEAREST + _SPACING * number, _GOLDEN_ANGLE * number
-        x, y = middle[0] + radius * math.cos(angle), middle[1] + radius * math.sin(angle)
-        return (x, y, height), angle + math.pi / 2
-
-    every = [place(number) for number in range(_TRIED * wanted)]
-    free = list(islice((found for found in every if is_free(found[0])), wanted))
-    return free if len(free) == wanted else [*free, *(found for found in every if found not in free)][:wanted]
+def scores_db(modelled: Modelled) -> Float64Array:
+    """What tells how far each pair's channel may be off [dB], Shape ``[T·R]``; see above."""
+    if modelled.split_nmse is not None:
+        return in_db(modelled.split_nmse.ravel())
+    channel = modelled.channel
+    last = (channel.interactions != 0).sum(1) == channel.options.max_depth
+    power = (np.abs(channel.a) ** 2).sum(0)
+    every = pair_powers(channel)
+    return in_db(_of_pairs(channel, power * last) / np.where(every > 0, every, 1.0))
 
 
-def _bodies(room: Mapping[str, int]) -> Iterator[str]:
-    """Assets by turns while there is room; boxes where there is no mesh."""
-    meshes = {asset: size for asset, size in room.items() if asset} or dict(room)
-    for turn in count():
-        left = [asset for asset in sorted(meshes) if turn < meshes[asset]]
-        if not left:
+def pair_powers(channel: Channel) -> Float64Array:
+    """Σ|a|² of each pair over all carriers, Shape ``[T·R]``."""
+    return _of_pairs(channel, (np.abs(channel.a) ** 2).sum(0))
+
+
+def _of_pairs(channel: Channel, values: Float64Array) -> Float64Array:
+    """Sums over the paths of each pair, each by itself: beside a strong pair a weak one keeps its digits."""
+    pair = np.repeat(np.arange(len(channel.offsets) - 1), np.diff(channel.offsets))
+    return np.bincount(pair, weights=values, minlength=len(channel.offsets) - 1).astype(np.float64)
+
+
+def in_db(ratio: Float64Array) -> Float64Array:
+    """Ratios of powers in dB, between floor and ceiling."""
+    least, most = 10 ** (FLOOR_DB / 10), 10 ** (CEILING_DB / 10)
+    found: Float64Array = 10 * np.log10(np.clip(ratio, least, most))
+    return found
+
+
+class BoundState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """An `ErrorBound` between two frames."""
+
+    learned: str
+    last: dict[str, tuple[int, float]]
+    measured: int
+
+
+class ErrorBound:
+    """Bounds of one rung.
+
+    Args:
+        declared_db: Error that the scenario expects [dB]; it takes the place of what is assumed before the
+            first check.
+    """
+
+    def __init__(self, declared_db: float | None = None) -> None:
+        self._assumed = np.array(_ASSUMED_DB if declared_db is None else (declared_db, declared_db))
+        self.measured = 0
+        """Checks so far."""
+        self.reset()
+
+    def reset(self) -> None:
+        """Know nothing."""
+        self.measured = 0
+        self._level = SHARE
+        # Score, last error and error of what was measured, in steps, Shape ``[N, 3]``.
+        self._known = np.zeros((0, 3), np.uint8)
+        self.forget_pairs()
+
+    def forget_pairs(self) -> None:
+        """Another episode: pairs are elsewhere, whatever their names."""
+        self._last: dict[str, tuple[int, float]] = {}
+
+    @property
+    def level(self) -> float:
+        """Of the quantile that is stated."""
+        return self._level
+
+    def bounds_db(self, frame: int, pairs: Sequence[str], scores: Float64Array) -> Float64Array:
+        """What is stated of pairs [dB], rounded up to 0.1 dB.
+
+        Args:
+            frame: Its number in the episode.
+            pairs: Their names.
+            scores: Of their channels [dB], Shape ``[len(pairs)]``.
+        """
+        values, last = self._known * STEP_DB + FLOOR_DB, self._last_errors(frame, pairs)
+        count = len(values)
+        distance = ((values[:, 0] - scores[:, None]) / _WIDTH_DB) ** 2
+        known = (self._known[:, 1] != _NOT_KNOWN) & ~np.isnan(last)[:, None]
+        apart = ((values[:, 1] - np.nan_to_num(last)[:, None]) / _WIDTH_DB) ** 2
+        weight = np.exp(-(distance + np.where(known, apart, _UNKNOWN)) / 2) + _LEAST_WEIGHT
+        if count:
+            weight *= count / weight.sum(1, keepdims=True)
+        assumed = self._assumed
+        if count:
+            assumed = np.minimum(_ASSUMED_DB, values[:, 2].max() + np.array(_ASSUMED_ABOVE_DB))
+        of_assumed = (_ASSUMED_UNTIL / max(count, _ASSUMED_UNTIL)) ** 3
+        weight = np.pad(weight, ((0, 0), (0, len(assumed))), constant_values=of_assumed)
+        every = np.concatenate([values[:, 2], assumed])
+        order = np.argsort(every, kind="stable")
+        share = np.cumsum(weight[:, order], axis=1)
+        below = share < (self._level - 1e-9) * share[:, -1:]
+        bound = every[order][np.minimum(below.sum(1), len(every) - 1)]
+        bound = bound + max(self._level - 1.0, 0.0) * _BEYOND_DB
+        rounded: Float64Array = np.ceil(bound * 10 - 1e-6) / 10
+        return rounded
+
+    def check(self, frame: int, pairs: Sequence[str], scores: Float64Array, errors: Float64Array) -> int:
+        """Take note of the errors of pairs [dB]; how many were within their bounds."""
+        held = errors <= self.bounds_db(frame, pairs, scores) + _ROUNDING_DB
+        if self.measured and len(errors):
+            missed = 1 - held.mean()
+            level = self._level + _TRACKING * (missed - (1 - SHARE)) * min(len(errors), _TRACKED_AT_ONCE)
+            self._level = round(min(max(level, _LEVELS[0]), _LEVELS[1]) * _LEVEL_STEPS) / _LEVEL_STEPS
+        last = self._last_errors(frame, pairs)
+        before = np.where(np.isnan(last), _NOT_KNOWN, _steps(last))
+        found = np.stack([_steps(scores), before, _steps(errors, up=True)], axis=1).astype(np.uint8)
+        every = -(-len(found) // _MOST_AT_ONCE)
+        self._known = np.concatenate([self._known, found[:: max(every, 1)]])[-WINDOW:]
+        self._last = {pair: (frame, error) for pair, error in zip(pairs, errors.tolist(), strict=True)}
+        self.measured += 1
+        return int(held.sum())
+
+    def _last_errors(self, frame: int, pairs: Sequence[str]) -> Float64Array:
+        """Error of each pair in the last check [dB]; NaN where it is too old or there is none."""
+        never = (-math.inf, math.nan)
+        found = [self._last.get(pair, never) for pair in pairs]
+        return np.array([error if frame - at <= _LAST_FRAMES else math.nan for at, error in found])
+
+    # --- what outlives a frame, an episode, a process ----------------------------------------------
+
+    @property
+    def learned(self) -> str:
+        """Level and measured errors as a text; empty: none."""
+        if not self.measured:
+            return ""
+        level = round(self._level * _LEVEL_STEPS).to_bytes(2, "big")
+        return base64.b64encode(level + self._known.tobytes()).decode("ascii")
+
+    def learn(self, text: str) -> None:
+        """Know what another one had `learned`. Raises `ValueError` where that is no such text."""
+        self.reset()
+        if not text:
             return
-        yield from left
+        content = base64.b64decode(text, validate=True)
+        if len(content) < 2 or (len(content) - 2) % 3 or len(content) > 2 + 3 * WINDOW:
+            raise ValueError(f"{len(content)} bytes are no level and errors")
+        self._level = int.from_bytes(content[:2], "big") / _LEVEL_STEPS
+        self._known = np.frombuffer(content[2:], np.uint8).reshape(-1, 3).copy()
+        self.measured = 1
+
+    @property
+    def state(self) -> BoundState:
+        """All that is known."""
+        return BoundState(learned=self.learned, last=dict(self._last), measured=self.measured)
+
+    def go_on(self, state: BoundState) -> None:
+        """Know what another one knew."""
+        self.learn(state.learned)
+        self._last, self.measured = dict(state.last), state.measured
 
 
-def _alone(device: Device, position: Vector) -> Device:
-    """A device that stands in the world."""
-    return replace(device, parent="", position=position)
+def _steps(values: Float64Array, *, up: bool = False) -> Float64Array:
+    """Values [dB] in steps above the floor."""
+    steps = (np.clip(np.nan_to_num(values), FLOOR_DB, CEILING_DB) - FLOOR_DB) / STEP_DB
+    return np.ceil(steps - 1e-6) if up else np.round(steps)
 
 
 DECISION = "state:errors"
@@ -155,12 +270,10 @@ class CalibrationState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 class Calibration:
     """Bounds on the errors of all rungs.
 
-    Parameters
-    ----------
-    rungs
-        The ladder, and behind it a reference that is no rung.
-    every
-        Frames from one check to the next; 0: there are none, and only errors that rungs declare are stated.
+    Args:
+        rungs: The ladder, and behind it a reference that is no rung.
+        every: Frames from one check to the next; 0: there are none, and only errors that rungs declare are
+            stated.
     """
 
     def __init__(self, rungs: Sequence[Rung], every: int) -> None:

@@ -43,27 +43,27 @@ REVERSION = 128
 OBJECTS = 10.0
 """Moving objects whose cost is compared with that of a scene without."""
 
+# Older ratios weigh less than two percent together.
 _WINDOW = 6 * HALF_LIFE
-"""Older ratios weigh less than two percent together."""
 
+# Frames that are taken to have gone by before the first, so that it alone decides little.
 _ASSUMED = 32
-"""Frames that are taken to have gone by before the first, so that it alone decides little."""
+# Their standard deviation: what a machine with other things to do showed.
 _ASSUMED_SCATTER = 0.15
-"""Their standard deviation: what a machine with other things to do showed."""
 
 _PRIOR = np.array([0.0, 0.5, 0.1])
+# Of bias, α and β: half of a frame grows with its pairs, a little with its objects.
 _PRIOR_DEVIATION = np.array([0.2, 0.3, 0.2])
-"""Of bias, α and β: half of a frame grows with its pairs, a little with its objects."""
 
+# Of load before the first frame: the timings are of another scene.
 _LOAD_DEVIATION = 0.3
-"""Of load before the first frame: the timings are of another scene."""
+# Standard deviation of what load changes from one frame to the next.
 _LOAD_STEP = 0.06
-"""Standard deviation of what load changes from one frame to the next."""
+# Standard deviation of a frame, as far as it decides how fast is learned.
 _SCATTER = 0.1
-"""Standard deviation of a frame, as far as it decides how fast is learned."""
+# One frame that is so far from what was expected says only that it was slower or faster, not how much; the
+# second in a row, that something has changed.
 _SURPRISE = 0.5
-"""One frame that is so far from what was expected says only that it was slower or faster, not how much; the
-second in a row, that something has changed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,14 +96,10 @@ class CostState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 class CostModel:
     """Durations of the next frame on every rung, as quantiles.
 
-    Parameters
-    ----------
-    timings_ns
-        What each rung took before the first frame [ns], a few times each.
-    work
-        What those timings are of.
-    quantile
-        That predictions state, in (0, 1).
+    Args:
+        timings_ns: What each rung took before the first frame [ns], a few times each.
+        work: What those timings are of.
+        quantile: That predictions state, in (0, 1).
     """
 
     def __init__(self, timings_ns: Sequence[Sequence[int]], work: Workload, quantile: float) -> None:
@@ -117,13 +113,13 @@ class CostModel:
         self._kept = np.concatenate([[1.0], np.full(3 * count, kept)])
         # What makes the prior the spread that a rung goes back to.
         self._drift = np.diag(np.concatenate([[_LOAD_STEP], deviation * math.sqrt(1 - kept**2)]) ** 2)
+        # Of the last frame: 1 slower than expected by far, −1 faster by far.
         self._side = 0
-        """Of the last frame: 1 slower than expected by far, −1 faster by far."""
+        # What has changed if the next one is so, too: the load, or the bias of the rung that came.
         self._changed = 0
-        """What has changed if the next one is so, too: the load, or the bias of the rung that came."""
         self._rung: int | None = None
+        # Logarithm of what the stated quantile is raised by.
         self._raised = 0.0
-        """Logarithm of what the stated quantile is raised by."""
         self._rows: deque[Float64Array] = deque(maxlen=_WINDOW)
         self._measured: deque[float] = deque(maxlen=_WINDOW)
         self._expected: deque[float] = deque(maxlen=_WINDOW)
@@ -273,14 +269,10 @@ class Controller:
     ``margin`` to spare, in each of the last ``patience`` frames. So noise about a border does not make the
     products change their quality from frame to frame.
 
-    Parameters
-    ----------
-    share
-        Of the budget that a prediction may take: the rest is for decoding, encoding, and surprises.
-    margin
-        Share of that which must be spare before going up.
-    patience
-        Frames in a row that must have it.
+    Args:
+        share: Of the budget that a prediction may take: the rest is for decoding, encoding, and surprises.
+        margin: Share of that which must be spare before going up.
+        patience: Frames in a row that must have it.
     """
 
     def __init__(self, share: float, margin: float, patience: int) -> None:

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Protocol, TypeVar
 
 import numpy as np
 
 from caviar_protocol.arrays import Complex64Array, Complex128Array, Float64Array, Int64Array
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
-from caviar_protocol.topics import Carrier, ChannelMatrix
+from caviar_protocol.topics import Carrier
 from caviar_services.antenna_arrays import steering_vector
 from caviar_services.channel.paths import Antenna
 from caviar_services.channel.propagation.geometry import PathGeometry
 from caviar_services.channel.propagation.patterns import radiated_field
 from caviar_services.channel.wideband import Bins, superposed
 
+# Products of elements that are summed together: OpenBLAS shares twice as many out to threads.
 _PRODUCTS = 32_768
-"""Products of elements that are summed together: OpenBLAS shares twice as many out to threads."""
 
 
 def summed(receive: Complex128Array, transmit: Complex128Array) -> Complex128Array:
@@ -54,26 +54,18 @@ class Located:
     """As in `Product`."""
 
 
-class Matrices(Protocol):
-    """Makes the matrices of a product from its paths, at the carriers and over the band."""
+class PairMatrices(Protocol):
+    """Matrices between the antennas of all pairs of a frame, transmitters slowest."""
 
-    def __call__(
-        self,
-        carriers: Sequence[Carrier],
-        transmitters: Sequence[Antenna],
-        receivers: Sequence[Antenna],
-        located: Located,
-    ) -> tuple[ChannelMatrix, ...]:
-        """H of every carrier and pair, carriers slowest."""
+    def matrices(self, index: int) -> Iterator[Complex128Array]:
+        """H of each pair on a carrier, by its index, Shape ``[Nr, Nt]`` each."""
 
-    def responses(
-        self,
-        bins: Sequence[Bins],
-        transmitters: Sequence[Antenna],
-        receivers: Sequence[Antenna],
-        located: Located,
-    ) -> Iterator[Complex64Array]:
-        """What `Bins` ask for, of each of them and each pair, pairs fastest; Shape ``[J, Nr, Nt]`` each."""
+    def responses(self, asked: Bins) -> Iterator[Complex64Array]:
+        """What `Bins` ask for of each pair, Shape ``[J, Nr, Nt]`` each."""
+
+
+Matrices = Callable[[Sequence[Carrier], Sequence[Antenna], Sequence[Antenna], Located], PairMatrices]
+"""Makes the matrices of a product from its carriers, transmitters, receivers and paths."""
 
 
 class PlaneWaves:
@@ -82,36 +74,37 @@ class PlaneWaves:
 
     With several subarrays the sum holds for each block of H, with the amplitudes between these two and the
     phases of their centres.
+
+    Args:
+        carriers: Of the product.
+        transmitters: In its order; receivers likewise.
+        receivers: See ``transmitters``.
+        located: Its paths.
     """
 
-    def __call__(
+    def __init__(
         self,
         carriers: Sequence[Carrier],
         transmitters: Sequence[Antenna],
         receivers: Sequence[Antenna],
         located: Located,
-    ) -> tuple[ChannelMatrix, ...]:
-        steered = _steered(transmitters, receivers, located)
-        return tuple(
-            ChannelMatrix(carrier=index, tx=pair // len(receivers), rx=pair % len(receivers), h=h)
-            for index, carrier in enumerate(carriers)
-            for pair, h in enumerate(of.h(index, carrier) for of in steered)
-        )
+    ) -> None:
+        self._carriers, self._geometry = carriers, located.geometry
+        self._pairs = [
+            _Steered.of(antennas, slice(*ends), located)
+            for antennas, ends in zip(
+                product(transmitters, receivers), pairwise(located.offsets.tolist()), strict=True
+            )
+        ]
 
-    def responses(
-        self,
-        bins: Sequence[Bins],
-        transmitters: Sequence[Antenna],
-        receivers: Sequence[Antenna],
-        located: Located,
-    ) -> Iterator[Complex64Array]:
-        geometry = located.geometry
-        steered = _steered(transmitters, receivers, located)
-        for asked in bins:
-            doppler = geometry.doppler_ratio * asked.carrier.frequency_hz
-            for pair, of in enumerate(steered):
-                weights = asked.weights(pair, geometry.tau[of.mine], doppler[of.mine])
-                yield of.response(asked.index, asked.carrier, weights)
+    def matrices(self, index: int) -> Iterator[Complex128Array]:
+        return (pair.h(index, self._carriers[index]) for pair in self._pairs)
+
+    def responses(self, asked: Bins) -> Iterator[Complex64Array]:
+        doppler = self._geometry.doppler_ratio * asked.carrier.frequency_hz
+        for number, pair in enumerate(self._pairs):
+            weights = asked.weights(number, self._geometry.tau[pair.mine], doppler[pair.mine])
+            yield pair.response(asked.index, asked.carrier, weights)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +118,16 @@ class _Steered:
     transmit: list[Complex128Array]
     """Of each subarray of the transmitter, Shape ``[p, N]`` each; ``receive`` likewise."""
     receive: list[Complex128Array]
+
+    @classmethod
+    def of(cls, antennas: tuple[Antenna, Antenna], mine: slice, located: Located) -> _Steered:
+        """Of a pair whose paths are the rows ``mine``."""
+        towards = located.geometry.departure[mine], located.geometry.arrival[mine]
+        transmit, receive = (
+            [steering_vector(part.array, along @ part.rotation) for part in end.subarrays]
+            for end, along in zip(antennas, towards, strict=True)
+        )
+        return cls(antennas, mine, located, transmit, receive)
 
     def h(self, index: int, carrier: Carrier) -> Complex128Array:
         """H on a carrier, which is the ``index``-th."""
@@ -161,20 +164,6 @@ class _Steered:
         return a[:, :, 0] * _centre_phases(carrier, self.antennas, towards)
 
 
-def _steered(
-    transmitters: Sequence[Antenna], receivers: Sequence[Antenna], located: Located
-) -> list[_Steered]:
-    """The paths of each pair."""
-    geometry, found = located.geometry, []
-    for pair, (begin, end) in enumerate(pairwise(located.offsets.tolist())):
-        antennas = transmitters[pair // len(receivers)], receivers[pair % len(receivers)]
-        mine = slice(begin, end)
-        transmit = [_steering(part, geometry.departure[mine]) for part in antennas[0].subarrays]
-        receive = [_steering(part, geometry.arrival[mine]) for part in antennas[1].subarrays]
-        found.append(_Steered(antennas, mine, located, transmit, receive))
-    return found
-
-
 Blocks = TypeVar("Blocks", Complex64Array, Complex128Array)
 
 
@@ -201,14 +190,10 @@ def subarray_amplitudes(
     """Amplitudes of paths between elements at the devices' positions, of each subarray of a receiver and each
     of a transmitter, Shape ``[R, T, C, P]``.
 
-    Parameters
-    ----------
-    antennas
-        Transmitter and receiver.
-    towards
-        Directions of departure and of arrival in world axes, Shape ``[P, 3]`` each.
-    transfer, phase
-        As in `PathTable` and from `carrier_phase`, of these paths.
+    Args:
+        antennas: Transmitter and receiver.
+        towards: Directions of departure and of arrival in world axes, Shape ``[P, 3]`` each.
+        transfer, phase: As in `PathTable` and from `carrier_phase`, of these paths.
     """
     sent, taken = (
         np.array([radiated_field(part.array, part.rotation, along, part.pattern) for part in end.subarrays])
@@ -229,7 +214,3 @@ def _centre_phases(
     metres = nearer[1][:, None] + nearer[0][None]
     phases: Complex128Array = np.exp(2j * np.pi * carrier.frequency_hz / SPEED_OF_LIGHT * metres)
     return phases
-
-
-def _steering(antenna: Antenna, directions: Float64Array) -> Complex128Array:
-    return steering_vector(antenna.array, directions @ antenna.rotation)

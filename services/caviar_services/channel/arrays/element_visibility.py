@@ -35,24 +35,24 @@ class Look:
     """Whether there are paths by way of planes ``[Q, D]``, −1 behind the last, between ends ``[Q, 3]``."""
 
 
+# [m]; rays from face to face start this far from the first, whose points are known to some 1e-5 m.
 _OFF_SURFACE = 2e-4
-"""[m]; rays from face to face start this far from the first, whose points are known to some 1e-5 m."""
 
+# [m]; rays to and from an edge pass this far outside of it.
 _OFF_EDGE = 1e-3
-"""[m]; rays to and from an edge pass this far outside of it."""
 
+# [m]; a surface this near a segment's end is what stands there.
 _AT_END = 1e-2
-"""[m]; a surface this near a segment's end is what stands there."""
 
+# Elements of each side of the arrays that are looked at first, at most, by the number of sides there are.
 _NODES = (1, 33, 17, 7, 5)
-"""Elements of each side of the arrays that are looked at first, at most, by the number of sides there are."""
 
 
+# Memory that looking at one pair of elements takes, for each segment that a path can have.
 _LANE_BYTES = 320
-"""Memory that looking at one pair of elements takes, for each segment that a path can have."""
 
+# [bytes]; more at once is no faster.
 _AT_ONCE = 1 << 28
-"""[bytes]; more at once is no faster."""
 
 
 @dataclass(frozen=True, eq=False)

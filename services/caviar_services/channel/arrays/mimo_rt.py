@@ -10,14 +10,15 @@ its answer is that of a neighbouring element. Paths of reflections alone are ask
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 
 import numpy as np
 
 from caviar_protocol.arrays import Complex64Array, Complex128Array, Float64Array, Int64Array
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
-from caviar_protocol.topics import Carrier, ChannelMatrix, Interaction
+from caviar_protocol.topics import Carrier, Interaction
 from caviar_services.channel.arrays.channel_matrices import Located
 from caviar_services.channel.arrays.element_visibility import elements
 from caviar_services.channel.paths import Antenna, PathTable, antenna_fields
@@ -35,22 +36,14 @@ from caviar_services.channel.wideband import Bins
 class ElementTracer:
     """Makes the matrices of a frame, by traces between elements.
 
-    Parameters
-    ----------
-    tracer
-        Set up for the options of the scenario.
-    scene
-        Of the frame.
-    velocity
-        Of each object of the scene [m/s], Shape ``[len(scene.names), 3]``.
-    wavelengths
-        Of the carriers [m].
-    lanes
-        Candidates looked at together at most.
-    los
-        Whether straight paths count.
-    foliage
-        Of the frame; None: there is none.
+    Args:
+        tracer: Set up for the options of the scenario.
+        scene: Of the frame.
+        velocity: Of each object of the scene [m/s], Shape ``[len(scene.names), 3]``.
+        wavelengths: Of the carriers [m].
+        lanes: Candidates looked at together at most.
+        los: Whether straight paths count.
+        foliage: Of the frame; None: there is none.
     """
 
     def __init__(
@@ -73,8 +66,6 @@ class ElementTracer:
         self.counts: list[Int64Array] = []
         """Paths between elements in this frame, of each carrier and transmitter: Shape ``[M, N]``, M elements
         of all receivers."""
-        self._traced: dict[tuple[int, int], list[_ElementPaths]] = {}
-        """Of each transmitting element, by carrier and transmitter: the parts of a product share them."""
 
     def __call__(
         self,
@@ -82,62 +73,12 @@ class ElementTracer:
         transmitters: Sequence[Antenna],
         receivers: Sequence[Antenna],
         located: Located,
-    ) -> tuple[ChannelMatrix, ...]:
-        made: list[ChannelMatrix] = []
-        ends = np.cumsum([antenna.array.size for antenna in receivers]).tolist()
-        for carrier in range(len(carriers)):
-            for t in range(len(transmitters)):
-                columns = self._paths_of(carrier, t, carriers, transmitters, receivers, located)
-                h = np.stack([column.summed(column.a) for column in columns], axis=1)
-                self.counts.append(np.stack([column.counts for column in columns], axis=1))
-                made += [
-                    ChannelMatrix(carrier=carrier, tx=t, rx=r, h=h[end - receiver.array.size : end])
-                    for r, (receiver, end) in enumerate(zip(receivers, ends, strict=True))
-                ]
-        return tuple(made)
+    ) -> _TracedPairs:
+        """Matrices that are traced when they are asked for; the arguments are those of `PlaneWaves`."""
+        return _TracedPairs(self, carriers, transmitters, receivers, located)
 
-    def responses(
-        self,
-        bins: Sequence[Bins],
-        transmitters: Sequence[Antenna],
-        receivers: Sequence[Antenna],
-        located: Located,
-    ) -> Iterator[Complex64Array]:
-        sizes = [antenna.array.size for antenna in receivers]
-        ends = np.cumsum(sizes).tolist()
-        for asked in bins:
-            carriers = {asked.index: asked.carrier}
-            for t in range(len(transmitters)):
-                columns = self._paths_of(asked.index, t, carriers, transmitters, receivers, located)
-                for r, (end, size) in enumerate(zip(ends, sizes, strict=True)):
-                    pair = t * len(receivers) + r
-                    of_elements = [
-                        column.weighted(asked, pair, end - size, end).astype(np.complex64)
-                        for column in columns
-                    ]
-                    yield np.stack(of_elements, axis=-1)
-
-    def _paths_of(
-        self,
-        carrier: int,
-        t: int,
-        carriers: Sequence[Carrier] | Mapping[int, Carrier],
-        transmitters: Sequence[Antenna],
-        receivers: Sequence[Antenna],
-        located: Located,
-    ) -> list[_ElementPaths]:
-        """Paths from each element of a transmitter to those of all receivers, traced once."""
-        if (carrier, t) not in self._traced:
-            wavelength = SPEED_OF_LIGHT / carriers[carrier].frequency_hz
-            targets = self._ends(receivers, wavelength)
-            self._traced[carrier, t] = [
-                self._column(carrier, wavelength, source, targets, located)
-                for source in self._ends([transmitters[t]], wavelength)
-            ]
-        return self._traced[carrier, t]
-
-    def _ends(self, antennas: Sequence[Antenna], wavelength: float) -> list[_Element]:
-        """All elements of these antennas, in order."""
+    def elements(self, antennas: Sequence[Antenna], wavelength: float) -> list[_Element]:
+        """All elements of antennas, in order; arrays are given in wavelengths [m]."""
         parts = [part for antenna in antennas for part in antenna.subarrays]
         placed = elements(parts, wavelength)
         return [
@@ -146,23 +87,22 @@ class ElementTracer:
             for at in placed.of(index)
         ]
 
-    def _column(
+    def column(
         self,
         carrier: int,
         wavelength: float,
         source: _Element,
         targets: Sequence[_Element],
-        located: Located,
+        absorption_db_per_km: Float64Array | None,
     ) -> _ElementPaths:
-        """What arrives from one transmitting element at M receiving ones."""
+        """What arrives from one transmitting element at M receiving ones, at a wavelength [m]."""
         others = np.flatnonzero([target.place.name != source.place.name for target in targets])
         ends = [targets[index] for index in others.tolist()]
         table = self._paths(source, ends)
         a, geometry = self._amplitudes(carrier, wavelength, table, source.place, [end.place for end in ends])
         target = others[table.pair]
-        if located.absorption_db_per_km is not None:
-            per_km = located.absorption_db_per_km[carrier : carrier + 1]
-            a = a * amplitude_factor(per_km, geometry.tau)[0]
+        if absorption_db_per_km is not None:
+            a = a * amplitude_factor(absorption_db_per_km[carrier : carrier + 1], geometry.tau)[0]
         # The tracer's order may change with threads, and a sum with its order.
         order = np.lexsort([a.imag, a.real, target])
         finite = order[np.isfinite(a[order])]
@@ -224,6 +164,56 @@ class ElementTracer:
             phase = np.exp(-2j * np.pi * (turns - np.round(turns)))
             a: Complex128Array = np.einsum("pi,pij,pj->p", taken, table.transfer[carrier], sent) * phase
         return a, geometry
+
+
+class _TracedPairs:
+    """The matrices of a frame: each transmitting element is traced once on each carrier."""
+
+    def __init__(
+        self,
+        tracer: ElementTracer,
+        carriers: Sequence[Carrier],
+        transmitters: Sequence[Antenna],
+        receivers: Sequence[Antenna],
+        located: Located,
+    ) -> None:
+        self._tracer, self._carriers, self._transmitters = tracer, carriers, transmitters
+        self._absorption = located.absorption_db_per_km
+        self._receivers = receivers
+        sizes = [antenna.array.size for antenna in receivers]
+        # Receiving elements of each receiver, among those of all.
+        self._rows = [slice(end - size, end) for end, size in zip(accumulate(sizes), sizes, strict=True)]
+        # By carrier and transmitter: H and the wideband parts are made of the same traces, which cost most.
+        self._columns: dict[tuple[int, int], list[_ElementPaths]] = {}
+
+    def matrices(self, index: int) -> Iterator[Complex128Array]:
+        for t in range(len(self._transmitters)):
+            columns = self._traced(index, t)
+            h = np.stack([column.summed(column.a) for column in columns], axis=1)
+            self._tracer.counts.append(np.stack([column.counts for column in columns], axis=1))
+            yield from (h[rows] for rows in self._rows)
+
+    def responses(self, asked: Bins) -> Iterator[Complex64Array]:
+        for t in range(len(self._transmitters)):
+            columns = self._traced(asked.index, t)
+            for r, rows in enumerate(self._rows):
+                pair = t * len(self._rows) + r
+                of_elements = [
+                    column.weighted(asked, pair, rows.start, rows.stop).astype(np.complex64)
+                    for column in columns
+                ]
+                yield np.stack(of_elements, axis=-1)
+
+    def _traced(self, carrier: int, t: int) -> list[_ElementPaths]:
+        """Paths from each element of a transmitter to those of all receivers."""
+        if (carrier, t) not in self._columns:
+            wavelength = SPEED_OF_LIGHT / self._carriers[carrier].frequency_hz
+            targets = self._tracer.elements(self._receivers, wavelength)
+            self._columns[carrier, t] = [
+                self._tracer.column(carrier, wavelength, source, targets, self._absorption)
+                for source in self._tracer.elements([self._transmitters[t]], wavelength)
+            ]
+        return self._columns[carrier, t]
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Complex64Array, Complex128Array, Float64Array, Int64Array
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
-from caviar_protocol.topics import AntennaArray, Carrier, ChannelMatrix
+from caviar_protocol.topics import AntennaArray, Carrier
 from caviar_services.channel.arrays.channel_matrices import Blocks, Located, joined
 from caviar_services.channel.arrays.element_paths import Bend, ElementPaths, Lengths, Surfaces
 from caviar_services.channel.arrays.element_visibility import Elements, Look, Visibility, elements, visibility
@@ -33,18 +33,12 @@ from caviar_services.channel.wideband import Bins
 class ElementGains:
     """Amplitudes of P paths at single elements, without spreading and carrier phase.
 
-    Parameters
-    ----------
-    antennas
-        Transmitters and receivers.
-    which
-        Transmitter and receiver of each path, Shape ``[P]`` each.
-    towards
-        Where straight lines along the path from both lead [m], Shape ``[P, 3]`` each.
-    transfer
-        That of `PathTable`, times what takes its spreading out, Shape ``[P, 3, 3]``.
-    wavelength
-        [m].
+    Args:
+        antennas: Transmitters and receivers.
+        which: Transmitter and receiver of each path, Shape ``[P]`` each.
+        towards: Where straight lines along the path from both lead [m], Shape ``[P, 3]`` each.
+        transfer: That of `PathTable`, times what takes its spreading out, Shape ``[P, 3, 3]``.
+        wavelength: [m].
     """
 
     def __init__(
@@ -128,11 +122,11 @@ def _axis(count: int) -> tuple[Float64Array, Float64Array]:
     return np.array([-1.0, 0.0, 1.0]), np.stack([at * (at - 1) / 2, 1 - at**2, at * (at + 1) / 2], axis=1)
 
 
+# Subcarriers or taps times element pairs that are computed at once.
 _BINS = 1 << 20
-"""Subcarriers or taps times element pairs that are computed at once."""
 
+# Element pairs times paths computed at once: what stays in a processor's cache.
 _LANES = 1 << 15
-"""Element pairs times paths computed at once: what stays in a processor's cache."""
 
 
 class SphericalWaves:
@@ -143,18 +137,11 @@ class SphericalWaves:
     size of the arrays (`element_gains`). Subarrays, of one panel and one polarisation, are looked at one by
     one.
 
-    Parameters
-    ----------
-    surfaces
-        What the paths meet, in the order of the model's table.
-    look
-        Asks this frame's scene.
-    traced_from
-        Transmitters and receivers off the surfaces that they are at: there their elements look.
-    carriers
-        Of the product.
-    memory
-        For looking at pairs of elements [bytes] at most; what is kept of each path comes on top.
+    Args:
+        surfaces: What the paths meet, in the order of the model's table.
+        look: Asks this frame's scene.
+        traced_from: Transmitters and receivers off the surfaces that they are at: there their elements look.
+        memory: For looking at pairs of elements [bytes] at most; what is kept of each path comes on top.
     """
 
     def __init__(
@@ -162,16 +149,12 @@ class SphericalWaves:
         surfaces: Surfaces,
         look: Look,
         traced_from: tuple[Sequence[Antenna], Sequence[Antenna]],
-        carriers: Sequence[Carrier],
         memory: int,
     ) -> None:
-        self._carriers = carriers
-        self._made: list[_Field] = []
-        self._split: _Split
-        self._memory = memory
         self._surfaces = surfaces
         self._look = look
         self._sources, self._targets = traced_from
+        self._memory = memory
 
     def __call__(
         self,
@@ -179,39 +162,9 @@ class SphericalWaves:
         transmitters: Sequence[Antenna],
         receivers: Sequence[Antenna],
         located: Located,
-    ) -> tuple[ChannelMatrix, ...]:
-        fields = self._fields(carriers, transmitters, receivers, located)
-        split = self._split
-        return tuple(
-            ChannelMatrix(carrier=carrier, tx=pair // len(receivers), rx=pair % len(receivers), h=h)
-            for carrier, field in enumerate(fields)
-            for pair, h in enumerate(split.joined(list(field.matrices(split.offsets))))
-        )
-
-    def responses(
-        self,
-        bins: Sequence[Bins],
-        transmitters: Sequence[Antenna],
-        receivers: Sequence[Antenna],
-        located: Located,
-    ) -> Iterator[Complex64Array]:
-        fields = self._fields(self._carriers, transmitters, receivers, located)
-        split = self._split
-        for asked in bins:
-            doppler = located.geometry.doppler_ratio[split.path] * asked.carrier.frequency_hz
-            yield from split.joined(list(fields[asked.index].responses(split, asked, doppler)))
-
-    def _fields(
-        self,
-        carriers: Sequence[Carrier],
-        transmitters: Sequence[Antenna],
-        receivers: Sequence[Antenna],
-        located: Located,
-    ) -> Sequence[_Field]:
-        """The field of each carrier, made once: the parts of a product share it."""
-        if self._made:
-            return self._made
-        split = self._split = _Split.of(transmitters, receivers, located.pair)
+    ) -> _Fields:
+        """The fields of all paths between elements; the arguments are those of `PlaneWaves`."""
+        split = _Split.of(transmitters, receivers, located.pair)
         paths = ElementPaths(self._surfaces.take(located.row[split.path]))
         tx, rx = np.divmod(located.pair[split.path], max(len(receivers), 1))
         start, end = _positions(transmitters)[tx], _positions(receivers)[rx]
@@ -224,12 +177,13 @@ class SphericalWaves:
         )
         towards = paths.ends(start, end)
         ends = split.transmitter, split.receiver
+        fields = []
         for carrier, properties in enumerate(carriers):
             wavelength = SPEED_OF_LIGHT / properties.frequency_hz
             transmit, receive = elements(split.transmit, wavelength), elements(split.receive, wavelength)
             looking = elements(_parts(self._sources), wavelength), elements(_parts(self._targets), wavelength)
             seen = visibility(paths, *ends, *looking, self._look, self._memory)
-            self._made.append(
+            fields.append(
                 _Field(
                     paths=paths,
                     seen=_far_enough(seen, paths, ends, (transmit, receive), wavelength),
@@ -247,7 +201,24 @@ class SphericalWaves:
                     wavelength=wavelength,
                 )
             )
-        return self._made
+        return _Fields(fields, split, located.geometry.doppler_ratio[split.path])
+
+
+@dataclass(frozen=True, eq=False)
+class _Fields:
+    """All paths of a frame between elements, on each carrier."""
+
+    fields: Sequence[_Field]
+    split: _Split
+    doppler_ratio: Float64Array
+    """Of each path between subarrays, Shape ``[Q]``."""
+
+    def matrices(self, index: int) -> Iterator[Complex128Array]:
+        return self.split.joined(list(self.fields[index].matrices(self.split.offsets)))
+
+    def responses(self, asked: Bins) -> Iterator[Complex64Array]:
+        doppler = self.doppler_ratio * asked.carrier.frequency_hz
+        return self.split.joined(list(self.fields[asked.index].responses(self.split, asked, doppler)))
 
 
 @dataclass(frozen=True, eq=False)

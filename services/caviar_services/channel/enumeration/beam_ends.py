@@ -1,10 +1,10 @@
-"""Chains of reflections with faces of moving bodies, enumerated, and the receivers where their beams end.
+"""Chains of reflections by way of moving bodies, enumerated, and the receivers that their beams light.
 
 Where bodies are small, rays rarely meet them, so a launch misses most chains by way of them. Here every
-sequence of faces is a candidate that has a face of a body in it; what beams cannot reach is left out
-(`image_beams`). Of B, a face of a body, and S, one of scenery, that is to a depth of three: B, SB, BS, BB,
-SSB, SBS, SBB, BSS, BSB, BBS and BBB. The last reflection needs no beams of its own: the receiver's image in
-its face lies in the beam before it.
+sequence of faces with a face of a body in it is a candidate; sequences that beams cannot reach are left out
+(`image_beams`). With B for a face of a body and S for one of scenery, these are to a depth of three: B, SB,
+BS, BB, SSB, SBS, SBB, BSS, BSB, BBS and BBB. The last reflection needs no beam of its own: it exists where
+the receiver's image in the last face lies in the beam before it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array
-from caviar_services.channel.enumeration.face_rectangles import ranges
 from caviar_services.channel.enumeration.image_beams import (
     Beams,
     Targets,
@@ -31,33 +30,35 @@ from caviar_services.channel.enumeration.image_beams import (
     reflected_beams,
     scenery_beams,
 )
+from caviar_services.channel.propagation.geometry import ranges
 from caviar_services.ray_tracing import aligned_indices, positions, several
 
+# Beams of one group that lanes test together: groups are filled up to a multiple of it, so that a lane finds
+# its beam by a division and not by a search.
 _BLOCK = 16
-"""Beams of one group that are looked at together: groups are filled up to a multiple of it."""
 
 
 @dataclass(frozen=True, eq=False)
 class SceneryViews:
-    """Faces of scenery that may be the last ones before receivers."""
+    """Faces of scenery that may reflect last before receivers."""
 
     faces: Int64Array
     """In ascending order, Shape ``[U]``."""
     sights: Int64Array
-    """Which of these see one another, as places among them, in both orders and sorted, Shape ``[M, 2]``."""
+    """Pairs of these that see one another, by index into ``faces``, in both orders, sorted, ``[M, 2]``."""
     receiver: Int64Array
-    """Of W pairs of a receiver and a face that it may see, Shape ``[W]``."""
+    """Receiver of each of W pairs of a receiver and a face that it may see, Shape ``[W]``."""
     place: Int64Array
-    """Places of these faces, Shape ``[W]``."""
+    """Face of each, by index into ``faces``, Shape ``[W]``."""
 
 
 def receiver_beams(targets: Targets, receivers: Float64Array, faces: Int64Array) -> Beams:
-    """What each of some receivers [m], Shape ``[W, 3]``, sees in a face of scenery, Shape ``[W]``."""
+    """The beam of what a receiver [m] sees in a face of scenery, of Shapes ``[W, 3]`` and ``[W]``."""
     return reflected_beams(targets, faces[:, None], positions(receivers[several(len(faces))]), None)
 
 
 def ends_at(targets: Targets, beams: Beams, receivers: Float64Array) -> tuple[Int64Array, Int64Array]:
-    """Beam and receiver of each pair where the one lights the other; receivers [m] are of Shape
+    """Beam and receiver of each pair where the beam lights the receiver; receivers [m] have the Shape
     ``[R, 3]``."""
     place = positions(receivers[several(len(receivers))])
 
@@ -74,8 +75,13 @@ def ends_at(targets: Targets, beams: Beams, receivers: Float64Array) -> tuple[In
 def ends_by_bodies(
     targets: Targets, beams: Beams, receivers: Float64Array
 ) -> tuple[Int64Array, Int64Array, Int64Array]:
-    """Beam, face of a body and receiver, where the beam may light the receiver by way of the face; receivers
-    [m] are of Shape ``[R, 3]``."""
+    """Beam, face of a body and receiver wherever the beam may light the receiver by a reflection at the face.
+
+    Args:
+        targets: Faces.
+        beams: Beams before the last reflection.
+        receivers: Positions [m], Shape ``[R, 3]``.
+    """
     import drjit as dr
 
     beam, face = lit_bodies(targets, beams)
@@ -97,10 +103,18 @@ def ends_by_bodies(
 def ends_by_scenery(
     targets: Targets, beams: Beams, receivers: Float64Array, scenery: SceneryViews
 ) -> tuple[Int64Array, Int64Array, Int64Array]:
-    """Beam by way of a body, face of scenery and receiver, where the beam may light the receiver by way of
-    the face; receivers [m] are of Shape ``[R, 3]``.
+    """Beam by way of a body, face of scenery and receiver wherever the beam may light the receiver by a
+    reflection at the face.
 
-    What a receiver sees in a face is a beam too: only bodies and faces that it meets can come before.
+    What a receiver sees in a face is a beam, too: only bodies and faces that this one lights can reflect
+    before. So beams of the transmitter are grouped by their last body or face, and each view is tested
+    against the groups that it shows instead of against all beams.
+
+    Args:
+        targets: Faces.
+        beams: Beams before the last reflection.
+        receivers: Positions [m], Shape ``[R, 3]``.
+        scenery: Which faces the receivers see.
     """
     import mitsuba as mi
 
@@ -155,8 +169,16 @@ def ends_by_scenery(
 
 
 def shown_scenery(targets: Targets, views: Beams, scenery: SceneryViews) -> tuple[Int64Array, Int64Array]:
-    """What receivers see by way of faces of scenery: numbers of views, one for each pair of a receiver and a
-    face, and places of the other faces that they show."""
+    """Which faces of scenery receivers see by a reflection in another one.
+
+    Args:
+        targets: Faces.
+        views: Beams of the receivers, one for each pair of ``scenery``.
+        scenery: Which faces the receivers see, and which faces see one another.
+
+    Returns:
+        View and face of each pair, by index into ``views`` and into ``scenery.faces``.
+    """
     import drjit as dr
     import mitsuba as mi
 
@@ -185,7 +207,7 @@ def shown_scenery(targets: Targets, views: Beams, scenery: SceneryViews) -> tupl
 
 
 def _crosses(targets: Targets, image: Any, face: Any, point: Any) -> Any:
-    """Whether points see images in faces: on the side that reflects, and within the rectangle."""
+    """Whether points see images in faces: from the side that reflects, and within the rectangle."""
     import drjit as dr
 
     there, here = targets.height(image, face), targets.height(point, face)
@@ -198,7 +220,7 @@ def _crosses(targets: Targets, image: Any, face: Any, point: Any) -> Any:
 
 
 def _either(used: Any, index: Any) -> Any:
-    """An index where it is used, else 0."""
+    """An index where it is used, else 0, which can be gathered without reading beyond an array."""
     import drjit as dr
 
     return dr.select(used, index, 0)
@@ -215,7 +237,7 @@ class ChainPairs:
 
     @classmethod
     def joined(cls, parts: list[tuple[Int64Array, Int64Array]], depth: int) -> ChainPairs:
-        """Of chains of any length up to ``depth``."""
+        """All pairs of parts, whose chains may have any length up to ``depth``."""
         chains = [np.full((0, depth), -1, np.int64)]
         chains += [
             np.pad(chain, ((0, 0), (0, depth - chain.shape[1])), constant_values=-1) for chain, _ in parts
@@ -231,22 +253,16 @@ def chain_pairs(
     transmitter: Float64Array,
     receivers: Float64Array,
 ) -> ChainPairs:
-    """All pairs of a chain and a receiver that it may be a path to: no reflection, chains of scenery alone,
-    and chains with a face of a body.
+    """All pairs of a chain and a receiver that may be a path: without a reflection, by way of scenery alone,
+    and by way of bodies.
 
-    Parameters
-    ----------
-    targets
-        Faces of scenery, and behind them of bodies, body after body.
-    scenery
-        Chains of scenery alone that waves from the transmitter go along, with the beginnings of each, as
-        faces, −1 behind the last, Shape ``[K, D]``.
-    views
-        Of all faces of these chains.
-    transmitter
-        [m], Shape ``[3]``.
-    receivers
-        [m], Shape ``[R, 3]``.
+    Args:
+        targets: Faces of scenery, then those of bodies, body after body.
+        scenery: Chains of scenery alone that waves from the transmitter go along, as faces, −1 behind the
+            last, Shape ``[K, D]``; the beginnings of each chain are among them.
+        views: Faces of these chains that may reflect last, and who sees them.
+        transmitter: Position [m], Shape ``[3]``.
+        receivers: Positions [m], Shape ``[R, 3]``.
     """
     depth = scenery.shape[1]
     every = np.arange(len(receivers))
@@ -267,7 +283,7 @@ def chain_pairs(
             beams = next_beams(targets, beams, views.faces, scenery[length == n, :n])
             add(beams)
     if depth > 1 and len(beams):
-        # The last reflection needs no beams of its own: its faces are held against the receivers at once.
+        # The last reflection needs no beams of its own: its faces are tested with the receivers at once.
         add(scenery_beams(targets, beams, scenery[length == depth]))
         for beam, face, receiver in (
             ends_by_scenery(targets, beams, receivers, views),

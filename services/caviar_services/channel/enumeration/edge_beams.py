@@ -1,13 +1,14 @@
-"""Edges of moving bodies that beams light, from the transmitter and from receivers, and which of both meet.
+"""Paths over an edge of a moving body, enumerated: edges that beams light from both sides.
 
 A path over an edge is a chain of reflections from the transmitter to the edge and one from the receiver to
 it. Beams say which edges each side lights (`image_beams`). Unfolded around the edge, the path is a straight
-line between the images of both, and meets the edge where J. B. Keller's law says ("Geometrical Theory of
-Diffraction", 1962): pairs are left out where that is beyond the ends of the edge, or out of a beam.
+line between the images of both ends, which meets the edge at the point that J. B. Keller's law gives
+("Geometrical Theory of Diffraction", 1962). Pairs of a chain before and a chain behind are left out where
+this point is beyond the ends of the edge or outside of a beam.
 
-Enumerated are paths over one edge in which a body has the edge or a face, and each side has up to two
-reflections at whatever faces, or any number at scenery alone. Where scenery has many edges, it is those of
-bodies alone.
+Enumerated are paths over one edge in which a body has the edge or a face. Each side has up to two reflections
+at any faces, or any number at scenery alone. Where scenery has more than `_FEW` edges, only edges of bodies
+are enumerated.
 """
 
 from __future__ import annotations
@@ -21,7 +22,6 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_services.channel.enumeration.beam_ends import SceneryViews, shown_scenery
-from caviar_services.channel.enumeration.face_rectangles import FaceRectangles, ranges
 from caviar_services.channel.enumeration.image_beams import (
     Beams,
     Targets,
@@ -38,36 +38,34 @@ from caviar_services.channel.enumeration.image_beams import (
     reflected_beams,
     scenery_beams,
 )
+from caviar_services.channel.enumeration.scene_faces import FaceRectangles
+from caviar_services.channel.propagation.geometry import ranges
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.ray_tracing import aligned_columns, aligned_indices, positions, several
 
+# Edges of scenery over which paths by way of bodies are enumerated; with more, rays look for such paths.
 _FEW = 512
-"""Edges of scenery of which paths by way of bodies are enumerated; of more, rays find them."""
 
+# Edges of a group at most; groups are tested by their spheres before edges are tested one by one.
 _GROUP = 12
-"""Edges of a group at most."""
 
+# Pairs of both sides that are tested together, so that memory is bounded.
 _AT_ONCE = 1 << 22
-"""Pairs of both sides that are looked at together."""
 
+# Offset of a plane that nothing is behind.
 _EVERYWHERE = -1e30
-"""Offset of a plane that nothing is behind."""
 
 
 class EdgeTargets:
-    """E edges of a frame: those of scenery, if these are few, and behind them those of bodies.
+    """E edges of a frame that beams may light: those of scenery, if these are few, then those of bodies.
 
     Coordinates are those of the ray tracer.
 
-    Parameters
-    ----------
-    scene
-        Whose edges, as they stand.
-    edges
-        All of them.
-    faces
-        Of scenery, and behind them of standing bodies.
+    Args:
+        scene: The scene, whose bodies are where they were placed last.
+        edges: All edges of the scene.
+        faces: Faces of scenery, then those of standing bodies.
     """
 
     def __init__(self, scene: SionnaScene, edges: SceneEdges, faces: FaceRectangles) -> None:
@@ -81,7 +79,7 @@ class EdgeTargets:
         piece = np.concatenate([np.full(len(still), -1), piece[kept]])
         wedges, is_edge = edges.faces(number)
         self.number = number[is_edge]
-        """Of each edge among all of the scene, Shape ``[E]``."""
+        """Index of each edge among all edges of the scene, Shape ``[E]``."""
         self.ends = edges.ends(self.number) - scene.centre
         """[m], Shape ``[E, 2, 3]``."""
         self.normals = wedges.normals[is_edge]
@@ -107,20 +105,20 @@ class EdgeTargets:
         return len(self.number)
 
     def outside(self, points: Float64Array, edges: Int64Array) -> BoolArray:
-        """Which points [m], Shape ``[N, 3]``, are in front of a face of N edges at least."""
+        """Whether points [m], Shape ``[N, 3]``, are in front of at least one face of their edge, ``[N]``."""
         towards = points - self.ends[edges, 0]
         outside: BoolArray = (np.einsum("nc,nfc->nf", towards, self.normals[edges]) > 0).any(1)
         return outside
 
 
 def enumerated_scenery(edges: SceneEdges) -> int:
-    """How many edges of scenery, which are the first ones, paths by way of bodies are enumerated over."""
+    """Number of edges of scenery over which paths are enumerated; they are the first of all edges."""
     count = len(edges) - len(edges.of_bodies[0])
     return count if count <= _FEW else 0
 
 
 class _Groups:
-    """Some of the edges, piece by piece in groups of neighbours, with spheres around pieces and groups."""
+    """Edges in a hierarchy of spheres: pieces, and within these groups of neighbours."""
 
     def __init__(self, edges: EdgeTargets, wanted: BoolArray) -> None:
         import mitsuba as mi
@@ -137,7 +135,7 @@ class _Groups:
         rows = rows[np.lexsort((along, own))]
         counts = -(-sizes // _GROUP)
         self.most = int(counts.max())
-        """Groups of a piece at most."""
+        """Largest number of groups of a piece."""
         of, number = ranges(np.zeros(self.pieces, np.int64), counts)
         begin = first[of] + number * _GROUP
         size = np.minimum(first[of] + sizes[of] - begin, _GROUP)
@@ -152,7 +150,7 @@ class _Groups:
 
 
 def _spheres(ends: Float64Array, begin: Int64Array) -> tuple[Any, Any]:
-    """Centres and radii of spheres around edges, each from one of these on, in the ray tracer's arrays."""
+    """Centres and radii of spheres around runs of edges that begin at these, in the ray tracer's arrays."""
     import mitsuba as mi
 
     low, high = np.minimum.reduceat(ends.min(1), begin), np.maximum.reduceat(ends.max(1), begin)
@@ -163,7 +161,7 @@ def _spheres(ends: Float64Array, begin: Int64Array) -> tuple[Any, Any]:
 
 @dataclass(frozen=True, eq=False)
 class EdgeChains:
-    """N candidates for paths over an edge, with as many reflections before it, and as many behind it."""
+    """N candidates for paths over an edge, all with I reflections before it and J behind it."""
 
     before: Int64Array
     """Faces from the transmitter to the edge, Shape ``[N, I]``."""
@@ -183,7 +181,16 @@ def edge_chains(
     transmitter: Float64Array,
     receivers: Float64Array,
 ) -> list[EdgeChains]:
-    """Candidates by way of one edge of a body, of all lengths; the parameters are those of `chain_pairs`."""
+    """Candidates for paths over one edge, of all numbers of reflections.
+
+    Args:
+        targets: Faces.
+        edges: Edges of the frame.
+        scenery: As in `chain_pairs`; likewise the others.
+        views: See ``scenery``.
+        transmitter: See ``scenery``.
+        receivers: See ``scenery``.
+    """
     depth = scenery.shape[1]
     if not (depth and len(edges) and len(receivers)):
         return []
@@ -192,7 +199,8 @@ def edge_chains(
     every = _Groups(edges, np.ones(len(edges), np.bool_))
     sent = [_lit(targets, edges, every, sources[0], np.zeros(1, np.int64))]
     taken = [_lit(targets, edges, every, *sinks[0])]
-    # Behind as many reflections as there may be, only edges count that the other side lights at once.
+    # A side with all reflections that a path may have leaves none to the other side: only edges that the
+    # other side lights directly can be met there.
     of_sent, of_taken = (
         _Groups(edges, np.isin(np.arange(len(edges)), side[0].edge)) for side in (taken, sent)
     )
@@ -212,11 +220,11 @@ def edge_chains(
 
 @dataclass(frozen=True, eq=False)
 class _Lit:
-    """Pairs of a beam and an edge that it may light."""
+    """Pairs of a beam and an edge that the beam may light."""
 
     beams: Beams
     owner: Int64Array
-    """Receiver that each beam is of, Shape ``[B]``."""
+    """Receiver of each beam, Shape ``[B]``; 0 for beams of the transmitter."""
     beam: Int64Array
     edge: Int64Array
 
@@ -224,7 +232,7 @@ class _Lit:
 def _from_transmitter(
     targets: Targets, scenery: Int64Array, views: SceneryViews, transmitter: Float64Array
 ) -> Iterator[Beams]:
-    """Beams without a reflection, with one, and so on, up to one less than the depth."""
+    """Beams of the transmitter after no reflection, one, and so on, up to one less than the depth."""
     depth, length = scenery.shape[1], (scenery >= 0).sum(1)
     yield _source_beams(transmitter[None])
     if depth == 1:
@@ -245,7 +253,7 @@ def _from_transmitter(
 def _from_receivers(
     targets: Targets, views: SceneryViews, receivers: Float64Array, depth: int
 ) -> Iterator[tuple[Beams, Int64Array]]:
-    """The same of receivers, with the receiver of each beam."""
+    """Beams of the receivers in the same order, with the receiver of each beam."""
     yield _source_beams(receivers), np.arange(len(receivers))
     if depth == 1:
         return
@@ -273,7 +281,7 @@ def _from_receivers(
 
 
 def _onward(targets: Targets, beams: Beams, views: SceneryViews) -> tuple[Int64Array, Int64Array]:
-    """Beams and faces that they light: those of scenery alone, the beams of ``views``, come first."""
+    """Pairs of a beam and a face that it lights; beams of scenery alone, those of ``views``, come first."""
     view, place = shown_scenery(targets, beams, views)
     of_body = by_scenery(targets, beams, views.faces)
     by_body = filtered(partial(lights_corner, targets, beams), lit_bodies(targets, beams))
@@ -282,7 +290,7 @@ def _onward(targets: Targets, beams: Beams, views: SceneryViews) -> tuple[Int64A
 
 
 def _source_beams(points: Float64Array) -> Beams:
-    """All that lies around points [m], Shape ``[N, 3]``, as beams without a reflection."""
+    """Beams without a reflection, which light everything around points [m], Shape ``[N, 3]``."""
     import mitsuba as mi
 
     count = len(points)
@@ -307,7 +315,7 @@ def _source_beams(points: Float64Array) -> Beams:
 
 
 def _lit(targets: Targets, edges: EdgeTargets, groups: _Groups, beams: Beams, owner: Int64Array) -> _Lit:
-    """Edges of groups that beams may light: not those of the face that each beam was reflected at last."""
+    """Edges that beams may light, except for edges of the face that reflected the beam last."""
     import drjit as dr
 
     none = np.zeros(0, np.int64)
@@ -355,7 +363,7 @@ def _lit(targets: Targets, edges: EdgeTargets, groups: _Groups, beams: Beams, ow
 
 
 def _outside(targets: Targets, edges: EdgeTargets, beams: Beams, beam: Any, edge: Any) -> Any:
-    """Whether images are in front of a face of edges."""
+    """Whether images are in front of at least one face of edges."""
     import drjit as dr
 
     back = gathered(beams.image, beam) - gathered(edges.a, edge)
@@ -364,7 +372,7 @@ def _outside(targets: Targets, edges: EdgeTargets, beams: Beams, beam: Any, edge
 
 
 def _in_beam(targets: Targets, edges: EdgeTargets, beams: Beams, beam: Any, edge: Any) -> Any:
-    """Whether edges are not wholly beyond a side of beams."""
+    """Whether edges may be lit: no side of the beam has both ends beyond it."""
     import drjit as dr
 
     image, a, b = gathered(beams.image, beam), gathered(edges.a, edge), gathered(edges.b, edge)
@@ -377,7 +385,7 @@ def _in_beam(targets: Targets, edges: EdgeTargets, beams: Beams, beam: Any, edge
 
 
 def _meeting(targets: Targets, edges: EdgeTargets, one: _Lit, other: _Lit) -> Iterator[EdgeChains]:
-    """Pairs of both sides that meet at an edge, within the beams of both."""
+    """Pairs of a beam from each side that meet at an edge within both beams."""
     import mitsuba as mi
 
     order = np.argsort(other.edge, kind="stable")
@@ -413,7 +421,7 @@ def _meeting(targets: Targets, edges: EdgeTargets, one: _Lit, other: _Lit) -> It
 def _kept(
     targets: Targets, edges: EdgeTargets, one: tuple[Beams, Any], other: tuple[Beams, Any], edge: Any
 ) -> Int64Array:
-    """Which pairs of beams, given with the number of the beam in each pair, meet at their edge."""
+    """Indices of the pairs of beams that meet at their edge, at the point of Keller's law."""
     import drjit as dr
 
     origin, along = gathered(edges.a, edge), gathered(edges.along, edge)
@@ -430,7 +438,7 @@ def _kept(
 
 
 def _unfolded(point: Any, along: Any) -> tuple[Any, Any]:
-    """How far points are along lines through the origin, and off them."""
+    """Coordinate of points along lines through the origin, and their distance from these lines."""
     import drjit as dr
 
     s = dr.dot(point, along)

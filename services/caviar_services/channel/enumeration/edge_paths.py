@@ -1,4 +1,4 @@
-"""Paths over edges of bodies: their points by images and Keller's law, in float64, and what is in the way."""
+"""Paths over edges of bodies: points by the image method and Keller's law, in float64, and visibility."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_services.channel.enumeration.edge_beams import EdgeChains, EdgeTargets
-from caviar_services.channel.enumeration.face_rectangles import FaceRectangles
 from caviar_services.channel.enumeration.image_paths import AT_END, OFF_SURFACE, in_front, reflection_points
+from caviar_services.channel.enumeration.scene_faces import FaceRectangles
 from caviar_services.channel.propagation.image_method import keller_point
-from caviar_services.channel.propagation.shadow_boundaries import beyond_edges
+from caviar_services.channel.propagation.utd import beyond_edges
 from caviar_services.channel.sionna.candidate_visibility import Faces
 from caviar_services.channel.sionna.scene import SionnaScene
 
@@ -54,10 +54,20 @@ def edge_paths(
     receivers: Float64Array,
     depth: int,
 ) -> EdgePaths:
-    """Those of the candidates whose reflections lie within triangles of their faces, and whose edge has both
-    sides outside of its wedge; paths by way of faces that are one surface are there once.
+    """Candidates that are paths: reflections lie in triangles of their faces, and both segments at the edge
+    run outside of its wedge.
 
-    They are sorted by receiver, number of interactions, edge and faces; positions in metres.
+    Args:
+        faces: Faces of the chains.
+        edges: Edges of the chains.
+        candidates: From `edge_chains`.
+        transmitter: Position [m], Shape ``[3]``.
+        receivers: Positions [m], Shape ``[R, 3]``.
+        depth: Interactions of a path at most, D.
+
+    Returns:
+        Paths sorted by receiver, number of interactions, edge and surfaces. Of paths by way of faces that are
+        one surface, the first one.
     """
     parts = [_with_points(faces, edges, chains, transmitter, receivers, depth) for chains in candidates]
     parts.append(_no_paths(depth))
@@ -121,7 +131,7 @@ def _with_points(
 
 
 def _image(faces: FaceRectangles, chain: Int64Array, points: Float64Array) -> Float64Array:
-    """Images of points [m] behind all faces of chains, none of which is shorter, Shape ``[N, 3]``."""
+    """Images of points [m] in all faces of chains of one length, Shape ``[N, 3]``."""
     for column in chain.T:
         points = faces.mirrored(points, column)
     return points
@@ -136,9 +146,9 @@ def unhidden_over_edges(
     transmitter: Float64Array,
     receivers: Float64Array,
 ) -> BoolArray:
-    """Which paths nothing stands in the way of, as `unhidden` has it, Shape ``[P]``; positions in metres.
+    """Which paths have no obstacle on their segments, Shape ``[P]``; the arguments are those of `unhidden`.
 
-    A segment to an edge meets neither of its faces before: what a ray meets of them there is rounding.
+    Both faces of an edge are no obstacle to a segment that ends there: what a ray meets of them is rounding.
     """
     total, depth = paths.chain.shape
     free = np.ones(total, np.bool_)
@@ -155,11 +165,11 @@ def unhidden_over_edges(
             _Ends.of(scene, faces, edges, paths, lane, d + 1),
         )
         before, after = corners[lane, d], corners[lane, d + 1]
-        # The last segment is looked along from the receiver, which is off every surface.
+        # The last ray goes from the receiver, which is off every surface and needs no lift.
         backward = paths.count[lane] == d if d else np.zeros(len(lane), np.bool_)
         lifted = one.lifted(before, after), other.lifted(after, before)
         first = np.where(backward[:, None], lifted[1], lifted[0])
-        # A ray ends at a face itself, and beside an edge, not in one of its faces.
+        # A ray ends on a face, but beside an edge: on it, rounding would put the end into one of both faces.
         last = np.where(
             backward[:, None],
             np.where(one.bends[:, None], lifted[0], before),
@@ -180,16 +190,16 @@ def unhidden_over_edges(
 
 @dataclass(frozen=True, eq=False)
 class _Ends:
-    """Ends of segments."""
+    """What is at one end of each of N segments."""
 
     normals: Float64Array
-    """Of the faces there, 0 at antennas; of edges, between both faces; Shape ``[N, 3]``."""
+    """Unit normals of faces, for edges between both faces, 0 at antennas, Shape ``[N, 3]``."""
     bends: BoolArray
     """Which of them are at an edge."""
     plane: Int64Array
     """Of a face, −1 elsewhere."""
     surfaces: Int64Array
-    """That a segment meets there, −1 for none, Shape ``[N, 2]``."""
+    """Surfaces that a ray may meet there, −1 for none, Shape ``[N, 2]``."""
 
     @classmethod
     def of(
@@ -201,7 +211,7 @@ class _Ends:
         rows: Int64Array,
         corner: int,
     ) -> _Ends:
-        """Corner of paths: 0 is the transmitter."""
+        """Those of a corner of paths by its index; 0 is the transmitter."""
         count = len(rows)
         inner = (paths.count[rows] >= corner) & (corner > 0)
         d = min(max(corner - 1, 0), paths.chain.shape[1] - 1)
@@ -217,7 +227,7 @@ class _Ends:
         return cls(normals, bends, plane, surfaces)
 
     def lifted(self, points: Float64Array, towards: Float64Array) -> Float64Array:
-        """Points a little off their faces, on the side of others; off edges, outwards."""
+        """Points `OFF_SURFACE` off faces, on the side of ``towards``; off edges, away from the wedge."""
         side = np.sign(np.einsum("nc,nc->n", towards - points, self.normals))
         side = np.where(self.bends, 1.0, side)
         off: Float64Array = points + OFF_SURFACE * side[:, None] * self.normals

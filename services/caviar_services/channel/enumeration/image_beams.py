@@ -1,14 +1,15 @@
-"""Beams of images: where waves can go that were reflected at given faces, culled in the ray tracer's arrays.
+"""Beam tracing: where waves can go that given faces have reflected, culled in the ray tracer's arrays.
 
 Mirrored in a face, a transmitter is an image, and what it lights by way of that face is the pyramid from the
 image through the face's rectangle. The next face mirrors the image and the last rectangle with it: a beam is
 an image, the pyramids through its last two rectangles, and the side of the last plane that it lights (M. F.
 Catedra et al., "Efficient ray-tracing techniques for three-dimensional analyses of propagation in mobile
-communications", IEEE Antennas Propag. Mag. 40(2), 1998, cull by such beams). Nothing that a beam lights is
-left out, and some that it does not light is kept: the image method decides, in float64, which is a path.
+communications", IEEE Antennas Propag. Mag. 40(2), 1998, cull by such beams). The test is conservative: it
+leaves out nothing that a beam lights and keeps some that it does not light. Which chains are paths is decided
+in float64 by the image method (`image_paths`).
 
-Everything here counts in float32, with a slack that is more than its rounding. Pairs of many by many that
-pass a test are the lanes of a kernel.
+All of this is computed in float32, with a slack that is larger than its rounding. Every test is one kernel:
+its lanes are all pairs of two lists, for example of beams and faces.
 """
 
 from __future__ import annotations
@@ -21,20 +22,30 @@ from typing import Any
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
-from caviar_services.channel.enumeration.face_rectangles import FaceRectangles
+from caviar_services.channel.enumeration.scene_faces import FaceRectangles
 from caviar_services.ray_tracing import aligned_columns, aligned_indices, positions, several
 
+# Pairs that one kernel tests at most, so that its memory is bounded.
 _LANES = 1 << 23
-"""Pairs that are looked at together at most."""
 
 
 def pairs(first: int, second: int, test: Callable[[Any, Any], Any]) -> tuple[Any, Any]:
-    """Which pairs of numbers below ``first`` and below ``second`` pass a test, as `mitsuba.UInt`."""
+    """Pairs of indices that pass a test.
+
+    Args:
+        first: The first index of a pair is below it; the second one is below ``second``.
+        second: See ``first``.
+        test: From both indices, as `mitsuba.UInt`, whether the pair passes.
+
+    Returns:
+        First and second index of each pair, as `mitsuba.UInt`.
+    """
     import drjit as dr
     import mitsuba as mi
 
     parts = []
     at_once = max(1, _LANES // max(second, 1))
+    # Opaque: as a literal, each size would be another kernel to compile, and sizes change in every frame.
     many = dr.opaque(mi.UInt, second)
     for begin in range(0, first if second else 0, at_once):
         count = min(at_once, first - begin)
@@ -51,7 +62,7 @@ def pairs(first: int, second: int, test: Callable[[Any, Any], Any]) -> tuple[Any
 
 
 def filtered(test: Callable[[Any, Any], Any], numbers: tuple[Any, Any]) -> tuple[Any, Any]:
-    """Those of pairs of numbers that pass a test."""
+    """Those of pairs of indices that pass a test, evaluated."""
     import drjit as dr
 
     if not dr.width(numbers[0]):
@@ -70,7 +81,7 @@ def gathered(column: Any, index: Any) -> Any:
 
 
 def opaque(number: int) -> Any:
-    """A number that a kernel reads: as a constant of the kernel, each would be another kernel."""
+    """A number that a kernel reads from memory: as a literal, each number would be another kernel."""
     import drjit as dr
     import mitsuba as mi
 
@@ -78,30 +89,27 @@ def opaque(number: int) -> Any:
 
 
 def numbers(indices: Any) -> Int64Array:
-    """Indices of the ray tracer for NumPy, Shape ``[N]``."""
+    """Indices in the ray tracer's arrays as a NumPy array, Shape ``[N]``."""
     found: Int64Array = indices.numpy().astype(np.int64)
     return found
 
 
+# [m] by which every target is larger in tests; float32 rounds a coordinate of 1 km to 6e-5 m.
 _SLACK = 5e-3
-"""[m] around everything that is looked for."""
 
+# The same as a part of the largest coordinate, some 30 times the rounding of float32.
 _RELATIVE_SLACK = 2e-6
-"""The same as a part of the largest coordinate."""
 
+# Cosine of the half angle of the widest cone that is tested; wider ones light everything.
 _WIDE = 0.01
-"""Cosine of the half angle of the widest cone that is held against anything."""
 
 
 class Targets:
-    """What beams are held against in a frame: faces, the spheres around bodies, and points.
+    """What beams of a frame may light: faces, and bodies by the spheres around them.
 
-    Parameters
-    ----------
-    faces
-        Of scenery, and behind them of bodies, body after body.
-    sizes
-        How many of the last ones each body has, Shape ``[V]``.
+    Args:
+        faces: Those of scenery first, then those of bodies, body after body.
+        sizes: Number of faces of each body, Shape ``[V]``.
     """
 
     def __init__(self, faces: FaceRectangles, sizes: Int64Array) -> None:
@@ -137,7 +145,7 @@ class Targets:
         self.body_begin, self.body_size = (mi.UInt(aligned_indices(part[some])) for part in (begin, sizes))
         slack = _SLACK + _RELATIVE_SLACK * float(np.abs(faces.centre).max(initial=0.0))
         self.slack = dr.opaque(mi.Float, slack)
-        """Around everything that is looked for [m]; a number in a kernel would be another kernel."""
+        """By which every target is larger in tests [m], as an opaque `mitsuba.Float`."""
 
     def body_of(self, faces: Int64Array) -> Int64Array:
         """Number of the body of these faces of bodies."""
@@ -145,12 +153,12 @@ class Targets:
         return np.searchsorted(begin, faces, side="right") - 1
 
     def corners(self, face: Any) -> list[Any]:
-        """Those of rectangles, in turn."""
+        """The four corners of rectangles, in turn."""
         centre, u, v = (gathered(column, face) for column in (self.centre, self.u, self.v))
         return [centre - u - v, centre + u - v, centre + u + v, centre - u + v]
 
     def height(self, point: Any, face: Any) -> Any:
-        """How far points are in front of planes."""
+        """How far points are in front of the planes of faces [m]; negative behind."""
         import drjit as dr
 
         return dr.dot(point, gathered(self.normal, face)) - gathered(self.offset, face)
@@ -172,18 +180,20 @@ def _spheres(faces: FaceRectangles, first: int, sizes: Int64Array) -> tuple[Floa
 
 @dataclass(frozen=True, eq=False)
 class Beams:
-    """B beams behind the same number of reflections, in the ray tracer's arrays and in NumPy's."""
+    """B beams after n reflections each; attributes of type `Any` are arrays of the ray tracer."""
 
     chain: Int64Array
-    """Faces that they were reflected at, Shape ``[B, n]``."""
+    """Faces that reflected them, Shape ``[B, n]``."""
     by_body: BoolArray
     """Whether one of these is of a body, Shape ``[B]``."""
     image: Any
+    """Of the source [m]."""
     sides: Sequence[Any]
     """Unit normals, inwards, of the pyramids' sides: four for each rectangle."""
     axis: Any
+    """Of the narrowest cone around the pyramids."""
     cosine: Any
-    """Of the half angle of the narrowest cone around a pyramid."""
+    """Of the half angle of that cone."""
     last: Any
     """The last face."""
     lit: Any
@@ -196,11 +206,14 @@ class Beams:
 
     @property
     def first_by_body(self) -> int:
-        """Number of the first beam by way of a body: those of scenery alone stand before."""
+        """Index of the first beam by way of a body: beams of scenery alone stand before it."""
         return int(np.argmax(self.by_body)) if self.by_body.any() else len(self)
 
     def light_cone(self, beam: Any, centre: Any, radius: Any, slack: Any) -> Any:
-        """Whether spheres reach into the cones of beams, and before their last planes."""
+        """Whether spheres reach into the cones of beams, on the lit side of their last planes.
+
+        A cheap test before `light`: a cone is one dot product, a pyramid up to eight.
+        """
         import drjit as dr
 
         axis, cosine = gathered(self.axis, beam), gathered(self.cosine, beam)
@@ -213,7 +226,7 @@ class Beams:
         return (across * cosine - along * sine <= reach) & (before > -reach)
 
     def light(self, beam: Any, centre: Any, reach: Any) -> Any:
-        """Whether spheres reach into the pyramids of beams."""
+        """Whether spheres reach into all pyramids of beams."""
         import drjit as dr
         import mitsuba as mi
 
@@ -225,7 +238,8 @@ class Beams:
 
 
 def first_beams(targets: Targets, source: Float64Array, scenery: Int64Array) -> Beams:
-    """Beams of a transmitter [m], Shape ``[3]``, by faces of scenery, then by all that bodies show it."""
+    """Beams of a transmitter [m], Shape ``[3]``, after one reflection: at given faces of scenery, then at all
+    faces of bodies whose reflecting side the transmitter sees."""
     faces = targets.faces
     bodies = np.arange(targets.first_body, len(faces))
     shown = faces.height(np.broadcast_to(source, (len(bodies), 3)), bodies) > 0
@@ -235,15 +249,17 @@ def first_beams(targets: Targets, source: Float64Array, scenery: Int64Array) -> 
 
 
 def next_beams(targets: Targets, beams: Beams, scenery: Int64Array, known: Int64Array) -> Beams:
-    """Beams behind one more reflection.
+    """Beams after one more reflection.
 
-    Parameters
-    ----------
-    scenery
-        Faces of scenery that reflect what bodies reflected.
-    known
-        Chains of scenery alone that are one longer than those of ``beams``, Shape ``[K, n + 1]``, each
-        beginning with one of these: of scenery alone these are gone on with.
+    Args:
+        targets: Faces that may reflect.
+        beams: Beams after n reflections.
+        scenery: Faces of scenery that may reflect a beam by way of a body.
+        known: Chains of scenery alone, Shape ``[K, n + 1]``. Each begins with the chain of one of ``beams``.
+            Beams by way of scenery alone continue along these and no others.
+
+    Returns:
+        Beams of ``known`` first, then those by way of a body.
     """
 
     beam, face = by_scenery(targets, beams, scenery)
@@ -261,12 +277,12 @@ def next_beams(targets: Targets, beams: Beams, scenery: Int64Array, known: Int64
 
 
 def scenery_beams(targets: Targets, beams: Beams, known: Int64Array) -> Beams:
-    """Of `next_beams`, those of chains of scenery alone."""
+    """Those of `next_beams` whose chains are of scenery alone."""
     return longer_beams(targets, beams, _rows_of(beams.chain[: beams.first_by_body], known[:, :-1]), known)
 
 
 def longer_beams(targets: Targets, beams: Beams, parent: Int64Array, chain: Int64Array) -> Beams:
-    """Beams of chains, Shape ``[B, n + 1]``, each of which is longer by one than that of its parent."""
+    """Beams of chains, Shape ``[B, n + 1]``, each one face longer than the chain of its parent beam."""
     import mitsuba as mi
 
     index = mi.UInt(aligned_indices(parent[several(len(parent))]))
@@ -274,7 +290,7 @@ def longer_beams(targets: Targets, beams: Beams, parent: Int64Array, chain: Int6
 
 
 def by_scenery(targets: Targets, beams: Beams, scenery: Int64Array) -> tuple[Any, Any]:
-    """Beams by way of bodies and faces of scenery that they light, as `mitsuba.UInt`."""
+    """Pairs of a beam by way of a body and a face of scenery that it lights, as `mitsuba.UInt`."""
     import drjit as dr
     import mitsuba as mi
 
@@ -300,7 +316,7 @@ def by_scenery(targets: Targets, beams: Beams, scenery: Int64Array) -> tuple[Any
 
 
 def lit_bodies(targets: Targets, beams: Beams) -> tuple[Any, Any]:
-    """Beams and faces of bodies whose spheres they light, as `mitsuba.UInt`."""
+    """Pairs of a beam and a face of a body whose sphere it lights, as `mitsuba.UInt`."""
     import drjit as dr
 
     slack = targets.slack
@@ -330,7 +346,14 @@ def lit_bodies(targets: Targets, beams: Beams) -> tuple[Any, Any]:
 
 
 def reflected_beams(targets: Targets, chain: Int64Array, image: Any, before: Any | None) -> Beams:
-    """Beams by way of the last faces of chains, from images before these and by way of faces ``before``."""
+    """Beams after a reflection at the last face of each chain.
+
+    Args:
+        targets: Faces.
+        chain: All faces of each beam, Shape ``[B, n]``.
+        image: Image of the source before that reflection.
+        before: Face of the reflection before that one, which bounds the beam, too; None: there is none.
+    """
     import drjit as dr
     import mitsuba as mi
 
@@ -362,7 +385,7 @@ def reflected_beams(targets: Targets, chain: Int64Array, image: Any, before: Any
 
 
 def near_bodies(targets: Targets, beams: Beams) -> tuple[Any, Any]:
-    """Beams and bodies whose spheres they light, as `mitsuba.UInt`."""
+    """Pairs of a beam and a body whose sphere it lights, as `mitsuba.UInt`."""
 
     def near(beam: Any, body: Any) -> Any:
         centre, radius = gathered(targets.body_centre, body), gathered(targets.body_radius, body)
@@ -376,7 +399,7 @@ def near_bodies(targets: Targets, beams: Beams) -> tuple[Any, Any]:
 
 
 def lights_corner(targets: Targets, beams: Beams, beam: Any, face: Any) -> Any:
-    """Whether no side of beams has all corners of rectangles beyond it."""
+    """Whether rectangles may be lit: no side of the beam has all four corners beyond it."""
     import drjit as dr
 
     corners, image = targets.corners(face), gathered(beams.image, beam)
@@ -422,6 +445,6 @@ def _cone(image: Any, corners: list[Any]) -> tuple[Any, Any]:
 
 
 def _rows_of(rows: Int64Array, wanted: Int64Array) -> Int64Array:
-    """Number of the row that each of the wanted ones is."""
+    """Index of the row that equals each wanted row."""
     known = {tuple(row): number for number, row in enumerate(rows.tolist())}
     return np.array([known[tuple(row)] for row in wanted.tolist()], np.int64)

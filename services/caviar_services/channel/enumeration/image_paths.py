@@ -1,27 +1,36 @@
-"""Paths by way of chains of faces: their points by images, in float64, and whether anything is in the way."""
+"""Paths of reflections at chains of faces: points by the image method, in float64, visibility and
+transmission.
+
+A slab that transmits does not bend a path. So a chain of reflections with an obstacle on a segment is a path
+nevertheless where everything that its segments cross lets waves through, and the crossings are not too many
+(`crossings`).
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_services.channel.enumeration.beam_ends import ChainPairs
-from caviar_services.channel.enumeration.face_rectangles import FaceRectangles
+from caviar_services.channel.enumeration.scene_faces import FaceRectangles
 from caviar_services.channel.sionna.candidate_visibility import Faces
 from caviar_services.channel.sionna.coplanar_faces import COPLANAR, COPLANAR_RELATIVE
+from caviar_services.channel.sionna.materials import DRAWN, slab
 from caviar_services.channel.sionna.planes import PlaneTable
 from caviar_services.channel.sionna.scene import SionnaScene
 
 OFF_SURFACE = 2e-4
-"""[m]; rays from face to face start this far from the first."""
+"""[m]; rays from face to face start this far from the first face, whose points float32 rounds."""
 
+# Cosine between the normals of planes that count as parallel.
 _PARALLEL = 1 - 1e-6
-"""Cosine between the normals of planes that are parallel."""
 
 AT_END = 1e-3
-"""[m]; what stands this near the end of a segment is what it ends at: two faces meet there, or are one."""
+"""[m]; what a ray meets this near to its end is what it ends at: two faces meet there, or are one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,11 +38,11 @@ class ImagePaths:
     """P paths of at most D reflections."""
 
     chain: Int64Array
-    """Faces, −1 behind the last, Shape ``[P, D]``."""
+    """Faces that reflect, −1 behind the last, Shape ``[P, D]``."""
     receiver: Int64Array
-    """Shape ``[P]``."""
+    """Index of the receiver, Shape ``[P]``."""
     points: Float64Array
-    """Of the reflections, the receiver behind the last [m], Shape ``[P, D, 3]``."""
+    """Points of the reflections, the receiver's position behind the last [m], Shape ``[P, D, 3]``."""
 
     def take(self, which: BoolArray | Int64Array) -> ImagePaths:
         """These paths."""
@@ -43,8 +52,17 @@ class ImagePaths:
 def image_paths(
     faces: FaceRectangles, pairs: ChainPairs, transmitter: Float64Array, receivers: Float64Array
 ) -> ImagePaths:
-    """Those of the pairs whose chains mirror the transmitter, each within a triangle of its face, so that the
-    receiver may see it, sorted by receiver and chain; positions in metres."""
+    """Pairs whose reflections all lie in a triangle of their face, by the image method.
+
+    Args:
+        faces: Faces of the chains.
+        pairs: Candidates.
+        transmitter: Position [m], Shape ``[3]``.
+        receivers: Positions [m], Shape ``[R, 3]``.
+
+    Returns:
+        Paths sorted by receiver, number of reflections and chain, whether or not an obstacle hides them.
+    """
     chain, count = pairs.chain, (pairs.chain >= 0).sum(1)
     order = np.lexsort((*chain.T[::-1], count, pairs.receiver))
     chain, receiver = chain[order], pairs.receiver[order]
@@ -57,19 +75,17 @@ def image_paths(
 def reflection_points(
     faces: FaceRectangles, chain: Int64Array, start: Float64Array, end: Float64Array
 ) -> tuple[Float64Array, BoolArray]:
-    """Where chains of faces reflect what goes from N starts to N ends, and which chains do.
+    """Points where chains of faces reflect a wave on its way from a start to an end.
 
-    Parameters
-    ----------
-    chain
-        Faces, −1 behind the last, Shape ``[N, D]``.
-    start, end
-        [m], Shape ``[N, 3]``.
+    Args:
+        faces: Faces of the chains.
+        chain: Faces in turn, −1 behind the last, Shape ``[N, D]``.
+        start: Position [m], Shape ``[N, 3]``; ``end`` likewise.
+        end: See ``start``.
 
-    Returns
-    -------
-    Points, the end behind the last [m], Shape ``[N, D, 3]``, and which rows have each of them within a
-    triangle of its face, on the side that reflects, Shape ``[N]``. Of other rows, points are anything.
+    Returns:
+        Points, the end behind the last [m], Shape ``[N, D, 3]``, and which rows have every point in a
+        triangle of its face, on the side that reflects, Shape ``[N]``. Points of other rows are undefined.
     """
     depth, count = chain.shape[1], (chain >= 0).sum(1)
     images = [start]
@@ -78,6 +94,9 @@ def reflection_points(
         image = images[-1].copy()
         image[used] = faces.mirrored(image[used], chain[used, d])
         images.append(image)
+    # Back from the end: the line to the last image meets the last face at the last point, and so on. Rows
+    # that miss a rectangle drop out at once; triangles, which cost most, are tested for the rows that are
+    # left.
     here = end.copy()
     points = np.repeat(here[:, None], depth, axis=1)
     good = np.ones(len(chain), np.bool_)
@@ -108,10 +127,18 @@ def unhidden(
     transmitter: Float64Array,
     receivers: Float64Array,
 ) -> BoolArray:
-    """Which paths nothing stands in the way of, Shape ``[P]``; positions in metres.
+    """Which paths have no obstacle on their segments, Shape ``[P]``.
 
-    A ray along each segment meets the surface of its end first, or something within `AT_END` of it that
-    does not stand in front of it: shorter rays would lose what grazes.
+    A segment is free if a ray along it first meets the surface at its end, or something within `AT_END` of it
+    that does not stand in front of it: rays that end before would lose what grazes.
+
+    Args:
+        scene: The scene.
+        look: Casts the rays.
+        faces: Faces of the paths.
+        paths: Paths of the image method.
+        transmitter: Position [m], Shape ``[3]``.
+        receivers: Positions [m], Shape ``[R, 3]``.
     """
     count = (paths.chain >= 0).sum(1)
     end = receivers[paths.receiver]
@@ -127,7 +154,7 @@ def unhidden(
             arriving, face = end[lane], np.full(len(lane), -1)
         plane = np.where(ends, -1, faces.plane[face] if len(faces) else -1)
         if d:
-            # The last segment is looked along from the receiver, which is off every surface.
+            # The last ray goes from the receiver, which is off every surface and needs no lift.
             mirror = paths.chain[lane, d - 1]
             normal = faces.normal[mirror]
             side = np.sign(np.einsum("nc,nc->n", arriving - before, normal))[:, None]
@@ -155,10 +182,176 @@ def unhidden(
 
 
 def in_front(table: PlaneTable, met: Int64Array, wanted: Int64Array, points: Float64Array) -> BoolArray:
-    """Whether planes that rays met before points [m] of others hide these: they are parallel, and farther
-    apart than rounding."""
+    """Whether planes hide points of other planes that rays met right behind them.
+
+    They do if both planes are parallel and farther apart than rounding.
+
+    Args:
+        table: Planes of the scene.
+        met: Plane that each ray met first, Shape ``[N]``.
+        wanted: Plane that each point lies in, Shape ``[N]``.
+        points: Points [m], Shape ``[N, 3]``.
+    """
     normal = table.normal[met]
     parallel = np.abs(np.einsum("nc,nc->n", normal, table.normal[wanted])) > _PARALLEL
     height = np.abs(np.einsum("nc,nc->n", points - table.origin[met], normal))
     hidden: BoolArray = parallel & (height > COPLANAR + COPLANAR_RELATIVE * np.abs(points).max(1))
     return hidden
+
+
+# Surfaces at both ends of a segment, each of which a ray may meet once more by rounding.
+_PASSED_TWICE = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Crossings:
+    """M places where segments of paths go through a surface, along each path in turn."""
+
+    path: Int64Array
+    """Index of the path, Shape ``[M]``."""
+    segment: Int64Array
+    """Index of the segment within its path, Shape ``[M]``."""
+    along: Float64Array
+    """Share of the segment before the place, from 0 to 1, Shape ``[M]``."""
+    points: Float64Array
+    """Position [m], Shape ``[M, 3]``."""
+    triangle: Int64Array
+    """Triangle of the surface, Shape ``[M]``."""
+
+
+def crossings(
+    scene: SionnaScene,
+    look: Faces,
+    faces: FaceRectangles,
+    paths: ImagePaths,
+    transmitter: Float64Array,
+    receivers: Float64Array,
+    most: Int64Array,
+) -> tuple[Crossings, BoolArray]:
+    """Surfaces that the segments of paths cross.
+
+    Args:
+        scene: The scene.
+        look: Casts the rays.
+        faces: Faces of the paths.
+        paths: Paths of the image method that something hides.
+        transmitter: Position [m], Shape ``[3]``.
+        receivers: Positions [m], Shape ``[R, 3]``.
+        most: Number of surfaces that each path may cross, Shape ``[P]``.
+
+    Returns:
+        The crossings, and which paths cross at most so many surfaces and no opaque one, Shape ``[P]``.
+    """
+    segments = _Segments.of(scene, faces, paths, transmitter, receivers)
+    good = most > 0
+    start, alive = segments.lifted.copy(), np.arange(len(segments.path))
+    crossed = np.full((len(alive), int(most.max(initial=0)) + 1), -1)
+    found: list[tuple[Any, ...]] = []
+    for _ in range(int(most.max(initial=0)) + 1 + _PASSED_TWICE):
+        alive = alive[good[segments.path[alive]]]
+        if not len(alive):
+            break
+        behind, triangle = look.first_triangle(start[alive], segments.last[alive])
+        on = behind < -AT_END
+        alive, triangle = alive[on], triangle[on]
+        along, points, side = segments.met(scene, alive, triangle)
+        start[alive] = points + OFF_SURFACE * side
+        surface = scene.surface_of[triangle]
+        # A line crosses a plane once, and that of an end only there: a second hit is rounding.
+        again = (surface[:, None] == np.column_stack([segments.ends[alive], crossed[alive]])).any(1)
+        new = np.flatnonzero(~again)
+        alive_new, path = alive[new], segments.path[alive[new]]
+        opaque = ~_lets_through(scene, triangle[new], segments.direction[alive_new])
+        good[path[opaque]] = False
+        place = (crossed[alive_new] >= 0).sum(1)
+        fits = place < crossed.shape[1]
+        crossed[alive_new[fits], place[fits]] = surface[new][fits]
+        found.append((alive_new, along[new], points[new], triangle[new]))
+    else:
+        good[segments.path[alive]] = False
+    none = (np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0, np.int64))
+    rows, along, points, triangle = (np.concatenate(column) for column in zip(none, *found, strict=True))
+    path = segments.path[rows]
+    count = np.bincount(path, minlength=len(good))
+    good &= (count <= most) & (count > 0)
+    kept = good[path]
+    order = np.lexsort((along[kept], segments.number[rows[kept]], path[kept]))
+    columns = (path, segments.number[rows], along, points, triangle)
+    return Crossings(*(column[kept][order] for column in columns)), good
+
+
+@dataclass(frozen=True, eq=False)
+class _Segments:
+    """Q segments of paths."""
+
+    path: Int64Array
+    """Index of the path, Shape ``[Q]``; ``number`` is that of the segment within it."""
+    number: Int64Array
+    first: Float64Array
+    """Start [m], Shape ``[Q, 3]``; ``last`` is the end."""
+    last: Float64Array
+    lifted: Float64Array
+    """The start, `OFF_SURFACE` off its surface."""
+    direction: Float64Array
+    """Unit vectors, Shape ``[Q, 3]``."""
+    ends: Int64Array
+    """Surfaces at both ends, −1 for none, Shape ``[Q, 2]``."""
+
+    @classmethod
+    def of(
+        cls,
+        scene: SionnaScene,
+        faces: FaceRectangles,
+        paths: ImagePaths,
+        transmitter: Float64Array,
+        receivers: Float64Array,
+    ) -> _Segments:
+        count, rows = (paths.chain >= 0).sum(1), np.arange(len(paths.chain))
+        start = np.broadcast_to(transmitter, (len(rows), 1, 3))
+        corners = np.concatenate([start, paths.points, receivers[paths.receiver][:, None]], axis=1)
+        mirror = np.pad(paths.chain, ((0, 0), (1, 1)), constant_values=-1)
+        normal, surface = np.zeros(corners.shape), np.full(mirror.shape, -1)
+        used = mirror >= 0
+        normal[used] = faces.normal[mirror[used]]
+        surface[used] = scene.joined.label[faces.plane[mirror[used]]]
+        path, number = np.nonzero(np.arange(corners.shape[1] - 1) <= count[:, None])
+        first, last = corners[path, number], corners[path, number + 1]
+        direction = last - first
+        direction = direction / np.sqrt((direction**2).sum(1, keepdims=True))
+        side = np.sign(np.einsum("nc,nc->n", direction, normal[path, number]))[:, None]
+        lifted = first + OFF_SURFACE * side * normal[path, number]
+        ends = np.column_stack([surface[path, number], surface[path, number + 1]])
+        return cls(path, number, first, last, lifted, direction, ends)
+
+    def met(
+        self, scene: SionnaScene, rows: Int64Array, triangle: Int64Array
+    ) -> tuple[Float64Array, Float64Array, Float64Array]:
+        """Where segments cross the planes of triangles: share of the segment, point [m], and unit normal
+        towards the far side."""
+        normal, origin = _plane(scene, triangle)
+        first, line = self.first[rows], self.last[rows] - self.first[rows]
+        with np.errstate(invalid="ignore", divide="ignore"):  # of a segment within a plane
+            along = np.einsum("nc,nc->n", origin - first, normal) / np.einsum("nc,nc->n", line, normal)
+        along = np.clip(np.nan_to_num(along), 0.0, 1.0)
+        side = np.where(np.einsum("nc,nc->n", line, normal) < 0, -1.0, 1.0)[:, None]
+        return along, first + along[:, None] * line, side * normal
+
+
+def _plane(scene: SionnaScene, triangle: Int64Array) -> tuple[Float64Array, Float64Array]:
+    """Unit normal and a corner of triangles [m], each of Shape ``[N, 3]``."""
+    corners = scene.corners(triangle) - scene.centre
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return normal / np.sqrt((normal**2).sum(1, keepdims=True)), corners[:, 0]
+
+
+def _lets_through(scene: SionnaScene, triangle: Int64Array, direction: Float64Array) -> BoolArray:
+    """Triangles that a launched ray along unit vectors ``[N, 3]`` could pass on any carrier: the ray tracer
+    draws transmission with a probability of at least `DRAWN`."""
+    media = scene.media(scene.shapes_of(triangle)[0])
+    cosine = np.abs(np.einsum("nc,nc->n", direction, _plane(scene, triangle)[0]))
+    through = np.zeros(len(triangle), np.bool_)
+    for carrier, wavelength in enumerate(scene.wavelengths):
+        constants = media.permittivity[carrier], media.conductivity[carrier]
+        back, passed = slab(cosine, constants, media.thickness, SPEED_OF_LIGHT / wavelength)
+        through |= (np.abs(passed) ** 2).sum(0) >= DRAWN * (np.abs(back) ** 2).sum(0)
+    return through

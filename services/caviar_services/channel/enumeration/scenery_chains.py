@@ -10,115 +10,51 @@ another is a chain, from wherever it is. From a place, the beams of its images l
 
 Of a thousand planes in a town each sees some thirty. Rays in all directions from points of each plane tell
 which; planes that are hidden but for less than one ray meets count as hidden.
+
+Launched chains are kept in files, so that the next run with the same scenery does not launch them again. A
+file's name is a digest of all that its chains follow from, so a file is never out of date: the scenery's
+triangles, the transmitter's position, how rays are launched, and the versions of this format and of the ray
+tracer. Files are put in place in one step, and one that is damaged is launched again.
 """
 
 from __future__ import annotations
 
-import math
+import hashlib
 from collections.abc import Callable
 from dataclasses import astuple, dataclass, replace
-from functools import lru_cache, reduce
+from functools import reduce
 from itertools import pairwise
+from pathlib import Path
+from typing import Literal
 
+import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
-from caviar_services.channel.enumeration.chain_cache import ChainCache, cache_key
-from caviar_services.channel.enumeration.face_rectangles import FaceRectangles, ranges
-from caviar_services.channel.enumeration.scene_faces import SceneFaces
+from caviar_protocol.files import read_regular, replace_file
+from caviar_protocol.messages import WARNING
+from caviar_services.channel.enumeration.scene_faces import (
+    FaceRectangles,
+    SceneFaces,
+    seen_planes,
+    visible_pairs,
+)
+from caviar_services.channel.propagation.geometry import ranges
 from caviar_services.channel.sionna.candidate_visibility import Faces
 from caviar_services.channel.sionna.candidates import chains_of
 from caviar_services.channel.sionna.ray_launcher import Launch, Launcher, LaunchOptions, PartedLauncher
 from caviar_services.channel.sionna.scene import SionnaScene
+from caviar_services.checkpoint import Packed
 from caviar_services.ray_tracing import positions
-
-_OFF_PLANE = 1e-3
-"""[m] from its plane that a ray starts."""
-
-_PART = 1_000_000
-"""Rays that are traced together."""
-
-
-def visible_pairs(look: Faces, faces: FaceRectangles, rays: int, seed: int) -> Int64Array:
-    """Both planes of each pair that see one another, each pair in both orders, sorted, Shape ``[M, 2]``.
-
-    Parameters
-    ----------
-    look
-        Asks the scene, in which nothing that moves should stand.
-    faces
-        Of the planes.
-    rays
-        From each of them.
-    seed
-        Of the points and directions that are drawn.
-    """
-    rng = np.random.default_rng(seed)
-    at_once = max(1, _PART // rays)
-    found = [np.zeros((0, 2), np.int64)]
-    for begin in range(0, len(faces), at_once):
-        some = np.arange(begin, min(begin + at_once, len(faces)))
-        face = np.repeat(some, rays)
-        start = _points(faces.take(some), rays, rng)
-        direction = rng.standard_normal((len(face), 3))
-        direction /= np.sqrt((direction**2).sum(1))[:, None]
-        off = np.sign((direction * faces.normal[face]).sum(1))[:, None] * faces.normal[face] * _OFF_PLANE
-        behind, plane = look.nearest(start + off, start + off + direction)
-        hit = np.isfinite(behind)
-        found.append(np.unique(np.column_stack([faces.plane[face], plane])[hit], axis=0))
-    pairs = np.concatenate(found)
-    pairs = pairs[np.isin(pairs[:, 1], faces.plane) & (pairs[:, 0] != pairs[:, 1])]
-    return np.unique(np.concatenate([pairs, pairs[:, ::-1]]), axis=0)
-
-
-def seen_planes(look: Faces, points: Float64Array, planes: Int64Array, rays: int) -> BoolArray:
-    """Which of some planes, in ascending order, each of some points [m], Shape ``[R, 3]``, sees, Shape
-    ``[R, U]``: those that rays in all directions meet first."""
-    seen = np.zeros((len(points), len(planes) + 1), np.bool_)
-    start = np.repeat(points, rays, axis=0)
-    behind, plane = look.nearest(start, start + np.tile(_directions(rays), (len(points), 1)))
-    place = np.searchsorted(planes, plane)
-    known = np.isfinite(behind) & (np.append(planes, -1)[place] == plane)
-    seen[np.repeat(np.arange(len(points)), rays), np.where(known, place, len(planes))] = True
-    return seen[:, :-1]
-
-
-@lru_cache(maxsize=4)
-def _directions(rays: int) -> Float64Array:
-    """Unit vectors that are spread evenly, Shape ``[N, 3]``."""
-    number = np.arange(rays) + 0.5
-    z, turn = 1 - 2 * number / rays, np.pi * (1 + math.sqrt(5.0)) * number
-    flat = np.sqrt(1 - z**2)
-    return np.column_stack([flat * np.cos(turn), flat * np.sin(turn), z])
-
-
-def _points(faces: FaceRectangles, count: int, rng: np.random.Generator) -> Float64Array:
-    """So many points of each face [m], evenly spread over its triangles, face after face."""
-    corners = faces.triangles
-    one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    area = np.abs(one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0])
-    ends = np.cumsum(area)
-    last = np.cumsum(faces.sizes) - 1
-    begin, whole = ends[last] - np.add.reduceat(area, last + 1 - faces.sizes), ends[last]
-    drawn = begin[:, None] + rng.random((len(faces), count)) * (whole - begin)[:, None]
-    triangle = np.clip(np.searchsorted(ends, drawn), (last + 1 - faces.sizes)[:, None], last[:, None])
-    triangle = triangle.ravel()
-    weights = rng.random((len(triangle), 2))
-    weights = np.where((weights.sum(1) > 1)[:, None], 1 - weights, weights)
-    flat = corners[triangle, 0] + weights[:, :1] * one[triangle] + weights[:, 1:] * other[triangle]
-    face = np.repeat(np.arange(len(faces)), count)
-    points: Float64Array = faces.centre[face] + np.einsum("na,nac->nc", flat, faces.axes[face])
-    return points
-
 
 MOST_CHAINS = 20_000
 """Sequences of which all are taken, at most."""
 
+# [m] around pyramids; more than the rim of triangles.
 _SLACK = 1e-3
-"""[m] around pyramids; more than the rim of triangles."""
 
+# [m]; walls of a building that meet at a corner do not show one another.
 _IN_FRONT = 1e-6
-"""[m]; walls of a building that meet at a corner do not show one another."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,12 +72,9 @@ class _Level:
 class ChainTree:
     """Sequences of faces, each of which sees the next one.
 
-    Parameters
-    ----------
-    faces
-        Of scenery, in ascending order of their planes.
-    levels
-        Sequences of one face, of two faces, and so on.
+    Args:
+        faces: Of scenery, in ascending order of their planes.
+        levels: Sequences of one face, of two faces, and so on.
     """
 
     def __init__(self, faces: FaceRectangles, levels: list[_Level]) -> None:
@@ -179,12 +112,9 @@ class ChainTree:
         """Planes of the sequences that a source can light, those of fewer planes first, with the beginnings
         of each, −1 behind the last, Shape ``[K, D]``.
 
-        Parameters
-        ----------
-        source
-            [m], Shape ``[3]``.
-        seen
-            Faces that the source may see, Shape ``[U]``.
+        Args:
+            source: [m], Shape ``[3]``.
+            seen: Faces that the source may see, Shape ``[U]``.
         """
         faces, level = self._faces, self._levels[0]
         rows = last = np.flatnonzero(seen)
@@ -232,18 +162,18 @@ def _beyond(apex: Float64Array, corners: Float64Array, target: Float64Array) -> 
     return beyond
 
 
+# From each plane, to find which others it sees: before the first frame, and in each.
 _SIGHT_RAYS, _SIGHT_RAYS_PER_FRAME = 4096, 64
-"""From each plane, to find which others it sees: before the first frame, and in each."""
 
+# Of a coordinate; a transmitter that is this near to where it was prepared has not moved: worlds in other
+# languages may send its position in single precision.
 _ROUNDING = float(np.finfo(np.float32).eps)
-"""Of a coordinate; a transmitter that is this near to where it was prepared has not moved: worlds in other
-languages may send its position in single precision."""
 
+# Of a transmitter that moves, to find the faces that may come first: 2.2° apart.
 _SEEN_RAYS = 8192
-"""Of a transmitter that moves, to find the faces that may come first: 2.2° apart."""
 
+# Faces of scenery of which all sequences are taken.
 _FEW = 64
-"""Faces of scenery of which all sequences are taken."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -272,16 +202,11 @@ class SceneryChains:
 
     Made while no body is in the scene.
 
-    Parameters
-    ----------
-    scene, options
-        What is traced in, and the depth and the seed of what is wanted.
-    launch
-        From where a transmitter stands.
-    per_frame
-        Rays from one that moves.
-    cache
-        Where chains are kept between runs; None: nowhere.
+    Args:
+        scene, options: What is traced in, and the depth and the seed of what is wanted.
+        launch: From where a transmitter stands.
+        per_frame: Rays from one that moves.
+        cache: Where chains are kept between runs; None: nowhere.
     """
 
     def __init__(
@@ -296,12 +221,11 @@ class SceneryChains:
         self._launcher = PartedLauncher(scene.mi_scene, only_reflected(options, per_frame))
         self._look = Faces(scene)
         self._faces = SceneFaces(scene)
+        # By the name of a transmitter that stands: its place in the world [m], and what is known from there.
+        # Each has its own: however near to another one it stands, a wall may be between them.
         self._known: dict[str, tuple[Float64Array, KnownScenery]] = {}
-        """By the name of a transmitter that stands: its place in the world [m], and what is known from there.
-
-        Each has its own: however near to another one it stands, a wall may be between them."""
+        # All chains, and which planes see one another; None: too many.
         self._every = self._every_chain()
-        """All chains, and which planes see one another; None: too many."""
         self._last: tuple[bytes, int, KnownScenery] | None = None
 
     def prepare(self, name: str, transmitter: Float64Array, progress: Callable[[int, int], None]) -> str:
@@ -391,14 +315,10 @@ def launched_chains(
 
     Chains are sorted, those of fewer planes first, and with each chain its beginnings are there.
 
-    Parameters
-    ----------
-    options
-        Of the paths that are wanted: the depth and the seed; only reflections are looked for.
-    transmitter
-        In the ray tracer's coordinates [m], Shape ``[3]``.
-    progress
-        Called before each part with its number and how many there are.
+    Args:
+        options: Of the paths that are wanted: the depth and the seed; only reflections are looked for.
+        transmitter: In the ray tracer's coordinates [m], Shape ``[3]``.
+        progress: Called before each part with its number and how many there are.
     """
     reflected = only_reflected(options, launch.samples)
     source = positions(transmitter[None])
@@ -435,3 +355,80 @@ def united(one: Int32Array, other: Int32Array) -> Int32Array:
     chains = np.unique(np.concatenate([one, other]), axis=0)
     order: Int64Array = np.lexsort((*chains.T[::-1], (chains >= 0).sum(1)))
     return chains[order]
+
+
+_FORMAT: Literal["caviar-chains-1"] = "caviar-chains-1"
+
+
+class _ChainFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The content of a file."""
+
+    format: Literal["caviar-chains-1"]
+    key: str
+    tables: tuple[Packed, ...]
+    """Of planes by number."""
+    digest: bytes
+    """Of the tables' bytes."""
+
+
+class ChainCache:
+    """Files of chains below a folder, which is made when the first one is written.
+
+    Args:
+        folder: Any; several processes may use it at once.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self.notes: list[str] = []
+        """What could not be read or written, and why."""
+
+    def load(self, key: str, widths: tuple[int, ...]) -> tuple[Int32Array, ...] | None:
+        """The tables of a key, which have rows of these widths; None where there is no file, or a damaged
+        one."""
+        path = self._folder / key
+        try:
+            data = read_regular(path, "it is replaced")
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            self.notes.append(
+                f"{WARNING}{path} cannot be read ({error.strerror}); its chains are launched again"
+            )
+            return None
+        try:
+            file = msgspec.msgpack.decode(data, type=_ChainFile)
+            tables: tuple[Int32Array, ...] = tuple([table.array(np.int32) for table in file.tables])
+            intact = file.key == key and file.digest == _digest(file.tables)
+        except (msgspec.MsgspecError, UnicodeDecodeError, ValueError):
+            intact = False
+        if intact and [table.shape[1:] for table in tables] == [(width,) for width in widths]:
+            return tables
+        self.notes.append(f"{WARNING}{path} is damaged; its chains are launched again")
+        return None
+
+    def save(self, key: str, tables: tuple[Int32Array, ...]) -> None:
+        """Keep the tables of a key; where that cannot be done, a note says so."""
+        packed = tuple([Packed.of(table, "<i4") for table in tables])
+        file = _ChainFile(format=_FORMAT, key=key, tables=packed, digest=_digest(packed))
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            replace_file(self._folder / key, msgspec.msgpack.encode(file), durable=False)
+        except OSError as error:
+            self.notes.append(
+                f"{WARNING}chains cannot be kept in {self._folder} ({error.strerror}); the next run "
+                "launches them again, unless XDG_CACHE_HOME names a folder that can be written"
+            )
+
+
+def cache_key(*parts: bytes) -> str:
+    """Digest of all that chains follow from."""
+    digest = hashlib.blake2b(digest_size=20)
+    for part in (_FORMAT.encode(), *parts):
+        digest.update(len(part).to_bytes(8, "little"))
+        digest.update(part)
+    return digest.hexdigest()
+
+
+def _digest(tables: tuple[Packed, ...]) -> bytes:
+    return hashlib.blake2b(b"".join([table.data for table in tables]), digest_size=16).digest()

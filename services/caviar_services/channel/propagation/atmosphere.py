@@ -19,8 +19,8 @@ from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 FREQUENCIES_GHZ = (1.0, 1000.0)
 """Where Annex 1 is defined."""
 
+# ρ·T/e of water vapour [g·K/(m³·hPa)] (eq. 4).
 _SPECIFIC_GAS = 216.7
-"""ρ·T/e of water vapour [g·K/(m³·hPa)] (eq. 4)."""
 
 
 class Atmosphere(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -62,16 +62,12 @@ def specific_attenuation(atmosphere: Atmosphere, frequency_hz: float) -> float:
 def amplitude_factor(db_per_km: Float64Array, tau: Float64Array) -> Float64Array:
     """What absorption leaves of amplitudes: 10^(−γ·d/20) with d = c·τ.
 
-    Parameters
-    ----------
-    db_per_km
-        γ of each carrier [dB/km], Shape ``[C]``.
-    tau
-        Delay of each path [s], Shape ``[P]``.
+    Args:
+        db_per_km: γ of each carrier [dB/km], Shape ``[C]``.
+        tau: Delay of each path [s], Shape ``[P]``.
 
-    Returns
-    -------
-    Factors of Shape ``[C, P]``.
+    Returns:
+        Factors of Shape ``[C, P]``.
     """
     factor: Float64Array = 10 ** (-db_per_km[:, None] * (SPEED_OF_LIGHT / 1000 * tau) / 20)
     return factor
@@ -121,6 +117,7 @@ def _continuum(f: float, p: float, e: float, theta: float) -> float:
     return continuum
 
 
+# Table 1: f0 [GHz], a1 to a6.
 _OXYGEN = (
     (50.474214, 0.975, 9.651, 6.69, 0.0, 2.566, 6.85),
     (50.987745, 2.529, 8.653, 7.17, 0.0, 2.246, 6.8),
@@ -167,8 +164,8 @@ _OXYGEN = (
     (773.83949, 572.3, 0.141, 16.2, 0.0, 0.0, 0.0),
     (834.145546, 183.1, 0.145, 14.7, 0.0, 0.0, 0.0),
 )
-"""Table 1: f0 [GHz], a1 to a6."""
 
+# Table 2: f0 [GHz], b1 to b6.
 _WATER_VAPOUR = (
     (22.23508, 0.1079, 2.144, 26.38, 0.76, 5.087, 1.0),
     (67.80396, 0.0011, 8.732, 28.58, 0.69, 4.93, 0.82),
@@ -206,4 +203,3 @@ _WATER_VAPOUR = (
     (987.926764, 134.6, 0.257, 29.85, 0.68, 4.55, 0.9),
     (1780.0, 17506.0, 0.952, 196.3, 2.0, 24.15, 5.0),
 )
-"""Table 2: f0 [GHz], b1 to b6."""

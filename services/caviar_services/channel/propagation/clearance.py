@@ -69,28 +69,25 @@ CLEARANCE = 0.02
 NEAR_PAIR = 0.05
 """[m]; pairs nearer than this have their line of sight by formula, not from the ray tracer."""
 
+# [m]; nearer to a surface, the side that an antenna is on is not told by its position.
 _ON_SURFACE = 1e-6
-"""[m]; nearer to a surface, the side that an antenna is on is not told by its position."""
 
+# [m] beyond the edges of a triangle that still are at it.
 _MARGIN = 1e-3
-"""[m] beyond the edges of a triangle that still are at it."""
 
 RISING_RAYS = 6
 _RISES = np.radians(np.linspace(10.0, 85.0, RISING_RAYS))
 _TURNS = 1.0 + 2.4 * np.arange(RISING_RAYS)
+# Directions of the rays of `Surfaces.above`: upwards, from shallow to steep, each of another azimuth.
 _RISING = np.stack([np.cos(_TURNS), np.sin(_TURNS), np.tan(_RISES)], axis=-1)
-"""Directions of the rays of `Surfaces.above`: upwards, from shallow to steep, each of another azimuth."""
 
 
 class Surfaces:
     """Triangles, to be asked what is near a point and what stands in the way.
 
-    Parameters
-    ----------
-    triangles
-        Corners [m], Shape ``[F, 3, 3]``.
-    outside
-        From the number of a triangle and its unit normal: whether the normal points outside.
+    Args:
+        triangles: Corners [m], Shape ``[F, 3, 3]``.
+        outside: From the number of a triangle and its unit normal: whether the normal points outside.
     """
 
     def __init__(self, triangles: Float64Array, outside: Callable[[int, Float64Array], bool]) -> None:

@@ -20,6 +20,17 @@ def cross(one: Float64Array, other: Float64Array) -> Float64Array:
     return product
 
 
+def unit(vectors: Float64Array) -> Float64Array:
+    units: Float64Array = vectors / np.sqrt((vectors**2).sum(-1, keepdims=True))
+    return units
+
+
+def ranges(begin: Int64Array, sizes: Int64Array) -> tuple[Int64Array, Int64Array]:
+    """The numbers of N ranges, one range after the other: the range that each is of, and the numbers."""
+    own = np.repeat(np.arange(len(begin)), sizes)
+    return own, np.arange(len(own)) - np.repeat(np.cumsum(sizes) - sizes - begin, sizes)
+
+
 @dataclass(frozen=True, eq=False)
 class PathGeometry:
     """What follows from the corner points of P paths."""
@@ -45,18 +56,12 @@ def path_geometry(
 ) -> PathGeometry:
     """Geometry of paths start → points → end.
 
-    Parameters
-    ----------
-    start, end
-        TX and RX position of each path [m], Shape ``[P, 3]``; likewise their velocities [m/s].
-    points
-        Interaction points [m], Shape ``[P, D, 3]``; entries from ``count`` on are ignored. Likewise
-        ``point_velocity``, the velocity [m/s] of what stands at each point.
-    count
-        Number of interactions of each path, Shape ``[P]``.
+    Args:
+        start, end: TX and RX position of each path [m], Shape ``[P, 3]``; likewise their velocities [m/s].
+        points: Interaction points [m], Shape ``[P, D, 3]``; entries from ``count`` on are ignored. Likewise
+            ``point_velocity``, the velocity [m/s] of what stands at each point.
+        count: Number of interactions of each path, Shape ``[P]``.
 
-    Notes
-    -----
     Doppler shift to first order in v/c, with unit vector k_i of the segment behind corner i:
     f_D / f = Σ_i (v_i − v_{i+1})·k_i / c (a source that approaches raises the frequency).
     """

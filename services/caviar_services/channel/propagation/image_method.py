@@ -23,21 +23,21 @@ from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt8Arr
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.propagation.geometry import cross
 
+# [m]; a point that moves less is the same.
 _NEAR = 0.05
-"""[m]; a point that moves less is the same."""
 
+# Part of a path's length by which a point may move where the length stays: at grazing incidence a rounding
+# moves the point far and the length not at all.
 _FAR = 1e-2
-"""Part of a path's length by which a point may move where the length stays: at grazing incidence
-a rounding moves the point far and the length not at all."""
 
+# [m]; what rounding changes of a path's length at most, in scenes of some kilometres.
 _SAME_LENGTH = 2e-3
-"""[m]; what rounding changes of a path's length at most, in scenes of some kilometres."""
 
+# [m]; a segment needs a length to have a direction, and this is 1e-4 rad at 300 GHz.
 _BIT = 1e-8
-"""[m]; a segment needs a length to have a direction, and this is 1e-4 rad at 300 GHz."""
 
+# [m]; points of one type and pair that are nearer than this are one.
 _SAME_PLACE = 1e-4
-"""[m]; points of one type and pair that are nearer than this are one."""
 
 
 def refined_points(
@@ -54,20 +54,13 @@ def refined_points(
     A path whose points cannot be (a line within the plane, a triangle without area, another edge than the
     traced one) stays as traced.
 
-    Parameters
-    ----------
-    start, end
-        TX and RX position [m], Shape ``[P, 3]``.
-    points
-        Traced points [m], Shape ``[P, D, 3]``.
-    types
-        `Interaction` at each, Shape ``[P, D]``; diffraction at most once in a path.
-    triangles
-        Corners [m] of the triangle at each interaction, Shape ``[P, D, 3, 3]``.
-    edges
-        Both ends [m] of the edge of each path that is diffracted, Shape ``[P, 2, 3]``; None: none is.
-    traced_ends
-        From where and to where the points were traced, where that was not from start to end.
+    Args:
+        start, end: TX and RX position [m], Shape ``[P, 3]``.
+        points: Traced points [m], Shape ``[P, D, 3]``.
+        types: `Interaction` at each, Shape ``[P, D]``; diffraction at most once in a path.
+        triangles: Corners [m] of the triangle at each interaction, Shape ``[P, D, 3, 3]``.
+        edges: Both ends [m] of the edge of each path that is diffracted, Shape ``[P, 2, 3]``; None: none is.
+        traced_ends: From where and to where the points were traced, where that was not from start to end.
     """
     some = np.flatnonzero((types != 0).any(1))
     if not len(some):
@@ -217,12 +210,9 @@ def _square(vectors: Float64Array) -> Float64Array:
 def keller_point(source: Float64Array, target: Float64Array, edges: Float64Array) -> Float64Array:
     """Where the shortest path from source to target over the line of an edge meets it [m].
 
-    Parameters
-    ----------
-    source, target
-        [m], Shape ``[P, 3]``.
-    edges
-        Both ends of each [m], Shape ``[P, 2, 3]``.
+    Args:
+        source, target: [m], Shape ``[P, 3]``.
+        edges: Both ends of each [m], Shape ``[P, 2, 3]``.
     """
     origin, along = edges[:, 0], edges[:, 1] - edges[:, 0]
     along = along / np.sqrt(_square(along))

@@ -19,8 +19,8 @@ Field = Float64Array | Complex128Array
 """Complex where an element is circularly polarized, or its file says so."""
 
 
+# [dBi]; mean gain over the sphere that is not remarked on: files round, and sum cuts.
 _TOLERANCE_DBI = 2.0
-"""[dBi]; mean gain over the sphere that is not remarked on: files round, and sum cuts."""
 
 
 def spherical_basis(directions: Float64Array, pole: float = 0.0) -> tuple[Float64Array, Float64Array]:
@@ -123,16 +123,11 @@ def radiated_field(
 ) -> Field:
     """Far field of one element, in world axes, Shape ``[P, 3]``; its squared norm is the gain.
 
-    Parameters
-    ----------
-    array
-        Pattern and polarization; of a dual one the first.
-    rotation
-        3×3 matrix that turns the device's axes into world axes.
-    directions
-        Unit vectors from the device outwards, in world axes, Shape ``[P, 3]``.
-    pattern
-        Of the element; None: the one that the array names.
+    Args:
+        array: Pattern and polarization; of a dual one the first.
+        rotation: 3×3 matrix that turns the device's axes into world axes.
+        directions: Unit vectors from the device outwards, in world axes, Shape ``[P, 3]``.
+        pattern: Of the element; None: the one that the array names.
     """
     local = directions @ rotation
     field = polarized_field(pattern or _formula(array.pattern), array.polarizations[0], local)

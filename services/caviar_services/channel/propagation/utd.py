@@ -23,6 +23,11 @@ with Rn = −1 for a face in the shadow.
 Each Di changes its sign at one boundary: D1 and D2 where the wave that passes the edge ends, D4 and D3 where
 the waves end that the first and the second face reflect. `Bends.margins` says how far off these are. Where
 it is known otherwise which of these waves there are, ``lit`` says so, and the sum of all waves is continuous.
+
+That sum is continuous only if lines of sight, reflections and diffracted fields go by one decision. A ray
+tracer in float32 decides about lines of sight to some micrometres, and about reflections to a millimetre. So
+the diffracted field's own angles, in float64, decide about lines of sight that pass an edge within
+`_UNSURE`; about other waves there, it goes by what the ray tracer has decided (`waves_beside`).
 """
 
 from __future__ import annotations
@@ -33,37 +38,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int64Array, UInt8Array
-from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Interaction
-from caviar_services.channel.propagation.geometry import cross
-from caviar_services.channel.sionna.materials import slab
+from caviar_services.channel.propagation.fresnel import Media, Wall
+from caviar_services.channel.propagation.geometry import unit
 
 IN_PLANE = 1e-8
 """[rad]; a ray this near the plane of a face is in it, and this near a shadow boundary on its lit side."""
 
+# Sine of the angle between faces below which they are one plane, or lie upon one another.
 _FLAT = 1e-6
-"""Sine of the angle between faces below which they are one plane, or lie upon one another."""
 
+# Of reflection matrices in the bases of diffraction, which turn round from the incoming to the outgoing ray:
+# with it the field is continuous where reflection ends, without it, as in the ray tracer, it is not.
 _SIGN = -1.0
-"""Of reflection matrices in the bases of diffraction, which turn round from the incoming to the outgoing ray:
-with it the field is continuous where reflection ends, without it, as in the ray tracer, it is not."""
-
-_ALONG = 1e-9
-"""Sine of the angle between two directions below which they are one."""
-
-
-@dataclass(frozen=True, eq=False)
-class Media:
-    """What surfaces at the interactions of P paths are made of, on C carriers."""
-
-    permittivity: Float64Array
-    """Relative, Shape ``[C, P, D]``."""
-    conductivity: Float64Array
-    """[S/m], Shape ``[C, P, D]``."""
-    thickness: Float64Array
-    """[m], Shape ``[P, D]``."""
-    scattering: Float64Array
-    """Scattering coefficients, Shape ``[P, D]``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,17 +85,15 @@ class Faces:
 def faces_of(ends: Float64Array, apexes: Float64Array) -> tuple[Faces, BoolArray]:
     """Faces of wedges, and where there are any: not where an edge has no length or a face no width.
 
-    Parameters
-    ----------
-    ends
-        Of the edges [m], Shape ``[P, 2, 3]``.
-    apexes
-        A point of each face that is not on the edge [m], Shape ``[P, 2, 3]``; of a single face, twice.
+    Args:
+        ends: Of the edges [m], Shape ``[P, 2, 3]``.
+        apexes: A point of each face that is not on the edge [m], Shape ``[P, 2, 3]``; of a single face,
+            twice.
     """
     begin, end = ends[:, 0], ends[:, 1]
     with np.errstate(invalid="ignore", divide="ignore"):  # of what is no wedge
-        edge = _unit(end - begin)
-        inward = [_unit(_across(apexes[:, face] - begin, edge)) for face in (0, 1)]
+        edge = unit(end - begin)
+        inward = [unit(_across(apexes[:, face] - begin, edge)) for face in (0, 1)]
         normals = [np.cross(edge, part) for part in inward]
         for normal, other in zip(normals, inward[::-1], strict=True):
             normal *= np.where((normal * other).sum(-1, keepdims=True) > 0, -1.0, 1.0)
@@ -147,7 +132,7 @@ class Bends:
         at, rows = np.argmax(bent, axis=1), np.arange(len(types))
         behind = np.cumsum(bent, axis=1) > 0
         legs = lengths[:, 0] + (lengths[:, 1:] * ~behind).sum(1), (lengths[:, 1:] * behind).sum(1)
-        k, out = _unit(steps[rows, at]), _unit(steps[rows, at + 1])
+        k, out = unit(steps[rows, at]), unit(steps[rows, at + 1])
         met = -(faces.normals * k[:, None]).sum(-1)
         swap = met[:, 1] > met[:, 0] + IN_PLANE
         return cls(at, k, out, legs, faces.turned(swap), swap)
@@ -199,24 +184,18 @@ def edge_fields(
     """Dyads of `PathTable` of paths that are diffracted once, Shape ``[C, P, 3, 3]``; not finite where the
     geometry leaves none.
 
-    Parameters
-    ----------
-    corners
-        TX, interaction points, and RX in all places behind the last one [m], Shape ``[P, D + 2, 3]``.
-    types
-        `Interaction` at each point, Shape ``[P, D]``: reflections, transmissions, and one diffraction.
-    normals
-        Of the triangle at each point, of any length, Shape ``[P, D, 3]``.
-    faces
-        Of the wedge.
-    media
-        At each point; at the edge, that of the first face.
-    second
-        Of the second face, Shape ``[C, P, 1]`` or ``[P, 1]``.
-    wavelengths
-        Of the carriers [m].
-    lit
-        Which of the waves of `Bends.margins` there are: 1, −1 for none, 0 where angles tell; ``[P, 3]``.
+    Args:
+        corners: TX, interaction points, and RX in all places behind the last one [m], Shape ``[P, D + 2,
+            3]``.
+        types: `Interaction` at each point, Shape ``[P, D]``: reflections, transmissions, and one
+            diffraction.
+        normals: Of the triangle at each point, of any length, Shape ``[P, D, 3]``.
+        faces: Of the wedge.
+        media: At each point; at the edge, that of the first face.
+        second: Of the second face, Shape ``[C, P, 1]`` or ``[P, 1]``.
+        wavelengths: Of the carriers [m].
+        lit: Which of the waves of `Bends.margins` there are: 1, −1 for none, 0 where angles tell; ``[P,
+            3]``.
     """
     steps = np.diff(corners, axis=1)
     bends = Bends.of(corners, types, faces)
@@ -224,14 +203,14 @@ def edge_fields(
     s_in, s_out = bends.legs
     fields = []
     for carrier, wavelength in enumerate(wavelengths):
-        k = _unit(steps[:, 0])
+        k = unit(steps[:, 0])
         field = np.eye(3) - k[:, :, None] * k[:, None] + 0j
         other = Wall.of(second, carrier, 0, wavelength)
         for d in range(types.shape[1]):
             going = types[:, d] != 0
-            out = np.where(going[:, None], _unit(steps[:, d + 1]), k)
+            out = np.where(going[:, None], unit(steps[:, d + 1]), k)
             wall = Wall.of(media, carrier, d, wavelength)
-            flat = wall.dyad(k, _unit(normals[:, d]), types[:, d] == Interaction.TRANSMISSION)
+            flat = wall.dyad(k, unit(normals[:, d]), types[:, d] == Interaction.TRANSMISSION)
             rows = np.flatnonzero(bends.at == d)
             if len(rows):
                 walls = wall.take(rows), other.take(rows)
@@ -241,53 +220,6 @@ def edge_fields(
         spreading = 1 / np.sqrt(s_in * s_out * (s_in + s_out))
         fields.append(field * (wavelength / (4 * np.pi) * spreading)[:, None, None])
     return np.stack(fields)
-
-
-@dataclass(frozen=True, eq=False)
-class Wall:
-    """Slabs that P rays meet, at one wavelength [m]."""
-
-    permittivity: Float64Array
-    conductivity: Float64Array
-    thickness: Float64Array
-    scattering: Float64Array
-    wavelength: float
-
-    @classmethod
-    def of(cls, media: Media, carrier: int, d: int, wavelength: float) -> Wall:
-        """What is at interaction ``d`` of paths."""
-        constants = media.permittivity[carrier, :, d], media.conductivity[carrier, :, d]
-        return cls(*constants, media.thickness[:, d], media.scattering[:, d], wavelength)
-
-    def where(self, which: BoolArray, other: Wall) -> Wall:
-        """These where ``which`` is true, and elsewhere those of another."""
-        return Wall(
-            np.where(which, self.permittivity, other.permittivity),
-            np.where(which, self.conductivity, other.conductivity),
-            np.where(which, self.thickness, other.thickness),
-            np.where(which, self.scattering, other.scattering),
-            self.wavelength,
-        )
-
-    def take(self, rows: Int64Array) -> Wall:
-        """Those of these rays."""
-        return Wall(
-            self.permittivity[rows],
-            self.conductivity[rows],
-            self.thickness[rows],
-            self.scattering[rows],
-            self.wavelength,
-        )
-
-    def dyad(self, k: Float64Array, normal: Float64Array, through: BoolArray) -> Complex128Array:
-        """From the field that comes in along ``k`` to what is reflected, or goes through."""
-        across = (k * normal).sum(-1)
-        frequency = SPEED_OF_LIGHT / self.wavelength
-        back, passed = slab(np.abs(across), (self.permittivity, self.conductivity), self.thickness, frequency)
-        te, tm = np.where(through, passed, back * np.sqrt(1 - self.scattering**2))
-        s = _unit(_perpendicular(k, normal))
-        out = np.where(through[:, None], k, k - 2 * across[:, None] * normal)
-        return _outer(te[:, None] * s, s) + _outer(tm[:, None] * cross(out, s), cross(k, s))
 
 
 def _diffracted(bends: Bends, walls: tuple[Wall, Wall], lit: Int64Array) -> Complex128Array:
@@ -300,14 +232,14 @@ def _diffracted(bends: Bends, walls: tuple[Wall, Wall], lit: Int64Array) -> Comp
     legs = bends.spread * _sine(k, edge) ** 2
     wavelength = walls[0].wavelength
     d14, d23 = _coefficients(angle_in, angle_out, exterior, _sine(k, edge), legs, wavelength, lit)
-    s_in, s_out = _unit(np.cross(k, edge)), -_unit(np.cross(out, edge))
+    s_in, s_out = unit(np.cross(k, edge)), -unit(np.cross(out, edge))
     incoming = np.stack([s_in, np.cross(k, s_in)], axis=1)
     outgoing = np.stack([s_out, np.cross(out, s_out)], axis=1)
     no = np.zeros(len(k), np.bool_)
     parts = []
     for normal, wall in zip(np.moveaxis(bends.faces.normals, 1, 0), walls, strict=True):
         sent_back = k - 2 * (k * normal).sum(-1, keepdims=True) * normal
-        s_back = -_unit(np.cross(sent_back, edge))
+        s_back = -unit(np.cross(sent_back, edge))
         back = np.stack([s_back, np.cross(sent_back, s_back)], axis=1)
         parts.append(_SIGN * back @ wall.dyad(k, normal, no) @ incoming.transpose(0, 2, 1))
     shadowed = exterior >= np.pi + angle_in - IN_PLANE
@@ -382,26 +314,103 @@ def _sine(one: Float64Array, other: Float64Array) -> Float64Array:
     return sine
 
 
-def _perpendicular(k: Float64Array, normal: Float64Array) -> Float64Array:
-    """A direction across both; any across ``k`` where both are one."""
-    across = cross(k, normal)
-    axis = np.eye(3)[np.argmin(np.abs(k), axis=-1)]
-    lost = (across**2).sum(-1, keepdims=True) < _ALONG**2
-    perpendicular: Float64Array = np.where(lost, cross(k, axis), across)
-    return perpendicular
-
-
 def _across(vectors: Float64Array, axis: Float64Array) -> Float64Array:
     """What of vectors is across unit vectors."""
     across: Float64Array = vectors - (vectors * axis).sum(-1, keepdims=True) * axis
     return across
 
 
-def _outer(one: Complex128Array | Float64Array, other: Float64Array) -> Complex128Array:
-    outer: Complex128Array = one.astype(np.complex128)[:, :, None] * other[:, None]
-    return outer
+# [m]; farther from an edge, a wave is there or not as the ray tracer says.
+_UNSURE = 2e-3
+
+# Sine of the angle to a face below which no reflection is traced that could end.
+_GRAZING = 1e-3
 
 
-def _unit(vectors: Float64Array) -> Float64Array:
-    unit: Float64Array = vectors / np.sqrt((vectors**2).sum(-1, keepdims=True))
-    return unit
+@dataclass(frozen=True, eq=False)
+class Chains:
+    """What P paths meet."""
+
+    pair: Int64Array
+    """Shape ``[P]``."""
+    types: UInt8Array
+    """`Interaction` of each point, Shape ``[P, D]``."""
+    planes: Int64Array
+    """Plane that is met there, Shape ``[P, D]``; anything at an edge."""
+
+    def key(self, path: int) -> tuple[tuple[int, int], ...]:
+        """Type and plane of each interaction of a path."""
+        met = zip(self.types[path].tolist(), self.planes[path].tolist(), strict=True)
+        return tuple((kind, plane) for kind, plane in met if kind)
+
+
+@dataclass(frozen=True)
+class Sight:
+    """The line of sight of a pair that passes edges closely."""
+
+    lit: bool
+    """Whether it does so on the lit side of each."""
+    passed: frozenset[int]
+    """The planes of their faces."""
+
+
+def waves_beside(
+    bends: Bends, faces: Int64Array, bent: Int64Array, chains: Chains
+) -> tuple[Int64Array, dict[int, Sight]]:
+    """Which of the waves there are that end near diffracted paths.
+
+    Args:
+        bends: Of B diffracted paths.
+        faces: Planes of the two faces that each goes over, Shape ``[B, 2]``.
+        bent: Which of all paths these are, Shape ``[B]``.
+        chains: Of all paths; those of pair −1 count for none.
+
+    Returns:
+        ``lit`` of `edge_fields`, Shape ``[B, 3]``, and the lines of sight that pass edges closely, by pair.
+    """
+    margins = bends.margins
+    lit = np.zeros(margins.shape, np.int64)
+    sights: dict[int, Sight] = {}
+    near = np.abs(margins) * bends.spread[:, None] < _UNSURE
+    near[:, 1:] &= _steep(bends)
+    rows, waves = np.nonzero(near)
+    if not len(rows):
+        return lit, sights
+    same = np.flatnonzero(np.isin(chains.pair, chains.pair[bent[rows]]))
+    there = {(int(chains.pair[path]), chains.key(path)) for path in same.tolist()}
+    for row, wave in zip(rows.tolist(), waves.tolist(), strict=True):
+        path = int(bent[row])
+        pair = int(chains.pair[path])
+        key = _without_edge(chains.key(path), None if wave == 0 else int(faces[row, wave - 1]))
+        if key:
+            lit[row, wave] = 1 if (pair, key) in there else -1
+        elif pair >= 0:
+            before = sights.get(pair, Sight(True, frozenset()))
+            passes = before.lit and bool(margins[row, 0] > -IN_PLANE)
+            sights[pair] = Sight(passes, before.passed | set(faces[row].tolist()))
+    return lit, sights
+
+
+def _steep(bends: Bends) -> BoolArray:
+    """Which of both faces, as they were given, rays do not merely graze, Shape ``[B, 2]``."""
+    met = np.abs((bends.faces.normals * bends.k[:, None]).sum(-1)) > _GRAZING
+    steep: BoolArray = np.where(bends.swapped[:, None], met[:, ::-1], met)
+    return steep
+
+
+def _without_edge(key: Sequence[tuple[int, int]], face: int | None) -> tuple[tuple[int, int], ...]:
+    """The chain with a reflection at a face in place of the edge, or with nothing."""
+    instead = [] if face is None else [(int(Interaction.REFLECTION), face)]
+    bent = next(d for d, (kind, _) in enumerate(key) if kind == Interaction.DIFFRACTION)
+    return (*key[:bent], *instead, *key[bent + 1 :])
+
+
+def beyond_edges(points: Float64Array, ends: Float64Array) -> BoolArray:
+    """Which points [m], Shape ``[B, 3]``, on the lines of edges ``[B, 2, 3]`` are beyond their ends.
+
+    An edge has its first end and not its last one, so that of two in one line one has the place between.
+    """
+    line = ends[:, 1] - ends[:, 0]
+    along = ((points - ends[:, 0]) * line).sum(1)
+    beyond: BoolArray = (along < 0) | (along >= (line**2).sum(1))
+    return beyond

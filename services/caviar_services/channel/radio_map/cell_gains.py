@@ -31,8 +31,8 @@ PART = 1_000_000
 """Rays that are shot together at most."""
 
 _LEAST_PART = 20_000
+# Of a ray and of a cell, beside those for each beam: measured, with room to spare.
 _RAY_BYTES, _CELL_BYTES = 600, 300
-"""Of a ray and of a cell, beside those for each beam: measured, with room to spare."""
 
 _RAY_BEAM_BYTES, _CELL_BEAM_BYTES = 8, 20
 
@@ -102,14 +102,10 @@ def cell_gains(
 ) -> CellGains:
     """Shoot the rays of one transmitter, at the carrier that the scene is tuned to.
 
-    Parameters
-    ----------
-    transmitter
-        Where it is traced from.
-    beams
-        Numbers of beams of the transmitter's codebook, B of them; none: only the element's gain.
-    part
-        Rays that are shot together, as `part_of` tells.
+    Args:
+        transmitter: Where it is traced from.
+        beams: Numbers of beams of the transmitter's codebook, B of them; none: only the element's gain.
+        part: Rays that are shot together, as `part_of` tells.
     """
     from sionna.rt import Transmitter
 
@@ -143,14 +139,10 @@ def beam_gains(antenna: Antenna, beams: range, directions: Any) -> Any:
     rows (C. A. Balanis, Antenna Theory, 3rd ed., eq. 6-10c and section 6.10.1); beams are those of
     `caviar_services.antenna_arrays.dft_codebook`.
 
-    Parameters
-    ----------
-    directions
-        Unit vectors, a `mitsuba.Vector3f` of width R.
+    Args:
+        directions: Unit vectors, a `mitsuba.Vector3f` of width R.
 
-    Returns
-    -------
-    mitsuba.Float
+    Returns:
         Of each beam the gains in all directions, one beam after the other, width ``len(beams)·R``.
     """
     import drjit as dr

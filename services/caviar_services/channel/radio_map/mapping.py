@@ -88,10 +88,10 @@ BeamChoice = Literal["best", "wide"] | int
 beamforming. A number: that beam, everywhere."""
 
 
+# Its test for what is in the way ends after 1 m there (`spawn_ray_to`, sionna-rt 2.2.0).
 _NO_DIFFRACTION = (
     "diffraction is left out: Sionna RT's solver finds none over a surface that is not level; a plane has it"
 )
-"""Its test for what is in the way ends after 1 m there (`spawn_ray_to`, sionna-rt 2.2.0)."""
 
 _ALL_EDGES = "edges_within_m is left out: in maps all edges diffract"
 
@@ -189,21 +189,13 @@ def radio_map(
 ) -> RadioMap:
     """Map what the transmitters of a scene bring to a surface.
 
-    Parameters
-    ----------
-    channel
-        With its scene loaded.
-    samples
-        Rays of each transmitter.
-    carrier
-        Its index among those of the run.
-    noise_w
-        Of a receiver [W].
-    part, done
-        As in `cell_gains`; ``done`` counts the parts of all transmitters.
+    Args:
+        channel: With its scene loaded.
+        samples: Rays of each transmitter.
+        carrier: Its index among those of the run.
+        noise_w: Of a receiver [W].
+        part, done: As in `cell_gains`; ``done`` counts the parts of all transmitters.
 
-    Notes
-    -----
     While another transmitter serves other cells with beams of its codebook, it interferes with each of these
     in turn: in the mean over a unitary codebook, that is the gain of one element.
     """

@@ -106,8 +106,8 @@ def heights(triangles: Float64Array, x: Float64Array, y: Float64Array) -> Float6
     return np.where(np.isfinite(found), found, np.nan)
 
 
+# [m]; a corner of a cell this near to the border of the ground is over it.
 _RIM = 1e-6
-"""[m]; a corner of a cell this near to the border of the ground is over it."""
 
 
 def _height_over(triangle: Float64Array, x: Float64Array, y: Float64Array) -> Float64Array:

@@ -13,8 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
-from caviar_services.channel.enumeration.face_rectangles import ranges
-from caviar_services.channel.propagation.geometry import cross
+from caviar_services.channel.propagation.geometry import cross, ranges
 from caviar_services.channel.sionna.planes import PlaneTable
 
 COPLANAR = 1e-5

@@ -334,7 +334,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         finder, memory = self._finder, int(self.settings.memory_gib * 2**30)
         if self.rung == "spherical" and table.traced is not None:
             surfaces = traced_surfaces(launches, table.traced, table.types, table.points, self._scene)
-            return SphericalWaves(surfaces, finder.tracer.look, traced_from, self.run.carriers, memory)
+            return SphericalWaves(surfaces, finder.tracer.look, traced_from, memory)
         if self.rung == "mimo-rt":
             # A part of a launch is held whole; the rest is for the candidates of some receivers at a time.
             launched = self._launched

@@ -20,9 +20,13 @@ from caviar_protocol.assets import default_folder
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Scene
 from caviar_services.channel.arrays.element_visibility import outermost
-from caviar_services.channel.enumeration.chain_cache import ChainCache
 from caviar_services.channel.enumeration.path_solver import EnumeratedTracer
-from caviar_services.channel.enumeration.scenery_chains import KnownScenery, SceneryChains, SceneryLaunch
+from caviar_services.channel.enumeration.scenery_chains import (
+    ChainCache,
+    KnownScenery,
+    SceneryChains,
+    SceneryLaunch,
+)
 from caviar_services.channel.paths import Antenna, PathTable
 from caviar_services.channel.sionna.candidate_visibility import Corners
 from caviar_services.channel.sionna.diffracting_edges import EdgeRange

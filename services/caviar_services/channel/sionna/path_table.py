@@ -15,8 +15,14 @@ from caviar_services.channel.paths import Antenna, PathTable
 from caviar_services.channel.propagation.clearance import spread_anew, with_direct
 from caviar_services.channel.propagation.image_method import distinct, path_lengths, refined_points
 from caviar_services.channel.propagation.patterns import spherical_basis
-from caviar_services.channel.propagation.shadow_boundaries import Chains, Sight, beyond_edges, waves_beside
-from caviar_services.channel.propagation.utd import Bends, edge_fields
+from caviar_services.channel.propagation.utd import (
+    Bends,
+    Chains,
+    Sight,
+    beyond_edges,
+    edge_fields,
+    waves_beside,
+)
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.scene import SionnaScene
 

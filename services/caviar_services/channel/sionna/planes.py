@@ -15,8 +15,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
-from caviar_services.channel.enumeration.face_rectangles import ranges
-from caviar_services.channel.propagation.geometry import cross
+from caviar_services.channel.propagation.geometry import cross, ranges
 from caviar_services.mesh.shapes import Mesh
 
 # Room for rounding beyond the tolerances, so that no pair within them falls into separate cells.

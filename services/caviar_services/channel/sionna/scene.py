@@ -31,7 +31,7 @@ from caviar_protocol.space.scene import object_pose
 from caviar_protocol.topics import Scene
 from caviar_services.channel.mesh_detail import DetailSettings
 from caviar_services.channel.paths import Turning
-from caviar_services.channel.propagation.utd import Media
+from caviar_services.channel.propagation.fresnel import Media
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.materials import (
     OBJECT_MATERIAL,

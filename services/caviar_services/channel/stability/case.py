@@ -14,7 +14,7 @@ import numpy as np
 
 from caviar_protocol.errors import CaviarError
 from caviar_protocol.host import has_extra
-from caviar_services.channel.stability.bench import Bench
+from caviar_services.channel.stability.lab import Lab
 
 
 class Outcome(msgspec.Struct, frozen=True, kw_only=True):
@@ -32,7 +32,7 @@ class Case:
 
     group: str
     name: str
-    ask: Callable[[Bench], Outcome]
+    ask: Callable[[Lab], Outcome]
     traced: bool
     """Whether it needs the ray tracer."""
 
@@ -54,7 +54,7 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
 
 
 CASES: list[Case] = []
-"""All cases, in the order of the table."""
+"""All cases of the modules that are imported."""
 
 
 def case(group: str, name: str, traced: bool = True) -> Callable[[Ask], Ask]:
@@ -67,7 +67,7 @@ def case(group: str, name: str, traced: bool = True) -> Callable[[Ask], Ask]:
     return register
 
 
-Ask = Callable[[Bench], Outcome]
+Ask = Callable[[Lab], Outcome]
 
 
 def close(
@@ -129,15 +129,33 @@ def _number(value: float | complex) -> str:
 EXTRA = "channel"
 """Extra of the distribution that brings the ray tracer."""
 
-MODULES = ("waves", "places", "counts", "motion", "edges")
-"""Modules with cases, in the order of the table."""
+MODULES = ("waves", "limits", "motion")
+"""Modules with cases."""
+
+GROUPS = (
+    "frequency",
+    "distance",
+    "grazing",
+    "material",
+    "foliage",
+    "place",
+    "mesh",
+    "paths",
+    "array",
+    "input",
+    "speed",
+    "jump",
+    "flush",
+    "edge",
+)
+"""Groups in the order of the table."""
 
 
 def cases() -> Sequence[Case]:
-    """All cases."""
+    """All cases, group by group."""
     for module in MODULES:
         import_module(f"caviar_services.channel.stability.{module}")
-    return tuple(CASES)
+    return tuple(sorted(CASES, key=lambda known: GROUPS.index(known.group)))
 
 
 def run(chosen: Sequence[Case], progress: Callable[[int, Case], None] | None = None) -> list[Result]:
@@ -149,7 +167,7 @@ def run(chosen: Sequence[Case], progress: Callable[[int, Case], None] | None = N
     has_tracer = has_extra(EXTRA)
     results: list[Result] = []
     with TemporaryDirectory(prefix="caviar-stability-") as folder:
-        bench = Bench(Path(folder))
+        lab = Lab(Path(folder))
         for number, case in enumerate(chosen):
             if case.traced and not has_tracer:
                 results.append(_not_run(case))
@@ -157,7 +175,7 @@ def run(chosen: Sequence[Case], progress: Callable[[int, Case], None] | None = N
             if progress is not None:
                 progress(number, case)
             begin = time.perf_counter()
-            outcome = _asked(case, bench)
+            outcome = _asked(case, lab)
             results.append(
                 Result(
                     group=case.group,
@@ -182,10 +200,10 @@ def _not_run(case: Case) -> Result:
     )
 
 
-def _asked(case: Case, bench: Bench) -> Outcome:
+def _asked(case: Case, lab: Lab) -> Outcome:
     try:
         with np.errstate(all="ignore"):
-            return case.ask(bench)
+            return case.ask(lab)
     except Exception as error:  # whatever goes wrong in a case is its answer
         return Outcome(expected="an answer", got=f"{type(error).__name__}: {error}", right=False)
 

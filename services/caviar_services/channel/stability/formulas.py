@@ -1,4 +1,7 @@
-"""Answers from textbooks. Nothing here comes from the models: a wrong sign there cannot be the same here."""
+"""Answers from textbooks. Nothing here comes from the models: a wrong sign there cannot be the same here.
+
+Rotations, Fresnel's coefficients and images are written out once more; no module of the services is imported.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,9 @@ import math
 
 import numpy as np
 
-from caviar_protocol.arrays import Float64Array
+from caviar_protocol.arrays import Complex128Array, Float64Array
+
+Field = Float64Array | Complex128Array
 
 C = 299_792_458.0
 """Speed of light [m/s]."""
@@ -25,6 +30,11 @@ def phase(length: float, frequency: float) -> complex:
     return cmath.exp(-2j * math.pi * ((length * frequency / C) % 1.0))
 
 
+def spherical_wave(length: float, frequency: float) -> complex:
+    """λ/(4πd) · exp(−j2πd/λ): amplitude and phase between isotropic antennas."""
+    return friis(length, frequency) * phase(length, frequency)
+
+
 def doppler(closing_speed: float, frequency: float) -> float:
     """Shift f·v/c [Hz] of a path that shortens by v [m/s], to first order."""
     return frequency * closing_speed / C
@@ -39,6 +49,13 @@ def vegetation(length: float, gamma: float, most: float = math.inf) -> float:
 def permittivity(relative: float, conductivity: float, frequency: float) -> complex:
     """Complex relative permittivity ε_r − jσ/(2πfε₀)."""
     return complex(relative, -conductivity / (2 * math.pi * frequency * EPSILON_0))
+
+
+def itu_permittivity(a: float, b: float, c: float, d: float, frequency: float) -> complex:
+    """Complex relative permittivity from the constants of ITU-R P.2040-3, table 3: ε_r = a·f^b and σ = c·f^d
+    [S/m] with f in GHz."""
+    ghz = frequency / 1e9
+    return permittivity(a * ghz**b, c * ghz**d, frequency)
 
 
 def fresnel(cosine: float, eta: complex) -> tuple[complex, complex]:
@@ -66,10 +83,58 @@ def over_ground(height_tx: float, height_rx: float, distance: float) -> tuple[fl
     return direct, bounced, (height_tx + height_rx) / bounced
 
 
+def two_rays(heights: tuple[float, float], distance: float, eta: complex, frequency: float) -> complex:
+    """H of vertical antennas over flat ground of a permittivity (`permittivity`): direct and reflected ray.
+
+    Heights are those of both antennas, the distance is that along the ground [m].
+    """
+    direct, bounced, cosine = over_ground(*heights, distance)
+    along = fresnel(cosine, eta)[1]
+    return spherical_wave(direct, frequency) + along * spherical_wave(bounced, frequency)
+
+
 def mirrored(point: Float64Array, origin: Float64Array, normal: Float64Array) -> Float64Array:
     """Image of a point in a plane with a unit normal."""
     image: Float64Array = point - 2 * np.dot(point - origin, normal) * normal
     return image
+
+
+def reflected(field: Field, k_in: Float64Array, normal: Float64Array, eta: complex) -> Complex128Array:
+    """Field of a wave along a unit vector behind its reflection at a half-space, Shape ``[3]``."""
+    k_out = k_in - 2 * np.dot(k_in, normal) * normal
+    across, along = fresnel(abs(float(np.dot(k_in, normal))), eta)
+    s = unit(np.cross(k_in, normal))
+    p_in, p_out = np.cross(k_in, s), np.cross(k_out, s)
+    sent: Complex128Array = across * np.dot(field, s) * s + along * np.dot(field, p_in) * p_out
+    return sent
+
+
+def vertical(k: Float64Array) -> Float64Array:
+    """Field of an upright vertical isotropic element towards a unit vector: θ̂."""
+    theta, phi = np.arccos(k[2]), np.arctan2(k[1], k[0])
+    return np.array([np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), -np.sin(theta)])
+
+
+def horizontal(k: Float64Array) -> Float64Array:
+    """Field of an upright horizontal isotropic element towards a unit vector: φ̂."""
+    phi = np.arctan2(k[1], k[0])
+    return np.array([-np.sin(phi), np.cos(phi), 0.0])
+
+
+def unit(vector: Float64Array) -> Float64Array:
+    """A vector over its length."""
+    along: Float64Array = vector / np.linalg.norm(vector)
+    return along
+
+
+def turn(yaw: float, pitch: float, roll: float) -> Float64Array:
+    """Rz(yaw) · Ry(pitch) · Rx(roll) [rad], written out, Shape ``[3, 3]``."""
+    (cz, sz), (cy, sy), (cx, sx) = ((math.cos(angle), math.sin(angle)) for angle in (yaw, pitch, roll))
+    rz = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+    ry = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    rx = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    turned: Float64Array = rz @ ry @ rx
+    return turned
 
 
 def room_images(

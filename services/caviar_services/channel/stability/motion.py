@@ -8,30 +8,32 @@ from functools import partial
 import numpy as np
 
 from caviar_services.channel.stability import formulas
-from caviar_services.channel.stability.bench import (
+from caviar_services.channel.stability.case import Outcome, all_of, case, close, equal, worst
+from caviar_services.channel.stability.lab import (
     CONDUCTOR,
-    Bench,
+    Lab,
     Plate,
     Thing,
-    answer,
     antenna,
+    free_space,
+    geometric,
     link,
-    world,
+    measure,
+    scene,
 )
-from caviar_services.channel.stability.case import Outcome, all_of, case, close, equal, worst
 
 F = 60e9
 UNIT = np.array([0.6, 0.48, 0.64])
 """From the transmitter."""
 
 
-def _shift(speed: float, traced: bool, bench: Bench) -> Outcome:
+def _shift(speed: float, traced: bool, lab: Lab) -> Outcome:
     """A receiver on a vehicle that comes straight at the transmitter: f·v/c."""
-    model = bench.traced(F, without_body=["car"]) if traced else bench.free_space(F)
+    model = lab.traced(F, without_body=["car"]) if traced else free_space(F)
     place = 80.0 * UNIT
     car = Thing("car", place.tolist(), velocity=(-speed * UNIT).tolist())
     ends = [antenna("t", "tx", (0, 0, 0)), antenna("car/r", "rx", (0, 0, 0), parent="car")]
-    got = float(answer(model, world(ends, [car])).doppler[0, 0])
+    got = float(measure(model, scene(ends, [car])).doppler[0, 0])
     return close("Hz", formulas.doppler(speed, F), got, absolute=1e-6 * F * 300 / formulas.C)
 
 
@@ -41,24 +43,24 @@ for _kmh in (0, 3, 120, 1000):
 
 
 @case("speed", "1,000 km/h, two that pass each other, drawn channel", traced=False)
-def _(bench: Bench) -> Outcome:
+def _(lab: Lab) -> Outcome:
     """Both ends move; the straight wave is that of the difference."""
-    model = bench.geometric(F, components=1)
+    model = geometric(F, components=1)
     one = Thing("a", (0, 0, 30), velocity=(277.7777777777778, 0, 0))
     other = Thing("b", (300, 400, 30), velocity=(-277.7777777777778, 0, 0))
     ends = [
         antenna("a/t", "tx", (0, 0, 0), parent="a"),
         antenna("b/r", "rx", (0, 0, 0), parent="b"),
     ]
-    got = float(answer(model, world(ends, [one, other])).doppler[0, 0])
+    got = float(measure(model, scene(ends, [one, other])).doppler[0, 0])
     return close("Hz", formulas.doppler(2 * 1000 / 3.6 * 0.6, F), got, relative=1e-9)
 
 
-def _mirror(speed: float, bench: Bench) -> Outcome:
+def _mirror(speed: float, lab: Lab) -> Outcome:
     """A wall that comes closer: its image comes twice as fast."""
     wall = Thing("wall", (30.0, 0.0, 0.0), (2.0, 60.0, 60.0), velocity=(-speed, 0.0, 0.0))
     tx, rx = np.array([0.0, -9.0, 1.0]), np.array([4.0, 8.0, -2.0])
-    channel = link(bench.traced(F), tx.tolist(), rx.tolist(), wall)
+    channel = link(lab.traced(F), tx.tolist(), rx.tolist(), wall)
     image = formulas.mirrored(tx, np.array([29.0, 0.0, 0.0]), np.array([-1.0, 0.0, 0.0]))
     along = abs((image - rx)[0]) / float(np.linalg.norm(image - rx))
     (path,) = np.flatnonzero((channel.interactions == 1).any(1))
@@ -74,19 +76,19 @@ for _kmh in (0, 50, 1000):
 
 
 @case("speed", "sideways: no shift")
-def _(bench: Bench) -> Outcome:
+def _(lab: Lab) -> Outcome:
     car = Thing("car", (70.0, 0.0, 0.0), velocity=(0.0, 277.8, 0.0))
     ends = [antenna("t", "tx", (0, 0, 0)), antenna("car/r", "rx", (0, 0, 0), parent="car")]
-    got = float(answer(bench.free_space(F), world(ends, [car])).doppler[0, 0])
+    got = float(measure(free_space(F), scene(ends, [car])).doppler[0, 0])
     return close("Hz", 0.0, got, absolute=1e-6)
 
 
-def _corner(traced: bool, bench: Bench) -> Outcome:
+def _corner(traced: bool, lab: Lab) -> Outcome:
     """An antenna 2.5 m before the middle of a car that turns on the spot moves sideways with ω·r."""
-    model = bench.traced(F, without_body=["car"]) if traced else bench.free_space(F)
+    model = lab.traced(F, without_body=["car"]) if traced else free_space(F)
     car = Thing("car", (60.0, 0.0, 0.0), velocity=(3.0, 0.0, 0.0), turning=(0.0, 0.0, 1.2))
     ends = [antenna("t", "tx", (62.5, -40.0, 0)), antenna("car/r", "rx", (2.5, 0, 0), parent="car")]
-    got = float(answer(model, world(ends, [car])).doppler[0, 0])
+    got = float(measure(model, scene(ends, [car])).doppler[0, 0])
     return close("Hz", -formulas.doppler(1.2 * 2.5, F), got, absolute=0.06)
 
 
@@ -97,7 +99,7 @@ for _traced, _rung in ((False, "free-space"), (True, "siso-rt")):
 
 
 @case("speed", "reflected by a wall that turns")
-def _(bench: Bench) -> Outcome:
+def _(lab: Lab) -> Outcome:
     """The shift is that of the wall where the wave meets it: by differences of the image's distance."""
     rate, middle = 0.8, np.array([30.0, 0.0, 0.0])
     wall = Thing("wall", middle.tolist(), (2.0, 60.0, 60.0), turning=(0.0, 0.0, rate))
@@ -107,16 +109,16 @@ def _(bench: Bench) -> Outcome:
         normal = -np.array([math.cos(rate * t), math.sin(rate * t), 0.0])
         return float(np.linalg.norm(formulas.mirrored(tx, middle + normal, normal) - rx))
 
-    channel = link(bench.traced(F), tx.tolist(), rx.tolist(), wall)
+    channel = link(lab.traced(F), tx.tolist(), rx.tolist(), wall)
     (path,) = np.flatnonzero((channel.interactions == 1).any(1))
     shift = -F / formulas.C * (length(1e-4) - length(-1e-4)) / 2e-4
     return close("Hz", shift, float(channel.doppler[0, path]), absolute=1.0)
 
 
 @case("jump", "a vehicle that jumps into the line of sight, 700 m from frame to frame, and out again")
-def _(bench: Bench) -> Outcome:
+def _(lab: Lab) -> Outcome:
     """What a frame says follows from that frame: no path by way of where the vehicle was."""
-    model = bench.traced(F)
+    model = lab.traced(F)
     tx, rx = (-40.0, 0.0, 2.0), (40.0, 1.0, 1.5)
     there, away = (
         Thing("bus", (3.0, 0.5, 1.5), (2.0, 9.0, 9.0)),
@@ -127,8 +129,8 @@ def _(bench: Bench) -> Outcome:
 
 
 @case("jump", "its reflection is where it now is, and has the shift of its velocity alone")
-def _(bench: Bench) -> Outcome:
-    model = bench.traced(F)
+def _(lab: Lab) -> Outcome:
+    model = lab.traced(F)
     tx, rx = np.array([0.0, -9.0, 1.0]), np.array([4.0, 8.0, -2.0])
     errors = []
     shifts = []
@@ -144,8 +146,8 @@ def _(bench: Bench) -> Outcome:
 
 
 @case("jump", "a vehicle that turns up and leaves")
-def _(bench: Bench) -> Outcome:
-    model = bench.traced(F)
+def _(lab: Lab) -> Outcome:
+    model = lab.traced(F)
     bus = Thing("bus", (3.0, 0.5, 1.5), (2.0, 9.0, 9.0))
     seen = [
         len(link(model, (-40.0, 0.0, 2.0), (40.0, 1.0, 1.5), *some).tau) for some in ((), (bus,), (), (bus,))
@@ -153,9 +155,9 @@ def _(bench: Bench) -> Outcome:
     return equal([1, 0, 1, 0], seen, "paths")
 
 
-def _flush(candidates: str, bench: Bench) -> Outcome:
+def _flush(candidates: str, lab: Lab) -> Outcome:
     """Two lorries side by side pass the point of reflection: their walls are one mirror, whose wave stays."""
-    model = bench.traced(F, bodies=2, candidates=candidates)
+    model = lab.traced(F, bodies=2, candidates=candidates)
     tx, rx = np.array([-7.0, -9.0, 2.0]), np.array([6.0, -7.0, 1.5])
     image = formulas.mirrored(tx, np.array([0.0, 1.0, 0.0]), np.array([0.0, 1.0, 0.0]))
     expected = formulas.friis(float(np.linalg.norm(image - rx)), F)
@@ -182,10 +184,10 @@ for _how in ("enumerated", "launched"):
 
 
 @case("flush", "a box whose front is that of the wall beside it: one wall")
-def _(bench: Bench) -> Outcome:
+def _(lab: Lab) -> Outcome:
     """The receiver goes along; the point of reflection goes from the wall to the box."""
-    wall = Plate("wall", [(-30, 1, 0), (-5, 1, 0), (-5, 1, 6), (-30, 1, 6)], "steel")
-    model = bench.traced(F, [wall], {"steel": CONDUCTOR}, bodies=1, candidates="enumerated")
+    wall = Plate("wall", [(-30, 1, 0), (-5, 1, 0), (-5, 1, 6), (-30, 1, 6)], CONDUCTOR)
+    model = lab.traced(F, [wall], bodies=1, candidates="enumerated")
     box = Thing("box", (-3.5, 2.25, 1.5), (3.0, 2.5, 3.0))
     tx, counts, ids = (-7.0, -9.0, 2.0), set(), set()
     for x in np.arange(-4.0, 3.0, 0.1):

@@ -1,29 +1,37 @@
-"""Frequencies, distances, grazing incidence, materials and foliage: one ray, and two over flat ground."""
+"""Frequencies, distances, grazing incidence, materials and foliage: one ray, and two over flat ground.
+
+Edges: where meshes meet, where light and reflections end, and which edge a path goes over.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
 
-from caviar_protocol.topics import AntennaArray, Channel
+from caviar_protocol.arrays import Complex128Array, Float64Array
+from caviar_protocol.topics import AntennaArray, Channel, Interaction
 from caviar_services.channel.stability import formulas
-from caviar_services.channel.stability.bench import (
+from caviar_services.channel.stability.case import Outcome, all_of, case, close, equal, worst
+from caviar_services.channel.stability.lab import (
     CONDUCTOR,
-    Bench,
+    Lab,
     Material,
+    Model,
     Plate,
     Point,
     Thing,
-    answer,
     antenna,
+    free_space,
     link,
+    measure,
+    pair_sums,
+    scene,
     square,
     total,
-    world,
 )
-from caviar_services.channel.stability.case import Outcome, all_of, case, close, equal, worst
 
 FREQUENCIES = (0.5e9, 2.8e9, 28e9, 60e9, 100e9, 300e9)
 LOSSY = Material(5.0, 0.2)
@@ -31,8 +39,15 @@ FAR_OUT = np.array([7931.37, -6112.83, 311.19])
 """10 km from the origin."""
 
 
-def ground(half: float, material: str = "surface") -> Plate:
+def ground(half: float, material: Material = LOSSY) -> Plate:
+    """A horizontal square of half a side [m] about the origin."""
     return Plate("ground", square(half), material)
+
+
+def two_rays(heights: tuple[float, float], distance: float, frequency: float) -> complex:
+    """H of vertical antennas over the lossy ground; heights and distance [m]."""
+    eta = formulas.permittivity(LOSSY.permittivity, LOSSY.conductivity, frequency)
+    return formulas.two_rays(heights, distance, eta, frequency)
 
 
 def amplitude(channel: Channel) -> float:
@@ -43,26 +58,22 @@ def amplitude(channel: Channel) -> float:
 # --- frequencies ----------------------------------------------------------------------------
 
 
-def _in_free_space(frequency: float, bench: Bench) -> Outcome:
+def _in_free_space(frequency: float, lab: Lab) -> Outcome:
     tx, rx = (3.7, -11.2, 24.0), (88.1, 61.9, 7.5)
     d = math.dist(tx, rx)
-    expected = formulas.friis(d, frequency) * formulas.phase(d, frequency)
-    models = (bench.free_space(frequency), bench.traced(FREQUENCIES))
+    expected = formulas.spherical_wave(d, frequency)
+    models = (free_space(frequency), lab.traced(FREQUENCIES))
     carrier = FREQUENCIES.index(frequency)
     got = [total(link(model, tx, rx), number) for model, number in zip(models, (0, carrier), strict=True)]
     return all_of(*(close("(H)", expected, h, relative=1e-4) for h in got))
 
 
-def _over_ground(frequency: float, bench: Bench) -> Outcome:
+def _over_ground(frequency: float, lab: Lab) -> Outcome:
     heights, distance = (11.3, 1.7), 74.2
-    model = bench.traced(frequency, [ground(300.0)], {"surface": LOSSY})
+    model = lab.traced(frequency, [ground(300.0)])
     got = total(link(model, (0, 0, heights[0]), (distance, 0, heights[1])))
-    eta = formulas.permittivity(LOSSY.permittivity, LOSSY.conductivity, frequency)
-    direct, bounced, cosine = formulas.over_ground(*heights, distance)
-    expected = formulas.friis(direct, frequency) * formulas.phase(direct, frequency)
-    along = formulas.fresnel(cosine, eta)[1]
-    expected += along * formulas.friis(bounced, frequency) * formulas.phase(bounced, frequency)
-    return close("(H)", expected, got, absolute=2e-3 * formulas.friis(direct, frequency))
+    free = formulas.friis(formulas.over_ground(*heights, distance)[0], frequency)
+    return close("(H)", two_rays(heights, distance, frequency), got, absolute=2e-3 * free)
 
 
 for _frequency in FREQUENCIES:
@@ -74,9 +85,9 @@ for _frequency in FREQUENCIES:
 # --- distances ------------------------------------------------------------------------------
 
 
-def _apart(distance: float, frequency: float, traced: bool, bench: Bench) -> Outcome:
+def _apart(distance: float, frequency: float, traced: bool, lab: Lab) -> Outcome:
     """Friis from one wavelength on; nearer, no direct path, and the pair is counted."""
-    model = bench.traced((60e9, 300e9)) if traced else bench.free_space(frequency)
+    model = lab.traced((60e9, 300e9)) if traced else free_space(frequency)
     carrier = (60e9, 300e9).index(frequency) if traced else 0
     tx = np.array([1.5, -2.25, 10.0])
     channel = link(model, tx.tolist(), (tx + distance * np.array([0.6, 0.0, 0.8])).tolist())
@@ -85,7 +96,7 @@ def _apart(distance: float, frequency: float, traced: bool, bench: Bench) -> Out
         return all_of(
             equal(0, len(channel.tau), "paths"), equal(True, bool(channel.los[0, 0]), "line of sight")
         )
-    expected = formulas.friis(distance, frequency) * formulas.phase(distance, frequency)
+    expected = formulas.spherical_wave(distance, frequency)
     got = total(channel, carrier)
     return close("(H)", expected, got, relative=1e-3)
 
@@ -97,16 +108,16 @@ for _distance in (1e-3, 4e-3, 6e-3, 0.02, 0.3, 1.0, 1e3, 5e4):
 
 
 @case("distance", "1 mm at 300 GHz, a wavelength of 0.9993 mm, free-space", traced=False)
-def _(bench: Bench) -> Outcome:
-    got = amplitude(link(bench.free_space(300e9), (0, 0, 9), (1e-3, 0, 9)))
+def _(lab: Lab) -> Outcome:
+    got = amplitude(link(free_space(300e9), (0, 0, 9), (1e-3, 0, 9)))
     return close("|H|", formulas.friis(1e-3, 300e9), got, relative=1e-9)
 
 
-def _phase(frequency: float, distance: float, origin: Point, bench: Bench) -> Outcome:
+def _phase(frequency: float, distance: float, origin: Point, lab: Lab) -> Outcome:
     """Phase error of both rays [rad]."""
     out = np.array(origin, np.float64)
-    plate = Plate("ground", [(out + corner).tolist() for corner in square(distance)])
-    model = bench.traced(frequency, [plate], {"surface": CONDUCTOR})
+    plate = Plate("ground", [(out + corner).tolist() for corner in square(distance)], CONDUCTOR)
+    model = lab.traced(frequency, [plate])
     tx, rx = np.array([-0.493, 0.0213, 0.1571]) * distance, np.array([0.507, -0.0137, 0.1193]) * distance
     channel = link(model, (out + tx).tolist(), (out + rx).tolist())
     flat = math.hypot(rx[0] - tx[0], rx[1] - tx[1])
@@ -128,17 +139,13 @@ for _f, _d in ((60e9, 2000.0), (300e9, 1000.0)):
 # --- grazing incidence ----------------------------------------------------------------------
 
 
-def _grazing(heights: tuple[float, float], distance: float, bench: Bench) -> Outcome:
+def _grazing(heights: tuple[float, float], distance: float, lab: Lab) -> Outcome:
     """Two rays that all but cancel: relative to the direct one."""
     frequency = 2.8e9
-    model = bench.traced(frequency, [ground(1.2 * distance)], {"surface": LOSSY})
+    model = lab.traced(frequency, [ground(1.2 * distance)])
     got = total(link(model, (-distance / 2, 1.0, heights[0]), (distance / 2, 1.0, heights[1])))
-    eta = formulas.permittivity(LOSSY.permittivity, LOSSY.conductivity, frequency)
-    direct, bounced, cosine = formulas.over_ground(*heights, distance)
-    free = formulas.friis(direct, frequency)
-    expected = free * formulas.phase(direct, frequency)
-    along = formulas.fresnel(cosine, eta)[1]
-    expected += along * formulas.friis(bounced, frequency) * formulas.phase(bounced, frequency)
+    free = formulas.friis(formulas.over_ground(*heights, distance)[0], frequency)
+    expected = two_rays(heights, distance, frequency)
     return close("of the direct ray", abs(expected) / free, abs(got) / free, absolute=2e-3)
 
 
@@ -148,10 +155,10 @@ for _heights, _distance in (((1.5, 1.2), 100.0), ((1.5, 2.0), 2000.0), ((12.0, 1
 
 
 @case("grazing", "antennas within the plane of a wall")
-def _(bench: Bench) -> Outcome:
+def _(lab: Lab) -> Outcome:
     """No reflection: the wall is seen edge-on, and hides nothing."""
-    wall = Plate("wall", [(-5, 0, 0), (5, 0, 0), (5, 0, 9), (-5, 0, 9)])
-    model = bench.traced(28e9, [wall], {"surface": LOSSY})
+    wall = Plate("wall", [(-5, 0, 0), (5, 0, 0), (5, 0, 9), (-5, 0, 9)], LOSSY)
+    model = lab.traced(28e9, [wall])
     channel = link(model, (-30, 0, 3), (41, 0, 5))
     return close("|H|", formulas.friis(math.dist((-30, 0, 3), (41, 0, 5)), 28e9), amplitude(channel), 1e-4)
 
@@ -160,33 +167,33 @@ def _(bench: Bench) -> Outcome:
 
 
 def _reflection(
-    bench: Bench, material: Material, angle_deg: float, polarization: str, frequency: float = 10e9
+    lab: Lab, material: Material, angle_deg: float, polarization: str, frequency: float = 10e9
 ) -> tuple[complex, float]:
     """Coefficient at flat ground, and the cosine of incidence."""
     height = 7.0
     reach = height * math.tan(math.radians(angle_deg))
-    model = bench.traced(frequency, [ground(400.0)], {"surface": material})
+    model = lab.traced(frequency, [ground(400.0, material)])
     array = AntennaArray(polarization=polarization)  # type: ignore[arg-type]
     ends = [antenna("t", "tx", (-reach, 2, height), array), antenna("r", "rx", (reach, 2, height), array)]
-    channel = answer(model, world(ends))
+    channel = measure(model, scene(ends))
     reflected = channel.a[0, (channel.interactions == 1).any(1)].sum()
     length = 2 * math.hypot(reach, height)
-    free = formulas.friis(length, frequency) * formulas.phase(length, frequency)
+    free = formulas.spherical_wave(length, frequency)
     # A horizontal element's field turns its sign between the two ends, as they face each other.
     sign = -1.0 if polarization == "H" else 1.0
     return sign * complex(reflected) / free, math.cos(math.radians(angle_deg))
 
 
-def _conductor(angle_deg: float, bench: Bench) -> Outcome:
-    across = _reflection(bench, CONDUCTOR, angle_deg, "H")[0]
-    along = _reflection(bench, CONDUCTOR, angle_deg, "V")[0]
+def _conductor(angle_deg: float, lab: Lab) -> Outcome:
+    across = _reflection(lab, CONDUCTOR, angle_deg, "H")[0]
+    along = _reflection(lab, CONDUCTOR, angle_deg, "V")[0]
     return all_of(close("across", -1.0, across, absolute=0.01), close("along", 1.0, along, absolute=0.01))
 
 
-def _slab(material: Material, angle_deg: float, bench: Bench) -> Outcome:
+def _slab(material: Material, angle_deg: float, lab: Lab) -> Outcome:
     eta = formulas.permittivity(material.permittivity, material.conductivity, 10e9)
-    across, cosine = _reflection(bench, material, angle_deg, "H")
-    along, _ = _reflection(bench, material, angle_deg, "V")
+    across, cosine = _reflection(lab, material, angle_deg, "H")
+    along, _ = _reflection(lab, material, angle_deg, "V")
     expected = formulas.slab(cosine, eta, material.thickness, 10e9)
     return all_of(
         close("across", expected[0], across, absolute=2e-3), close("along", expected[1], along, absolute=2e-3)
@@ -208,10 +215,10 @@ case("material", "lossless dielectric of the permittivity of air")(
 
 
 @case("material", "energy at a lossless dielectric: what is not reflected goes through")
-def _(bench: Bench) -> Outcome:
+def _(lab: Lab) -> Outcome:
     frequency, angle = 10e9, math.radians(35.0)
-    wall = Plate("wall", [(0, -90, -90), (0, 90, -90), (0, 90, 90), (0, -90, 90)])
-    model = bench.traced(frequency, [wall], {"surface": GLASS}, refraction=True)
+    wall = Plate("wall", [(0, -90, -90), (0, 90, -90), (0, 90, 90), (0, -90, 90)], GLASS)
+    model = lab.traced(frequency, [wall], refraction=True)
     tx, through = (-6.0, 0.0, 1.0), (6.0, 12 * math.tan(angle), 1.0)
     back = (-6.0, 12 * math.tan(angle), 1.0)
     length = math.dist(tx, through)
@@ -226,16 +233,16 @@ def _(bench: Bench) -> Outcome:
 
 
 @case("foliage", "10 m of 1.5 dB/m on the line of sight, without a maximum and with one of 12 dB")
-def _(bench: Bench) -> Outcome:
+def _(lab: Lab) -> Outcome:
     frequency, distance = 28e9, 100.0
     hedge = {
         "attenuation_db_per_m": {"c0": 1.5, "c1": 1.5},
         "maximum_db": {"c1": 12.0},
         "source": "made up",
     }
-    model = bench.traced((frequency, frequency), foliage={"hedge": hedge})
+    model = lab.traced((frequency, frequency), foliage={"hedge": hedge})
     channel = link(model, (0, 0, 2), (distance, 0, 2), Thing("hedge", (50, 0, 2), (10, 8, 6)))
-    free = formulas.friis(distance, frequency) * formulas.phase(distance, frequency)
+    free = formulas.spherical_wave(distance, frequency)
     lost = formulas.vegetation(10.0, 1.5), formulas.vegetation(10.0, 1.5, 12.0)
     return all_of(
         *(
@@ -247,10 +254,10 @@ def _(bench: Bench) -> Outcome:
 
 
 @case("foliage", "two crowns that overlap, on the way to the ground and back")
-def _(bench: Bench) -> Outcome:
+def _(lab: Lab) -> Outcome:
     """From (0, 20) over (50, 0) to (100, 20): each crown is 6 m wide, and 8 m are in one of them or both."""
     crowns = {"attenuation_db_per_m": {"c0": 0.5, "c1": 0.0}, "source": "made up"}
-    model = bench.traced((3.5e9, 3.5e9), [ground(300.0)], {"surface": LOSSY}, foliage={"crown.*": crowns})
+    model = lab.traced((3.5e9, 3.5e9), [ground(300.0)], foliage={"crown.*": crowns})
     boxes = [Thing(f"crown.{i}", (x, 0, 10.5), (6, 8, 19)) for i, x in enumerate((23, 25))]
     channel = link(model, (0, 0, 20), (100, 0, 20), *boxes)
     direct, bounced = (
@@ -259,4 +266,106 @@ def _(bench: Bench) -> Outcome:
     return all_of(
         close("dB straight", 0.0, float(direct), absolute=1e-6),
         close("dB by the ground", 0.5 * 8 * math.hypot(50, 20) / 50, float(bounced), absolute=1e-6),
+    )
+
+
+MMWAVE = 28e9
+STATION = np.array([8.0, 5.0, 3.0])
+"""Sees one wall of the corner; its light ends behind the edge x = y = 0."""
+
+ONE: list[Point] = [(0, 0, 0), (0, 40, 0), (0, 40, 9), (0, 0, 9)]
+OTHER: list[Point] = [(0, 0, 0), (-40, 0, 0), (-40, 0, 9), (0, 0, 9)]
+BOTH: list[Point] = [(0, 0, 0), (0, 40, 0), (0, 40, 9), (0, 0, 9), (-40, 0, 9), (-40, 0, 0)]
+CORNER = [Plate("one", ONE, CONDUCTOR), Plate("other", OTHER, CONDUCTOR)]
+
+
+def _corner(lab: Lab, plates: Sequence[Plate]) -> Model:
+    """A model of 50,000 rays that are reflected and diffracted once each."""
+    settings = {"diffraction": True, "max_depth": 2, "samples": 50_000, "receivers_at_once": 500}
+    return lab.traced(MMWAVE, plates, **settings)
+
+
+def _along(model: Model, places: Float64Array, *things: Thing) -> Channel:
+    """The channels to receivers at these places [m], Shape ``[N, 3]``, in their order."""
+    devices = [antenna(f"r{i:05d}", "rx", place) for i, place in enumerate(places.tolist())]
+    return measure(model, scene([antenna("t", "tx", STATION.tolist()), *devices], things))
+
+
+def _around(count: int) -> Float64Array:
+    """Places in light and in shadow of the corner, on a walk of 9 m about it."""
+    angle = np.linspace(-3.0, 1.2, count)
+    return np.column_stack([9 * np.cos(angle), 9 * np.sin(angle), np.linspace(1.4, 2.6, count)])
+
+
+@case("edge", "a corner as two meshes: the same as one mesh")
+def _(lab: Lab) -> Outcome:
+    one, two = (
+        20 * np.log10(np.abs(pair_sums(_along(_corner(lab, plates), _around(24)))))
+        for plates in ([Plate("both", BOTH, CONDUCTOR)], CORNER)
+    )
+    return worst(np.abs(two - one).tolist(), 0.01, "dB", "level at 24 places")
+
+
+def _boundary(image: Float64Array, lab: Lab) -> tuple[Complex128Array, Channel, float]:
+    """H in 120 steps of 1 µm across the line where the wave from an image ends, and free space's |H|."""
+    steps = (np.arange(-60, 60) + 0.3) * 1e-6
+    onward = -image / np.linalg.norm(image)
+    ground = 10 * onward + steps[:, None] * np.array([-onward[1], onward[0]])
+    channel = _along(_corner(lab, CORNER), np.column_stack([ground, np.full(len(steps), 2.0)]))
+    return pair_sums(channel), channel, formulas.friis(math.dist((*ground[0], 2.0), STATION), MMWAVE)
+
+
+@case("edge", "where light ends, in steps of 1 µm: half of free space, without a jump")
+def _(lab: Lab) -> Outcome:
+    h, channel, free = _boundary(STATION[:2], lab)
+    return all_of(
+        worst((np.abs(np.diff(h)) / free).tolist(), 0.03, "of free space", "steps"),
+        equal(1, int(np.count_nonzero(np.diff(channel.los[0].astype(int)))), "time that light goes out"),
+        close("of free space", 0.5, float(np.abs(h[60])) / free, absolute=0.02),
+    )
+
+
+@case("edge", "where a reflection ends, in steps of 1 µm: no jump")
+def _(lab: Lab) -> Outcome:
+    h, _, free = _boundary(STATION[:2] * [-1, 1], lab)
+    return worst((np.abs(np.diff(h)) / free).tolist(), 0.03, "of free space", "steps")
+
+
+@case("edge", "a free edge: Sommerfeld's half-plane of a conductor, field along its edge")
+def _(lab: Lab) -> Outcome:
+    """Deep in the shadow; the other rims are so far that their paths are left out."""
+    screen = Plate("screen", [(0, 0, -60), (0, 120, -60), (0, 120, 60), (0, 0, 60)], CONDUCTOR)
+    settings = {"diffraction": True, "free_edges": True, "samples": 100_000}
+    model = lab.traced(MMWAVE, [screen], **settings)
+    # Angles from the face on the side of the source, which the screen is at 0 and 2π of.
+    at, s_in, s_out = 1.1, 12.0, 8.0
+    tx = s_in * np.array([math.sin(at), math.cos(at), 0.0])
+    outcomes = []
+    for angle in (5.2, 5.5, 5.8):
+        rx = s_out * np.array([math.sin(angle), math.cos(angle), 0.0])
+        channel = measure(model, scene([antenna("t", "tx", tx.tolist()), antenna("r", "rx", rx.tolist())]))
+        over = (channel.interactions[:, 0] == Interaction.DIFFRACTION) & (
+            np.abs(channel.points[:, 0]).max(1) < 1e-6
+        )
+        expected = formulas.behind_half_plane(at, angle, s_in, s_out, MMWAVE)
+        outcomes.append(close("|H|", expected, abs(complex(channel.a[0, over].sum())), relative=0.02))
+    return all_of(*outcomes)
+
+
+@case("edge", "2,000 steps about a corner and a car: ids stay with their edges")
+def _(lab: Lab) -> Outcome:
+    """Edges are farther apart than a point moves from one step to the next."""
+    car = Thing("car", (3.0, -3.5, 0.76), quaternion=(math.cos(0.2), 0.0, 0.0, math.sin(0.2)))
+    channel = _along(_corner(lab, CORNER), _around(2000), car)
+    lived = swapped = 0
+    last: dict[int, Float64Array] = {}
+    for begin, end in zip(channel.offsets[:-1].tolist(), channel.offsets[1:].tolist(), strict=True):
+        rows = begin + np.flatnonzero((channel.interactions[begin:end] == Interaction.DIFFRACTION).any(1))
+        now = {int(channel.id[row]): channel.points[row] for row in rows}
+        both = last.keys() & now.keys()
+        lived += len(both)
+        swapped += sum(bool(np.abs(last[key] - now[key]).max() > 0.3) for key in both)
+        last = now
+    return all_of(
+        equal(True, lived > 4000, "that paths live on"), equal(0, swapped, f"ids swapped of {lived}")
     )

@@ -105,8 +105,8 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         self._behind_straight = math.sqrt(1 / ((k + 1) * (count - 1))) if count > 1 else 0.0
         self._straight = math.sqrt(k / (k + 1)) if count > 1 else 1.0
         ids = [_id(f"component {number}") for number in range(count)]
+        # Of a pair, by whether its line of sight is free.
         self._ids = {False: ids, True: [_id("straight"), *ids[1:]]}
-        """Of a pair, by whether its line of sight is free."""
         self._obstacles = Boxes.aligned([(box.minimum_m, box.maximum_m) for box in settings.obstacles])
         self._draws: dict[tuple[str, str], Draws] = {}
         self._block = 0

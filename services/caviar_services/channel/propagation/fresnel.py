@@ -1,0 +1,134 @@
+"""Reflection and transmission at surfaces: Fresnel's coefficients of slabs (ITU-R P.2040-3), in float64."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int64Array
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
+from caviar_services.channel.propagation.geometry import cross, unit
+from caviar_services.channel.sionna.materials import slab
+
+# Sine of the angle between two directions below which they are one.
+_ALONG = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Media:
+    """What surfaces at the interactions of P paths are made of, on C carriers."""
+
+    permittivity: Float64Array
+    """Relative, Shape ``[C, P, D]``."""
+    conductivity: Float64Array
+    """[S/m], Shape ``[C, P, D]``."""
+    thickness: Float64Array
+    """[m], Shape ``[P, D]``."""
+    scattering: Float64Array
+    """Scattering coefficients, Shape ``[P, D]``."""
+
+
+@dataclass(frozen=True, eq=False)
+class Wall:
+    """Slabs that P rays meet, at one wavelength [m]."""
+
+    permittivity: Float64Array
+    conductivity: Float64Array
+    thickness: Float64Array
+    scattering: Float64Array
+    wavelength: float
+
+    @classmethod
+    def of(cls, media: Media, carrier: int, d: int, wavelength: float) -> Wall:
+        """What is at interaction ``d`` of paths."""
+        constants = media.permittivity[carrier, :, d], media.conductivity[carrier, :, d]
+        return cls(*constants, media.thickness[:, d], media.scattering[:, d], wavelength)
+
+    def where(self, which: BoolArray, other: Wall) -> Wall:
+        """These where ``which`` is true, and elsewhere those of another."""
+        return Wall(
+            np.where(which, self.permittivity, other.permittivity),
+            np.where(which, self.conductivity, other.conductivity),
+            np.where(which, self.thickness, other.thickness),
+            np.where(which, self.scattering, other.scattering),
+            self.wavelength,
+        )
+
+    def take(self, rows: Int64Array) -> Wall:
+        """Those of these rays."""
+        return Wall(
+            self.permittivity[rows],
+            self.conductivity[rows],
+            self.thickness[rows],
+            self.scattering[rows],
+            self.wavelength,
+        )
+
+    def dyad(self, k: Float64Array, normal: Float64Array, through: BoolArray) -> Complex128Array:
+        """From the field that comes in along ``k`` to what is reflected, or goes through."""
+        across = (k * normal).sum(-1)
+        frequency = SPEED_OF_LIGHT / self.wavelength
+        back, passed = slab(np.abs(across), (self.permittivity, self.conductivity), self.thickness, frequency)
+        te, tm = np.where(through, passed, back * np.sqrt(1 - self.scattering**2))
+        s = unit(_perpendicular(k, normal))
+        out = np.where(through[:, None], k, k - 2 * across[:, None] * normal)
+        return _outer(te[:, None] * s, s) + _outer(tm[:, None] * cross(out, s), cross(k, s))
+
+
+def reflection_fields(
+    corners: Float64Array,
+    count: Int64Array,
+    normals: Float64Array,
+    through: BoolArray,
+    media: Media,
+    wavelengths: Sequence[float],
+) -> Complex128Array:
+    """Dyads of `PathTable`, Shape ``[C, P, 3, 3]``, with the spreading of the paths' lengths.
+
+    Args:
+        corners: TX, points of interactions, and RX in all places behind the last one [m], Shape ``[P, D + 2,
+            3]``.
+        count: Interactions of each path, Shape ``[P]``.
+        normals: Unit, of the plane at each point, Shape ``[P, D, 3]``.
+        through: Which of them let the wave through, Shape ``[P, D]``; the others reflect it.
+        media: At each point.
+        wavelengths: Of the carriers [m].
+    """
+    steps = np.diff(corners, axis=1)
+    lengths = np.sqrt(np.einsum("pdc,pdc->pd", steps, steps))
+    directions = steps / np.where(lengths > 0, lengths, 1.0)[..., None]
+    total = lengths.sum(1)
+    first = directions[:, 0]
+    transverse = np.eye(3) - first[:, :, None] * first[:, None]
+    fields = np.empty((len(wavelengths), len(count), 3, 3), np.complex128)
+    for carrier, wavelength in enumerate(wavelengths):
+        field = transverse + 0j
+        for d in range(normals.shape[1]):
+            rows = np.flatnonzero(count > d)
+            wall = Wall(
+                media.permittivity[carrier, rows, d],
+                media.conductivity[carrier, rows, d],
+                media.thickness[rows, d],
+                media.scattering[rows, d],
+                wavelength,
+            )
+            dyad = wall.dyad(directions[rows, d], normals[rows, d], through[rows, d])
+            field[rows] = dyad @ field[rows]
+        fields[carrier] = field * (wavelength / (4 * np.pi) / total)[:, None, None]
+    return fields
+
+
+def _perpendicular(k: Float64Array, normal: Float64Array) -> Float64Array:
+    """A direction across both; any across ``k`` where both are one."""
+    across = cross(k, normal)
+    axis = np.eye(3)[np.argmin(np.abs(k), axis=-1)]
+    lost = (across**2).sum(-1, keepdims=True) < _ALONG**2
+    perpendicular: Float64Array = np.where(lost, cross(k, axis), across)
+    return perpendicular
+
+
+def _outer(one: Complex128Array | Float64Array, other: Float64Array) -> Complex128Array:
+    outer: Complex128Array = one.astype(np.complex128)[:, :, None] * other[:, None]
+    return outer
