@@ -161,7 +161,8 @@ def test_a_broker_that_hangs_is_given_up_once_its_services_have_left_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(launch, "BROKER_S", 0.3)
-    monkeypatch.setattr("caviar_broker.supervision.is_stopped", lambda _: False)  # it hangs, and nobody can tell why
+    # It hangs, and why cannot be seen.
+    monkeypatch.setattr("caviar_broker.supervision.is_stopped", lambda _: False)
     with launcher(tmp_path, frames=1_000_000, extra="[timeouts]\nshutdown_s = 0.5\n") as started:
         wait_for(started, "frame")
         assert started._broker is not None

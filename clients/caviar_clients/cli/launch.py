@@ -447,7 +447,7 @@ class Launcher:
             elif name not in self._unhandled():
                 self._start_again(name)
 
-    def _unseen(self) -> set[str]:
+    def _unhandled(self) -> set[str]:
         """Names of services whose end has not been handled yet."""
         return {key.data.name for key in self._selector.get_map().values() if isinstance(key.data, Child)}
 
