@@ -32,7 +32,7 @@ from msgspec import Meta
 from caviar_protocol.errors import SetupError
 from caviar_protocol.files import replace_file
 from caviar_protocol.messages import Role
-from caviar_protocol.scenario.toml import toml_text
+from caviar_protocol.scenario.toml import key_lines, toml_text
 
 BROKER = "broker"
 """Name of the broker's own pair."""
@@ -192,11 +192,10 @@ def write_pair(directory: Path, name: str, pair: Pair) -> tuple[Path, Path]:
     for path in (key, pub):
         if path.exists() or path.is_symlink():
             raise SetupError(f"{path} exists and is not overwritten; choose another name, or remove it first")
-    secret = f"# Secret key of {name!r}: keep it on its machine, and to yourself.\n" + _table(
-        "public", pair.public
-    )
-    secret += _table("secret", pair.secret)
-    public = f"# Public key of {name!r}: for its peers.\n" + _table("public", pair.public)
+    line = f'public = "{pair.public}"\n'
+    secret = f"# Secret key of {name!r}: keep it on its machine, and to yourself.\n{line}"
+    secret += f'secret = "{pair.secret}"\n'
+    public = f"# Public key of {name!r}: for its peers.\n{line}"
     try:
         directory.mkdir(parents=True, exist_ok=True)
         _create(key, secret, 0o600)
@@ -299,22 +298,12 @@ def read_tokens(directory: Path) -> tuple[Token, ...]:
     # Checked here and not by type, so that the error can name the line.
     for number, token in enumerate(tokens):
         if token.role not in TOKEN_ROLES:
+            line = key_lines(path.read_text())["token", number, "role"]
             raise SetupError(
-                f"{path}, line {_line_of_role(path, number)}: {token.name!r} has the role {token.role!r}; "
+                f"{path}, line {line}: {token.name!r} has the role {token.role!r}; "
                 f"write one of {', '.join(TOKEN_ROLES)}"
             )
     return tokens
-
-
-def _line_of_role(path: Path, number: int) -> int:
-    """Line with the role of a token, or, where it is written in another way, the one where it begins."""
-    seen, begins = -1, 1
-    for line, text in enumerate(path.read_text(errors="replace").splitlines(), start=1):
-        if re.match(r"\s*\[\[\s*token\s*\]\]", text):
-            seen, begins = seen + 1, line if seen < number else begins
-        elif seen == number and re.match(r"""\s*["']?role["']?\s*=""", text):
-            return line
-    return begins
 
 
 def write_tokens(directory: Path, entries: Sequence[Token]) -> None:
@@ -406,15 +395,8 @@ def _decoded(path: Path, kind: type[T], remedy: str) -> T:
         raise SetupError(f"cannot read {path}: {error.strerror}; {remedy}") from error
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         # What the file holds may be secret: only the place and the rule are shown, never the content.
-        raise SetupError(f"{path} is not what it should be: {_rule(error)}; {remedy}") from None
-
-
-def _rule(error: Exception) -> str:
-    return str(error) if isinstance(error, msgspec.ValidationError) else "it is not TOML"
-
-
-def _table(key: str, text: str) -> str:
-    return f'{key} = "{text}"\n'
+        rule = str(error) if isinstance(error, msgspec.ValidationError) else "it is not TOML"
+        raise SetupError(f"{path} is not what it should be: {rule}; {remedy}") from None
 
 
 def _create(path: Path, text: str, mode: int) -> None:

@@ -537,8 +537,6 @@ def test_the_command_prints_a_table_writes_files_and_tells_by_its_status(tmp_pat
 def test_a_file_that_cannot_be_written_is_named_before_the_first_case(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, option: str
 ) -> None:
-    monkeypatch.setattr(
-        "caviar_clients.conform.conform", lambda *_, **__: pytest.fail("a case was played")
-    )
+    monkeypatch.setattr("caviar_clients.conform.conform", lambda *_, **__: pytest.fail("a case was played"))
     with pytest.raises(RunError, match=r"cannot write .*: Is a directory; choose another file"):
         app(["conform", "--listen", ANY, option, str(tmp_path)], standalone_mode=False)

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from caviar_protocol.scenario import Scenario, load_scenario
-from caviar_protocol.scenario.rules import devices_of
+from caviar_protocol.scenario.rules import world_of
 from caviar_services.registry import BUILT_IN, load
 from caviar_services.testing import CONFORMANCE, ServiceConformance
 
@@ -67,7 +67,9 @@ def _tests_of(key: str) -> type[ServiceConformance]:
         scenario, service = example
         members["settings"] = {**scenario.services[service].settings, **OVERRIDES.get(key, {})}
         if role == "world":
-            members["devices"] = devices_of(scenario, service)
+            members["devices"] = tuple(
+                d for i, d in enumerate(scenario.devices) if world_of(scenario, i) == service
+            )
     title = "Test" + "".join(word.capitalize() for word in f"{role}-{name}".split("-"))
     tests = type(title, (CONFORMANCE[role],), members)
     package = EXTRAS.get(key)

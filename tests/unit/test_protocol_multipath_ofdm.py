@@ -18,9 +18,8 @@ from caviar_protocol.multipath import (
     subcarrier_weights,
     tap_weights,
 )
-from caviar_protocol.scenario import parse_scenario
+from caviar_protocol.scenario import parse_scenario, with_numerology
 from caviar_protocol.scenario.conversion import Place
-from caviar_protocol.scenario.rules import with_numerology
 from caviar_protocol.topics import Carrier
 
 FREQUENCY = 28e9

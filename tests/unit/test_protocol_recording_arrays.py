@@ -14,8 +14,8 @@ from caviar_protocol.errors import ProductError, RecordingError
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import Recording
 from caviar_protocol.recording.arrays import TopicArrays
-from caviar_protocol.recording.reader import TOPIC_ARRAYS
-from caviar_protocol.recording.topics import DeviceArrays, MotionArrays, User
+from caviar_protocol.recording.scene import DeviceArrays, MotionArrays
+from caviar_protocol.recording.topics import TOPIC_ARRAYS, User
 from caviar_protocol.topics import (
     Action,
     BeamChoice,

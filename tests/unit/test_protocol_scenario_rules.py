@@ -23,13 +23,20 @@ from caviar_protocol.scenario import (
 from caviar_protocol.scenario.conversion import Source, convert_settings
 from caviar_protocol.scenario.rules import (
     check_scenario,
-    devices_of,
     resolved,
     scenario_error,
     settings_place,
     with_overrides,
+    world_of,
 )
 from caviar_protocol.scenario.schema import owned_by
+
+
+def devices_of(scenario: Scenario, world: str) -> tuple[DeviceSpec, ...]:
+    """The devices that a world publishes."""
+    return tuple(
+        device for index, device in enumerate(scenario.devices) if world_of(scenario, index) == world
+    )
 
 
 def world(prefix: str = "") -> ServiceSpec:

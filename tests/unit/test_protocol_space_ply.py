@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from caviar_protocol.errors import AssetError
-from caviar_protocol.space.ply import read_ply, read_ply_vertices
+from caviar_protocol.space.ply import read_ply
 
 VERTICES = [(10_000.123456789, -2.5, 1e-3), (1 / 3, 7.0, -8.25), (0.0, 1e6 + 1 / 7, 4.0)]
 
@@ -33,7 +33,7 @@ def test_binary_files_in_their_own_precision(
     face = struct.pack(f"{order}Biii", 3, 0, 1, 2)
     file.write_bytes(b"".join([header(form, kind).encode(), *rows, face]))
     expected = np.array(VERTICES, order + code).astype(np.float64)
-    assert np.array_equal(read_ply_vertices(file), expected)
+    assert np.array_equal(read_ply(file)[0], expected)
 
 
 def test_text_is_read_as_it_is_written(tmp_path: Path) -> None:
@@ -41,7 +41,7 @@ def test_text_is_read_as_it_is_written(tmp_path: Path) -> None:
     file = tmp_path / "a.ply"
     body = "\n".join(f"{z!r} 200 {x!r} {y!r}" for x, y, z in VERTICES)
     file.write_text(header("ascii", "float") + body + "\n3 0 1 2\n")
-    assert np.array_equal(read_ply_vertices(file), VERTICES)
+    assert np.array_equal(read_ply(file)[0], VERTICES)
 
 
 def test_elements_before_the_vertices_are_passed_over(tmp_path: Path) -> None:
@@ -49,8 +49,9 @@ def test_elements_before_the_vertices_are_passed_over(tmp_path: Path) -> None:
     before = ["element material 2", "property int id", "element strip 2", "property list uchar short rows"]
     rows = struct.pack("<ii", 5, 6) + struct.pack("<Bhh", 2, 1, 2) + struct.pack("<Bh", 1, 3)
     rows += b"".join(struct.pack("<dBdd", z, 200, x, y) for x, y, z in VERTICES)
+    rows += struct.pack("<Biii", 3, 0, 1, 2)
     file.write_bytes(header("binary_little_endian", "double", *before).encode() + rows)
-    assert np.array_equal(read_ply_vertices(file), VERTICES)
+    assert np.array_equal(read_ply(file)[0], VERTICES)
 
 
 @pytest.mark.parametrize(
@@ -69,7 +70,7 @@ def test_what_is_no_mesh_is_named(tmp_path: Path, data: bytes) -> None:
     file = tmp_path / "bad.ply"
     file.write_bytes(data)
     with pytest.raises(AssetError, match=r"bad\.ply: not a PLY file"):
-        read_ply_vertices(file)
+        read_ply(file)
 
 
 @pytest.mark.parametrize("faces", [[(3, 0, 1, 2)], [(3, 2, 1, 0), (4, 0, 1, 2, 1)]], ids=["triangle", "quad"])

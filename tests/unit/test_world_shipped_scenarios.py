@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from caviar_protocol.scenario import Scenario, load_scenario
+from caviar_protocol.scenario import Scenario, load_scenario, rules
 from caviar_protocol.scenario.conversion import convert_settings
-from caviar_protocol.scenario.rules import devices_of, settings_place
+from caviar_protocol.scenario.rules import settings_place
 from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import AntennaDevice, LidarDevice, Scene
 from caviar_services.registry import load
@@ -36,7 +36,7 @@ def world_of(scenario: Scenario) -> World:
         settings,
         RunInfo(
             name=name,
-            devices=devices_of(scenario, name),
+            devices=tuple(d for i, d in enumerate(scenario.devices) if rules.world_of(scenario, i) == name),
             sampling_period_ns=scenario.run.sampling_period_ns,
             frames=scenario.run.frames,
         ),

@@ -10,8 +10,8 @@
 `newest_run` gives the directory of the newest run, `Recording.__getitem__` a topic as arrays over all frames,
 `Recording.frames` the products frame by frame; docs/reference/recordings.md has more.
 
-This module has the records and names that the writer and the readers of a recording share. `Recording` and
-the other names of `caviar_protocol.recording.reader` are loaded when they are first used.
+This module has what a recording consists of: metadata, frames, products, segments and the manifest.
+`Recording` itself, of `caviar_protocol.recording.reader`, is loaded when it is first used.
 
 ``recording.json``, the *manifest*, says which segments a recording has, and what each finished one is. A
 segment that is removed, exchanged or cut leaves no trace in the other segments; the manifest shows it. It is
@@ -23,20 +23,27 @@ later. A recording without a manifest was made by an earlier version, and is rea
 
 from __future__ import annotations
 
+import hashlib
 import zlib
+from functools import cached_property
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast
 
 import msgspec
 
-from caviar_protocol.arrays import quantity
-from caviar_protocol.errors import RecordingError
+from caviar_protocol.arrays import Payload, quantity
+from caviar_protocol.codec.payloads import decode_payload
+from caviar_protocol.errors import ProtocolError, RecordingError, suggestion
 from caviar_protocol.files import RunDirectory, newest_run, read_regular, replace_file
-from caviar_protocol.messages import Asset, GrantInput, Report
+from caviar_protocol.messages import Asset, GrantInput, Report, Status
+from caviar_protocol.space.scene import merge_scenes
+from caviar_protocol.topics import PAYLOADS, Scene
 
 if TYPE_CHECKING:
-    from caviar_protocol.recording.reader import RecordedFrame, RecordedProduct, Recording, RecordingWarning
+    from caviar_protocol.recording.reader import Recording, RecordingWarning
+
+P = TypeVar("P", bound=Payload)
 
 FORMAT = 1
 """Version of the layout of a recording; a reader refuses any other."""
@@ -222,7 +229,169 @@ def _sealed(content: bytes) -> bytes:
     return b'{"crc":%d,"manifest":%s}\n' % (zlib.crc32(content), content)
 
 
-_READER = ("RecordedFrame", "RecordedProduct", "Recording", "RecordingWarning")
+def check_topic(topic: str) -> str:
+    """Check that there is a topic of this name, and return it.
+
+    Args:
+        topic: What a caller asks for.
+
+    Raises:
+        RecordingError: There is none; the text suggests the one that was probably meant.
+
+    Example:
+        >>> check_topic("chanel")
+        Traceback (most recent call last):
+            ...
+        caviar_protocol.errors.RecordingError: there is no topic 'chanel'; did you mean 'channel'?
+    """
+    if topic not in PAYLOADS:
+        raise RecordingError(f"there is no topic {topic!r}; {suggestion(topic, PAYLOADS)}")
+    return topic
+
+
+class RecordedProduct:
+    """One product of a frame; its payload is decoded on first use.
+
+    Args:
+        provenance: Topic, source, status and digest, as the frame's record has them.
+        data: Header length (8 bytes, little-endian), header and body.
+        place: Recording, frame, topic and source, as errors name them.
+
+    Example:
+        >>> from caviar_protocol.recording import Recording
+        >>> recording = Recording("runs/smoke-20261122-101500")
+        >>> product = recording.frame(episode=0, frame=7).products[0]
+        >>> product.provenance.topic, product.digest == product.provenance.digest
+        ('action', True)
+        >>> type(product.payload).__name__
+        'Action'
+    """
+
+    def __init__(self, provenance: GrantInput, data: memoryview, place: str) -> None:
+        self.provenance = provenance
+        self.place = place
+        """Recording, frame, topic and source, as errors name them."""
+        self._data = data
+
+    @property
+    def size(self) -> int:
+        """Stored bytes."""
+        return len(self._data)
+
+    @property
+    def header(self) -> memoryview:
+        """The wire bytes of the payload's header."""
+        return self._data[8 : 8 + self._header_length]
+
+    @property
+    def body(self) -> memoryview:
+        """The wire bytes of the payload's arrays."""
+        return self._data[8 + self._header_length :]
+
+    @property
+    def _header_length(self) -> int:
+        # The bytes are checked only where their CRC or digest was: a length may be anything.
+        length = int.from_bytes(self._data[:8], "little")
+        if len(self._data) < 8 or 8 + length > len(self._data):
+            raise RecordingError(f"{self.place}: a header of {length} B does not fit {len(self._data)} B")
+        return length
+
+    @cached_property
+    def payload(self) -> Payload:
+        """The typed payload; its arrays are read-only views into the file.
+
+        Raises:
+            RecordingError: The bytes are not a payload of the topic.
+        """
+        try:
+            return decode_payload(self.provenance.topic, self.header, self.body)
+        except ProtocolError as error:
+            raise RecordingError(f"{self.place}: {error}") from error
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the recorded bytes (`caviar_protocol.digest.payload_digest`)."""
+        return hashlib.sha256(self._data).hexdigest()
+
+
+class RecordedFrame:
+    """One frame: the provenance of all its products, and the products, read on first use.
+
+    Args:
+        recording: Of which the frame is.
+        index: Place of the frame in it, from 0.
+
+    Example:
+        >>> from caviar_protocol.recording import Recording
+        >>> recording = Recording("runs/smoke-20261122-101500")
+        >>> frame = recording.frame(episode=0, frame=7)
+        >>> frame.t_ns, [product.provenance.topic for product in frame.products]
+        (700000000, ['action', 'channel', 'link', 'scene'])
+    """
+
+    def __init__(self, recording: Recording, index: int) -> None:
+        self._recording = recording
+        self._index = index
+        self.entry = recording.entry(index)
+        self.episode = self.entry.episode
+        self.number = self.entry.frame
+        self.t_ns = self.entry.t_ns
+        self.inputs = self.entry.inputs
+        """Provenance of every product, absent ones included."""
+        self.reports = self.entry.reports
+        """What services reported beside their products: decisions, counts, wall times."""
+
+    @cached_property
+    def products(self) -> tuple[RecordedProduct, ...]:
+        """What is not absent, in the order of `inputs`.
+
+        Raises:
+            RecordingError: Bytes are damaged or missing; the text names the place.
+        """
+        return self._recording.products_of(self._index)
+
+    def payloads(self, topic: str, cls: type[P]) -> dict[str, P]:
+        """Payloads of a topic by source, fresh and held ones.
+
+        Args:
+            topic: Name of the topic.
+            cls: Its payload class, of which the result is.
+
+        Raises:
+            RecordingError: There is no such topic, or ``cls`` is not its payload class.
+
+        Example:
+            >>> from caviar_protocol.recording import Recording
+            >>> from caviar_protocol.topics import Link
+            >>> frame = Recording("runs/smoke-20261122-101500").frame(episode=0, frame=7)
+            >>> frame.payloads("link", Link)["link"].rx
+            ('car/rx', 'uav/rx-uav')
+        """
+        if PAYLOADS.get(topic) is not cls:
+            check_topic(topic)
+            raise RecordingError(f"payloads of {topic!r} are {PAYLOADS[topic].__name__}, not {cls.__name__}")
+        return {
+            product.provenance.source: cast(P, product.payload)
+            for product in self.products
+            if product.provenance.topic == topic and product.provenance.status is not Status.LATE
+        }
+
+    of = payloads  # its earlier name
+
+    def scene(self) -> Scene | None:
+        """The scenes of all worlds as one (contract, clause 3); None where there is none.
+
+        Example:
+            >>> from caviar_protocol.recording import Recording
+            >>> recording = Recording("runs/smoke-20261122-101500")
+            >>> recording.frame(episode=0, frame=7).scene().names
+            ('car', 'uav')
+        """
+        scenes = self.payloads("scene", Scene)
+        return merge_scenes(scenes) if scenes else None
+
+
+_READER = ("Recording", "RecordingWarning")
 
 
 def __getattr__(name: str) -> object:

@@ -3,7 +3,7 @@
 `Recording.__getitem__` makes a `TopicArrays`: ``recording["channel"]``. It knows which frames it covers, and
 reads them when an attribute is asked for. A `Column` says how the rows of one product (users, objects,
 sensors) become rows of an array whose first axis counts frames. `caviar_protocol.recording.topics` and
-`caviar_protocol.recording.sensors` have a class for each topic.
+`caviar_protocol.recording.scene` have a class for each topic.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, Payload, array_fields
 from caviar_protocol.errors import RecordingError, suggestion
 from caviar_protocol.fields import GrantInput, Status
+from caviar_protocol.space.scene import merge_scenes
 
 if TYPE_CHECKING:
     from caviar_protocol.recording.reader import Recording
@@ -60,13 +61,6 @@ class Column(Generic[S]):
         shape: Of one row: fixed sizes, or the name of one that differs between rows. Such an axis is as long
             as the longest row, and the others are padded with the missing value.
         rows: Rows of one product; by default the payload's field of this attribute's name.
-
-    Example:
-        >>> from caviar_protocol.recording import Recording
-        >>> recording = Recording("runs/smoke-20261122-101500")
-        >>> column = recording["link"].columns["abs_y"]
-        >>> column.unit, column.doc
-        ('1', '|y| of the chosen pair')
     """
 
     def __init__(
@@ -121,12 +115,6 @@ def payload_column(
         name: The field.
         axes: Leading axes of the field that count rows.
         rows: Rows of one product; by default those of the field along its first axis.
-
-    Example:
-        >>> from caviar_protocol.topics import Scene
-        >>> column = payload_column(np.float64, Scene, "position")
-        >>> column.shape, column.unit
-        ((3,), 'm')
     """
     spec, hint = array_fields(cls)[name], get_type_hints(cls, include_extras=True)[name]
     candidates = (hint, *get_args(hint))  # an optional field is a union with the annotated type
@@ -191,14 +179,29 @@ class TopicArrays(Generic[P, K]):
         """File or directory, and topic, as an error names them."""
         return f"{self._recording.path}: {self.topic}"
 
-    def was_asked_for(self, part: str) -> bool:
-        """Whether ``record`` of the scenario names a part, as ``channel.h``.
+    def recorded(self, part: str, rows: Sequence[NDArray[Any] | None]) -> list[NDArray[Any]]:
+        """Rows of a part that is computed only where a consumer asks for it.
 
         Args:
             part: Topic and part: ``channel.h``.
+            rows: Rows of one product; None where one lacks the part.
+
+        Raises:
+            RecordingError: A row is not there; the text says what to write into the scenario.
         """
+        found = [row for row in rows if row is not None]
+        if len(found) == len(rows):
+            return found
         run = self._recording.metadata.scenario.get("run", {})
-        return isinstance(run, Mapping) and part in run.get("record", ())
+        if isinstance(run, Mapping) and part in run.get("record", ()):
+            raise RecordingError(
+                f"{self.place} has no {part}, which `record` below [run] of its scenario asks for: "
+                f"{' and '.join(map(repr, self.sources))} did not deliver it; mend it, and run again"
+            )
+        raise RecordingError(
+            f"{self.place} was recorded without {part}: write it into `record` below [run] of the scenario, "
+            "and run again"
+        )
 
     def __len__(self) -> int:
         """Number of frames F."""
@@ -323,13 +326,6 @@ class TopicArrays(Generic[P, K]):
 
         Args:
             other: The view, such as that of all frames.
-
-        Example:
-            >>> from caviar_protocol.recording import Recording
-            >>> recording = Recording("runs/smoke-20261122-101500")
-            >>> link = recording["link"]
-            >>> link[:10].like(link).keys == link.keys
-            True
         """
         view = self._view(self._indices)
         view._reference = other
@@ -420,14 +416,6 @@ class TopicArrays(Generic[P, K]):
         """
         raise NotImplementedError
 
-    def merged(self, payloads: dict[str, P]) -> P:
-        """The payloads of several sources as one; only a topic that allows them defines it.
-
-        Args:
-            payloads: By source.
-        """
-        raise NotImplementedError
-
     # --- reading --------------------------------------------------------------------------------
 
     def _view(self, indices: Int64Array) -> Self:
@@ -460,7 +448,8 @@ class TopicArrays(Generic[P, K]):
                 found[item.source] = self._recording.recorded_product(index, item).payload  # type: ignore[assignment]
         if len(found) < 2:
             return next(iter(found.values()), None)
-        return self.merged(found)
+        # `Recording` lets several sources through of scenes alone: those of the worlds.
+        return merge_scenes(found)  # type: ignore[arg-type, return-value]
 
     def _items(self, index: int) -> list[GrantInput]:
         """Provenance by source; a source that the frame does not list is absent."""

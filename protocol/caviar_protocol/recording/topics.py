@@ -1,7 +1,7 @@
-"""What a recording has as arrays of topics ``scene``, ``channel``, ``link`` and ``action``.
+"""What a recording has as arrays of topics ``channel``, ``link`` and ``action``, and a class for each topic.
 
-The second axis counts users (`User`) in ``channel``, ``link`` and ``action``, objects in ``scene``, and
-devices in ``scene.devices``. `caviar_protocol.recording.sensors` has the sensors.
+The second axis counts users (`User`). `caviar_protocol.recording.scene` has the topics with a row for each
+object, device or sensor.
 """
 
 from __future__ import annotations
@@ -10,24 +10,18 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, ClassVar, Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from caviar_protocol.arrays import Float64Array, Int64Array, Payload
-from caviar_protocol.errors import RecordingError, suggestion
+from caviar_protocol.arrays import Float64Array, Payload
 from caviar_protocol.recording.arrays import Column, Rows, TopicArrays, payload_column
-from caviar_protocol.space.scene import device_pose, device_velocity, merge_scenes
-from caviar_protocol.topics import (
-    Action,
-    AntennaDevice,
-    BeamChoice,
-    Carrier,
-    Channel,
-    Link,
-    Scene,
-    VelocityCommand,
-    WaypointCommand,
+from caviar_protocol.recording.scene import (
+    CameraArrays,
+    DepthArrays,
+    LidarArrays,
+    MotionArrays,
+    SceneArrays,
+    SegmentationArrays,
 )
-from caviar_protocol.topics.scene import Device
+from caviar_protocol.topics import Action, BeamChoice, Carrier, Channel, Link
 
 P = TypeVar("P", bound=Payload)
 
@@ -45,33 +39,6 @@ class User(NamedTuple):
     tx: str
     rx: str
     carrier: str
-
-
-def recorded_part(
-    view: TopicArrays[Any, Any], part: str, rows: Sequence[NDArray[Any] | None]
-) -> list[NDArray[Any]]:
-    """Rows of a part that is computed only where a consumer asks for it.
-
-    Args:
-        view: The topic in some frames.
-        part: Topic and part: ``channel.h``.
-        rows: Rows of one product; None where one lacks the part.
-
-    Raises:
-        RecordingError: A row is not there; the text says what to write into the scenario.
-    """
-    found = [row for row in rows if row is not None]
-    if len(found) < len(rows):
-        if view.was_asked_for(part):
-            raise RecordingError(
-                f"{view.place} has no {part}, which `record` below [run] of its scenario asks for: "
-                f"{' and '.join(map(repr, view.sources))} did not deliver it; mend it, and run again"
-            )
-        raise RecordingError(
-            f"{view.place} was recorded without {part}: write it into `record` below [run] of the scenario, "
-            "and run again"
-        )
-    return found
 
 
 class UserArrays(TopicArrays[P, User], Generic[P]):
@@ -136,185 +103,6 @@ class UserArrays(TopicArrays[P, User], Generic[P]):
         return sorted(found, key=lambda user: (rank[user.carrier], user.tx, user.rx))
 
 
-class NamedArrays(TopicArrays[P, str], Generic[P]):
-    """A topic whose arrays have a row for each name, sorted."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """What the second axis counts."""
-        return self.keys
-
-    def index(self, names: Iterable[str]) -> Int64Array:
-        """Place of each name on the second axis, to align arrays: ``position[:, devices.index(channel.rx)]``.
-
-        Args:
-            names: Names of rows.
-
-        Returns:
-            Shape as there are names.
-
-        Raises:
-            RecordingError: A name is not there.
-
-        Example:
-            >>> from caviar_protocol.recording import Recording
-            >>> recording = Recording("runs/smoke-20261122-101500")
-            >>> recording["scene"].index(["uav", "car"]).tolist()
-            [1, 0]
-        """
-        names = list(names)
-        for name in names:
-            if name not in self._place_of:
-                hint = suggestion(name, self.keys)
-                raise RecordingError(f"{self.place} has no {name!r} in these frames; {hint}")
-        return np.array([self._place_of[name] for name in names], dtype=np.int64)
-
-    def select(
-        self,
-        *,
-        episode: int | None = None,
-        frames: Iterable[int] | None = None,
-        names: str | Iterable[str] | None = None,
-    ) -> Self:
-        """These frames and these names only; each argument that is left out allows all.
-
-        Args:
-            episode: Number of an episode.
-            frames: Numbers of frames in their episodes.
-            names: Name of a row, or several.
-
-        Raises:
-            RecordingError: A frame, an episode or a name is not there; the text says what is.
-
-        Example:
-            >>> from caviar_protocol.recording import Recording
-            >>> recording = Recording("runs/smoke-20261122-101500")
-            >>> recording["scene"].select(names="uav").velocity.shape
-            (100, 1, 3)
-        """
-        return super().select(episode=episode, frames=frames)._narrowed([(0, "row named", names)])
-
-    def sorted_keys(self, keys: Iterable[str]) -> Iterable[str]:
-        return sorted(keys)
-
-
-# --- scene ------------------------------------------------------------------------------------------
-
-
-class SceneArrays(NamedArrays[Scene]):
-    """Topic ``scene``: objects, of all worlds.
-
-    Example:
-        >>> from caviar_protocol.recording import Recording
-        >>> recording = Recording("runs/smoke-20261122-101500")
-        >>> scene = recording["scene"]
-        >>> scene.names, scene.classes, scene.position.shape  # frames × objects × 3
-        (('car', 'uav'), ('car', 'uav'), (100, 2, 3))
-    """
-
-    axis: ClassVar[str] = "N"
-
-    def _turning(self, scene: Scene) -> Rows:
-        turning = scene.angular_velocity
-        return list(np.zeros_like(scene.velocity) if turning is None else turning)
-
-    position = payload_column(np.float64, Scene, "position")
-    orientation = payload_column(np.float64, Scene, "orientation")
-    velocity = payload_column(np.float64, Scene, "velocity")
-    angular_velocity = Column(
-        np.float64, 3, unit="rad/s", doc="in world axes; 0 where the world does not say", rows=_turning
-    )
-    dimensions = payload_column(np.float64, Scene, "dimensions")
-
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """Class of each object (``car``, ``uav``, …), where it first occurs. Length N."""
-        found: dict[str, str] = {}
-        for scene in self:
-            if scene is not None:
-                for name, kind in zip(scene.names, scene.classes, strict=True):
-                    found.setdefault(name, kind)
-        return tuple(found.get(name, "") for name in self.keys)
-
-    @property
-    def devices(self) -> DeviceArrays:
-        """The antennas and sensors of the same frames, where they are in the world."""
-        # Of the same frames, but not of the same rows: those are objects.
-        return DeviceArrays(self._recording, self.topic, self.sources, self._indices)
-
-    def keys_of(self, payload: Scene) -> Sequence[str]:
-        return payload.names
-
-    def merged(self, payloads: dict[str, Scene]) -> Scene:
-        return merge_scenes(payloads)
-
-
-def _each_device(value: Callable[[Scene, Device], Any]) -> Callable[[Any, Scene], Rows]:
-    return lambda _, scene: [value(scene, device) for device in scene.devices]
-
-
-class DeviceArrays(NamedArrays[Scene]):
-    """Devices of topic ``scene``, fixed ones and those mounted on objects, in world axes.
-
-    Example:
-        >>> from caviar_protocol.recording import Recording
-        >>> recording = Recording("runs/smoke-20261122-101500")
-        >>> devices = recording["scene"].devices
-        >>> devices.position[0, devices.index(["bs"])].shape
-        (1, 3)
-    """
-
-    axis: ClassVar[str] = "D"
-
-    position = Column(
-        np.float64,
-        3,
-        unit="m",
-        doc="reference point, in the world",
-        rows=_each_device(lambda scene, device: device_pose(scene, device).position),
-    )
-    orientation = Column(
-        np.float64,
-        4,
-        doc="(w, x, y, z), device axes into world axes",
-        rows=_each_device(lambda scene, device: device_pose(scene, device).orientation),
-    )
-    velocity = Column(np.float64, 3, unit="m/s", doc="in world axes", rows=_each_device(device_velocity))
-
-    @property
-    def devices(self) -> dict[str, Device]:
-        """Each device as its first frame states it: role, array, power, optics. By name."""
-        found: dict[str, Device] = {}
-        for scene in self:
-            for device in scene.devices if scene is not None else ():
-                found.setdefault(device.name, device)
-        return {name: found[name] for name in self.keys if name in found}
-
-    def antennas(self, role: str) -> tuple[str, ...]:
-        """Names of the antennas that transmit or receive.
-
-        Args:
-            role: ``"tx"`` for those that transmit, ``"rx"`` for those that receive.
-
-        Example:
-            >>> from caviar_protocol.recording import Recording
-            >>> recording = Recording("runs/smoke-20261122-101500")
-            >>> recording["scene"].devices.antennas("rx")
-            ('car/rx', 'uav/rx-uav')
-        """
-        return tuple(
-            name
-            for name, device in self.devices.items()
-            if isinstance(device, AntennaDevice) and device.role in (role, "both")
-        )
-
-    def keys_of(self, payload: Scene) -> Sequence[str]:
-        return [device.name for device in payload.devices]
-
-    def merged(self, payloads: dict[str, Scene]) -> Scene:
-        return merge_scenes(payloads)
-
-
 # --- channel and link -------------------------------------------------------------------------------
 
 
@@ -354,11 +142,11 @@ def _paths(field: str) -> Callable[[Any, Channel], Rows]:
 def _wideband(field: str, carrier_field: str) -> Callable[[Any, Channel], Rows]:
     """Rows of a part that only carriers with a numerology have; empty ones for the others."""
 
-    def rows(view: Any, channel: Channel) -> Rows:
+    def rows(view: TopicArrays[Any, Any], channel: Channel) -> Rows:
         stored = {(part.carrier, part.tx, part.rx): part.h for part in getattr(channel, field)}
         has_bins = [getattr(carrier, carrier_field) for carrier in channel.carriers]
         found = [stored.get(pair) if has_bins[pair[0]] else _NO_BINS for pair in _pairs(channel)]
-        return recorded_part(view, f"channel.{field}", found if stored else [None for _ in found[:1]])
+        return view.recorded(f"channel.{field}", found if stored else [None for _ in found[:1]])
 
     return rows
 
@@ -383,7 +171,7 @@ class ChannelArrays(UserArrays[Channel]):
 
     def _matrices(self, channel: Channel) -> Rows:
         found = {(m.carrier, m.tx, m.rx): m.h for m in channel.h}
-        return recorded_part(self, "channel.h", [found.get(pair) for pair in _pairs(channel)])
+        return self.recorded("channel.h", [found.get(pair) for pair in _pairs(channel)])
 
     def _first_taps(self, channel: Channel) -> Rows:
         if not channel.taps:
@@ -505,20 +293,9 @@ class LinkArrays(UserArrays[Link]):
 
 # --- action -----------------------------------------------------------------------------------------
 
-_NO_VECTOR = (np.nan, np.nan, np.nan)
-
 
 def _beam_choices(action: Action) -> list[BeamChoice]:
     return [command for command in action.commands if isinstance(command, BeamChoice)]
-
-
-def _motions(action: Action) -> list[WaypointCommand | VelocityCommand]:
-    return [c for c in action.commands if isinstance(c, WaypointCommand | VelocityCommand)]
-
-
-def _each_motion(field: str, missing: Any) -> Callable[[Any, Action], Rows]:
-    """Rows of a field that only some commands have."""
-    return lambda _, action: [getattr(command, field, missing) for command in _motions(action)]
 
 
 class ActionArrays(UserArrays[Action]):
@@ -551,24 +328,16 @@ class ActionArrays(UserArrays[Action]):
         return [User(choice.tx, choice.rx, choice.carrier) for choice in _beam_choices(payload)]
 
 
-class MotionArrays(NamedArrays[Action]):
-    """Commands of topic ``action`` that move objects, by object."""
+# --- all topics --------------------------------------------------------------------------------------------
 
-    axis: ClassVar[str] = "N"
-
-    waypoint = Column(
-        np.float64, 3, unit="m", doc="where to; NaN: not commanded", rows=_each_motion("position", _NO_VECTOR)
-    )
-    speed = Column(
-        np.float64, unit="m/s", doc="at most, towards the waypoint", rows=_each_motion("speed", np.nan)
-    )
-    velocity = Column(
-        np.float64,
-        3,
-        unit="m/s",
-        doc="in world axes; NaN: not commanded",
-        rows=_each_motion("velocity", _NO_VECTOR),
-    )
-
-    def keys_of(self, payload: Action) -> Sequence[str]:
-        return [command.object for command in _motions(payload)]
+TOPIC_ARRAYS: dict[str, type[TopicArrays[Any, Any]]] = {
+    "scene": SceneArrays,
+    "channel": ChannelArrays,
+    "lidar": LidarArrays,
+    "camera": CameraArrays,
+    "depth": DepthArrays,
+    "segmentation": SegmentationArrays,
+    "action": ActionArrays,
+    "link": LinkArrays,
+}
+"""Class of the arrays of each topic."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import PurePosixPath
 from typing import Any
@@ -10,7 +9,6 @@ from typing import Any
 import msgspec
 
 from caviar_protocol.errors import ScenarioError, suggestion
-from caviar_protocol.fields import MAX_SUBCARRIERS
 from caviar_protocol.scenario.conversion import Place, convert_table
 from caviar_protocol.scenario.schema import DeviceSpec, Scenario, ServiceSpec
 from caviar_protocol.topics import PARTS, PAYLOADS
@@ -114,26 +112,11 @@ def refuse_remote(scenario: Scenario) -> None:
             )
 
 
-def devices_of(scenario: Scenario, world: str) -> tuple[DeviceSpec, ...]:
-    """The devices that a world publishes.
-
-    A device belongs to the world it names, or to the only world of the run, or to the one with
-    whose ``prefix`` (a setting; else its name and a dot) ``on`` begins.
-
-    Args:
-        scenario: The scenario.
-        world: Name of a service.
-
-    Raises:
-        ScenarioError: The world of a device is ambiguous.
-    """
-    return tuple(
-        device for index, device in enumerate(scenario.devices) if world_of(scenario, index) == world
-    )
-
-
 def world_of(scenario: Scenario, index: int) -> str:
-    """Name of the world that publishes a device; see `devices_of`.
+    """Name of the world that publishes a device.
+
+    A device belongs to the world it names, or to the only world of the run, or to the one with whose
+    ``prefix`` (a setting; else its name and a dot) ``on`` begins.
 
     Args:
         scenario: The scenario.
@@ -462,64 +445,6 @@ def _check_ascending(
     if not least <= low < high <= most:
         upper = "" if most == float("inf") else f" and at most {most}"
         raise place.error(f"is [{low}, {high}], write two ascending numbers, at least {least}{upper}")
-
-
-_BANDWIDTHS_HZ = (1.0, 1e12)
-"""[Hz]; beyond, numbers of noise powers and of taps overflow."""
-
-
-def with_numerology(carrier: Carrier, sampling_period_ns: int | None, place: Place) -> Carrier:
-    """The carrier with the spacing, number or slot duration that follows from its other keys.
-
-    Args:
-        carrier: As the scenario has it.
-        sampling_period_ns: Between frames [ns]; None where it is not the same between all of them.
-        place: Where the carrier stands in the scenario.
-
-    Raises:
-        ScenarioError: The bandwidth is no carrier's, subcarriers are too many or do not fit into
-            it, or slots have no duration; the text names the key.
-
-    Example:
-        >>> carrier = Carrier(name="n257", frequency_hz=28e9, subcarrier_spacing_hz=120e3)
-        >>> with_numerology(carrier, 100_000_000, Place("carriers[0]")).subcarriers
-        833
-    """
-    count, spacing, bandwidth = carrier.subcarriers, carrier.subcarrier_spacing_hz, carrier.bandwidth_hz
-    least, most = _BANDWIDTHS_HZ
-    if not least <= bandwidth <= most:
-        raise place.at("bandwidth_hz").error(f"is {bandwidth:g} Hz, write {least:g} to {most:g}")
-    if spacing > bandwidth * (1 + 1e-9):
-        raise place.at("subcarrier_spacing_hz").error(
-            f"is {spacing:g} Hz, wider than bandwidth_hz = {bandwidth:g}; write at most the bandwidth"
-        )
-    if spacing and not count:
-        if bandwidth / MAX_SUBCARRIERS > spacing:
-            raise place.at("subcarrier_spacing_hz").error(
-                f"is {spacing:g} Hz, of which bandwidth_hz = {bandwidth:g} has more than {MAX_SUBCARRIERS}; "
-                f"write at least {bandwidth / MAX_SUBCARRIERS:g}, or subcarriers"
-            )
-        # 100e6 / 120e3 and the like must not lose a subcarrier to rounding.
-        count = math.floor(bandwidth / spacing * (1 + 1e-12))
-    elif count and not spacing:
-        spacing = bandwidth / count
-    if count * spacing > bandwidth * (1 + 1e-9):
-        raise place.at("subcarriers").error(
-            f"{count} subcarriers of {spacing:g} Hz take {count * spacing:g} Hz, more than bandwidth_hz = "
-            f"{bandwidth:g}; write bandwidth_hz = {count * spacing:g}, or at most "
-            f"{math.floor(bandwidth / spacing)} subcarriers"
-        )
-    duration = carrier.slot_duration_s
-    if carrier.slots > 1 and not duration:
-        if sampling_period_ns is None:
-            raise place.at("slots").error(
-                f"are {carrier.slots}, and run.instants_s has no period that they could share; write "
-                "slot_duration_s"
-            )
-        duration = sampling_period_ns * 1e-9 / carrier.slots
-    return msgspec.structs.replace(
-        carrier, subcarriers=count, subcarrier_spacing_hz=spacing, slot_duration_s=duration
-    )
 
 
 def undefined_part(part: str, carriers: Sequence[Carrier]) -> str:

@@ -49,41 +49,18 @@ def read_ply(file: Path, called: str = "") -> tuple[Float64Array, Int64Array]:
         >>> vertices.shape, triangles.tolist()
         ((4, 3), [[0, 1, 2], [0, 2, 3]])
     """
-    elements = _read(file, "face", called or str(file))
-    return elements["vertex"], elements["face"]
-
-
-def read_ply_vertices(file: Path) -> Float64Array:
-    """Read the vertices of a PLY file; what follows them is not parsed.
-
-    Args:
-        file: A PLY file with an element ``vertex``. Numbers of a text file are read as they are written, also
-            where its header calls them ``float``.
-
-    Returns:
-        Vertices [m] in the file's order, Shape ``[V, 3]``.
-
-    Raises:
-        AssetError: The file cannot be read, is no mesh, breaks off, or has a vertex that is not finite.
-    """
-    vertices: Float64Array = _read(file, "vertex", str(file))["vertex"]
-    return vertices
-
-
-def _read(file: Path, last: str, called: str) -> dict[str, NDArray[Any]]:
-    """Elements of a file up to ``last``, by name: vertices as coordinates, elements of lists as triangles."""
+    called = called or str(file)
     try:
-        found = _parse(file.read_bytes(), last)
+        vertices, triangles = _parse(file.read_bytes())
     except OSError as error:
         raise AssetError(f"{called} cannot be read: {error.strerror}") from error
     except (ValueError, KeyError, IndexError) as error:
         raise AssetError(f"{called}: not a PLY file that can be read ({error!r}); export it again") from error
-    vertices = found["vertex"]
     bad = np.flatnonzero(~np.isfinite(vertices).all(1))
     if len(bad):
         where = vertices[bad[0]].tolist()
         raise AssetError(f"{called}: vertex {bad[0]} is at {where}; give every vertex finite coordinates")
-    return found
+    return vertices, triangles
 
 
 @dataclass
@@ -109,20 +86,21 @@ class _Element:
         return list("xyz") if self.name == "vertex" else []
 
 
-def _parse(data: bytes, last: str) -> dict[str, NDArray[Any]]:
+def _parse(data: bytes) -> tuple[Float64Array, Int64Array]:
     order, elements, begin = _header(data)
     body = _Binary(data, begin, order) if order else _Text(data[begin:])
     found: dict[str, NDArray[Any]] = {}
     for element in elements:
         found[element.name] = body.triangles(element) if element.has_lists else body.columns(element)
-        if element.name == last:
+        # What stands behind the faces, such as lines and materials of some tools, need not be readable.
+        if element.name == "face":
             break
-    if missing := {"vertex", last} - set(found):
-        raise ValueError(f"no element {missing.pop()} up to {last}")
-    faces, count = found.get("face", np.empty(0)), len(found["vertex"])
-    if len(faces) and not 0 <= faces.min() <= faces.max() < count:
-        raise ValueError(f"faces refer to vertices {faces.min()} to {faces.max()} of {count}")
-    return found
+    if missing := {"vertex", "face"} - set(found):
+        raise ValueError(f"no element {missing.pop()}")
+    vertices, faces = found["vertex"], found["face"]
+    if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
+        raise ValueError(f"faces refer to vertices {faces.min()} to {faces.max()} of {len(vertices)}")
+    return vertices, faces
 
 
 def _header(data: bytes) -> tuple[str, list[_Element], int]:
