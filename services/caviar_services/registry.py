@@ -33,7 +33,7 @@ BUILT_IN: dict[str, str] = {
     "link:beams": "caviar_services.link.beam_sweep:BeamLink",
     "agent:los-beam": "caviar_services.agent.baselines:LosBeamAgent",
     "agent:random": "caviar_services.agent.baselines:RandomAgent",
-    "agent:waypoints": "caviar_services.agent.waypoints:WaypointsAgent",
+    "agent:waypoints": "caviar_services.agent.baselines:WaypointsAgent",
     "agent:oracle": "caviar_services.agent.baselines:OracleAgent",
     "recorder:mcap": "caviar_services.recorder.mcap:McapRecorder",
 }

@@ -26,7 +26,7 @@ from caviar_protocol.space.scene import object_pose
 from caviar_protocol.topics import Camera, CameraDevice, Scene
 from caviar_services.sensors.camera import CameraSensors, CameraSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo, StepResult
-from caviar_services.world.assets import object_assets, scenery_assets
+from caviar_services.world.scenery import object_assets, scenery_assets
 
 DEMANDS: dict[str, dict[str, frozenset[str]]] = {
     "RGB": {"camera": frozenset()},

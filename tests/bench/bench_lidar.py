@@ -20,10 +20,10 @@ from caviar_protocol.codec import encode_payload
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import LidarDevice, Scene
+from caviar_services.sensors.base import active_variant
 from caviar_services.sensors.lidar import LidarSensors, LidarSettings, ray_directions
-from caviar_services.sensors.traced_scene import active_variant
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
-from caviar_services.world.assets import object_assets, scenery_assets
+from caviar_services.world.scenery import object_assets, scenery_assets
 
 
 def traffic(frame: int, count: int) -> Scene:

@@ -20,7 +20,7 @@ from caviar_services.channel.stability.lab import Array, Thing, antenna, free_sp
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.pattern_files import read_pattern
 from caviar_services.service import Preparation, RunInfo
-from caviar_services.world.assets import scenery_assets
+from caviar_services.world.scenery import scenery_assets
 
 pytestmark = pytest.mark.channel
 

@@ -11,10 +11,10 @@ import pytest
 
 from caviar_protocol.errors import SetupError
 from caviar_protocol.scenario import load_scenario
-from caviar_services.mesh.scenery import read_scenery
+from caviar_services.mesh.scenery import read_scenery, world_mesh
 from caviar_services.ray_tracing import activate_llvm
-from caviar_services.sensors.traced_scene import active_variant, load_scenery
-from caviar_services.world.assets import scenery_assets
+from caviar_services.sensors.base import active_variant
+from caviar_services.world.scenery import scenery_assets
 from caviar_services.world.trajectory import Track, read_waypoints
 
 pytestmark = [
@@ -39,7 +39,7 @@ def distances(mi: Any, scene: Any, origins: np.ndarray, directions: np.ndarray) 
 
 def merged(mi: Any, xml: Path) -> Any:
     """All meshes of a scenery as one Mitsuba scene."""
-    meshes = load_scenery(mi, read_scenery(xml))
+    meshes = [world_mesh(shape) for shape in read_scenery(xml).shapes]
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     mesh = mi.Mesh("munich", int(starts[-1]), sum(len(part.faces) for part in meshes))
     parameters = mi.traverse(mesh)

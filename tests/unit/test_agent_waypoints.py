@@ -11,8 +11,7 @@ from caviar_protocol.scenario.conversion import convert_settings
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.topics import Action, BeamChoice, Scene, WaypointCommand
 from caviar_services.agent.base import AgentSettings
-from caviar_services.agent.baselines import LosBeamAgent
-from caviar_services.agent.waypoints import WaypointsAgent, WaypointsSettings
+from caviar_services.agent.baselines import LosBeamAgent, WaypointsAgent, WaypointsSettings
 from caviar_services.service import Preparation, RunInfo
 
 POINTS = ((10.0, 0.0, 5.0), (10.0, 20.0, 5.0), (0.0, 0.0, 5.0))

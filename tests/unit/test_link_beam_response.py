@@ -13,8 +13,8 @@ from caviar_protocol.topics import AntennaArray, Carrier, Channel, Scene
 from caviar_services.antenna_arrays import dft_beam, dft_codebook
 from caviar_services.channel.statistical.geometric import GeometricChannel
 from caviar_services.channel.statistical.waves import GeometricSettings
-from caviar_services.link.beam_response import beam_responses
-from caviar_services.link.users import Users, users_of
+from caviar_services.link.base import Users, users_of
+from caviar_services.link.beam_sweep import beam_responses
 from caviar_services.service import Preparation, RunInfo
 from caviar_services.testing import samples
 
@@ -37,7 +37,7 @@ def street() -> tuple[Scene, Users, Channel]:
     run = RunInfo(name="channel", carriers=CARRIERS)
     model = GeometricChannel(GeometricSettings(components=6), run)
     model.prepare(Preparation(demand={"channel": frozenset({"hf"})}))
-    frame = samples._frame(model.inputs, 1, "channel")
+    frame = samples.granted(model.inputs, 1, "channel")
     channel = model.step(frame).products["channel"]
     assert isinstance(channel, Channel)
     scene = frame.scene()
@@ -49,7 +49,7 @@ def test_beams_of_paths_are_beams_of_the_whole_grid(street: tuple[Scene, Users, 
     grid = {(r.carrier, r.tx, r.rx): r.h for r in channel.hf}
     for beams in itertools.product((0, 5, 13), (0, 1)):
         found = beam_responses(channel, scene, users, [beams] * len(users))
-        for user, place, y in zip(users, users.places(channel), found, strict=True):
+        for user, place, y in zip(users, users.channel_indices(channel), found, strict=True):
             assert place is not None
             w, f = dft_codebook(user.rx.array)[beams[1]], dft_codebook(user.tx.array)[beams[0]].conj()
             expected = np.einsum("m,skmn,n->sk", w.conj(), grid[place], f)

@@ -201,7 +201,7 @@ def test_an_impossible_power_is_refused_naming_the_device(power: float) -> None:
 def test_a_frame_without_channel_is_refused_by_name() -> None:
     link = BeamLink(BeamLinkSettings(), RunInfo(name="my-link"))
     with pytest.raises(PayloadError, match="my-link was granted frame 4 without a channel"):
-        link.step(frame_of(given("scene", scene_of(BS)), number=4))
+        link.step(frame_of(given("scene", scene_of(BS)), number=4, service="my-link"))
 
 
 def test_the_product_names_the_rung_it_stands_on() -> None:

@@ -10,7 +10,7 @@ from link_builders import CARRIER, antenna, choices, frame_of, scene_of
 from caviar_protocol.errors import PayloadError, ProductError
 from caviar_protocol.messages import Status
 from caviar_protocol.topics import Carrier, UserSchedule, WaypointCommand
-from caviar_services.link.users import Choices, choices_of, users_of
+from caviar_services.link.base import Choices, choices_of, users_of
 from caviar_services.service import FrameInput
 
 SECOND = Carrier(name="sub6", frequency_hz=3.5e9)

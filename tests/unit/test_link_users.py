@@ -12,8 +12,8 @@ from caviar_protocol.errors import PayloadError
 from caviar_protocol.space.coordinates import angles
 from caviar_protocol.space.scene import directions, pairs_of
 from caviar_protocol.topics import Carrier
+from caviar_services.link.base import channels_of, users_of
 from caviar_services.link.beam_sweep import sweep_users
-from caviar_services.link.users import channels_of, users_of
 
 BS = antenna("bs", "tx", (1, 4))
 CAR = antenna("car/rx", "rx", (1, 2), (10.0, 0.0, 0.0))

@@ -10,8 +10,7 @@ import pytest
 
 from caviar_protocol.errors import RunError
 from caviar_protocol.topics import Carrier
-from caviar_services.agent.baselines import RandomAgent
-from caviar_services.agent.waypoints import WaypointsAgent, WaypointsSettings
+from caviar_services.agent.baselines import RandomAgent, WaypointsAgent, WaypointsSettings
 from caviar_services.checkpoint import Packed, restored, saved
 from caviar_services.service import RunInfo
 

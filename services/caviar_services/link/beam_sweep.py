@@ -1,8 +1,16 @@
-"""Link ``beams``: analog beamforming with DFT codebooks at both ends.
+"""Link ``beams``: analog beamforming with DFT codebooks at both ends, and what beam pairs get over the band.
 
 Each end has one RF chain and the DFT codebook of its array (paper, section 2.1). Every beam pair of every
 user is swept each frame (eq. 1), so that the chosen pair stands beside the best one (eq. 2) and beside the
-pair along the straight line (the baseline of section 4).
+pair along the straight line (the baseline of section 4). The sweep is a Fourier transform of H; the codebook
+as vectors is in `caviar_services.antenna_arrays`.
+
+Over the band and the slots of a frame the equivalent channel (eq. 1) of a pair of beams w and f is
+
+    y(Δf, Δt) = w* H(Δf, Δt) f = Σ_p (w* r_p) · (t_pᵀ f) · a_p · exp(−j2π(Δf·(τ_p − Δt·ν_p/f_c) − ν_p·Δt))
+
+with the phases r_p and t_p of the elements on path p: two numbers a path instead of a matrix a subcarrier
+(`beam_responses`).
 """
 
 from __future__ import annotations
@@ -19,13 +27,25 @@ import numpy as np
 
 from caviar_protocol.arrays import Complex128Array, Float64Array, Int32Array, Int64Array, quantity
 from caviar_protocol.errors import PayloadError
+from caviar_protocol.multipath import subcarrier_weights
 from caviar_protocol.space.beams import straight_beams
-from caviar_protocol.space.coordinates import Vector
-from caviar_protocol.space.scene import directions
-from caviar_protocol.topics import Carrier, Channel, Link, Scene
+from caviar_protocol.space.coordinates import Vector, rotation_matrix
+from caviar_protocol.space.scene import device_pose, directions
+from caviar_protocol.topics import AntennaDevice, Carrier, Channel, Link, Scene
+from caviar_protocol.topics.channel import PLANE_WAVES
 from caviar_protocol.topics.scene import AntennaArray, Device
-from caviar_services.link.base import LinkModel
-from caviar_services.link.users import Choices, User, UserChannels, Users, channels_of, choices_of, users_of
+from caviar_services.antenna_arrays import dft_beam, steering_vector
+from caviar_services.link.base import (
+    Choices,
+    LinkModel,
+    User,
+    UserChannels,
+    Users,
+    channels_of,
+    choices_of,
+    require_channel,
+    users_of,
+)
 from caviar_services.service import Frame, StepResult
 
 BOLTZMANN = 1.380649e-23
@@ -53,16 +73,34 @@ class BeamLinkSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 
 
 class BeamLink(LinkModel[BeamLinkSettings]):
-    """Scores the agents' beam pairs against the best pair and the straight-line pair."""
+    """Scores the agents' beam pairs against the best pair and the straight-line pair.
+
+    Args:
+        settings: Noise, cap of the spectral efficiency, reward, and how many pairs are listed.
+        run: What the link knows about the run.
+
+    Example:
+        >>> from caviar_services.service import RunInfo
+        >>> from caviar_services.testing.samples import granted
+        >>> link = BeamLink(BeamLinkSettings(top_k=1), RunInfo(name="link"))
+        >>> found = link.step(granted(link.inputs, 0, "link")).products["link"]
+        >>> found.rx, bool((found.abs_y <= found.top_abs_y[:, 0]).all())
+        (('car.1/rx', 'truck.2/rx'), True)
+    """
 
     Settings = BeamLinkSettings
+    # Of the last frame. Devices and carriers seldom change from frame to frame; comparing them is cheaper
+    # than naming all users and their noise anew.
     _budget: _Budget | None = None
 
     def step(self, frame: Frame) -> StepResult:
-        """Link of a frame. Raises `PayloadError` naming the agent or user at fault."""
-        channel = frame.only("channel", Channel)
-        if channel is None:
-            raise PayloadError(f"{self.run.name} was granted frame {frame.number} without a channel")
+        """Compute the link of a frame.
+
+        Raises:
+            PayloadError: There is no channel, or a user, or two agents, are at fault; the text names them.
+            ProductError: An agent is at fault.
+        """
+        channel = require_channel(frame)
         scene = frame.scene()
         budget = self._budget
         if budget is None or (budget.devices, budget.carriers) != (scene.devices, channel.carriers):
@@ -88,6 +126,8 @@ class BeamLink(LinkModel[BeamLinkSettings]):
     ) -> Link:
         settings = self.settings
         best = scores.top_abs_y[:, :1].reshape(-1)  # no column where there is no user
+        # Beams have unit norm, so |y|² is the power gain of the pair; one RF chain an end carries one stream,
+        # whose Shannon bound this is.
         snr = budget.power_over_noise * scores.abs_y**2
         efficiency = np.log2(1 + snr)
         if settings.max_spectral_efficiency is not None:
@@ -156,12 +196,30 @@ class _Budget:
 
 
 def noise_power(carrier: Carrier, noise_figure_db: float, temperature_k: float) -> float:
-    """Thermal noise k·T·B·F [W] in the carrier's bandwidth (Recommendation ITU-R P.372, noise factor)."""
+    """Thermal noise k·T·B·F [W] in the carrier's bandwidth (Recommendation ITU-R P.372, noise factor).
+
+    Args:
+        carrier: The carrier, with its bandwidth.
+        noise_figure_db: Noise figure of the receiver [dB].
+        temperature_k: Temperature of the thermal noise [K].
+
+    Example:
+        >>> carrier = Carrier(name="mmwave", frequency_hz=28e9, bandwidth_hz=100e6)
+        >>> round(10 * math.log10(noise_power(carrier, 9.0, 290.0)) + 30, 1)  # [dBm]
+        -85.0
+    """
     return BOLTZMANN * temperature_k * carrier.bandwidth_hz * 10 ** (noise_figure_db / 10)
 
 
 def transmit_power(user: User) -> float:
-    """Transmit power [W] of a user's transmitter; `PayloadError` where it cannot be meant."""
+    """Transmit power [W] of a user's transmitter.
+
+    Args:
+        user: The user.
+
+    Raises:
+        PayloadError: The power is beyond ±`MAX_POWER_DBM`; names the device.
+    """
     if not abs(user.tx.power_dbm) <= MAX_POWER_DBM:
         raise PayloadError(
             f"device {user.tx.name!r} transmits {user.tx.power_dbm} dBm; "
@@ -244,13 +302,29 @@ class Pairs(NamedTuple):
 
 
 def sweep(h: Complex128Array, tx: AntennaArray, rx: AntennaArray) -> Float64Array:
-    """|y| of every pair of DFT beams, Shape ``[..., Nr, Nt]`` to ``[..., Nt, Nr]``.
+    """Compute |y| of every pair of DFT beams.
 
-    y = w* H f (paper, eq. 1) with the beams of `codebook.dft_codebook`. Both conj(w) and f have
+    y = w* H f (paper, eq. 1) with the beams of `antenna_arrays.dft_codebook`. Both conj(w) and f have
     entries exp(−j2πkn/N)/sqrt(N), so the product over all pairs is a Fourier transform over the
     columns and rows of both arrays, and no codebook of N² entries has to be formed. Of several panels or
     polarizations each block is transformed by itself.
+
+    Args:
+        h: Channel matrices, Shape ``[..., Nr, Nt]``.
+        tx: Array of the transmitter, of Nt elements.
+        rx: Array of the receiver, of Nr elements.
+
+    Returns:
+        |y| by TX beam and RX beam, Shape ``[..., Nt, Nr]``.
+
+    Example:
+        >>> uniform = AntennaArray(rows=1, columns=4)
+        >>> abs_y = sweep(np.ones((4, 4), np.complex128), uniform, uniform)  # in phase: towards boresight
+        >>> round(float(abs_y[0, 0]), 6), round(float(abs_y[1, 1]), 6)
+        (4.0, 0.0)
     """
+    # Elements are numbered panel by panel, column by column (`antenna_arrays.element_positions`): so the axes
+    # of the grid come out of a reshape, and the transform of one axis after the other is that of all.
     leading = h.shape[:-2]
     grids = (rx.size // (rx.columns * rx.rows), rx.columns, rx.rows)
     elements = h.reshape(*leading, *grids, tx.size // (tx.columns * tx.rows), tx.columns, tx.rows)
@@ -275,10 +349,18 @@ def _fourier(size: int) -> Complex128Array:
 
 
 def best_pairs(abs_y: Float64Array, k: int) -> Pairs:
-    """The ``k`` pairs with the greatest |y|, Shape ``[U, Nt, Nr]``; all of them where there are fewer.
+    """Find the pairs of beams with the greatest |y|.
 
     The first one is eq. (2) of the paper. Of equal ones the lowest pair index
     ``tx_beam·Nr + rx_beam`` comes first.
+
+    Args:
+        abs_y: |y| of all pairs, Shape ``[U, Nt, Nr]``.
+        k: Number of pairs; all of them where there are fewer.
+
+    Example:
+        >>> best_pairs(np.array([[[1.0, 3.0], [2.0, 0.0]]]), 2).abs_y
+        array([[3., 2.]])
     """
     flat = abs_y.reshape(len(abs_y), -1)
     k = min(k, flat.shape[1])
@@ -290,6 +372,7 @@ def best_pairs(abs_y: Float64Array, k: int) -> Pairs:
     if abs_y.shape[2] > 1:
         tx_beam, rx_beam = np.divmod(tx_beam, np.int32(abs_y.shape[2]))
     if len(flat) > 1:
+        # `take` on one flat axis: `take_along_axis` forms index arrays of all axes first.
         order = order + np.arange(0, flat.size, flat.shape[1])[:, None]
     return Pairs(tx_beam, rx_beam, flat.take(order))
 
@@ -311,13 +394,104 @@ class Swept(msgspec.Struct, frozen=True):
 
 
 def sweep_users(users: Users, h: Sequence[Complex128Array | None]) -> list[Swept]:
-    """|y| of all beam pairs of the users with an H."""
+    """Sweep all users that have an H, those with equal arrays as one batch.
+
+    Args:
+        users: The users.
+        h: H of each user, Shape ``[Nr, Nt]``; None for a user without a path.
+
+    Returns:
+        A batch for each combination of arrays.
+    """
     groups: dict[int, list[int]] = defaultdict(list)
-    for index, (matrix, batch) in enumerate(zip(h, users.batch, strict=True)):
+    for index, (matrix, group) in enumerate(zip(h, users.array_groups, strict=True)):
         if matrix is not None:
-            groups[batch].append(index)
+            groups[group].append(index)
     swept = []
     for found in groups.values():
         first = users[found[0]]
         swept.append(Swept(found, sweep(np.array([h[u] for u in found]), first.tx.array, first.rx.array)))
     return swept
+
+
+def beam_responses(
+    channel: Channel, scene: Scene, users: Users, beams: Sequence[tuple[int, int]]
+) -> list[Complex128Array]:
+    """Compute y of each user's beam pair on the subcarriers and in the slots of its carrier.
+
+    Args:
+        channel: With its paths; on the rungs ``spherical`` and ``mimo-rt``, where an array does not see
+            plane waves, with part ``hf``; so for arrays of dual polarization or several panels.
+        scene: Of the same frame.
+        users: Of that scene.
+        beams: TX and RX beam of each user; a pair with −1 is not served.
+
+    Returns:
+        Of each user, Shape ``[S, K]`` with S slots and K subcarriers; zeros for a user that is not served,
+        has no path, or is not in ``channel``.
+
+    Raises:
+        PayloadError: Naming the user, for a beam that its codebook does not have, or where part ``hf`` is
+            missing.
+
+    Example:
+        >>> from caviar_services.testing.samples import CARRIERS, product, scene
+        >>> users = users_of(scene(0), CARRIERS)
+        >>> responses = beam_responses(product("channel", 0), scene(0), users, [(0, 0)] * len(users))
+        >>> [y.shape for y in responses]  # slots × subcarriers of the carrier
+        [(2, 5), (2, 5)]
+    """
+    matrices = {(response.carrier, response.tx, response.rx): response.h for response in channel.hf}
+    rotations: dict[str, Float64Array] = {}
+    found = []
+    for user, indices, (tx_beam, rx_beam) in zip(users, users.channel_indices(channel), beams, strict=True):
+        if indices is None or tx_beam < 0 or rx_beam < 0:
+            found.append(np.zeros((user.carrier.slots, user.carrier.subcarriers), np.complex128))
+            continue
+        for beam, device in ((tx_beam, user.tx), (rx_beam, user.rx)):
+            if beam >= device.array.size:
+                raise PayloadError(
+                    f"beam {beam} of user {user} does not exist; the codebook of {device.name!r} has beams "
+                    f"0 to {device.array.size - 1}"
+                )
+        ends = dft_beam(user.tx.array, tx_beam).conj(), dft_beam(user.rx.array, rx_beam).conj()
+        index, tx, rx = indices
+        # The one amplitude of a path is that between two of its devices' subarrays.
+        uniform = user.tx.array.is_uniform and user.rx.array.is_uniform
+        if channel.rung in PLANE_WAVES and uniform:
+            paths = channel.pair(user.tx.name, user.rx.name)
+            sent = _gains(scene, user.tx, channel.aod[paths], ends[0], rotations)
+            taken = _gains(scene, user.rx, channel.aoa[paths], ends[1], rotations)
+            carrier = channel.carriers[index]
+            weights = subcarrier_weights(carrier, channel.tau[paths], channel.doppler[index, paths])
+            found.append(weights @ (channel.a[index, paths] * sent * taken))
+        elif (index, tx, rx) in matrices:
+            found.append((matrices[index, tx, rx] @ ends[0]) @ ends[1])
+        else:
+            raise PayloadError(
+                f"the response of user {user} on rung {channel.rung!r} does not follow from paths; ask for "
+                "part 'hf' of the channel in the inputs of this service"
+            )
+    return found
+
+
+def _gains(
+    scene: Scene,
+    device: AntennaDevice,
+    angles: Float64Array,
+    beam: Complex128Array,
+    rotations: dict[str, Float64Array],
+) -> Complex128Array:
+    """Gain of a beam on paths with these angles in world axes, Shape ``[P, 2]`` to ``[P]``."""
+    if device.array.size == 1:
+        return np.ones(len(angles), np.complex128)
+    # Of one device for all its users: a base station is the transmitter of most of them.
+    if device.name not in rotations:
+        rotations[device.name] = rotation_matrix(device_pose(scene, device).orientation)
+    sine = np.sin(angles[:, 0])
+    directions = np.empty((len(angles), 3))
+    directions[:, 0] = sine * np.cos(angles[:, 1])
+    directions[:, 1] = sine * np.sin(angles[:, 1])
+    directions[:, 2] = np.cos(angles[:, 0])
+    gains: Complex128Array = steering_vector(device.array, directions @ rotations[device.name]) @ beam
+    return gains

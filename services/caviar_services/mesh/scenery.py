@@ -19,6 +19,8 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import AssetError, suggestion
+from caviar_protocol.space.ply import read_ply
+from caviar_services.mesh.shapes import Mesh
 
 ITU_MATERIALS = frozenset(
     (
@@ -58,6 +60,22 @@ class Scenery:
 
     file: Path
     shapes: tuple[SceneryShape, ...]
+
+
+def world_mesh(shape: SceneryShape) -> Mesh:
+    """Read the mesh of a shape.
+
+    Args:
+        shape: A shape of the scenery.
+
+    Returns:
+        Its triangles in world coordinates [m], in the precision of the file.
+
+    Raises:
+        AssetError: The file is no mesh, or a vertex is not finite; names the shape.
+    """
+    vertices, faces = read_ply(shape.file, f"{shape.place}: mesh {shape.file}")
+    return Mesh(vertices @ shape.to_world[:3, :3].T + shape.to_world[:3, 3], faces.astype(np.int32))
 
 
 def find_scenery(assets: Mapping[str, Path]) -> Path | None:

@@ -164,18 +164,40 @@ def loft(sections: Float64Array) -> Mesh:
 
 
 def joined(parts: Sequence[Mesh]) -> Mesh:
-    """Several closed meshes that do not touch, as one.
+    """Several meshes as one, vertices and faces in their order; without any, a mesh of nothing."""
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    faces = [part.faces + np.int32(start) for part, start in zip(parts, starts, strict=False)]
+    return Mesh(
+        np.concatenate([np.zeros((0, 3)), *(part.vertices for part in parts)]),
+        np.concatenate([np.zeros((0, 3), np.int32), *faces], dtype=np.int32),
+    )
+
+
+def contains(mesh: Mesh, point: Float64Array) -> bool:
+    """Whether a point lies inside a closed mesh; undecided on its surface.
+
+    Sums the solid angles of all triangles (Van Oosterom and Strackee, "The solid angle of a plane
+    triangle", 1983): ±4π inside, 0 outside.
 
     Args:
-        parts: One at least.
+        mesh: A closed mesh.
+        point: The point, in the coordinates of the mesh, Shape ``[3]``.
+
+    Example:
+        >>> contains(unit_box(), np.array([0.4, 0.0, 0.0])), contains(unit_box(), np.array([0.6, 0.0, 0.0]))
+        (True, False)
     """
-    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    return Mesh(
-        np.concatenate([part.vertices for part in parts]),
-        np.concatenate(
-            [part.faces + np.int32(start) for part, start in zip(parts, starts, strict=False)], dtype=np.int32
-        ),
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces] - point, 1, 0)
+    la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
+    numerator = np.einsum("ij,ij->i", a, np.cross(b, c))
+    denominator = (
+        la * lb * lc
+        + np.einsum("ij,ij->i", a, b) * lc
+        + np.einsum("ij,ij->i", b, c) * la
+        + np.einsum("ij,ij->i", c, a) * lb
     )
+    angle = 2 * float(np.arctan2(numerator, denominator).sum())
+    return abs(angle) > 2 * np.pi
 
 
 def _along_x(stations: Sequence[tuple[float, float, float, float, float]]) -> Mesh:

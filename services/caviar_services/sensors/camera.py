@@ -10,9 +10,9 @@ from typing import Annotated, Any, ClassVar
 import msgspec
 import numpy as np
 
-from caviar_protocol.arrays import Float32Array, Float64Array, Payload, quantity
+from caviar_protocol.arrays import Float32Array, Float64Array, Int32Array, Int64Array, Payload, quantity
 from caviar_protocol.errors import PayloadError, ScenarioError
-from caviar_protocol.space.coordinates import Pose
+from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.topics import (
     Camera,
     CameraDevice,
@@ -25,13 +25,17 @@ from caviar_protocol.topics import (
     SegmentationImage,
 )
 from caviar_protocol.topics.scene import Device
-from caviar_services.sensors.base import Sensors, SensorSettings, pose_outside, turned
+from caviar_services.ray_tracing import aligned_columns
+from caviar_services.sensors.base import (
+    NO_HIT,
+    Sensors,
+    SensorSettings,
+    TracedScene,
+    sensor_poses,
+    visible_names,
+)
 from caviar_services.sensors.shading import Colour, Painter, View, object_colour, shape_colour
-from caviar_services.sensors.traced_scene import NO_HIT, Hits, TracedScene, visible_names
 from caviar_services.service import Preparation, Prepared
-
-FAR = float(np.finfo(np.float32).max)
-"""[m]; a camera sees however far."""
 
 
 class CameraSettings(SensorSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -48,31 +52,15 @@ class CameraSettings(SensorSettings, frozen=True, kw_only=True, forbid_unknown_f
 
 
 @dataclass(frozen=True, eq=False)
-class _Look:
-    """One camera at one instant."""
+class _Hits:
+    """What the rays of a view hit, Shape ``[H·W]`` each."""
 
-    device: CameraDevice
-    optics: Intrinsics
-    pose: Pose
-
-    @property
-    def rays(self) -> Float64Array:
-        """Unit vectors through the pixels' centres in device axes, Shape ``[3, H·W]``."""
-        return pixel_rays(self.device.width, self.device.height, self.optics)
-
-    @property
-    def fields(self) -> dict[str, Any]:
-        """What every image says of its camera."""
-        return {
-            "sensor": self.device.name,
-            "intrinsics": self.optics,
-            "position": self.pose.position,
-            "orientation": self.pose.orientation,
-        }
-
-    def image(self, pixels: Any) -> Any:
-        """Values by pixel, Shape ``[H·W, …]``, as an image."""
-        return pixels.reshape(self.device.height, self.device.width, *pixels.shape[1:])
+    distance: Float32Array
+    """[m]; infinite where nothing is hit."""
+    owner: Int32Array
+    """What is hit (`TracedScene`); `NO_HIT` for nothing."""
+    face: Int64Array
+    """Which triangle is hit; 0 where nothing is."""
 
 
 class CameraSensors(Sensors[CameraSettings]):
@@ -81,6 +69,15 @@ class CameraSensors(Sensors[CameraSettings]):
     What is not in demand is not computed: neither a topic, nor part ``normals`` of ``depth``, nor part
     ``materials`` of ``segmentation`` (clause 5). Normals point to the camera's side of a surface. As
     for a LIDAR, every object of the scene is solid, the camera's own carrier too.
+
+    Args:
+        settings: Materials and colours of what is seen, the sun, and how many bodies there may be.
+        run: What the service knows about the run.
+
+    Example:
+        >>> from caviar_services.service import RunInfo
+        >>> CameraSensors(CameraSettings(sun_elevation_deg=30.0), RunInfo(name="camera")).outputs
+        ('camera', 'depth', 'segmentation')
     """
 
     outputs: ClassVar[tuple[str, ...]] = ("camera", "depth", "segmentation")
@@ -104,22 +101,22 @@ class CameraSensors(Sensors[CameraSettings]):
 
     def observe(self, mi: Any, traced: TracedScene, scene: Scene) -> dict[str, Payload]:
         """One image of each camera on each topic that is in demand."""
-        devices = sorted(
-            (d for d in scene.devices if isinstance(d, CameraDevice)), key=lambda device: device.name
-        )
-        looks = [_Look(device, intrinsics(device), pose_outside(traced, scene, device)) for device in devices]
+        views = [
+            View(device, intrinsics(device), pose)
+            for device, pose in sensor_poses(traced, scene, CameraDevice)
+        ]
         products: dict[str, Payload] = {}
         if "camera" in self._demand:
-            products["camera"] = self._pictures(mi, traced, scene, looks)
+            products["camera"] = self._pictures(mi, traced, scene, views)
         if self._demand.keys() & {"depth", "segmentation"}:
-            hits = [_traced(mi, traced, look) for look in looks]
+            hits = [_first_hits(mi, traced, view) for view in views]
             if "depth" in self._demand:
-                products["depth"] = self._depth(traced, looks, hits)
+                products["depth"] = self._depth(traced, views, hits)
             if "segmentation" in self._demand:
-                products["segmentation"] = self._segmentation(traced, looks, hits)
+                products["segmentation"] = self._segmentation(traced, views, hits)
         return products
 
-    def _pictures(self, mi: Any, traced: TracedScene, scene: Scene, looks: list[_Look]) -> Camera:
+    def _pictures(self, mi: Any, traced: TracedScene, scene: Scene, views: list[View]) -> Camera:
         azimuth = math.radians(self.settings.sun_azimuth_deg)
         elevation = math.radians(self.settings.sun_elevation_deg)
         sun = np.array(
@@ -130,15 +127,7 @@ class CameraSensors(Sensors[CameraSettings]):
             ]
         )
         painter = Painter(mi, traced, self._albedo(traced, scene), sun)
-        return Camera(
-            images=tuple(
-                CameraImage(
-                    **look.fields,
-                    rgb=painter.paint(View(look.device.width, look.device.height, look.optics, look.pose)),
-                )
-                for look in looks
-            )
-        )
+        return Camera(images=tuple(CameraImage(**view.fields, rgb=painter.paint(view)) for view in views))
 
     def _albedo(self, traced: TracedScene, scene: Scene) -> Float64Array:
         """Linear sRGB of each owner, Shape ``[owners, 3]``."""
@@ -153,20 +142,20 @@ class CameraSensors(Sensors[CameraSettings]):
         colours = [shape_colour(shape, self.settings.colours) for shape in self.shapes]
         return np.array(colours).reshape(-1, 3)
 
-    def _depth(self, traced: TracedScene, looks: list[_Look], hits: list[Hits]) -> Depth:
+    def _depth(self, traced: TracedScene, views: list[View], hits: list[_Hits]) -> Depth:
         of_face = traced.face_normals() if "normals" in self._demand["depth"] else None
         return Depth(
             images=tuple(
                 DepthImage(
-                    **look.fields,
-                    depth=look.image(_depths(look, hit)),
-                    normals=None if of_face is None else look.image(_normals(look, hit, of_face)),
+                    **view.fields,
+                    depth=view.image(_depths(view, hit)),
+                    normals=None if of_face is None else view.image(_normals(view, hit, of_face)),
                 )
-                for look, hit in zip(looks, hits, strict=True)
+                for view, hit in zip(views, hits, strict=True)
             )
         )
 
-    def _segmentation(self, traced: TracedScene, looks: list[_Look], hits: list[Hits]) -> Segmentation:
+    def _segmentation(self, traced: TracedScene, views: list[View], hits: list[_Hits]) -> Segmentation:
         owners = [hit.owner for hit in hits]
         of_owner = list(traced.owner_names)
         names, index = visible_names(of_owner, owners)
@@ -181,42 +170,89 @@ class CameraSensors(Sensors[CameraSettings]):
             material_names=materials,
             images=tuple(
                 SegmentationImage(
-                    **look.fields,
-                    object=look.image(index[owner]),
-                    material=None if material is None else look.image(material[owner]),
+                    **view.fields,
+                    object=view.image(index[owner]),
+                    material=None if material is None else view.image(material[owner]),
                 )
-                for look, owner in zip(looks, owners, strict=True)
+                for view, owner in zip(views, owners, strict=True)
             ),
         )
 
 
-def _traced(mi: Any, traced: TracedScene, look: _Look) -> Hits:
-    world = turned(look.pose, look.rays)
-    origin = np.repeat(np.array(look.pose.position)[:, None], world.shape[1], axis=1)
-    return traced.trace(mi, origin, world, np.full(world.shape[1], FAR))
+def _first_hits(mi: Any, traced: TracedScene, view: View) -> _Hits:
+    """What the ray through the centre of each pixel hits."""
+    import drjit as dr
+
+    world = _ray_directions(view)
+    origin = np.repeat(np.array(view.pose.position)[:, None], world.shape[1], axis=1)
+    # Every value is an array, never a Python number: a number becomes part of the kernel, and
+    # each new one makes a kernel to compile.
+    columns = [mi.Float(column) for column in aligned_columns(np.vstack([origin, world]))]
+    distances, faces = traced.intersect(mi, mi.Ray3f(mi.Point3f(*columns[:3]), mi.Vector3f(*columns[3:])))
+    dr.eval(distances, faces)
+    distance = distances.numpy()
+    found = np.isfinite(distance)
+    # A ray that hits nothing has no face; 0 stands in, so that the tables can be read.
+    face = np.where(found, faces.numpy(), 0).astype(np.int64)
+    if not len(traced.face_owner):
+        return _Hits(distance, np.full(len(distance), NO_HIT, dtype=np.int32), face)
+    return _Hits(distance, np.where(found, traced.face_owner[face], np.int32(NO_HIT)), face)
 
 
-def _depths(look: _Look, hits: Hits) -> Float32Array:
+def _pixel_rays(view: View) -> Float64Array:
+    return pixel_rays(view.device.width, view.device.height, view.optics)
+
+
+def _ray_directions(view: View) -> Float64Array:
+    """Unit vectors of a view's rays in world axes, Shape ``[3, H·W]``."""
+    local = _pixel_rays(view)
+    # Written out instead of a matrix product, whose rounding may depend on the BLAS and its threads.
+    return np.stack(
+        [
+            row[0] * local[0] + row[1] * local[1] + row[2] * local[2]
+            for row in rotation_matrix(view.pose.orientation)
+        ]
+    )
+
+
+def _depths(view: View, hits: _Hits) -> Float32Array:
+    """Distances along the optical axis [m], Shape ``[H·W]``; 0 where nothing is hit."""
     found = hits.owner != NO_HIT
     depth = np.zeros(len(found), dtype=np.float32)
-    np.multiply(hits.distance, look.rays[0], out=depth, where=found, casting="same_kind")
+    # In float64 up to the assignment, so that the only rounding is that of the product.
+    np.multiply(hits.distance, _pixel_rays(view)[0], out=depth, where=found, casting="same_kind")
     return depth
 
 
-def _normals(look: _Look, hits: Hits, of_face: Float32Array) -> Float32Array:
+def _normals(view: View, hits: _Hits, of_face: Float32Array) -> Float32Array:
+    """Unit normals in world axes, Shape ``[H·W, 3]``; 0 where nothing is hit."""
     found = hits.owner != NO_HIT
     normals = np.zeros((len(found), 3), dtype=np.float32)
     normals[found] = of_face[hits.face[found]]
-    away = np.einsum("ij,ji->i", normals, turned(look.pose, look.rays)) > 0
+    # Meshes of scenery are often open sheets, of which either side may be seen.
+    away = np.einsum("ij,ji->i", normals, _ray_directions(view)) > 0
     normals[away] *= -1
     return normals
 
 
 def intrinsics(device: CameraDevice) -> Intrinsics:
-    """Square pixels, the principal point in the middle of the image.
+    """Pinhole of a camera: square pixels, the principal point in the middle of the image.
 
     Half of the width is seen under half of the field of view: ``fx = width / 2 / tan(fov / 2)``.
-    Raises `PayloadError` for an image without pixels, and for a field of view that no plane can hold.
+
+    Args:
+        device: The camera; its field of view [rad] is horizontal.
+
+    Returns:
+        Focal lengths and principal point [px].
+
+    Raises:
+        PayloadError: The image has no pixels, or no plane can hold the field of view.
+
+    Example:
+        >>> optics = intrinsics(CameraDevice(name="roof", width=640, height=480, field_of_view=math.pi / 2))
+        >>> round(optics.fx, 6), optics.cy
+        (320.0, 240.0)
     """
     if min(device.width, device.height) < 1:
         raise PayloadError(
@@ -235,8 +271,19 @@ def intrinsics(device: CameraDevice) -> Intrinsics:
 def pixel_rays(width: int, height: int, optics: Intrinsics) -> Float64Array:
     """Unit vectors through the pixel centres in device axes (x forward, y left, z up).
 
-    Shape ``[3, height·width]``, row by row from the top. The first row is the cosine of the angle to
-    the optical axis, so depth is a ray's length times it.
+    The first component is the cosine of the angle to the optical axis, so depth is a ray's length times it.
+
+    Args:
+        width: Width of the image [px].
+        height: Height of the image [px].
+        optics: Focal lengths and principal point [px].
+
+    Returns:
+        Shape ``[3, height·width]``, row by row from the top, read-only: calls with equal arguments share it.
+
+    Example:
+        >>> pixel_rays(1, 1, Intrinsics(fx=1.0, fy=1.0, cx=0.5, cy=0.5)).ravel().tolist()
+        [1.0, -0.0, -0.0]
     """
     right = (np.arange(width) + 0.5 - optics.cx) / optics.fx
     down = ((np.arange(height) + 0.5 - optics.cy) / optics.fy)[:, None]

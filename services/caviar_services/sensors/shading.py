@@ -14,16 +14,17 @@ import math
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from caviar_protocol.arrays import Float32Array, Float64Array, Int64Array, UInt8Array
 from caviar_protocol.space.coordinates import Pose, rotation_matrix
-from caviar_protocol.topics import Intrinsics
+from caviar_protocol.topics import CameraDevice, Intrinsics
 from caviar_services.mesh.scenery import SceneryShape
 from caviar_services.ray_tracing import aligned_columns
-from caviar_services.sensors.traced_scene import TracedScene
+from caviar_services.sensors.base import TracedScene
 
 SUN = (1.0, 0.93, 0.80)
 """Irradiance of a surface that faces the sun, over π; linear sRGB, as all colours here."""
@@ -45,14 +46,37 @@ EDGE_SAMPLES = 8
 """In a pixel with an edge, one in each of as many rows and columns."""
 
 
+P = TypeVar("P", bound=np.generic)
+
+
 @dataclass(frozen=True, eq=False)
 class View:
-    """One camera at one instant."""
+    """What one camera sees at one instant is looked at through this: device, optics and world pose."""
 
-    width: int
-    height: int
+    device: CameraDevice
     optics: Intrinsics
     pose: Pose
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """What every image says of its camera: sensor, intrinsics, position and orientation."""
+        return {
+            "sensor": self.device.name,
+            "intrinsics": self.optics,
+            "position": self.pose.position,
+            "orientation": self.pose.orientation,
+        }
+
+    def image(self, pixels: NDArray[P]) -> NDArray[P]:
+        """Values by pixel as an image.
+
+        Args:
+            pixels: Row by row from the top, Shape ``[height·width, …]``.
+
+        Returns:
+            Shape ``[height, width, …]``.
+        """
+        return pixels.reshape(self.device.height, self.device.width, *pixels.shape[1:])
 
 
 class Painter:
@@ -72,20 +96,21 @@ class Painter:
 
     def paint(self, view: View) -> UInt8Array:
         """sRGB picture of a view, Shape ``[height, width, 3]``, top row first."""
-        rows, columns = np.divmod(np.arange(view.width * view.height), view.width)
+        width, height = view.device.width, view.device.height
+        rows, columns = np.divmod(np.arange(width * height), width)
         seen = self._trace(view, columns + 0.5, rows + 0.5, (rows % TILE) * TILE + columns % TILE)
         colour, edge = self._smoothed(view, seen)
         pixels = np.flatnonzero(edge)
         if len(pixels):
             colour[:, pixels] = self._edges(view, pixels)
-        return encoded(colour).T.reshape(view.height, view.width, 3)
+        return view.image(encoded(colour).T)
 
     def _edges(self, view: View, pixels: Int64Array) -> Float32Array:
         """Colours of pixels that are more than one thing: the mean of several points of each."""
         part = np.arange(EDGE_SAMPLES)
         # Steps of 3 mod 8 spread the points so that no two share a row or a column.
         x, y = (part + 0.5) / EDGE_SAMPLES, ((3 * part + 1) % EDGE_SAMPLES + 0.5) / EDGE_SAMPLES
-        rows, columns = np.divmod(pixels[:, None], view.width)
+        rows, columns = np.divmod(pixels[:, None], view.device.width)
         index = np.broadcast_to(part * (TILE * TILE // EDGE_SAMPLES), (len(pixels), EDGE_SAMPLES))
         seen = self._trace(view, (columns + x).ravel(), (rows + y).ravel(), index.ravel())
         colour = _stacked(seen.colour(self._mi, seen.ambient))
@@ -161,8 +186,8 @@ class Painter:
         import drjit as dr
 
         mi = self._mi
-        width, height = _opaque(mi.Int32, view.width), _opaque(mi.Int32, view.height)
-        index = dr.arange(mi.Int32, view.width * view.height)
+        width, height = _opaque(mi.Int32, view.device.width), _opaque(mi.Int32, view.device.height)
+        index = dr.arange(mi.Int32, view.device.width * view.device.height)
         row = index // width
         column = index - row * width
         total, count, edge = mi.Color3f(seen.ambient), mi.Float(1.0), mi.Bool(False)

@@ -1,4 +1,8 @@
-"""What holds for services of every role."""
+"""Conformance tests of the contract that services of every role keep to (`caviar_services.service`).
+
+The tests drive a service as the runner would, without sockets: prepare, play episodes, close. They compare
+bytes, since products are bytes to everything behind the service.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +27,7 @@ from caviar_protocol.topics import PARTS, PAYLOADS, Carrier
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
 from caviar_services.testing import samples
 
+# Importing one of these costs start-up time and memory in every process that does, an agent's too.
 HEAVY = ("mitsuba", "drjit", "sionna", "torch", "libsumo", "traci", "matplotlib", "scipy")
 """Libraries that an implementation imports only when it prepares."""
 
@@ -38,20 +43,35 @@ Encoded = dict[str, tuple[bytes, bytes]]
 
 @dataclass
 class Played:
-    """What a service did in one life: prepared, played episodes, was closed."""
+    """What a service did in one life: prepared, played episodes, was closed.
+
+    Example:
+        >>> from caviar_services.agent.baselines import RandomAgent
+        >>> from caviar_services.testing import AgentConformance
+        >>> class TestRandomAgent(AgentConformance):
+        ...     service_class = RandomAgent
+        >>> played = TestRandomAgent.play(Path())
+        >>> [len(results) for results in played.episodes], sorted(played.encoded()[0])
+        ([4, 4], ['action'])
+    """
 
     service: Service[Any]
     prepared: Prepared
     assets: Mapping[str, Path]
     directory: Path
     episodes: list[list[StepResult]] = field(default_factory=list)
+    """Results of each episode, frame by frame."""
     frames: list[Frame] = field(default_factory=list)
     """Grants of the first episode."""
     granted: list[list[tuple[bytes, bytes]]] = field(default_factory=list)
     """Bytes of the inputs of each, as they were before the service saw them."""
 
     def encoded(self, episode: int = 0) -> list[Encoded]:
-        """Bytes of every product, frame by frame."""
+        """Bytes of every product, frame by frame.
+
+        Args:
+            episode: Index of the episode in the order in which they were played.
+        """
         return [encoded(result) for result in self.episodes[episode]]
 
 
@@ -159,28 +179,38 @@ class ServiceConformance:
         ]
 
     @classmethod
-    def prepared(cls, service: Service[Any], directory: Path) -> tuple[Prepared, Mapping[str, Path]]:
+    def prepared(
+        cls, service: Service[Any], directory: Path, demand: Mapping[str, frozenset[str]] | None = None
+    ) -> tuple[Prepared, Mapping[str, Path]]:
         """Prepare a service with the sample street.
 
         Args:
             service: The service.
             directory: Where the files of scenery are written.
+            demand: Parts asked for, by topic; None: those of the class, by default all.
 
         Returns:
             What the service answers, and the files of scenery by asset name.
         """
         assets = cls.street(service, directory / "assets")
-        demand = cls.demand or {topic: frozenset(PARTS.get(topic, ())) for topic in service.outputs}
+        demand = demand or cls.demand or {topic: frozenset(PARTS.get(topic, ())) for topic in service.outputs}
         producers = {topic: (samples.source(topic),) for topic in PAYLOADS}
         return service.prepare(Preparation(demand=demand, assets=assets, producers=producers)), assets
 
     @classmethod
     @contextmanager
-    def at_start(cls, directory: Path) -> Iterator[Service[Any]]:
-        """The service at the beginning of the first episode; closed in the end."""
+    def at_start(
+        cls, directory: Path, demand: Mapping[str, frozenset[str]] | None = None
+    ) -> Iterator[Service[Any]]:
+        """The service at the beginning of the first episode; closed in the end.
+
+        Args:
+            directory: Where files of scenery, and a recorder's, are written.
+            demand: As for `prepared`.
+        """
         service = cls.build(directory)
         try:
-            cls.prepared(service, directory)
+            cls.prepared(service, directory, demand)
             service.reset(cls.episodes[0], EPISODE_SEED, 0)
             yield service
         finally:
@@ -188,13 +218,19 @@ class ServiceConformance:
 
     @classmethod
     def play(cls, directory: Path, skip: Sequence[int] = ()) -> Played:
-        """Prepare, play the episodes without the frames in ``skip``, close."""
+        """Prepare, play the episodes, close.
+
+        Args:
+            directory: Where files of scenery, and a recorder's, are written.
+            skip: Numbers of frames that are left out of each episode.
+        """
         service = cls.build(directory)
         try:
             played = Played(service, *cls.prepared(service, directory), service.run.directory)
             for episode in cls.episodes:
                 service.reset(episode, EPISODE_SEED, 0)
                 frames = [frame for frame in cls.frames_of(service, episode) if frame.number not in skip]
+                # Copied before the steps: a service that writes into its inputs is to be found out.
                 granted = [[(bytes(i.header), bytes(i.body)) for i in frame.inputs] for frame in frames]
                 played.episodes.append([])
                 for frame in frames:
@@ -257,6 +293,7 @@ class ServiceConformance:
         show = (
             f"import {module}, sys; print(*({{m.partition('.')[0] for m in sys.modules}} & set({HEAVY!r})))"
         )
+        # A process of its own: in this one other tests have imported everything.
         done = subprocess.run(  # noqa: S603 - this interpreter, a module of ours
             [sys.executable, "-c", show], capture_output=True, text=True, timeout=60, check=False
         )
@@ -313,6 +350,7 @@ class ServiceConformance:
                 second.restore(state)
                 assert second.checkpoint() == state, "what was restored is not what was saved"
             else:
+                # The frame before was another process's: a service whose products depend on it shows now.
                 later[0] = msgspec.structs.replace(later[0], previous=-1)
             found = [encoded(second.step(frame)) for frame in later]
         assert found == expected, "has state that outlives a frame: " + (

@@ -1,4 +1,8 @@
-"""Conformance tests of each role, beyond `ServiceConformance`."""
+"""Conformance tests of each role, beyond `ServiceConformance`.
+
+Each class is subclassed in a test file of its own (`caviar_services.testing`). Clauses are those of the
+service contract in `protocol/SPEC.md`.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +34,7 @@ from caviar_protocol.topics import (
     Scene,
     Segmentation,
 )
-from caviar_services.service import Frame, FrameInput, Preparation, Service
+from caviar_services.service import FrameInput, Preparation, Service
 from caviar_services.testing import samples
 from caviar_services.testing.base import EPISODE_SEED, FRAMES, Played, ServiceConformance
 
@@ -48,13 +52,26 @@ def _products(played: Played, topic: str, cls: type[P]) -> Iterator[P]:
             yield cast(P, result.products[topic])
 
 
+def _array_sizes(scene: Scene) -> dict[str, int]:
+    """Elements of each antenna, which are the beams of its codebook too, by name."""
+    return {device.name: device.array.size for role in ("tx", "rx") for device in antennas(scene, role)}
+
+
 def _sorted(names: Iterable[str]) -> bool:
     listed = list(names)
     return listed == sorted(set(listed))
 
 
 class WorldConformance(ServiceConformance):
-    """Worlds: objects and devices, one `Scene` a frame."""
+    """Worlds: objects and devices, one `Scene` a frame.
+
+    Example:
+        >>> from caviar_services.world.trajectory import TrajectoryWorld
+        >>> class TestTrajectoryWorld(WorldConformance):
+        ...     service_class = TrajectoryWorld
+        >>> TestTrajectoryWorld.__test__
+        True
+    """
 
     @classmethod
     def street(cls, service: Service[Any], directory: Path) -> Mapping[str, Path]:
@@ -89,6 +106,8 @@ class WorldConformance(ServiceConformance):
 
     def test_velocities_are_what_positions_do(self, played: Played) -> None:
         """Mean of the velocities at both ends of a step, against the way gone in it."""
+        # By the trapezoidal rule, which is exact for a constant acceleration; the tolerance is for the corners
+        # of what a world steps within a frame.
         scenes = list(_products(played, "scene", Scene))
         step = samples.SAMPLING_PERIOD_NS / 1e9
         for before, after in pairwise(scenes):
@@ -105,7 +124,15 @@ class WorldConformance(ServiceConformance):
 
 
 class ChannelConformance(ServiceConformance):
-    """Channel models: paths, and matrices, of all TX/RX pairs."""
+    """Channel models: paths, and matrices, of all TX/RX pairs.
+
+    Example:
+        >>> from caviar_services.channel.statistical.free_space import FreeSpaceChannel
+        >>> class TestFreeSpaceChannel(ChannelConformance):
+        ...     service_class = FreeSpaceChannel
+        >>> TestFreeSpaceChannel.__test__
+        True
+    """
 
     def test_pairs_are_those_of_the_scene(self, played: Played) -> None:
         """All transmitters and receivers, by name, also those without a path."""
@@ -140,7 +167,7 @@ class ChannelConformance(ServiceConformance):
     def test_matrices_have_an_entry_per_antenna_pair(self, played: Played) -> None:
         """One matrix per carrier and pair, carriers slowest, [Nr, Nt]."""
         for frame, channel in zip(played.frames, _products(played, "channel", Channel), strict=True):
-            size = {d.name: d.array.size for r in ("tx", "rx") for d in antennas(frame.scene(), r)}
+            size = _array_sizes(frame.scene())
             order = [(m.carrier, m.tx, m.rx) for m in channel.h]
             counts = (len(channel.carriers), len(channel.tx), len(channel.rx))
             assert order == [tuple(index) for index in np.ndindex(*counts)]
@@ -149,14 +176,8 @@ class ChannelConformance(ServiceConformance):
 
     def test_matrices_are_made_only_where_asked_for(self, tmp_path: Path) -> None:
         """Clause 5."""
-        service = self.build(tmp_path)
-        try:
-            assets = self.street(service, tmp_path)
-            service.prepare(Preparation(demand={"channel": frozenset({"paths"})}, assets=assets))
-            service.reset(0, EPISODE_SEED, 0)
+        with self.at_start(tmp_path, {"channel": frozenset({"paths"})}) as service:
             (product,) = service.step(self.frames_of(service, 0)[0]).products.values()
-        finally:
-            service.close()
         assert isinstance(product, Channel)
         assert product.h == product.hf == product.taps == ()
 
@@ -179,7 +200,15 @@ class ChannelConformance(ServiceConformance):
 
 
 class SensorConformance(ServiceConformance):
-    """Sensors: what devices on moving objects see."""
+    """Sensors: what devices on moving objects see.
+
+    Example:
+        >>> from caviar_services.sensors.lidar import LidarSensors
+        >>> class TestLidarSensors(SensorConformance):
+        ...     service_class = LidarSensors
+        >>> TestLidarSensors.__test__
+        True
+    """
 
     def test_scans_are_sorted_and_indexed(self, played: Played) -> None:
         """One scan per LIDAR with its points, whatever parts are asked for beside them."""
@@ -255,7 +284,16 @@ class SensorConformance(ServiceConformance):
 
 
 class LinkConformance(ServiceConformance):
-    """Links: what users got out of the chosen beams."""
+    """Links: what users got out of the chosen beams.
+
+    Example:
+        >>> from caviar_services.link.beam_sweep import BeamLink
+        >>> class TestBeamLink(LinkConformance):
+        ...     service_class = BeamLink
+        ...     settings = {"top_k": 3}
+        >>> TestBeamLink.__test__
+        True
+    """
 
     def test_users_are_listed_once_in_order(self, played: Played) -> None:
         """Sorted by carrier, TX, RX."""
@@ -281,7 +319,7 @@ class LinkConformance(ServiceConformance):
             assert (values[:, ~link.has_path] == 0).all()
             assert (values >= 0).all()
 
-    def test_users_whom_no_agent_serves_get_nothing(self, played: Played) -> None:
+    def test_users_that_no_agent_serves_get_nothing(self, played: Played) -> None:
         """In the last frame the actions are absent."""
         *_, last = _products(played, "link", Link)
         assert (last.tx_beam == -1).all()
@@ -289,7 +327,15 @@ class LinkConformance(ServiceConformance):
 
 
 class AgentConformance(ServiceConformance):
-    """Agents: decisions for the actuators they own."""
+    """Agents: decisions for the actuators they own.
+
+    Example:
+        >>> from caviar_services.agent.baselines import LosBeamAgent
+        >>> class TestLosBeamAgent(AgentConformance):
+        ...     service_class = LosBeamAgent
+        >>> TestLosBeamAgent.__test__
+        True
+    """
 
     def test_commands_are_sorted_one_per_actuator_and_carrier(self, played: Played) -> None:
         """The link could not tell which of two to obey."""
@@ -300,7 +346,7 @@ class AgentConformance(ServiceConformance):
     def test_beams_exist_in_the_codebooks(self, played: Played) -> None:
         """A codebook has as many beams as its array has elements."""
         for frame, action in zip(played.frames, _products(played, "action", Action), strict=True):
-            size = {d.name: d.array.size for r in ("tx", "rx") for d in antennas(frame.scene(), r)}
+            size = _array_sizes(frame.scene())
             for command in action.commands:
                 if isinstance(command, BeamChoice):
                     assert command.tx_beam < size[command.tx]
@@ -316,26 +362,14 @@ class AgentConformance(ServiceConformance):
 
     def test_the_final_grant_takes_no_action(self, tmp_path: Path) -> None:
         """Clause 16: it carries the last link only."""
-        service = self.build(tmp_path)
-        try:
-            service.prepare(Preparation(demand={"action": frozenset()}))
-            service.reset(0, EPISODE_SEED, 0)
+        with self.at_start(tmp_path) as service:
             for frame in self.frames_of(service, 0):
                 service.step(frame)
             lagged = tuple(item for item in service.inputs if item.lag == 1)
-            final = Frame(
-                episode=0,
-                number=FRAMES,
-                t_ns=FRAMES * samples.SAMPLING_PERIOD_NS,
-                previous=FRAMES - 1,
-                final=True,
-                inputs=samples.inputs(lagged, FRAMES),
-                service=service.run.name,
-                seed=service.run.seed,
+            final = replace(
+                samples.granted(lagged, FRAMES, service.run.name), previous=FRAMES - 1, final=True
             )
             assert service.step(final).products == {}
-        finally:
-            service.close()
 
 
 def _held(item: FrameInput) -> FrameInput:
@@ -344,7 +378,15 @@ def _held(item: FrameInput) -> FrameInput:
 
 
 class RecorderConformance(ServiceConformance):
-    """Recorders: every product of a frame is on disk, byte for byte."""
+    """Recorders: every product of a frame is on disk, byte for byte.
+
+    Example:
+        >>> from caviar_services.recorder.mcap import McapRecorder
+        >>> class TestMcapRecorder(RecorderConformance):
+        ...     service_class = McapRecorder
+        >>> TestMcapRecorder.__test__
+        True
+    """
 
     episodes: ClassVar[tuple[int, ...]] = (0, 1)
 
@@ -369,30 +411,20 @@ class RecorderConformance(ServiceConformance):
 
     def test_a_frame_is_on_disk_when_its_step_returns(self, tmp_path: Path) -> None:
         """What is read without the recorder being closed is what a killed process leaves."""
-        service = self.build(tmp_path)
-        try:
-            service.prepare(Preparation(demand={}, assets=self.street(service, tmp_path / "assets")))
-            service.reset(0, EPISODE_SEED, 0)
+        with self.at_start(tmp_path) as service:
             for frame in self.frames_of(service, 0)[:2]:
                 service.step(frame)
                 assert len(list(Recording(service.run.directory).frames())) == frame.number + 1
-        finally:
-            service.close()
 
     def test_absent_and_held_products_are_recorded_as_such(self, tmp_path: Path) -> None:
         """The provenance tells what a consumer got."""
-        service = self.build(tmp_path)
-        try:
-            service.prepare(Preparation(demand={}, assets={}))
-            service.reset(0, EPISODE_SEED, 0)
+        with self.at_start(tmp_path) as service:
             first, second = self.frames_of(service, 0)[:2]
             service.step(first)
             held = [_held(item) for item in first.inputs if item.provenance.topic == "channel"]
             absent = samples.inputs(service.inputs, 1, {"lidar": "lidar was late"})
             lidar = [item for item in absent if item.provenance.topic == "lidar"]
             service.step(replace(second, inputs=(*held, *lidar)))
-        finally:
-            service.close()
         _, frame = Recording(service.run.directory).frames()
         status = {item.topic: item.status for item in frame.inputs}
         assert status == {"channel": Status.HELD, "lidar": Status.ABSENT}

@@ -158,14 +158,14 @@ def product(topic: str, frame: int) -> Payload:
         case "channel":
             channel = FreeSpaceChannel(FreeSpaceSettings(), _run("channel"))
             channel.prepare(Preparation(demand={"channel": frozenset(PARTS["channel"])}))
-            return channel.step(_frame(channel.inputs, frame, "channel")).products["channel"]
+            return channel.step(granted(channel.inputs, frame, "channel")).products["channel"]
         case "action":
             agent = RandomAgent(AgentSettings(), _run("agent"))
-            return agent.step(_frame((Input(topic="scene"),), frame, "agent")).products["action"]
+            return agent.step(granted((Input(topic="scene"),), frame, "agent")).products["action"]
         case "link":
             link = BeamLink(BeamLinkSettings(), _run("link"))
             link.prepare(Preparation(demand={"link": frozenset()}))
-            return link.step(_frame(link.inputs, frame, "link")).products["link"]
+            return link.step(granted(link.inputs, frame, "link")).products["link"]
         case _:
             return _sensed(topic, frame)
 
@@ -207,7 +207,14 @@ def _input(topic: str, computed: int, age: int, cause: str) -> FrameInput:
     return FrameInput(provenance, header, body)
 
 
-def _frame(declared: Iterable[Input], number: int, service: str) -> Frame:
+def granted(declared: Iterable[Input], number: int, service: str) -> Frame:
+    """A frame of the street as a service is granted it.
+
+    Args:
+        declared: Inputs that the service declares.
+        number: Number of the frame.
+        service: Name of the service.
+    """
     return Frame(
         episode=0,
         number=number,

@@ -27,7 +27,7 @@ from caviar_protocol.space.coordinates import UnitQuaternion, Vector
 from caviar_protocol.topics import Scene
 from caviar_protocol.topics.scene import WITHOUT_OBJECT_PREFIX, Device
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
-from caviar_services.world.assets import object_assets, pattern_assets, scenery_assets, scenery_file
+from caviar_services.world.scenery import object_assets, pattern_assets, scenery_assets, scenery_file
 
 
 class ObjectState(NamedTuple):

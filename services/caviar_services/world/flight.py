@@ -21,10 +21,9 @@ from caviar_protocol.topics import Action, VelocityCommand, WaypointCommand
 from caviar_services.checkpoint import restored, saved
 from caviar_services.mesh.shapes import SHAPES
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
-from caviar_services.world.assets import scenery_assets
 from caviar_services.world.base import ObjectState
 from caviar_services.world.flight_dynamics import Flyer, FlyerState, Limits, Motion
-from caviar_services.world.obstacles import Obstacles, scenery_triangles
+from caviar_services.world.scenery import Obstacles, scenery_assets, scenery_triangles
 from caviar_services.world.trajectory import Length, MovingObject, TrajectorySettings, TrajectoryWorld
 
 

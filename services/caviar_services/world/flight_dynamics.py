@@ -19,7 +19,7 @@ import msgspec
 
 from caviar_protocol.space.coordinates import Vector
 from caviar_services.world.base import course_rate
-from caviar_services.world.obstacles import Obstacles
+from caviar_services.world.scenery import Obstacles
 
 SUB_STEP_NS = 10_000_000
 """[ns]"""

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from caviar_services.mesh.shapes import SHAPES, box
+from caviar_services.mesh.shapes import SHAPES, box, contains
 from caviar_services.sensors.lidar import ray_directions
-from caviar_services.sensors.traced_scene import contains
 
 
 @pytest.mark.parametrize("seed", range(3))

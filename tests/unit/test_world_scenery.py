@@ -12,7 +12,6 @@ from caviar_protocol.arrays import Float64Array
 from caviar_protocol.space.coordinates import Vector
 from caviar_services.mesh.shapes import box
 from caviar_services.service import Preparation, RunInfo
-from caviar_services.world.assets import scenery_assets
 from caviar_services.world.flight import FlightSettings, FlightWorld, FlownObject
 from caviar_services.world.flight_dynamics import (
     SLID_ALONG_OBSTACLE,
@@ -21,7 +20,7 @@ from caviar_services.world.flight_dynamics import (
     Limits,
     Motion,
 )
-from caviar_services.world.obstacles import Obstacles, scenery_triangles
+from caviar_services.world.scenery import Obstacles, scenery_assets, scenery_triangles
 
 Bounds = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
 
