@@ -128,11 +128,11 @@ def test_no_flight_comes_too_near_to_boxes(speed: float, step_s: float) -> None:
         for _ in range(12):
             target = vector(rng.uniform(-20, 20, 3))
             for _ in range(math.ceil(25 / (speed * step_s)) + 3):
-                before = np.array(made.position)
+                before = np.array(made.state.position)
                 hits += len(made.fly(Motion(target=target, speed=speed), round(step_s * 1e9)))
-                after = np.array(made.position)
+                after = np.array(made.state.position)
                 assert min(from_box(after, b) for b in bounds) >= clearance - 1e-5
-                assert math.hypot(*made.velocity) <= speed + 1e-9
+                assert math.hypot(*made.state.velocity) <= speed + 1e-9
                 # Around a corner a step is no straight line, but it is never through a box.
                 if np.linalg.norm(after - before) < clearance:
                     for s in (0.25, 0.5, 0.75):
@@ -151,7 +151,7 @@ def test_no_speed_leads_through_a_thin_wall(speed: float) -> None:
         velocity = vector(course / np.linalg.norm(course) * speed)
         for _ in range(30):
             made.fly(Motion(velocity=velocity), 100 * MS)
-            assert made.position[0] <= 9.0 + 1e-6
+            assert made.state.position[0] <= 9.0 + 1e-6
 
 
 def test_along_a_wall_it_slides_and_head_on_it_stops() -> None:
@@ -159,8 +159,8 @@ def test_along_a_wall_it_slides_and_head_on_it_stops() -> None:
     made = flyer(wall, 10.0, 50.0)
     made.reset((0.0, 0.0, 0.0), 0.0)
     made.fly(Motion(velocity=(6.0, 8.0, 0.0)), 4000 * MS)
-    assert made.velocity[0] == pytest.approx(0.0, abs=1e-9)
-    assert made.velocity[1] > 5.0
+    assert made.state.velocity[0] == pytest.approx(0.0, abs=1e-9)
+    assert made.state.velocity[1] > 5.0
     head_on = flyer(wall, 10.0, 50.0)
     head_on.reset((0.0, 0.0, 0.0), 0.0)
     events = head_on.fly(Motion(velocity=(10.0, 0.0, 0.0)), 4000 * MS)
@@ -175,10 +175,10 @@ def test_in_a_corner_it_stops_and_gets_out_again() -> None:
     made = flyer(Obstacles(corner), 10.0, 50.0)
     made.reset((0.0, 0.0, 0.0), 0.0)
     made.fly(Motion(velocity=(7.0, 6.0, 0.0)), 4000 * MS)
-    assert 8.4 < made.position[0] <= 9.0 + 1e-6
-    assert 8.4 < made.position[1] <= 9.0 + 1e-6
+    assert 8.4 < made.state.position[0] <= 9.0 + 1e-6
+    assert 8.4 < made.state.position[1] <= 9.0 + 1e-6
     made.fly(Motion(target=(0.0, 0.0, 0.0), speed=5.0), 5000 * MS)
-    assert math.dist(made.position, (0.0, 0.0, 0.0)) < 1e-2
+    assert math.dist(made.state.position, (0.0, 0.0, 0.0)) < 1e-2
 
 
 def test_the_same_commands_lead_to_the_same_flight_bit_by_bit() -> None:
@@ -195,7 +195,7 @@ def test_the_same_commands_lead_to_the_same_flight_bit_by_bit() -> None:
         places = []
         for target in targets:
             events |= set(made.fly(Motion(target=target, speed=20.0), 1000 * MS))
-            places.append((made.position, made.velocity))
+            places.append((made.state.position, made.state.velocity))
         flights.append(places)
     assert flights[0] == flights[1]
     assert SLID_ALONG_OBSTACLE in events
@@ -223,10 +223,10 @@ def test_the_acceleration_keeps_its_limit_at_walls_too(seed: int) -> None:
     for _ in range(20):
         wanted = motion(rng)
         for _ in range(400):
-            before = made.velocity
+            before = made.state.velocity
             events |= set(made.fly(wanted, 7 * MS))
-            assert math.dist(before, made.velocity) <= 4.0 * 0.007 * (1 + 1e-9)
-            assert min(from_box(np.array(made.position), b) for b in bounds) >= 1.0 - 1e-9
+            assert math.dist(before, made.state.velocity) <= 4.0 * 0.007 * (1 + 1e-9)
+            assert min(from_box(np.array(made.state.position), b) for b in bounds) >= 1.0 - 1e-9
     assert events & {SLID_ALONG_OBSTACLE, STOPPED_BY_OBSTACLE}
 
 
@@ -249,7 +249,7 @@ def test_nothing_stands_in_the_way_where_there_is_no_scenery() -> None:
     made = flyer(Obstacles.none(), 10.0, 50.0)
     made.reset((0.0, 0.0, 0.0), 0.0)
     assert made.fly(Motion(velocity=(10.0, 0.0, 0.0)), 2000 * MS) == {}
-    assert made.position[0] == pytest.approx(10.0 * 2.0 - 10.0**2 / (2 * 50.0))
+    assert made.state.position[0] == pytest.approx(10.0 * 2.0 - 10.0**2 / (2 * 50.0))
 
 
 @needs_scenes
@@ -266,7 +266,7 @@ def test_flights_over_munich_keep_clear_of_it() -> None:
         target = vector(rng.uniform((-200, -200, 2), (250, 300, 30)))
         for _ in range(4):
             events |= set(made.fly(Motion(target=target, speed=40.0), 500 * MS))
-            assert obstacles.distance(made.position, 5.0) >= 1.0 - 1e-5
+            assert obstacles.distance(made.state.position, 5.0) >= 1.0 - 1e-5
     assert events
 
 

@@ -23,7 +23,7 @@ import msgspec
 
 from caviar_protocol.errors import AssetError, RunError
 from caviar_protocol.files import sync_file
-from caviar_protocol.messages import Asset, Input, Role
+from caviar_protocol.messages import Asset, GrantInput, Input, Role, Status
 from caviar_services.service import Service
 
 S = TypeVar("S", bound=msgspec.Struct)
@@ -37,6 +37,10 @@ class Recorder(Service[S], Generic[S]):
     A subclass implements `Service.step`, which returns once every product of the frame, and its provenance,
     is with the operating system (``frame.inputs`` are the products, ``frame.reports`` what services reported
     beside them).
+
+    Args:
+        settings: The scenario's settings of the recorder.
+        run: What the recorder knows about the run; it writes into ``run.directory``.
 
     Example:
         >>> from caviar_services.service import Frame, NoSettings, RunInfo, StepResult
@@ -64,6 +68,89 @@ class Recorder(Service[S], Generic[S]):
         return found
 
 
+class RunTime:
+    """Run time of frames: a later episode begins one sampling period after the end of the one before.
+
+    Args:
+        sampling_period_ns: Sampling period of the run [ns].
+
+    Example:
+        >>> time = RunTime(100)
+        >>> time.base_of(0, 0), time.base_of(0, 100), time.base_of(1, 0)
+        (0, 0, 200)
+    """
+
+    def __init__(self, sampling_period_ns: int) -> None:
+        self._period = sampling_period_ns
+        self._episode = -1
+        self._base_ns, self._last_ns = 0, 0
+
+    def continue_from(self, episode: int, base_ns: int, t_ns: int) -> None:
+        """Note a frame that is recorded already.
+
+        Args:
+            episode: Its episode.
+            base_ns: Run time of the episode's zero [ns].
+            t_ns: Simulated time of the frame [ns].
+        """
+        self._episode, self._base_ns, self._last_ns = episode, base_ns, base_ns + t_ns
+
+    def base_of(self, episode: int, t_ns: int) -> int:
+        """Run time of an episode's zero [ns], for its next frame.
+
+        Args:
+            episode: The episode.
+            t_ns: Simulated time of the frame [ns].
+        """
+        if self._episode >= 0 and episode != self._episode:
+            self._base_ns = self._last_ns + self._period - t_ns
+        self._episode, self._last_ns = episode, self._base_ns + t_ns
+        return self._base_ns
+
+
+class StoredProducts:
+    """Which products of the episode are in the recording already: their bytes are stored once.
+
+    Example:
+        >>> stored = StoredProducts()
+        >>> stored.begin(0)
+        >>> fresh = GrantInput(topic="scene", source="world", status=Status.FRESH, frame=3)
+        >>> held = GrantInput(topic="scene", source="world", status=Status.HELD, frame=3, age=1)
+        >>> stored.is_new(fresh), stored.is_new(held)
+        (True, False)
+    """
+
+    def __init__(self) -> None:
+        self._newest: dict[tuple[str, str], int] = {}
+        self._episode = -1
+
+    def begin(self, episode: int) -> None:
+        """Begin an episode, unless it has begun.
+
+        Args:
+            episode: Number of the episode.
+        """
+        if episode != self._episode:
+            self._newest.clear()
+            self._episode = episode
+
+    def is_new(self, entry: GrantInput) -> bool:
+        """Whether the bytes of a product have to be stored; from then on they count as stored.
+
+        Args:
+            entry: Provenance of the product.
+        """
+        if entry.status is Status.ABSENT:
+            return False
+        key = (entry.topic, entry.source)
+        newest = self._newest.get(key, -1)
+        # A product that came too late for its own frame is held by later ones, and stored with the first.
+        if entry.status is Status.HELD and newest == entry.frame:
+            return False
+        self._newest[key] = max(newest, entry.frame)
+        return True
+
+
 _REMEDIES = {
     errno.ENOSPC: "free space on its file system, then go on with caviar run --resume {folder}, "
     "or choose another directory with --out",
@@ -79,7 +166,20 @@ _REMEDIES = {
 
 
 def failure(path: Path, error: OSError) -> RunError:
-    """The error that ends a run whose recording cannot be written: path, reason and remedy."""
+    """The error that ends a run whose recording cannot be written.
+
+    Args:
+        path: The file or directory.
+        error: What the operating system said.
+
+    Returns:
+        The error, with path, reason and remedy.
+
+    Example:
+        >>> print(failure(Path("/run/x.mcap"), OSError(errno.EROFS, "Read-only file system")))
+        the recorder cannot write /run/x.mcap: Read-only file system (errno 30); its file system can only be \
+read: choose another directory with --out
+    """
     remedy = _REMEDIES.get(error.errno or 0, "choose another directory with --out")
     return RunError(
         f"the recorder cannot write {path}: {error.strerror or error} (errno {error.errno}); "
@@ -127,10 +227,19 @@ def _after(key: str, file: Path) -> str:
 
 
 def copy_assets(assets: Mapping[str, Path], folder: Path, *, sync: bool = False) -> tuple[Asset, ...]:
-    """Copy files of scenery to ``folder`` at their names; their digests and sizes, sorted by name.
+    """Copy files of scenery into a recording.
 
-    With ``sync`` they are on disk when this returns.
-    Raises `AssetError` for a name that leads out of ``folder``.
+    Args:
+        assets: File by asset name, which is the relative path of the copy.
+        folder: Where the copies go.
+        sync: Whether they are on disk when this returns.
+
+    Returns:
+        Digests and sizes, sorted by name.
+
+    Raises:
+        AssetError: A name leads out of ``folder``.
+        OSError: A file cannot be read or written.
     """
     copied = []
     for name, source in sorted(assets.items()):
@@ -145,6 +254,7 @@ def copy_assets(assets: Mapping[str, Path], folder: Path, *, sync: bool = False)
         copied.append(Asset(name=name, digest=digest, size=target.stat().st_size))
     if sync and copied:
         files = [folder / asset.name for asset in copied]
+        # Directories too: a file whose name is not on disk is lost with the power, whatever else was synced.
         for path in [*files, *{file.parent for file in files}, folder, folder.parent]:
             sync_file(path)
     return tuple(copied)

@@ -15,18 +15,22 @@ A recording is a run directory with ``recording-0000.mcap``, ``recording-0001.mc
   same for the instant the product was computed for.
 * One chunk a frame, and behind it a seal with the CRC-32 of all bytes before it
   (`caviar_protocol.recording.segment`), handed to the operating system before DONE, and on disk as the
-  run's ``durability`` says (`persistence`). MCAP's index and statistics are written when a segment is full
-  or the run ends; then the manifest ``recording.json`` lists it as finished
-  (`caviar_protocol.recording`).
+  run's ``durability`` says (`segment_writer.Persistence`). MCAP's index and statistics are written when a
+  segment is full or the run ends; then the manifest ``recording.json`` lists it as finished.
 * Metadata record ``caviar``: `caviar_protocol.recording.RecordingMetadata`, a JSON text a field.
+
+A recorder that is started again goes on in the recording of the process before it: nothing is there twice,
+nothing is lost (clause 18).
 """
 
 from __future__ import annotations
 
 import errno
 import os
+import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -36,19 +40,29 @@ import msgspec
 from caviar_protocol.arrays import quantity
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.digest import payload_digest
-from caviar_protocol.errors import CaviarError, RunError
+from caviar_protocol.errors import CaviarError, RecordingError, RunError
 from caviar_protocol.files import Durability, RunDirectory, sync_file
 from caviar_protocol.messages import GrantInput
 from caviar_protocol.recording import (
     FrameEntry,
+    Manifest,
     RecordingMetadata,
     SegmentRecord,
+    frame_name,
 )
+from caviar_protocol.recording.integrity import RecordedSegments, follows
 from caviar_protocol.recording.segment import Segment
 from caviar_protocol.validation import check_digest
-from caviar_services.recorder.base import Recorder, copy_assets, failure, machine, versions
-from caviar_services.recorder.continuation import Continuation, RunTime, Stored
-from caviar_services.recorder.segment_writer import Persistence, SegmentWriter
+from caviar_services.recorder.base import (
+    Recorder,
+    RunTime,
+    StoredProducts,
+    copy_assets,
+    failure,
+    machine,
+    versions,
+)
+from caviar_services.recorder.segment_writer import Persistence, SegmentWriter, stored_products
 from caviar_services.service import Frame, FrameInput, Preparation, Prepared, RunInfo, StepResult
 
 # Topics that may have no other consumer: a data set needs no agent. All others have one that checks them,
@@ -71,7 +85,24 @@ class McapSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 
 class McapRecorder(Recorder[McapSettings]):
-    """Writes every product of every frame to MCAP segments in the run directory."""
+    """Writes every product of every frame to MCAP segments in the run directory.
+
+    Args:
+        settings: When a segment is closed, compression, and what is copied and noted.
+        run: What the recorder knows about the run; it writes into ``run.directory``.
+
+    Example:
+        >>> import tempfile
+        >>> folder = tempfile.TemporaryDirectory()
+        >>> recorder = McapRecorder(McapSettings(), RunInfo(name="recorder", directory=Path(folder.name)))
+        >>> note = recorder.prepare(Preparation(demand={})).notes
+        >>> recorder.step(Frame(episode=0, number=0, t_ns=0)).products
+        {}
+        >>> recorder.close()
+        >>> sorted(file.name for file in Path(folder.name).iterdir())
+        ['recording-0000.mcap', 'recording.json']
+        >>> folder.cleanup()
+    """
 
     Settings = McapSettings
     outputs: ClassVar[tuple[str, ...]] = ()
@@ -86,7 +117,7 @@ class McapRecorder(Recorder[McapSettings]):
         self._persistence: Persistence | None = None
         self._failure: RunError | None = None
         self._runtime = RunTime(run.sampling_period_ns)
-        self._stored = Stored()
+        self._stored = StoredProducts()
         # Whether frames that another process recorded are still to be taken over.
         self._goes_on = False
 
@@ -126,8 +157,10 @@ class McapRecorder(Recorder[McapSettings]):
     def step(self, frame: Frame) -> StepResult:
         """Write a frame; when this returns, the operating system has it, under ``frame`` the disk.
 
-        Raises `RunError` naming path, errno and remedy where it cannot be written, `ProductError` naming the
-        producer of a product that is not that of its digest: the recording would be damaged.
+        Raises:
+            RunError: The frame cannot be written; names path, errno and remedy.
+            ProductError: A product is not that of its digest, and the recording would be damaged; names the
+                producer.
         """
         begin = time.perf_counter_ns()
         if self._failure is not None:
@@ -152,6 +185,7 @@ class McapRecorder(Recorder[McapSettings]):
         try:
             segment.write(entry, new, base_ns)
             self._kept.written(segment)
+            # A file that was deleted takes writes without an error, and all of them would be lost.
             if segment.removed:
                 raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(segment.path))
             if (
@@ -199,22 +233,18 @@ class McapRecorder(Recorder[McapSettings]):
     def _take_over(self, until: tuple[int, int] | None) -> None:
         """Go on behind what another process recorded, before the frame ``until``."""
         self._goes_on = False
-        folder, compression = self.run.directory, self.settings.compression
-        before = Continuation(folder, self._runtime, self._stored)
-
-        def rewrite(path: Path, segment: Segment) -> SegmentWriter:
-            path.unlink(missing_ok=True)
-            return SegmentWriter(path, segment.metadata, compression)
-
+        folder = self.run.directory
+        sync = self._durability != "none"
+        before = _Continuation(folder, self._runtime, self._stored, self.settings.compression, sync)
         try:
-            before.take_over(until, rewrite, sync=self._durability != "none")
+            records = before.take_over(until)
         except OSError as error:
             raise failure(Path(error.filename or folder), error) from error
         except CaviarError as error:
             self._failure = RunError(str(error))
             raise self._failure from error
-        self._segments = len(before.records)
-        self._persistence = self._persisted(before.records)
+        self._segments = len(records)
+        self._persistence = self._persisted(records)
 
     def _open_segment(self) -> SegmentWriter:
         path = RunDirectory(self.run.directory).segment(self._segments)
@@ -238,6 +268,139 @@ class McapRecorder(Recorder[McapSettings]):
         path = Path(error.filename) if error.filename else segment.path if segment else self.run.directory
         self._failure = failure(path, error)
         return self._failure
+
+
+@dataclass
+class _Continuation:
+    """What an earlier process recorded, up to the frame that is granted next.
+
+    Args:
+        folder: Directory of the run.
+        runtime: Run time, brought to where it was.
+        stored: Stored products, brought to where they were.
+        compression: Of segments that are written anew.
+        sync: Whether segments and manifest are on disk before they take their places.
+    """
+
+    folder: Path
+    runtime: RunTime
+    stored: StoredProducts
+    compression: str
+    sync: bool
+
+    def take_over(self, until: tuple[int, int] | None) -> list[SegmentRecord]:
+        """Keep the frames before ``until`` (episode, frame), or all of them.
+
+        A segment that breaks off, or has later frames, is written anew from its whole records and takes
+        its place in one step; one with nothing to keep is removed. The manifest says so first, so that a
+        reader who comes in between, or after a loss of power, finds nothing that contradicts it.
+        Of finished segments, which the manifest knows, only the last one is opened.
+
+        Returns:
+            The segments that are there, all of them finished.
+
+        Raises:
+            RunError: Frames before ``until`` are missing; nothing is changed.
+        """
+        files, damage = RunDirectory(self.folder).segments(), list[str]()
+        try:
+            found = RecordedSegments(self.folder, trusted_before=until or _END) if files else None
+        except RecordingError as error:
+            found, damage = None, [str(error)]  # it may have died before it wrote anything
+        records = found.trusted if found is not None else []
+        last = records[-1].last if records else None
+        keep: list[tuple[Segment, list[int]]] = []
+        for segment in found.segments if found is not None else ():
+            frames, last = _frames_to_keep(segment, last, until)
+            keep += [(segment, frames)] if frames else []
+        damage += found.damage if found is not None else []
+        if until is None and damage:
+            raise self._gap(last, None, damage)
+        if until is not None and until != (0, 0) and (last is None or not follows(last, until)):
+            raise self._gap(last, until, damage)
+        if found is not None and found.manifest is not None:
+            self._announce(found.manifest, [*records, *_announced(keep, found)])
+        kept = {record.name for record in records} | {segment.path.name for segment, _ in keep}
+        # The newest first: what a crash leaves in between is a recording without a gap.
+        for file in sorted(files, reverse=True):
+            if file.name not in kept:
+                file.unlink(missing_ok=True)
+        return [*records, *(self._take(segment, frames, found) for segment, frames in keep)]
+
+    def _announce(self, manifest: Manifest, records: list[SegmentRecord]) -> None:
+        """Replace the manifest before the segments, where it says more than they will hold."""
+        announced = msgspec.structs.replace(manifest, segments=tuple(records), closed=False)
+        if announced != manifest:
+            announced.save(self.folder, sync=self.sync)
+
+    def _take(self, segment: Segment, frames: list[int], found: RecordedSegments | None) -> SegmentRecord:
+        """Take over these frames of a segment; its part of the manifest."""
+        known = found.record(segment) if found is not None else None
+        mended = segment.path.with_suffix(".mending")
+        writer = None
+        if not _is_whole(segment, frames):
+            mended.unlink(missing_ok=True)  # of a process that died in the middle of this
+            writer = SegmentWriter(mended, segment.metadata, self.compression)
+        for index in frames:
+            entry, base_ns = segment.entries[index], segment.base_of(index)
+            self.runtime.continue_from(entry.episode, base_ns, entry.t_ns)
+            self.stored.begin(entry.episode)
+            for item in entry.inputs:
+                self.stored.is_new(item)
+            if writer is not None:
+                writer.write(entry, list(stored_products(segment, index)), base_ns)
+        if writer is None:
+            return known or segment.record()
+        record = writer.finish()
+        if self.sync:
+            writer.sync()
+        writer.close()
+        mended.replace(segment.path)
+        if self.sync:
+            sync_file(self.folder)
+        return msgspec.structs.replace(record, name=segment.path.name)
+
+    def _gap(
+        self, last: tuple[int, int] | None, until: tuple[int, int] | None, damage: list[str]
+    ) -> RunError:
+        ends = f"ends with {frame_name(last)}" if last else "has no frame"
+        goes_on = f", and the run goes on with {frame_name(until)}" if until else ""
+        why = f" ({damage[0]})" if damage else ""
+        return RunError(
+            f"the recording in {self.folder} {ends}{goes_on}: what is between is lost{why}; nothing was "
+            f"changed, and caviar doctor {self.folder} says what can be read; to have all frames, run the "
+            "scenario again"
+        )
+
+
+_END = (sys.maxsize, 0)
+
+
+def _is_whole(segment: Segment, frames: list[int]) -> bool:
+    """Whether a segment can stay as it is, with these of its frames."""
+    return segment.finished and not segment.damage and len(frames) == len(segment.chunks)
+
+
+def _announced(keep: list[tuple[Segment, list[int]]], found: RecordedSegments) -> Iterator[SegmentRecord]:
+    """What the manifest says of segments that are taken over; those to be written anew are open."""
+    for segment, frames in keep:
+        known = found.record(segment) if _is_whole(segment, frames) else None
+        entry = segment.entries[frames[0]]
+        yield known or SegmentRecord(name=segment.path.name, first=(entry.episode, entry.frame))
+
+
+def _frames_to_keep(
+    segment: Segment, last: tuple[int, int] | None, until: tuple[int, int] | None
+) -> tuple[list[int], tuple[int, int] | None]:
+    """Frames of a segment that are before ``until`` and follow ``last`` without a gap; the last one then."""
+    frames = []
+    for index, entry in enumerate(segment.entries):
+        instant = (entry.episode, entry.frame)
+        if (until is not None and instant >= until) or (last is not None and not follows(last, instant)):
+            break
+        frames.append(index)
+        last = instant
+    return frames, last
 
 
 def durability_of(scenario: Mapping[str, object]) -> Durability:

@@ -13,13 +13,14 @@ import sys
 import threading
 import time
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
 import msgspec
 
 from caviar_protocol.files import SYNC_PERIOD_S, Durability, sync_file
+from caviar_protocol.messages import Status
 from caviar_protocol.recording import (
     FRAME_TOPIC,
     METADATA_NAME,
@@ -28,7 +29,7 @@ from caviar_protocol.recording import (
     Manifest,
     SegmentRecord,
 )
-from caviar_protocol.recording.segment import seal
+from caviar_protocol.recording.segment import Channel, Segment, seal
 from caviar_services.service import FrameInput
 
 _SCHEMA_ENCODING = "x-caviar-text"
@@ -68,7 +69,7 @@ class _ChecksummedStream:
 
 
 class SegmentWriter:
-    """A segment that is being written. All methods raise `OSError` where the system refuses.
+    """A segment that is being written. All methods raise `OSError` where the operating system refuses.
 
     Args:
         path: The file; there must be none yet.
@@ -115,7 +116,13 @@ class SegmentWriter:
         return os.fstat(self._file.fileno()).st_nlink == 0
 
     def write(self, entry: FrameEntry, products: list[FrameInput], base_ns: int) -> None:
-        """Write one frame and hand it to the operating system."""
+        """Write one frame and hand it to the operating system.
+
+        Args:
+            entry: The frame, with the provenance of all its products.
+            products: Those of them whose bytes are new.
+            base_ns: Run time of the episode's zero [ns].
+        """
         frame_channel = self._channel(FRAME_TOPIC, "")
         keyed = [(self._channel(p.provenance.topic, p.provenance.source), p) for p in products]
         log_time = base_ns + entry.t_ns
@@ -187,6 +194,24 @@ class SegmentWriter:
         return self._schemas[topic]
 
 
+def stored_products(segment: Segment, index: int) -> Iterator[FrameInput]:
+    """Read the stored products of a frame back, under the provenance that they were stored with.
+
+    Args:
+        segment: A segment that another process wrote.
+        index: Number of the frame in it.
+    """
+    entry, chunk = segment.entries[index], segment.chunks[index]
+    provenance = {
+        (Channel(item.topic, item.source), item.frame): item
+        for item in entry.inputs
+        if item.status is not Status.ABSENT
+    }
+    for channel, frame, data in segment.messages(chunk):
+        length = int.from_bytes(data[:8], "little")
+        yield FrameInput(provenance[channel, frame], data[8 : 8 + length], data[8 + length :])
+
+
 # [s] between two syncs under ``periodic``, so that one that takes a while is done within the period.
 _PAUSE_S = SYNC_PERIOD_S / 2
 
@@ -199,7 +224,8 @@ class Persistence:
     Args:
         folder: Directory of the run.
         durability: When what is written has to be on disk.
-        run, seed: Of the run, for the manifest.
+        run: Identity of the run, for the manifest.
+        seed: Seed of the run, for the manifest.
         earlier: Segments that are there already, all of them finished.
     """
 
@@ -214,16 +240,25 @@ class Persistence:
         self._periodic = _PeriodicSync(folder, self._list) if durability == "periodic" else None
 
     def written(self, segment: SegmentWriter) -> None:
-        """A frame was written to a segment. Under ``frame`` it is on disk when this returns."""
+        """Note that a frame was written to a segment. Under ``frame`` it is on disk when this returns.
+
+        Args:
+            segment: The segment.
+        """
         if self._durability == "frame":
             segment.sync()
+        # With its first frame, not before: a segment that the manifest names holds something.
         if segment.frames == 1:
             self._list(SegmentRecord(name=segment.path.name, first=segment.first))
         if self._periodic is not None:
             self._periodic.note(segment)
 
     def finished(self, segment: SegmentWriter) -> None:
-        """Finish and close a segment, and say so in the manifest once it is on disk."""
+        """Finish and close a segment, and say so in the manifest once it is on disk.
+
+        Args:
+            segment: The segment, to which nothing is written any more.
+        """
         record = segment.finish()
         if self._periodic is not None:
             self._periodic.note(segment, record)
@@ -282,6 +317,7 @@ class _PeriodicSync:
         """Bring everything to disk, and close what is finished."""
         with self._lock:
             dirty, self._dirty = self._dirty, {}
+        # Outside the lock: a sync may take as long as the disk likes, and `note` is called in each frame.
         if dirty:
             sync_file(self._folder)
         for segment, record in dirty.items():

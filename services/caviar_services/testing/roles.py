@@ -106,8 +106,7 @@ class WorldConformance(ServiceConformance):
 
     def test_velocities_are_what_positions_do(self, played: Played) -> None:
         """Mean of the velocities at both ends of a step, against the way gone in it."""
-        # By the trapezoidal rule, which is exact for a constant acceleration; the tolerance is for the corners
-        # of what a world steps within a frame.
+        # Exact for a constant acceleration; the tolerance is for accelerations that change within a frame.
         scenes = list(_products(played, "scene", Scene))
         step = samples.SAMPLING_PERIOD_NS / 1e9
         for before, after in pairwise(scenes):

@@ -171,7 +171,7 @@ class FlightWorld(TrajectoryWorld):
                         f"{name!r} cannot be at {list(target)}: it keeps within {list(limits.low)} and "
                         f"{list(limits.high)}, and {limits.kept:.3f} m clear of scenery; choose another point"
                     )
-                flyer.reset(target, flyer.yaw)
+                flyer.reset(target, flyer.state.yaw)
 
     def checkpoint(self) -> bytes:
         """Where the flown objects are, and what is under way."""
@@ -183,7 +183,7 @@ class FlightWorld(TrajectoryWorld):
         was = restored(self, 1, _State, state)
         self._elapsed_ns, self._begun = was.elapsed_ns, True
         for name, flyer in self._flyers.items():
-            flyer.go_on(was.flyers[name])
+            flyer.state = was.flyers[name]
 
     def _motions(self, frame: Frame) -> dict[str, Motion]:
         """Commands for each flown object; beams and schedules are not for worlds."""
@@ -217,11 +217,11 @@ class FlightWorld(TrajectoryWorld):
             yield ObjectState(
                 name=name,
                 kind=thing.kind,
-                position=flyer.position,
-                orientation=quaternion_from_euler(flyer.yaw),
-                velocity=flyer.velocity,
+                position=flyer.state.position,
+                orientation=quaternion_from_euler(flyer.state.yaw),
+                velocity=flyer.state.velocity,
                 dimensions=thing.dimensions_m,
-                yaw_rate=flyer.yaw_rate,
+                yaw_rate=flyer.state.yaw_rate,
             )
 
 

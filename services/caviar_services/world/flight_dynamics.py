@@ -11,7 +11,7 @@ free before. So speed, acceleration and clearance hold at once, at any speed.
 from __future__ import annotations
 
 import math
-from collections import Counter, deque
+from collections import Counter
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
@@ -115,133 +115,137 @@ class _Piece(NamedTuple):
         return self.acceleration if t <= self.ramp else _REST
 
 
-class FlyerState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A `Flyer` between two frames."""
+class FlyerState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
+    """All that the further way of a `Flyer` follows from, beside commands and obstacles."""
 
-    position: Vector
-    velocity: Vector
-    yaw: float
-    motion: Motion
-    begin: tuple[Vector, Vector]
+    position: Vector = (0.0, 0.0, 0.0)
+    """[m]"""
+    velocity: Vector = _REST
+    """[m/s]"""
+    yaw: float = 0.0
+    """[rad], counter-clockwise from +x."""
+    motion: Motion = _HOVER
+    """The command that it obeys."""
+    begin: tuple[Vector, Vector] = ((0.0, 0.0, 0.0), _REST)
     """Position and velocity at the beginning of the sub-step under way."""
-    begin_yaw: float
-    into_ns: Annotated[int, msgspec.Meta(ge=0, lt=SUB_STEP_NS)]
+    begin_yaw: float = 0.0
+    into_ns: Annotated[int, msgspec.Meta(ge=0, lt=SUB_STEP_NS)] = 0
     """How far into it."""
-    pieces: tuple[_Piece, ...]
+    pieces: list[_Piece] = []
     """It and those looked at behind it."""
-    at_once: Annotated[int, msgspec.Meta(ge=1, le=_AT_ONCE)]
+    at_once: Annotated[int, msgspec.Meta(ge=1, le=_AT_ONCE)] = _AT_ONCE
+    """How many sub-steps are looked at together next."""
     yaw_rate: float = 0.0
+    """[rad/s]"""
+
+    def restart(self) -> None:
+        """Count sub-steps from here on."""
+        self.begin, self.begin_yaw = (self.position, self.velocity), self.yaw
+        self.into_ns, self.pieces, self.at_once = 0, [], _AT_ONCE
 
 
 class Flyer:
-    """Position, velocity, yaw and its rate, of one object."""
+    """Moves one object, sub-step by sub-step.
+
+    Args:
+        limits: What the object may do.
+
+    Example:
+        >>> limits = Limits(speed=5.0, acceleration=2.0, clearance=1.0, low=(-9.0,) * 3, high=(9.0,) * 3)
+        >>> flyer = Flyer(limits)
+        >>> flyer.fly(Motion(velocity=(1.0, 0.0, 0.0)), 1_000_000_000)  # half a second to speed up
+        Counter()
+        >>> round(flyer.state.position[0], 6), flyer.state.velocity
+        (0.75, (1.0, 0.0, 0.0))
+    """
 
     def __init__(self, limits: Limits) -> None:
         self.limits = limits
         self.obstacles = Obstacles.none()
-        self.reset((0.0, 0.0, 0.0), 0.0)
+        self.state = FlyerState()
 
     def reset(self, position: Vector, yaw: float) -> None:
-        """At rest at a position [m], with a yaw [rad]."""
-        self.position: Vector = position
-        self.velocity: Vector = _REST
-        self.yaw = yaw
-        self.yaw_rate = 0.0
-        self._motion = _HOVER
-        self._restart()
+        """Put the object at rest.
 
-    def _restart(self) -> None:
-        """Count sub-steps from here on."""
-        self._begin, self._begin_yaw = (self.position, self.velocity), self.yaw
-        self._into_ns = 0
-        self._pieces: deque[_Piece] = deque()
-        self._at_once = _AT_ONCE
-
-    @property
-    def state(self) -> FlyerState:
-        """All that its further way follows from, beside commands and obstacles."""
-        return FlyerState(
-            position=self.position,
-            velocity=self.velocity,
-            yaw=self.yaw,
-            motion=self._motion,
-            begin=self._begin,
-            begin_yaw=self._begin_yaw,
-            into_ns=self._into_ns,
-            pieces=tuple(self._pieces),
-            at_once=self._at_once,
-            yaw_rate=self.yaw_rate,
-        )
-
-    def go_on(self, state: FlyerState) -> None:
-        """Be where another one was."""
-        self.position, self.velocity, self.yaw = state.position, state.velocity, state.yaw
-        self._motion = state.motion
-        self._begin, self._begin_yaw, self._into_ns = state.begin, state.begin_yaw, state.into_ns
-        self._pieces, self._at_once = deque(state.pieces), state.at_once
-        self.yaw_rate = state.yaw_rate
+        Args:
+            position: Its centre [m].
+            yaw: Counter-clockwise from +x [rad].
+        """
+        self.state = FlyerState(position=position, yaw=yaw)
+        self.state.restart()
 
     def fly(self, motion: Motion | None, length_ns: int) -> Counter[str]:
-        """Move for a time [ns]; without a motion brake and hover.
+        """Move for a time.
 
-        Returns what limited the motion, each at most once.
+        Args:
+            motion: What is commanded; None: brake and hover.
+            length_ns: The time [ns].
+
+        Returns:
+            What limited the motion, each at most once.
         """
-        events: set[str] = set()
+        state, events = self.state, set[str]()
         wanted = motion or _HOVER
         asked = math.hypot(*wanted.velocity) if wanted.target is None else wanted.speed
         if asked > self.limits.speed * (1 + _ROUNDING):
             events.add(LIMITED_SPEED)
-        if wanted != self._motion:
-            self._motion = wanted
-            self._restart()
-        self._into_ns += length_ns
+        # The same command again, as agents send it in each frame, does not restart the count: so it makes no
+        # difference how a flight is cut into frames.
+        if wanted != state.motion:
+            state.motion = wanted
+            state.restart()
+        state.into_ns += length_ns
         acceleration = _REST
-        while self._into_ns >= SUB_STEP_NS:
+        while state.into_ns >= SUB_STEP_NS:
             events.add(self._next().event)
-            piece = self._pieces.popleft()
-            self._begin, acceleration = piece.at(_H), piece.acceleration_at(_H)
-            self._begin_yaw = _course(self._begin[1], self._begin_yaw)
-            self._into_ns -= SUB_STEP_NS
-        self.position, self.velocity = self._begin
-        if self._into_ns:
+            piece = state.pieces.pop(0)
+            state.begin, acceleration = piece.at(_H), piece.acceleration_at(_H)
+            state.begin_yaw = _course(state.begin[1], state.begin_yaw)
+            state.into_ns -= SUB_STEP_NS
+        state.position, state.velocity = state.begin
+        if state.into_ns:
             events.add(self._next().event)
-            self.position, self.velocity = self._next().at(self._into_ns / 1e9)
-            acceleration = self._next().acceleration_at(self._into_ns / 1e9)
-        self.yaw = _course(self.velocity, self._begin_yaw)
-        is_on_course = math.hypot(*self.velocity[:2]) > _HOVERING
-        self.yaw_rate = course_rate(self.velocity, acceleration) if is_on_course else 0.0
+            state.position, state.velocity = self._next().at(state.into_ns / 1e9)
+            acceleration = self._next().acceleration_at(state.into_ns / 1e9)
+        state.yaw = _course(state.velocity, state.begin_yaw)
+        is_on_course = math.hypot(*state.velocity[:2]) > _HOVERING
+        state.yaw_rate = course_rate(state.velocity, acceleration) if is_on_course else 0.0
         return Counter(events - {""})
 
     def _next(self) -> _Piece:
         """The sub-step under way."""
-        if not self._pieces:
+        state = self.state
+        if not state.pieces:
+            # Looking at several at once is one question to the obstacles. Beside a wall mostly the answer is
+            # no: then one is looked at, and twice as many each time that nothing is in the way.
             found = self._several()
-            self._at_once = min(2 * self._at_once, _AT_ONCE) if found else 1
-            self._pieces.extend(found or [self._one()])
-        return self._pieces[0]
+            state.at_once = min(2 * state.at_once, _AT_ONCE) if found else 1
+            state.pieces = found or [self._one()]
+        return state.pieces[0]
 
     def _several(self) -> list[_Piece]:
         """The next sub-steps, if nothing is in their way."""
-        state, pieces, places = self._begin, list[_Piece](), list[Vector]()
-        for _ in range(self._at_once):
-            wish = self._desired(*state)
-            if wish == state[1] == _REST:
+        at, pieces, places = self.state.begin, list[_Piece](), list[Vector]()
+        for _ in range(self.state.at_once):
+            wish = self._desired(*at)
+            if wish == at[1] == _REST:
                 if not pieces:
-                    return [_Piece(state[0], _REST, _REST, 0.0, _REST)]
+                    return [_Piece(at[0], _REST, _REST, 0.0, _REST)]
                 break
-            pieces.append(self._towards(*state, wish))
-            state = pieces[-1].at(_H)
-            places += [state[0], self._stop(*state)]
+            pieces.append(self._towards(*at, wish))
+            at = pieces[-1].at(_H)
+            # To the end of each, and to a stop behind it: braking there was free, so it can be done any time.
+            places += [at[0], self._stop(*at)]
         return [] if self._in_the_way(places)[1] else pieces
 
     def _one(self) -> _Piece:
         """The next sub-step, along what is in the way, or braking."""
-        wish = self._desired(*self._begin)
+        wish = self._desired(*self.state.begin)
         planes: list[Vector] = []
         event = ""
         for _ in range(_CONTACTS):
             bent = _bent(wish, planes)
-            piece = self._towards(*self._begin, bent)
+            piece = self._towards(*self.state.begin, bent)
             end = piece.at(_H)
             plane, found = self._in_the_way([end[0], self._stop(*end)])
             if not found:
@@ -251,7 +255,7 @@ class Flyer:
             event = found
             planes.append(plane)
         stopped = STOPPED_BY_OBSTACLE if event == SLID_ALONG_OBSTACLE else event
-        return self._towards(*self._begin, _REST)._replace(event=stopped)
+        return self._towards(*self.state.begin, _REST)._replace(event=stopped)
 
     def _towards(self, position: Vector, velocity: Vector, after: Vector) -> _Piece:
         """The sub-step in which the velocity goes to ``after``, as far as it gets."""
@@ -269,7 +273,7 @@ class Flyer:
     def _in_the_way(self, places: list[Vector]) -> tuple[Vector, str]:
         """What is in the way of straight lines to and between places: a unit vector away from it,
         and the event that it makes; empty where there is nothing."""
-        here = self._begin[0]
+        here = self.state.begin[0]
         for place in places:
             for axis in range(3):
                 if place[axis] < self.limits.low[axis] and place[axis] < here[axis]:
@@ -288,7 +292,7 @@ class Flyer:
         ramp from v to w and the stop from w are as long as the way d:
         w·h ± (w − v)²/2a + w²/2a = d, with the sign of v − w.
         """
-        motion, a = self._motion, self.limits.acceleration
+        motion, a = self.state.motion, self.limits.acceleration
         if motion.target is None:
             speed = math.hypot(*motion.velocity)
             return _scaled(motion.velocity, min(1.0, self.limits.speed / speed)) if speed else _REST
@@ -308,6 +312,7 @@ class Flyer:
 
 def _bent(wish: Vector, planes: list[Vector]) -> Vector:
     """A velocity without what leads into planes, given by unit vectors away from them."""
+    # Of two planes that both are in the way, what is left is the part along their line of intersection.
     if not planes:
         return wish
     found = _sum(wish, planes[-1], -min(_dot(wish, planes[-1]), 0.0))
