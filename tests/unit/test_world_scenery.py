@@ -165,7 +165,7 @@ def test_along_a_wall_it_slides_and_head_on_it_stops() -> None:
     head_on.reset((0.0, 0.0, 0.0), 0.0)
     events = head_on.fly(Motion(velocity=(10.0, 0.0, 0.0)), 4000 * MS)
     assert events == {STOPPED_BY_OBSTACLE: 1}
-    assert 8.5 < head_on.position[0] <= 9.0
+    assert 8.5 < head_on.state.position[0] <= 9.0
 
 
 def test_in_a_corner_it_stops_and_gets_out_again() -> None:
@@ -242,7 +242,11 @@ def test_how_the_time_is_cut_makes_no_difference(seed: int) -> None:
             length = min(left, int(rng.integers(1, 400 * MS)))
             cut.fly(wanted, length)
             left -= length
-        assert (whole.position, whole.velocity, whole.yaw) == (cut.position, cut.velocity, cut.yaw)
+        assert (whole.state.position, whole.state.velocity, whole.state.yaw) == (
+            cut.state.position,
+            cut.state.velocity,
+            cut.state.yaw,
+        )
 
 
 def test_nothing_stands_in_the_way_where_there_is_no_scenery() -> None:

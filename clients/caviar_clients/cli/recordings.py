@@ -42,8 +42,7 @@ from caviar_protocol.recording import Recording, RecordingWarning, frame_name
 from caviar_protocol.recording.segment import Segment
 from caviar_protocol.scenario import Scenario
 from caviar_services.recorder.base import failure
-from caviar_services.recorder.segment_writer import stored_products
-from caviar_services.recorder.segment_writer import Persistence, SegmentWriter
+from caviar_services.recorder.segment_writer import Persistence, SegmentWriter, stored_products
 
 # A replay loads what runs a scenario, 0.2 s of imports that the other commands do without.
 if TYPE_CHECKING:

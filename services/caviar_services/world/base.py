@@ -31,7 +31,13 @@ from caviar_services.world.scenery import object_assets, pattern_assets, scenery
 
 
 class ObjectState(NamedTuple):
-    """One object at one instant."""
+    """One object at one instant.
+
+    Example:
+        >>> level, still = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+        >>> ObjectState("car.1", "car", (0.0, 0.0, 0.75), level, still, (4.6, 1.9, 1.5)).yaw_rate
+        0.0
+    """
 
     name: str
     kind: str
@@ -125,7 +131,11 @@ class World(Service[W]):
 
     @classmethod
     def known_objects(cls, settings: W) -> Mapping[str, str] | None:
-        """Class of each object that may come, by name; None where they are not known before the run."""
+        """Class of each object that may come, by name; None where they are not known before the run.
+
+        Args:
+            settings: The settings of the world.
+        """
         return None
 
     @abstractmethod
@@ -164,8 +174,16 @@ class World(Service[W]):
         """
 
     def scenery(self) -> Mapping[str, Path | bytes]:
-        """The XML, the files it names, the meshes of the objects that may come, and the pattern files of
-        antennas."""
+        """Find the files that this world brings.
+
+        Returns:
+            File, or content, by asset name: the XML and the files it names, the meshes of the objects that
+            may come, and the pattern files of antennas.
+
+        Raises:
+            AssetError: A file is missing or wrong.
+            ScenarioError: The pattern file of a device is wrong; names its key.
+        """
         return {
             **scenery_assets(self.settings.scenery),
             **object_assets(self.mesh_classes()),
@@ -173,7 +191,11 @@ class World(Service[W]):
         }
 
     def prepare(self, preparation: Preparation) -> Prepared:
-        """Declare the names: prefixes of objects, and fixed devices by their whole name."""
+        """Declare the names: prefixes of objects, and fixed devices by their whole name.
+
+        Raises:
+            ScenarioError: A device is mounted on an object that can never come; names its key.
+        """
         self._check_parents()
         scenery = self.settings.scenery or "none"
         return Prepared(
@@ -183,6 +205,7 @@ class World(Service[W]):
 
     def _check_parents(self) -> None:
         """Refuse a device on an object that can never come."""
+        # It would be missing in each frame, which looks like bad coverage.
         objects, prefixes = self.known_objects(self.settings), self.prefixes()
         known = prefixes if objects is None else tuple(objects)
         for spec in self.run.devices:
@@ -213,9 +236,10 @@ class World(Service[W]):
         """The scene at the frame's instant."""
         scene = self._scene(list(self.objects_at(frame.t_ns - self._t0_ns)))
         counts = {f"{WITHOUT_OBJECT_PREFIX}{name}": 1 for name in self._mounts.without_object}
-        return StepResult(products={"scene": scene}, counts=counts)
+        return StepResult(products={"scene": scene}, counts=counts)  # counted in the run's summary
 
     def _scene(self, states: list[ObjectState]) -> Scene:
+        # Before they are sorted: devices go to the objects that came first, which a world lists in front.
         devices = self._mounts.devices([(state.name, state.dimensions) for state in states])
         states = sorted(states)
         names = tuple(state.name for state in states)
@@ -273,8 +297,17 @@ def _tables(states: Sequence[ObjectState]) -> tuple[Float64Array, ...]:
 class Mounts:
     """Which devices exist in a frame, and where they are mounted.
 
-    A pattern with ``count`` devices gives them to the objects that came first. Who has one
+    A pattern with ``count`` devices gives them to the objects that came first. An object that has one
     keeps it, since all that came earlier have one too or have left.
+
+    Args:
+        specs: Devices that the world publishes.
+
+    Example:
+        >>> mounts = Mounts([DeviceSpec(name="rx", kind="antenna", role="rx", on="car.*", count=1)])
+        >>> size = (4.6, 1.9, 1.5)
+        >>> [device.name for device in mounts.devices([("car.b", size), ("car.a", size)])]
+        ['car.b/rx']
     """
 
     def __init__(self, specs: Sequence[DeviceSpec]) -> None:
@@ -298,15 +331,23 @@ class Mounts:
         return tuple(self._arrived)
 
     def clear(self, arrived: Sequence[str] = ()) -> None:
-        """Forget who came first: a new episode begins, or goes on behind a frame with these objects."""
+        """Forget which objects came first: a new episode begins, or goes on behind a frame.
+
+        Args:
+            arrived: Objects of that frame, those that came first in front.
+        """
         self._arrived = list(arrived)
         self._objects = None
 
     def devices(self, objects: Sequence[tuple[str, Vector]]) -> tuple[Device, ...]:
-        """Devices of a frame, sorted by name.
+        """Mount the devices of a frame.
 
-        ``objects`` are the names and dimensions [m] of all objects of the frame. Those that
-        were not there in the previous frame count as having come in the given order.
+        Args:
+            objects: Names and dimensions [m] of all objects of the frame. Those that were not there in the
+                previous frame count as having come in the given order.
+
+        Returns:
+            Devices, sorted by name.
         """
         if objects == self._objects:
             return self._devices
@@ -335,14 +376,34 @@ _TIGHTEST_M = 0.1
 
 
 def turning(rate: float) -> float:
-    """A yaw rate [rad/s]; 0 where it is but rounding, so that a scene in which nothing turns says so."""
+    """Clear a yaw rate of rounding, so that a scene in which nothing turns says so.
+
+    Args:
+        rate: [rad/s]
+
+    Returns:
+        The rate; 0 where it is but rounding.
+
+    Example:
+        >>> turning(0.3), turning(1e-12)
+        (0.3, 0.0)
+    """
     return rate if abs(rate) > _TURNS else 0.0
 
 
 def course_rate(velocity: Sequence[float], acceleration: Sequence[float]) -> float:
-    """How fast [rad/s] the horizontal course of a velocity [m/s] turns with an acceleration [m/s²].
+    """How fast the horizontal course of a velocity turns: dψ/dt = (vₓ·a_y − v_y·aₓ)/(vₓ² + v_y²).
 
-    0 where the course reverses rather than turns (`reverses`): it jumps there.
+    Args:
+        velocity: [m/s]
+        acceleration: [m/s²]
+
+    Returns:
+        [rad/s], counter-clockwise; 0 where the course reverses instead of turning (`reverses`): it jumps.
+
+    Example:
+        >>> course_rate((10.0, 0.0, 0.0), (0.0, 2.0, 0.0))
+        0.2
     """
     if reverses(velocity, acceleration):
         return 0.0
@@ -351,6 +412,15 @@ def course_rate(velocity: Sequence[float], acceleration: Sequence[float]) -> flo
 
 
 def reverses(velocity: Sequence[float], acceleration: Sequence[float]) -> bool:
-    """Whether a course bends more tightly than a vehicle turns: its radius is v³ / |v × a|."""
+    """Whether a course bends more tightly than a vehicle turns: its radius is v³ / |v × a|.
+
+    Args:
+        velocity: [m/s]
+        acceleration: [m/s²]
+
+    Example:
+        >>> reverses((10.0, 0.0, 0.0), (0.0, 2.0, 0.0)), reverses((1e-4, 0.0, 0.0), (-2.0, 1.0, 0.0))
+        (False, True)
+    """
     (vx, vy, _), (ax, ay, _) = velocity, acceleration
     return math.hypot(vx, vy) ** 3 < _TIGHTEST_M * abs(vx * ay - vy * ax)

@@ -19,23 +19,22 @@ from caviar_protocol.messages import Input
 from caviar_protocol.space.coordinates import Vector, quaternion_from_euler
 from caviar_protocol.topics import Action, VelocityCommand, WaypointCommand
 from caviar_services.checkpoint import restored, saved
-from caviar_services.mesh.shapes import SHAPES
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 from caviar_services.world.base import ObjectState
 from caviar_services.world.flight_dynamics import Flyer, FlyerState, Limits, Motion
 from caviar_services.world.scenery import Obstacles, scenery_assets, scenery_triangles
-from caviar_services.world.trajectory import Length, MovingObject, TrajectorySettings, TrajectoryWorld
+from caviar_services.world.trajectory import (
+    MovingObject,
+    NamedObject,
+    TrajectorySettings,
+    TrajectoryWorld,
+    unique_name,
+)
 
 
-class FlownObject(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class FlownObject(NamedObject, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One object that agents fly, and what it is capable of."""
 
-    name: Annotated[str, msgspec.Meta(min_length=1, max_length=100)]
-    """Of the object; its actuator is ``motion:<name>``."""
-    kind: str = "uav"
-    """Class of the object; one without a mesh of its own is a box."""
-    dimensions_m: tuple[Length, Length, Length] = (0.6, 0.6, 0.25)
-    """Length, width, height."""
     start_m: tuple[float, float, float]
     """Centre of the object at the start of every episode."""
     start_yaw_deg: float = 0.0
@@ -69,6 +68,18 @@ class FlightWorld(TrajectoryWorld):
     """Objects that agents fly, with limited speed and acceleration, clear of the scenery.
 
     Beside other worlds of a run, commands for objects of no name of its own are left to them.
+
+    Args:
+        settings: The objects, what they are capable of, and the scenery.
+        run: What the world knows about the run.
+
+    Raises:
+        ScenarioError: Two objects have one name, or limits contradict each other; names the key.
+
+    Example:
+        >>> uav = FlownObject(name="uav", start_m=(0, 0, 30), max_speed_m_s=10, max_acceleration_m_s2=2)
+        >>> FlightWorld(FlightSettings(flown=(uav,)), RunInfo(name="world")).prefixes()
+        ('uav',)
     """
 
     Settings: ClassVar[type[msgspec.Struct]] = FlightSettings
@@ -84,9 +95,7 @@ class FlightWorld(TrajectoryWorld):
         self._alone = True
         for index, thing in enumerate(settings.flown):
             key = f"services.{run.name}.settings.flown[{index}]"
-            name = (settings.prefix or "") + thing.name
-            if name in self._flown or name in self._tracks:
-                raise ScenarioError(f"a second object is named {name!r}; give it another name", key=key)
+            name = unique_name(settings, thing, {*self._flown, *self._tracks}, key)
             self._flown[name] = thing
             self._flyers[name] = Flyer(_limits(thing, key))
 
@@ -105,21 +114,18 @@ class FlightWorld(TrajectoryWorld):
         own = {(settings.prefix or "") + thing.name: thing.kind for thing in flown}
         return {**(super().known_objects(settings) or {}), **own}
 
-    def prefixes(self) -> tuple[str, ...]:
-        """The setting, or all names, which are known."""
-        return (self.settings.prefix,) if self.settings.prefix else (*self._tracks, *self._flown)
-
-    def mesh_classes(self) -> tuple[str, ...]:
-        """The classes of the objects, those that have a mesh."""
-        flown = {thing.kind for thing in self._flown.values()}
-        return tuple(sorted((flown & SHAPES.keys()) | set(super().mesh_classes())))
-
     def prepare(self, preparation: Preparation) -> Prepared:
-        """Load the scenery as obstacles, and see that every flown object starts clear of it."""
+        """Load the scenery as obstacles, and see that every flown object starts clear of it.
+
+        Raises:
+            AssetError: A file of the scenery is missing or wrong.
+            ScenarioError: An object starts too near to the scenery; names the key.
+        """
         self._alone = len(preparation.producers.get("scene", ())) <= 1
         triangles = scenery_triangles(scenery_assets(self.settings.scenery))
         for index, (name, flyer) in enumerate(self._flyers.items()):
             thing = self._flown[name]
+            # The ground below the bounds cannot be reached: most triangles of a flat street are left out so.
             flyer.obstacles = Obstacles(triangles[triangles[..., 2].max(axis=1) > flyer.limits.low[2]])
             distance = flyer.obstacles.distance(thing.start_m, flyer.limits.kept)
             if distance < flyer.limits.kept:
@@ -137,7 +143,13 @@ class FlightWorld(TrajectoryWorld):
             self._flyers[name].reset(thing.start_m, math.radians(thing.start_yaw_deg))
 
     def step(self, frame: Frame) -> StepResult:
-        """The scene at the frame's instant, the commands having acted since the one before."""
+        """The scene at the frame's instant, the commands having acted since the one before.
+
+        Raises:
+            PayloadError: A command is for no object of this world, is not finite, is one of two for an
+                object, or puts an object where it cannot be.
+            RunError: The process before this one took the state of the flight with it.
+        """
         if frame.number > 0 and not self._begun:
             raise RunError(
                 f"world {self.run.name!r} came back in frame {frame.number}: where its objects had been "
@@ -157,10 +169,7 @@ class FlightWorld(TrajectoryWorld):
         return replace(made, counts={**made.counts, **counts})
 
     def _place(self, motions: Mapping[str, Motion]) -> None:
-        """Put the objects where they are to be at once; they hover there.
-
-        Raises `PayloadError` for a point beyond the bounds or near to the scenery.
-        """
+        """Put the objects where they are to be at once; they hover there."""
         for name, motion in motions.items():
             if motion.at_once and motion.target is not None:
                 flyer = self._flyers[name]
@@ -174,7 +183,7 @@ class FlightWorld(TrajectoryWorld):
                 flyer.reset(target, flyer.state.yaw)
 
     def checkpoint(self) -> bytes:
-        """Where the flown objects are, and what is under way."""
+        """The motion of each flown object: it follows from all commands since the episode began."""
         flyers = {name: flyer.state for name, flyer in self._flyers.items()}
         return saved(self, 1, _State(elapsed_ns=self._elapsed_ns, flyers=flyers))
 

@@ -60,7 +60,12 @@ _REST: Vector = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """What an object may do."""
+    """What an object may do.
+
+    Example:
+        >>> Limits(speed=10.0, acceleration=8.0, clearance=1.0, low=(-9.0,) * 3, high=(9.0,) * 3).kept
+        1.0001
+    """
 
     speed: float
     """Greatest speed [m/s]."""
@@ -79,11 +84,19 @@ class Limits:
 
 
 class Motion(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Commanded motion: a velocity, or a target and the speed with which to go there."""
+    """Commanded motion: a velocity, or a target and the speed with which to go there.
+
+    Example:
+        >>> Motion(target=(10.0, 0.0, 30.0), speed=5.0).velocity
+        (0.0, 0.0, 0.0)
+    """
 
     velocity: Vector = (0.0, 0.0, 0.0)
+    """[m/s]; without effect where there is a target."""
     target: Vector | None = None
+    """[m]"""
     speed: float = 0.0
+    """On the way to the target [m/s]."""
     at_once: bool = False
     """Whether it is put there before it moves."""
 

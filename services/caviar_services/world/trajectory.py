@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 from bisect import bisect_right
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, ClassVar, NamedTuple
@@ -33,15 +33,20 @@ _ROUND_DEG = 90.0
 Length = Annotated[float, quantity("m", "side of a bounding box", gt=0)]
 
 
-class MovingObject(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One object and where it is when."""
+class NamedObject(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a scenario says of each object by name, whatever moves it."""
 
     name: Annotated[str, msgspec.Meta(min_length=1, max_length=100)]
-    """Unique among the objects of the run."""
+    """Unique among the objects of the run; where agents fly the object, its actuator is ``motion:<name>``."""
     kind: str = "uav"
     """Class of the object: ``uav``, ``car``, …; one without a mesh of its own is a box."""
     dimensions_m: tuple[Length, Length, Length] = (0.6, 0.6, 0.25)
     """Length, width, height."""
+
+
+class MovingObject(NamedObject, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One object and where it is when."""
+
     waypoints: str | tuple[tuple[float, ...], ...]
     """``file:PATH.csv``, or rows ``[t_s, x_m, y_m, z_m]`` or ``[t_s, x_m, y_m, z_m, yaw_deg]``.
     The point is the centre of the object; without a yaw it looks along its horizontal course."""
@@ -55,7 +60,22 @@ class TrajectorySettings(WorldSettings, frozen=True, kw_only=True, forbid_unknow
 
 
 class TrajectoryWorld(World[TrajectorySettings]):
-    """Objects that follow timed waypoints; they rest before the first and after the last one."""
+    """Objects that follow timed waypoints; they rest before the first and after the last one.
+
+    Args:
+        settings: The objects and their waypoints.
+        run: What the world knows about the run.
+
+    Raises:
+        ScenarioError: Two objects have one name, or waypoints are wrong; names the key.
+
+    Example:
+        >>> rows = ((0.0, 0.0, 0.0, 30.0), (4.0, 40.0, 0.0, 30.0))
+        >>> settings = TrajectorySettings(objects=(MovingObject(name="uav", waypoints=rows),))
+        >>> world = TrajectoryWorld(settings, RunInfo(name="world"))
+        >>> [state.position for state in world.objects_at(2_000_000_000)]
+        [(20.0, 0.0, 30.0)]
+    """
 
     Settings: ClassVar[type[msgspec.Struct]] = TrajectorySettings
 
@@ -64,9 +84,7 @@ class TrajectoryWorld(World[TrajectorySettings]):
         self._tracks: dict[str, tuple[MovingObject, Track]] = {}
         for index, thing in enumerate(settings.objects):
             key = f"services.{run.name}.settings.objects[{index}]"
-            name = (settings.prefix or "") + thing.name
-            if name in self._tracks:
-                raise ScenarioError(f"a second object is named {name!r}; give it another name", key=key)
+            name = unique_name(settings, thing, self._tracks, key)
             self._tracks[name] = (thing, Track(read_waypoints(thing.waypoints, f"{key}.waypoints")))
 
     @classmethod
@@ -78,16 +96,18 @@ class TrajectoryWorld(World[TrajectorySettings]):
 
     @classmethod
     def known_objects(cls, settings: TrajectorySettings) -> Mapping[str, str] | None:
-        """All of them."""
+        """All of them, with the prefix."""
         return {(settings.prefix or "") + thing.name: thing.kind for thing in settings.objects}
 
     def prefixes(self) -> tuple[str, ...]:
         """The setting, or all names, which are known."""
-        return (self.settings.prefix,) if self.settings.prefix else tuple(self._tracks)
+        known = self.known_objects(self.settings) or {}
+        return (self.settings.prefix,) if self.settings.prefix else tuple(known)
 
     def mesh_classes(self) -> tuple[str, ...]:
         """The classes of the objects, those that have a mesh."""
-        return tuple({thing.kind for thing, _ in self._tracks.values()} & SHAPES.keys())
+        known = self.known_objects(self.settings) or {}
+        return tuple(sorted(set(known.values()) & SHAPES.keys()))
 
     def prepare(self, preparation: Preparation) -> Prepared:
         """As `World.prepare`, with a note for each object that a waypoint turns round at once."""
@@ -119,6 +139,24 @@ class TrajectoryWorld(World[TrajectorySettings]):
             )
 
 
+def unique_name(settings: WorldSettings, thing: NamedObject, taken: Container[str], key: str) -> str:
+    """Name of an object in the scene: the prefix of the world, and its own.
+
+    Args:
+        settings: The settings of the world.
+        thing: The object.
+        taken: Names of the objects before it.
+        key: Key of the object in the scenario, for the error.
+
+    Raises:
+        ScenarioError: The name is taken.
+    """
+    name = (settings.prefix or "") + thing.name
+    if name in taken:
+        raise ScenarioError(f"a second object is named {name!r}; give it another name", key=key)
+    return name
+
+
 class Waypoint(NamedTuple):
     """Where an object is when."""
 
@@ -136,6 +174,14 @@ class Track:
     The velocity is the exact derivative of the position. Without a given yaw the object looks
     along its horizontal course; while it hovers, climbs or descends on the spot it turns evenly
     from the course before to the one after.
+
+    Args:
+        waypoints: In the order of time; all of them have a yaw, or none has.
+
+    Example:
+        >>> track = Track([Waypoint(0.0, (0.0, 0.0, 30.0)), Waypoint(4.0, (40.0, 0.0, 30.0))])
+        >>> track.position(2.0), track.velocity(2.0), track.yaw(2.0)
+        ((20.0, 0.0, 30.0), (15.0, 0.0, 0.0), 0.0)
     """
 
     def __init__(self, waypoints: Sequence[Waypoint]) -> None:
@@ -158,28 +204,44 @@ class Track:
         return (x, y, z)
 
     def yaw(self, t: float, velocity: Vector | None = None) -> float:
-        """[rad] at instant ``t`` [s], counter-clockwise from +x; ``velocity`` there, if it is known."""
+        """Yaw at an instant.
+
+        Args:
+            t: The instant [s].
+            velocity: Velocity there [m/s]; None: it is computed.
+
+        Returns:
+            [rad], counter-clockwise from +x.
+        """
         if self._given is not None:
             return self._given.at(t)[0]
         times = self._curve.times
         k = self._curve.segment(t)
         if k < 0:
             return self._hover[0][0] if t < times[0] else self._hover[-1][1]
-        if self._moves(k):
+        if self._moving[k]:
             return self._course(t, k, velocity or self.velocity(t))
         start, end = self._hover[k]
         s = (t - float(times[k])) / float(times[k + 1] - times[k])
+        # 3s² − 2s³: the turn begins and ends at rest, so the yaw rate has no jump.
         return start + (end - start) * s * s * (3 - 2 * s)
 
     def yaw_rate(self, t: float, velocity: Vector) -> float:
-        """[rad/s] at instant ``t`` [s], where the velocity [m/s] is this: the derivative of `yaw`, and 0
-        where the course reverses (`yaw_rate.reverses`)."""
+        """Derivative of `yaw`, and 0 where the course reverses (`world.base.reverses`).
+
+        Args:
+            t: The instant [s].
+            velocity: Velocity there [m/s].
+
+        Returns:
+            [rad/s], counter-clockwise.
+        """
         if self._given is not None:
             return turning(self._given.at(t, 1)[0])
         k = self._curve.segment(t)
         if k < 0:
             return 0.0
-        if self._moves(k):
+        if self._moving[k]:
             return course_rate(velocity, self._curve.at(t, 2)) if math.hypot(*velocity[:2]) > _SLOW else 0.0
         start, end = self._hover[k]
         length = float(self._curve.times[k + 1] - self._curve.times[k])
@@ -202,13 +264,11 @@ class Track:
                 found.append((k, t))
         return found
 
-    def _moves(self, k: int) -> bool:
-        return self._moving[k]
-
     def _course(self, t: float, k: int, velocity: Vector) -> float:
         vx, vy, _ = velocity
         if math.hypot(vx, vy) > _SLOW:
             return math.atan2(vy, vx)
+        # At a point of rest the velocity has no direction: it is the limit on the nearer side.
         begin, end = self._curve.times[k], self._curve.times[k + 1]
         return self._limit(k, at_end=bool(t - begin > end - t))
 
@@ -228,7 +288,7 @@ class Track:
     def _hover_yaws(self) -> list[tuple[float, float]]:
         """Yaw at the beginning and the end of each segment; one entry for a single waypoint."""
         count = max(len(self._curve.times) - 1, 1)
-        moving = [k for k in range(len(self._curve.times) - 1) if self._moves(k)]
+        moving = [k for k in range(len(self._curve.times) - 1) if self._moving[k]]
         if not moving:
             return [(0.0, 0.0)] * count
         yaws: list[tuple[float, float]] = []
@@ -256,10 +316,21 @@ class Track:
 
 
 def read_waypoints(source: str | Sequence[Sequence[float]], key: str = "") -> list[Waypoint]:
-    """Waypoints of a CSV file or of rows.
+    """Read waypoints from a CSV file or from rows.
 
     The file has one header line, ``t_s,x_m,y_m,z_m`` or with ``yaw_deg`` behind; lines that
-    begin with ``#`` and empty lines are skipped. Raises `ScenarioError` naming file and line.
+    begin with ``#`` and empty lines are skipped.
+
+    Args:
+        source: Absolute path of the file, or rows ``[t_s, x_m, y_m, z_m]``, each with ``yaw_deg`` or none.
+        key: Key of the waypoints in the scenario, for errors.
+
+    Raises:
+        ScenarioError: A value is no finite number, or instants do not increase; names file and line, or key.
+
+    Example:
+        >>> read_waypoints([[0.0, 0.0, 0.0, 30.0], [4.0, 40.0, 0.0, 30.0]])[1].position
+        (40.0, 0.0, 30.0)
     """
     if isinstance(source, str):
         return _from_csv(Path(source), key)
@@ -341,13 +412,21 @@ class MonotoneCurve:
     Args:
         times: Increasing instants [s], Shape ``[K]``, K ≥ 1.
         points: Values there, Shape ``[K, D]``.
+
+    Example:
+        >>> curve = MonotoneCurve(np.array([0.0, 2.0]), np.array([[0.0], [8.0]]))
+        >>> curve.at(1.0), curve.at(1.0, order=1), curve.at(3.0)
+        ([4.0], [6.0], [8.0])
     """
+
+    # SciPy's PchipInterpolator has the same slopes inside, other ones at the ends, and would make SciPy a
+    # dependency of every world.
 
     def __init__(self, times: Float64Array, points: Float64Array) -> None:
         self.times = times
         self.points = points
         self.slopes = _slopes(times, points)
-        # Evaluated a few numbers at a time, which is faster with numbers than with arrays of three.
+        # Evaluated at one instant at a time, which is faster with numbers than with arrays of three.
         self._instants: list[float] = times.tolist()
         self._ends: tuple[list[float], list[float]] = points[0].tolist(), points[-1].tolist()
         self._segments = [self._coefficients(k) for k in range(len(times) - 1)]
@@ -365,15 +444,26 @@ class MonotoneCurve:
         )
 
     def segment(self, t: float) -> int:
-        """Index of the segment that holds instant ``t`` [s]; −1 where the curve rests."""
+        """Index of the segment that holds an instant; −1 where the curve rests.
+
+        Args:
+            t: The instant [s].
+        """
         if not self._instants[0] <= t < self._instants[-1]:
             return -1
         return bisect_right(self._instants, t) - 1
 
     def at(self, t: float, order: int = 0) -> list[float]:
-        """The derivative of an order (0: the value, 1, 2) at instant ``t`` [s], D numbers.
+        """Evaluate the curve or a derivative.
 
         The second derivative jumps at the points; there it is that of the segment that begins.
+
+        Args:
+            t: The instant [s].
+            order: Of the derivative: 0 (the value), 1 or 2.
+
+        Returns:
+            D numbers.
         """
         k = self.segment(t)
         if k < 0:
@@ -387,12 +477,9 @@ class MonotoneCurve:
             return [(d0 + s * (2 * c2 + s * 3 * c3)) / length for _, d0, c2, c3 in cubics]
         return [(2 * c2 + s * 6 * c3) / length**2 for _, _, c2, c3 in cubics]
 
-    def __call__(self, t: float, order: int = 0) -> Float64Array:
-        """The same as an array, Shape ``[D]``."""
-        return np.array(self.at(t, order))
-
 
 def _slopes(times: Float64Array, points: Float64Array) -> Float64Array:
+    """Slopes at the points by Fritsch and Butland's eq. (5), 0 at both ends, Shape ``[K, D]``."""
     slopes = np.zeros_like(points)
     if len(times) < 3:
         return slopes
@@ -400,6 +487,7 @@ def _slopes(times: Float64Array, points: Float64Array) -> Float64Array:
     secant = np.diff(points, axis=0) / length
     before, after = secant[:-1], secant[1:]
     w1, w2 = 2 * length[1:] + length[:-1], length[1:] + 2 * length[:-1]
+    # 0 where the secants differ in sign: an extremum stays at its point, and the curve does not overshoot it.
     same_sign = before * after > 0
     safe_before, safe_after = np.where(same_sign, before, 1.0), np.where(same_sign, after, 1.0)
     slopes[1:-1] = np.where(same_sign, (w1 + w2) / (w1 / safe_before + w2 / safe_after), 0.0)
