@@ -14,11 +14,14 @@ from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import AntennaArray, Scene
 from caviar_services.antenna_arrays import dft_codebook, steering_vector
 from caviar_services.channel.paths import Antenna
-from caviar_services.channel.radio_map.mapping import RadioMap, radio_map, rays_at_once, transmitters_of
-from caviar_services.channel.radio_map.measurement_surface import (
-    MeasurementSurface,
+from caviar_services.channel.radio_map.cell_gains import MeasurementSurface
+from caviar_services.channel.radio_map.mapping import (
+    RadioMap,
     draped_surface,
     level_surface,
+    radio_map,
+    rays_at_once,
+    transmitters_of,
 )
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.stability.formulas import C, turn

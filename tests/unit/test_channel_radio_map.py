@@ -7,13 +7,16 @@ import pytest
 
 from caviar_protocol.errors import RunError
 from caviar_protocol.topics import AntennaArray
-from caviar_services.channel.radio_map.cell_gains import least_memory, part_of
-from caviar_services.channel.radio_map.mapping import Coverage, beams_of, decibels
-from caviar_services.channel.radio_map.measurement_surface import (
+from caviar_services.channel.radio_map.mapping import (
+    Coverage,
+    beams_of,
     cell_counts,
+    decibels,
     draped_surface,
     heights,
+    least_memory,
     level_surface,
+    part_of,
 )
 
 

@@ -21,14 +21,14 @@ from caviar_protocol.space.ply import read_ply
 from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import Carrier, Scene
 from caviar_services.channel.adaptive.settings import AdaptiveSettings, models
-from caviar_services.channel.radio_map.mapping import rounded_up
-from caviar_services.channel.radio_map.measurement_surface import (
+from caviar_services.channel.radio_map.cell_gains import MeasurementSurface
+from caviar_services.channel.radio_map.mapping import (
     Area,
-    MeasurementSurface,
     cell_counts,
     draped_surface,
     heights,
     level_surface,
+    rounded_up,
 )
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.sionna.settings import SionnaSettings

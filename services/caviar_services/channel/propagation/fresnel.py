@@ -10,10 +10,43 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int64Array
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_services.channel.propagation.geometry import cross, unit
-from caviar_services.channel.sionna.materials import slab
+
+# Permittivity of vacuum [F/m] (CODATA 2018).
+EPSILON_0 = 8.8541878128e-12
 
 # Sine of the angle between two directions below which they are one.
 _ALONG = 1e-9
+
+
+def slab(
+    cosine: Float64Array,
+    constants: tuple[float, float] | tuple[Float64Array, Float64Array],
+    thickness_m: float | Float64Array,
+    frequency_hz: float,
+) -> tuple[Complex128Array, Complex128Array]:
+    """Reflection and transmission coefficients of slabs in air (ITU-R P.2040-3, eqs. 37, 43 and 44).
+
+    Args:
+        cosine: Of the angles between rays and the normal, Shape ``[N]``.
+        constants: Relative permittivity and conductivity [S/m], of one slab or of each ray's.
+        thickness_m: Likewise [m].
+        frequency_hz: Of the wave [Hz].
+
+    Returns:
+        Reflection and transmission of fields, TE and TM: Shape ``[2, N]`` each.
+
+    Example:
+        >>> back, through = slab(np.array([1.0]), (4.0, 0.0), 0.01, 7.5e9)  # a half of a wavelength in it
+        >>> bool(np.allclose(back, 0.0, atol=2e-3)), bool(np.allclose(abs(through), 1.0, atol=1e-3))
+        (True, True)
+    """
+    permittivity, conductivity = constants
+    eta = permittivity - 1j * conductivity / (2 * np.pi * frequency_hz * EPSILON_0)
+    root = np.sqrt(eta - (1 - cosine**2))
+    single = np.stack([(cosine - root) / (cosine + root), (eta * cosine - root) / (eta * cosine + root)])
+    through = np.exp(-2j * np.pi * thickness_m * frequency_hz / SPEED_OF_LIGHT * root)
+    many = 1 - (single * through) ** 2
+    return single * (1 - through**2) / many, (1 - single**2) * through / many
 
 
 @dataclass(frozen=True, eq=False)

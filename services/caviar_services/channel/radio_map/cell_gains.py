@@ -1,4 +1,4 @@
-"""Power gain of one transmitter in every cell of a surface, for all of its beams at once.
+"""Cells of a surface, and the power gain of one transmitter in each of them, for all of its beams at once.
 
 Sionna RT's `RadioMapSolver` shoots rays from a transmitter and adds up the power of those that pass through
 each cell (A. Aoudia et al., "Sionna RT: Technical Report", 2025, section 4). It knows one precoding vector
@@ -6,6 +6,9 @@ and one polarisation model, so that a codebook of 64 beams would be shot 64 time
 is that of the channel engine's own element pattern (`Antenna.radiated`), and each ray that passes
 through a cell is counted once for every beam, with the beam's gain in the direction in which it left: a
 single-polarised array in the far field is the element times its array factor.
+
+A surface is a grid of cells, level or draped over the ground. The solver intersects rays with a level one by
+formula; of another one a mesh with two triangles for each cell stands in the scene while rays are shot.
 """
 
 from __future__ import annotations
@@ -18,23 +21,63 @@ from typing import Any
 
 import numpy as np
 
-from caviar_protocol.arrays import Float64Array, Int64Array
+from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_services.channel.paths import Antenna
 from caviar_services.channel.propagation.patterns import spherical_basis
-from caviar_services.channel.radio_map.measurement_surface import MeasurementSurface
 from caviar_services.channel.sionna.ray_launcher import spread_directions
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.channel.sionna.scene_loading import Shape, mi_mesh
+from caviar_services.mesh.shapes import Mesh
 from caviar_services.ray_tracing import aligned_columns, aligned_indices
 
-PART = 1_000_000
-"""Rays that are shot together at most."""
 
-_LEAST_PART = 20_000
-# Of a ray and of a cell, beside those for each beam: measured, with room to spare.
-_RAY_BYTES, _CELL_BYTES = 600, 300
+@dataclass(frozen=True, eq=False)
+class MeasurementSurface:
+    """Cells that are squares from above: ``nx`` along x, ``ny`` along y."""
 
-_RAY_BEAM_BYTES, _CELL_BEAM_BYTES = 8, 20
+    x: Float64Array
+    """Edges of the columns [m], ascending, Shape ``[nx + 1]``."""
+    y: Float64Array
+    """Edges of the rows [m], ascending, Shape ``[ny + 1]``."""
+    z: Float64Array
+    """Height of the cells' corners [m], Shape ``[ny + 1, nx + 1]``; NaN where there is no ground."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """``(ny, nx)``."""
+        return len(self.y) - 1, len(self.x) - 1
+
+    @property
+    def is_level(self) -> bool:
+        """Whether it is a horizontal plane without a gap."""
+        return bool((self.z == self.z[0, 0]).all())
+
+    @property
+    def centres(self) -> Float64Array:
+        """Middle of each cell [m], Shape ``[ny, nx, 3]``; NaN heights where a corner has no ground."""
+        x, y = np.meshgrid((self.x[:-1] + self.x[1:]) / 2, (self.y[:-1] + self.y[1:]) / 2)
+        z = self.z
+        return np.stack([x, y, (z[:-1, :-1] + z[:-1, 1:] + z[1:, :-1] + z[1:, 1:]) / 4], axis=-1)
+
+    @property
+    def covered(self) -> BoolArray:
+        """Cells that have ground at all four corners, Shape ``[ny, nx]``."""
+        there: BoolArray = np.isfinite(self.centres[..., 2])
+        return there
+
+    def triangles(self) -> tuple[Mesh, Int64Array]:
+        """Two triangles for each covered cell, with upward normals, and the flat index of their cells,
+        Shape ``[F]``."""
+        _, nx = self.shape
+        x, y = np.meshgrid(self.x, self.y)
+        vertices = np.stack([x, y, self.z], axis=-1).reshape(-1, 3)
+        cells = np.flatnonzero(self.covered)
+        first = cells // nx * (nx + 1) + cells % nx
+        squares = first[:, None] + [0, 1, nx + 2, 0, nx + 2, nx + 1]
+        faces = squares.reshape(-1, 3).astype(np.int32)
+        used, compact = np.unique(faces, return_inverse=True)
+        return Mesh(vertices[used], compact.reshape(-1, 3).astype(np.int32)), np.repeat(cells, 2)
+
 
 _SURFACE, _SOURCE = "caviar-measurement-surface", "caviar-map-source"
 
@@ -72,25 +115,6 @@ class CellGains:
     """That passed through each cell, Shape ``[ny, nx]``."""
 
 
-def part_of(samples: int, cells: int, beams: int, memory: int) -> int:
-    """Rays that fit into ``memory`` [bytes] together, beside what cells and beams take.
-
-    0 where not even a small part does; `least_memory` tells what would do.
-    """
-    left = memory - cells * (_CELL_BYTES + _CELL_BEAM_BYTES * beams)
-    fitting = left // (_RAY_BYTES + _RAY_BEAM_BYTES * beams)
-    if fitting < _LEAST_PART:
-        return 0
-    part = int(min(samples, PART, fitting))
-    return math.ceil(samples / math.ceil(samples / part))  # parts of one size: another one is another kernel
-
-
-def least_memory(cells: int, beams: int) -> int:
-    """Memory [bytes] that a map of so many cells and beams takes at least."""
-    of_cells = cells * (_CELL_BYTES + _CELL_BEAM_BYTES * beams)
-    return of_cells + _LEAST_PART * (_RAY_BYTES + _RAY_BEAM_BYTES * beams)
-
-
 def cell_gains(
     scene: SionnaScene,
     surface: MeasurementSurface,
@@ -103,9 +127,13 @@ def cell_gains(
     """Shoot the rays of one transmitter, at the carrier that the scene is tuned to.
 
     Args:
+        scene: Loaded, with its bodies in place.
+        surface: Whose cells are counted.
         transmitter: Where it is traced from.
         beams: Numbers of beams of the transmitter's codebook, B of them; none: only the element's gain.
-        part: Rays that are shot together, as `part_of` tells.
+        shooting: What rays do, and how many there are.
+        part: Rays that are shot together.
+        done: Called after each part.
     """
     from sionna.rt import Transmitter
 
@@ -203,7 +231,8 @@ def _one_element(antenna: Antenna) -> Any:
 def _launched(directions: Any) -> Iterator[None]:
     """While rays are shot, they leave in these directions, a `mitsuba.Vector3f`.
 
-    Sionna RT would take all points of a lattice at once, and the same ones in every part.
+    Sionna RT's solver takes all points of a lattice at once, and the same ones in every call, so that parts
+    would repeat each other. The function that it calls is replaced in its module and put back.
     """
     import drjit as dr
     import mitsuba as mi
@@ -242,7 +271,7 @@ def _solver(
 
         def __init__(self, samples: int) -> None:
             super().__init__(rt_scene, **geometry.map_arguments)
-            # Opaque, so that maps of other cells and beams have the same kernels.
+            # Opaque: as literals, each number of cells and beams would be another kernel to compile.
             self._samples, self._cells, self._beams = (
                 dr.opaque(mi.UInt, count) for count in (samples, cells, len(beams))
             )
@@ -321,7 +350,7 @@ def _solver(
 
 @dataclass(frozen=True, kw_only=True)
 class _Geometry:
-    """How the ray tracer has a surface."""
+    """How a surface is given to the ray tracer's solver."""
 
     map_class: Any
     """The `sionna.rt.RadioMap` of such surfaces."""
@@ -389,7 +418,8 @@ def _draped(rt_scene: Any, surface: MeasurementSurface, centre: Float64Array) ->
 
 
 def _areas(mesh: Any, cell_of: Int64Array, cells: int) -> Float64Array:
-    """Area [m²] of each cell, Shape ``[cells]``; infinite for one without triangles."""
+    """Area [m²] of each cell, Shape ``[cells]``; infinite for a cell without triangles, whose gain is then
+    0."""
     corners = mesh.vertices[mesh.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     areas = np.bincount(cell_of, np.linalg.norm(normals, axis=1) / 2, minlength=cells)

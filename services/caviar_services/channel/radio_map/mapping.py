@@ -1,7 +1,9 @@
-"""The radio map of a scene: every transmitter shot in turn; power, SINR and best server of each cell."""
+"""The radio map of a scene: surfaces over its ground, and received power, SINR and best server of their
+cells."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -16,15 +18,23 @@ from caviar_protocol.topics import AntennaArray, AntennaDevice, Scene
 from caviar_services.channel.paths import Antenna
 from caviar_services.channel.radio_map.cell_gains import (
     CellGains,
+    MeasurementSurface,
     PartDone,
     Shooting,
     cell_gains,
-    least_memory,
-    part_of,
 )
-from caviar_services.channel.radio_map.measurement_surface import MeasurementSurface
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.sionna.settings import SionnaSettings
+
+PART = 1_000_000
+"""Rays that are shot together at most."""
+
+# Fewer rays than that at once are not worth a kernel: the memory is said to be too small.
+_LEAST_PART = 20_000
+
+# Memory of a ray and of a cell, and what each beam adds to both: measured, with room to spare.
+_RAY_BYTES, _CELL_BYTES = 600, 300
+_RAY_BEAM_BYTES, _CELL_BEAM_BYTES = 8, 20
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -32,6 +42,14 @@ class Coverage:
     """Gains of T transmitters in a grid of cells, and their powers.
 
     A receiver has one isotropic element that takes waves of both polarisations.
+
+    Example:
+        >>> gains = np.array([[[1e-9, 4e-9]], [[3e-9, 1e-9]]])  # two transmitters, two cells
+        >>> found = Coverage(gain=gains, interference_gain=gains, power_w=np.array([1.0, 2.0]), noise_w=1e-12)
+        >>> found.best_server.tolist()
+        [[1, 0]]
+        >>> decibels(found.of_server(found.rss), reference=1e-3).round(1).tolist()  # [dBm]
+        [[-52.2, -54.0]]
     """
 
     gain: Float64Array
@@ -78,7 +96,15 @@ class Coverage:
 
 
 def decibels(values: Float64Array, reference: float = 1.0) -> Float64Array:
-    """10·log10(values/reference) [dB]; NaN for 0 and for NaN."""
+    """Levels of powers or gains.
+
+    Args:
+        values: Of any shape.
+        reference: What 0 dB is.
+
+    Returns:
+        10·log10(values / reference) [dB]; NaN for 0 and for NaN.
+    """
     positive = values > 0
     return np.where(positive, 10 * np.log10(np.where(positive, values, 1.0) / reference), np.nan)
 
@@ -88,7 +114,8 @@ BeamChoice = Literal["best", "wide"] | int
 beamforming. A number: that beam, everywhere."""
 
 
-# Its test for what is in the way ends after 1 m there (`spawn_ray_to`, sionna-rt 2.2.0).
+# The solver's test for obstacles of diffracted rays ends after 1 m on a mesh (`spawn_ray_to`, sionna-rt
+# 2.2.0).
 _NO_DIFFRACTION = (
     "diffraction is left out: Sionna RT's solver finds none over a surface that is not level; a plane has it"
 )
@@ -102,7 +129,7 @@ class RadioMap:
 
     surface: MeasurementSurface
     names: tuple[str, ...]
-    """Of the transmitters."""
+    """Names of the transmitters."""
     positions: Float64Array
     """Of the transmitters [m], Shape ``[T, 3]``."""
     power_dbm: Float64Array
@@ -117,11 +144,102 @@ class RadioMap:
     """What of the channel's settings the map leaves out, for the user."""
 
 
+Area = tuple[float, float, float, float]
+"""Lowest x and y, highest x and y [m]."""
+
+
+def level_surface(area: Area, cell: float, z: float) -> MeasurementSurface:
+    """A horizontal plane in square cells.
+
+    Args:
+        area: Lowest x and y, highest x and y [m]; what the last cell has too much is shared by both sides.
+        cell: Side of a cell [m].
+        z: Height [m].
+
+    Example:
+        >>> level_surface((0.0, 0.0, 10.0, 4.0), cell=2.0, z=1.5).shape
+        (2, 5)
+    """
+    x, y = _edges(area, cell)
+    return MeasurementSurface(x, y, np.full((len(y), len(x)), float(z)))
+
+
+def draped_surface(area: Area, cell: float, height: float, ground: Float64Array) -> MeasurementSurface:
+    """Square cells that follow the ground.
+
+    Args:
+        area: As in `level_surface`; ``cell`` likewise.
+        cell: See ``area``.
+        height: Of the cells' corners above the highest ground there [m].
+        ground: Triangles [m], Shape ``[F, 3, 3]``.
+    """
+    x, y = _edges(area, cell)
+    return MeasurementSurface(x, y, heights(ground, x, y) + height)
+
+
+def cell_counts(area: Area, cell: float) -> tuple[int, int]:
+    """Number of cells ``(ny, nx)`` that an area [m] needs in cells of one side [m]."""
+    x0, y0, x1, y1 = area
+    return max(1, math.ceil((y1 - y0) / cell - 1e-9)), max(1, math.ceil((x1 - x0) / cell - 1e-9))
+
+
+def _edges(area: Area, cell: float) -> tuple[Float64Array, Float64Array]:
+    """Edges of columns and rows; what the last cell has too much is shared by both sides."""
+    x0, y0, x1, y1 = area
+    ny, nx = cell_counts(area, cell)
+    left, bottom = (x0 + x1 - nx * cell) / 2, (y0 + y1 - ny * cell) / 2
+    return np.linspace(left, left + nx * cell, nx + 1), np.linspace(bottom, bottom + ny * cell, ny + 1)
+
+
+def heights(triangles: Float64Array, x: Float64Array, y: Float64Array) -> Float64Array:
+    """Height of the highest triangle over each point of a grid.
+
+    Args:
+        triangles: Corners [m], Shape ``[F, 3, 3]``.
+        x: Of the grid's columns [m], ascending.
+        y: Of the grid's rows [m], ascending.
+
+    Returns:
+        Heights [m], Shape ``[len(y), len(x)]``; NaN where there is no triangle.
+    """
+    found = np.full((len(y), len(x)), -np.inf)
+    low, high = triangles[..., :2].min(axis=1), triangles[..., :2].max(axis=1)
+    columns = np.searchsorted(x, [low[:, 0] - _RIM, high[:, 0] + _RIM])
+    rows = np.searchsorted(y, [low[:, 1] - _RIM, high[:, 1] + _RIM])
+    for f in np.flatnonzero((columns[0] < columns[1]) & (rows[0] < rows[1])).tolist():
+        at = slice(*rows[:, f].tolist()), slice(*columns[:, f].tolist())
+        found[at] = np.maximum(found[at], _height_over(triangles[f], x[at[1]], y[at[0]]))
+    return np.where(np.isfinite(found), found, np.nan)
+
+
+# [m]; a corner of a cell this near to the border of the ground is over it: areas mostly end where ground
+# does.
+_RIM = 1e-6
+
+
+def _height_over(triangle: Float64Array, x: Float64Array, y: Float64Array) -> Float64Array:
+    """Height of one triangle over a grid, −∞ beside it, by barycentric coordinates."""
+    a, b, c = triangle
+    (ux, uy, uz), (vx, vy, vz) = b - a, c - a
+    area = ux * vy - uy * vx
+    if abs(area) < 1e-12:  # upright: it has no height of its own
+        return np.full((len(y), len(x)), -np.inf)
+    px, py = np.meshgrid(x - a[0], y - a[1])
+    s, t = (px * vy - py * vx) / area, (ux * py - uy * px) / area
+    rim = _RIM * max(np.hypot(ux, uy), np.hypot(vx, vy)) / abs(area)
+    inside = (s >= -rim) & (t >= -rim) & (s + t <= 1 + rim)
+    return np.where(inside, a[2] + s * uz + t * vz, -np.inf)
+
+
 def transmitters_of(scene: Scene, where: str) -> list[AntennaDevice]:
     """The transmitters of a scene.
 
-    Raises `RunError`, which names ``where`` it is from, without one, and for one of dual polarization or of
-    several panels.
+    Args:
+        scene: The scene.
+        where: Where it is from, for errors.
+
+    Raises:
+        RunError: It has no transmitter, or one of dual polarization or with several panels.
     """
     found = list(antennas(scene, "tx"))
     for device in found:
@@ -138,9 +256,15 @@ def transmitters_of(scene: Scene, where: str) -> list[AntennaDevice]:
 
 
 def beams_of(array: AntennaArray, beam: BeamChoice, name: str) -> range:
-    """Beams of the codebook to choose among; none for ``wide``, nor for a single element.
+    """Beams of the codebook to choose among; none for ``wide`` and for a single element.
 
-    Raises `RunError` naming the transmitter where its codebook lacks the beam.
+    Args:
+        array: Of the transmitter.
+        beam: The user's choice.
+        name: Of the transmitter, for errors.
+
+    Raises:
+        RunError: The codebook has no such beam.
     """
     if beam == "wide" or (beam == "best" and array.size == 1):
         return range(0)
@@ -151,12 +275,47 @@ def beams_of(array: AntennaArray, beam: BeamChoice, name: str) -> range:
     return range(beam, beam + 1)
 
 
+def part_of(samples: int, cells: int, beams: int, memory: int) -> int:
+    """Number of rays that are shot together.
+
+    Args:
+        samples: All rays of a transmitter.
+        cells: Of the surface.
+        beams: Of the transmitter's codebook that are mapped.
+        memory: For rays, cells and beams together [bytes].
+
+    Returns:
+        Rays of a part, all of one size; 0 where not even a small part fits (`least_memory`).
+    """
+    left = memory - cells * (_CELL_BYTES + _CELL_BEAM_BYTES * beams)
+    fitting = left // (_RAY_BYTES + _RAY_BEAM_BYTES * beams)
+    if fitting < _LEAST_PART:
+        return 0
+    part = int(min(samples, PART, fitting))
+    # Parts of one size: a last one of another size would be another kernel to compile.
+    return math.ceil(samples / math.ceil(samples / part))
+
+
+def least_memory(cells: int, beams: int) -> int:
+    """Memory [bytes] that a map of so many cells and beams needs for the smallest part of rays."""
+    of_cells = cells * (_CELL_BYTES + _CELL_BEAM_BYTES * beams)
+    return of_cells + _LEAST_PART * (_RAY_BYTES + _RAY_BEAM_BYTES * beams)
+
+
 def rays_at_once(
     surface: MeasurementSurface, devices: Sequence[AntennaDevice], beam: BeamChoice, samples: int, memory: int
 ) -> int:
-    """Rays that are shot together within ``memory`` [bytes].
+    """Number of rays of each transmitter that are shot together.
 
-    Raises `RunError` with the cell that would do where a map of this many cells does not fit.
+    Args:
+        surface: Of the map.
+        devices: The transmitters.
+        beam: The user's choice.
+        samples: Rays of each transmitter.
+        memory: That the map may take [bytes].
+
+    Raises:
+        RunError: The map does not fit; the text names the side of a cell that would.
     """
     ny, nx = surface.shape
     beams = max(len(beams_of(device.array, beam, device.name)) for device in devices)
@@ -191,10 +350,17 @@ def radio_map(
 
     Args:
         channel: With its scene loaded.
+        scene: Transmitters, and bodies that hide and reflect.
+        surface: Of the map.
         samples: Rays of each transmitter.
-        carrier: Its index among those of the run.
+        carrier: Index of the carrier among those of the run.
+        beam: Of the transmitters.
         noise_w: Of a receiver [W].
-        part, done: As in `cell_gains`; ``done`` counts the parts of all transmitters.
+        part: As in `cell_gains`; likewise ``done``, which counts the parts of all transmitters.
+        done: See ``part``.
+
+    Raises:
+        RunError: The scene has no transmitter, or one of which no map is made.
 
     While another transmitter serves other cells with beams of its codebook, it interferes with each of these
     in turn: in the mean over a unitary codebook, that is the gain of one element.
@@ -253,7 +419,7 @@ def radio_map(
 
 
 def _left_out(settings: SionnaSettings, surface: MeasurementSurface) -> tuple[str, ...]:
-    """What of the settings a map of this surface has not."""
+    """Notes on settings that a map of this surface leaves out."""
     if not settings.diffraction:
         return ()
     if not surface.is_level:
@@ -273,7 +439,10 @@ def _served(found: CellGains, beams: range) -> tuple[Float64Array, Int32Array]:
 def _transmittance(
     channel: SionnaChannel, carrier: int, surface: MeasurementSurface, source: Float64Array
 ) -> Float64Array | float:
-    """What the air lets through over the straight line to each cell; paths by reflection are longer."""
+    """Share of the power that the air lets through on the straight line to each cell.
+
+    Rays by way of reflections are longer; they lose as little here as the straight line does.
+    """
     if channel.absorption_db_per_km is None:
         return 1.0
     km = np.linalg.norm(surface.centres - source, axis=-1) / 1e3
@@ -282,6 +451,11 @@ def _transmittance(
 
 
 def rounded_up(value: float) -> float:
-    """A value above 0 with two significant digits, not less than it is."""
+    """A value above 0, rounded up to two significant digits.
+
+    Example:
+        >>> rounded_up(0.1234)
+        0.13
+    """
     unit = 10 ** (np.floor(np.log10(value)) - 1)
     return float(np.ceil(value / unit) * unit)

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt64Array
 from caviar_protocol.seeding import derive_seed
 from caviar_services.channel.paths import Antenna
+from caviar_services.channel.propagation.fresnel import EPSILON_0
 from caviar_services.channel.propagation.patterns import FormulaPattern
 from caviar_services.channel.sionna.ray_launcher import (
     REFLECTED,
@@ -38,9 +39,6 @@ from caviar_services.ray_tracing import aligned_columns, aligned_indices, severa
 # What a factor of a weight is at least: factors leave out polarisation and the thickness of walls, and a
 # point that was chosen against all odds brings far too much.
 _LEAST = 0.01
-
-# Permittivity of vacuum [F/m] (CODATA 2018).
-_EPSILON_0 = 8.8541878128e-12
 
 # Added to the cosine of Lambert's law: a point that is seen at a small angle is chosen now and then.
 _GRAZING = 0.1
@@ -244,7 +242,7 @@ class _Met:
 
 def _at_normal(material: Any) -> float:
     """|Γ|² of a half-space of a radio material at normal incidence (Fresnel)."""
-    loss = float(material.conductivity[0]) / (float(material.scene.angular_frequency[0]) * _EPSILON_0)
+    loss = float(material.conductivity[0]) / (float(material.scene.angular_frequency[0]) * EPSILON_0)
     root = complex(float(material.relative_permittivity[0]), -loss) ** 0.5
     return abs((1 - root) / (1 + root)) ** 2
 

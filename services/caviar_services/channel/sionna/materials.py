@@ -14,19 +14,14 @@ from fnmatch import fnmatchcase
 from typing import Annotated, Any, Literal
 
 import msgspec
-import numpy as np
 
-from caviar_protocol.arrays import Complex128Array, Float64Array, quantity
+from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import ScenarioError, suggestion
 from caviar_protocol.scenario.conversion import Place
-from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
+from caviar_services.channel.propagation.fresnel import EPSILON_0
 
 Constants = tuple[float, float]
 """Relative permittivity and conductivity [S/m]."""
-
-# Permittivity of vacuum [F/m] (CODATA 2018).
-_EPSILON_0 = 8.8541878128e-12
-
 
 DRAWN = 2.0**-26
 """A ray is sent through a surface with a probability; below this one none ever is.
@@ -57,26 +52,6 @@ class UsedSurfaces:
     """Whether anything diffracts (`mesh_edges`)."""
 
 
-def slab(
-    cosine: Float64Array,
-    constants: Constants | tuple[Float64Array, Float64Array],
-    thickness_m: float | Float64Array,
-    frequency_hz: float,
-) -> tuple[Complex128Array, Complex128Array]:
-    """Reflection and transmission coefficients of a slab in air for waves that come in at these angles.
-
-    Recommendation ITU-R P.2040-3, eqs. 37, 43 and 44; both of Shape ``[2, N]``, TE and TM. Slabs
-    may be one or N.
-    """
-    permittivity, conductivity = constants
-    eta = permittivity - 1j * conductivity / (2 * np.pi * frequency_hz * _EPSILON_0)
-    root = np.sqrt(eta - (1 - cosine**2))
-    single = np.stack([(cosine - root) / (cosine + root), (eta * cosine - root) / (eta * cosine + root)])
-    through = np.exp(-2j * np.pi * thickness_m * frequency_hz / SPEED_OF_LIGHT * root)
-    many = 1 - (single * through) ** 2
-    return single * (1 - through**2) / many, (1 - single**2) * through / many
-
-
 @dataclass(frozen=True)
 class OtherMaterial:
     """A material that ITU-R P.2040 lacks."""
@@ -92,17 +67,17 @@ def _dry_skin(gigahertz: float) -> Constants:
     biological tissues: III. Parametric models for the dielectric spectrum of tissues", Phys. Med. Biol. 41,
     1996, eq. 1 and table 1; the dispersions of strength 0 are left out)."""
     omega = 2 * math.pi * gigahertz * 1e9
-    permittivity = complex(4.0, -0.0002 / (omega * _EPSILON_0))
+    permittivity = complex(4.0, -0.0002 / (omega * EPSILON_0))
     for strength, relaxation_s, alpha in ((32.0, 7.234e-12, 0.0), (1100.0, 32.481e-9, 0.20)):
         permittivity += strength / (1 + (1j * omega * relaxation_s) ** (1 - alpha))
-    return permittivity.real, -permittivity.imag * omega * _EPSILON_0
+    return permittivity.real, -permittivity.imag * omega * EPSILON_0
 
 
 def _abs_plastic(gigahertz: float) -> Constants:
     """ABS, of which bumpers and housings are made: ε = 2.7 and tan δ = 0.008 at 11 GHz (B. Riddle,
     J. Baker-Jarvis and J. Krupka, "Complex permittivity measurements of common plastics over variable
     temperatures", IEEE Trans. Microw. Theory Tech. 51(3), 2003), taken as the same at other frequencies."""
-    return 2.7, 2.7 * 0.008 * 2 * math.pi * gigahertz * 1e9 * _EPSILON_0
+    return 2.7, 2.7 * 0.008 * 2 * math.pi * gigahertz * 1e9 * EPSILON_0
 
 
 OTHER_MATERIALS: Mapping[str, OtherMaterial] = {

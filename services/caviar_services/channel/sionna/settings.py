@@ -24,6 +24,7 @@ from caviar_protocol.scenario.conversion import Place
 from caviar_services.channel.base import ChannelSettings
 from caviar_services.channel.mesh_detail import DetailSettings
 from caviar_services.channel.propagation.foliage import FoliageSettings
+from caviar_services.channel.propagation.fresnel import slab
 from caviar_services.channel.sionna.materials import (
     DRAWN,
     OTHER_MATERIALS,
@@ -31,7 +32,6 @@ from caviar_services.channel.sionna.materials import (
     OutsideRange,
     SurfaceMaterial,
     UsedSurfaces,
-    slab,
 )
 from caviar_services.channel.sionna.ray_launcher import LaunchOptions, rays_within
 from caviar_services.mesh.scenery import ITU_MATERIALS
