@@ -15,12 +15,12 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from caviar_clients.cli.radio_map_inputs import Wanted, carrier_of, channel_of, in_hertz, noise_of, surface_of
+from caviar_clients.cli.radio_map_inputs import Wanted, carrier_of, channel_of, noise_of, surface_of
 from caviar_clients.files import reserved, writing
 from caviar_clients.plots.map import RadioMapView, draw_servers, draw_values
 from caviar_clients.plots.rays import footprints
 from caviar_clients.session.checks import checked_scenario
-from caviar_clients.session.plausibility import implausible_values
+from caviar_clients.session.plausibility import implausible_values, in_hertz
 from caviar_clients.tradeoff.scenes import is_recording, scene_at
 from caviar_protocol.errors import RunError, SetupError, suggestion
 from caviar_protocol.host import DISTRIBUTION, has_extra, install_command

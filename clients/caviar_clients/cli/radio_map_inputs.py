@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from caviar_clients.plots.rays import ground
+from caviar_clients.session.plausibility import in_hertz
 from caviar_clients.tradeoff.scenes import Scenes
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import RunError, ScenarioError, suggestion
@@ -240,11 +241,3 @@ def _area(channel: SionnaChannel, scene: Scene) -> Area:
         around = np.concatenate([np.array(places).reshape(-1, 3), scene.position])
         low, high = around.min(axis=0) - _AROUND, around.max(axis=0) + _AROUND
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])
-
-
-def in_hertz(value: float) -> str:
-    """A frequency with a unit that suits it."""
-    for unit, size in (("GHz", 1e9), ("MHz", 1e6), ("kHz", 1e3)):
-        if value >= size:
-            return f"{value / size:g} {unit}"
-    return f"{value:g} Hz"

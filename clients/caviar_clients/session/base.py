@@ -17,29 +17,51 @@ from caviar_protocol.scenario.rules import BEAM
 from caviar_services.service import Frame as Frame
 from caviar_services.service import Preparation, Prepared, Service, StepResult
 
+# On the wire: the agent chooses no seed, and the episode has that of the run.
 _NO_SEED = -1
 _HIGHEST_SEED = 2**63 - 1
 
 
 class Session(ABC):
-    """One run, driven from grant to grant (contract, clause 16).
+    """A run that a program steps, in place of one of its agents (contract, clause 16).
 
-    Call `reset`, then `step` until a frame is ``final``, then `reset` again; `close` at the end. All
-    of them raise `RunError` with the broker's blame where the run has ended.
+    Call `reset`, then `step` until a frame is ``final``, then `reset` again; `close` at the end, or use it as
+    a context manager. All of them raise `RunError` with the broker's blame where the run has ended.
+
+    Example:
+        >>> from caviar_clients.session.checks import checked_scenario
+        >>> from caviar_clients.session.connected import open_session
+        >>> from caviar_protocol.topics import Action
+        >>> scenario, inputs = checked_scenario("smoke", frames=3), (Input(topic="scene"),)
+        >>> with open_session(scenario, "agent", inputs) as session:
+        ...     frame = session.reset(seed=7)
+        ...     while not frame.final:
+        ...         frame = session.step({"action": Action(commands=())})
+        >>> frame.number
+        3
     """
 
     def __init__(self) -> None:
         self._frame: Frame | None = None
         self.scenery: Mapping[str, Path] = {}
-        """Files of the run's scenery by asset name, behind the first `reset`; empty unless asked for."""
+        """Files of the run's scenery by asset name, after the first `reset`; empty unless asked for."""
 
     def _take_scenery(self, assets: Mapping[str, Path]) -> None:
         self.scenery = assets
 
     def reset(self, seed: int | None = None) -> Frame:
-        """Begin an episode; its frame 0. The same ``seed`` leads to the same episode.
+        """Begin an episode. An episode that is under way ends.
 
-        Without one the next episode follows on the last one's seed. An episode that is under way ends.
+        Args:
+            seed: From 0 to 2⁶³ − 1; the same seed leads to the same episode. None: the episode that follows
+                on the one before, of the same seed.
+
+        Returns:
+            Frame 0 of the episode.
+
+        Raises:
+            PayloadError: The seed is out of its range.
+            RunError: The run has ended.
         """
         if seed is not None and not 0 <= seed <= _HIGHEST_SEED:
             raise PayloadError(f"seed={seed}; write a whole number from 0 to 2**63 - 1")
@@ -49,11 +71,12 @@ class Session(ABC):
             self._frame = self._granted()
             if _begins(self._frame, seed):
                 return self._frame
-            # The agent that had the place before left the run in the middle of an episode.
+            # An agent that had the place before left the run in the middle of an episode.
         if self._frame.final:
             self._answer(StepResult(seed=chosen))
         else:
             self._answer(StepResult(end_episode=True, seed=chosen))
+            # Frames of the old episode may have been granted before the broker knew that it ends.
             while not self._granted().final:
                 self._answer(StepResult(end_episode=True, seed=chosen))
             self._answer(StepResult())
@@ -61,18 +84,30 @@ class Session(ABC):
         return self._frame
 
     def step(self, products: Mapping[str, Payload]) -> Frame:
-        """Answer the frame, and the next one: with this one's link, and ``final`` behind the last."""
+        """Answer the frame that is granted, and wait for the next one.
+
+        Args:
+            products: By topic, what the agent decided: ``{"action": Action(…)}``.
+
+        Returns:
+            The next frame, with the link of the answered one; behind the last frame of an episode one that
+            is ``final`` and needs no answer.
+
+        Raises:
+            PayloadError: A product is not its topic's.
+            RunError: The run has ended, or no frame is granted.
+        """
         self._answer(StepResult(products=products))
         self._frame = self._granted()
         return self._frame
 
     @abstractmethod
     def close(self) -> None:
-        """End the run, or leave it; again: nothing."""
+        """End the run, or leave it. A second call does nothing."""
 
     @abstractmethod
     def _begin(self, seed: int) -> None:
-        """Start or join the run; −1: no seed is chosen."""
+        """Start or join the run, with the seed of its first episode; −1: none is chosen."""
 
     @abstractmethod
     def _answer(self, result: StepResult) -> None:
@@ -98,8 +133,8 @@ def _begins(frame: Frame, seed: int | None) -> bool:
 
 
 PATIENCE_S = 600.0
-"""[s] that a run waits for a decision before it blames the agent: learning takes time, and so does looking
-at what was learned."""
+"""[s] that a run waits for a decision before it blames the agent: between two of them a program may learn, or
+its user look at what it learned."""
 
 
 class OutsideSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -110,7 +145,7 @@ class OutsideSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
 
 
 class OutsideAgent(Service[OutsideSettings]):
-    """Declares an agent that decides outside of the run. `declared` makes the class for one session."""
+    """An agent that decides outside of the run. `declared` makes the class for one session."""
 
     role: ClassVar[Role] = "agent"
     outputs: ClassVar[tuple[str, ...]] = ("action",)
@@ -120,17 +155,18 @@ class OutsideAgent(Service[OutsideSettings]):
     first_seed: ClassVar[Callable[[], int]]
 
     def prepare(self, preparation: Preparation) -> Prepared:
-        """Declare the actuators, and the seed of the first episode once it is known."""
+        """Declare the actuators and, once `Session.reset` was called, the seed of the first episode."""
         type(self).scenery_here(preparation.assets)
         self.run.progress("waiting for the first reset", PATIENCE_S)
         seed = type(self).first_seed()
         if self.settings.except_users:
+            # The broker gives it what other agents do not own: which users that is, it knows alone.
             return Prepared(notes=("serves the users whom no other agent owns",), seed=seed)
         owned = tuple(text if ":" in text else BEAM + text for text in self.settings.users)
         return Prepared(actuators=owned, seed=seed)
 
     def step(self, frame: Frame) -> StepResult:
-        """What is decided outside."""
+        """Wait for the decision."""
         self.run.progress("waiting for a decision", PATIENCE_S)
         return type(self).decide(frame)
 
@@ -141,21 +177,20 @@ def declared(
     decide: Callable[[Frame], StepResult],
     scenery_here: Callable[[Mapping[str, Path]], None] | None = None,
 ) -> type[OutsideAgent]:
-    """The class of an agent with these inputs.
+    """Make the class of an agent that decides outside of the run.
 
-    ``first_seed`` gives the seed of the first episode, −1 for the run's; ``decide`` answers a frame;
-    ``scenery_here`` is given the files of the run's scenery before the first frame, which are not fetched
-    without it.
+    Args:
+        inputs: What it consumes.
+        first_seed: Waits for the seed of the first episode; −1 for the run's.
+        decide: Answers a frame.
+        scenery_here: Gets the files of the run's scenery by asset name, before the first frame. None: they
+            are not fetched.
     """
     fields = {
         "inputs": inputs,
         "first_seed": staticmethod(first_seed),
         "decide": staticmethod(decide),
         "uses_scenery": scenery_here is not None,
-        "scenery_here": staticmethod(scenery_here or _unused),
+        "scenery_here": staticmethod(scenery_here or (lambda _: None)),
     }
     return type("OutsideAgent", (OutsideAgent,), fields)
-
-
-def _unused(_: Mapping[str, Path]) -> None:
-    """For a session that does not look at the scenery."""

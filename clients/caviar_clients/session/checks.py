@@ -35,20 +35,31 @@ TOPICS_OF: Mapping[str, tuple[str, ...]] = {
 
 
 def checked_scenario(
-    path: Path, frames: int | None = None, seed: int | None = None, pace: str | None = None
+    path: str | Path, frames: int | None = None, seed: int | None = None, pace: str | None = None
 ) -> Scenario:
-    """Load a scenario and check it against the implementations it uses.
+    """Load a scenario and check it against the implementations that it uses.
 
-    Raises `ScenarioError` naming file, key and line for an implementation or a setting that does
-    not exist, and for a topic to record that no implementation produces.
+    Args:
+        path: The scenario's file, or the name of one that ships.
+        frames, seed, pace: What replaces the scenario's; None: nothing.
+
+    Raises:
+        ScenarioError: An implementation or a setting does not exist, or no implementation produces a topic to
+            record; the text has file, key and line.
+
+    Example:
+        >>> checked_scenario("smoke", frames=3).run.frames
+        3
     """
-    return check_implementations(with_overrides(load_scenario(path), frames, seed, pace))
+    return check_implementations(with_overrides(load_scenario(Path(path)), frames, seed, pace))
 
 
 def module_folders(scenario: Scenario) -> tuple[Path, ...]:
-    """Where modules of services that are named ``module:Class`` may lie: beside the scenario, and here.
+    """List the folders of modules of services that are named ``module:Class``.
 
-    Empty where no service is named so, and no rung of a service's settings.
+    Returns:
+        The scenario's folder and the current one; empty where neither a service nor a rung of a service's
+        settings is named so.
     """
     named = (name for spec in scenario.services.values() for name in (spec.use, *_used_by(spec.settings)))
     if not any(":" in name for name in named):
@@ -97,7 +108,14 @@ def _settings_of(implementation: type[Service[Any]]) -> tuple[str, ...]:
 
 
 def check_implementations(scenario: Scenario) -> Scenario:
-    """The scenario, checked as `checked_scenario` does."""
+    """Check a scenario that is loaded, as `checked_scenario` does.
+
+    Returns:
+        The scenario.
+
+    Raises:
+        ScenarioError: As of `checked_scenario`.
+    """
     for folder in module_folders(scenario):
         find_modules_in(folder)
     produced: set[str] = set()
@@ -187,7 +205,7 @@ TRIES = 10_000
 
 
 class Airspace:
-    """Points that are free for an object.
+    """The points of a box that are free for an object: clear of scenery, and outside of buildings.
 
     Args:
         low, high: Corners [m] of the box that it keeps within.
@@ -199,17 +217,18 @@ class Airspace:
         self.low, self.high = low, high
         self._clearance = clearance
         triangles = scenery_triangles(scenery)
+        # What ends below the box is no obstacle: an object may fly low over the ground.
         self._obstacles = Obstacles(triangles[triangles[..., 2].max(axis=1) > low[2]])
         self._surfaces = Surfaces(triangles, lambda triangle, normal: True)
 
     def within(self, low: Vector, high: Vector) -> Airspace:
-        """The same scenery, and another box [m]."""
+        """Take another box [m] in the same scenery, which is not loaded again."""
         other = copy.copy(self)
         other.low, other.high = low, high
         return other
 
     def is_free(self, point: Vector) -> bool:
-        """Whether the object can be at a point [m]."""
+        """Tell whether the object can be at a point [m]."""
         if not all(a <= x <= b for a, x, b in zip(self.low, point, self.high, strict=True)):
             return False
         if self._obstacles.distance(point, self._clearance) < self._clearance:
@@ -222,8 +241,17 @@ class Airspace:
         near: Vector | None = None,
         distance: tuple[float, float] = (0.0, np.inf),
     ) -> Vector | None:
-        """A free point [m], uniform in the box, and, where ``near`` is given, as far from it [m] as
-        ``distance`` says; None where none was found."""
+        """Draw a free point.
+
+        Args:
+            random: Generator of the draw.
+            near: Point from which the distance is measured [m]; None: any distance is right.
+            distance: Least and greatest distance [m].
+
+        Returns:
+            A point [m], uniform among those that fit; None where `TRIES` draws found none.
+        """
+        # By rejection, which needs no volume of what is free: a city leaves most of its air.
         for _ in range(TRIES):
             x, y, z = random.uniform(self.low, self.high).tolist()
             far = 0.0 if near is None else float(np.linalg.norm(np.subtract((x, y, z), near)))

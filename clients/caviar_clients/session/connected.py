@@ -1,7 +1,4 @@
-"""A session at a broker: the runner of all services in a thread, its agent here.
-
-`open_session`: from a scenario to a session of one of its agents, here or at a broker elsewhere.
-"""
+"""Open a session: in this process, or at a broker, where the runner of all services serves in a thread."""
 
 from __future__ import annotations
 
@@ -31,15 +28,15 @@ _POLL_S = 0.2
 
 
 class ConnectedSession(Session):
-    """The agent ``agent`` of the run at the broker ``broker``, which plays the scenario's episodes.
+    """An agent of the run that a broker serves, which plays the episodes of the scenario.
 
     It joins at once and gets ready at the first `reset`, whose seed becomes that of the first episode.
 
     Args:
-        broker: ZeroMQ address.
+        broker: ZeroMQ address of the broker.
         agent: Name of a service of the run that no process fills yet (``use = "remote"``).
-        inputs: What it consumes.
-        connect_timeout_s: Until the broker has to answer [s].
+        inputs: What the agent consumes.
+        connect_timeout_s: Time in which the broker has to answer [s].
         credentials: For a broker with keys; None: what the environment says.
         with_scenery: Whether `Session.scenery` is fetched.
     """
@@ -74,11 +71,12 @@ class ConnectedSession(Session):
             own_process=False,
             credentials=credentials,
         )
+        # A daemon: a program that forgets to close its session ends all the same.
         self._thread = threading.Thread(target=self._serve, args=(runner,), name="session", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Leave the run; behind its last episode that is its orderly end."""
+        """Leave the run; after the last frame of its last episode the run ends in order."""
         if self._frame is not None and self._frame.final and self._thread.is_alive():
             self._answer(StepResult())
             self._drained()
@@ -87,12 +85,16 @@ class ConnectedSession(Session):
         self._thread.join(LEAVE_S)
 
     def leave(self, error: CaviarError | None = None) -> None:
-        """End the thread, and pass the reason to a caller that waits for a grant."""
+        """End the thread. May be called from the thread itself, or a signal handler.
+
+        Args:
+            error: Raised by the call that waits for a grant, or by the next one.
+        """
         self._termination.requested = True
         if error is not None:
             self._grants.put(error)
-        self._seeds.put(None)
-        self._results.put(None)
+        self._seeds.put(None)  # wakes the thread where it waits for the first reset
+        self._results.put(None)  # and where it waits for a decision
 
     def _begin(self, seed: int) -> None:
         self._seeds.put(seed)
@@ -102,6 +104,7 @@ class ConnectedSession(Session):
 
     def _granted(self) -> Frame:
         while True:
+            # Without a timeout, Ctrl-C would wait until the next grant, and a thread that died be waited for.
             try:
                 grant = self._grants.get(timeout=_POLL_S)
             except Empty:
@@ -160,9 +163,14 @@ class _Leaving(Termination):
 
 
 def agent_of(scenario: Scenario, agent: str | None) -> str:
-    """The agent whose place a session takes: the one named, the remote one, or the only one.
+    """Find the agent whose place a session takes: the one named, the remote one, or the only one.
 
-    Raises `ScenarioError` naming the agents where that does not say which.
+    Args:
+        scenario: Has the agents.
+        agent: Its name; None: it is to be found.
+
+    Raises:
+        ScenarioError: There is no such agent, or there are several; the text names those there are.
     """
     agents = {name: spec for name, spec in scenario.services.items() if spec.role == "agent"}
     remote = [name for name, spec in agents.items() if spec.remote]
@@ -188,7 +196,20 @@ def open_session(
     credentials: Credentials | None = None,
     with_scenery: bool = False,
 ) -> Session:
-    """A session of ``agent``, at ``broker`` or, without one, in this process."""
+    """Open a session of one agent of a scenario.
+
+    Args:
+        scenario: Checked, as `checked_scenario` returns it.
+        agent: Name of the agent whose place is taken, as `agent_of` finds it.
+        inputs: What the agent consumes.
+        broker: ZeroMQ address of a broker that serves the scenario; None: the run is in this process.
+        directory: Where a run in this process records; None: nowhere, which is a lot faster.
+        credentials: For a broker with keys; None: what the environment says.
+        with_scenery: Whether `Session.scenery` is fetched.
+
+    Raises:
+        ScenarioError: A broker and a directory are given; a broker records where it was started.
+    """
     if broker is None:
         return EmbeddedSession(scenario, agent, inputs, directory, with_scenery)
     if directory is not None:

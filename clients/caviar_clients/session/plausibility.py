@@ -1,7 +1,4 @@
-"""What of a scenario is allowed and yet hardly meant: a frequency of 28 Hz, a base station below the ground.
-
-It is warned of, and the run goes on.
-"""
+"""Warnings of what a scenario may say and its author hardly means: 28 Hz, a base station below the ground."""
 
 from __future__ import annotations
 
@@ -9,15 +6,16 @@ import math
 from collections.abc import Iterator, Sequence
 from difflib import get_close_matches
 from fnmatch import fnmatchcase
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import AssetError, ScenarioError, SetupError
+from caviar_protocol.messages import Role
 from caviar_protocol.multipath import TAPS_BEFORE
 from caviar_protocol.scenario import Scenario
-from caviar_protocol.scenario.conversion import convert_settings
+from caviar_protocol.scenario.conversion import Place, convert_settings
 from caviar_protocol.scenario.rules import scenario_error, settings_place
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.topics.scene import Panel
@@ -25,6 +23,7 @@ from caviar_services.channel.adaptive.settings import AdaptiveSettings, models
 from caviar_services.channel.propagation.clearance import Surfaces
 from caviar_services.mesh.scenery import read_scenery
 from caviar_services.registry import load
+from caviar_services.service import Service
 from caviar_services.world.base import World
 from caviar_services.world.scenery import scenery_assets, scenery_file, scenery_triangles
 
@@ -36,6 +35,8 @@ POWER_DBM = (-60.0, 90.0)
 """From a femtocell's uplink to a long-range radar."""
 MOST_ELEMENTS = 2**16
 """Elements of one device: the channel of a pair of such is 64 GiB for each subcarrier."""
+# Values beyond this are written in a larger unit: 2400 MHz, not 60,000 MHz.
+_MOST_OF_A_UNIT = 10_000
 WIDEST = 100.0
 """[wavelengths] between elements."""
 FARTHEST_PANEL_M = 100.0
@@ -44,7 +45,19 @@ LOOKED_AT = 200
 
 
 def implausible_values(scenario: Scenario) -> list[str]:
-    """A warning for each implausible value, with file, line, key and what may have been meant."""
+    """Warn of implausible values; the run takes place all the same.
+
+    Args:
+        scenario: Checked, as `checked_scenario` returns it.
+
+    Returns:
+        A line for each value, with file, line, key and what may have been meant.
+
+    Example:
+        >>> from caviar_clients.session.checks import checked_scenario
+        >>> implausible_values(checked_scenario("smoke"))
+        []
+    """
     found = [
         *_carriers(scenario),
         *_numerologies(scenario),
@@ -66,18 +79,21 @@ def _carriers(scenario: Scenario) -> _Warnings:
     for index, carrier in enumerate(scenario.carriers):
         frequency, bandwidth = carrier.frequency_hz, carrier.bandwidth_hz
         if not low <= frequency <= high:
-            usual = f"radio carriers are from {_si(low)} to {_si(high)}"
+            usual = f"radio carriers are from {in_hertz(low)} to {in_hertz(high)}"
             key = f"carriers[{index}].frequency_hz"
-            yield key, f"is {_si(frequency)}; {usual}{_meant(frequency, low, high)}"
+            yield key, f"is {in_hertz(frequency)}; {usual}{_meant(frequency, low, high)}"
         elif bandwidth > frequency / 2:
             yield (
                 f"carriers[{index}].bandwidth_hz",
-                f"is {_si(bandwidth)}, more than half of the frequency, {_si(frequency)}; write it in Hz",
+                (
+                    f"is {in_hertz(bandwidth)}, more than half of the frequency, {in_hertz(frequency)}; "
+                    "write it in Hz"
+                ),
             )
         if bandwidth < NARROWEST_HZ:
             yield (
                 f"carriers[{index}].bandwidth_hz",
-                f"is {_si(bandwidth)}, narrower than any radio carrier; write it in Hz, as 100e6",
+                f"is {in_hertz(bandwidth)}, narrower than any radio carrier; write it in Hz, as 100e6",
             )
 
 
@@ -89,7 +105,8 @@ def _numerologies(scenario: Scenario) -> _Warnings:
         key = f"carriers[{index}]"
         if carrier.subcarriers and spacing < NARROWEST_HZ:
             meant = f"; {spacing:g} kHz is written {spacing:g}e3" if spacing >= 1 else ""
-            yield f"{key}.subcarrier_spacing_hz", f"is {_si(spacing)}; OFDM has 1.25 kHz and more{meant}"
+            yield f"{key}.subcarrier_spacing_hz", f"is {in_hertz(spacing)}; OFDM has 1.25 kHz and more{meant}"
+        # A path between two samples is spread over both sides of its delay.
         if 0 < carrier.taps <= TAPS_BEFORE:
             yield (
                 f"{key}.taps",
@@ -98,6 +115,7 @@ def _numerologies(scenario: Scenario) -> _Warnings:
                     f"these end before it; write {2 * TAPS_BEFORE + 1} or more"
                 ),
             )
+        # Of given instants no two need be a sampling period apart.
         if slots > 1 and slots * duration > frame_s * (1 + 1e-9) and not scenario.run.instants_s:
             yield (
                 f"{key}.slot_duration_s",
@@ -139,13 +157,17 @@ def _arrays(scenario: Scenario) -> _Warnings:
                 )
 
 
+def _configured(scenario: Scenario, role: Role) -> Iterator[tuple[Place, type[Service[Any]], Any]]:
+    """Implementations of a role that run here: the place of the settings, the class, and the settings."""
+    for name, spec in scenario.services.items():
+        if spec.role == role and not spec.remote:
+            place, cls = settings_place(scenario, name), load(role, spec.use)
+            yield place, cls, convert_settings(cls.Settings, spec.settings, place)
+
+
 def _ladders(scenario: Scenario) -> _Warnings:
     """References of adaptive channels that know less than the rungs that they judge."""
-    for name, spec in scenario.services.items():
-        if spec.role != "channel" or spec.remote:
-            continue
-        place, cls = settings_place(scenario, name), load(spec.role, spec.use)
-        settings = convert_settings(cls.Settings, spec.settings, place)
+    for place, _, settings in _configured(scenario, "channel"):
         if not isinstance(settings, AdaptiveSettings) or settings.reference is None:
             continue
         *rungs, (_, reference) = models(settings, place)
@@ -171,11 +193,7 @@ def _object_keys(scenario: Scenario) -> _Warnings:
     if known is None:
         return
     names, classes = known
-    for name, spec in scenario.services.items():
-        if spec.role != "channel" or spec.remote:
-            continue
-        place, cls = settings_place(scenario, name), load(spec.role, spec.use)
-        settings = convert_settings(cls.Settings, spec.settings, place)
+    for place, _, settings in _configured(scenario, "channel"):
         for setting in ("object_materials", "foliage"):
             for key in getattr(settings, setting, ()):
                 fits = key in classes or any(name == key or fnmatchcase(name, key) for name in names)
@@ -188,24 +206,19 @@ def _object_keys(scenario: Scenario) -> _Warnings:
 
 def _objects_and_pieces(scenario: Scenario) -> tuple[set[str], set[str]] | None:
     """Names of all objects and pieces of scenery, and all classes; None where they are not known yet."""
+    if any(spec.role == "world" and spec.remote for spec in scenario.services.values()):
+        return None
     names, classes = set[str](), set[str]()
-    for name, spec in scenario.services.items():
-        if spec.role != "world":
-            continue
-        world = None if spec.remote else load(spec.role, spec.use)
-        if world is None or not issubclass(world, World):
-            return None
-        try:
-            settings = convert_settings(world.Settings, spec.settings, settings_place(scenario, name))
-            objects = world.known_objects(settings)
-            scenery: str = settings.scenery  # type: ignore[attr-defined]  # of all worlds
-            pieces = read_scenery(scenery_file(scenery)).shapes if scenery else ()
-        except (AssetError, ScenarioError, SetupError):
-            return None  # the world says so itself
-        if objects is None:
-            return None
-        names.update(objects, (piece.name for piece in pieces))
-        classes.update(objects.values())
+    try:
+        for _, world, settings in _configured(scenario, "world"):
+            objects = world.known_objects(settings) if issubclass(world, World) else None
+            if objects is None:
+                return None
+            pieces = read_scenery(scenery_file(settings.scenery)).shapes if settings.scenery else ()
+            names.update(objects, (piece.name for piece in pieces))
+            classes.update(objects.values())
+    except (AssetError, ScenarioError, SetupError):
+        return None  # the world refuses it itself, with the remedy
     return names, classes
 
 
@@ -251,24 +264,18 @@ def _placed_devices(scenario: Scenario) -> Iterator[_Placed]:
 
 
 def _placed_objects(scenario: Scenario) -> Iterator[_Placed]:
-    for name, spec in scenario.services.items():
-        if spec.role != "world" or spec.remote:
-            continue
-        world = load(spec.role, spec.use)
-        place = settings_place(scenario, name)
-        if not issubclass(world, World):
-            continue
+    for place, world, settings in _configured(scenario, "world"):
         try:
-            placements = list(world.placements(convert_settings(world.Settings, spec.settings, place)))
+            placements = list(world.placements(settings)) if issubclass(world, World) else []
         except ScenarioError:
-            continue  # the world says so itself, with what to write instead
+            continue  # the world refuses it itself, with the remedy
         for key, thing, positions in placements:
             for position in positions[:: max(1, math.ceil(len(positions) / LOOKED_AT))]:
                 yield _Placed(f"{place.key}.{key}", thing, position)
 
 
 class _Ground:
-    """The scenery of a scenario: how far it reaches, and where it is above what."""
+    """The scenery of a scenario: how far it reaches, and what is below its ground."""
 
     def __init__(self, triangles: Float64Array) -> None:
         corners = triangles.reshape(-1, 3)
@@ -277,7 +284,7 @@ class _Ground:
 
     @classmethod
     def of(cls, scenario: Scenario) -> _Ground | None:
-        """None where there is no scenery, or it cannot be read: its world says so, with the remedy."""
+        """Load the scenery; None where there is none, or its world will refuse it, with the remedy."""
         worlds = [spec for spec in scenario.services.values() if spec.role == "world"]
         try:
             found = [
@@ -292,6 +299,7 @@ class _Ground:
         """What is wrong with a position [m], Shape ``[3]``; empty: nothing."""
         if (position[:2] < self._low[:2]).any() or (position[:2] > self._high[:2]).any():
             return f"outside the scenery, which reaches {_span(self._low, self._high)}"
+        # Under the ground, and not under a roof or a bridge: something is above and nothing below.
         above = np.array([*position[:2], self._high[2] + 1.0])
         below = np.array([*position[:2], self._low[2] - 1.0])
         if position[2] < self._low[2] or (
@@ -309,18 +317,20 @@ def _span(low: Sequence[float] | Float64Array, high: Sequence[float] | Float64Ar
 
 
 def _meant(value_hz: float, low: float, high: float) -> str:
-    """What a frequency may have been meant as, which was written in another unit."""
+    """What a frequency that is written in another unit may mean; empty where no unit makes it plausible."""
     for exponent, unit in ((9, "GHz"), (6, "MHz"), (3, "kHz")):
         if value_hz < _MOST_OF_A_UNIT and low <= value_hz * 10.0**exponent <= high:
             return f"; {value_hz:g} {unit} is written {value_hz:g}e{exponent}"
-    return f"; is it {_si(value_hz / 1e3)}?" if low <= value_hz / 1e3 <= high else ""
+    return f"; is it {in_hertz(value_hz / 1e3)}?" if low <= value_hz / 1e3 <= high else ""
 
 
-# Values beyond this are written in a larger unit: 2400 MHz, not 60,000 MHz.
-_MOST_OF_A_UNIT = 10_000
+def in_hertz(value_hz: float) -> str:
+    """Write a frequency with a unit of suitable size.
 
-
-def _si(value_hz: float) -> str:
+    Example:
+        >>> in_hertz(28e9), in_hertz(15e3)
+        ('28 GHz', '15 kHz')
+    """
     for factor, unit in ((1e12, "THz"), (1e9, "GHz"), (1e6, "MHz"), (1e3, "kHz")):
         if value_hz >= factor:
             return f"{value_hz / factor:g} {unit}"
