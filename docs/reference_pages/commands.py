@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
@@ -9,6 +10,7 @@ from typing import Any, Literal, get_args, get_origin
 import typer
 
 from caviar_clients.cli.main import app
+from caviar_protocol import spec
 
 from . import markdown
 
@@ -35,7 +37,7 @@ def _command(command: Any, parent: Any, path: str, level: int) -> Iterator[str]:
     """A command with its arguments and options, and below it its own commands."""
     context = command.context_class(command, info_name=path.rpartition(" ")[2], parent=parent)
     usage = " ".join([path, *command.collect_usage_pieces(context)])
-    yield from ("#" * level + f" {path}", "", markdown.prose(command.help or ""), "")
+    yield from ("#" * level + f" {path}", "", spec.markdown(inspect.cleandoc(command.help or "")), "")
     yield from ("```text", usage, "```", "")
     for kind in ("argument", "option"):
         shown = [p for p in command.params if not getattr(p, "hidden", False)]

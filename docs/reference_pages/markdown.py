@@ -2,27 +2,14 @@
 
 from __future__ import annotations
 
-import inspect
-import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+
+from caviar_protocol import spec
 
 
-def prose(text: str) -> str:
-    """Docstring markup as Markdown."""
-    return re.sub(r"``([^`]+)``", r"`\1`", inspect.cleandoc(text))
-
-
-def one_line(text: str) -> str:
-    """A text as the cell of a table."""
-    return " ".join(prose(text).split()).replace("|", "\\|")
-
-
-def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> Iterator[str]:
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
     """Lines of a table, and an empty one behind it."""
-    columns = list(head)
-    for cells in (columns, ["---"] * len(columns), *rows):
-        yield "| " + " | ".join(one_line(cell) for cell in cells) + " |"
-    yield ""
+    yield from (spec.table(head, rows), "")
 
 
 def toctree(names: Iterable[str], *options: str) -> Iterator[str]:

@@ -5,16 +5,15 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Iterator, Mapping
-from typing import Any, get_args
 
 import msgspec
 
 from caviar_protocol.scenario.schema import Scenario
-from caviar_protocol.spec import prose, rows
+from caviar_protocol.spec import markdown, prose, rows, structs_in
 from caviar_services.registry import load
 from caviar_services.scenario_schema import settings_classes
 
-from . import markdown
+from .markdown import table, toctree
 
 TITLES = {"services": "[services.NAME]", "carriers": "[[carriers]]", "devices": "[[devices]]"}
 """How tables stand in a file whose field is not a single table of the same name."""
@@ -40,13 +39,13 @@ def pages() -> Iterator[tuple[str, str]]:
     inner: Structs = {}
     for field in msgspec.structs.fields(Scenario):
         if field.name not in Scenario.not_in_file:
-            (cls,) = _structs_of(field.type)
+            (cls,) = structs_in(field.type)
             title = TITLES.get(field.name, f"[{field.name}]").replace("[", "\\[")
-            lines += [f"## {title}", "", _meaning(cls), "", *_keys(cls, inner)]
+            lines += [f"## {title}", "", markdown(prose(cls)), "", *_keys(cls, inner)]
     lines += _nested(inner)
     lines += ["## Settings of implementations", ""]
     lines += ["`[services.NAME.settings]` has the keys of the implementation that `use` names:", ""]
-    lines += markdown.toctree([f"settings-{role}" for role in roles], ":maxdepth: 2")
+    lines += toctree([f"settings-{role}" for role in roles], ":maxdepth: 2")
     yield "index.md", "\n".join(lines)
     for role in roles:
         yield f"settings-{role}.md", "\n".join(_role(role, settings))
@@ -61,7 +60,7 @@ def _role(role: str, settings: Mapping[tuple[str, str], type[msgspec.Struct]]) -
     for other, name in settings:
         if other == role:
             docstring = inspect.cleandoc(load(role, name).__doc__ or "")
-            yield from (f"## {name}", "", markdown.prose(docstring.partition("\n\n")[0]), "")
+            yield from (f"## {name}", "", markdown(docstring.partition("\n\n")[0]), "")
             yield from _keys(settings[role, name], inner)
     yield from _nested(inner)
 
@@ -73,9 +72,9 @@ def _keys(cls: type[msgspec.Struct], inner: Structs) -> Iterator[str]:
     if not found:
         yield from ("It has no settings.", "")
         return
-    yield from markdown.table(("key", "type", "unit", "default", "meaning"), found)
+    yield from table(("key", "type", "unit", "default", "meaning"), found)
     for field in msgspec.structs.fields(cls):
-        inner |= {struct.__name__: struct for struct in _structs_of(field.type)}
+        inner |= {struct.__name__: struct for struct in structs_in(field.type)}
 
 
 def _key(name: str, kind: str, unit: str, default: str, _: str, meaning: str) -> tuple[str, ...]:
@@ -91,15 +90,4 @@ def _nested(inner: Structs) -> Iterator[str]:
     while names := [name for name in inner if name not in shown]:
         shown.add(names[0])
         cls = inner[names[0]]
-        yield from (f"## {cls.__name__}", "", _meaning(cls), "", *_keys(cls, inner))
-
-
-def _meaning(cls: type[msgspec.Struct]) -> str:
-    return markdown.prose(prose(cls))
-
-
-def _structs_of(hint: Any) -> list[type[msgspec.Struct]]:
-    """Structs that a type hint names."""
-    if isinstance(hint, type) and issubclass(hint, msgspec.Struct):
-        return [hint]
-    return [cls for argument in get_args(hint) for cls in _structs_of(argument)]
+        yield from (f"## {cls.__name__}", "", markdown(prose(cls)), "", *_keys(cls, inner))

@@ -11,7 +11,7 @@ from uuid import uuid4
 
 import msgspec
 
-from caviar_protocol.digest import geometry_digest
+from caviar_protocol.digest import file_digest, geometry_digest
 from caviar_protocol.errors import AssetError, SetupError
 from caviar_protocol.fields import MAX_ASSET_CHUNK, MAX_BODY, AssetName
 from caviar_protocol.files import replace_file
@@ -140,7 +140,7 @@ class AssetStore:
                 return False
             # Hashed once a process and not once a run, of which an environment has thousands.
             if digest not in self._verified:
-                if _file_digest(path) != digest:
+                if file_digest(path) != digest:
                     return False
                 self._verified.add(digest)
         except OSError:
@@ -150,7 +150,7 @@ class AssetStore:
     def _lay_out(self, asset: Asset, target: Path) -> None:
         source = self.path(asset.digest)
         # A file that is a link to the one in the store needs no second hash.
-        if target.is_file() and (target.samefile(source) or _file_digest(target) == asset.digest):
+        if target.is_file() and (target.samefile(source) or file_digest(target) == asset.digest):
             return
         target.parent.mkdir(parents=True, exist_ok=True)
         staged = target.with_name(f".staged-{uuid4().hex}")
@@ -242,8 +242,3 @@ def _check_name(name: str) -> None:
 def _check_size(asset: Asset) -> None:
     if asset.size > MAX_ASSET:
         raise AssetError(f"asset {asset.name!r} has {asset.size} B, a file may have {MAX_ASSET} B")
-
-
-def _file_digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

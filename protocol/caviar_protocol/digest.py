@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
+from pathlib import Path
 
+from caviar_protocol.files import open_regular
 from caviar_protocol.messages import Asset
 
 MOST_WAITING = 64
@@ -29,6 +31,22 @@ def payload_digest(header: bytes | memoryview, body: bytes | memoryview) -> str:
     h.update(header)
     h.update(body)
     return h.hexdigest()
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of the content of a regular file.
+
+    Args:
+        path: The file.
+
+    Returns:
+        64 lower-case hexadecimal digits.
+
+    Raises:
+        OSError: It cannot be read, or is no file.
+    """
+    with open_regular(path) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def geometry_digest(assets: Iterable[Asset]) -> str:

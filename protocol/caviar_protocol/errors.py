@@ -42,6 +42,7 @@ class CaviarError(Exception):
 class ProtocolError(CaviarError):
     """A peer broke the protocol. ``code`` is the word that SPEC.md lists for the ERROR reply."""
 
+    # The word stands in the ERROR that answers the peer; clients compare it, so it never changes.
     code = "protocol"
 
 
@@ -81,6 +82,7 @@ class ProductError(ProtocolError):
     code = "product"
 
     def __init__(self, topic: str, source: str, frame: int, problem: str) -> None:
+        # Apart from the text as well: the runner names the source as culprit of its FAULT.
         self.topic, self.source, self.frame, self.problem = topic, source, frame, problem
         super().__init__(f"{topic} of {source!r}, frame {frame}: {problem}")
 
@@ -108,6 +110,7 @@ class ScenarioError(CaviarError):
     """
 
     def __init__(self, message: str, file: str = "", key: str = "", line: int | None = None) -> None:
+        # Apart from the text as well, so that a caller can give the message another place.
         self.file, self.key, self.line, self.message = file, key, line, message
         # As compilers write it, so that editors and terminals make it a link.
         place = file + (f":{line}" if line is not None else "")

@@ -26,6 +26,7 @@ MAX_HEADER = 1 << 20
 MAX_BODY = 1 << 30
 """Bytes of the body of one product."""
 
+# A header and two parts each of 256 products; `few` bounds the lists of products to as many.
 MAX_PARTS = 513
 """Parts of a message without its routing part: a header and 256 products."""
 
@@ -82,12 +83,14 @@ FrameOrNone = Annotated[int, quantity("1", "frame of the episode; −1: none", g
 Age = Annotated[int, quantity("frame", "age", ge=0, le=MAX_INTEGER)]
 Seed = Annotated[int, quantity("1", "seed of everything random", ge=0, le=MAX_INTEGER)]
 SeedOrNone = Annotated[int, quantity("1", "seed; −1: none", ge=-1, le=MAX_INTEGER)]
+# Whole: sums of periods are exact, and every client gets the same instant.
 Nanoseconds = Annotated[int, quantity("ns", "simulated time, whole", ge=-MAX_INTEGER, le=MAX_INTEGER)]
 Duration = Annotated[int, quantity("ns", "wall time, whole", ge=0, le=MAX_INTEGER)]
 Period = Annotated[int, quantity("ns", "wall time, whole, at least 1", ge=1, le=MAX_INTEGER)]
 Count = Annotated[int, quantity("1", "count", ge=0, le=MAX_INTEGER)]
 Size = Annotated[int, quantity("B", "number of bytes", ge=0, le=MAX_INTEGER)]
 
+# `max_length` keeps out a line feed, which ``$`` would let pass behind 64 digits.
 Digest = Annotated[
     str,
     quantity("1", "SHA-256, 64 lower-case hexadecimal digits", max_length=64, pattern="^[0-9a-f]{64}$"),
@@ -141,6 +144,7 @@ class Input(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     lag: Annotated[int, quantity("frame", "0: of the same frame, 1: of the one before", ge=0, le=1)] = 0
     required: bool = True
     """Without a required input the service is not granted the frame (clause 10)."""
+    # A word of another minor version is accepted here; `PARTS` knows those of this one.
     parts: Annotated[tuple[Word, ...], few] = ()
     """Parts of the payload that the service needs beyond the mandatory fields (clause 5)."""
 
@@ -194,6 +198,7 @@ class GrantInput(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Frames between its frame and the granted one: 0 or 1 when fresh, as its lag says; more when held."""
     fidelity: Text = ""
     """Rung or quality, as its producer states it."""
+    # The producer's, passed on unchanged: a consumer compares it with the bytes that it got.
     digest: DigestOrNone = ""
     """Product digest (`caviar_protocol.digest.payload_digest`); empty when absent."""
     cause: Text = ""
@@ -306,6 +311,7 @@ def required_knowledge(value: msgspec.Struct) -> Iterator[tuple[str, Any, Versio
         [('polarization', 'VH', (1, 4))]
     """
     cls = type(value)
+    # What has its default is not on the wire, so that a reader of 1.0 never meets it.
     defaults = {field.name: field.default for field in msgspec.structs.fields(cls)}
     for name in value.__struct_fields__:
         key, got = f"{cls.__name__}.{name}", getattr(value, name)

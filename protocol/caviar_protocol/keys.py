@@ -124,6 +124,7 @@ class Pair(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_d
         public, secret = zmq.curve_keypair()
         return cls(public=public.decode(), secret=secret.decode())
 
+    # msgspec's own text has all fields.
     def __repr__(self) -> str:
         """Without the secret, which a traceback or a log might show."""
         return f"Pair(public={self.public!r}, secret=…)"
@@ -252,6 +253,7 @@ def read_authorized(directory: Path) -> tuple[Authorization, ...]:
     Raises:
         SetupError: The file breaks a rule, or has a name or a key twice.
     """
+    # A missing file is an empty one: a broker with keys lets no service in until one is authorized.
     path = directory / AUTHORIZED
     if not path.exists():
         return ()
@@ -316,6 +318,7 @@ def write_tokens(directory: Path, entries: Sequence[Token]) -> None:
     Raises:
         SetupError: The file cannot be written.
     """
+    # Digests alone: the file tells a reader no token.
     heading = "# Digests of the tokens that open runs over HTTP. caviar keys token writes it.\n"
     _replace(directory / TOKENS, heading, "token", entries)
 
@@ -373,6 +376,7 @@ def credentials(
         >>> credentials(environment={}) is None
         True
     """
+    # Arguments come before the environment, as with most commands.
     own = key or _path(environment.get(KEY_VARIABLE))
     broker = broker_key or _path(environment.get(BROKER_KEY_VARIABLE))
     if own is None and broker is None:

@@ -87,6 +87,7 @@ class Hello(_Message, frozen=True, kw_only=True, tag="HELLO"):
     max_in_flight: Annotated[
         int, quantity("1", "grants it can queue; more than 1 only under wait", ge=1, le=64)
     ] = 1
+    # A remote broker cannot watch a process by its id: it goes by heartbeats alone.
     host: Text = ""
     """Identifies kernel and process namespace, so that a broker on the same one can watch ``pid``."""
     pid: Count = 0
@@ -104,14 +105,17 @@ class Welcome(_Message, frozen=True, kw_only=True, tag="WELCOME"):
     attempt: Attempt
     capabilities: Annotated[tuple[Word, ...], few] = ()
     """Optional features of HELLO that the broker implements too; only these may be used."""
+    # From the broker and not from the client: one scenario sets both sides.
     heartbeat_ns: Period
     """Send a HEARTBEAT this often."""
     liveness_ns: Period
     """Silence after which a peer counts as gone."""
     seed: Seed = 0
     """Of the run."""
+    # Plain, since the broker does not know the settings of implementations.
     settings: dict[str, Any] = {}
     """Settings of this service from the scenario, as they stand there."""
+    # No file name: the service may be on another machine.
     scenario: dict[str, Any] = {}
     """What concerns every service: ``carriers``, ``devices``, ``episodes``, ``frames``,
     ``sampling_period_ns``; a recorder also gets its ``directory`` and, in ``resolved``, the whole
@@ -124,11 +128,6 @@ class Welcome(_Message, frozen=True, kw_only=True, tag="WELCOME"):
 class Refuse(_Message, frozen=True, kw_only=True, tag="REFUSE"):
     """Broker to service, answers HELLO or ATTACH: you cannot take part. The service exits with a status other
     than 0.
-
-    Example:
-        >>> from caviar_protocol.codec import decode_message, encode_message
-        >>> decode_message(encode_message(Refuse(code="late", message="the run is complete"))).code
-        'late'
     """
 
     code: Word
@@ -144,10 +143,12 @@ class Prepare(_Message, frozen=True, kw_only=True, tag="PREPARE"):
     attempt: Attempt
     demand: Annotated[tuple[Demand, ...], few] = ()
     """Outputs with a consumer, and the parts asked for. A service without any is not run (clause 5)."""
+    # Without `few`: a city has thousands of files, and none of them is a message part.
     assets: tuple[Asset, ...] = ()
     """All scenery of the run; empty for worlds, which announce it."""
     producers: dict[str, tuple[Name, ...]] = {}
     """Topic to the names of its sources in this run."""
+    # Consumers check the names of objects with them (`SceneRules.prefixes`).
     prefixes: dict[str, tuple[Text, ...]] = {}
     """World to the prefixes of its READY; empty for worlds."""
 
@@ -155,13 +156,6 @@ class Prepare(_Message, frozen=True, kw_only=True, tag="PREPARE"):
 class AssetOffer(_Message, frozen=True, kw_only=True, tag="ASSET_OFFER"):
     """World to broker, before READY: the scenery I bring. Answered by an ASSET_GET for each
     digest that the broker does not hold.
-
-    Example:
-        >>> import hashlib
-        >>> mesh = b"ply"
-        >>> wall = Asset(name="meshes/wall.ply", digest=hashlib.sha256(mesh).hexdigest(), size=len(mesh))
-        >>> AssetOffer(epoch=1, attempt=1, assets=(wall,)).assets[0].size
-        3
     """
 
     epoch: Epoch
@@ -185,13 +179,7 @@ class AssetGet(_Message, frozen=True, kw_only=True, tag="ASSET_GET"):
 
 
 class AssetData(_Message, frozen=True, kw_only=True, tag="ASSET_DATA"):
-    """Either way: bytes of an asset, in one further message part of at most `MAX_ASSET_CHUNK`.
-
-    Example:
-        >>> chunk = b"ply"  # the further part
-        >>> AssetData(digest="00" * 32, offset=0, size=len(chunk)).size
-        3
-    """
+    """Either way: bytes of an asset, in one further message part of at most `MAX_ASSET_CHUNK`."""
 
     digest: Digest
     """Of the whole asset."""
@@ -222,6 +210,7 @@ class Ready(_Message, frozen=True, kw_only=True, tag="READY"):
     """Worlds: prefixes of the names of their objects and fixed devices."""
     actuators: tuple[NamePattern, ...] = ()
     """Agents: the actuators they own, as patterns with ``*``: ``beam:car.*``, ``motion:uav``."""
+    # Free text: a reader that knows no warnings logs them, and loses nothing.
     notes: tuple[Text, ...] = ()
     """What a user should know: the library chosen, the GPU used. One that begins with ``warning:`` is shown
     as such; the others are logged."""
@@ -242,6 +231,7 @@ class Reset(_Message, frozen=True, kw_only=True, tag="RESET"):
     """Of the run, or what an agent reset to."""
     t0_ns: Nanoseconds
     """Time of frame 0."""
+    # Two runs with one seed draw alike, whatever number their episodes have in the run.
     seed_episode: EpisodeIndex = 0
     """Episodes since the first one with this seed: random numbers derive from both (clause 19)."""
 
@@ -273,6 +263,7 @@ class Grant(_Message, frozen=True, kw_only=True, tag="GRANT"):
     attempt: Attempt
     episode: EpisodeIndex
     frame: FrameIndex
+    # Frames may have been skipped: what a service computes from motion needs the time between.
     previous_frame: FrameOrNone = -1
     """What this service last completed; a world steps the whole gap."""
     t_ns: Nanoseconds
@@ -311,6 +302,7 @@ class Done(_Message, frozen=True, kw_only=True, tag="DONE"):
     """At most one a topic; a declared output that is not here is absent."""
     decisions: dict[str, str] = {}
     """Decisions taken that a replay has to impose (a rung chosen, say)."""
+    # In the message and in no product: a digest of wall times would differ in every run.
     measured: dict[str, Duration] = {}
     """How long a named phase took. Wall time stands here, never in a product (clause 6)."""
     counts: dict[str, Count] = {}
@@ -340,6 +332,7 @@ class Fault(_Message, frozen=True, kw_only=True, tag="FAULT"):
     """``prepare``, ``reset``, ``step``, ``encode``, …"""
     message: Text
     """One line for the user. ``KEY: …``, of a wrong key of the scenario, is shown with file and line."""
+    # Apart from the line for the user, to whom a traceback says nothing.
     detail: Text = ""
     """Traceback, for the log."""
     culprit: Text = ""
@@ -347,6 +340,7 @@ class Fault(_Message, frozen=True, kw_only=True, tag="FAULT"):
     it."""
 
 
+# Advisory: a service in the middle of a library call cannot stop, and its late answer is recorded.
 class Cancel(_Message, frozen=True, kw_only=True, tag="CANCEL"):
     """Broker to service, advisory: the run no longer waits for this frame. DONE or FAULT is still due."""
 
@@ -378,13 +372,7 @@ class Checkpoint(_Message, frozen=True, kw_only=True, tag="CHECKPOINT"):
 
 
 class CheckpointDone(_Message, frozen=True, kw_only=True, tag="CHECKPOINT_DONE"):
-    """Service to broker: my state after this frame, in one further part. Opaque to the broker.
-
-    Example:
-        >>> state = b"..."  # the further part
-        >>> CheckpointDone(epoch=1, attempt=1, episode=0, frame=19).frame
-        19
-    """
+    """Service to broker: my state after this frame, in one further part. Opaque to the broker."""
 
     epoch: Epoch
     attempt: Attempt
@@ -441,18 +429,13 @@ class Stale(_Message, frozen=True, kw_only=True, tag="STALE"):
     epoch: Epoch
     attempt: Attempt
     episode: EpisodeIndex
+    # Required: a client that lost count finds here where it has to be.
     frame: FrameOrNone
     """The frame that is outstanding."""
 
 
 class Error(_Message, frozen=True, kw_only=True, tag="ERROR"):
-    """Either way: I could not use what you sent. Never answered.
-
-    Example:
-        >>> answer = Error(code="unknown-asset", message="no asset has this digest", of="ASSET_GET")
-        >>> msgspec.to_builtins(answer)["code"]
-        'unknown-asset'
-    """
+    """Either way: I could not use what you sent. Never answered."""
 
     code: Word
     """``malformed``, ``limit``, ``version``, ``unexpected``, ``unknown-asset``, ``unknown-peer``."""
@@ -468,12 +451,7 @@ class Error(_Message, frozen=True, kw_only=True, tag="ERROR"):
 
 
 class Attach(_Message, frozen=True, kw_only=True, tag="ATTACH"):
-    """Service to broker, first message on the heartbeat connection (clause 2).
-
-    Example:
-        >>> msgspec.to_builtins(Attach(epoch=1, attempt=1, name="agent"))
-        {'type': 'ATTACH', 'epoch': 1, 'attempt': 1, 'name': 'agent'}
-    """
+    """Service to broker, first message on the heartbeat connection (clause 2)."""
 
     epoch: Epoch
     attempt: Attempt
@@ -492,6 +470,7 @@ class Heartbeat(_Message, frozen=True, kw_only=True, tag="HEARTBEAT"):
 
     sequence: Count
     """Counts heartbeats, from 0."""
+    # A counter and no flag: two heartbeats show that work advanced between them.
     progress: Count = 0
     """Grows whenever work advances."""
     phase: Text = ""

@@ -11,6 +11,7 @@ import inspect
 import re
 import sys
 import textwrap
+from collections.abc import Iterable, Sequence
 from enum import Enum
 from functools import cache
 from itertools import pairwise
@@ -31,6 +32,7 @@ _MARKER = re.compile(r"(<!-- (\w+)(?:: ([\w ]+))? -->\n).*?(<!-- end -->)", re.D
 
 def render(text: str, vectors: Path) -> str:
     """SPEC.md with every generated block made anew."""
+    # Blocks are found by their markers: text between them is written by hand and stays.
     makers = {"fields": _fields_block, "types": _types_block, "limits": _limits_block,
               "elements": _elements_block, "parts": _parts_block}  # fmt: skip
 
@@ -42,16 +44,12 @@ def render(text: str, vectors: Path) -> str:
     return _MARKER.sub(block, text)
 
 
-def documented(text: str) -> set[str]:
-    """Names of the classes that have a table in ``text``."""
-    return {match[3] for match in _MARKER.finditer(text) if match[2] == "fields"}
-
-
 # --- tables -----------------------------------------------------------------------------------------
 
 
 def rows(cls: type[msgspec.Struct]) -> list[tuple[str, str, str, str, str, str]]:
     """(field, type, unit, default, since, meaning) of every field of a class, in wire order."""
+    # `msgspec.structs.fields` gives types without annotations, in which units and meanings stand.
     hints, docs = get_type_hints(cls, include_extras=True), _attribute_docs(cls)
     found = []
     tag = cls.__struct_config__
@@ -111,6 +109,7 @@ def type_text(hint: Any) -> str:
 
 def _annotated_text(hint: Any) -> str:
     base, *metas = get_args(hint)
+    # By identity: two types may have equal bounds and mean different things.
     for meta in metas:
         if id(meta) in _aliases():
             name = _aliases()[id(meta)]
@@ -126,6 +125,7 @@ def _annotated_text(hint: Any) -> str:
 def _bounds_text(metas: list[Any]) -> list[str]:
     found = []
     for meta in metas:
+        # Bounds of 64 bits hold for every integer, and SPEC.md says so once.
         if meta.ge is not None and meta.ge != -fields.MAX_INTEGER:
             found.append(f"≥ {meta.ge}")
         if meta.gt is not None:
@@ -160,6 +160,7 @@ def _description(hint: Any) -> str:
 def _default_text(field: msgspec.structs.FieldInfo) -> str:
     if field.required:
         return "required"
+    # Empty maps and lists have a factory, since they could be changed.
     value = field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
     if value is None:
         return "left out"
@@ -174,8 +175,8 @@ def _default_text(field: msgspec.structs.FieldInfo) -> str:
 
 def _fields_block(name: str) -> str:
     cls = classes()[name]
-    table = _table(("field", "type", "unit", "default", "since", "meaning"), rows(cls))
-    return f"{_markdown(prose(cls))}\n\n{table}"
+    fields_table = table(("field", "type", "unit", "default", "since", "meaning"), rows(cls))
+    return f"{markdown(prose(cls))}\n\n{fields_table}"
 
 
 def prose(cls: type) -> str:
@@ -198,7 +199,7 @@ def _types_block(_: str) -> str:
                 extra = docs.get(name, "")
                 meaning = meta.description + (f". {extra}" if extra else "")
                 found.append((name, kind, unit_of(hint), meaning))
-    return _table(("type", "is", "unit", "meaning"), found)
+    return table(("type", "is", "unit", "meaning"), found)
 
 
 def _shared_bounds(meta: msgspec.Meta) -> list[str]:
@@ -212,12 +213,12 @@ def _limits_block(_: str) -> str:
     # A bound of every integer field, which stands in the sentence on integers.
     del limits["MAX_INTEGER"]
     found = [(name, f"{getattr(fields, name):,}", text) for name, text in limits.items()]
-    return _table(("limit", "value", "of what"), found)
+    return table(("limit", "value", "of what"), found)
 
 
 def _elements_block(_: str) -> str:
     found = [(f"`{code}`", dtype.name, str(dtype.itemsize)) for code, dtype in WIRE_DTYPES.items()]
-    return _table(("dtype", "element", "bytes"), found)
+    return table(("dtype", "element", "bytes"), found)
 
 
 def _parts_block(_: str) -> str:
@@ -226,7 +227,7 @@ def _parts_block(_: str) -> str:
         for topic, parts in PARTS.items()
         for part in parts
     ]
-    return _table(("topic", "part", "since"), found)
+    return table(("topic", "part", "since"), found)
 
 
 def _bytes_block(name: str, vectors: Path) -> str:
@@ -248,17 +249,33 @@ def _hex(data: bytes) -> list[str]:
     return found
 
 
-def _table(head: tuple[str, ...], body: list[Any]) -> str:
-    lines = [head, tuple("---" for _ in head), *body]
+def table(head: Sequence[str], body: Iterable[Sequence[str]]) -> str:
+    """A table in Markdown; cells may have the markup of docstrings.
+
+    Args:
+        head: Titles of the columns.
+        body: Cells of each row.
+
+    Example:
+        >>> print(table(("key", "unit"), [("``frames``", "frame")]))
+        | key | unit |
+        | --- | --- |
+        | `frames` | frame |
+    """
+    lines = [head, ["---"] * len(head), *body]
     return "\n".join("| " + " | ".join(_cell(cell) for cell in line) + " |" for line in lines)
 
 
 def _cell(text: str) -> str:
-    return _markdown(" ".join(text.split())).replace("|", "\\|")
+    return markdown(" ".join(text.split())).replace("|", "\\|")
 
 
-def _markdown(text: str) -> str:
-    """Docstring markup as Markdown."""
+def markdown(text: str) -> str:
+    """Docstring markup as Markdown.
+
+    Args:
+        text: Of a docstring.
+    """
     return re.sub(r"``([^`]+)``", r"`\1`", text)
 
 
@@ -276,14 +293,19 @@ def classes() -> dict[str, type[msgspec.Struct]]:
         if cls.__name__ not in found:
             found[cls.__name__] = cls
             for field in msgspec.structs.fields(cls):
-                queue += _structs_in(field.type)
+                queue += structs_in(field.type)
     return found
 
 
-def _structs_in(hint: Any) -> list[type[msgspec.Struct]]:
+def structs_in(hint: Any) -> list[type[msgspec.Struct]]:
+    """Structs that a type hint names.
+
+    Args:
+        hint: Of a field.
+    """
     if isinstance(hint, type) and issubclass(hint, msgspec.Struct):
         return [hint]
-    return [cls for argument in get_args(hint) for cls in _structs_in(argument)]
+    return [cls for argument in get_args(hint) for cls in structs_in(argument)]
 
 
 @cache
@@ -304,6 +326,7 @@ def _attribute_docs(cls: type) -> dict[str, str]:
     # A class may say more about a field than its base; the last one wins.
     for base in reversed(cls.__mro__):
         if base.__module__.startswith("caviar_"):
+            # Python keeps no docstrings of attributes; the source has them.
             node = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0]
             if isinstance(node, ast.ClassDef):
                 found |= _docs_in(node.body)

@@ -48,7 +48,7 @@ def test_a_changed_block_is_noticed_and_mended(tmp_path: Path) -> None:
 
 
 def test_every_class_on_the_wire_has_a_table() -> None:
-    assert spec.documented(TEXT) == set(CLASSES)
+    assert set(re.findall(r"<!-- fields: (\w+) -->", TEXT)) == set(CLASSES)
 
 
 @pytest.mark.parametrize("cls", CLASSES.values(), ids=CLASSES)

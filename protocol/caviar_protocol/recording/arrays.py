@@ -285,12 +285,6 @@ class TopicArrays(Generic[P, K]):
 
         Raises:
             RecordingError: An episode or a frame was not recorded; the text says what was.
-
-        Example:
-            >>> from caviar_protocol.recording import Recording
-            >>> recording = Recording("runs/smoke-20261122-101500")
-            >>> recording["scene"].select(episode=0, frames=[0, 50]).position.shape
-            (2, 2, 3)
         """
         chosen = np.ones(len(self), dtype=bool)
         if episode is not None:
@@ -401,19 +395,11 @@ class TopicArrays(Generic[P, K]):
     # --- what a topic defines -------------------------------------------------------------------
 
     def keys_of(self, payload: P) -> Sequence[K]:
-        """Key of each row of one product.
-
-        Args:
-            payload: A product of the topic.
-        """
+        """Key of each row of one product."""
         raise NotImplementedError
 
     def sorted_keys(self, keys: Iterable[K]) -> Iterable[K]:
-        """All keys in the order of the second axis.
-
-        Args:
-            keys: Each once, in the order in which they occurred.
-        """
+        """All keys in the order of the second axis; ``keys`` come in the order in which they occurred."""
         raise NotImplementedError
 
     # --- reading --------------------------------------------------------------------------------

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import msgspec
 
-from caviar_protocol.digest import RunDigest
+from caviar_protocol.digest import RunDigest, file_digest
 from caviar_protocol.errors import RecordingError
-from caviar_protocol.files import SEGMENT_PATTERN, RunDirectory, open_regular
+from caviar_protocol.files import SEGMENT_PATTERN, RunDirectory
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import (
     FORMAT,
@@ -347,8 +347,7 @@ def damaged_assets(recorded: RecordedSegments) -> list[str]:
     for asset in metadata_of(recorded.segments[0]).assets:
         file = RunDirectory(recorded.path).assets / asset.name
         try:
-            with open_regular(file) as stream:
-                digest = hashlib.file_digest(stream, "sha256").hexdigest()
+            digest = file_digest(file)
         except OSError as error:
             found.append(f"{file} cannot be read: {error.strerror}")
             continue

@@ -136,6 +136,7 @@ def parse_scenario(text: str, file: str = "", folder: Path | None = None) -> Sce
     source = Source(file=file, lines=lines)
     if isinstance(table.get("run"), dict):
         table["run"] = with_instants(table["run"], Place("run", source), folder or Path())
+    # Types first: rules between keys may rely on them.
     scenario = convert_table(Scenario, table, Place("", source))
     scenario = msgspec.structs.replace(scenario, source=_with_device_names(source, scenario))
     check_scenario(scenario)
@@ -151,6 +152,7 @@ def _with_device_names(source: Source, scenario: Scenario) -> Source:
     """
     root = Place("devices")
     named: dict[str, int] = {}
+    # The first of two devices of one name has the line; the second is an error of its own.
     for index, device in enumerate(scenario.devices):
         place, by_name = root.at(index).key, root.at(device.name).key
         for key, line in source.lines.items():
@@ -193,6 +195,7 @@ def _beside(path: Path) -> str:
 def _with_numerologies(scenario: Scenario) -> Scenario:
     """The scenario with all that follows from the keys of its carriers written out."""
     run, place = scenario.run, Place("carriers", scenario.source)
+    # Given instants have no period, so that slots need a duration of their own.
     period = None if run.instants_s else run.sampling_period_ns
     carriers = tuple(
         with_numerology(carrier, period, place.at(index)) for index, carrier in enumerate(scenario.carriers)

@@ -104,6 +104,7 @@ def located(text: str, service: str, source: Source) -> str:
         >>> located("settings.samples: is 0, write a whole number ≥ 1", "channel", source)
         'my.toml:20: services.channel.settings.samples: is 0, write a whole number ≥ 1'
     """
+    # A service knows its own keys only; the file is on the machine of the broker.
     key, separator, message = text.partition(": ")
     if not separator or _KEY.fullmatch(key) is None:
         return text
@@ -236,6 +237,7 @@ def _check_union(value: object, choices: tuple[inspect.Type, ...], place: Place)
     if len(structs) == 1:
         _check_struct(value, structs[0], place)
         return
+    # By tag and not by trial: the errors are those of the type that was meant.
     tag_field = structs[0].tag_field or "type"
     by_tag = {str(choice.tag): choice for choice in structs}
     tag = value.get(tag_field)

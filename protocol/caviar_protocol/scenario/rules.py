@@ -14,7 +14,9 @@ from caviar_protocol.scenario.schema import DeviceSpec, Scenario, ServiceSpec
 from caviar_protocol.topics import PARTS, PAYLOADS
 from caviar_protocol.topics.channel import Carrier
 
+# Without a scene there is nothing to compute, without a recorder nothing is kept.
 _STRICT_ROLES = ("world", "recorder")
+# Half of what 64 bits hold: sums of two instants stay within them.
 LONGEST_NS = 2**62
 """[ns] Longest episode: an instant is a 64-bit integer."""
 BEAM = "beam:"
@@ -171,6 +173,7 @@ def with_overrides(
         >>> with_overrides(load_scenario("smoke"), frames=3).run.frames
         3
     """
+    # Converted as if they stood in the file: the same ranges, and errors with the same words.
     given = {"frames": frames, "seed": seed, "pace": None if pace is None else _number_or_word(pace)}
     changes = {name: value for name, value in given.items() if value is not None}
     if not changes:
@@ -204,6 +207,7 @@ def resolved(scenario: Scenario, settings: Mapping[str, msgspec.Struct] | None =
         30.0
     """
     table = plain(scenario)
+    # Of the file and not of the run: two copies of a scenario are one scenario.
     del table["source"]
     for name, value in (settings or {}).items():
         table["services"][name]["settings"] = plain(value)
@@ -284,6 +288,7 @@ def _prefix(name: str, world: ServiceSpec) -> str:
 
 
 def _unique(names: Iterable[str], what: str, place: Place) -> None:
+    # By name the place of the first one, which the error about a second one names.
     first: dict[str, int] = {}
     for index, name in enumerate(names):
         here = place.at(index).at("name")
@@ -333,6 +338,7 @@ def _check_limits(scenario: Scenario, place: Place) -> None:
                 f"is {value}, and each of the {len(scenario.services)} services has one and another "
                 f"for its heartbeats, perhaps at the same time; write at least {needed}"
             )
+    # A service whose heartbeats alone exceed its rate would be cut off in every run.
     if limits.messages_per_s < 1.0 / heartbeat_s:
         raise place.at("messages_per_s").error(
             f"is {limits.messages_per_s:g}, and a heartbeat each {heartbeat_s:g} s (timeouts.heartbeat_s) is "
@@ -381,6 +387,7 @@ def _check_service(name: str, service: ServiceSpec, place: Place) -> None:
 
 
 def _check_device(device: DeviceSpec, place: Place) -> None:
+    # Which values are defaults: a key that is not in the file has its own.
     blank = DeviceSpec(name=device.name, kind=device.kind)
     for kind, keys in _KIND_KEYS.items():
         for key in keys:
@@ -424,6 +431,7 @@ def _check_users(scenario: Scenario, place: Place) -> None:
     # A remote world may bring devices that the scenario does not list.
     if any(service.role == "world" and service.remote for service in scenario.services.values()):
         return
+    # Mounted devices have the pattern of their object in place of its name.
     there = [
         f"{device.on}/{device.name}" if device.on else device.name
         for device in scenario.devices
@@ -441,6 +449,7 @@ def _check_users(scenario: Scenario, place: Place) -> None:
 def _check_ascending(
     pair: tuple[float, float], place: Place, least: float, most: float = float("inf")
 ) -> None:
+    # Written so that a NaN fails: every comparison with it is false.
     low, high = pair
     if not least <= low < high <= most:
         upper = "" if most == float("inf") else f" and at most {most}"

@@ -36,6 +36,7 @@ class _Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Base of all tables of a scenario: unknown keys are refused."""
 
 
+# 1e17 ns, of which 90 add up within 64 bits.
 LONGEST_S = 1e8
 """[s] Longest wait and budget that a scenario may ask for, three years: nanoseconds are 64-bit numbers."""
 
@@ -49,6 +50,7 @@ class Timeouts(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     reset_s: Annotated[float, quantity("s", "wait for RESET_DONE", gt=0, le=LONGEST_S)] = 60.0
     stall_s: Annotated[float, quantity("s", "wait without progress", gt=0, le=LONGEST_S)] = 30.0
     """For a service of policy ``wait`` that neither answers nor reports progress."""
+    # None and not a number: the default depends on whether the user starts the service.
     rejoin_s: (
         Annotated[
             float,
@@ -107,6 +109,7 @@ class Run(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     follow from it. ``instants_ns`` and ``file:PATH.csv`` are read into it."""
     episodes: Annotated[int, quantity("1", "episodes of the run", ge=1)] = 1
     seed: Annotated[int, quantity("1", "seed of everything random", ge=0, le=2**63 - 1)] = 1
+    # `fast` stays: scenarios of earlier versions have it.
     pace: Literal["free", "realtime", "fast"] | Annotated[float, quantity("1", "", ge=1e-6, le=1e6)] = "free"
     """When frames are released: ``free`` (``fast`` is its older name) as soon as they can be, ``realtime``
     as simulated time passes, a number that many times as fast. Never is a frame skipped (clause 8)."""
@@ -136,6 +139,7 @@ class DeviceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
     """Name of the device, behind that of the object it is mounted on."""
+    # One struct for all kinds: TOML has no types, and an error can name the kind that a key belongs to.
     kind: Literal["antenna", "lidar", "camera"]
     """What the device is; keys of the other kinds are refused."""
     on: str = ""
@@ -180,6 +184,7 @@ class ServiceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """What the service does in the run."""
     use: str
     """Registered implementation of the role, or ``module:Class``; ``remote``: the user starts the service."""
+    # Without a default: how long a part may take is a decision of each scenario.
     budget_ms: Annotated[
         float, quantity("ms", "wall time for a frame; misses are counted", gt=0, le=1e3 * LONGEST_S)
     ]
@@ -192,6 +197,7 @@ class ServiceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     users: tuple[str, ...] = ()
     """Agents: the receivers (or actuators) this agent owns, as patterns; empty: a default agent,
     which serves the receivers without another agent (clause 17)."""
+    # Plain: only the process of the implementation imports the class that checks them.
     settings: dict[str, Any] = {}
     """Settings of the implementation, which its ``Settings`` class defines."""
 

@@ -35,6 +35,7 @@ def parse_toml(text: str) -> dict[str, Any]:
         tomllib.TOMLDecodeError: It is no TOML, larger than `MAX_SIZE`, deeper than `MAX_DEPTH`, or has a
             number of a thousand digits. The text ends with the line where one is known.
     """
+    # First, since all that follows takes time in proportion to it.
     if len(text) > MAX_SIZE:
         raise tomllib.TOMLDecodeError(f"{len(text)} characters, of which a file may have {MAX_SIZE}")
     # Strings keep their lines, so that places stay right.

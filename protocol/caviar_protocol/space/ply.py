@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_protocol.errors import AssetError
 
+# Names of PLY 1.0, and those with sizes that later tools write.
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
     "ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
@@ -105,6 +106,7 @@ def _parse(data: bytes) -> tuple[Float64Array, Int64Array]:
 
 def _header(data: bytes) -> tuple[str, list[_Element], int]:
     """Byte order, elements, and where the data begin."""
+    # Before the lines are split: binary data behind the header may hold line feeds.
     end = data.index(b"end_header")
     order, elements = None, list[_Element]()
     for words in (line.split() for line in data[:end].decode("latin-1").splitlines()):
@@ -208,6 +210,7 @@ def _triangle_row(
     """A row with one list, if that has three items; None where there are several lists."""
     if sum(length is not None for _, length, _ in properties) != 1:
         return None
+    # As one structured row the whole element is read by one call of NumPy.
     row: list[Any] = []
     for name, length, item in properties:
         row += [(f"number {name}", item)] if length is None else [("length", length), ("corners", item, 3)]
@@ -216,5 +219,6 @@ def _triangle_row(
 
 def _fans(polygons: list[list[int]]) -> Int64Array:
     """Triangles around the first corner of each polygon."""
+    # Right for convex polygons, which are what tools export.
     corners = [(p[0], *p[i : i + 2]) for p in polygons for i in range(1, len(p) - 1)]
     return np.array(corners, dtype=np.int64).reshape(-1, 3)

@@ -25,6 +25,7 @@ class BeamChoice(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, 
     """Receiving device."""
     tx_beam: Annotated[int, quantity("1", "index into the transmitter's codebook", ge=0)]
     rx_beam: Annotated[int, quantity("1", "index into the receiver's codebook", ge=0)] = 0
+    # By name and not by index: an agent need not know the channel's order of carriers.
     carrier: str = ""
     """Name of the carrier; empty: every carrier."""
 
@@ -42,6 +43,7 @@ class WaypointCommand(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=T
     position: Vector3
     """Where to."""
     speed: Annotated[float, quantity("m/s", "at most", gt=0)]
+    # A world of an earlier version ignores the field and flies there: later, and without harm.
     at_once: bool = False
     """Be there in the next frame, at rest, without the way between: to begin an episode elsewhere."""
 
@@ -59,6 +61,7 @@ class VelocityCommand(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=T
     velocity: Annotated[tuple[float, float, float], quantity("m/s", "in world axes")]
 
 
+# Agents choose beams of all users; which of them is served is a decision of its own.
 class UserSchedule(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, tag="schedule"):
     """Let a transmitter serve one receiver in this frame. The actuator is ``schedule:<tx>``.
 
@@ -89,6 +92,7 @@ class Action(Payload, frozen=True, kw_only=True, omit_defaults=True):
         True
     """
 
+    # In one order, so that equal decisions are equal bytes.
     commands: tuple[Command, ...]
     """Each with its ``type``."""
 
@@ -142,6 +146,7 @@ class Link(Payload, frozen=True, kw_only=True, omit_defaults=True):
     tx_beam: Annotated[Int32Array, array("<i4", "U", unit="1", doc="chosen TX beam; −1: none chosen")]
     rx_beam: Annotated[Int32Array, array("<i4", "U", unit="1", doc="chosen RX beam; −1: none chosen")]
     abs_y: Annotated[Float64Array, array("<f8", "U", unit="1", doc="|y| of the chosen pair")]
+    # Indices of both ends apart: one number for a pair would need the size of a codebook to be read.
     top_tx_beam: Annotated[
         Int32Array, array("<i4", "U", "K", unit="1", doc="TX beams of the best K pairs, best first")
     ]

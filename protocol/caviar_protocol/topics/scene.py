@@ -50,6 +50,7 @@ class AntennaArray(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
     columns: Annotated[int, quantity("1", "elements along y", ge=1, le=1024)] = 1
     vertical_spacing: Annotated[float, quantity("wavelengths", "between rows", gt=0)] = 0.5
     horizontal_spacing: Annotated[float, quantity("wavelengths", "between columns", gt=0)] = 0.5
+    # Names of Sionna RT, so that a pattern is looked up and not translated.
     pattern: Literal["iso", "dipole", "hw_dipole", "tr38901"] = "iso"
     """Of each element: isotropic, short dipole, half-wave dipole, 3GPP TR 38.901."""
     polarization: Literal["V", "H", "-45", "+45", "RHCP", "LHCP", "VH", "cross", "circular"] = "V"
@@ -78,6 +79,7 @@ class AntennaArray(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
         return self.rows * self.columns * len(self.polarizations) * max(1, len(self.panels))
 
 
+# A private base: devices are distinguished by their tag on the wire, never by inheritance.
 class _Device(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """What all devices share.
 
@@ -182,8 +184,10 @@ class Scene(Payload, frozen=True, kw_only=True, omit_defaults=True, dict=True):
     dimensions: Annotated[
         Float64Array, array("<f8", "N", 3, unit="m", doc="length (x), width (y), height (z)")
     ]
+    # In every scene and not once a run: vehicles bring and take devices while it lasts.
     devices: tuple[Device, ...] = ()
     """Devices that exist in this frame. A device whose parent left is not listed."""
+    # Optional: it came with 1.4, and worlds of earlier versions do not send it.
     angular_velocity: (
         Annotated[
             Float64Array,

@@ -9,7 +9,6 @@ and ``abort`` are allowed (clause 9).
 from __future__ import annotations
 
 import errno
-import hashlib
 import os
 import platform
 import re
@@ -21,6 +20,7 @@ from typing import ClassVar, Generic, TypeVar
 
 import msgspec
 
+from caviar_protocol.digest import file_digest
 from caviar_protocol.errors import AssetError, RunError
 from caviar_protocol.files import sync_file
 from caviar_protocol.messages import Asset, GrantInput, Input, Role, Status
@@ -249,9 +249,7 @@ def copy_assets(assets: Mapping[str, Path], folder: Path, *, sync: bool = False)
         target = folder / relative
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(source, target)
-        with target.open("rb") as stream:
-            digest = hashlib.file_digest(stream, "sha256").hexdigest()
-        copied.append(Asset(name=name, digest=digest, size=target.stat().st_size))
+        copied.append(Asset(name=name, digest=file_digest(target), size=target.stat().st_size))
     if sync and copied:
         files = [folder / asset.name for asset in copied]
         # Directories too: a file whose name is not on disk is lost with the power, whatever else was synced.
