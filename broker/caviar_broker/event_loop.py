@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 import zmq
+from zmq.backend import zmq_poll
 
 PRIORITY = 1
 """The least of the real-time class: before whatever computes, behind every other real-time task."""
@@ -75,7 +76,6 @@ Source = int | zmq.Socket[Any]
 
 COARSE_NS = 1_000_000
 """[ns] The poller counts whole milliseconds, and may take one more than it was given."""
-_EVENTS = int(zmq.EVENTS)
 _POLLIN = int(zmq.POLLIN)
 SELECTABLE = 1024
 """Descriptors from here on are nothing for ``select``."""
@@ -91,6 +91,8 @@ class EventLoop:
     def __init__(self) -> None:
         self._poller = zmq.Poller()
         self._sockets: dict[int, zmq.Socket[Any]] = {}
+        # The same as `zmq_poll` takes them.
+        self._polled: list[tuple[zmq.Socket[Any], int]] = []
         self._callbacks: dict[Source, Callable[[], None]] = {}
         self._prompt: set[int] = set()
         self._polls = 0
@@ -117,6 +119,7 @@ class EventLoop:
             if isinstance(source, zmq.Socket) and events == zmq.POLLIN:
                 fd = int(source.getsockopt(zmq.FD))
                 self._sockets |= {fd: source} if fd < SELECTABLE else {}
+                self._polled = [(s, _POLLIN) for s in self._sockets.values()]
             elif prompt and isinstance(source, int) and source < SELECTABLE:
                 self._prompt.add(source)
 
@@ -125,6 +128,7 @@ class EventLoop:
         if self._callbacks.pop(source, None) is not None:
             self._poller.unregister(source)
             self._sockets = {fd: socket for fd, socket in self._sockets.items() if socket is not source}
+            self._polled = [(s, _POLLIN) for s in self._sockets.values()]
             self._prompt -= {fd for fd in self._prompt if fd == source}
 
     def poll(self, wait_ns: int = 0) -> list[Source]:
@@ -138,8 +142,9 @@ class EventLoop:
     def poll_sockets(self, until: int) -> list[Source]:
         """Which sockets and prompt descriptors can be read, until that instant [ns] at the latest."""
         while True:
-            # Asked before it is waited for: only then does a socket's descriptor tell of what comes.
-            ready: list[Source] = [s for s in self._sockets.values() if int(s.getsockopt(_EVENTS)) & _POLLIN]
+            # Asked before it is waited for: only then does a socket's descriptor tell of what comes. One call
+            # for all of them: asking each for its EVENTS takes 4 µs a socket.
+            ready: list[Source] = [s for s, _ in zmq_poll(self._polled, 0)]
             rest = until - time.monotonic_ns()
             if ready or rest <= 0:
                 return ready

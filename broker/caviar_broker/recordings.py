@@ -1,4 +1,8 @@
-"""What the recording of a run tells a broker: how far it goes, whose it is, what a replay repeats."""
+"""What the recording of a run tells a broker: how far it goes, whose it is, what a replay repeats.
+
+Readers of recordings are imported by the functions that read: a broker that begins a run reads none, and they
+take an eighth of its start.
+"""
 
 from __future__ import annotations
 
@@ -6,17 +10,17 @@ from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from caviar_broker.core.plan import RunPlan
 from caviar_broker.journal_format import run_of_journal
 from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.files import PUT_BACK, RunDirectory, refuse_other_kinds, sync_file
 from caviar_protocol.messages import GrantInput, Status
-from caviar_protocol.recording import Recording, read_manifest
-from caviar_protocol.recording.integrity import metadata_of, recorded_until
-from caviar_protocol.recording.reader import recorded_decisions
-from caviar_protocol.recording.segment import Segment
 from caviar_protocol.scenario import ReplaySpec, Scenario
+
+if TYPE_CHECKING:
+    from caviar_protocol.recording import Recording
 
 
 def has_recording(directory: Path) -> bool:
@@ -37,6 +41,8 @@ def recorded_frames(directory: Path, scenario: Scenario) -> tuple[tuple[int, int
     # A recording on another machine cannot be looked at: its recorder says what it lacks when it is granted.
     if not any(not spec.remote for spec in recorders):
         return None, ()
+    from caviar_protocol.recording.integrity import recorded_until
+
     last, damage = recorded_until(directory)
     return ((0, 0) if last is None else (last[0], last[1] + 1)), damage
 
@@ -67,6 +73,10 @@ def check_run_files(directory: Path, journal: Path, run: str) -> None:
         RunError: A file is another run's, or no regular file.
         RecordingError: The journal is none. What is damaged is not looked at here.
     """
+    from caviar_protocol.recording import read_manifest
+    from caviar_protocol.recording.integrity import metadata_of
+    from caviar_protocol.recording.segment import Segment
+
     files = RunDirectory(directory)
     segments = files.segments()
     for path in (journal, files.manifest, *segments):
@@ -100,6 +110,9 @@ def with_replay(plan: RunPlan, spec: ReplaySpec | None) -> RunPlan:
     """
     if spec is None:
         return plan
+    from caviar_protocol.recording import Recording
+    from caviar_protocol.recording.reader import recorded_decisions
+
     recording = Recording(spec.recording)
     decisions = recorded_decisions(recording)
     return replace(

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import zmq
+from zmq.backend import zmq_poll
 
 from caviar_broker.security.access import Access, check_bind
 from caviar_broker.security.limits import FRAMING, PeerGuard, PeerLimits
@@ -99,6 +100,7 @@ class Router:
         self.socket.rcvtimeo = WAIT_MS
         # A level below a wrapper in Python, which only sees to options that no ROUTER has.
         self._send = super(zmq.Socket, self.socket).send
+        self._polled = [(self.socket, _POLLIN)]
         self.guard = PeerGuard(self._context, self.socket, access, peer_limits)
         """Watches over the peers."""
         self.socket.setsockopt(zmq.MAXMSGSIZE, self.guard.limits.part + FRAMING)
@@ -129,7 +131,9 @@ class Router:
     @property
     def readable(self) -> bool:
         """Whether a message is here; cheaper than `receive` where there is none."""
-        return bool(int(self.socket.getsockopt(zmq.EVENTS)) & _POLLIN)
+        # 2.8 µs. Asking for EVENTS takes 4.4 µs, since pyzmq makes an enumeration of each option's number; an
+        # exception of `receive` takes 7.6 µs.
+        return bool(zmq_poll(self._polled, 0))
 
     def receive(self, wait: bool = False) -> tuple[bytes, list[zmq.Frame]] | None:
         """Routing id and parts of the next message; None where there is none now, or one to be dropped.

@@ -46,6 +46,9 @@ DISK_NOTE_S = 2.0
 """[s] that the disk may take for an entry of the journal before a notice says so."""
 MESSAGES_A_TURN = 64
 """Messages taken before the clock is looked at again."""
+PROMPT_BYTES = 1 << 16
+"""[B] of products in journal entries that are written while services are at work: 10 MB take milliseconds,
+which the next frame would wait for."""
 # Actions that no service waits for: carried out once the services have their grants.
 _CAN_WAIT = frozenset({ev.Notice, ev.Latency, ev.FrameFinished})
 
@@ -107,6 +110,8 @@ class BrokerServer:
             reply=self._reply,
             note=self.note,
         )
+        # Services that were sent a grant, and have answered none since.
+        self._owing: set[str] = set()
         # Whether the clock took answers that it has not acted upon yet.
         self._has_answers = False
         # Frames of the episode that were finished when it last acted.
@@ -115,8 +120,8 @@ class BrokerServer:
         self._entries: list[ev.Journal] = []
         # Notices, latencies and finished frames, in order: no service waits for these.
         self._later: list[ev.Action] = []
-        # Whether a service was sent something in this turn.
-        self._has_sent = False
+        # [B] of the products in them.
+        self._entered_bytes = 0
         self._next_check = self._look_at = 0
         self._budgets_are_long = not plan.realtime and all(s.budget_ns >= LONG_NS for s in plan.services)
         self._unhurried = False
@@ -228,10 +233,13 @@ class BrokerServer:
         self._flush()
 
     def _flush(self) -> None:
-        """Flush journal entries that block a grant, then run deferred actions."""
-        if self._has_sent or self.clock.waits_for_journal or self.clock.over:
+        """Write journal entries that must not wait, then run deferred actions.
+
+        The others are written with the last one of their frame, or when deadlines are looked at: one write
+        for all of them saves a call of the system, and two turns through the clock, for each service.
+        """
+        if self._entered_bytes >= PROMPT_BYTES or self.clock.waits_for_journal or self.clock.over:
             self._write_journal()
-            self._has_sent = False
         while self._later:
             later, self._later = self._later, []
             for action in later:
@@ -262,7 +270,10 @@ class BrokerServer:
             received = self._router.receive(wait)
             if received is not None:
                 self._handle(*received)
-            if not self._router.readable:
+            elif wait:
+                break
+            # Where no service owes an answer, there is none to be taken together with this one.
+            if not self._owing or not self._router.readable:
                 break
             wait = False
         if self._has_answers:  # what services answer together is acted upon once
@@ -301,6 +312,7 @@ class BrokerServer:
         payloads = tuple(zip(parts[::2], parts[1::2], strict=True))
         self.clock.handle(ev.DoneReceived(service, message, payloads), time.monotonic_ns())
         self._has_answers = True
+        self._owing.discard(service)
 
     def _error(self, service: str, message: m.Error, _: Sequence[zmq.Frame]) -> None:
         if self._assets.handle_error(service, message):
@@ -318,6 +330,8 @@ class BrokerServer:
                     self._send(action)
                 elif type(action) is ev.Journal:
                     self._entries.append(action)
+                    for product in action.products:
+                        self._entered_bytes += _payload_size(product.payload)
                 elif type(action) in _CAN_WAIT:
                     self._later.append(action)
                 else:
@@ -326,8 +340,8 @@ class BrokerServer:
     def _write_journal(self) -> None:
         """Clause 18: nothing that relies on an entry is granted before the system has it.
 
-        Written once a grant waits for it, while services are at work, and whenever deadlines are looked
-        at; so services that answer one after the other cost one write.
+        Written once a grant waits for it, behind the last answer of a frame, and whenever deadlines are
+        looked at; so services that answer one after the other cost one write.
         """
         while self._entries and not self._standby.calling:
             self._hand_over_entries()
@@ -341,7 +355,7 @@ class BrokerServer:
     def _hand_over_entries(self) -> None:
         if not self._entries or self._standby.calling:
             return
-        entries, self._entries = self._entries, []
+        entries, self._entries, self._entered_bytes = self._entries, [], 0
         finished = self.clock.episode, self.clock.finished_frames - 1
         snapshot = self.clock.snapshot() if self._journal.wants_snapshot else None
         self._standby.call(lambda: self._journal.write(entries, finished, snapshot))
@@ -376,8 +390,9 @@ class BrokerServer:
             parts += product.payload
         if action.attachment is not None:
             parts.append(action.attachment)
-        self._has_sent = True
         route, message = self._routes[action.service], action.message
+        if type(message) is m.Grant:
+            self._owing.add(action.service)
         complains = isinstance(message, COMPLAINTS)
         reason = self._router.send(route, encode_message(message), parts, not complains)
         # A complaint that does not go is no verdict: who floods gets one for each message, and reads none.

@@ -161,10 +161,16 @@ class Connection:
 
     def _next(self) -> tuple[m.Message, Sequence[zmq.Frame]] | None:
         """What comes within `POLL_MS`, unless it is nothing, or nonsense, which is answered."""
+        receive = self._socket.recv
         try:
-            parts = self._socket.recv_multipart(copy=False)
+            part = receive(0, False)
         except zmq.Again:
             return None
+        # Not `recv_multipart`: it asks the socket, by an option of its, what each frame knows already.
+        parts = [part]
+        while part.more:
+            part = receive(0, False)
+            parts.append(part)
         try:
             message = decode_message(parts[0].buffer)
             check_parts(message, parts)
@@ -174,6 +180,8 @@ class Connection:
             _log.warning("the broker sent what is no message: %s", error)
             self.send(m.Error(code=error.code, message=str(error)))
             return None
+        if type(message) is m.Grant:
+            return message, parts[1:]
         if isinstance(message, m.Shutdown):
             raise RunOver(message.reason)
         if isinstance(message, m.Error | m.Stale):

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import fcntl
 import json
 import os
@@ -193,11 +192,16 @@ def ask(directory: Path, **request: Any) -> dict[str, Any]:
 
 async def ask_in_thread(directory: Path, **request: Any) -> dict[str, Any]:
     """Do the same as `ask` for a caller in an event loop, which goes on meanwhile."""
+    # Here and below: a broker without HTTP does not load asyncio, which takes 25 ms with ssl and logging.
+    import asyncio
+
     return await asyncio.to_thread(lambda: ask(directory, **request))
 
 
 def call_at_end(connection: socket.socket, callback: Callable[[], None]) -> None:
     """Have the running event loop call back once the broker at the other end of an idle connection ends."""
+    import asyncio
+
     loop = asyncio.get_running_loop()
     connection.setblocking(False)
 
