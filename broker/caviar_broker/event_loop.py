@@ -197,6 +197,8 @@ class Standby:
         """When the call that is under way began [s]; None: there is none."""
         self.cpu_s = 0.0
         """CPU time of the leader, once the loop is over [s]."""
+        # Whether the standby runs a turn.
+        self._relieved = False
         # Held by the thread that runs turns.
         self._role = threading.Lock()
         self._ended = threading.Event()
@@ -204,8 +206,10 @@ class Standby:
 
     @property
     def calling(self) -> bool:
-        """Whether a call is under way: then nothing may be called."""
-        return self.calling_since is not None
+        """Whether nothing may be called: a call is under way, or the standby runs a turn."""
+        # A call may end while the standby is in a turn. One that it made itself then would give the loop back
+        # to the leader, and never end: the leader calls nothing before it knows what came of that call.
+        return self.calling_since is not None or self._relieved
 
     def run(self, begin: Callable[[], object] = lambda: None) -> None:
         """Run the loop until it is over; raises what a turn raised.
@@ -269,7 +273,11 @@ class Standby:
             if since is None or time.monotonic() - since < PATIENCE_S:
                 continue
             with self._role:
-                while self.calling and not self._over():
-                    self._turn()
+                self._relieved = True
+                try:
+                    while self.calling_since is not None and not self._over():
+                        self._turn()
+                finally:
+                    self._relieved = False
                 if self._over():
                     self._ended.set()

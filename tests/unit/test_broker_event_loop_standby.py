@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 
 import pytest
@@ -68,6 +69,32 @@ def test_the_standby_serves_while_a_call_waits_and_gives_the_loop_back() -> None
     assert len(others) >= 3
     assert set(others) == {"standby"}
     assert events[events.index("goes on") :] == ["goes on", "leader"]
+
+
+def test_a_turn_of_the_standby_may_call_nothing_though_the_call_ends_meanwhile() -> None:
+    """It would give the loop back to the leader by that, and wait for it for ever."""
+    answered, allowed = threading.Event(), list[bool]()
+
+    def turn(loop: Loop) -> None:
+        if threading.current_thread().name == "standby":
+            answered.set()
+            until = time.monotonic() + LONG_S
+            while loop.standby.calling_since is not None and time.monotonic() < until:
+                threading.Event().wait(0.001)
+            allowed.append(not loop.standby.calling)
+        elif not allowed:
+            loop.standby.call(lambda: assert_set(answered))
+        else:
+            allowed.append(not loop.standby.calling)
+            loop.over = True
+
+    def assert_set(event: threading.Event) -> None:
+        assert event.wait(LONG_S)
+
+    loop = Loop(turn)
+    loop.standby.run()
+    assert allowed == [False, True]
+    loop.standby.close()
 
 
 def test_a_loop_that_is_over_meanwhile_ends_though_the_call_goes_on_waiting() -> None:

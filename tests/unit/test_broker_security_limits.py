@@ -61,19 +61,25 @@ def wire_of(end: socket.socket) -> TcpConnection:
     return TcpConnection(end.fileno(), os.fstat(end.fileno()).st_ino, "127.0.0.1", 0)
 
 
+def counted(end: socket.socket) -> tuple[int, int]:
+    found = wire_of(end).transferred()
+    assert found is not None
+    return found
+
+
 def test_the_bytes_of_a_connection_are_counted_in_both_directions(couple) -> None:
     near, far = couple
     near.sendall(bytes(1000))
     far.sendall(bytes(300))
-    eventually(lambda: wire_of(far).transferred()[1] == 1000, "what came is counted")
-    eventually(lambda: wire_of(far).transferred()[0] in (300, 301), "what went is counted")  # 1 is the SYN
+    eventually(lambda: counted(far)[1] == 1000, "what came is counted")
+    eventually(lambda: counted(far)[0] in (300, 301), "what went is counted")  # 1 is the SYN
 
 
 def test_a_descriptor_that_is_another_connection_by_now_is_left_alone(couple) -> None:
     near, far = couple
     stale = TcpConnection(far.fileno(), os.fstat(far.fileno()).st_ino + 1, "127.0.0.1", 0)
     stale.end()
-    assert stale.transferred() == (0, 0)
+    assert stale.transferred() is None
     near.sendall(b"alive")
     assert far.recv(10) == b"alive"
 
@@ -82,7 +88,7 @@ def test_a_descriptor_that_is_no_socket_is_left_alone(tmp_path: Path) -> None:
     with (tmp_path / "file").open("wb") as file:
         wire = TcpConnection(file.fileno(), os.fstat(file.fileno()).st_ino, "127.0.0.1", 0)
         wire.end()
-        assert wire.transferred() == (0, 0)
+        assert wire.transferred() is None
         file.write(b"x")
 
 
@@ -114,6 +120,22 @@ def test_a_connection_over_ipv4_to_an_ipv6_port_is_known(tmp_path: Path) -> None
         (peer,) = broker.server._guard._peers.values()
         assert peer.address == "127.0.0.1"
         assert peer.wire is not None
+
+
+def test_a_service_at_a_socket_file_may_be_sent_more_than_may_wait_for_it(tmp_path: Path) -> None:
+    """How much of it waits is not known there: a long run would end with the first GiB."""
+    limits = PeerLimits(queued=1 << 16)
+    with (
+        serving(plan("world"), tmp_path, endpoint=f"ipc://{tmp_path}/broker", peer_limits=limits) as broker,
+        Client(broker.endpoint, "world") as world,
+    ):
+        world.join()
+        guard = broker.server._guard
+        (peer,) = guard._peers.values()
+        peer.sent = 1 << 30
+        begun = time.monotonic_ns()
+        eventually(lambda: guard._scan_at > begun + 250 * MS, "its connection was looked at")
+        assert not peer.cut
 
 
 def test_a_connection_is_known_where_no_descriptor_is_left(couple) -> None:

@@ -338,7 +338,10 @@ class PeerGuard:
 
     def _measure(self, wire: TcpConnection, maybe: _Peer | None, now: int) -> None:
         """Cut off a peer that has more waiting than it may; ``maybe``: whose connection it may be."""
-        acknowledged, received = wire.transferred()
+        counted = wire.transferred()
+        if counted is None:
+            return  # a socket file, which only this user's processes can connect to: nothing counts its bytes
+        acknowledged, received = counted
         peer = self._by_wire.get(wire)
         chatter = CHATTER * (1 + (now - wire.since) // 10**9)
         whose = peer or maybe

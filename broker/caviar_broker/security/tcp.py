@@ -58,13 +58,14 @@ class TcpConnection:
                 except OSError:
                     return  # it ended by itself
 
-    def transferred(self) -> tuple[int, int]:
-        """Bytes that the peer has acknowledged, and that came from it [B]; (0, 0) if it is no TCP."""
+    def transferred(self) -> tuple[int, int] | None:
+        """Bytes that the peer has acknowledged, and that came from it [B]; None where the system counts none,
+        as of a socket file."""
         with self._socket() as found:
             if found is None or found.family not in (socket.AF_INET, socket.AF_INET6):
-                return 0, 0
+                return None
             info = found.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _BYTES_AT + _BYTES.size)
-        return _BYTES.unpack_from(info, _BYTES_AT) if len(info) >= _BYTES_AT + _BYTES.size else (0, 0)
+        return _BYTES.unpack_from(info, _BYTES_AT) if len(info) >= _BYTES_AT + _BYTES.size else None
 
     @contextmanager
     def _socket(self) -> Iterator[socket.socket | None]:

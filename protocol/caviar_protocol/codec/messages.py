@@ -156,7 +156,7 @@ def check_parts(message: Message, parts: Sequence[Any]) -> None:
         _check_chunk(message, len(parts[1]))
         return
     # What fits the smallest limit fits all of them: one look in C at the parts of most messages.
-    if max(map(len, parts)) <= limits.MAX_HEADER:
+    if max(map(len, parts)) <= MAX_HEADER:
         return
     # The only part of RESTORE and CHECKPOINT_DONE is a state, which is as large as a body.
     payload_header = MAX_HEADER if isinstance(message, (Grant, Done)) else MAX_BODY
