@@ -1,10 +1,10 @@
 """CAVIAR from a program or a notebook: run a scenario, open its recording, make an environment.
 
 >>> import caviar
->>> run = caviar.run("smoke", frames=100, out="results")
+>>> run = caviar.run("smoke", frames=10, out="results")
 >>> recording = caviar.open(run)
 >>> recording["channel"].h.shape  # frames × users × Nr × Nt
-(100, 2, 4, 32)
+(10, 2, 4, 32)
 
 Importing this package registers the environments, so that ``gymnasium.make("caviar:caviar/BeamSelection-v0",
 scenario="geometric")`` needs no other import. Ray tracer, SUMO and broker are loaded when a run needs them.
@@ -30,10 +30,15 @@ def load_scenario(scenario: str | Path) -> Scenario:
     Args:
         scenario: Name of a scenario that ships (``caviar scenarios``), or a TOML file.
 
+    Returns:
+        The scenario, a frozen struct: ``run``, ``services``, ``devices``, ``carriers`` and what else its file
+        may have, with defaults filled in.
+
     Raises:
         ScenarioError: A key or value is wrong; the text has file, line and remedy.
 
     Example:
+        >>> import caviar
         >>> caviar.load_scenario("smoke").run.sampling_period_ns
         100000000
     """
@@ -52,12 +57,14 @@ def run(
     embedded: bool = False,
     progress: bool = False,
 ) -> Path:
-    """Run a scenario to its end, as ``caviar run`` does; only the main thread of a program can.
+    """Run a scenario to its end, as ``caviar run`` does.
+
+    Call it from the main thread: for the time of the run it handles Ctrl-C, which ends the run in order.
 
     Args:
         scenario: Name of a scenario that ships, or a TOML file.
         frames: Frames of each episode; None for those of the scenario.
-        seed: Of all random numbers; None for that of the scenario.
+        seed: Of all random numbers, from 0 to 2⁶³ − 1; None for that of the scenario.
         out: Directory in which the run's own is made.
         embedded: Whether all services run in this process, without sockets; the digest is the same.
         progress: Whether to print what ``caviar run`` prints.
@@ -67,7 +74,14 @@ def run(
 
     Raises:
         ScenarioError: A key or value of the scenario is wrong.
+        SetupError: An extra that the scenario needs is not installed; the text has the command.
         RunError: The run did not come to its end; the text has the cause and the directory.
+
+    Example:
+        >>> import caviar
+        >>> directory = caviar.run("smoke", frames=3, embedded=True)
+        >>> sorted(file.name for file in directory.glob("summary.*"))
+        ['summary.json', 'summary.txt']
     """
     from rich.console import Console
 
@@ -87,8 +101,17 @@ def open(run: str | Path | None = None) -> Recording:  # noqa: A001 - read as ca
     Args:
         run: Directory of the run; None for the newest one below ``runs``.
 
+    Returns:
+        The recording: arrays by topic over all frames (``recording["link"].abs_y``), or frame by frame.
+
     Raises:
         RecordingError: There is no recording, or it is damaged; the text has the place and the remedy.
+
+    Example:
+        >>> import caviar
+        >>> run = caviar.run("smoke", frames=3, embedded=True)
+        >>> caviar.open(run)["link"].abs_y.shape  # frames × users
+        (3, 2)
     """
     from caviar_protocol.recording import Recording, newest_run
 

@@ -21,7 +21,7 @@ from recording_builders import record_run
 
 from caviar_protocol.scenario import find_scenario, parse_scenario
 
-PACKAGES = ("caviar_protocol", "caviar_broker", "caviar_services", "caviar_clients")
+PACKAGES = ("caviar_protocol", "caviar_broker", "caviar_services", "caviar_clients", "caviar")
 ROOT = Path(__file__).parents[2]
 RUN = "runs/smoke-20261122-101500"
 ELSEWHERE = {
@@ -89,8 +89,9 @@ GIVEN: dict[str, Callable[[], dict[str, Any]]] = {
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a recorded run of `smoke`."""
+    """A folder with a recorded run of `smoke` and, as in a checkout, the example clients."""
     place = tmp_path_factory.mktemp("examples")
+    (place / "clients").symlink_to(ROOT / "clients")
     record_run(place / RUN)
     return place
 
@@ -137,7 +138,8 @@ def run_block(code: str, page: str, line: int, names: dict[str, Any]) -> Iterato
 def sources() -> Iterator[tuple[str, str]]:
     """Name and text of every module of the packages."""
     for package in PACKAGES:
-        folder = ROOT / package.removeprefix("caviar_") / package
+        component = package.removeprefix("caviar_") if package != "caviar" else "clients"
+        folder = ROOT / component / package
         for file in sorted(folder.rglob("*.py")):
             parts = file.relative_to(folder.parent).with_suffix("").parts
             yield ".".join(parts).removesuffix(".__init__"), file.read_text()

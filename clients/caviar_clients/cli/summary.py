@@ -279,8 +279,9 @@ def summarise(recording: Recording) -> RunSummary:
     Damaged frames are listed, and count as if they had no products.
 
     Example:
-        >>> summarise(Recording("runs/smoke-20261123-120000")).frames  # doctest: +SKIP
-        100
+        >>> summary = summarise(Recording("runs/smoke-20261122-101500"))
+        >>> summary.frames == summary.frames_planned
+        True
     """
     metadata, damage = recording.metadata, list(recording.damage)
     sources: dict[tuple[str, str], SourceSummary] = {}

@@ -95,7 +95,7 @@ def scenes_of(path: Path, frames: int) -> Scenes:
         RunError: The worlds fail, or no scene has both a transmitter and a receiver.
 
     Example:
-        >>> scenes = scenes_of(Path("deploy/caviar_scenarios/smoke.toml"), 2)
+        >>> scenes = scenes_of(Path("smoke"), 2)
         >>> [instant.frame for instant in scenes.instants]
         [0, 99]
     """
