@@ -13,7 +13,8 @@ from caviar_protocol.arrays import Float64Array
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.topics import AntennaDevice, Carrier, Channel, Scene
-from caviar_services.channel.base import Found, outage_counts
+from caviar_services.channel.assemble import outage_counts
+from caviar_services.channel.base import Found
 from caviar_services.channel.paths import Antenna
 from caviar_services.channel.propagation.clearance import RISING_RAYS, Surfaces
 from caviar_services.channel.sionna.model import SionnaChannel

@@ -38,7 +38,8 @@ from caviar_services.channel.adaptive.controller import (
     Workload,
 )
 from caviar_services.channel.adaptive.settings import AdaptiveSettings, Rung, built, models, naming, rung_of
-from caviar_services.channel.base import Modelled, outage_counts
+from caviar_services.channel.assemble import outage_counts
+from caviar_services.channel.base import Modelled
 from caviar_services.channel.sionna.scene import shared_scenes
 from caviar_services.checkpoint import restored, saved
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
