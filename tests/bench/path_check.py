@@ -59,7 +59,7 @@ class PathCheck:
         a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
         normal = np.cross(b - a, c - a)
         area = np.linalg.norm(normal, axis=1)
-        kept = (area > 1e-12) & (scene.piece_of(numbers) != scene.parking_piece)
+        kept = area > 1e-12
         self._numbers, self._every = numbers[kept], corners
         self._corners, self._normal = corners[kept], normal[kept] / area[kept, None]
         self._edges = np.roll(self._corners, -1, axis=1) - self._corners

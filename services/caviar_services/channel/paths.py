@@ -9,6 +9,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -119,13 +120,63 @@ class Turning:
         return cross(turning, points - centre)
 
 
+class Rows:
+    """Base of frozen dataclasses whose arrays have a row for each path, candidate or chain.
+
+    Example:
+        >>> @dataclass(frozen=True, eq=False)
+        ... class Points(Rows):
+        ...     x: Float64Array
+        ...     unit: str
+        >>> points = Points(np.array([1.0, 2.0]), "m")
+        >>> Points.joined([points, points]).take(np.array([3, 0]))
+        Points(x=array([2., 1.]), unit='m')
+    """
+
+    by_carrier: ClassVar[frozenset[str]] = frozenset()
+    """Arrays whose second axis has the rows."""
+    shared: ClassVar[frozenset[str]] = frozenset()
+    """Arrays that are of all rows together."""
+
+    def take(self, which: Int64Array | BoolArray) -> Self:
+        """These rows, in this order.
+
+        Args:
+            which: Numbers of rows, or for each row whether it is taken.
+        """
+        # Without __init__, which sets each field of a frozen dataclass by a call.
+        taken = object.__new__(type(self))
+        for name, value in self.__dict__.items():
+            if isinstance(value, np.ndarray) and name not in self.shared:
+                value = value[:, which] if name in self.by_carrier else value[which]
+            taken.__dict__[name] = value
+        return taken
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """The rows of several, one at least, part by part; what is no array is that of the first.
+
+        Args:
+            parts: With arrays of one width.
+        """
+        made = object.__new__(cls)
+        for name, value in parts[0].__dict__.items():
+            if isinstance(value, np.ndarray) and name not in cls.shared:
+                columns = [part.__dict__[name] for part in parts]
+                value = np.concatenate(columns, axis=int(name in cls.by_carrier))
+            made.__dict__[name] = value
+        return made
+
+
 @dataclass(frozen=True, eq=False)
-class PathTable:
+class PathTable(Rows):
     """Paths as a model found them: any order, no antennas applied, no carrier phase.
 
     P paths of at most D interactions, C carriers.
     """
 
+    by_carrier = frozenset({"transfer"})
+    shared = frozenset({"object_velocity"})
     pair: Int64Array
     """TX index · number of RX + RX index, Shape ``[P]``."""
     transfer: Complex128Array
@@ -161,23 +212,6 @@ class PathTable:
         if self.object_turning is not None:
             velocity = velocity + self.object_turning.velocity(self.objects, self.points)
         return velocity
-
-    def take(self, which: Int64Array | BoolArray) -> PathTable:
-        """These paths, in this order."""
-        return PathTable(
-            pair=self.pair[which],
-            transfer=self.transfer[:, which],
-            types=self.types[which],
-            objects=self.objects[which],
-            points=self.points[which],
-            object_names=self.object_names,
-            object_velocity=self.object_velocity,
-            faces=None if self.faces is None else self.faces[which],
-            joined_faces=self.joined_faces,
-            hidden=None if self.hidden is None else self.hidden[which],
-            traced=None if self.traced is None else self.traced[which],
-            object_turning=self.object_turning,
-        )
 
 
 def stable_ids(table: PathTable) -> UInt64Array:

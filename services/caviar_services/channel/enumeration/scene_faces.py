@@ -226,7 +226,7 @@ class SceneFaces:
         first = scene.first_moving_plane
         triangles, sizes = table.triangles_of(np.arange(len(table.triangle)))
         piece = scene.piece_of(triangles)
-        self._scenery = _faces_of(scene, np.arange(first), piece != scene.parking_piece)
+        self._scenery = _faces_of(scene, np.arange(first))
         self._row = np.full(first, -1)
         self._row[self._scenery.plane] = np.arange(len(self._scenery))
         body_of = piece[np.cumsum(sizes) - sizes] - scene.first_body_piece
@@ -275,12 +275,12 @@ class SceneFaces:
         return faces, counts
 
 
-def _faces_of(scene: SionnaScene, planes: Int64Array, used: BoolArray) -> FaceRectangles:
-    """Faces of planes of scenery; ``used`` says which of their triangles count, in the order of planes."""
+def _faces_of(scene: SionnaScene, planes: Int64Array) -> FaceRectangles:
+    """Faces of planes of scenery."""
     table = scene.plane_table
     triangles, sizes = table.triangles_of(planes)
     own = np.repeat(np.arange(len(planes)), sizes)
-    used = used[: len(triangles)] & (table.normal[planes] != 0).any(1)[own]
+    used = (table.normal[planes] != 0).any(1)[own]
     corners = scene.corners(triangles[used]) - scene.centre
     sizes = np.bincount(own[used], minlength=len(planes))
     kept = np.flatnonzero(sizes)

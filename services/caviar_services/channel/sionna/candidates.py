@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array, UInt64Array
+from caviar_services.channel.paths import Rows
 from caviar_services.channel.sionna.candidate_visibility import Planes
 from caviar_services.channel.sionna.diffuse_paths import ChosenPoints, DrawnPoints, Scattered, scattered_of
 from caviar_services.channel.sionna.ray_launcher import (
@@ -35,7 +36,7 @@ MANY_RAYS = 1000
 
 
 @dataclass(frozen=True, eq=False)
-class Chains:
+class Chains(Rows):
     """C specular chains, or specular ends behind a scattering point."""
 
     ray: Int64Array
@@ -48,12 +49,6 @@ class Chains:
     """Whether a chain has but reflections and transmissions, Shape ``[C]``."""
     rays: Int64Array
     """How many rays went along each, Shape ``[C]``."""
-
-    def take(self, which: BoolArray | Int64Array) -> Chains:
-        """These chains."""
-        return Chains(
-            self.ray[which], self.depth[which], self.planes[which], self.straight[which], self.rays[which]
-        )
 
     def rays_of(self, planes: Int64Array, depth: Int64Array) -> Int64Array:
         """Rays that went along the chains of paths with these planes, Shape ``[P, D]``, and depths, Shape
@@ -114,12 +109,8 @@ def united(parts: Sequence[Met], scene: SionnaScene) -> Met:
     launch = Launch.joined([part.launch for part in parts])
     widths = np.array([part.launch.rays for part in parts])
     first = np.cumsum(widths) - widths
-    chains = Chains(
-        np.concatenate([part.chains.ray + begin for part, begin in zip(parts, first, strict=True)]),
-        np.concatenate([part.chains.depth for part in parts]),
-        np.concatenate([part.chains.planes for part in parts]),
-        np.concatenate([part.chains.straight for part in parts]),
-        np.concatenate([part.chains.rays for part in parts]),
+    chains = Chains.joined(
+        [replace(part.chains, ray=part.chains.ray + begin) for part, begin in zip(parts, first, strict=True)]
     )
     signature = np.column_stack([chains.depth, _signature(launch, chains, scene)])
     _, kept, which = np.unique(signature, axis=0, return_index=True, return_inverse=True)
@@ -138,7 +129,8 @@ def chains_of(launch: Launch, scene: SionnaScene, max_depth: int) -> Chains:
     ray = np.zeros(0, np.int64)
     chain = np.zeros(0, np.int64)
     planes, straight = np.full((1, max_depth), -1, np.int32), np.ones(1, np.bool_)
-    found: list[Chains] = []
+    none = np.zeros(0, np.int64)
+    found = [Chains(none, none, planes[:0], straight[:0], none)]
     for d, bounce in enumerate(launch.bounces):
         kinds = bounce.kind.numpy()
         if d == 0:
@@ -172,13 +164,7 @@ def chains_of(launch: Launch, scene: SionnaScene, max_depth: int) -> Chains:
                 rays[specular],
             )
         )
-    return Chains(
-        _stacked([part.ray for part in found]),
-        _stacked([part.depth for part in found]),
-        np.concatenate([np.zeros((0, max_depth), np.int32), *(part.planes for part in found)]),
-        np.concatenate([np.zeros(0, np.bool_), *(part.straight for part in found)]),
-        _stacked([part.rays for part in found]),
-    )
+    return Chains.joined(found)
 
 
 def _begins(launch: Launch, d: int, ray: Int64Array, chain: Int64Array) -> BoolArray:
@@ -241,12 +227,8 @@ def _first_edge(scene: SionnaScene) -> int:
     return len(scene.plane_table.triangle) + 16
 
 
-def _stacked(parts: list[Int64Array]) -> Int64Array:
-    return np.concatenate([np.zeros(0, np.int64), *parts])
-
-
 @dataclass(frozen=True, eq=False)
-class Candidates:
+class Candidates(Rows):
     """P candidates for paths from one transmitter."""
 
     ray: Int64Array
@@ -262,17 +244,6 @@ class Candidates:
     chosen: Float64Array
     """Probability with which a path was chosen that is diffuse at its last interaction, whatever its ray did
     there; 0 where its ray did what it does; Shape ``[P]``."""
-
-    def take(self, which: Int64Array | BoolArray) -> Candidates:
-        """These candidates."""
-        return Candidates(
-            self.ray[which],
-            self.depth[which],
-            self.receiver[which],
-            self.planes[which],
-            self.found[which],
-            self.chosen[which],
-        )
 
 
 class Offer:

@@ -43,15 +43,12 @@ class SceneEdges:
     Args:
         scene: Whose edges.
         bodies: Unit meshes of the bodies, by asset.
-        leave_out: Piece of scenery that is not in the world.
         free: Whether the rims of open surfaces are edges.
     """
 
-    def __init__(
-        self, scene: NumberedTriangles, bodies: Mapping[str, Mesh], leave_out: int, free: bool
-    ) -> None:
+    def __init__(self, scene: NumberedTriangles, bodies: Mapping[str, Mesh], free: bool) -> None:
         self._scene = scene
-        self._edges = _of_all_pieces(scene, bodies, leave_out, free)
+        self._edges = _of_all_pieces(scene, bodies, free)
         owner = scene.piece_of(self._edges.triangles[:, 0])
         self.number: Int32Array = (np.arange(len(self)) - np.searchsorted(owner, owner)).astype(np.int32)
         """Of each edge within the object that its first face is of, the same in every frame."""
@@ -127,11 +124,9 @@ class SceneEdges:
         return np.where(is_edge, columns.T, 0.0)
 
 
-def _of_all_pieces(
-    scene: NumberedTriangles, bodies: Mapping[str, Mesh], leave_out: int, free: bool
-) -> MeshEdges:
+def _of_all_pieces(scene: NumberedTriangles, bodies: Mapping[str, Mesh], free: bool) -> MeshEdges:
     piece = scene.piece_of(np.arange(len(scene.triangle_vertices)))
-    still = np.flatnonzero((piece < scene.first_body_piece) & (piece != leave_out))
+    still = np.flatnonzero(piece < scene.first_body_piece)
     of_scenery = mesh_edges(
         scene.vertices,
         scene.triangle_vertices[still].astype(np.int64),

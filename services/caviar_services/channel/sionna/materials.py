@@ -131,8 +131,8 @@ def body_kind(asset: str, material: str) -> str:
 OBJECT_MATERIAL = "caviar-object-"
 """What the ray tracer's names of materials begin with that objects are given."""
 
-# [m]; of walls of bodies, where a scenario does not say.
-_BODY_THICKNESS = 0.1
+BODY_THICKNESS = 0.1
+"""[m]; of the walls of bodies, where a scenario does not say."""
 
 OutsideRange = Literal["error", "nearest", "extrapolate"]
 """Where a carrier lies in none of the ranges that ITU-R P.2040 defines a material in: refuse it; take the
@@ -355,7 +355,7 @@ def object_materials(
             itu = tuple(itu_material(key, name, f, policy, remedy) for f in frequencies_hz)
         defined = [of.constants for of in itu] or [(1.0, 0.0)] * len(frequencies_hz)
         constants = tuple(change.applied(of_carrier) for of_carrier in defined)
-        radio = RadioMaterial(f"{OBJECT_MATERIAL}{name}", _BODY_THICKNESS)
+        radio = RadioMaterial(f"{OBJECT_MATERIAL}{name}", BODY_THICKNESS)
         _checked_change(radio, name, change, policy)
         radio.relative_permittivity, radio.conductivity = constants[0]
         made[name] = ObjectMaterial(name, radio, itu, constants)

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
+from caviar_services.channel.paths import Rows
 from caviar_services.channel.propagation.geometry import ranges
 
 # [rad]; faces that deviate less from one plane are one, as in `sionna_planes`.
@@ -105,7 +106,7 @@ def mesh_edges(
 
 
 @dataclass(frozen=True, eq=False)
-class _Sides:
+class _Sides(Rows):
     """Sides of triangles, or parts of them, between two places; the lower number comes first."""
 
     ends: Int64Array
@@ -114,9 +115,6 @@ class _Sides:
     """Shape ``[S]``."""
     apex: Int64Array
     """Corner of the triangle that is not on the side, 0 to 2, Shape ``[S]``."""
-
-    def take(self, which: Int64Array | BoolArray) -> _Sides:
-        return _Sides(self.ends[which], self.triangle[which], self.apex[which])
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,11 +188,7 @@ def _divided(sides: _Sides, at: Float64Array, tolerance: float) -> _Sides:
     within = owner[1:] == owner[:-1]
     ends = np.sort(np.stack([stop[:-1], stop[1:]], axis=-1)[within], axis=-1)
     whole, parts = sides.take(np.delete(np.arange(len(sides.triangle)), cut)), sides.take(owner[:-1][within])
-    return _Sides(
-        np.concatenate([whole.ends, ends]),
-        np.concatenate([whole.triangle, parts.triangle]),
-        np.concatenate([whole.apex, parts.apex]),
-    )
+    return _Sides.joined([whole, replace(parts, ends=ends)])
 
 
 def _on(

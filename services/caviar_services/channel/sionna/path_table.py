@@ -11,7 +11,7 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int64Array, UInt8Array
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.arrays.element_paths import Surfaces
-from caviar_services.channel.paths import Antenna, PathTable
+from caviar_services.channel.paths import Antenna, PathTable, Rows
 from caviar_services.channel.propagation.clearance import spread_anew, with_direct
 from caviar_services.channel.propagation.image_method import distinct, path_lengths, refined_points
 from caviar_services.channel.propagation.patterns import spherical_basis
@@ -40,9 +40,10 @@ _TYPES[[1, 2, 4, 8]] = (
 
 
 @dataclass(frozen=True, eq=False)
-class Traced:
+class Traced(Rows):
     """P paths from one transmitter, of at most D interactions."""
 
+    by_carrier = frozenset({"transfer"})
     receiver: Int64Array
     """Index of the receiver, Shape ``[P]``."""
     transfer: Complex128Array
@@ -65,21 +66,6 @@ class Traced:
     """Paths that all corners of both arrays are known to have, Shape ``[P]``."""
     lost: int
     """How many more candidates were found than ``max_paths`` of each receiver."""
-
-    def take(self, which: BoolArray) -> Traced:
-        """These paths."""
-        return Traced(
-            receiver=self.receiver[which],
-            transfer=self.transfer[:, which],
-            types=self.types[which],
-            shapes=self.shapes[which],
-            primitives=self.primitives[which],
-            points=self.points[which],
-            edge=self.edge[which],
-            hidden=self.hidden[which],
-            settled=self.settled[which],
-            lost=self.lost,
-        )
 
     def seen_from(self, first: int) -> Traced:
         """The same with receivers counted from this one on."""
@@ -106,19 +92,8 @@ def joined(parts: Sequence[Traced], carriers: int, depth: int) -> Traced:
     """All of these paths, part by part."""
     if len(parts) == 1:
         return parts[0]
-    parts = [nothing(carriers, depth, 0), *parts]
-    return Traced(
-        receiver=np.concatenate([part.receiver for part in parts]),
-        transfer=np.concatenate([part.transfer for part in parts], axis=1),
-        types=np.concatenate([part.types for part in parts]),
-        shapes=np.concatenate([part.shapes for part in parts]),
-        primitives=np.concatenate([part.primitives for part in parts]),
-        points=np.concatenate([part.points for part in parts]),
-        edge=np.concatenate([part.edge for part in parts]),
-        hidden=np.concatenate([part.hidden for part in parts]),
-        settled=np.concatenate([part.settled for part in parts]),
-        lost=sum(part.lost for part in parts),
-    )
+    whole = Traced.joined([nothing(carriers, depth, 0), *parts])
+    return replace(whole, lost=sum(part.lost for part in parts))
 
 
 def geometry(buffer: Any) -> tuple[UInt8Array, Int64Array, Int64Array, Float64Array]:
@@ -267,7 +242,7 @@ def path_table(
     shown = np.flatnonzero(~met.hidden & kept)
     kept &= met.hidden
     kept[shown] = distinct(pair[shown], types[shown], points[shown])
-    table = table.take(kept & ~((objects == scene.parking_piece) & (types != 0)).any(1))
+    table = table.take(kept)
     return _with_sights(table, scene, sights, antennas, traced_from) if sights else table
 
 

@@ -234,6 +234,8 @@ def shared_planes(table: PlaneTable, count: int) -> Int64Array:
     The first ``count`` planes, which stand still, share one where they agree to a grid of 1e-4 in the
     normal and 1 mm in the offset: the walls of a row of houses reflect as one. The others are on their own.
     """
+    if not count:
+        return np.arange(len(table.normal))
     normal, middle = table.normal[:count], (table.low[:count].min(0) + table.high[:count].max(0)) / 2
     # One of both directions of a normal: that whose first component of some size is positive.
     leading = np.argmax(np.abs(normal) > 1e-3, axis=1)
@@ -262,6 +264,7 @@ class PlaneTable:
         self._order = np.argsort(numbers, kind="stable")
         count = int(numbers.max(initial=-1)) + 1
         self._begin = np.searchsorted(numbers[self._order], np.arange(count))
+        self._sizes = np.diff(np.append(self._begin, len(numbers)))
         self.triangle = np.zeros(count, np.int64)
         """The triangle that stands for each plane."""
         self.origin = np.zeros((count, 3))
@@ -312,9 +315,8 @@ class PlaneTable:
 
     def triangles_of(self, planes: Int64Array) -> tuple[Int64Array, Int64Array]:
         """Numbers of the triangles of these planes, plane after plane, and how many each has."""
-        sizes = np.append(self._begin[1:], len(self._order))[planes] - self._begin[planes]
-        place = np.arange(int(sizes.sum())) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-        return self._order[place + np.repeat(self._begin[planes], sizes)], sizes
+        sizes = self._sizes[planes]
+        return self._order[ranges(self._begin[planes], sizes)[1]], sizes
 
     def first_holding(self, triangles: Int64Array, points: Float64Array) -> Int64Array:
         """For each point [m], Shape ``[N, 3]``, in one of these triangles, the first triangle of the same
@@ -326,10 +328,7 @@ class PlaneTable:
         if not len(triangles):
             return triangles
         plane = self._numbers[triangles]
-        begin = self._begin[plane]
-        sizes = np.append(self._begin[1:], len(self._order))[plane] - begin
-        hit = np.repeat(np.arange(len(triangles)), sizes)
-        place = np.arange(len(hit)) - np.repeat(np.cumsum(sizes) - sizes, sizes) + begin[hit]
+        hit, place = ranges(self._begin[plane], self._sizes[plane])
         candidate = self._order[place]
         held = _holds(self._corners[self._faces[candidate]], points[hit])
         first = triangles.copy()

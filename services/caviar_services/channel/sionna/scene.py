@@ -34,6 +34,7 @@ from caviar_services.channel.paths import Turning
 from caviar_services.channel.propagation.fresnel import Media
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.materials import (
+    BODY_THICKNESS,
     OBJECT_MATERIAL,
     Constants,
     MaterialPolicy,
@@ -63,18 +64,13 @@ from caviar_services.channel.sionna.scene_loading import (
 )
 from caviar_services.channel.sionna.triangle_numbering import Body, NumberedTriangles
 from caviar_services.mesh.scenery import find_scenery
-from caviar_services.mesh.shapes import Mesh, assign_bodies, box, placed
+from caviar_services.mesh.shapes import Mesh, assign_bodies, placed, unit_box
 
 # Frequency [Hz] of a carrier, and what is to be set at materials.
 _Tuning = tuple[float, list[tuple[Any, Constants]]]
 
-# Sionna RT needs a shape where there is neither scenery nor a body: a closed metal box of 8 m, so far below
-# the scenery [m] that hardly a ray meets it. Paths by way of it are dropped.
-_PARKING_DEPTH = 2000.0
-_HALF_BOX = 4.0
-
-_PARKING = "caviar-parking"
 _SKIN = "caviar-body"
+_NOTHING = "caviar-nothing"
 
 _SKIN_NAME = "body_material"
 _OTHER_SKIN = "choose another body_material"
@@ -119,6 +115,8 @@ class SionnaScene(NumberedTriangles):
     """
 
     def __init__(self, assets: Mapping[str, Path], pool: Mapping[str, int], settings: SceneSettings) -> None:
+        from sionna.rt import RadioMaterial
+
         bodied = any(pool.values())
         skins = [
             itu_material(_SKIN_NAME, settings.body_material, frequency, settings.materials, _OTHER_SKIN)
@@ -153,43 +151,43 @@ class SionnaScene(NumberedTriangles):
         self._standing: frozenset[Body] = frozenset()
         self.turning: Turning | None = None
         """How the objects turn that bodies stand for, by the names that `place` returned; None: none does."""
-        is_metal = settings.body_material == "metal"
-        moving = self._moving_shapes(of_material[""], skins[0].constants if skins else None, is_metal)
-        self._moving = [moving[-1]]
+        skin = RadioMaterial(f"{_SKIN}-skin", BODY_THICKNESS, *(skins[0].constants if skins else (1.0, 0.0)))
+        self._moving = [self._body_shape(of_material[""], _SKIN, skin)]
         if bodied:
             self._moving += [
                 self._body_shape(of_material[m], f"{_SKIN}-of-{m}", of.radio) for m, of in made.items()
             ]
-        self._shapes = [*shapes, *moving[:-1], *self._moving]
+        else:  # the ray tracer needs a shape also where there is neither scenery nor a body
+            self._moving = [Shape(_NOTHING, skin, [_NOTHING], [self._shrunk(unit_box())])]
+        self._shapes = [*shapes, *self._moving]
+        # The note names the piece that is so far from the others that the ray tracer is coarse there.
         centre, self.far_note = counting_centre(shapes)
-        # Says which piece is so far from the others that the ray tracer is coarse there; mostly empty.
         super().__init__(
             self._shapes, self._replace_shapes(centre), bodies, self._meshes, centre, len(self._moving)
         )
         self.edges: SceneEdges | None = None
         """None where nothing is diffracted."""
         if settings.edges:
-            self.edges = SceneEdges(self, self.unit_meshes, self.parking_piece, settings.free_edges)
+            self.edges = SceneEdges(self, self.unit_meshes, settings.free_edges)
         set_materials(self._scene, settings.frequencies_hz[0], settings.materials, made)
         self._carriers: list[_Tuning] = []
-        outside: list[OutsideUse] = []
+        self.outside: tuple[OutsideUse, ...] = ()
+        """Materials used where they are not defined, by carrier."""
         for carrier, frequency in enumerate(settings.frequencies_hz):
             found = itu_materials(self._scene, frequency, settings.materials)
             used = [(material.name, itu, constants) for material, itu, constants in found]
-            tuning = [(material, constants) for material, _, constants in found]
+            tuned = [(material, constants) for material, _, constants in found]
             if skins:
                 used.append((_SKIN_NAME, skins[carrier], skins[carrier].constants))
-                tuning.append((moving[-1].material, skins[carrier].constants))
+                tuned.append((skin, skins[carrier].constants))
             used += [(name, of.itu[carrier], of.constants[carrier]) for name, of in made.items() if of.itu]
-            tuning += [(of.radio, of.constants[carrier]) for of in made.values()]
-            self._carriers.append((frequency, tuning))
-            outside += [
+            tuned += [(of.radio, of.constants[carrier]) for of in made.values()]
+            self._carriers.append((frequency, tuned))
+            self.outside += tuple(
                 OutsideUse(name=name, carrier=carrier, itu=itu, constants=constants)
                 for name, itu, constants in used
                 if itu.is_outside
-            ]
-        self.outside = tuple(outside)
-        """Materials used where they are not defined, by carrier."""
+            )
 
     @property
     def mi_scene(self) -> Any:
@@ -220,7 +218,7 @@ class SionnaScene(NumberedTriangles):
     def used_surfaces(self) -> UsedSurfaces:
         """What waves can meet, at rest and moving."""
         constants, slabs = self._surface_materials
-        used = [(i, shape) for i, shape in enumerate(self._shapes) if shape.id != _PARKING]
+        used = [(i, shape) for i, shape in enumerate(self._shapes) if shape.id != _NOTHING]
         return UsedSurfaces(
             materials=tuple(
                 SurfaceMaterial(
@@ -264,11 +262,6 @@ class SionnaScene(NumberedTriangles):
     def standing_bodies(self) -> tuple[int, ...]:
         """Numbers of the bodies that stand for an object, in ascending order."""
         return tuple(number for number, body in enumerate(self._bodies) if body in self._standing)
-
-    @property
-    def parking_piece(self) -> int:
-        """Number of the piece that is not in the world: the box that the ray tracer has in an empty one."""
-        return self.names.index(_PARKING)
 
     def place(self, scene: Scene, without_body: frozenset[str]) -> tuple[tuple[str, ...], Float64Array]:
         """Move the bodies to the objects of a scene, in one update; foliage has none.
@@ -360,30 +353,13 @@ class SionnaScene(NumberedTriangles):
     def _middle(self) -> Float64Array:
         return (self.low + self.high) / 2
 
-    def _moving_shapes(self, bodies: Sequence[Body], constants: Constants | None, metal: bool) -> list[Shape]:
-        """The closed box below the world, and last the bodies; one shape where both are of metal."""
-        from sionna.rt import RadioMaterial
-
-        x, y, z = *self._middle[:2], self.low[2] - _PARKING_DEPTH
-        h = _HALF_BOX
-        walls = box((x - h, x + h), (y - h, y + h), (z - h, z + h))
-        if constants is None:
-            return [
-                Shape(_PARKING, RadioMaterial(f"{_PARKING}-walls", conductivity=1e7), [_PARKING], [walls])
-            ]
-        skin = self._body_shape(bodies, _SKIN, RadioMaterial(f"{_SKIN}-skin", 0.1, *constants))
-        if metal:
-            return [Shape(_SKIN, skin.material, [_PARKING, *skin.names], [walls, *skin.meshes])]
-        return [*self._moving_shapes(bodies, None, metal), skin]
-
     def _body_shape(self, bodies: Sequence[Body], name: str, radio: Any) -> Shape:
         """Moving bodies of one material, none of which stands for anything yet."""
         names = [f"{_SKIN}-{kind or 'box'}-{slot}" for kind, slot in bodies]
-        return Shape(name, radio, names, [self._parked(kind) for kind, _ in bodies])
+        return Shape(name, radio, names, [self._shrunk(self._meshes[kind]) for kind, _ in bodies])
 
-    def _parked(self, kind: str) -> Mesh:
-        """A body that stands for nothing: a point."""
-        mesh = self._meshes[kind]
+    def _shrunk(self, mesh: Mesh) -> Mesh:
+        """A mesh as a point, which no ray hits."""
         return Mesh(np.tile(self._middle, (len(mesh.vertices), 1)), mesh.faces)
 
     def _moving_rows(self) -> Iterator[tuple[Shape, slice]]:

@@ -18,6 +18,7 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt64Array
 from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.topics import Scene
+from caviar_services.channel.paths import Rows
 from caviar_services.channel.sionna.candidates import (
     MANY_RAYS,
     Candidates,
@@ -50,7 +51,7 @@ _KEPT = 5
 
 
 @dataclass(frozen=True, eq=False)
-class _Table:
+class _Table(Rows):
     """K chains of at most D interactions, with the triangles that some ray met."""
 
     depth: Int64Array
@@ -63,18 +64,6 @@ class _Table:
     """That this kind of interaction was drawn, Shape ``[K, D]``."""
     seen: Int64Array
     """Number of the last launch that met it, Shape ``[K]``."""
-
-    def take(self, which: BoolArray | Int64Array) -> _Table:
-        """These chains."""
-        return _Table(*(column[which] for column in self._columns()))
-
-    def with_those(self, other: _Table) -> _Table:
-        """These chains and others."""
-        columns = zip(self._columns(), other._columns(), strict=True)
-        return _Table(*(np.concatenate(both) for both in columns))
-
-    def _columns(self) -> tuple[Any, ...]:
-        return self.depth, self.kind, self.triangle, self.probability, self.seen
 
 
 class TableState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -186,12 +175,12 @@ class Followed:
 
         met, *others = launcher.each(look, source, rays, number)
         for other in others:
-            met = met.with_those(other.take(~np.isin(_keys(other, scene), _keys(met, scene))))
+            met = _Table.joined([met, other.take(~np.isin(_keys(other, scene), _keys(met, scene)))])
         if known is not None:
             triangle = scene.moved_triangles(known.triangle, self._names, names)
             recent = known.seen > number - _KEPT * self._parts
             known = replace(known, triangle=triangle).take((triangle >= 0).all(1) & recent)
-            met = met.with_those(known.take(~np.isin(_keys(known, scene), _keys(met, scene))))
+            met = _Table.joined([met, known.take(~np.isin(_keys(known, scene), _keys(met, scene)))])
         self._known, self._names, self._number, self._from = met, names, number + 1, transmitter
         return FollowedOffer(met, scene, source, options)
 

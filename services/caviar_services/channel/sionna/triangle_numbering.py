@@ -207,8 +207,8 @@ class NumberedTriangles:
 
     def _left(self, met: Int64Array) -> int:
         """Piece that a ray leaves for good which meets these triangles, nearest first; −1: none."""
-        pieces = np.searchsorted(self._first_triangles, met, side="right") - 1
-        is_body = pieces >= len(self._first_triangles) - len(self._bodies)
+        pieces = self.piece_of(met)
+        is_body = pieces >= self.first_body_piece
         bodies, crossings = np.unique(pieces[is_body], return_counts=True)
         odd = bodies[crossings % 2 == 1]
         if len(odd):
@@ -227,8 +227,7 @@ class NumberedTriangles:
     def triangles(self, shapes: Int64Array, primitives: Int64Array) -> Float64Array:
         """The corners [m] of triangles, Shape ``[..., 3, 3]``, in float64: those of scenery as they stand in
         its files, those of moving bodies where `place` put them last. Anything for no shape."""
-        corners: Float64Array = self._corners[self._faces[self.triangle_numbers(shapes, primitives)]]
-        return corners
+        return self.corners(self.triangle_numbers(shapes, primitives))
 
     def triangle_numbers(self, shapes: Int64Array, primitives: Int64Array) -> Int64Array:
         """Number, through all shapes, of triangles of process-local shapes; anything for no shape."""
@@ -247,11 +246,6 @@ class NumberedTriangles:
         where = order[np.searchsorted(self._offsets[order], triangles, side="right") - 1]
         return self._ids[where], triangles - self._offsets[where]
 
-    def face_number(self, shapes: Int64Array, primitives: Int64Array) -> Int32Array:
-        """Number of the plane of triangles within their object, the same in every frame; anything for no
-        shape."""
-        return self._face_of[self.triangle_numbers(shapes, primitives)]
-
     def moved_triangles(
         self, triangles: Int64Array, before: tuple[str, ...], now: tuple[str, ...]
     ) -> Int64Array:
@@ -261,9 +255,9 @@ class NumberedTriangles:
         """
         if before == now:
             return triangles
-        first = len(now) - len(self._bodies)
+        first = self.first_body_piece
         place = {name: number for number, name in enumerate(now[first:], start=first)}
-        piece = np.searchsorted(self._first_triangles, triangles, side="right") - 1
+        piece = self.piece_of(triangles)
         moved = np.arange(len(now))
         for number, name in enumerate(before[first:], start=first):
             there = place.get(name, -1)
@@ -279,7 +273,7 @@ class NumberedTriangles:
     def object_index(self, shapes: Int64Array, primitives: Int64Array) -> Int32Array:
         """Index into the names of `place` of triangles of process-local shapes; −1 for no shape."""
         where = self._where(shapes)
-        piece = np.searchsorted(self._first_triangles, self._offsets[where] + primitives, side="right") - 1
+        piece = self.piece_of(self._offsets[where] + primitives)
         return np.where(self._ids[where] == shapes, piece, -1).astype(np.int32)
 
     def _number_shapes(self, shapes: Sequence[Shape], ids: Int64Array, moving: int) -> None:
