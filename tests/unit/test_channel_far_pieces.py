@@ -16,6 +16,14 @@ def shape(**pieces: Mesh) -> Shape:
 HOUSE, YARD = box((300.0, 320.0), (0.0, 10.0), (0.0, 8.0)), box((250.0, 400.0), (-50.0, 50.0), (-1.0, 0.0))
 
 
+@pytest.mark.parametrize("distance", [-1e8, 1e8])
+def test_of_two_places_that_at_the_origin_counts(distance: float) -> None:
+    rock = box((distance, distance + 10.0), (0.0, 1.0), (0.0, 1.0))
+    centre, warning = counting_centre([shape(rock=rock, house=HOUSE)])
+    assert (centre == counting_centre([shape(house=HOUSE)])[0]).all()
+    assert "'rock'" in warning
+
+
 @pytest.mark.parametrize("distance", [1e6, 1e8, 1e12])
 def test_a_far_piece_is_named_and_does_not_move_the_centre(distance: float) -> None:
     rock = box((distance, distance + 10.0), (0.0, 1.0), (0.0, 1.0))

@@ -65,12 +65,23 @@ def assemble(
     los: BoolArray,
     matrices: Matrices | None = None,
 ) -> tuple[Channel, frozenset[int]]:
-    """The canonical product, and the numbers of the pairs of which paths were dropped.
+    """Make the canonical product of the paths that a model found.
 
     Antennas, phase and absorption are applied, paths that are not finite dropped, the others sorted.
 
-    ``matrices`` makes H, and its wideband parts, where they are in demand: `PlaneWaves` unless the model has
-    a way of its own.
+    Args:
+        product: What the product says about itself.
+        transmitters: T antennas where they are in this frame.
+        receivers: R antennas.
+        table: The paths, in any order.
+        los: Whether the line of sight is free, Shape ``[T, R]``.
+        matrices: Makes H, and its wideband parts, where they are in demand; None: `PlaneWaves`.
+
+    Returns:
+        The product, and the numbers of the pairs of which paths were dropped.
+
+    Example:
+        The paths of a model, and what becomes of them, are in `docs/howto/channel-models.md`.
     """
     table = _canonical_names(table)
     row = np.arange(len(table.pair))
@@ -271,7 +282,14 @@ class Surroundings(Protocol):
         """Lowest and highest corner [m] of the scenery, Shape ``[3]`` each; None: there is none."""
 
     def enclosing(self, position: Float64Array) -> str:
-        """Name of the object that a point [m], Shape ``[3]``, is inside; empty: none."""
+        """Name the object that a point is inside.
+
+        Args:
+            position: Of the point [m], Shape ``[3]``.
+
+        Returns:
+            The name; empty where there is none.
+        """
 
 
 def outage_counts(

@@ -207,6 +207,15 @@ class ChannelModel(Service[S]):
         """
 
     def prepare(self, preparation: Preparation) -> Prepared:
+        """Read pattern files, load the model, and say what the user should know.
+
+        Args:
+            preparation: Parts in demand, and the files of the run.
+
+        Raises:
+            ScenarioError: Parts in demand are larger than a product may be.
+            AssetError: A file is not what it should be.
+        """
         demand = preparation.demand.get("channel", frozenset())
         self.with_h = "h" in demand
         self.wideband = demand & {"hf", "taps"}
@@ -222,7 +231,11 @@ class ChannelModel(Service[S]):
         return Prepared(notes=(*notes, *self.patterns.notes()))
 
     def load_patterns(self, preparation: Preparation) -> None:
-        """Read the pattern files of the run's antennas; `prepare` begins with it."""
+        """Read the pattern files of the run's antennas; `prepare` begins with it.
+
+        Args:
+            preparation: With the files of the run.
+        """
         self.patterns = Patterns(
             {
                 name: read_pattern(file)
@@ -232,6 +245,15 @@ class ChannelModel(Service[S]):
         )
 
     def step(self, frame: Frame) -> StepResult:
+        """Make the product of a frame, with counts and durations for the report.
+
+        Args:
+            frame: With the scene among its inputs.
+
+        Raises:
+            PayloadError: A number of the scene is not finite, something is faster than light, or a path
+                brings more power than was sent.
+        """
         scene = frame.scene()
         if scene.devices is not self._summed[0]:
             self._summed = scene.devices, _numbers_of(scene.devices)
@@ -373,6 +395,14 @@ class PathModel(ChannelModel[S]):
         transmitters: Sequence[AntennaDevice],
         receivers: Sequence[AntennaDevice],
     ) -> Modelled:
+        """Find the paths of a frame and make the product of them.
+
+        Args:
+            frame, scene, transmitters, receivers: See `ChannelModel.model`.
+
+        Raises:
+            PayloadError: A path brings more power than was sent.
+        """
         begin = time.perf_counter_ns()
         tx = [Antenna.of(scene, device, self.patterns) for device in transmitters]
         rx = [Antenna.of(scene, device, self.patterns) for device in receivers]

@@ -35,17 +35,36 @@ _TURN = 0.2
 
 
 def welded(mesh: Mesh) -> Mesh:
-    """The mesh with one vertex where there were several at exactly one place, faces in their order; faces
-    that lose a side by it, and vertices of no face, are gone."""
+    """Weld the vertices that are at exactly one place.
+
+    Args:
+        mesh: Any.
+
+    Returns:
+        The mesh with one vertex for each place, faces in their order; faces that lose a side by it, and
+        vertices of no face, are gone.
+    """
     vertices, inverse = np.unique(mesh.vertices, axis=0, return_inverse=True)
     return _used(Mesh(vertices, inverse.reshape(-1)[mesh.faces].astype(np.int32)))
 
 
 def decimated(mesh: Mesh, tolerance_m: float) -> Mesh:
-    """A mesh of fewer triangles, a subset of the vertices, welded.
+    """Leave out vertices that lie nearly in the planes of their neighbours.
 
-    Each vertex taken away lies in planes no farther than ``tolerance_m`` [m] from the one that stands for it.
+    Each vertex taken away lies in planes no farther than the tolerance from the one that stands for it.
     Rims keep their course within the same tolerance. The result depends on nothing but the mesh.
+
+    Args:
+        mesh: Any.
+        tolerance_m: [m].
+
+    Returns:
+        A mesh of fewer triangles, a subset of the vertices, welded.
+
+    Example:
+        >>> from caviar_services.mesh.shapes import unit_box
+        >>> len(decimated(unit_box(), 0.1).faces)
+        12
     """
     mesh = welded(mesh)
     return _used(_Decimation(mesh, tolerance_m).run())
@@ -259,9 +278,15 @@ class DetailEffect:
 def detailed(
     shapes: Sequence[tuple[str, Mesh]], settings: DetailSettings
 ) -> tuple[list[tuple[str, Mesh]], DetailEffect]:
-    """Named meshes with this detail, in their order, and what that did to them.
+    """Leave out what is small or far, and decimate the rest.
 
-    Shapes of which no piece is left are gone. A mesh that is left whole and not decimated is passed through.
+    Args:
+        shapes: Names and meshes.
+        settings: What is left out.
+
+    Returns:
+        The meshes with this detail, in their order, and what that did to them. Shapes of which no piece is
+        left are gone; a mesh that is left whole and not decimated is passed through.
     """
     kept: list[tuple[str, Mesh]] = []
     lost: Counter[str] = Counter()
@@ -292,8 +317,14 @@ def detailed(
 
 
 def piece_numbers(mesh: Mesh) -> Int64Array:
-    """Number of the piece that each triangle belongs to, from 0 in the order of their first triangles; Shape
-    ``[F]``. Triangles that touch at a corner are of one piece."""
+    """Number the pieces of a mesh, from 0 in the order of their first triangles.
+
+    Args:
+        mesh: Any; triangles that touch at a corner are of one piece.
+
+    Returns:
+        Number of the piece that each triangle belongs to, Shape ``[F]``.
+    """
     _, place = np.unique(mesh.vertices, axis=0, return_inverse=True)
     corners: Int64Array = place.reshape(-1)[mesh.faces].astype(np.int64)
     label = np.arange(len(mesh.vertices), dtype=np.int64)

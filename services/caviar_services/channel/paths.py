@@ -49,9 +49,12 @@ class Antenna:
 
     @classmethod
     def of(cls, scene: Scene, device: AntennaDevice, patterns: Patterns | None = None) -> Antenna:
-        """The antenna of a device, composed with its parent's pose.
+        """Place the antenna of a device in the world: its pose is composed with that of its parent.
 
-        ``patterns`` knows those from files; without it the antenna is not to be asked for its field.
+        Args:
+            scene: With the parent.
+            device: Of the scene.
+            patterns: Knows patterns from files; without it the antenna is not to be asked for its field.
         """
         pose = device_pose(scene, device)
         return cls(
@@ -80,13 +83,23 @@ class Antenna:
         )
 
     def radiated(self, directions: Float64Array) -> Field:
-        """Far field of an element of the first subarray, towards unit vectors in world axes, ``[P, 3]``."""
+        """Far field of an element of the first subarray.
+
+        Args:
+            directions: Unit vectors in world axes, Shape ``[P, 3]``.
+        """
         first = self.subarrays[0]
         return radiated_field(first.array, first.rotation, directions, first.pattern)
 
 
 def antenna_fields(antennas: Sequence[Antenna], which: Int64Array, directions: Float64Array) -> Field:
-    """Field of the antenna that each path has at one end, towards the path, Shape ``[P, 3]``."""
+    """Field of the antenna that each path has at one end, towards the path, Shape ``[P, 3]``.
+
+    Args:
+        antennas: All at this end.
+        which: Index of the antenna of each path, Shape ``[P]``.
+        directions: Unit vectors from the antenna towards the path, Shape ``[P, 3]``.
+    """
     if len(antennas) == 1:
         return antennas[0].radiated(directions)
     found: Field = np.zeros((len(which), 3))
@@ -109,12 +122,20 @@ class Turning:
     """In world axes [rad/s], Shape ``[K, 3]``."""
 
     def take(self, which: Sequence[int]) -> Turning:
-        """Those of these objects, in this order."""
+        """Those of some objects, in this order.
+
+        Args:
+            which: Numbers of objects.
+        """
         return Turning(self.centre[list(which)], self.angular_velocity[list(which)])
 
     def velocity(self, objects: Int32Array, points: Float64Array) -> Float64Array:
-        """What turning adds to the velocity [m/s] of points [m] of objects, by number, −1 for what stands,
-        Shape ``[..., 3]``: ω × r."""
+        """Velocity that turning adds to points of objects, ω × r [m/s], Shape ``[..., 3]``.
+
+        Args:
+            objects: Number of the object of each point, −1 for what stands, Shape ``[...]``.
+            points: [m], Shape ``[..., 3]``.
+        """
         centre = np.concatenate([self.centre, np.zeros((1, 3))])[objects]
         turning = np.concatenate([self.angular_velocity, np.zeros((1, 3))])[objects]
         return cross(turning, points - centre)
@@ -215,7 +236,16 @@ class PathTable(Rows):
 
 
 def stable_ids(table: PathTable) -> UInt64Array:
-    """Stable ids of sorted paths: hash of types, object names, faces, and rank among equals in the pair."""
+    """Give paths ids that are the same in other frames and products.
+
+    An id is a hash of types, object names, faces, and rank among equals in the pair.
+
+    Args:
+        table: Sorted.
+
+    Returns:
+        Shape ``[P]``.
+    """
     ids = np.zeros(len(table.pair), np.uint64)
     if not len(ids):
         return ids

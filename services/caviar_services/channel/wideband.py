@@ -58,7 +58,10 @@ class Bins:
     def weights(self, pair: int, tau: Float64Array, doppler: Float64Array) -> Complex128Array:
         """What the amplitudes of a pair's paths are multiplied with, Shape ``[J, ...]``.
 
-        Delays [s] have the Shape ``[...]``, Doppler shifts [Hz] one that broadcasts to it.
+        Args:
+            pair: Number of the pair.
+            tau: Delays [s], Shape ``[...]``.
+            doppler: Doppler shifts [Hz], of a shape that broadcasts to that of ``tau``.
         """
         if self.part == "hf":
             found = subcarrier_weights(self.carrier, tau, doppler)
@@ -68,7 +71,12 @@ class Bins:
 
 
 def empty_parts(demand: Collection[str], carriers: Sequence[Carrier]) -> tuple[str, ...]:
-    """Notes for the user on wideband parts in demand that no carrier has, so that they are empty."""
+    """Notes for the user on wideband parts in demand that no carrier has, so that they are empty.
+
+    Args:
+        demand: Parts in demand.
+        carriers: Of the run.
+    """
     found = [undefined_part(part, carriers) for part in sorted({"hf", "taps"} & set(demand))]
     return tuple(f"a part in demand is empty: {problem}" for problem in found if problem)
 
@@ -107,7 +115,14 @@ def check_size(demand: Collection[str], carriers: Sequence[Carrier], sent: int, 
 def bins_of(
     parts: Collection[str], carriers: Sequence[Carrier], tau: Float64Array, offsets: Int64Array
 ) -> tuple[Bins, ...]:
-    """The parts of all carriers that have them; delays [s] and ``offsets`` are those of `Channel`."""
+    """List what is asked of the carriers that have the parts.
+
+    Args:
+        parts: ``hf``, ``taps`` or both.
+        carriers: Of the run.
+        tau: Delays [s], as in `Channel`.
+        offsets: First path of each pair, as in `Channel`.
+    """
     pairs = len(offsets) - 1
     found = []
     for index, carrier in enumerate(carriers):
@@ -121,7 +136,13 @@ def bins_of(
 
 
 def wideband_parts(bins: Sequence[Bins], responses: Iterable[Complex64Array], receivers: int) -> Wideband:
-    """Both parts from the responses ``[J, Nr, Nt]`` of each of the bins and pairs, pairs fastest."""
+    """Make both parts of responses.
+
+    Args:
+        bins: What was asked for.
+        responses: Of each of the bins and pairs, pairs fastest, each of Shape ``[J, Nr, Nt]``.
+        receivers: How many.
+    """
     hf: list[ChannelResponse] = []
     taps: list[ChannelTaps] = []
     rest = iter(responses)
@@ -140,7 +161,11 @@ def wideband_parts(bins: Sequence[Bins], responses: Iterable[Complex64Array], re
 def superposed(weights: Complex128Array, waves: Complex128Array) -> Complex64Array:
     """Σ_p weights[j, p] · waves[p, m, n] in single precision, Shape ``[J, Nr, Nt]``.
 
-    In blocks that one thread multiplies: see `stacked.summed`.
+    In blocks that one thread multiplies: see `channel_matrices.summed`.
+
+    Args:
+        weights: Of J bins and P paths, Shape ``[J, P]``.
+        waves: Between Nr and Nt elements, Shape ``[P, Nr, Nt]``.
     """
     paths, *sizes = waves.shape
     columns = waves.reshape(paths, math.prod(sizes)).astype(np.complex64)

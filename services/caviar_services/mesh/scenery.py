@@ -79,9 +79,17 @@ def world_mesh(shape: SceneryShape) -> Mesh:
 
 
 def find_scenery(assets: Mapping[str, Path]) -> Path | None:
-    """The scene description among the assets of a run (``scenery/*.xml``); None where there is none.
+    """Find the scene description among the assets of a run (``scenery/*.xml``); None where there is none.
 
-    Raises `AssetError` naming them where there are several.
+    Args:
+        assets: Files by name.
+
+    Raises:
+        AssetError: There are several; names them.
+
+    Example:
+        >>> find_scenery({"scenery/town.xml": Path("town.xml"), "objects/car.ply": Path("car.ply")}).name
+        'town.xml'
     """
     found = sorted(name for name in assets if PurePosixPath(name).match("scenery/*.xml"))
     if len(found) > 1:
@@ -92,18 +100,25 @@ def find_scenery(assets: Mapping[str, Path]) -> Path | None:
 
 
 def asset_name(description: Path | None) -> str:
-    """What errors call a description that came from another service: its file is a copy in a cache."""
+    """What errors call a description that came from another service: its file is a copy in a cache.
+
+    Args:
+        description: None: there is none.
+    """
     return f"scenery/{description.name}" if description else "the empty scene"
 
 
 def read_scenery(file: Path, called: str = "") -> Scenery:
     """Read a scene description; every mesh it names lies in its folder or below.
 
-    ``called`` is what errors call the file, where its path would mean nothing to the user: a copy.
+    Args:
+        file: The description.
+        called: What errors call the file, where its path would mean nothing to the user: a copy.
 
-    Raises `AssetError` naming the file, the line, the shape or material and the remedy where the XML is
-    broken, a shape is of another type than ``ply``, a mesh is missing, an id occurs twice, or ITU-R P.2040
-    has no such material.
+    Raises:
+        AssetError: The XML is broken, a shape is of another type than ``ply``, a mesh is missing, an id
+            occurs twice, or ITU-R P.2040 has no such material; names file, line, shape or material, and the
+            remedy.
     """
     called = called or str(file)
     root, lines = _parse(file, called)

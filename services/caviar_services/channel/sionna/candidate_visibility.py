@@ -36,7 +36,11 @@ _AT_END = 1e-2
 
 
 class Planes:
-    """The planes of a frame on the ray tracer's side, to rule out chains by."""
+    """The planes of a frame on the ray tracer's side, to mirror in and to rule out chains by.
+
+    Args:
+        table: As the planes stand.
+    """
 
     def __init__(self, table: PlaneTable) -> None:
         import mitsuba as mi
@@ -90,7 +94,12 @@ class Planes:
         return lanes // receivers, lanes % receivers
 
     def images(self, source: Any, numbers: Sequence[Any]) -> list[Any]:
-        """A source and its image in one plane after the other; numbers of planes count from 1, 0 is none."""
+        """A source and its image in one plane after the other.
+
+        Args:
+            source: A `mitsuba.Point3f`.
+            numbers: Of the planes, from 1; 0 is none. Each a `mitsuba.UInt`.
+        """
         import drjit as dr
 
         images = [source]
@@ -101,7 +110,11 @@ class Planes:
         return images
 
     def plane(self, number: Any) -> tuple[Any, Any]:
-        """A point [m] and the unit normal of planes, counted from 1."""
+        """A point [m] and the unit normal of planes.
+
+        Args:
+            number: Counted from 1, 0 is none, a `mitsuba.UInt`.
+        """
         import drjit as dr
         import mitsuba as mi
 
@@ -130,7 +143,11 @@ class Planes:
 
 
 class Faces:
-    """What rays meet first in a scene: how far away, and which of the surfaces of its objects' faces."""
+    """What rays meet first in a scene: how far away, and which of the surfaces of its objects' faces.
+
+    Args:
+        scene: Its bodies are where they were placed last.
+    """
 
     def __init__(self, scene: SionnaScene) -> None:
         import mitsuba as mi
@@ -149,7 +166,15 @@ class Faces:
             self._surface = mi.UInt(aligned_indices(self._surface_of))
 
     def along(self, start: Any, end: Any, active: Any) -> tuple[Any, Any]:
-        """How much farther than a segment's end [m] the first surface along it is, and its number."""
+        """Look along segments, in a kernel.
+
+        Args:
+            start, end: `mitsuba.Point3f`.
+            active: `mitsuba.Bool`.
+
+        Returns:
+            How much farther than a segment's end [m] the first surface along it is, and its number.
+        """
         import drjit as dr
         import mitsuba as mi
 
@@ -173,11 +198,23 @@ class Faces:
         return met.t - length, offset + met.prim_index, hit
 
     def nearest(self, start: Float64Array, end: Float64Array) -> tuple[Float64Array, Int64Array]:
-        """The same of segments ``[Q, 3]`` → ``[Q, 3]``; infinite where there is none, its number anything."""
+        """Look along segments.
+
+        Args:
+            start, end: [m], Shape ``[Q, 3]``.
+
+        Returns:
+            How much farther than a segment's end [m] the first surface along it is, infinite where there is
+            none, and its number, anything where there is none; each of Shape ``[Q]``.
+        """
         return _looked(self.along, start, end)
 
     def first_triangle(self, start: Float64Array, end: Float64Array) -> tuple[Float64Array, Int64Array]:
-        """As `nearest`, with the number of the triangle."""
+        """As `nearest`, with the number of the triangle.
+
+        Args:
+            start, end: [m], Shape ``[Q, 3]``.
+        """
         return _looked(self._met, start, end)
 
 
@@ -206,11 +243,19 @@ class Corners:
     """Shape ``[R, L, 3]``."""
 
     def relative_to(self, centre: Float64Array) -> Corners:
-        """The same, counted from there."""
+        """The same, counted from a centre.
+
+        Args:
+            centre: [m], Shape ``[3]``.
+        """
         return Corners(self.transmitter - centre, self.receivers - centre)
 
     def take(self, which: slice) -> Corners:
-        """Those of some receivers."""
+        """Those of some receivers.
+
+        Args:
+            which: Of the receivers.
+        """
         return Corners(self.transmitter, self.receivers[which])
 
 
@@ -290,7 +335,13 @@ def reached(
 def reflected(
     faces: Faces, planes: Planes, chains: Int64Array, start: Float64Array, end: Float64Array
 ) -> BoolArray:
-    """Whether chains of reflections ``[Q, D]`` are paths between positions ``[Q, 3]`` [m], Shape ``[Q]``."""
+    """Whether chains of reflections are paths between positions, Shape ``[Q]``.
+
+    Args:
+        faces, planes: Of the scene.
+        chains: Plane at each interaction, −1 behind the last, Shape ``[Q, D]``.
+        start, end: [m], Shape ``[Q, 3]``.
+    """
     import mitsuba as mi
 
     lanes = several(len(chains))

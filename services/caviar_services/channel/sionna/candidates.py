@@ -51,9 +51,16 @@ class Chains(Rows):
     """How many rays went along each, Shape ``[C]``."""
 
     def rays_of(self, planes: Int64Array, depth: Int64Array) -> Int64Array:
-        """Rays that went along the chains of paths with these planes, Shape ``[P, D]``, and depths, Shape
-        ``[P]``; chains that differ in other things than planes count together. ``MANY_RAYS`` for a path of
-        none of these chains.
+        """Count the rays that went along the chains of paths.
+
+        Chains that differ in other things than planes count together.
+
+        Args:
+            planes: At each interaction that is a reflection, −1 elsewhere, Shape ``[P, D]``.
+            depth: Interactions of each path, Shape ``[P]``.
+
+        Returns:
+            Shape ``[P]``; ``MANY_RAYS`` for a path of none of these chains.
         """
         known, which = np.unique(_chain_keys(self.planes, self.depth), return_inverse=True)
         if not len(known):
@@ -86,9 +93,15 @@ class Met:
 def met_by(
     launch: Launch, scene: SionnaScene, max_depth: int, scattered: Scattered | None = None, part: bool = False
 ) -> Met:
-    """What a launch met; ``scattered`` where points of diffuse paths are not those that were drawn.
+    """Find the chains and the scattering points of a launch.
 
-    Of a ``part`` of a larger launch only the rays that matter are kept."""
+    Args:
+        launch: All rays, or a part of them.
+        scene: Where they went.
+        max_depth: Interactions at most.
+        scattered: Points of diffuse paths; None: those that were drawn.
+        part: Whether the launch is a part of a larger one, of which only the rays that matter are kept.
+    """
     chains = chains_of(launch, scene, max_depth)
     scattered = scattered or scattered_of(launch)
     if not part:
@@ -103,7 +116,12 @@ def met_by(
 
 
 def united(parts: Sequence[Met], scene: SionnaScene) -> Met:
-    """What the parts of a launch, one at least, met together; each chain once, as `chains_of` sorts."""
+    """Unite what the parts of a launch met; each chain once, as `chains_of` sorts.
+
+    Args:
+        parts: One at least.
+        scene: Where the rays went.
+    """
     if len(parts) == 1:
         return parts[0]
     launch = Launch.joined([part.launch for part in parts])
@@ -125,7 +143,13 @@ def united(parts: Sequence[Met], scene: SionnaScene) -> Met:
 
 
 def chains_of(launch: Launch, scene: SionnaScene, max_depth: int) -> Chains:
-    """All chains that rays of a launch went along, shortest first, then in a stable order."""
+    """Find all chains that rays of a launch went along, shortest first, then in a stable order.
+
+    Args:
+        launch: The rays.
+        scene: Where they went.
+        max_depth: Interactions at most.
+    """
     ray = np.zeros(0, np.int64)
     chain = np.zeros(0, np.int64)
     planes, straight = np.full((1, max_depth), -1, np.int32), np.ones(1, np.bool_)
@@ -289,9 +313,15 @@ class Offer:
         return max(len(self._chains.ray), len(self._scattered.ray))
 
     def candidates(self, targets: Any, count: int) -> tuple[Candidates, Launch, int]:
-        """Direct paths, chains and scattering points that could be paths to the first ``count`` of receivers,
-        a `mitsuba.Point3f`; the launch that their rays are of; and how many more there are than ``max_paths``
-        of each.
+        """List what could be paths: straight lines, chains and scattering points.
+
+        Args:
+            targets: The receivers, a `mitsuba.Point3f`.
+            count: How many of them count: the first ones.
+
+        Returns:
+            The candidates, the launch that their rays are of, and how many more there are than ``max_paths``
+            of each receiver.
         """
         import drjit as dr
 
@@ -331,7 +361,16 @@ class Offer:
 
 
 def first_of_each(receiver: Int64Array, count: int) -> BoolArray:
-    """Which of these receivers' candidates are among the first ``count`` of each."""
+    """Which candidates are among the first of their receiver, Shape ``[P]``.
+
+    Args:
+        receiver: Of each candidate, Shape ``[P]``.
+        count: How many of each receiver.
+
+    Example:
+        >>> first_of_each(np.array([4, 7, 4, 4]), 2).tolist()
+        [True, True, True, False]
+    """
     order = np.argsort(receiver, kind="stable")
     place = np.empty(len(receiver), np.int64)
     ranked = receiver[order]

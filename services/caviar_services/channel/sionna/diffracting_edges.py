@@ -76,15 +76,28 @@ class SceneEdges:
         return edges, self._piece
 
     def ends(self, edges: Int64Array) -> Float64Array:
-        """Both ends of these edges as they stand [m], Shape ``[N, 2, 3]``; 0 for −1."""
+        """Both ends of edges as they stand [m], Shape ``[N, 2, 3]``; 0 for −1.
+
+        Args:
+            edges: Numbers, Shape ``[N]``.
+        """
         return self._corners(self._edges.ends, edges)
 
     def faces(self, edges: Int64Array) -> tuple[Faces, BoolArray]:
-        """Their faces as they stand, and which edges have any: those of parked bodies have none."""
+        """Faces of edges as they stand, and which edges have any: those of bodies that stand for nothing
+        have none.
+
+        Args:
+            edges: Numbers, Shape ``[N]``.
+        """
         return faces_of(self.ends(edges), self._corners(self._edges.apexes, edges))
 
     def outward(self, edges: Int64Array) -> Float64Array:
-        """Unit vectors between the normals of both faces, Shape ``[N, 3]``; 0 at free edges and for −1."""
+        """Unit vectors between the normals of both faces, Shape ``[N, 3]``; 0 at free edges and for −1.
+
+        Args:
+            edges: Numbers, Shape ``[N]``.
+        """
         outward, some = np.zeros((len(edges), 3)), np.flatnonzero(edges >= 0)
         between = self.faces(edges[some])[0].normals.sum(1)
         length = np.sqrt((between**2).sum(-1, keepdims=True))
@@ -172,7 +185,12 @@ class DeviceEdges:
         self._take_rows()
 
     def move(self, first: int, rows: Float64Array) -> None:
-        """Put the edges from this one on there."""
+        """Put the edges from one on elsewhere.
+
+        Args:
+            first: Number of that edge.
+            rows: As for the class, of these edges.
+        """
         self._rows[:, first:] = rows
         self._take_rows()
 
@@ -229,7 +247,11 @@ class DeviceEdges:
 
 
 def edge_generator(edges: SceneEdges) -> Any:
-    """A `SBCandidateGenerator` of Sionna RT whose rays are diffracted at these edges."""
+    """Make a `SBCandidateGenerator` of Sionna RT whose rays are diffracted at these edges.
+
+    Args:
+        edges: Of the scene.
+    """
     import drjit as dr
     from sionna.rt.constants import InteractionType
     from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
@@ -267,7 +289,11 @@ class EdgeRange:
         self._edges, self._within = edges, within_m
 
     def reaches(self, places: Float64Array) -> bool:
-        """Whether any edge is in range of any of these places [m], Shape ``[N, 3]``."""
+        """Whether any edge is in range of any of these places.
+
+        Args:
+            places: [m], Shape ``[N, 3]``.
+        """
         if self._edges is None:
             return False
         edges = self._edges.all_ends
@@ -282,8 +308,12 @@ class EdgeRange:
         return False
 
     def within(self, table: PathTable, start: Float64Array, end: Float64Array) -> BoolArray:
-        """Which paths have no edge out of range of both ends, Shape ``[P]``; ``start`` and ``end`` ``[P, 3]``
-        [m] are these."""
+        """Which paths have no edge out of range of both ends, Shape ``[P]``.
+
+        Args:
+            table: The paths.
+            start, end: Their ends [m], Shape ``[P, 3]``.
+        """
         bent = table.types == Interaction.DIFFRACTION
         near = np.zeros(bent.shape, np.bool_)
         for place in (start, end):

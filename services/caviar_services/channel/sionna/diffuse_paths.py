@@ -68,7 +68,11 @@ class Scattered:
 
 
 def scattered_of(launch: Launch) -> Scattered:
-    """Every interaction of a launch that is a diffuse reflection."""
+    """List every interaction of a launch that is a diffuse reflection.
+
+    Args:
+        launch: The rays.
+    """
     rays = [np.flatnonzero(bounce.kind.numpy() == SCATTERED) for bounce in launch.bounces]
     depth = np.repeat(np.arange(1, len(rays) + 1), np.array([len(ray) for ray in rays], np.int64))
     return Scattered(np.concatenate([np.zeros(0, np.int64), *rays]), depth, np.zeros((0, len(depth))))
@@ -87,8 +91,14 @@ class DrawnPoints:
         self._mi_scene, self._launch, self._found = mi_scene, launch, found
 
     def reached(self, targets: Any) -> tuple[Int64Array, Int64Array, Float64Array]:
-        """Scattering points and the receivers that each of them reaches, on the side that was lit; all with
-        the probability of what was drawn."""
+        """Find the receivers that points reach, on the side that was lit.
+
+        Args:
+            targets: The receivers, a `mitsuba.Point3f`.
+
+        Returns:
+            Points and receivers of the pairs, and 0 as probability: that of what was drawn.
+        """
         import drjit as dr
         import mitsuba as mi
 
@@ -131,7 +141,11 @@ class Element:
         return repr(self.antenna.array).encode() + self.antenna.rotation.tobytes()
 
     def gain(self, directions: Float64Array) -> Float64Array:
-        """Power gain towards unit vectors in world axes, Shape ``[N, 3]``; the mean over subarrays."""
+        """Power gain towards directions, the mean over subarrays, Shape ``[N]``.
+
+        Args:
+            directions: Unit vectors in world axes, Shape ``[N, 3]``.
+        """
         gains = [
             (part.pattern or FormulaPattern(part.array.pattern)).amplitude(directions @ part.rotation) ** 2
             for part in self.antenna.subarrays
@@ -169,10 +183,16 @@ class Thinning:
             self._mirror[number] = _at_normal(material)
 
     def points(self, launch: Launch, source: Float64Array, element: Element | None) -> Scattered:
-        """All points at which rays of a launch from ``source``, Shape ``[3]``, met something rough, with
-        position [m], normal and what each is expected to bring, Shape ``[7, P]``.
+        """List all points at which rays of a launch met something rough.
 
-        ``element`` is the transmitter's; None: its gain is the same in all directions.
+        Args:
+            launch: The rays.
+            source: Where they came from [m], Shape ``[3]``.
+            element: Of the transmitter; None: its gain is the same in all directions.
+
+        Returns:
+            The points, with position [m], normal and what each is expected to bring as rows, Shape ``[7,
+            P]``.
         """
         parts = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((7, 0)))]
         here, power = source[None], np.ones(1)
@@ -199,10 +219,17 @@ class Thinning:
     def chosen(
         self, ray: Int64Array, depth: Int64Array, weight: Float64Array
     ) -> tuple[BoolArray, Float64Array]:
-        """Which points are kept for which receivers, and with what probability, each of Shape ``[P, R]``.
+        """Choose the points that are kept for each receiver.
 
-        A point's place in the sequence is its ray's and depth's, whoever receives: so the choice for a
-        receiver changes as little as its weights do.
+        A point's place in the sequence is that of its ray and depth, the same for all receivers: so the
+        choice for a receiver changes as little as its weights do.
+
+        Args:
+            ray, depth: Of each point, Shape ``[P]``.
+            weight: What each is expected to bring each receiver, Shape ``[P, R]``.
+
+        Returns:
+            Which are kept, and with what probability, each of Shape ``[P, R]``.
         """
         total = np.rint(weight * _UNIT).astype(np.int64).sum(0) / _UNIT
         probability = weight * (self._wanted / np.maximum(total, 1 / _UNIT))
@@ -253,7 +280,12 @@ def _turned(depth: Int64Array) -> UInt64Array:
 
 
 class ChosenPoints:
-    """The points that `Thinning.points` found."""
+    """The points that `Thinning.points` found, of which each receiver is offered a choice.
+
+    Args:
+        thinning: Chooses.
+        found: The points.
+    """
 
     def __init__(self, thinning: Thinning, found: Scattered) -> None:
         import mitsuba as mi
@@ -266,9 +298,13 @@ class ChosenPoints:
         self._point, self._normal = mi.Point3f(*columns[:3]), mi.Normal3f(*columns[3:])
 
     def reached(self, targets: Any) -> tuple[Int64Array, Int64Array, Float64Array]:
-        """Points that were chosen for receivers that they reach, the receivers, and the probabilities.
+        """Choose points for receivers, and keep those that they reach.
 
-        ``targets`` are the receivers, a `mitsuba.Point3f`.
+        Args:
+            targets: The receivers, a `mitsuba.Point3f`.
+
+        Returns:
+            Points and receivers of the pairs, and the probability with which each was chosen.
         """
         nobody = np.zeros(0, np.int64)
         if not len(self._ray):

@@ -7,17 +7,15 @@ single pieces of scenery have materials by name, pattern or class.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import msgspec
 
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import ScenarioError, suggestion
-from caviar_protocol.scenario.conversion import Place
 from caviar_services.channel.propagation.fresnel import EPSILON_0
 
 Constants = tuple[float, float]
@@ -99,12 +97,29 @@ class ObjectMaterials:
         return tuple(sorted(set(self.by_key.values())))
 
     def of(self, name: str, cls: str = "") -> str:
-        """Material of an object, or of a piece of scenery; empty where no key is for it."""
+        """Material of an object, or of a piece of scenery; empty where no key is for it.
+
+        Args:
+            name: Of the object or piece.
+            cls: Class of the object; empty for scenery.
+
+        Example:
+            >>> materials = ObjectMaterials({"car": "glass", "bus.*": "metal"})
+            >>> materials.of("bus.3", "bus"), materials.of("c7", "car"), materials.of("wall")
+            ('metal', 'glass', '')
+        """
         return self.by_key.get(self.key_for(name, cls), "")
 
     def key_for(self, name: str, cls: str = "") -> str:
-        """Key that counts for an object: its name, else the first pattern that matches it, else its class;
-        empty where none of these is there."""
+        """Find the key that counts for an object: its name, else the first pattern that matches it, else its
+        class.
+
+        Args:
+            name, cls: See `of`.
+
+        Returns:
+            The key; empty where there is none.
+        """
         if not self.by_key:
             return ""
         if name in self.by_key:
@@ -113,18 +128,34 @@ class ObjectMaterials:
         return next(patterns, cls if cls in self.by_key else "")
 
     def key_of(self, material: str) -> str:
-        """The first key of a material."""
+        """The first key of a material.
+
+        Args:
+            material: One of `names`.
+        """
         return next(key for key, found in self.by_key.items() if found == material)
 
     def unmatched(self, named: Iterable[tuple[str, str]]) -> tuple[str, ...]:
-        """Keys that count for none of these names and classes."""
+        """Keys that count for no object, in which a name is mostly misspelt.
+
+        Args:
+            named: Names and classes of objects and pieces of scenery.
+        """
         used = {self.key_for(name, cls) for name, cls in named}
         return tuple(key for key in self.by_key if key not in used)
 
 
 def body_kind(asset: str, material: str) -> str:
-    """Name of the bodies of a mesh and a material; those of ``body_material``, the empty string here, are
-    called as the asset itself."""
+    """Name the bodies of a mesh and a material.
+
+    Args:
+        asset: File of the mesh; empty for the box.
+        material: Empty for ``body_material``, whose bodies are called as the asset itself.
+
+    Example:
+        >>> body_kind("objects/car.ply", "glass")
+        'objects/car.ply of glass'
+    """
     return f"{asset or 'the box'} of {material}" if material else asset
 
 
@@ -160,14 +191,22 @@ class MaterialSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
         return self.relative_permittivity is not None and self.conductivity_s_per_m is not None
 
     def missing(self, name: str) -> str:
-        """What a material of the user's own, of this name, lacks; empty where neither constant is given."""
+        """Remedy for a material of the user's own that lacks a constant; empty where both or none are given.
+
+        Args:
+            name: Of the material.
+        """
         lacking = [
             key for key in ("relative_permittivity", "conductivity_s_per_m") if getattr(self, key) is None
         ]
         return f"write materials.{name}.{lacking[0]} for one of your own, or " if len(lacking) == 1 else ""
 
     def applied(self, constants: Constants) -> Constants:
-        """These constants with the changes."""
+        """Change constants as the scenario says.
+
+        Args:
+            constants: As ITU-R P.2040 defines them.
+        """
         permittivity, conductivity = constants
         if self.relative_permittivity is not None:
             permittivity = self.relative_permittivity
@@ -187,6 +226,11 @@ class MaterialPolicy:
     """Of the settings in the scenario, for messages."""
 
     def of(self, name: str) -> MaterialSettings:
+        """What is changed about a material.
+
+        Args:
+            name: Of the material.
+        """
         return self.changes.get(name, MaterialSettings())
 
 
@@ -234,11 +278,19 @@ class OutsideUse:
     """As used, with what the scenario changes."""
 
     def brief(self, carrier: str) -> str:
-        """For the provenance: ``brick@mmwave: nearest 40 GHz``."""
+        """For the provenance: ``brick@mmwave: nearest 40 GHz``.
+
+        Args:
+            carrier: Name of the carrier.
+        """
         return f"{self.name}@{carrier}: {self.itu.source}"
 
     def note(self, carrier: str) -> str:
-        """For the user, with the constants."""
+        """For the user, with the constants.
+
+        Args:
+            carrier: Name of the carrier.
+        """
         permittivity, conductivity = self.constants
         return (
             f"material {self.name!r} ({self.itu.label}) is defined for {_spans(self.itu.ranges_ghz)}; "
@@ -250,12 +302,22 @@ class OutsideUse:
 def itu_material(
     name: str, itu_type: str, frequency_hz: float, policy: MaterialPolicy, remedy: str = ""
 ) -> ItuMaterial:
-    """A material by its ITU-R P.2040 type: a·f^b and c·f^d with f in GHz (P.2040-3, eqs. 28 and 29, table 3);
-    or one of `OTHER_MATERIALS` by its name.
+    """Evaluate a material of ITU-R P.2040, or one of `OTHER_MATERIALS`, at a frequency.
 
-    Outside of all ranges the nearest one counts, by the distance [Hz] of its nearest end; of two equally
-    near, the first of the table. Raises `ScenarioError` naming material, ranges and remedies under the policy
-    ``error``; ``remedy`` stands in place of constants of the user's own.
+    Its constants are a·f^b and c·f^d with f in GHz (P.2040-3, eqs. 28 and 29, table 3). Outside of all
+    ranges the nearest one counts, by the distance [Hz] of its nearest end; of two equally near, the first of
+    the table.
+
+    Args:
+        name: Of the material in the scenario, for messages.
+        itu_type: Its name in the Recommendation: ``concrete``.
+        frequency_hz: [Hz].
+        policy: What to do where the material is not defined.
+        remedy: What an error proposes in place of constants of the user's own.
+
+    Raises:
+        ScenarioError: There is no such material, or it is not defined at the frequency under the policy
+            ``error``; names material, ranges and remedies.
     """
     from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
 
@@ -298,130 +360,6 @@ def itu_material(
         policy=policy.outside,
         constants=constants,
     )
-
-
-@contextmanager
-def any_frequency() -> Iterator[None]:
-    """While a scene is loaded, which Sionna RT does at 3.5 GHz, no material is outside its range.
-
-    The materials then have constants that mean nothing: `freeze` and `set_materials` are to follow.
-    """
-    from sionna.rt.radio_materials import itu_material as module
-
-    evaluate = module.itu_material
-    module.itu_material = lambda name, frequency: (1.0, 0.0)
-    try:
-        yield
-    finally:
-        module.itu_material = evaluate
-
-
-def freeze(scene: Any) -> None:
-    """Let no change of the scene's frequency change a material."""
-    for material in scene.radio_materials.values():
-        if hasattr(material, "itu_type"):
-            material.frequency_update_callback = None
-
-
-@dataclass(frozen=True, eq=False)
-class ObjectMaterial:
-    """A material that objects are given, in the ray tracer."""
-
-    name: str
-    radio: Any
-    """The `sionna.rt.RadioMaterial`."""
-    itu: tuple[ItuMaterial, ...]
-    """On each carrier; empty where its constants are the scenario's."""
-    constants: tuple[Constants, ...]
-    """On each carrier, as used."""
-
-
-def object_materials(
-    objects: ObjectMaterials, frequencies_hz: tuple[float, ...], policy: MaterialPolicy
-) -> dict[str, ObjectMaterial]:
-    """The materials that objects are given, by name.
-
-    Raises `ScenarioError` naming the key for one that neither ITU-R P.2040 nor `OTHER_MATERIALS` has, without
-    constants of the scenario's own.
-    """
-    from sionna.rt import RadioMaterial
-
-    made = {}
-    for name in objects.names:
-        change, key = policy.of(name), Place("object_materials").at(objects.key_of(name)).key
-        remedy = f"choose another material, give {policy.key}.materials.{name} constants of its own"
-        itu: tuple[ItuMaterial, ...] = ()
-        if not change.is_electric:
-            itu = tuple(itu_material(key, name, f, policy, remedy) for f in frequencies_hz)
-        defined = [of.constants for of in itu] or [(1.0, 0.0)] * len(frequencies_hz)
-        constants = tuple(change.applied(of_carrier) for of_carrier in defined)
-        radio = RadioMaterial(f"{OBJECT_MATERIAL}{name}", BODY_THICKNESS)
-        _checked_change(radio, name, change, policy)
-        radio.relative_permittivity, radio.conductivity = constants[0]
-        made[name] = ObjectMaterial(name, radio, itu, constants)
-    return made
-
-
-def set_materials(
-    scene: Any, frequency_hz: float, policy: MaterialPolicy, others: Iterable[str] = ()
-) -> None:
-    """Give all materials of a `sionna.rt.Scene` their constants at the carrier.
-
-    Constants are set here rather than by Sionna RT, whose float32 frequency puts 60 GHz outside of
-    a range that ends at 60 GHz; the scene's own materials are frozen. ``others`` are those that objects are
-    given. Raises `ScenarioError` for an unknown name or a bad value.
-    """
-    materials = scene.radio_materials
-    unknown = sorted(policy.changes.keys() - materials.keys() - set(others))
-    if unknown:
-        raise ScenarioError(
-            f"the scenery has no material {unknown[0]!r}; it has: {', '.join(sorted(materials))}",
-            key=f"{policy.key}.materials.{unknown[0]}",
-        )
-    for name, material in materials.items():
-        itu = _itu_of(name, material, frequency_hz, policy)
-        if itu is not None:
-            material.relative_permittivity, material.conductivity = itu.constants
-        _checked_change(material, name, policy.of(name), policy)
-    scene.frequency = frequency_hz
-
-
-def itu_materials(
-    scene: Any, frequency_hz: float, policy: MaterialPolicy
-) -> list[tuple[Any, ItuMaterial, Constants]]:
-    """Materials of a `sionna.rt.Scene` that may differ between carriers, with their constants at one, as ITU
-    defines them and as changed."""
-    found = []
-    for name, material in scene.radio_materials.items():
-        itu = _itu_of(name, material, frequency_hz, policy)
-        if itu is not None:
-            found.append((material, itu, policy.of(name).applied(itu.constants)))
-    return found
-
-
-def _itu_of(name: str, material: Any, frequency_hz: float, policy: MaterialPolicy) -> ItuMaterial | None:
-    """The ITU material that a material of the scene is; None for others, and for those that nothing needs."""
-    if not hasattr(material, "itu_type") or policy.of(name).is_electric or not material.is_used:
-        return None
-    return itu_material(name, material.itu_type, frequency_hz, policy)
-
-
-def _checked_change(material: Any, name: str, change: MaterialSettings, policy: MaterialPolicy) -> None:
-    """Give a material what a scenario changes about it. Raises `ScenarioError` for a bad value."""
-    try:
-        for attribute, value in (
-            ("relative_permittivity", change.relative_permittivity),
-            ("conductivity", change.conductivity_s_per_m),
-            ("scattering_coefficient", change.scattering_coefficient),
-            ("xpd_coefficient", change.xpd_coefficient),
-            ("thickness", change.thickness_m),
-        ):
-            if value is not None:
-                setattr(material, attribute, value)
-    except ValueError as error:
-        raise ScenarioError(
-            f"material {name!r}: {error}; correct it", key=f"{policy.key}.materials.{name}"
-        ) from error
 
 
 def _clamped(gigahertz: float, span: tuple[float, float]) -> float:

@@ -232,13 +232,21 @@ class PathFinder:
         return self._following.state(self.tracer.offers()) if self._following else FollowingState()
 
     def resume(self, state: FollowingState) -> None:
-        """Follow the chains of a saved state."""
+        """Follow the chains of a saved state.
+
+        Args:
+            state: Of another finder with the same settings.
+        """
         if self._following is not None:
             self._following.resume(state)
             self.tracer.offer_again(state.offers)
 
     def place(self, scene: Scene) -> tuple[tuple[str, ...], Float64Array]:
-        """Move the bodies to the objects of a frame; see `SionnaScene.place`."""
+        """Move the bodies to the objects of a frame; see `SionnaScene.place`.
+
+        Args:
+            scene: The scene of the frame.
+        """
         self._without_edge, self.missed = 0, []
         if self._following is not None:
             return self._following.place(scene)
@@ -312,7 +320,12 @@ class PathFinder:
         return found
 
     def in_edge_range(self, table: PathTable, antennas: Ends) -> PathTable:
-        """Paths without those over edges that are out of range of both ends."""
+        """Leave out paths over edges that are out of range of both ends.
+
+        Args:
+            table: All paths of a frame.
+            antennas: Transmitters and receivers.
+        """
         if self._edge_range is None:
             return table
         return table.take(self._edge_range.within(table, *path_ends(table.pair, *antennas)))

@@ -120,7 +120,11 @@ class Tracer:
         )
 
     def offer_again(self, offers: Sequence[tuple[bytes, TableState]]) -> None:
-        """Go on with what was on offer, the scene being as it was then."""
+        """Go on with what was on offer, the scene being as it was then.
+
+        Args:
+            offers: Of `offers`.
+        """
         for position, state in offers:
             offer = FollowedOffer.again(state, np.frombuffer(position), self._scene, self._options)
             self._last[position] = _Last(self._scene.version, offer, np.zeros((0, 3)), self.nothing)
@@ -131,7 +135,11 @@ class Tracer:
         A path whose chain n rays went along is missing from one half, over all ways to halve the launch, with
         probability 2⁻ⁿ. So the power of paths times this is the expected error of half of the rays against
         all of them: what a launch in two halves would show, without a second one. Straight and diffuse paths
-        have 0. ``traced`` is what the last `trace` from ``transmitter`` returned.
+        have 0.
+
+        Args:
+            transmitter: Where the last `trace` was from [m], Shape ``[3]``.
+            traced: What it returned, or some of it.
         """
         last = self._last.get((transmitter - self._scene.centre).tobytes())
         depth = (traced.types != 0).sum(1)
@@ -172,13 +180,19 @@ class Tracer:
         corners: Corners | None = None,
         element: Element | None = None,
     ) -> Traced:
-        """Paths from one transmitter [3] to all receivers [R, 3], positions in metres in the world.
+        """Find the paths from one transmitter to all receivers.
 
-        ``at_once`` receivers are handled together, or as many as fit ``lanes``: to the paths it makes no
-        difference. With ``followed``, what the transmitter's last launches met, a part of the rays is
-        launched; ``names`` is what `SionnaScene.place` returned. With ``corners`` also paths that only a part
-        of the arrays has; nothing is then taken from an earlier trace. Diffuse paths are chosen by the gain
-        of ``element`` too, the transmitter's.
+        Args:
+            transmitter: In the world [m], Shape ``[3]``.
+            receivers: In the world [m], Shape ``[R, 3]``.
+            at_once: Receivers that are looked at together; None: as many as fit ``lanes``. The paths are the
+                same.
+            followed: What the transmitter's last launches met: a part of the rays is launched. None: all are.
+            names: What `SionnaScene.place` returned; for ``followed``.
+            lanes: Candidates that are looked at together at most.
+            corners: Asks also for paths that only a part of the arrays has; nothing is then taken from an
+                earlier trace. None: the centres alone count.
+            element: The transmitter's, by whose gain diffuse paths are chosen; None: by no gain.
         """
         if not len(receivers):
             return self.nothing

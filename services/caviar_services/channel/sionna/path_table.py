@@ -68,12 +68,22 @@ class Traced(Rows):
     """How many more candidates were found than ``max_paths`` of each receiver."""
 
     def seen_from(self, first: int) -> Traced:
-        """The same with receivers counted from this one on."""
+        """The same with receivers counted from another one on.
+
+        Args:
+            first: Index of that receiver.
+        """
         return replace(self, receiver=self.receiver + first)
 
 
 def nothing(carriers: int, depth: int, lost: int) -> Traced:
-    """No paths."""
+    """No paths.
+
+    Args:
+        carriers: How many.
+        depth: Interactions of a path at most.
+        lost: How many candidates were lost.
+    """
     return Traced(
         receiver=np.zeros(0, np.int64),
         transfer=np.zeros((carriers, 0, 3, 3), np.complex128),
@@ -89,7 +99,13 @@ def nothing(carriers: int, depth: int, lost: int) -> Traced:
 
 
 def joined(parts: Sequence[Traced], carriers: int, depth: int) -> Traced:
-    """All of these paths, part by part."""
+    """All of these paths, part by part.
+
+    Args:
+        parts: Of one transmitter; none at all are no paths.
+        carriers: How many.
+        depth: Interactions of a path at most.
+    """
     if len(parts) == 1:
         return parts[0]
     whole = Traced.joined([nothing(carriers, depth, 0), *parts])
@@ -97,7 +113,11 @@ def joined(parts: Sequence[Traced], carriers: int, depth: int) -> Traced:
 
 
 def geometry(buffer: Any) -> tuple[UInt8Array, Int64Array, Int64Array, Float64Array]:
-    """Types, shapes, triangles and points that a buffer holds, each of Shape ``[P, D]`` or ``[P, D, 3]``."""
+    """Types, shapes, triangles and points that a buffer holds, each of Shape ``[P, D]`` or ``[P, D, 3]``.
+
+    Args:
+        buffer: A `PathsBuffer` of Sionna RT.
+    """
     import drjit as dr
 
     depth = buffer.max_depth
@@ -118,7 +138,15 @@ def read(
     receivers: Float64Array,
     lost: int,
 ) -> Traced:
-    """The paths of a solver's buffer, from a transmitter [3] to receivers [R, 3], positions in metres."""
+    """Read the paths of a solver's buffer.
+
+    Args:
+        buffer: A `PathsBuffer` of Sionna RT, with the fields of all carriers.
+        carriers: How many.
+        transmitter: As the ray tracer has it [m], Shape ``[3]``.
+        receivers: As the ray tracer has them [m], Shape ``[R, 3]``.
+        lost: How many candidates were lost.
+    """
     import drjit as dr
 
     dr.eval(buffer.a, buffer.valid)
@@ -144,7 +172,12 @@ def read(
 
 
 def edge_numbers(buffer: Any, types: UInt8Array) -> Int64Array:
-    """Number of the edge in each path that is diffracted, −1 in others, Shape ``[P]``."""
+    """Number of the edge in each path that is diffracted, −1 in others, Shape ``[P]``.
+
+    Args:
+        buffer: A `PathsBuffer` of Sionna RT.
+        types: `Interaction` of each point, Shape ``[P, D]``.
+    """
     wedges = buffer.diffracting_wedges
     if wedges is None:
         return np.full(len(types), -1)
@@ -350,7 +383,12 @@ def _with_sights(
 def path_ends(
     pair: Int64Array, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]
 ) -> tuple[Float64Array, Float64Array]:
-    """Positions [m] of TX and RX of paths, each of Shape ``[P, 3]``."""
+    """Positions [m] of TX and RX of paths, each of Shape ``[P, 3]``.
+
+    Args:
+        pair: Of each path, Shape ``[P]``.
+        transmitters, receivers: Antennas.
+    """
     tx, rx = np.divmod(pair, max(len(receivers), 1))
     start = np.array([antenna.position for antenna in transmitters]).reshape(-1, 3)
     end = np.array([antenna.position for antenna in receivers]).reshape(-1, 3)
@@ -364,9 +402,13 @@ def traced_surfaces(
     points: Float64Array,
     scene: SionnaScene,
 ) -> Surfaces:
-    """Surfaces of some paths of all launches: ``traced`` are their numbers, −1 for paths that meet nothing.
+    """Surfaces that some paths of all launches meet.
 
-    ``types`` and ``points`` are those of the table.
+    Args:
+        launches: What was traced.
+        traced: Numbers of the paths among all, −1 for paths that meet nothing, Shape ``[P]``.
+        types, points: Those of the table.
+        scene: As it stands.
     """
     depth = types.shape[1]
     # Nothing stands at the end, where −1 finds it.

@@ -194,12 +194,24 @@ def plane_numbers(mesh: Mesh) -> Int32Array:
     Planes are numbered in the order of their first triangles, so a number stays what it is while the
     mesh moves, turns and is stretched: what lies in one plane does so afterwards. Triangles need not touch:
     a path has one point in a plane at most. A triangle without area is a plane of its own.
+
+    Args:
+        mesh: Any.
+
+    Example:
+        >>> from caviar_services.mesh.shapes import unit_box
+        >>> plane_numbers(unit_box()).tolist()
+        [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5]
     """
     return plane_numbers_of([mesh])[0]
 
 
 def plane_numbers_of(meshes: Sequence[Mesh]) -> list[Int32Array]:
-    """`plane_numbers` of each of many meshes, all at once."""
+    """`plane_numbers` of each of many meshes, all at once.
+
+    Args:
+        meshes: Any.
+    """
     if not meshes:
         return []
     counts = [len(mesh.faces) for mesh in meshes]
@@ -229,10 +241,14 @@ def _in_order(label: Int64Array) -> Int32Array:
 
 
 def shared_planes(table: PlaneTable, count: int) -> Int64Array:
-    """For each plane of a table, the number of the infinite plane that it is a part of, Shape ``[P]``.
+    """Number of the infinite plane that each plane of a table is a part of, Shape ``[P]``.
 
-    The first ``count`` planes, which stand still, share one where they agree to a grid of 1e-4 in the
+    The first planes, which stand still, share one where they agree to a grid of 1e-4 in the
     normal and 1 mm in the offset: the walls of a row of houses reflect as one. The others are on their own.
+
+    Args:
+        table: Planes of faces.
+        count: How many stand still.
     """
     if not count:
         return np.arange(len(table.normal))
@@ -277,8 +293,12 @@ class PlaneTable:
         self._joined: Sequence[Int64Array] = ()
 
     def update(self, corners: Float64Array, planes: Int64Array | None = None) -> None:
-        """Take planes, all of them where none are named, from these corners of all meshes [m], Shape
-        ``[V, 3]``; the table keeps them."""
+        """Find planes anew.
+
+        Args:
+            corners: Of all meshes [m], Shape ``[V, 3]``; the table keeps them.
+            planes: Numbers of those that have moved; None: all.
+        """
         self._corners = corners
         if planes is None:
             planes = np.arange(len(self._begin))
@@ -301,29 +321,44 @@ class PlaneTable:
         self.high[planes] = np.maximum.reduceat(np.maximum(np.maximum(a, b), c), begin)
 
     def join(self, groups: Sequence[Int64Array]) -> None:
-        """Take planes, group by group in ascending order, for one surface, until `update` is called for the
-        first of each: the box of the first is around all of them."""
+        """Take planes for one surface, until `update` is called for the first of each group: the box of the
+        first is around all of them.
+
+        Args:
+            groups: Planes of each surface, in ascending order.
+        """
         self._joined = groups
         for group in groups:
             self.low[group[0]] = self.low[group].min(0)
             self.high[group[0]] = self.high[group].max(0)
 
     def corners_of(self, triangles: Int64Array) -> Float64Array:
-        """Corners of triangles by number [m], Shape ``[N, 3, 3]``."""
+        """Corners of triangles [m], Shape ``[N, 3, 3]``.
+
+        Args:
+            triangles: Numbers, Shape ``[N]``.
+        """
         corners: Float64Array = self._corners[self._faces[triangles]]
         return corners
 
     def triangles_of(self, planes: Int64Array) -> tuple[Int64Array, Int64Array]:
-        """Numbers of the triangles of these planes, plane after plane, and how many each has."""
+        """Numbers of the triangles of planes, plane after plane, and how many each has.
+
+        Args:
+            planes: Numbers.
+        """
         sizes = self._sizes[planes]
         return self._order[ranges(self._begin[planes], sizes)[1]], sizes
 
     def first_holding(self, triangles: Int64Array, points: Float64Array) -> Int64Array:
-        """For each point [m], Shape ``[N, 3]``, in one of these triangles, the first triangle of the same
-        surface that holds it too.
+        """Find the first triangle of the same surface that holds a point too.
 
         Where faces coincide, the floor of a house and the ground below it, or two houses' common wall, a ray
         hits whichever was looked at first, which depends on the rays beside it.
+
+        Args:
+            triangles: That hold the points, Shape ``[N]``.
+            points: [m], Shape ``[N, 3]``.
         """
         if not len(triangles):
             return triangles
@@ -362,6 +397,15 @@ def two_sided_planes(mesh: Mesh, numbers: Int32Array) -> BoolArray:
 
     From outside of a closed surface whose normals lead outwards, only front faces are met. Every side of a
     triangle then belongs to as many triangles that go along it one way as the other.
+
+    Args:
+        mesh: Any.
+        numbers: Plane of each triangle, Shape ``[F]``.
+
+    Example:
+        >>> from caviar_services.mesh.shapes import unit_box
+        >>> two_sided_planes(unit_box(), plane_numbers(unit_box())).any()
+        np.False_
     """
     count = int(numbers.max(initial=-1)) + 1
     corners = mesh.vertices[mesh.faces]

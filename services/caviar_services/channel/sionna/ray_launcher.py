@@ -34,7 +34,16 @@ _INTERACTION_BYTES = 250
 
 
 def rays_within(memory_gib: float, max_depth: int) -> int:
-    """How many rays may be traced together: at least 10,000, and at most `RAYS_AT_ONCE`."""
+    """How many rays may be traced together: at least 10,000, and at most `RAYS_AT_ONCE`.
+
+    Args:
+        memory_gib: Memory for them [GiB].
+        max_depth: Interactions of a ray at most.
+
+    Example:
+        >>> rays_within(0.05, 3)
+        71582
+    """
     fit = memory_gib * 2**30 / (_INTERACTION_BYTES * max(max_depth, 1))
     return int(min(max(fit, 10_000), RAYS_AT_ONCE))
 
@@ -99,7 +108,11 @@ class Bounce:
     """`mitsuba.Float`: that this kind of interaction was drawn."""
 
     def take(self, rays: Any) -> Bounce:
-        """Those of these rays, a `mitsuba.UInt`."""
+        """Those of some rays.
+
+        Args:
+            rays: Their numbers, a `mitsuba.UInt`.
+        """
         import drjit as dr
 
         columns = [getattr(self, field.name) for field in fields(self)]
@@ -124,7 +137,11 @@ class Launch:
         return int(dr.width(self.bounces[0].kind)) if self.bounces else 0
 
     def take(self, rays: Int64Array) -> Launch:
-        """These rays alone."""
+        """Some rays alone.
+
+        Args:
+            rays: Their numbers.
+        """
         import drjit as dr
         import mitsuba as mi
 
@@ -136,7 +153,11 @@ class Launch:
 
     @classmethod
     def joined(cls, parts: Sequence[Launch]) -> Launch:
-        """The rays of several launches of one depth, one part at least, part by part."""
+        """The rays of several launches of one depth, part by part.
+
+        Args:
+            parts: One at least.
+        """
         bounces = tuple(
             Bounce(
                 *(_concatenated([getattr(bounce, field.name) for bounce in met]) for field in fields(Bounce))
@@ -190,10 +211,18 @@ class PartedLauncher:
         rays: Int64Array | None = None,
         number: int = 0,
     ) -> list[T]:
-        """What ``look`` finds in each part of a launch, which it gets with the numbers of its rays.
+        """Look at each part of a launch.
 
-        The rest is as for `Launcher`; ``rays`` are in ascending order. A part's memory is free before
-        the next one is launched, unless ``look`` holds it.
+        A part's memory is free before the next one is launched, unless ``look`` holds it.
+
+        Args:
+            look: Gets the numbers of a part's rays, and what they met.
+            source: See `Launcher`.
+            rays: Numbers of the rays, in ascending order; None: all.
+            number: See `Launcher`.
+
+        Returns:
+            What ``look`` found in each part.
         """
         if rays is None:
             return [
@@ -319,8 +348,13 @@ class Launcher:
 
 
 def spread_directions(count: int, part: int, parts: int) -> Any:
-    """Every ``parts``-th of ``count`` directions that share the sphere, from number ``part`` on, a
-    `mitsuba.Vector3f`; each part is spread over all of it."""
+    """Directions that share the sphere, a `mitsuba.Vector3f`; each part is spread over all of it.
+
+    Args:
+        count: Of all parts together.
+        part: Which part, from 0.
+        parts: How many.
+    """
     return _along_curve(_lattice(count, part, count, parts))
 
 
@@ -350,8 +384,16 @@ def _along_curve(lattice: Any) -> Any:
 
 
 def morton_order(x: Float64Array, y: Float64Array) -> Int64Array:
-    """Indices that sort points of the unit square along the Morton curve (G. M. Morton, "A Computer Oriented
-    Geodetic Data Base", IBM, 1966), Shape ``[N]``; the bits of both coordinates alternate in the key."""
+    """Indices that sort points along the Morton curve, Shape ``[N]``; the bits of both coordinates alternate
+    in the key (G. M. Morton, "A Computer Oriented Geodetic Data Base", IBM, 1966).
+
+    Args:
+        x, y: From 0 to 1, Shape ``[N]``.
+
+    Example:
+        >>> morton_order(np.array([0.9, 0.1, 0.9, 0.1]), np.array([0.9, 0.9, 0.1, 0.1])).tolist()
+        [3, 2, 1, 0]
+    """
     bits = 16
     cells = [np.clip(axis * (1 << bits), 0, (1 << bits) - 1).astype(np.uint64) for axis in (x, y)]
     key = np.zeros(len(x), np.uint64)

@@ -44,9 +44,6 @@ from caviar_services.channel.sionna.materials import (
     UsedSurfaces,
     body_kind,
     itu_material,
-    itu_materials,
-    object_materials,
-    set_materials,
 )
 from caviar_services.channel.sionna.scene_loading import (
     Shape,
@@ -56,9 +53,12 @@ from caviar_services.channel.sionna.scene_loading import (
     file_meshes,
     file_vertices,
     floats,
+    itu_materials,
     loaded,
     mi_mesh,
     near_middle,
+    object_materials,
+    set_materials,
     unit_mesh,
     with_detail,
 )
@@ -248,7 +248,11 @@ class SionnaScene(NumberedTriangles):
         return np.moveaxis(np.array(constants), -1, 0), np.array(slabs).T
 
     def media(self, shapes: Int64Array) -> Media:
-        """What process-local shapes are made of; anything for no shape."""
+        """What process-local shapes are made of; anything for no shape.
+
+        Args:
+            shapes: Of any Shape.
+        """
         of = self._shape_order[self._where(shapes)]
         constants, slabs = self._surface_materials
         return Media(*constants[..., of], *slabs[:, of])
@@ -345,7 +349,11 @@ class SionnaScene(NumberedTriangles):
         return bool(self._scenery)
 
     def enclosing(self, position: Float64Array) -> int:
-        """See `NumberedTriangles.enclosing`; below its lowest point, no scenery is around anything."""
+        """See `NumberedTriangles.enclosing`; below its lowest point, no scenery is around anything.
+
+        Args:
+            position: [m], Shape ``[3]``.
+        """
         piece = super().enclosing(position)
         return piece if piece >= self.first_body_piece or position[2] >= self.low[2] else -1
 

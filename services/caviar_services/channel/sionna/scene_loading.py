@@ -1,4 +1,4 @@
-"""Scenery in Sionna RT: loaded, joined to one shape a material, with as much detail as asked for.
+"""Scenery in Sionna RT: loaded, given its materials, joined to a shape a material, with the detail asked for.
 
 Faces are as the ray tracer has them, vertices as they stand in the files: it keeps them in float32 only.
 """
@@ -6,7 +6,8 @@ Faces are as the ray tracer has them, vertices as they stand in the files: it ke
 from __future__ import annotations
 
 import gc
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,19 @@ import numpy as np
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import AssetError, ScenarioError
 from caviar_protocol.messages import WARNING
+from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.space.ply import read_ply
 from caviar_services.channel.mesh_detail import DetailEffect, DetailSettings, detailed
-from caviar_services.channel.sionna.materials import any_frequency, freeze
+from caviar_services.channel.sionna.materials import (
+    BODY_THICKNESS,
+    OBJECT_MATERIAL,
+    Constants,
+    ItuMaterial,
+    MaterialPolicy,
+    MaterialSettings,
+    ObjectMaterials,
+    itu_material,
+)
 from caviar_services.mesh.scenery import SceneryShape, asset_name, read_scenery
 from caviar_services.mesh.shapes import Mesh, unit_box
 from caviar_services.ray_tracing import aligned_columns
@@ -38,9 +49,13 @@ class Shape:
 
 
 def file_vertices(description: Path) -> dict[str, Float64Array]:
-    """World vertices [m] of a scenery's shapes as they stand in its files, by name.
+    """Read the world vertices [m] of a scenery's shapes as they stand in its files, by name.
 
-    Raises `AssetError` naming what is wrong with the description, a material or a mesh.
+    Args:
+        description: The scene description.
+
+    Raises:
+        AssetError: Names what is wrong with the description, a material or a mesh.
     """
     vertices = {}
     for shape in read_scenery(description, asset_name(description)).shapes:
@@ -64,7 +79,12 @@ def _check_material(shape: SceneryShape) -> None:
 
 
 def file_meshes(scene: Any, vertices: Mapping[str, Float64Array]) -> dict[str, Mesh]:
-    """The meshes of what was loaded, by name, in world coordinates."""
+    """The meshes of what was loaded, by name, in world coordinates.
+
+    Args:
+        scene: A `sionna.rt.Scene`.
+        vertices: Of `file_vertices`.
+    """
     meshes = {}
     for name, item in scene.objects.items():
         mesh = _mesh_of(item.mi_mesh)
@@ -81,6 +101,15 @@ def _as_in_file(mesh: Mesh, vertices: Float64Array) -> Mesh:
 
 
 def unit_mesh(asset: str, assets: Mapping[str, Path]) -> Mesh:
+    """Load the unit mesh of an asset; that of an empty one is the box.
+
+    Args:
+        asset: Name of the file.
+        assets: Files of the run by name.
+
+    Raises:
+        AssetError: There is no such file, or it is no mesh.
+    """
     import mitsuba as mi
 
     if not asset:
@@ -108,7 +137,12 @@ def _mesh_of(shape: Any) -> Mesh:
 
 
 def mi_mesh(shape: Shape, centre: Float64Array) -> Any:
-    """A shape as the ray tracer has it, relative to ``centre`` [m]."""
+    """Make the mesh that the ray tracer has for a shape.
+
+    Args:
+        shape: In world coordinates.
+        centre: What the ray tracer counts from [m], Shape ``[3]``.
+    """
     import mitsuba as mi
 
     counts = np.array([len(mesh.vertices) for mesh in shape.meshes])
@@ -126,7 +160,11 @@ def mi_mesh(shape: Shape, centre: Float64Array) -> Any:
 
 
 def floats(vertices: Float64Array) -> Any:
-    """Coordinates, Shape ``[V, 3]``, as the ray tracer has them."""
+    """Coordinates as the ray tracer has them.
+
+    Args:
+        vertices: [m], Shape ``[V, 3]``.
+    """
     import mitsuba as mi
 
     (column,) = aligned_columns(vertices.reshape(1, -1))
@@ -134,9 +172,13 @@ def floats(vertices: Float64Array) -> Any:
 
 
 def loaded(description: Path | None) -> Any:
-    """The `sionna.rt.Scene` of a description, or an empty one.
+    """Load the `sionna.rt.Scene` of a description; its materials are frozen.
 
-    Raises `AssetError` where the ray tracer cannot take it.
+    Args:
+        description: None: an empty scene.
+
+    Raises:
+        AssetError: The ray tracer cannot take it.
     """
     from sionna.rt import load_scene
 
@@ -152,9 +194,164 @@ def loaded(description: Path | None) -> Any:
     return scene
 
 
+@contextmanager
+def any_frequency() -> Iterator[None]:
+    """While a scene is loaded, which Sionna RT does at 3.5 GHz, no material is outside its range.
+
+    The materials then have constants that mean nothing: `freeze` and `set_materials` are to follow.
+    """
+    from sionna.rt.radio_materials import itu_material as module
+
+    evaluate = module.itu_material
+    module.itu_material = lambda name, frequency: (1.0, 0.0)
+    try:
+        yield
+    finally:
+        module.itu_material = evaluate
+
+
+def freeze(scene: Any) -> None:
+    """Let no change of the scene's frequency change a material.
+
+    Args:
+        scene: A `sionna.rt.Scene`.
+    """
+    for material in scene.radio_materials.values():
+        if hasattr(material, "itu_type"):
+            material.frequency_update_callback = None
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectMaterial:
+    """A material that objects are given, in the ray tracer."""
+
+    name: str
+    radio: Any
+    """The `sionna.rt.RadioMaterial`."""
+    itu: tuple[ItuMaterial, ...]
+    """On each carrier; empty where its constants are the scenario's."""
+    constants: tuple[Constants, ...]
+    """On each carrier, as used."""
+
+
+def object_materials(
+    objects: ObjectMaterials, frequencies_hz: tuple[float, ...], policy: MaterialPolicy
+) -> dict[str, ObjectMaterial]:
+    """Make the materials that objects are given, by name.
+
+    Args:
+        objects: Which they are.
+        frequencies_hz: Of the carriers [Hz].
+        policy: Changes, and what to do where a material is not defined.
+
+    Raises:
+        ScenarioError: Neither ITU-R P.2040 nor `OTHER_MATERIALS` has one, and the scenario gives no
+            constants; names the key.
+    """
+    from sionna.rt import RadioMaterial
+
+    made = {}
+    for name in objects.names:
+        change, key = policy.of(name), Place("object_materials").at(objects.key_of(name)).key
+        remedy = f"choose another material, give {policy.key}.materials.{name} constants of its own"
+        itu: tuple[ItuMaterial, ...] = ()
+        if not change.is_electric:
+            itu = tuple(itu_material(key, name, f, policy, remedy) for f in frequencies_hz)
+        defined = [of.constants for of in itu] or [(1.0, 0.0)] * len(frequencies_hz)
+        constants = tuple(change.applied(of_carrier) for of_carrier in defined)
+        radio = RadioMaterial(f"{OBJECT_MATERIAL}{name}", BODY_THICKNESS)
+        _checked_change(radio, name, change, policy)
+        radio.relative_permittivity, radio.conductivity = constants[0]
+        made[name] = ObjectMaterial(name, radio, itu, constants)
+    return made
+
+
+def set_materials(
+    scene: Any, frequency_hz: float, policy: MaterialPolicy, others: Iterable[str] = ()
+) -> None:
+    """Give all materials of a `sionna.rt.Scene` their constants at a carrier.
+
+    Constants are set here rather than by Sionna RT, whose float32 frequency puts 60 GHz outside of
+    a range that ends at 60 GHz; the scene's own materials are frozen.
+
+    Args:
+        scene: A `sionna.rt.Scene`.
+        frequency_hz: Of the carrier [Hz].
+        policy: What the scenario says about materials.
+        others: Names of those that objects are given.
+
+    Raises:
+        ScenarioError: The scenario names an unknown material, or gives one a bad value.
+    """
+    materials = scene.radio_materials
+    unknown = sorted(policy.changes.keys() - materials.keys() - set(others))
+    if unknown:
+        raise ScenarioError(
+            f"the scenery has no material {unknown[0]!r}; it has: {', '.join(sorted(materials))}",
+            key=f"{policy.key}.materials.{unknown[0]}",
+        )
+    for name, material in materials.items():
+        itu = _itu_of(name, material, frequency_hz, policy)
+        if itu is not None:
+            material.relative_permittivity, material.conductivity = itu.constants
+        _checked_change(material, name, policy.of(name), policy)
+    scene.frequency = frequency_hz
+
+
+def itu_materials(
+    scene: Any, frequency_hz: float, policy: MaterialPolicy
+) -> list[tuple[Any, ItuMaterial, Constants]]:
+    """List the materials of a scene that may differ between carriers.
+
+    Args:
+        scene: A `sionna.rt.Scene`.
+        frequency_hz: Of the carrier [Hz].
+        policy: What the scenario says about materials.
+
+    Returns:
+        Each with its constants at the carrier, as ITU defines them and as changed.
+    """
+    found = []
+    for name, material in scene.radio_materials.items():
+        itu = _itu_of(name, material, frequency_hz, policy)
+        if itu is not None:
+            found.append((material, itu, policy.of(name).applied(itu.constants)))
+    return found
+
+
+def _itu_of(name: str, material: Any, frequency_hz: float, policy: MaterialPolicy) -> ItuMaterial | None:
+    """The ITU material that a material of the scene is; None for others, and for those that nothing needs."""
+    if not hasattr(material, "itu_type") or policy.of(name).is_electric or not material.is_used:
+        return None
+    return itu_material(name, material.itu_type, frequency_hz, policy)
+
+
+def _checked_change(material: Any, name: str, change: MaterialSettings, policy: MaterialPolicy) -> None:
+    """Give a material what a scenario changes about it. Raises `ScenarioError` for a bad value."""
+    try:
+        for attribute, value in (
+            ("relative_permittivity", change.relative_permittivity),
+            ("conductivity", change.conductivity_s_per_m),
+            ("scattering_coefficient", change.scattering_coefficient),
+            ("xpd_coefficient", change.xpd_coefficient),
+            ("thickness", change.thickness_m),
+        ):
+            if value is not None:
+                setattr(material, attribute, value)
+    except ValueError as error:
+        raise ScenarioError(
+            f"material {name!r}: {error}; correct it", key=f"{policy.key}.materials.{name}"
+        ) from error
+
+
 def by_material(scene: Any, meshes: Mapping[str, Mesh], changed: Mapping[str, Any]) -> list[Shape]:
-    """Meshes of what was loaded, by name, joined to one shape a material; ``changed`` has the materials of
-    pieces that are given another one than the scenery's."""
+    """Join meshes to one shape a material.
+
+    Args:
+        scene: What was loaded.
+        meshes: Of its pieces, by name.
+        changed: Materials of pieces that are given another one than the scenery's.
+    """
     groups: dict[str, Shape] = {}
     for name, mesh in meshes.items():
         material = changed.get(name, scene.objects[name].radio_material)
@@ -167,11 +364,18 @@ def by_material(scene: Any, meshes: Mapping[str, Mesh], changed: Mapping[str, An
 def with_detail(
     shapes: list[Shape], detail: DetailSettings, key: str
 ) -> tuple[list[Shape], DetailEffect | None]:
-    """Scenery with this detail, and what that did to it; None where nothing was to be left out.
+    """Give scenery the detail that the scenario asks for.
 
-    ``key`` is where the detail stands in the scenario.
+    Args:
+        shapes: The scenery.
+        detail: What is left out.
+        key: Where the detail stands in the scenario.
 
-    Raises `ScenarioError` where nothing would be left.
+    Returns:
+        The shapes, and what that did to them; None where nothing was to be left out.
+
+    Raises:
+        ScenarioError: Nothing would be left.
     """
     if detail.is_full:
         return shapes, None
@@ -198,13 +402,21 @@ _FARTHEST = 1e5
 
 
 def near_middle(low: Float64Array, high: Float64Array) -> Float64Array:
-    """Multiples of `_CENTRE_STEP` next to the middle of a box [m], Shape ``[3]``; no negative zeros."""
+    """Multiples of `_CENTRE_STEP` next to the middle of a box [m], Shape ``[3]``; no negative zeros.
+
+    Args:
+        low, high: Corners [m], Shape ``[3]`` each.
+    """
     middle: Float64Array = np.round((low + high) / (2 * _CENTRE_STEP)) * _CENTRE_STEP + 0.0
     return middle
 
 
 def bounds(shapes: Sequence[Shape]) -> tuple[Float64Array, Float64Array]:
-    """Lowest and highest corner [m] of all shapes, Shape ``[3]`` each; the origin where there are none."""
+    """Lowest and highest corner [m] of all shapes, Shape ``[3]`` each; the origin where there are none.
+
+    Args:
+        shapes: In world coordinates.
+    """
     low, high = _boxes(shapes)
     return (low.min(0), high.max(0)) if len(low) else (np.zeros(3), np.zeros(3))
 
@@ -231,18 +443,16 @@ def counting_centre(shapes: Sequence[Shape]) -> tuple[Float64Array, str]:
     low, high = _boxes(shapes)
     if not len(low) or (high.max(0) - low.min(0)).max() <= 2 * _FARTHEST:
         return near_middle(*bounds(shapes)), ""
-    most = np.median((low + high) / 2, axis=0)
-    reach = np.maximum(np.abs(low - most), np.abs(high - most)).max(1)
-    near = reach <= max(_FARTHEST, reach.min())
-    centre = near_middle(low[near].min(0), high[near].max(0))
-    names = [
-        name
-        for shape in shapes
-        for name, mesh in zip(shape.names, shape.meshes, strict=True)
-        if len(mesh.vertices)
-    ]
-    far = int(np.maximum(np.abs(low - centre), np.abs(high - centre)).max(1).argmax())
-    step = np.spacing(np.float32(reach[far]))
+    middles = (low + high) / 2
+    near = np.array([((low >= m - _FARTHEST) & (high <= m + _FARTHEST)).all(1) for m in middles])
+    # Where two places have as many pieces, that which is nearer to the origin counts.
+    most = np.lexsort((np.abs(middles).max(1), -near.sum(1)))[0]
+    kept = near[most] | (np.arange(len(near)) == most)
+    centre = near_middle(low[kept].min(0), high[kept].max(0))
+    reach = np.maximum(np.abs(low - centre), np.abs(high - centre)).max(1)
+    far, step = int(reach.argmax()), np.spacing(np.float32(reach.max()))
+    pieces = [piece for shape in shapes for piece in zip(shape.names, shape.meshes, strict=True)]
+    names = [name for name, mesh in pieces if len(mesh.vertices)]
     return centre, (
         f"{WARNING}the piece {names[far]!r} of the scenery reaches from {_place(low[far])} to "
         f"{_place(high[far])}, where the ray tracer counts in steps of {step:.2g} m: paths by way of it are "

@@ -77,7 +77,11 @@ class TableState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     @classmethod
     def of(cls, table: _Table) -> TableState:
-        """The state of a table."""
+        """The state of a table.
+
+        Args:
+            table: The chains.
+        """
         return cls(
             depth=Packed.of(table.depth, "<i4"),
             kind=Packed.of(table.kind, "<i4"),
@@ -144,7 +148,12 @@ class Followed:
 
     @classmethod
     def resumed(cls, parts: int, state: FollowedState) -> Followed:
-        """The chains of a saved state."""
+        """The chains of a saved state.
+
+        Args:
+            parts: As for the class.
+            state: Of `state`.
+        """
         made = cls(parts)
         made._number, made._names = state.number, state.names
         made._known = None if state.known is None else state.known.table()
@@ -161,8 +170,15 @@ class Followed:
         names: tuple[str, ...],
         options: LaunchOptions,
     ) -> Offer:
-        """What there is to offer to the receivers of the next frame; ``names`` is what `SionnaScene.place`
-        returned for it."""
+        """Launch a part of the rays, and offer what the last launches met.
+
+        Args:
+            launcher: Of all rays.
+            transmitter: Where it is, relative to the scene's centre [m], Shape ``[3]``.
+            scene: As it stands in the frame.
+            names: What `SionnaScene.place` returned for the frame.
+            options: What is launched.
+        """
         jumped = self._known is not None and np.linalg.norm(transmitter - self._from) > _JUMP
         known, number, source = None if jumped else self._known, self._number, positions(transmitter[None])
         rays = None if known is None else self._rays(number)
@@ -202,7 +218,13 @@ class FollowedOffer(Offer):
     def again(
         cls, state: TableState, transmitter: Float64Array, scene: SionnaScene, options: LaunchOptions
     ) -> FollowedOffer:
-        """What was on offer from a position when the scene was as it is now."""
+        """What was on offer from a position when the scene was as it is now.
+
+        Args:
+            state: The chains.
+            transmitter: Relative to the scene's centre [m], Shape ``[3]``.
+            scene, options: As for the class.
+        """
         return cls(state.table(), scene, positions(transmitter[None]), options)
 
     @property
@@ -220,7 +242,11 @@ class FollowedOffer(Offer):
         self._scene, self._table = scene, table
 
     def candidates(self, targets: Any, count: int) -> tuple[Candidates, Launch, int]:
-        """As `Offer.candidates`, with a launch that has one ray for each candidate."""
+        """As `Offer.candidates`, with a launch that has one ray for each candidate.
+
+        Args:
+            targets, count: See `Offer.candidates`.
+        """
         found, _, lost = super().candidates(targets, count)
         return replace(found, ray=np.arange(len(found.ray))), self._launch_of(found.ray), lost
 
@@ -323,24 +349,40 @@ class Following:
         self._placed = None
 
     def of(self, transmitter: str) -> Followed:
-        """The chains of a transmitter."""
+        """The chains of a transmitter.
+
+        Args:
+            transmitter: Its name.
+        """
         return self._followed.setdefault(transmitter, Followed(self._parts))
 
     def place(self, scene: Scene) -> tuple[tuple[str, ...], Float64Array]:
-        """Move the bodies; see `SionnaScene.place`."""
+        """Move the bodies; see `SionnaScene.place`.
+
+        Args:
+            scene: The scene of a frame.
+        """
         placed = self._scene.place(scene, self._without_body)
         self._placed = scene, self._scene.version
         return placed
 
     def state(self, offers: tuple[tuple[bytes, TableState], ...]) -> FollowingState:
-        """All that the next frame's chains follow from, beside its scene; ``offers`` are the tracer's."""
+        """All that the next frame's chains follow from, beside its scene.
+
+        Args:
+            offers: Of the tracer.
+        """
         followed = {name: one.state for name, one in self._followed.items()}
         if self._placed is None or self._placed[1] != self._scene.version:
             return FollowingState(followed=followed)
         return FollowingState(followed=followed, scene=encode_payload(self._placed[0]), offers=offers)
 
     def resume(self, state: FollowingState) -> None:
-        """Take over a state; the tracer is then to offer what it says again."""
+        """Take over a state; the tracer is then to offer what it says again.
+
+        Args:
+            state: Of another channel with the same settings.
+        """
         self._followed = {name: Followed.resumed(self._parts, one) for name, one in state.followed.items()}
         if state.scene is not None:
             self.place(cast(Scene, decode_payload("scene", *state.scene)))

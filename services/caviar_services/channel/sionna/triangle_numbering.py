@@ -87,14 +87,25 @@ class NumberedTriangles:
         return self._vertices.copy()
 
     def count_from(self, centre: Float64Array) -> None:
-        """Move everything to stand about another centre [m], Shape ``[3]``, as it stood about the last."""
+        """Move everything to stand about another centre as it stood about the last.
+
+        Args:
+            centre: [m], Shape ``[3]``.
+        """
         self._corners += centre - self.centre
         self.centre = centre
         self.version += 1
         self.surfaces.move(np.arange(len(self._faces)), self._corners[self._faces])
 
     def move(self, vertices: Float64Array) -> bool:
-        """Put the vertices that may move there [m], Shape ``[V, 3]``. Returns whether any has moved."""
+        """Move the bodies.
+
+        Args:
+            vertices: All that may move [m], Shape ``[V, 3]``.
+
+        Returns:
+            Whether any has moved.
+        """
         changed = (vertices != self._vertices).any(1)
         if not changed.any():
             return False
@@ -120,11 +131,19 @@ class NumberedTriangles:
             self.surface_of = self.joined.label[self.plane_of]
 
     def surface_names(self, triangles: Int64Array, names: Sequence[str]) -> tuple[Int32Array, SurfaceNames]:
-        """By what name paths by way of triangles are known: the number of the plane within its object, or
-        where a body's face is one surface with others, −1 minus the place of that surface's object and plane.
+        """Name surfaces so that paths by way of them are known in other frames.
 
-        A surface has the name of the first scenery that its bodies touch, else the least of its names.
-        ``names`` are those of all pieces, as `SionnaScene.place` returned them.
+        A surface of several planes has the name of the first scenery that its bodies touch, else the least
+        of its names.
+
+        Args:
+            triangles: Numbers, of any Shape.
+            names: Of all pieces, as `SionnaScene.place` returned them.
+
+        Returns:
+            The number of the plane within its object, or where a body's face is one surface with others, −1
+            minus the
+            place of that surface among the second: object and plane of each such surface.
         """
         numbers = self._face_of[triangles].astype(np.int32)
         of, known = self.plane_of[triangles], []
@@ -152,7 +171,11 @@ class NumberedTriangles:
         return self._faces
 
     def begin_of(self, piece: int) -> tuple[int, int]:
-        """Numbers of the first vertex and of the first triangle of a piece."""
+        """Numbers of the first vertex and the first triangle of a piece.
+
+        Args:
+            piece: Its number.
+        """
         return int(self._first_vertices[piece]), int(self._first_triangles[piece])
 
     @property
@@ -176,26 +199,41 @@ class NumberedTriangles:
         return digest.digest()
 
     def bodies_of(self, asset: str) -> Int64Array:
-        """Numbers of the bodies of an asset, counted through all bodies."""
+        """Numbers of the bodies of an asset, counted through all bodies.
+
+        Args:
+            asset: Or the kind of body (`body_kind`).
+        """
         return np.flatnonzero([of == asset for of, _ in self._bodies])
 
     def face_numbers(self, asset: str) -> Int32Array:
-        """Number of the plane of each triangle of a body of an asset, within it; it has one body at least."""
+        """Number of the plane of each triangle of a body of an asset, within it.
+
+        Args:
+            asset: It has one body at least.
+        """
         piece = self.first_body_piece + int(self.bodies_of(asset)[0])
         ends = np.append(self._first_triangles, len(self._faces))
         return self._face_of[ends[piece] : ends[piece + 1]]
 
     def piece_of(self, triangles: Int64Array) -> Int64Array:
-        """Number of the piece that each of these triangles is of."""
+        """Number of the piece that each triangle is of.
+
+        Args:
+            triangles: Numbers, of any Shape.
+        """
         return np.searchsorted(self._first_triangles, triangles, side="right") - 1
 
     def enclosing(self, position: Float64Array) -> int:
-        """Piece that a point [m], Shape ``[3]``, is inside; −1: none.
+        """Find the piece that a point is inside; −1: none.
 
         A ray from inside of a closed surface crosses it an odd number of times. Walls and roof of one
         building may be pieces of their own, and houses mostly have no floor: so all pieces at rest count as
         one surface, and rays go upwards, from shallow to steep. All but one have to agree, so that a roof
         without walls, a screen or a slit does not count.
+
+        Args:
+            position: [m], Shape ``[3]``.
         """
         found: Counter[int] = Counter()
         for met in self.surfaces.above(position):
@@ -219,29 +257,47 @@ class NumberedTriangles:
     def planes(self, shapes: Int64Array, primitives: Int64Array) -> tuple[Float64Array, Float64Array]:
         """A corner [m] and the normal (of any length) of triangles, each of Shape ``[..., 3]``, in float64.
 
-        Anything for no shape.
+        Args:
+            shapes: Process-local shapes; anything follows for no shape.
+            primitives: Triangles of these.
         """
         a, b, c = np.moveaxis(self.triangles(shapes, primitives), -2, 0)
         return a, np.cross(b - a, c - a)
 
     def triangles(self, shapes: Int64Array, primitives: Int64Array) -> Float64Array:
         """The corners [m] of triangles, Shape ``[..., 3, 3]``, in float64: those of scenery as they stand in
-        its files, those of moving bodies where `place` put them last. Anything for no shape."""
+        its files, those of moving bodies where they were placed last.
+
+        Args:
+            shapes, primitives: See `planes`.
+        """
         return self.corners(self.triangle_numbers(shapes, primitives))
 
     def triangle_numbers(self, shapes: Int64Array, primitives: Int64Array) -> Int64Array:
-        """Number, through all shapes, of triangles of process-local shapes; anything for no shape."""
+        """Numbers, through all shapes, of triangles.
+
+        Args:
+            shapes, primitives: See `planes`.
+        """
         number = self._offsets[self._where(shapes)] + primitives
         clipped: Int64Array = np.clip(number, 0, len(self._faces) - 1)
         return clipped
 
     def corners(self, triangles: Int64Array) -> Float64Array:
-        """Corners of triangles by number [m], Shape ``[..., 3, 3]``; float64."""
+        """Corners of triangles [m], Shape ``[..., 3, 3]``; float64.
+
+        Args:
+            triangles: Numbers, of any Shape.
+        """
         corners: Float64Array = self._corners[self._faces[triangles]]
         return corners
 
     def shapes_of(self, triangles: Int64Array) -> tuple[Int64Array, Int64Array]:
-        """Process-local shape of triangles by number, and their numbers within it."""
+        """Process-local shape of triangles, and their numbers within it.
+
+        Args:
+            triangles: Numbers, of any Shape.
+        """
         order = np.argsort(self._offsets)
         where = order[np.searchsorted(self._offsets[order], triangles, side="right") - 1]
         return self._ids[where], triangles - self._offsets[where]
@@ -251,7 +307,12 @@ class NumberedTriangles:
     ) -> Int64Array:
         """Numbers of the same triangles of the same objects, where `place` has given bodies to others since.
 
-        ``before`` and ``now`` are what it returned; −1 where an object has left or has another mesh.
+        Args:
+            triangles: Numbers, of any Shape.
+            before, now: What `place` returned then and last.
+
+        Returns:
+            Numbers now; −1 where an object has left or has another mesh.
         """
         if before == now:
             return triangles
@@ -267,11 +328,19 @@ class NumberedTriangles:
         return np.where(moved[piece] >= 0, start, -1)
 
     def is_body(self, shapes: NDArray[np.uint32]) -> BoolArray:
-        """Whether process-local shapes are of moving bodies."""
+        """Whether shapes are of moving bodies.
+
+        Args:
+            shapes: Process-local shapes, of any Shape.
+        """
         return np.isin(shapes, self._body_ids)
 
     def object_index(self, shapes: Int64Array, primitives: Int64Array) -> Int32Array:
-        """Index into the names of `place` of triangles of process-local shapes; −1 for no shape."""
+        """Index into the names of `place` of triangles; −1 for no shape.
+
+        Args:
+            shapes, primitives: See `planes`.
+        """
         where = self._where(shapes)
         piece = self.piece_of(self._offsets[where] + primitives)
         return np.where(self._ids[where] == shapes, piece, -1).astype(np.int32)
