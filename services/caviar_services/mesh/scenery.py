@@ -267,14 +267,14 @@ def _colour(where: str, bsdf: ElementTree.Element) -> tuple[float, float, float]
 
 
 def _itu_material(bsdf: ElementTree.Element) -> str:
-    """ITU name of a material: told by its type, or by an id like ``mat-itu_concrete.001``."""
-    told = bsdf.find("string[@name='type']")
-    if bsdf.get("type") == "itu-radio-material" and told is not None:
-        return told.get("value", "")
+    """ITU name of a material, from its type, or from an id like ``mat-itu_concrete.001``."""
+    given = bsdf.find("string[@name='type']")
+    if bsdf.get("type") == "itu-radio-material" and given is not None:
+        return given.get("value", "")
     name = re.fullmatch(r"(?:mat-)?itu[_-](.+?)(?:\.\d+)?", bsdf.get("id", ""))
     if name is None:
         return ""
-    return name.group(1) if told is None else told.get("value", "")
+    return name.group(1) if given is None else given.get("value", "")
 
 
 def _resolved(where: str, value: str, defaults: Mapping[str, str]) -> str:

@@ -304,7 +304,11 @@ class Offer:
         self._scattered = met.scattered
 
     def rays_of(self, planes: Int64Array, depth: Int64Array) -> Int64Array:
-        """See `Chains.rays_of`."""
+        """See `Chains.rays_of`.
+
+        Args:
+            planes, depth: Of paths.
+        """
         return self._chains.rays_of(planes, depth)
 
     @property

@@ -3,7 +3,8 @@
 Sionna RT looks for edges within the mesh that a ray has hit, by vertices that faces of this mesh share. Here
 they are those of `mesh_edges`: of scenery as one surface, whose meshes may share none, and of each body.
 
-Diffraction over near edges only: who sets a range pays for no edges out of it.
+With a range (`EdgeRange`), edges out of it cost nothing: where none is in range, rays are launched without
+diffraction.
 """
 
 from __future__ import annotations

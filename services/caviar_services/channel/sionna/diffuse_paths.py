@@ -306,13 +306,13 @@ class ChosenPoints:
         Returns:
             Points and receivers of the pairs, and the probability with which each was chosen.
         """
-        nobody = np.zeros(0, np.int64)
+        none = np.zeros(0, np.int64)
         if not len(self._ray):
-            return nobody, nobody, np.zeros(0)
+            return none, none, np.zeros(0)
         kept, probability = self._thinning.chosen(self._ray, self._depth, self._weights(targets))
         point, receiver = np.nonzero(kept)
         if not len(point):
-            return nobody, nobody, np.zeros(0)
+            return none, none, np.zeros(0)
         free = self._free(point, receiver, targets)
         point, receiver = point[free], receiver[free]
         return point, receiver, probability[point, receiver]

@@ -1,7 +1,7 @@
 """Edges that diffract: where faces of meshes meet, welded by position, whichever meshes they are of.
 
 Buildings come as several meshes, walls apart from roofs, whose common borders share no vertex. So corners
-are told apart by their place, and a border that another mesh divides is divided likewise.
+are distinguished by their place, and a border that another mesh divides is divided likewise.
 
 Around an edge, half-planes of faces divide space into sectors. Where one of these is wider than π, its two
 half-planes are the faces of a wedge: that is a convex edge, whatever else ends there. A sector of 2π is that
@@ -52,12 +52,20 @@ class MeshEdges:
         return free
 
     def renumbered(self, triangles: Int64Array) -> MeshEdges:
-        """The same, with these numbers of the triangles, which ascend."""
+        """The same, with other numbers of the triangles.
+
+        Args:
+            triangles: The number of each, which ascend, Shape ``[F]``.
+        """
         sides = triangles[self.sides[0]], self.sides[1]
         return replace(self, triangles=triangles[self.triangles], sides=sides)
 
     def shifted(self, vertices: int, triangles: int) -> MeshEdges:
-        """The same, with so much higher numbers of vertices and triangles."""
+        """The same, with higher numbers.
+
+        Args:
+            vertices, triangles: By how much the numbers of vertices and triangles are higher.
+        """
         return MeshEdges(
             self.ends + vertices,
             self.apexes + vertices,
@@ -67,7 +75,11 @@ class MeshEdges:
 
     @classmethod
     def joined(cls, parts: Sequence[MeshEdges]) -> MeshEdges:
-        """All of these, part by part, of which each has higher triangles than the one before."""
+        """All of these, part by part.
+
+        Args:
+            parts: One at least; each has higher numbers of triangles than the one before.
+        """
         before = np.cumsum([0, *(len(part) for part in parts[:-1])])
         return cls(
             np.concatenate([part.ends for part in parts]),
@@ -83,7 +95,7 @@ class MeshEdges:
 def mesh_edges(
     vertices: Float64Array, faces: Int64Array, face_of: Int64Array, tolerance: float, free: bool
 ) -> MeshEdges:
-    """The edges of triangles.
+    """Find the straight edges of triangles.
 
     Args:
         vertices: [m], Shape ``[V, 3]``.
@@ -91,6 +103,15 @@ def mesh_edges(
         face_of: Number of the plane face that each triangle is a part of, Shape ``[F]``.
         tolerance: [m]; vertices that are nearer to each other are at one place.
         free: Whether free edges are wanted too.
+
+    Example:
+        >>> from caviar_services.channel.sionna.planes import plane_numbers
+        >>> from caviar_services.mesh.shapes import unit_box
+        >>> mesh = unit_box()
+        >>> faces, planes = mesh.faces.astype(int), plane_numbers(mesh).astype(int)
+        >>> edges = mesh_edges(mesh.vertices, faces, planes, 1e-6, free=False)
+        >>> len(edges)
+        12
     """
     wide = np.flatnonzero(_widths(vertices[faces]) > tolerance)
     if not len(wide):

@@ -70,7 +70,11 @@ class SionnaChannel(PathModel[SionnaSettings]):
 
     @classmethod
     def check_settings(cls, settings: SionnaSettings, place: Place) -> None:
-        """See `SionnaSettings.check`."""
+        """See `SionnaSettings.check`.
+
+        Args:
+            settings, place: What stands where in the scenario.
+        """
         settings.check(place)
 
     def __init__(self, settings: SionnaSettings, run: RunInfo) -> None:
@@ -124,7 +128,11 @@ class SionnaChannel(PathModel[SionnaSettings]):
         return self._room
 
     def enclosing(self, position: Float64Array) -> str:
-        """See `ChannelModel.enclosing`; an antenna at a surface is on the side that it is traced from."""
+        """See `ChannelModel.enclosing`; an antenna at a surface is on the side that it is traced from.
+
+        Args:
+            position: [m], Shape ``[3]``.
+        """
         piece = self._scene.enclosing(self._scene.surfaces.cleared(position))
         return self._names[piece] if piece >= 0 else ""
 
@@ -187,6 +195,14 @@ class SionnaChannel(PathModel[SionnaSettings]):
         return notes
 
     def load(self, preparation: Preparation) -> tuple[str, ...]:
+        """Load the scene, launch what is launched once, and compile; notes for the user.
+
+        Args:
+            preparation: With the files of the run.
+
+        Raises:
+            SetupError, AssetError, ScenarioError: See `load_scene`.
+        """
         s = self.settings
         notes = self.load_scene(preparation)
         frequencies = tuple(carrier.frequency_hz for carrier in self.run.carriers)
@@ -232,7 +248,11 @@ class SionnaChannel(PathModel[SionnaSettings]):
     # --- frames --------------------------------------------------------------------------------------
 
     def reset(self, episode: int, seed: int, t0_ns: int) -> None:
-        """Forget the paths of the episode before: what is followed must not begin with them."""
+        """Forget the paths of the episode before: what is followed must not begin with them.
+
+        Args:
+            episode, seed, t0_ns: See `Service.reset`.
+        """
         self._finder.forget()
 
     def checkpoint(self) -> bytes:
@@ -240,13 +260,25 @@ class SionnaChannel(PathModel[SionnaSettings]):
         return saved(self, 1, self._finder.state)
 
     def restore(self, state: bytes) -> None:
-        """See `checkpoint`."""
+        """Follow the chains of a saved state.
+
+        Args:
+            state: Of `checkpoint`.
+        """
         was = restored(self, 1, FollowingState, state)
         self._activate()
         self._finder.resume(was)
 
     def step(self, frame: Frame) -> StepResult:
-        """Raises `PayloadError` where paths that shall be followed are not known."""
+        """See `ChannelModel.step`.
+
+        Args:
+            frame: The frame.
+
+        Raises:
+            PayloadError: What `ChannelModel.step` refuses; paths are to be followed and are not known, or an
+                antenna is in the middle of a body.
+        """
         if self.settings.follow is not None and frame.previous < 0 < frame.number:
             raise PayloadError(
                 f"{self.run.name} follows paths from the beginning of an episode and was started again in "
@@ -262,6 +294,11 @@ class SionnaChannel(PathModel[SionnaSettings]):
         dr.flush_malloc_cache()
 
     def paths(self, scene: Scene, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]) -> Found:
+        """Find the paths of all pairs: traced, near ones by formula, with what foliage leaves of them.
+
+        Args:
+            scene, transmitters, receivers: See `PathModel.paths`.
+        """
         self._activate()
         _refuse_buried(scene, self.settings.without_body, self.foliage)
         if self.foliage is not None:

@@ -1,4 +1,4 @@
-"""Rays from one transmitter into the scene: every ray's interactions, whoever receives.
+"""Rays from one transmitter into the scene: every ray's interactions, the same for all receivers.
 
 Neighbouring lanes of a kernel walk the ray tracer's tree together. Sionna RT launches its rays in the order
 of the Fibonacci lattice, where neighbours point into quite different directions; here the same rays

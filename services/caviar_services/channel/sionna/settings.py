@@ -112,8 +112,8 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
         Annotated[int, quantity("1", "rays of a launch of its own for diffuse paths", ge=1, le=100_000_000)]
         | None
     ) = None
-    """Every point that a ray meets is a path to whoever sees it, so diffuse paths take far longer than
-    others, and their power converges far sooner. Absent: the rays of ``samples`` scatter too."""
+    """Every point that a ray meets is a path to each receiver that sees it, so diffuse paths take far
+    longer than others, and their power converges far sooner. Absent: the rays of ``samples`` scatter too."""
     scattering_paths: (
         Annotated[int, quantity("1", "diffuse paths of a receiver, about", ge=1, le=1_000_000)] | None
     ) = None

@@ -212,7 +212,14 @@ class Followed:
 
 
 class FollowedOffer(Offer):
-    """Known chains in place of those of a launch."""
+    """Known chains in place of those of a launch.
+
+    Args:
+        table: The chains.
+        scene: As it stands.
+        source: The transmitter, a `mitsuba.Point3f` of width 1.
+        options: What is traced.
+    """
 
     @classmethod
     def again(
