@@ -34,10 +34,20 @@ from caviar_protocol.topics.scene import AntennaArray
 
 
 def element_positions(array: AntennaArray) -> Float64Array:
-    """Element positions [wavelengths] in device axes around the array's centre, Shape ``[N, 3]``.
+    """Place the elements of an array in device axes around its centre.
 
     Element ``i`` is row ``i % rows`` of column ``i // rows``: rows from +z to −z, columns from
     −y to +y, boresight +x.
+
+    Args:
+        array: A uniform array.
+
+    Returns:
+        Positions [wavelengths], Shape ``[N, 3]``.
+
+    Example:
+        >>> element_positions(AntennaArray(rows=1, columns=2))[:, 1].tolist()
+        [-0.25, 0.25]
     """
     y, z = _grid(array)
     positions = np.zeros((array.size, 3))
@@ -47,10 +57,19 @@ def element_positions(array: AntennaArray) -> Float64Array:
 
 
 def steering_vector(array: AntennaArray, directions: Float64Array) -> Complex128Array:
-    """Phases ``exp(+j2π k̂·r)`` of the elements, Shape ``[..., N]``, each of magnitude 1.
+    """Compute the phases ``exp(+j2π k̂·r)`` of the elements. The element pattern is not part of it.
 
-    ``directions`` are unit vectors k̂ from the array towards the other end in device axes,
-    Shape ``[..., 3]``. The element pattern is not part of it.
+    Args:
+        array: A uniform array.
+        directions: Unit vectors k̂ from the array towards the other end in device axes, Shape ``[..., 3]``.
+
+    Returns:
+        Shape ``[..., N]``, each of magnitude 1.
+
+    Example:
+        >>> to_the_left = np.array([0.0, 1.0, 0.0])  # elements half a wavelength apart: opposite phases
+        >>> steering_vector(AntennaArray(rows=1, columns=2), to_the_left).round(6).imag.tolist()
+        [-1.0, 1.0]
     """
     if array.size == 1:
         return np.ones((*directions.shape[:-1], 1), np.complex128)
@@ -66,6 +85,7 @@ def steering_vector(array: AntennaArray, directions: Float64Array) -> Complex128
     return vector
 
 
+# A scenario has few arrays, and each frame asks for them for every path.
 @lru_cache(maxsize=256)
 def _grid(array: AntennaArray) -> tuple[Float64Array, Float64Array]:
     """y of each column and z of each row [wavelengths]."""
@@ -86,11 +106,21 @@ def _phases(array: AntennaArray) -> tuple[Complex128Array, Complex128Array]:
 
 
 def dft_codebook(array: AntennaArray) -> Complex128Array:
-    """All beams of an array, Shape ``[N, N]``: beam ``k`` is row ``k``, of norm 1.
+    """Compute all beams of an array.
 
     Of a uniform array, beam ``k`` combines row beam ``k % rows`` and column beam ``k // rows``, in the order
     of the elements: the Kronecker product of two DFT matrices with entries
     ``exp(+j2πkn/N)/sqrt(N)`` (Tse and Viswanath, section 7.3.4).
+
+    Args:
+        array: The array, uniform or of several panels or polarizations.
+
+    Returns:
+        Shape ``[N, N]``: beam ``k`` is row ``k``, of norm 1.
+
+    Example:
+        >>> dft_codebook(AntennaArray(rows=1, columns=2)).real.round(3).tolist()
+        [[0.707, 0.707], [0.707, -0.707]]
     """
     columns, rows = _dft(array.columns), _dft(array.rows)
     size = array.rows * array.columns
@@ -104,7 +134,19 @@ def dft_codebook(array: AntennaArray) -> Complex128Array:
 
 
 def dft_beam(array: AntennaArray, beam: int) -> Complex128Array:
-    """Row ``beam`` of `dft_codebook`, Shape ``[N]``, without the others."""
+    """Compute one row of `dft_codebook` without the others: N numbers instead of N².
+
+    Args:
+        array: The array.
+        beam: Index of the beam.
+
+    Returns:
+        Shape ``[N]``, of norm 1.
+
+    Example:
+        >>> dft_beam(AntennaArray(rows=1, columns=2), 1).real.round(3).tolist()
+        [0.707, -0.707]
+    """
     part, own = subarray_of(array, beam)
     column, row = divmod(own, array.rows)
     vector = np.zeros(array.size, np.complex128)
@@ -122,12 +164,26 @@ def _dft(size: int) -> Complex128Array:
 
 
 def pointing_directions(array: AntennaArray, beam: int) -> Float64Array:
-    """Directions in which a beam has its full gain ``sqrt(N)``, Shape ``[L, 3]``, unit vectors.
+    """Find the directions in which a beam has its full gain ``sqrt(N)``.
 
     Only the half space in front of the array, or of the beam's panel, (x ≥ 0) is listed; an array is blind to
     the sign of x. Along an axis with a single element the beam is a fan, of which the centre is given.
     L > 1 where there are grating lobes (spacing ≥ λ/2), nearest to boresight first; L = 0 for a
-    beam without a real direction (spacing < λ/2). Raises `PayloadError` for an unknown index.
+    beam without a real direction (spacing < λ/2).
+
+    Args:
+        array: The array.
+        beam: Index of the beam.
+
+    Returns:
+        Unit vectors in device axes, Shape ``[L, 3]``.
+
+    Raises:
+        PayloadError: The codebook has no such beam.
+
+    Example:
+        >>> pointing_directions(AntennaArray(rows=1, columns=4), 1).round(3).tolist()
+        [[0.866, 0.5, -0.0]]
     """
     if not 0 <= beam < array.size:
         raise PayloadError(f"beam {beam} does not exist, the codebook has beams 0 to {array.size - 1}")

@@ -35,7 +35,12 @@ class _Envelope(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fie
 
 
 class Packed(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """An array inside a state, C order."""
+    """An array inside a state, C order.
+
+    Example:
+        >>> Packed.of(np.array([1.0, 2.0]), "<f8").array(np.float64).tolist()
+        [1.0, 2.0]
+    """
 
     dtype: Literal["<f8", "<i8", "<i4"]
     shape: tuple[int, ...]
@@ -43,11 +48,20 @@ class Packed(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields
 
     @classmethod
     def of(cls, array: NDArray[Any], dtype: Literal["<f8", "<i8", "<i4"]) -> Packed:
-        """The array, with its numbers in this type, which must hold them all."""
+        """Pack an array.
+
+        Args:
+            array: The array.
+            dtype: Type of the numbers in the state, which must hold them all.
+        """
         return cls(dtype, array.shape, array.astype(dtype).tobytes())
 
     def array(self, kind: type[Any]) -> NDArray[Any]:
-        """An array of its own, of this type of numbers."""
+        """Unpack the array; it is a copy, which may be written to.
+
+        Args:
+            kind: Type of its numbers.
+        """
         return np.frombuffer(self.data, self.dtype).reshape(self.shape).astype(kind)
 
 
@@ -93,6 +107,8 @@ def restored(service: Service[Any], version: int, cls: type[T], state: bytes) ->
         RunError: The bytes are of another implementation, of another version of it, of other circumstances
             (settings, seed, sampling period, carriers, devices), or no state at all.
     """
+    # Each check has a text of its own: a state of another release asks something else of a user than one that
+    # a full disk cut off.
     who = f"{service.run.name!r} cannot go on from a saved state"
     try:
         envelope = msgspec.msgpack.decode(state, type=_Envelope)

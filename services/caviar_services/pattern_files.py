@@ -63,7 +63,13 @@ _CUTS = {"HORIZONTAL": "horizontal", "VERTICAL": "vertical"}
 
 @dataclass(frozen=True, eq=False)
 class PatternTable:
-    """Values at directions; between them they are bilinear in both angles."""
+    """Values at directions; between them they are bilinear in both angles.
+
+    Example:
+        >>> table = PatternTable(np.array([0.0, np.pi]), np.array([0.0, 2 * np.pi]), np.zeros((2, 2)))
+        >>> table.is_field, table.at(np.array([1.0]), np.array([0.5])).tolist()
+        (False, [0.0])
+    """
 
     theta: Float64Array
     """Zenith angles [rad], ascending from 0 to π, Shape ``[T]``."""
@@ -89,7 +95,15 @@ class PatternTable:
         return 10 * math.log10(mean) if mean > 0 else -math.inf
 
     def at(self, theta: Float64Array, phi: Float64Array) -> Float64Array | Complex128Array:
-        """Gains [dBi], Shape ``[P]``, or fields, Shape ``[P, 2]``, at zenith angles and azimuths [rad]."""
+        """Interpolate the pattern.
+
+        Args:
+            theta: Zenith angles [rad], Shape ``[P]``.
+            phi: Azimuths [rad], any turn, Shape ``[P]``.
+
+        Returns:
+            Gains [dBi], Shape ``[P]``, or fields, Shape ``[P, 2]``.
+        """
         turned = self.phi[0] + (phi - self.phi[0]) % (2 * np.pi)
         row, down = _cells(self.theta, theta)
         column, across = _cells(self.phi, turned)
@@ -108,9 +122,23 @@ def _cells(nodes: Float64Array, at: Float64Array) -> tuple[Int64Array, Float64Ar
 
 
 def read_pattern(file: Path) -> PatternTable:
-    """The pattern in a file, by the ending of its name.
+    """Read the pattern in a file, by the ending of its name.
 
-    Raises `AssetError` naming file, line and what to write instead.
+    Args:
+        file: A ``.csv`` table, or a Planet file, ``.msi`` or ``.pln``.
+
+    Raises:
+        AssetError: The file is wrong; names file, line and what to write instead.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     file = Path(folder, "isotropic.csv")
+        ...     text = "\\n".join(["theta_deg,phi_deg,gain_dbi", "0,0,0", "180,0,0"])
+        ...     _ = file.write_text(text)
+        ...     table = read_pattern(file)
+        >>> abs(round(table.mean_gain_dbi, 6))
+        0.0
     """
     if file.suffix.lower() not in SUFFIXES:
         raise AssetError(f"{file}: no pattern has the ending {file.suffix!r}; known: {', '.join(SUFFIXES)}")

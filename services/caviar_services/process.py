@@ -18,15 +18,30 @@ TERMINATED = 128 + signal.SIGTERM
 
 
 class Termination:
-    """The order to end, as a flag, and as a certain end of the process."""
+    """The order to end, as a flag, and as a certain end of the process.
+
+    Example:
+        >>> termination = Termination()
+        >>> termination.requested
+        False
+        >>> termination.enforce(60.0, 1, "too slow").set()  # called off
+    """
 
     def __init__(self) -> None:
         self.requested = False
         self._called_off: list[threading.Event] = []
 
     def enforce(self, grace_s: float, status: int, last_words: str) -> threading.Event:
-        """See to it that the process ends with ``status`` unless it does so itself within ``grace_s``, or
-        the event that is returned is set."""
+        """See to it that the process ends, unless it does so itself in time.
+
+        Args:
+            grace_s: Time until it is ended by force [s].
+            status: Its exit status then.
+            last_words: What it writes to standard error then.
+
+        Returns:
+            Set this event to call it off.
+        """
         called_off = threading.Event()
         self._called_off.append(called_off)
 
@@ -38,8 +53,15 @@ class Termination:
         return called_off
 
     def end(self, status: int, last_words: str) -> None:
-        """End the process at once."""
+        """End the process at once.
+
+        Args:
+            status: Exit status.
+            last_words: Written to standard error.
+        """
         sys.stderr.write(f"{last_words}\n")
+        # Not `sys.exit`: a thread that is not the main one would end alone, and a call that does not return
+        # keeps the interpreter from ending.
         os._exit(status)
 
     def finished(self) -> None:
@@ -55,7 +77,9 @@ class SignalTermination(Termination):
     thread of its own hears of the signal through ``set_wakeup_fd``, and ends the process when the
     main thread has not done so in time. Against a call that holds the interpreter's lock not even
     that helps: then the process ends as soon as the lock is free, or its parent kills it.
-    ``status`` is that of a process that ends so.
+
+    Args:
+        status: Exit status of a process that ends so.
     """
 
     def __init__(self, status: int = TERMINATED) -> None:
@@ -92,6 +116,10 @@ def restart_status(status: int, ended: str) -> int:
     Args:
         status: What the runner returned.
         ended: Why the broker ended the run; "" where it did not.
+
+    Example:
+        >>> restart_status(0, RUN_COMPLETE), restart_status(0, "world was lost"), restart_status(143, "")
+        (0, 1, 0)
     """
     if status == TERMINATED:
         return 0

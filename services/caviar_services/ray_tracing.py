@@ -59,7 +59,7 @@ class LlvmLibrary:
     """A libLLVM shared library."""
 
     version: tuple[int, ...]
-    """Major version first; as many parts as its file name tells."""
+    """Major version first; as many parts as its file name has."""
     path: Path
 
     def __str__(self) -> str:
@@ -105,21 +105,26 @@ def choose_llvm(
 def activate_llvm() -> str:
     """Make Dr.Jit use the chosen library; call before Dr.Jit is imported.
 
-    Returns a line that says which. Where Dr.Jit was imported before, it holds a library already: one that
-    is new enough stays, and an older one raises `SetupError`, as does what `choose_llvm` refuses.
+    Where Dr.Jit was imported before, it holds a library already: one that is new enough stays.
+
+    Returns:
+        A line that says which library it is.
+
+    Raises:
+        SetupError: Dr.Jit holds an older library, or `choose_llvm` refuses.
     """
     held = _held_by_drjit()
     if held is None:
         library = choose_llvm()
         os.environ[ENVIRONMENT] = str(library.path)
         return str(library)
-    told = ".".join(map(str, held))
+    version = ".".join(map(str, held))
     if not held or held[0] < OLDEST:
         raise SetupError(
-            f"Dr.Jit was imported before its library was chosen and holds LLVM {told or 'none'}, the ray "
+            f"Dr.Jit was imported before its library was chosen and holds LLVM {version or 'none'}, the ray "
             f"tracer needs {OLDEST} or newer; before the start: export {ENVIRONMENT}={choose_llvm().path}"
         )
-    return f"LLVM {told} (held by Dr.Jit since its import)"
+    return f"LLVM {version} (held by Dr.Jit since its import)"
 
 
 def _held_by_drjit() -> tuple[int, ...] | None:
@@ -136,7 +141,16 @@ def choose_variant() -> str:
 
 
 def cuda_devices(library: str = "libcuda.so.1") -> int:
-    """Number of CUDA devices that the driver reports; 0 without a driver."""
+    """Count the CUDA devices that the driver reports; 0 without a driver.
+
+    Args:
+        library: File name of the driver's library.
+
+    Example:
+        >>> cuda_devices("no-such-driver.so")
+        0
+    """
+    # The driver itself is asked: Dr.Jit would have to be imported, and with it the library be chosen.
     try:
         driver = ctypes.CDLL(library)
     except OSError:
@@ -165,7 +179,7 @@ def _explicit(path: Path) -> LlvmLibrary:
 
 
 def _library(path: Path) -> LlvmLibrary | None:
-    """The library of a file name that tells its version; None where it does not."""
+    """The library of a file name that has its version; None where it has not."""
     real = path.resolve()
     match = _NAME.match(real.name)
     if match is None:
@@ -180,7 +194,7 @@ def _library(path: Path) -> LlvmLibrary | None:
 
 
 def _asked(path: Path) -> tuple[int, ...]:
-    """Version that a library of unknown name tells itself; LLVMGetVersion came with LLVM 16."""
+    """Version that a library of unknown name says itself; LLVMGetVersion came with LLVM 16."""
     try:
         tell = ctypes.CDLL(str(path)).LLVMGetVersion
     except (OSError, AttributeError) as error:
@@ -211,12 +225,37 @@ def cores() -> int:
 
 
 def share_of_each(tracers: int) -> int:
-    """Threads for each of so many processes that trace rays on this machine at once."""
+    """Share the cores of this machine out among processes that trace rays at once.
+
+    Args:
+        tracers: Number of these processes.
+
+    Returns:
+        Threads for each of them, 1 at least.
+
+    Example:
+        >>> share_of_each(10_000)
+        1
+    """
     return max(1, cores() // max(1, tracers))
 
 
 def limited_threads(environment: Mapping[str, str] = os.environ) -> int:
-    """Number of threads that `THREADS_VARIABLE` sets, 0 where it is unset; `SetupError` for other text."""
+    """Read the number of threads from the environment.
+
+    Args:
+        environment: Where `THREADS_VARIABLE` may be.
+
+    Returns:
+        The number; 0 where the variable is unset.
+
+    Raises:
+        SetupError: The variable is no number from 1 on.
+
+    Example:
+        >>> limited_threads({THREADS_VARIABLE: "2"}), limited_threads({})
+        (2, 0)
+    """
     text = environment.get(THREADS_VARIABLE, "")
     if not text:
         return 0
@@ -250,30 +289,56 @@ def all_threads() -> Iterator[None]:
 
 
 def aligned_columns(rows: Float64Array) -> Float32Array:
-    """Rows as float32, Shape ``[R, N]``, each at a multiple of 64 bytes, with room behind it.
+    """Copy rows as float32, each at a multiple of 64 bytes, with room behind it.
 
     Dr.Jit computes in NumPy's memory where it can, whole vectors of up to 64 bytes at a time, and
     compiles a kernel anew for each combination of arrays that happen to be aligned or not.
+
+    Args:
+        rows: Shape ``[R, N]``.
+
+    Returns:
+        The same numbers, Shape ``[R, N]``.
+
+    Example:
+        >>> [row.ctypes.data % 64 for row in aligned_columns(np.zeros((2, 5)))]
+        [0, 0]
     """
     columns: Float32Array = _aligned(rows, np.dtype(np.float32))
     return columns
 
 
 def aligned_doubles(rows: Float64Array) -> Float64Array:
-    """Rows as float64, laid out like `aligned_columns`."""
+    """Copy rows as float64, laid out like `aligned_columns`.
+
+    Args:
+        rows: Shape ``[R, N]``.
+    """
     columns: Float64Array = _aligned(rows, np.dtype(np.float64))
     return columns
 
 
 def aligned_indices(values: Int64Array | Int32Array | BoolArray) -> NDArray[np.uint32]:
-    """Indices as uint32, Shape ``[N]``, laid out like `aligned_columns`."""
+    """Copy indices as uint32, laid out like `aligned_columns`.
+
+    Args:
+        values: Shape ``[N]``.
+    """
     column: NDArray[np.uint32] = aligned_columns(np.zeros((1, len(values)))).view(np.uint32)[0]
     column[...] = values
     return column
 
 
 def several(count: int) -> Int64Array:
-    """Indices of so many, a single one twice: to Dr.Jit an array of one element is another kernel."""
+    """Indices of so many things, a single one twice: to Dr.Jit an array of one element is another kernel.
+
+    Args:
+        count: How many.
+
+    Example:
+        >>> several(3).tolist(), several(1).tolist()
+        ([0, 1, 2], [0, 0])
+    """
     return np.arange(count) if count > 1 else np.zeros(2 * count, np.int64)
 
 

@@ -42,6 +42,7 @@ BUILT_IN: dict[str, str] = {
 ENTRY_POINT_GROUP = "caviar.services"
 
 
+# Once a process: looking for entry points reads the metadata of every installed distribution.
 @cache
 def registered() -> dict[str, str]:
     """Everything registered, built in and by entry points.
@@ -51,6 +52,10 @@ def registered() -> dict[str, str]:
 
     Raises:
         DeclarationError: Two distributions register the same ``role:name``.
+
+    Example:
+        >>> registered()["agent:random"]
+        'caviar_services.agent.baselines:RandomAgent'
     """
     found = dict(BUILT_IN)
     for point in entry_points(group=ENTRY_POINT_GROUP):
@@ -102,6 +107,7 @@ def load(role: str, name: str) -> type[Service[Any]]:
     if inspect.isabstract(cls):
         missing = ", ".join(sorted(cls.__abstractmethods__))
         raise DeclarationError(f"{role} {name!r} is {target}, which does not define: {missing}")
+    # Abstract methods are found above; a class attribute that is not set would fail where it is first read.
     missing = ", ".join(name for name in cls.attributes_to_set if not hasattr(cls, name))
     if missing:
         raise DeclarationError(f"{role} {name!r} is {target}, which does not set: {missing}")
@@ -116,12 +122,24 @@ def load(role: str, name: str) -> type[Service[Any]]:
 
 
 def registered_names(role: str) -> tuple[str, ...]:
-    """Names of the implementations of a role, sorted."""
+    """List the names of the implementations of a role, sorted.
+
+    Args:
+        role: The role.
+
+    Example:
+        >>> registered_names("recorder")
+        ('mcap',)
+    """
     return tuple(sorted(key.removeprefix(f"{role}:") for key in registered() if key.startswith(f"{role}:")))
 
 
 def find_modules_in(folder: Path) -> None:
-    """Let Python find modules in a folder too, after all other places, so that they hide no other module."""
+    """Let Python find modules in a folder too, after all other places, so that they hide no other module.
+
+    Args:
+        folder: The folder.
+    """
     text = str(folder.resolve())
     if text not in sys.path:
         sys.path.append(text)

@@ -41,6 +41,10 @@ class Replayer(Service[ReplaySettings]):
 
     Frames are found by episode and number, so that a run which leaves some out gets the others as they
     were. The broker reports what was held or absent (`caviar_broker.recordings`), with the recorded cause.
+
+    Args:
+        settings: The recording.
+        run: What the service knows about the run; it serves the products of the service of its own name.
     """
 
     Settings = ReplaySettings
@@ -133,7 +137,16 @@ class Replayer(Service[ReplaySettings]):
 
 
 def use_of(role: str, topics: Iterable[str]) -> str:
-    """What ``use`` says of a replayed service with these topics."""
+    """Name a replayed service for the ``use`` of a scenario.
+
+    Args:
+        role: Role of the recorded service.
+        topics: Topics that it produced.
+
+    Example:
+        >>> use_of("sensors", ["depth", "camera"])
+        'caviar_services.replay:sensors_camera_depth'
+    """
     return f"{__name__}:{'_'.join((role, *sorted(topics)))}"
 
 

@@ -20,6 +20,7 @@ from caviar_protocol.topics import Action, BeamChoice, Scene
 from caviar_protocol.topics.link import Command
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
 
+# What actuators other than beams begin with; a name without any of these is that of a receiver.
 _OTHER_ACTUATORS = ("motion:", "schedule:")
 
 WITHOUT_USERS = "frames-without-users"
@@ -75,6 +76,7 @@ class Agent(Service[S]):
 
     def __init__(self, settings: S, run: RunInfo) -> None:
         super().__init__(settings, run)
+        # Here, where the key is known: in the link, a user that no agent serves is nothing wrong.
         for text in settings.users:
             if text.startswith(_OTHER_ACTUATORS) and text not in self.other_actuators():
                 known = " and ".join(("beams", *map(repr, self.other_actuators())))
@@ -88,8 +90,9 @@ class Agent(Service[S]):
     def prepare(self, preparation: Preparation) -> Prepared:
         """Declare the actuators. One that leaves users to others owns no beam by name."""
         others = self.other_actuators()
+        # Patterns cannot say «all but these»: the broker looks for two owners of a name among those declared.
         if self.settings.except_users:
-            return Prepared(actuators=others, notes=("serves the users whom no other agent owns",))
+            return Prepared(actuators=others, notes=("serves the users that no other agent owns",))
         return Prepared(actuators=(*(BEAM + text for text in self._owned), *others))
 
     def other_actuators(self) -> tuple[str, ...]:
@@ -97,20 +100,24 @@ class Agent(Service[S]):
         return ()
 
     def other_commands(self, frame: Frame, scene: Scene) -> Iterable[Command]:
-        """Commands for `other_actuators`, in their order; an actuator without a command keeps its state.
+        """Choose commands for `other_actuators`.
 
         Args:
             frame: The frame.
             scene: The scenes of all worlds as one.
+
+        Returns:
+            Commands in the order of `other_actuators`; an actuator without one keeps its state.
         """
         return ()
 
     def step(self, frame: Frame) -> StepResult:
         """One choice per user, sorted by actuator, then TX, then carrier, and the other commands."""
-        if frame.final:
+        if frame.final:  # it brings the last link, for what an agent learns from; nothing follows it
             return StepResult()
         scene = frame.scene()
         pairs = [pair for pair in pairs_of(scene) if self.serves(pair.rx.name)]
+        # Sorted, so that equal decisions are equal bytes whatever order an agent makes them in.
         choices = sorted(self.choose(frame, scene, pairs), key=lambda c: (c.rx, c.tx, c.carrier))
         commands = (*choices, *self.other_commands(frame, scene))
         return StepResult(

@@ -151,6 +151,7 @@ class StoredProducts:
         return True
 
 
+# Whatever else the system says, another directory may help.
 _REMEDIES = {
     errno.ENOSPC: "free space on its file system, then go on with caviar run --resume {folder}, "
     "or choose another directory with --out",
@@ -188,7 +189,12 @@ read: choose another directory with --out
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python, of this distribution, and of its dependencies that are installed."""
+    """Versions of Python, of this distribution, and of its dependencies that are installed.
+
+    Example:
+        >>> versions()["python"] == platform.python_version()
+        True
+    """
     found = {"python": platform.python_version()}
     try:
         requirements = [DISTRIBUTION, *(metadata.requires(DISTRIBUTION) or ())]
@@ -206,9 +212,15 @@ def versions() -> dict[str, str]:
 
 
 def machine() -> dict[str, str]:
-    """What a reader of performance figures asks first: system, CPU, memory, GPU."""
+    """What a reader of performance figures asks first: system, CPU, memory, GPU.
+
+    Example:
+        >>> sorted({"cpu", "cpu_count", "memory_gib", "platform"} - machine().keys())
+        []
+    """
     found = {
         "platform": platform.platform(),
+        # `platform.processor` is empty on most Linux systems.
         "cpu": _after("model name", Path("/proc/cpuinfo")) or platform.processor() or platform.machine(),
         "cpu_count": str(os.cpu_count() or 0),
         "memory_gib": f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.1f}",

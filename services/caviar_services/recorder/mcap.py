@@ -71,7 +71,7 @@ _LOOKED_INTO = frozenset({"scene", "lidar", "camera", "depth", "segmentation"})
 
 
 class McapSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of the recorder."""
+    """Settings of the recorder ``mcap``."""
 
     segment_mib: Annotated[float, quantity("MiB", "a segment of this size is closed", gt=0)] = 256.0
     segment_frames: Annotated[int, quantity("frame", "a segment with so many frames is closed", ge=1)] = 2000
@@ -122,7 +122,11 @@ class McapRecorder(Recorder[McapSettings]):
         self._goes_on = False
 
     def prepare(self, preparation: Preparation) -> Prepared:
-        """Open the first segment. `RunError` where the directory is not writable or holds a run."""
+        """Copy the scenery and open the first segment.
+
+        Raises:
+            RunError: The directory cannot be written to, or holds a recording.
+        """
         folder = self.run.directory
         existing = RunDirectory(folder).segments()
         self._goes_on = self.run.again
@@ -149,6 +153,8 @@ class McapRecorder(Recorder[McapSettings]):
             assets=copied,
             notes=self.settings.notes,
         )
+        # Going on waits for the first frame, which says from where on: it may be one that was recorded, since
+        # the broker grants again what was not acknowledged.
         if not self._goes_on:
             self._persistence = self._persisted([])
             self._open_segment()
@@ -170,6 +176,7 @@ class McapRecorder(Recorder[McapSettings]):
         segment = self._segment or self._open_segment()
         base_ns = self._runtime.base_of(frame.episode, frame.t_ns)
         self._stored.begin(frame.episode)
+        # Sorted: equal runs have equal recordings, whatever came first.
         inputs = sorted(map(_encoded, frame.inputs), key=_canonical)
         entry = FrameEntry(
             episode=frame.episode,
@@ -179,6 +186,7 @@ class McapRecorder(Recorder[McapSettings]):
             inputs=tuple(_with_digest(item) for item in inputs),
             reports=frame.reports,
         )
+        # Before the first byte of the frame: a product that is wrong leaves no half of a frame behind.
         new = [item for item in inputs if self._stored.is_new(item.provenance)]
         for item in new:
             self._look_at(item)
@@ -199,7 +207,11 @@ class McapRecorder(Recorder[McapSettings]):
         return StepResult(measured={"write": time.perf_counter_ns() - begin})
 
     def close(self) -> None:
-        """Close the recording, so that it is complete. `RunError` naming path and errno where that fails."""
+        """Close the recording, so that it is complete.
+
+        Raises:
+            RunError: The system refuses; names path and errno.
+        """
         if self._goes_on and self._failure is None:
             self._take_over(None)
         segment, self._segment = self._segment, None
@@ -252,7 +264,7 @@ class McapRecorder(Recorder[McapSettings]):
         try:
             self._segment = SegmentWriter(path, _as_text(metadata), self.settings.compression)
             if self._durability == "frame":
-                sync_file(self.run.directory)
+                sync_file(self.run.directory)  # its name: the frames in it are synced, and found by it
         except OSError as error:
             raise self._failed(None, error) from error
         self._segments += 1
@@ -355,7 +367,7 @@ class _Continuation:
         if self.sync:
             writer.sync()
         writer.close()
-        mended.replace(segment.path)
+        mended.replace(segment.path)  # in one step: a reader finds the old file or the new one
         if self.sync:
             sync_file(self.folder)
         return msgspec.structs.replace(record, name=segment.path.name)
@@ -404,7 +416,18 @@ def _frames_to_keep(
 
 
 def durability_of(scenario: Mapping[str, object]) -> Durability:
-    """``run.durability`` of a scenario as resolved; by default ``periodic``."""
+    """Durability that a scenario asks for.
+
+    Args:
+        scenario: The scenario as resolved.
+
+    Returns:
+        ``run.durability``; by default ``periodic``.
+
+    Example:
+        >>> durability_of({"run": {"durability": "frame"}}), durability_of({})
+        ('frame', 'periodic')
+    """
     run = scenario.get("run")
     durability: Durability = run.get("durability", "periodic") if isinstance(run, Mapping) else "periodic"
     return durability

@@ -65,6 +65,7 @@ class _ChecksummedStream:
         """Ignored: the library flushes before the seal is written."""
 
     def hand_over(self) -> None:
+        """Write what is buffered, so that a killed process does not take it along."""
         self._stream.flush()
 
 
@@ -113,6 +114,7 @@ class SegmentWriter:
     @property
     def removed(self) -> bool:
         """Whether the file has no name any more: what is written to it is lost."""
+        # Of the descriptor, not the path: another file may stand under that name by now.
         return os.fstat(self._file.fileno()).st_nlink == 0
 
     def write(self, entry: FrameEntry, products: list[FrameInput], base_ns: int) -> None:
@@ -167,6 +169,7 @@ class SegmentWriter:
 
     def abandon(self) -> None:
         """Close after a failed write: what is buffered would fail again."""
+        # The raw file: closing the buffered one writes first.
         self._file.raw.close()
 
     def _seal(self) -> None:
@@ -175,6 +178,7 @@ class SegmentWriter:
         self._stream.hand_over()
 
     def _channel(self, topic: str, source: str) -> int:
+        # When it is first written to: what a run produces is known frame by frame only.
         channel = self._channels.get((topic, source))
         if channel is None:
             product = bool(source)
@@ -219,7 +223,8 @@ _PAUSE_S = SYNC_PERIOD_S / 2
 class Persistence:
     """Keeps the manifest, and brings segments and manifest to disk.
 
-    All methods raise `OSError` where the system refuses, under ``periodic`` with the frame that follows.
+    All methods raise `OSError` where the operating system refuses, under ``periodic`` with the frame that
+    follows.
 
     Args:
         folder: Directory of the run.
@@ -234,7 +239,7 @@ class Persistence:
     ) -> None:
         self._folder, self._run, self._seed = folder, run, seed
         self._durability = durability
-        # Of the manifest.
+        # Under ``periodic`` the thread lists finished segments while the recorder lists new ones.
         self._lock = threading.Lock()
         self._records = {record.name: record for record in earlier}
         self._periodic = _PeriodicSync(folder, self._list) if durability == "periodic" else None
@@ -310,6 +315,7 @@ class _PeriodicSync:
         with self._lock:
             self._dirty[segment] = record
             failure = self._failure
+        # In the recorder's thread, where the run ends with it; an exception of the other one ends that alone.
         if failure is not None:
             raise failure
 
@@ -319,7 +325,7 @@ class _PeriodicSync:
             dirty, self._dirty = self._dirty, {}
         # Outside the lock: a sync may take as long as the disk likes, and `note` is called in each frame.
         if dirty:
-            sync_file(self._folder)
+            sync_file(self._folder)  # the names of new segments
         for segment, record in dirty.items():
             segment.sync()
             if record is not None:

@@ -92,7 +92,7 @@ class CameraSensors(Sensors[CameraSettings]):
                     f"colour {list(colour)} of {name!r} is not sRGB; give red, green and blue from 0 to 1",
                     key=f"services.{self.run.name}.settings.colours.{name}",
                 )
-        self._demand = preparation.demand
+        self._demand = preparation.demand  # before `super`, whose warm-up observes
         return super().prepare(preparation)
 
     def example_devices(self) -> tuple[Device, ...]:
@@ -139,6 +139,7 @@ class CameraSensors(Sensors[CameraSettings]):
 
     @cached_property
     def _shape_colours(self) -> Float64Array:
+        # Once: scenery keeps its colours, and Munich has 2,367 shapes.
         colours = [shape_colour(shape, self.settings.colours) for shape in self.shapes]
         return np.array(colours).reshape(-1, 3)
 

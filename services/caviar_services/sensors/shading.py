@@ -83,6 +83,8 @@ class Painter:
     """Draws pictures of a scene. Use it under `active_variant`, after `TracedScene.update`.
 
     Args:
+        mi: Mitsuba, with the variant that is active.
+        traced: The scene for rays.
         albedo: Linear sRGB of each owner, Shape ``[owners, 3]``.
         sun: Unit vector towards the sun, world axes.
     """
@@ -95,7 +97,14 @@ class Painter:
         self._table = [mi.Float(column) for column in aligned_columns(table)]
 
     def paint(self, view: View) -> UInt8Array:
-        """sRGB picture of a view, Shape ``[height, width, 3]``, top row first."""
+        """Draw what a camera sees.
+
+        Args:
+            view: The camera.
+
+        Returns:
+            sRGB, Shape ``[height, width, 3]``, top row first.
+        """
         width, height = view.device.width, view.device.height
         rows, columns = np.divmod(np.arange(width * height), width)
         seen = self._trace(view, columns + 0.5, rows + 0.5, (rows % TILE) * TILE + columns % TILE)
@@ -130,6 +139,7 @@ class Painter:
         table = [dr.gather(mi.Float, column, face, hit) for column in self._table]
         normal = mi.Vector3f(*table[:3])
         normal = dr.select(dr.dot(normal, direction) > 0, -normal, normal)
+        # Off the surface, by more where float32 is coarser: a ray from it would hit the surface itself.
         point = origin + distance * direction + normal * (2e-3 + 2e-5 * distance)
         sun = self._sunlight(point, normal, hit)
         ambient = self._skylight(point, normal, turn, hit)
@@ -248,13 +258,24 @@ class _Seen:
         import drjit as dr
 
         light = mi.Color3f(SUN) * self.sun + ambient
+        # Beer and Lambert: of the light of a surface, exp(−way/HAZE) comes through.
         haze = 1 - dr.exp(-self.distance / HAZE)
         seen = dr.lerp(self.albedo * light, mi.Color3f(HORIZON), haze)
         return dr.select(self.hit, seen, _sky(mi, self.direction))
 
 
 def encoded(colour: Float32Array) -> UInt8Array:
-    """8-bit sRGB (IEC 61966-2-1) of linear colours, what is too bright cut off."""
+    """Encode linear colours as 8-bit sRGB (IEC 61966-2-1); what is too bright is cut off.
+
+    Args:
+        colour: Linear sRGB, any shape.
+
+    Example:
+        >>> encoded(np.array([0.0, 0.5, 2.0], np.float32)).tolist()
+        [0, 188, 255]
+    """
+    # A table instead of a power for each pixel; even where the curve is steepest, five of its steps are one
+    # of 8 bits.
     table: UInt8Array = _SRGB[(np.clip(colour, 0, 1) * (len(_SRGB) - 1) + 0.5).astype(np.int32)]
     return table
 
@@ -330,16 +351,31 @@ SHAPE_SHADES, OBJECT_SHADES = 0.2, 0.45
 
 
 def linear(colour: Colour) -> Float64Array:
-    """Linear sRGB of an sRGB colour, 0…1 (IEC 61966-2-1)."""
+    """Decode an sRGB colour to linear sRGB, 0…1 (IEC 61966-2-1).
+
+    Args:
+        colour: sRGB, 0…1.
+
+    Example:
+        >>> linear((1.0, 0.5, 0.0)).round(3).tolist()
+        [1.0, 0.214, 0.0]
+    """
     value = np.array(colour, dtype=np.float64)
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
 
 def shape_colour(shape: SceneryShape, chosen: Mapping[str, Colour]) -> Float64Array:
-    """Linear sRGB of a shape of the scenery, Shape ``[3]``.
+    """Choose the colour of a shape of the scenery.
 
-    By what was ``chosen`` for its material, else its own colour, else that of its ITU material; parts of
+    It is what was chosen for its material, else its own colour, else that of its ITU material; parts of
     one building (``town_hall-itu_marble``, ``town_hall-itu_metal``) are lighter or darker together.
+
+    Args:
+        shape: The shape.
+        chosen: sRGB by name of a material.
+
+    Returns:
+        Linear sRGB, Shape ``[3]``.
     """
     for name in (shape.material, shape.itu_material):
         if name in chosen:
@@ -352,12 +388,35 @@ def shape_colour(shape: SceneryShape, chosen: Mapping[str, Colour]) -> Float64Ar
 
 
 def object_colour(kind: str, name: str, chosen: Mapping[str, Colour]) -> Float64Array:
-    """Linear sRGB of a moving object of class ``kind``, Shape ``[3]``."""
+    """Choose the colour of a moving object.
+
+    Args:
+        kind: Class of the object.
+        name: Name of the object, which chooses its shade.
+        chosen: sRGB by class.
+
+    Returns:
+        Linear sRGB, Shape ``[3]``.
+
+    Example:
+        >>> bool((object_colour("car", "car.1", {}) == object_colour("car", "car.2", {})).all())
+        False
+    """
     return shaded(linear(chosen.get(kind) or CLASSES.get(kind, OTHER)), name, OBJECT_SHADES)
 
 
 def shaded(colour: Float64Array, name: str, share: float) -> Float64Array:
-    """A shade of a colour, lighter or darker by up to a ``share``, the same for the same name."""
+    """Shade a colour, the same way for the same name.
+
+    Args:
+        colour: Linear sRGB, Shape ``[3]``.
+        name: Name of the thing.
+        share: By how much it gets lighter or darker at most.
+
+    Returns:
+        Linear sRGB, Shape ``[3]``.
+    """
+    # CRC-32, not `hash`, which Python makes different in each process.
     value = zlib.crc32(name.encode())
     light, warm = ((value >> shift & 0xFFFF) / 0x7FFF - 1 for shift in (0, 16))
     factor = 1 + share * (0.7 * light + 0.3 * warm * np.array([1.0, 0.0, -1.0]))

@@ -76,7 +76,14 @@ class Played:
 
 
 def encoded(result: StepResult) -> Encoded:
-    """Bytes of every product of a frame."""
+    """Encode every product of a frame.
+
+    Args:
+        result: What a service made of the frame.
+
+    Returns:
+        Header and body by topic.
+    """
     return {topic: encode_payload(payload) for topic, payload in result.products.items()}
 
 
@@ -163,6 +170,7 @@ class ServiceConformance:
             episode: Number of the episode.
             count: Number of frames.
         """
+        # Absent in the last frame, not in the first, which has no lagged input anyway.
         optional = {i.topic: "left out" for i in service.inputs if not i.required and i.topic != "*"}
         return [
             Frame(
@@ -193,7 +201,8 @@ class ServiceConformance:
             What the service answers, and the files of scenery by asset name.
         """
         assets = cls.street(service, directory / "assets")
-        demand = demand or cls.demand or {topic: frozenset(PARTS.get(topic, ())) for topic in service.outputs}
+        if demand is None:
+            demand = cls.demand or {topic: frozenset(PARTS.get(topic, ())) for topic in service.outputs}
         producers = {topic: (samples.source(topic),) for topic in PAYLOADS}
         return service.prepare(Preparation(demand=demand, assets=assets, producers=producers)), assets
 
@@ -235,7 +244,7 @@ class ServiceConformance:
                 played.episodes.append([])
                 for frame in frames:
                     played.episodes[-1].append(service.step(frame))
-                    if len(played.episodes) > 1:  # so that it makes no difference
+                    if len(played.episodes) > 1:  # in the second one: the bytes of both are compared
                         service.release_memory()
                 service.end_episode(len(frames))
                 if not played.frames:
@@ -281,6 +290,7 @@ class ServiceConformance:
 
     def test_without_settings_it_starts_or_says_what_it_lacks(self, tmp_path: Path) -> None:
         """A setting that is not given leads to no traceback."""
+        # The length is that of a text with a value and a remedy; «error» alone would pass otherwise.
         run = RunInfo(name="service", carriers=self.carriers, devices=self.devices, directory=tmp_path)
         try:
             self.service_class(convert_settings(self.service_class.Settings, {}), run).close()
@@ -304,6 +314,7 @@ class ServiceConformance:
 
     def test_products_are_of_declared_topics_and_of_their_class(self, played: Played) -> None:
         """Every frame whose inputs are there gives every output that is asked for."""
+        # All of them in the first frame alone: in the last one, inputs that are not required are absent.
         for result in played.episodes[0]:
             assert set(result.products) <= set(self.service_class.outputs)
             for topic, payload in result.products.items():
@@ -318,6 +329,7 @@ class ServiceConformance:
 
     def test_what_it_reports_beside_products_can_travel(self, played: Played) -> None:
         """Decisions are strings; counts and measured times whole numbers ≥ 0."""
+        # `type(…) is int`: a NumPy integer is equal to one, and msgpack has no form for it.
         for result in played.episodes[0]:
             assert all(isinstance(value, str) for value in result.decisions.values())
             numbers = [*result.counts.values(), *result.measured.values()]
@@ -372,6 +384,7 @@ class ServiceConformance:
         with self.at_start(tmp_path) as service:
             service.step(self.frames_of(service, self.episodes[0])[0])
             state = service.checkpoint()
+            # Nothing, text, a state that was cut off, and one with a wrong bit: each is read in another step.
             flipped = bytes([*state[:-1], state[-1] ^ 1])
             for garbage in (b"", b"no state at all", state[: len(state) // 2], flipped):
                 with pytest.raises(CaviarError) as error:
@@ -388,5 +401,6 @@ class ServiceConformance:
 
     def test_it_can_be_closed_twice_and_before_it_was_prepared(self, played: Played, tmp_path: Path) -> None:
         """An error may come at any time."""
+        # Twice: the runner closes after an error, and again when it ends.
         played.service.close()
         self.build(tmp_path).close()

@@ -58,6 +58,8 @@ CARRIERS = (
         slot_duration_s=5e-4,
     ),
 )
+# Of every kind of device one, and antennas of which no two have the same array: a model that swaps TX and RX,
+# or rows and columns, gets shapes that do not fit.
 DEVICES = (
     DeviceSpec(name="bs", kind="antenna", role="tx"),
     DeviceSpec(name="rx", kind="antenna", role="rx", on="*", count=2),
@@ -87,7 +89,14 @@ _SCENERY = """\
 
 
 def scenery(folder: Path) -> dict[str, Path]:
-    """Write the street's ground, one wall and the meshes of its objects; asset name to file."""
+    """Write the street's ground, one wall and the meshes of its objects.
+
+    Args:
+        folder: Where the files are written, at their asset names as relative paths.
+
+    Returns:
+        File by asset name.
+    """
     files: dict[str, bytes] = {"scenery/street.xml": _SCENERY.encode()}
     pieces: dict[str, Mesh] = {
         "ground": box((-60, 80), (-40, 30), (-1.0, 0.0)),
@@ -103,10 +112,20 @@ def scenery(folder: Path) -> dict[str, Path]:
     return found
 
 
+# Cached, like `product`: a channel and a link of the same frame are inputs of every role's tests.
 @cache
 def scene(frame: int) -> Scene:
-    """A car with a receiver and a truck with a receiver, a LIDAR and a camera; a fixed base station."""
+    """A car with a receiver and a truck with a receiver, a LIDAR and a camera; a fixed base station.
+
+    Args:
+        frame: Number of the frame, `SAMPLING_PERIOD_NS` apart; objects move with constant velocities.
+
+    Example:
+        >>> scene(0).names, [device.name for device in scene(0).devices][:2]
+        (('car.1', 'truck.2'), ['bs', 'car.1/rx'])
+    """
     t = frame * SAMPLING_PERIOD_NS / 1e9
+    # The car turns while it drives straight, which none does: so nothing can take the course for the yaw.
     yaws = (0.3 + 0.2 * t, math.pi - 0.1)
     return Scene(
         names=("car.1", "truck.2"),
@@ -151,7 +170,19 @@ def scene(frame: int) -> Scene:
 
 @cache
 def product(topic: str, frame: int) -> Payload:
-    """What the street's services publish on a topic in a frame; the same bytes at every call."""
+    """What the street's services publish on a topic in a frame; the same bytes at every call.
+
+    Args:
+        topic: Name of the topic.
+        frame: Number of the frame.
+
+    Raises:
+        ValueError: The street has no product of the topic.
+
+    Example:
+        >>> product("channel", 0).rx
+        ('car.1/rx', 'truck.2/rx')
+    """
     match topic:
         case "scene":
             return scene(frame)
@@ -175,7 +206,15 @@ def inputs(
 ) -> tuple[FrameInput, ...]:
     """The inputs of a grant as the runner hands them over: bytes with provenance.
 
-    An input of frame −1, or one in ``leave_out`` (topic to cause), is absent.
+    Args:
+        declared: Inputs that a service declares.
+        frame: Number of the frame. An input of frame −1 is absent.
+        leave_out: Topics that are absent, with the cause.
+
+    Example:
+        >>> (channel,) = inputs([Input(topic="channel", lag=1)], 0)
+        >>> channel.present, channel.provenance.cause
+        (False, 'no frame before the first')
     """
     found = []
     for item in declared:
@@ -185,7 +224,15 @@ def inputs(
 
 
 def source(topic: str) -> str:
-    """Name of the service that publishes a topic in the street."""
+    """Name of the service that publishes a topic in the street.
+
+    Args:
+        topic: Name of the topic.
+
+    Example:
+        >>> source("scene")
+        'world'
+    """
     return {"scene": "world", "action": "agent"}.get(topic, topic)
 
 
@@ -214,6 +261,10 @@ def granted(declared: Iterable[Input], number: int, service: str) -> Frame:
         declared: Inputs that the service declares.
         number: Number of the frame.
         service: Name of the service.
+
+    Example:
+        >>> granted([Input(topic="scene")], 3, "agent").scene().names
+        ('car.1', 'truck.2')
     """
     return Frame(
         episode=0,
@@ -231,6 +282,7 @@ def _run(name: str) -> RunInfo:
 
 def _sensed(topic: str, frame: int) -> Payload:
     """Made-up sensor products with a few points and pixels that change from frame to frame."""
+    # Not those of the sensor services: they need Mitsuba, which a test of an agent has no use for.
     pose: dict[str, Any] = {"position": (24.0, 7.0, 4.0), "orientation": (1.0, 0.0, 0.0, 0.0)}
     if topic == "lidar":
         points = np.array([[1.0, 2.0, 0.5], [3.0, -1.0, 0.25 * frame]], dtype="<f4")

@@ -31,8 +31,8 @@ _LONGEST_STEP_MS = 1000
 # A vehicle that turns by more in a step has not turned: SUMO has put it elsewhere.
 _JUMP_DEG = 90.0
 
-# Steps between two reports of progress on the way to a distant instant.
-_TOLD_EVERY = 1000
+# Steps between two reports of progress on the way to a distant instant; a step takes some 0.3 ms.
+_REPORT_EVERY = 1000
 
 Files = str | tuple[str, ...]
 
@@ -94,6 +94,19 @@ class SumoWorld(World[SumoSettings]):
 
     Every frame shows the vehicles and persons that are in the network; a person inside a
     vehicle is not shown, nor a vehicle that SUMO is moving elsewhere (teleporting).
+
+    Args:
+        settings: Files of SUMO, its step, where the network lies, and classes of objects.
+        run: What the world knows about the run.
+
+    Raises:
+        ScenarioError: There is neither a network nor a configuration, SUMO's step does not fit the sampling
+            period, or a class has no mesh; names the key.
+
+    Example:
+        >>> world = SumoWorld(SumoSettings(net="/maps/town.net.xml"), RunInfo(name="traffic"))
+        >>> world.prefixes()
+        ('traffic.',)
     """
 
     Settings = SumoSettings
@@ -127,7 +140,12 @@ class SumoWorld(World[SumoSettings]):
         return self.settings.meshes
 
     def prepare(self, preparation: Preparation) -> Prepared:
-        """Check the files and load the library; an episode's reset starts SUMO."""
+        """Check the files and load the library; an episode's reset starts SUMO.
+
+        Raises:
+            ScenarioError: A file is missing or wrong; names file, key and line.
+            SetupError: libsumo is not installed.
+        """
         for key in ("net", "config", "routes", "additional"):
             for file in _tuple(getattr(self.settings, key)):
                 check_file(key, file)
@@ -144,10 +162,11 @@ class SumoWorld(World[SumoSettings]):
         simulation = self._started()
         self.run.progress("start SUMO", 0.0)
         simulation.start(self._arguments(derive_seed(seed, episode, self.run.name)))
+        # Compared in milliseconds, to half a step: SUMO adds its steps up in floating point.
         target_ms = self.settings.begin_s * 1e3
         while round(simulation.api.simulation.getTime() * 1e3) + self._step_ms / 2 < target_ms:
             self._step(simulation)
-            if self._steps % _TOLD_EVERY == 0:
+            if self._steps % _REPORT_EVERY == 0:
                 self.run.progress(f"fill the roads: {simulation.api.simulation.getTime():.0f} s", 0.0)
         self._steps = 0
         self._angles = {}
@@ -189,13 +208,14 @@ class SumoWorld(World[SumoSettings]):
         simulation = self._started()
         while self._steps < was.steps:
             self._step(simulation)
-            if self._steps % _TOLD_EVERY == 0:
+            if self._steps % _REPORT_EVERY == 0:
                 self.run.progress(f"the same traffic again: step {self._steps} of {was.steps}", 0.0)
         if self._traffic() != was.traffic:
             raise RunError(
                 f"world {self.run.name!r} has other traffic {was.steps} steps behind frame 0 than it had "
                 "before it was started again: its files, or SUMO, have changed; start the run again"
             )
+        # Which objects came first follows from all frames before, which are not computed again.
         self._mounts.clear(was.arrived)
 
     def _traffic(self) -> str:
@@ -230,6 +250,7 @@ class SumoWorld(World[SumoSettings]):
 
     def _step(self, simulation: Simulation) -> None:
         api = simulation.api
+        # Before the step: SUMO has no yaw rate, so it is the difference of two angles.
         self._angles = {name: api.vehicle.getAngle(name) for name in api.vehicle.getIDList()}
         simulation.step()
         self._steps += 1
@@ -246,9 +267,10 @@ class SumoWorld(World[SumoSettings]):
         present = set(domain.getIDList())
         for name in [name for name in known if name not in present]:
             del known[name]
+        # `known` keeps the order of departure, which `getIDList` does not have.
         for name, (kind, dimensions) in known.items():
             bumper = domain.getPosition3D(name)
-            if bumper[0] == api.INVALID_DOUBLE_VALUE:
+            if bumper[0] == api.INVALID_DOUBLE_VALUE:  # on its way elsewhere, by no road
                 continue
             if domain is api.person and domain.getVehicle(name):
                 continue
@@ -275,10 +297,21 @@ class SumoWorld(World[SumoSettings]):
 
 
 def step_length_ms(sampling_period_ns: int, step_ms: int | None) -> int:
-    """SUMO's step [ms] for a sampling period.
+    """Choose SUMO's step for a sampling period. SUMO steps whole milliseconds.
 
-    SUMO steps whole milliseconds. Raises `ScenarioError` unless the sampling period is a whole
-    number of steps.
+    Args:
+        sampling_period_ns: Sampling period of the run [ns].
+        step_ms: The step that is asked for [ms]; None: the sampling period.
+
+    Returns:
+        [ms]
+
+    Raises:
+        ScenarioError: The sampling period is no whole number of steps; says what to write.
+
+    Example:
+        >>> step_length_ms(100_000_000, None), step_length_ms(100_000_000, 20)
+        (100, 20)
     """
     period_ms, rest = divmod(sampling_period_ns, _NS_PER_MS)
     if rest:
@@ -307,7 +340,12 @@ def _tuple(files: Files) -> tuple[str, ...]:
 
 
 class Placement(NamedTuple):
-    """How the road network lies in the scene: turned about its origin, then shifted."""
+    """How the road network lies in the scene: turned about its origin, then shifted.
+
+    Example:
+        >>> Placement((100.0, 0.0, 0.0)).yaw
+        0.0
+    """
 
     offset: Vector = (0.0, 0.0, 0.0)
     """[m]"""
@@ -316,7 +354,12 @@ class Placement(NamedTuple):
 
 
 class Heading(NamedTuple):
-    """Where a body on the road points [rad]."""
+    """Where a body on the road points [rad].
+
+    Example:
+        >>> Heading(0.0, 0.0).forward
+        (1.0, 0.0, 0.0)
+    """
 
     yaw: float
     slope: float
@@ -335,12 +378,34 @@ class Heading(NamedTuple):
 
 
 def heading(angle_deg: float, slope_deg: float, placement: Placement) -> Heading:
-    """Heading in the scene: yaw = 90° − angle, turned with the network."""
+    """Convert a direction of SUMO: yaw = 90° − angle, turned with the network.
+
+    Args:
+        angle_deg: SUMO's angle, clockwise from north [°].
+        slope_deg: SUMO's slope, positive uphill [°].
+        placement: How the network lies in the scene.
+
+    Example:
+        >>> heading(90.0, 0.0, Placement())  # eastwards is +x
+        Heading(yaw=0.0, slope=0.0)
+    """
     return Heading(math.radians(90.0 - angle_deg) + placement.yaw, math.radians(slope_deg))
 
 
 def body_pose(bumper: Vector, towards: Heading, length: float, height: float, placement: Placement) -> Pose:
-    """Pose of the bounding box of a body whose front bumper stands at ``bumper`` in SUMO [m]."""
+    """Pose of the bounding box of a body, which SUMO places by its front bumper.
+
+    Args:
+        bumper: Centre of the front bumper on the ground, in SUMO's coordinates [m].
+        towards: Where the body points in the scene.
+        length: Of the body [m].
+        height: Of the body [m].
+        placement: How the network lies in the scene.
+
+    Example:
+        >>> body_pose((10.0, 0.0, 0.0), Heading(0.0, 0.0), 4.0, 1.5, Placement()).position
+        (8.0, 0.0, 0.75)
+    """
     c, s = math.cos(placement.yaw), math.sin(placement.yaw)
     x, y, z = bumper
     dx, dy, dz = placement.offset
@@ -384,9 +449,18 @@ _CLASS_OF: dict[str, str] = {
 
 
 def object_class(type_id: str, vehicle_class: str, chosen: dict[str, str]) -> str:
-    """Our class of a SUMO vehicle type: as chosen for its id or its vClass, else by its vClass.
+    """Find the class of an object: as chosen for its vehicle type or its vClass, else by its vClass.
 
-    A class that is not in the table drives on roads and is a ``car``.
+    A vClass that is not in the table drives on roads and is a ``car``.
+
+    Args:
+        type_id: SUMO's vehicle type.
+        vehicle_class: SUMO's vClass.
+        chosen: Class by vehicle type or vClass, which goes before the table.
+
+    Example:
+        >>> object_class("Lorry@17", "passenger", {"Lorry": "truck"}), object_class("t", "coach", {})
+        ('truck', 'bus')
     """
     base_type = type_id.partition("@")[0]  # SUMO appends @VEHICLE to a type changed for one vehicle
     for key in (base_type, vehicle_class):

@@ -40,7 +40,11 @@ _DEPARTS = {
 
 
 def load_libsumo() -> ModuleType:
-    """The library. Raises `SetupError` with the command that installs it."""
+    """Import libsumo.
+
+    Raises:
+        SetupError: It is not installed; says the command that installs it.
+    """
     try:
         import libsumo
     except ImportError as error:
@@ -51,13 +55,22 @@ def load_libsumo() -> ModuleType:
 
 
 def check_file(key: str, file: str) -> None:
-    """Raise `ScenarioError` unless ``file`` can be what setting ``key`` names (``net``, ``routes``, …)."""
+    """Check that a file can be what a setting names.
+
+    Args:
+        key: The setting: ``net``, ``config``, ``routes`` or ``additional``.
+        file: Path of the file.
+
+    Raises:
+        ScenarioError: The file is missing, is no XML of this kind, or has traffic out of order; names file,
+            key and line.
+    """
     path = Path(file)
     if not path.is_file():
         raise ScenarioError(
             f'there is no file {file}; write "file:PATH", relative to the scenario', key=f"settings.{key}"
         )
-    if path.suffix == ".gz":
+    if path.suffix == ".gz":  # SUMO reads them; what is wrong in one it says itself, where it does not crash
         return
     roots: list[str] = []
     order = _Departures(file, f"settings.{key}")
@@ -90,7 +103,7 @@ class _Departures:
         self._latest, self._of = -math.inf, ""
 
     def see(self, tag: str, attributes: dict[str, str], line: int) -> None:
-        """One more element. `ScenarioError` where it departs before the one before."""
+        """Look at one more element. `ScenarioError` where it departs before the one before."""
         time = attributes.get(_DEPARTS.get(tag, ""))
         try:
             departs = float(time or "nan")
@@ -108,14 +121,25 @@ class _Departures:
 
 
 class Simulation:
-    """One SUMO simulation at a time."""
+    """One SUMO simulation at a time.
+
+    Args:
+        libsumo: What `load_libsumo` gives.
+    """
 
     def __init__(self, libsumo: ModuleType) -> None:
         self.api: Any = libsumo
         self._running = False
 
     def start(self, arguments: Sequence[str]) -> None:
-        """Start, from the beginning. Raises `SetupError` with SUMO's own words where it refuses."""
+        """Start, from the beginning.
+
+        Args:
+            arguments: SUMO's command line.
+
+        Raises:
+            SetupError: SUMO refuses, or runs in this process already; has SUMO's own words.
+        """
         self.close()
         if self.api.isLoaded():
             raise SetupError(
@@ -131,11 +155,16 @@ class Simulation:
                 f"SUMO does not start: {_one_line(said)}; mend the file or setting it names"
             ) from error
         finally:
+            # A start that failed may leave a simulation behind, which would refuse the next start.
             self._running = bool(self.api.isLoaded())
         sys.stderr.write(output.getvalue())
 
     def step(self) -> None:
-        """One step. Raises `RunError` with SUMO's own words."""
+        """Simulate one step.
+
+        Raises:
+            RunError: SUMO stops; has its own words.
+        """
         try:
             self.api.simulationStep()
         except self.api.TraCIException as error:
@@ -153,6 +182,8 @@ class Simulation:
 @contextmanager
 def _caught_stderr() -> Iterator[io.StringIO]:
     """Catch what C++ code writes to standard error meanwhile."""
+    # By its descriptor: code that is not Python does not know `sys.stderr`. A file, not a pipe, which would
+    # block SUMO once it is full.
     output = io.StringIO()
     sys.stderr.flush()
     with tempfile.TemporaryFile() as file:
