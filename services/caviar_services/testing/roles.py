@@ -34,9 +34,9 @@ from caviar_protocol.topics import (
     Scene,
     Segmentation,
 )
-from caviar_services.service import FrameInput, Preparation, Service
+from caviar_services.service import FrameInput, Service
 from caviar_services.testing import samples
-from caviar_services.testing.base import EPISODE_SEED, FRAMES, Played, ServiceConformance
+from caviar_services.testing.base import FRAMES, Played, ServiceConformance
 
 P = TypeVar("P", bound=Payload)
 
