@@ -10,14 +10,13 @@ import pytest
 from recording_builders import channel, lidar, link, scene
 
 from caviar_clients.cli.plot import beam_gain
+from caviar_clients.plots.labels import Labels, common_prefix
 from caviar_clients.plots.map import (
     RECEIVER,
     WITHOUT_LOS,
     WITHOUT_PATH,
-    Labels,
     MapData,
     chosen_beam,
-    common_prefix,
     draw_antennas,
     draw_map,
     draw_objects,

@@ -115,6 +115,7 @@ def measure(topology: Topology, services: int, payload: int, frames: int, *, cur
             outcome = server.run()
             if outcome.error:
                 raise RunError(f"the measured run did not come to its end: {outcome.error}")
+    # From end to end of frames: what a user of the run sees, its client processes included.
     ends = np.asarray(server.statistics.finished_ns[WARM_UP - 1 :], np.int64)
     each = np.diff(ends) / 1e3
     mean = float(each.mean())
@@ -132,7 +133,7 @@ def measure(topology: Topology, services: int, payload: int, frames: int, *, cur
 
 
 def _keys(folder: Path, declared: Sequence[Part]) -> Access:
-    """A pair of the broker's, and one that all clients have."""
+    """Make a pair for the broker, and one that all clients have."""
     write_pair(folder, BROKER, Pair.new())
     clients = Pair.new()
     write_pair(folder, _CLIENTS, clients)

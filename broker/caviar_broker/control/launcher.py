@@ -35,6 +35,10 @@ class LogFile:
     """A file that a thread appends to, so that a disk that does not answer holds up no caller.
 
     Once lines could not be written, it takes no more: offsets of later ones would be wrong.
+
+    Args:
+        path: The file; it is made where it does not exist.
+
     Raises:
         RunError: The file cannot be opened.
     """
@@ -43,6 +47,7 @@ class LogFile:
         self._file = open_to_append(path)
         self.size = self._file.seek(0, os.SEEK_END)
         """[B] of the file, with what is on its way."""
+        # What has reached the file: between the two are the lines that the thread still has.
         self._written = self.size
         self._error = ""
         self._queue: queue.SimpleQueue[bytes] = queue.SimpleQueue()
@@ -62,7 +67,14 @@ class LogFile:
         return self._error
 
     def put(self, data: bytes) -> bool:
-        """Append lines; whether the file takes them. Waits `LOG_S` where too much is on its way."""
+        """Append lines. Waits `LOG_S` where too much is on its way.
+
+        Args:
+            data: Whole lines.
+
+        Returns:
+            Whether the file takes them.
+        """
         if self.size - self._written > MAX_PENDING and not self._wait_for(MAX_PENDING):
             self._error = self._error or "the disk did not answer"
         if self._error:
@@ -72,12 +84,13 @@ class LogFile:
         return True
 
     def read(self, start: int) -> bytes:
-        """Whole lines from an offset on, as far as they are written."""
+        """Read whole lines from an offset on, as far as they are written."""
+        # `pread` moves no offset, which the thread that appends would have to share.
         data = os.pread(self._file.fileno(), min(MAX_PENDING, self._written - start), start)
         return data[: data.rfind(b"\n") + 1]
 
     def wait(self, seconds: float) -> None:
-        """Until more is written, but not longer than that [s]."""
+        """Wait until more is written, but not longer than that [s]."""
         with self._progress:
             self._progress.wait(seconds)
 
@@ -85,6 +98,7 @@ class LogFile:
         """Close the file, once all is written or the disk has had `LOG_S` for it."""
         self._wait_for(0)
         self._queue.put(b"")
+        # A thread in a write to a disk that hangs cannot be ended; it is a daemon and dies with the process.
         self._thread.join(LOG_S)
         if not self._thread.is_alive():
             self._file.close()
@@ -94,6 +108,7 @@ class LogFile:
             return self._progress.wait_for(lambda: self.failed or self.size - self._written <= backlog, LOG_S)
 
     def _write_all(self) -> None:
+        # No lock around the write: the lines are in the queue, and only this thread touches the file's end.
         while data := self._queue.get():
             left = memoryview(data)
             try:
@@ -142,6 +157,7 @@ class Outbox:
 
     def notice(self, line: Line) -> None:
         """Log a line, and pass it on."""
+        # In the log first: from `start` on it can be read back, should the descriptor have no room.
         start = self._log.size
         logged = self._log.put(json.dumps(line, ensure_ascii=False).encode(errors="backslashreplace") + b"\n")
         if self.gone:
@@ -163,17 +179,23 @@ class Outbox:
             self.event(line)
 
     def flush(self) -> None:
-        """Write what the descriptor takes now."""
+        """Write what the descriptor takes now, without blocking."""
         while self.waiting and not self.gone:
             if not self._pending and not self._read_back():
                 return
+            # At most `CHUNK` after each poll: POSIX promises room for PIPE_BUF bytes and not for more.
             if self._poll.poll(0):
                 self._write()
             else:
                 return
 
     def finish(self, last: Line, within_s: float) -> None:
-        """Write all that waits and then ``last``, but wait no longer than ``within_s``."""
+        """Write all that waits and then a last line.
+
+        Args:
+            last: The last line.
+            within_s: Time for that [s]; what is not taken then is lost here, and is in the log.
+        """
         until = time.monotonic() + within_s
         while self.waiting and not self.gone and (left := until - time.monotonic()) > 0:
             if self._pending:
@@ -319,6 +341,7 @@ class LauncherPipe:
             self._server.feed(ev.StopRequested("the launcher of the run ended"))
             return
         *lines, self._rest = (self._rest + data).split(b"\n")
+        # A launcher that never ends a line must not fill the memory.
         self._rest = self._rest[-MAX_ORDER:]
         for line in lines:
             self._obey(line)
@@ -340,7 +363,9 @@ class LauncherPipe:
 
 
 def stop_on_signals(server: BrokerServer) -> Callable[[], bool]:
-    """SIGTERM and SIGINT end the run in order; whether one came can be asked."""
+    """Have SIGTERM and SIGINT end the run in order; the function that is returned says whether one came."""
+    # A handler of Python runs between two bytecodes of any call: instead the signal's number is written to a
+    # pipe, which the loop reads in its turn.
     came: list[int] = []
     read, write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
     for number in (signal.SIGTERM, signal.SIGINT):

@@ -28,6 +28,7 @@ MAX_REQUEST = 1 << 12
 MAX_WAITING = 1 << 18
 """[B] that may wait for a client that does not read; behind that the connection is cut."""
 MAX_CONNECTIONS = 32
+"""Clients at once; another one is hung up on, and reads that too many ask."""
 FRAME_EVENT_NS = 50_000_000
 """[ns] between ``frame`` events at least."""
 MAX_STEPS = 1_000_000_000
@@ -45,7 +46,7 @@ class ControlServer:
     It is the server's observer, in front of the one that it is given, so it knows the last blame.
 
     Args:
-        directory: Of the run; the socket is made there.
+        directory: Directory of the run; the socket is made there.
         observer: Gets everything too.
 
     Raises:
@@ -53,6 +54,7 @@ class ControlServer:
     """
 
     def __init__(self, directory: Path, observer: Observer) -> None:
+        # Before the broker itself exists: a second broker is refused before it touches anything of the run.
         self._place = ControlSocket(directory)
         self._observer = observer
         self._server: BrokerServer | None = None
@@ -75,12 +77,13 @@ class ControlServer:
 
     def attach(self, server: BrokerServer) -> None:
         """Begin to answer, in the server's loop."""
+        # In the loop and not in a thread: an answer is of one instant between two frames, without locks.
         self._server = server
         self._place.announce(run=server.clock.plan.run, pid=os.getpid(), broker=server.endpoint)
         server.loop.watch(self._place.socket.fileno(), self._accept)
 
     def close(self) -> None:
-        """Tell subscribers that this was it, and leave nothing behind."""
+        """Send subscribers the outcome, hang up, and remove socket and note."""
         outcome = self.server.outcome if self._server is not None else None
         if outcome is not None:
             line = {"error": outcome.error, "culprit": outcome.culprit, "digest": outcome.digest}
@@ -100,17 +103,19 @@ class ControlServer:
     # --- what the server tells ------------------------------------------------------------------------
 
     def notice(self, notice: ev.Notice) -> None:
-        """Remember the last blame, and pass it on."""
+        """Keep a notice that names a culprit, and pass every notice on."""
         fields: Answer = {"kind": notice.kind, "service": notice.service, "text": notice.text}
         fields |= {"episode": notice.episode, "frame": notice.frame}
         if notice.kind in BLAMES:
+            # The wall clock, which a user compares with logs; everything else here is monotonic.
             self._last_blame = {**fields, "at": time.time()}
         self._tell({"event": "notice", **fields})
         self._observer.notice(notice)
 
     def frame(self, frame: ev.FrameFinished, statistics: Statistics) -> None:
-        """Pass it on; subscribers get it not more often than a person could read it."""
+        """Pass a frame on; subscribers get one in 50 ms at most, which is as often as a person reads."""
         self._observer.frame(frame, statistics)
+        # The frame path: without a client it costs this one look.
         if not self._callers:
             return
         now = time.monotonic_ns()
@@ -121,6 +126,7 @@ class ControlServer:
             self._tell({"event": "frame", **line})
 
     def _tell(self, line: Answer) -> None:
+        # A copy, since a caller that does not read is closed while it is sent to, and forgotten.
         for caller in tuple(self._callers.values()):
             if caller.subscribed:
                 caller.say(line)
@@ -140,11 +146,18 @@ class ControlServer:
         self._callers[connection.fileno()] = caller
 
     def forget(self, fd: int) -> None:
-        """A connection is closed."""
+        """Forget a connection that is closed."""
         self._callers.pop(fd, None)
 
     def answer(self, line: bytes) -> tuple[Answer, bool]:
-        """The answer to one request, and whether events are wanted from now on."""
+        """Answer one request.
+
+        Args:
+            line: A JSON object; its ``id``, where it has one, comes back in the answer.
+
+        Returns:
+            The answer, and whether events are wanted from now on.
+        """
         try:
             request = json.loads(line)
         except (ValueError, RecursionError):  # what is nested too deep is no request
@@ -199,6 +212,7 @@ class ControlServer:
 
     def _step(self, request: Mapping[str, Any]) -> Answer:
         frames = request.get("frames", 1)
+        # The type and not an instance of it: true is an integer of Python.
         if type(frames) is not int or not 1 <= frames <= MAX_STEPS:
             return _refusal(f"frames is {frames!r:.80}, it is a whole number from 1 to {MAX_STEPS}")
         if not self.server.clock.status(time.monotonic_ns()).paused:
@@ -262,6 +276,8 @@ class _Caller:
 
     def _watch(self) -> None:
         """Wait for what is due: room for what waits, the turn of the next request, or a request."""
+        # A socket is nearly always writable: waiting for that gives a request that is here already its turn,
+        # behind what else the loop has to do.
         events = zmq.POLLOUT if self._waiting or b"\n" in self._received else zmq.POLLIN
         if events != self._watched:
             loop, self._watched = self._control.server.loop, events
@@ -280,7 +296,7 @@ class _Caller:
             self._watch()
 
     def _receive(self) -> bool:
-        """Take in what came; whether that makes a request."""
+        """Read what came; whether that makes a request."""
         try:
             data = self._socket.recv(MAX_REQUEST)
         except BlockingIOError:
@@ -288,12 +304,13 @@ class _Caller:
         except OSError:
             data = b""
         self._received += data
+        # An end, an error, or more than any request has without an end of line.
         if not data or (len(self._received) > MAX_REQUEST and b"\n" not in self._received):
             self.close()
         return b"\n" in self._received and bool(self._watched)
 
     def say(self, line: Answer) -> None:
-        """Send one line, as far as it goes now."""
+        """Send one line, as far as the socket takes it now; the rest waits."""
         self._waiting += json.dumps(line, ensure_ascii=False).encode() + b"\n"
         self._flush()
         if len(self._waiting) > MAX_WAITING:

@@ -22,6 +22,7 @@ from caviar_protocol.errors import RunError
 from caviar_protocol.files import RunDirectory, read_regular, refuse_other_kinds, replace_file
 
 BACKLOG = 16
+"""Connections that wait for the broker's loop; with more, a client waits `REACH_S` for its place."""
 REMOVE_S = 1.0
 """[s] that is waited for the disk to remove socket and note."""
 REACH_S = 2.0
@@ -54,6 +55,7 @@ class ControlSocket:
     """
 
     def __init__(self, directory: Path) -> None:
+        # A socket file may be left by a broker that was killed: only a connection shows whether one is there.
         refuse_second_broker(directory)
         self._files, self._elsewhere = RunDirectory(directory), ""
         self.socket = _listening()
@@ -62,7 +64,7 @@ class ControlSocket:
             path.unlink(missing_ok=True)
             with _short(directory) as folder:
                 self.socket.bind(f"{folder}/{path.name}")
-        except OSError:
+        except OSError:  # the file system takes no sockets
             self._elsewhere = tempfile.mkdtemp(prefix="caviar-")
             path = Path(self._elsewhere, path.name)
             self.socket.close()
@@ -72,11 +74,19 @@ class ControlSocket:
         self._announced: dict[str, str | int] = {"socket": str(path)}
 
     def announce(self, **facts: str | int) -> None:
-        """Add facts to the note. `RunError` naming it where it cannot be written."""
+        """Add facts to the note.
+
+        Args:
+            facts: Its fields, such as ``pid`` and ``http``.
+
+        Raises:
+            RunError: The note cannot be written.
+        """
         self._announced |= facts
         note = self._files.control_note
         try:
             refuse_other_kinds(note)
+            # In one step, for readers that poll it; not durable, since it is worth nothing after a crash.
             replace_file(note, json.dumps(self._announced, indent=2).encode() + b"\n", durable=False)
         except OSError as error:
             raise RunError(f"cannot write {note}: {error.strerror}") from error
@@ -162,15 +172,20 @@ def ask(directory: Path, **request: Any) -> dict[str, Any]:
     """Ask the broker that runs in a directory.
 
     Args:
-        directory: Of the run.
-        request: Its fields, ``do`` and what belongs to it.
+        directory: Directory of the run.
+        request: Fields of the request, ``do`` and what belongs to it.
 
     Returns:
-        The answer, with ``ok`` and what was asked for: ``ask(run, do="why")["why"]``.
+        The answer, with ``ok`` and what was asked for: ``ask(run, do="why")["why"]["state"]``.
 
     Raises:
         RequestRefusedError: The broker refuses the request.
         RunError: No broker runs there, or it does not answer within `REACH_S`.
+
+    Example:
+        >>> ask(Path("runs/gone"), do="why")  # doctest: +IGNORE_EXCEPTION_DETAIL
+        Traceback (most recent call last):
+        RunError: there is no directory runs/gone; give that of a run
     """
     line = b""
     with connect(directory) as connection:
@@ -192,6 +207,7 @@ def ask(directory: Path, **request: Any) -> dict[str, Any]:
 
 async def ask_in_thread(directory: Path, **request: Any) -> dict[str, Any]:
     """Do the same as `ask` for a caller in an event loop, which goes on meanwhile."""
+    # In a thread, so that there is one client of the socket and not another one for event loops.
     # Here and below: a broker without HTTP does not load asyncio, which takes 25 ms with ssl and logging.
     import asyncio
 
@@ -199,7 +215,12 @@ async def ask_in_thread(directory: Path, **request: Any) -> dict[str, Any]:
 
 
 def call_at_end(connection: socket.socket, callback: Callable[[], None]) -> None:
-    """Have the running event loop call back once the broker at the other end of an idle connection ends."""
+    """Have the running event loop call back once the broker ends.
+
+    Args:
+        connection: An idle connection to it; without a subscription nothing ever comes over it.
+        callback: Called once, when the connection is closed.
+    """
     import asyncio
 
     loop = asyncio.get_running_loop()
@@ -236,7 +257,8 @@ def _listening() -> socket.socket:
 
 @contextmanager
 def _short(directory: Path) -> Iterator[str]:
-    """A short name of a directory: the path of a socket may have 107 bytes at most."""
+    """Yield a short name of a directory: the path of a socket may have 107 bytes at most."""
+    # sun_path of struct sockaddr_un has 108 bytes with the final NUL (unix(7)); run directories are longer.
     fd = os.open(directory, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         yield f"/proc/self/fd/{fd}"

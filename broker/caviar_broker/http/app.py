@@ -21,17 +21,23 @@ from caviar_protocol.errors import RunError
 from caviar_protocol.keys import OPERATOR, VIEWER
 from caviar_protocol.messages import PROTOCOL_VERSION
 
+# Version of the text format that every Prometheus reads; it makes no use of OpenMetrics.
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 STATES = ("joining", "preparing", "resetting", "running", "stopping", "finished")
 
 
 def metrics(status: Mapping[str, Any], peers: int) -> str:
-    """The status of a run in Prometheus's text format, and the number of open WebSockets.
+    """Write the status of a run in Prometheus's text format.
 
     Args:
         status: Answer of the control channel to ``status``.
         peers: Number of open WebSockets.
+
+    Returns:
+        Families of samples with ``# HELP`` and ``# TYPE``, ending in a line feed.
     """
+    # Made of an answer at each request, where prometheus-client would keep counters of its own: these are the
+    # broker's, in another process, and the library's collector for them has as many lines.
     return "\n".join(_lines(status, peers)) + "\n"
 
 
@@ -169,6 +175,7 @@ def make_app(ask: Ask, tokens: Tokens, gateway: Gateway) -> FastAPI:
 
 
 def _questions(app: FastAPI, ask: Ask, gateway: Gateway, viewer: list[Any]) -> None:
+    # A function that makes each handler: one made in the loop would answer with the loop's last name.
     def answers(name: str) -> Callable[[], Awaitable[Any]]:
         async def answer() -> Any:
             return (await ask(do=name))[name]
@@ -218,6 +225,7 @@ def _probes(app: FastAPI, ask: Ask) -> None:
     @app.get("/healthz", responses=_example("healthz") | _unready("the broker does not answer"))
     async def healthz() -> Any:
         """Whether the broker answers. Needs no token."""
+        # Of `why` and not of `status`, which computes quantiles for every service.
         await ask(do="why")
         return {"ok": True}
 
@@ -229,9 +237,10 @@ def _probes(app: FastAPI, ask: Ask) -> None:
 
 
 def _may(role: str, tokens: Tokens) -> Callable[[Request], Awaitable[None]]:
-    """A dependency that checks a request's token for a role."""
+    """Make a dependency that checks a request's token for a role."""
 
     async def check(request: Request) -> None:
+        # Without tokens `LocalOnly` has refused what a page of elsewhere sends.
         if not tokens.exist:
             return
         token = token_of(request.headers, tokens)

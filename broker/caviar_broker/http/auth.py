@@ -33,7 +33,8 @@ class Tokens:
         return self._stamp is not None
 
     def find(self, text: str) -> Token | None:
-        """The token that reads so."""
+        """Find the token with this text; None where it is not known."""
+        # The file holds digests: a copy of it lets no one in.
         self._read()
         return self._by_digest.get(hashlib.sha256(text.encode()).hexdigest())
 
@@ -61,6 +62,7 @@ class Tokens:
             return
         except OSError as error:
             raise SetupError(f"cannot read {path}: {error.strerror}") from error
+        # The inode too: editors replace a file, and two versions may have the same size and instant.
         stamp = (found.st_mtime_ns, found.st_ino, found.st_size)
         if stamp != self._stamp:
             tokens = read_tokens(directory)
@@ -68,7 +70,7 @@ class Tokens:
 
 
 def http_address(text: str, keys: Path | None) -> tuple[str, int]:
-    """Host and port of ``HOST:PORT``.
+    """Check the address that HTTP is to be served at, and split it.
 
     Args:
         text: ``HOST:PORT``; an IPv6 address in brackets.
@@ -77,6 +79,13 @@ def http_address(text: str, keys: Path | None) -> tuple[str, int]:
     Raises:
         SetupError: It is no address, other machines could reach it without a token, or a broker
             with keys has no tokens: a process of this machine without a key could then stop the run.
+
+    Example:
+        >>> http_address("127.0.0.1:8080", None)
+        ('127.0.0.1', 8080)
+        >>> http_address("0.0.0.0:8080", None)  # doctest: +IGNORE_EXCEPTION_DETAIL
+        Traceback (most recent call last):
+        SetupError: HTTP at 0.0.0.0:8080 could be reached by others, and there are no tokens
     """
     host, _, port = text.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")
@@ -103,6 +112,10 @@ def is_loopback(host: str) -> bool:
     between this check and the bind, or be decided by who runs the name server, and then HTTP without
     tokens would be open to others. A name that happens to mean this machine is refused instead, and
     its user writes the address.
+
+    Example:
+        >>> is_loopback("127.0.0.1"), is_loopback("localhost"), is_loopback("broker.lan")
+        (True, True, False)
     """
     if host == "localhost":
         return True
@@ -117,13 +130,14 @@ BEARER = "bearer."
 
 
 def foreign(headers: Mapping[str, str], tokens: Tokens) -> str:
-    """Why a request is that of a page of elsewhere, and refused; empty where there are tokens, or it is not.
+    """Say why a request, as one of a page of another machine, is refused; empty where it is not.
 
     Such a page gives itself away by its ``Origin``, or, where it has had its own name point to this
     machine, by ``Host``.
     """
     if tokens.exist:
         return ""  # a page cannot know a token, wherever it is from
+    # DNS rebinding: the browser takes the page and this machine for one origin, but states the page's name.
     if not is_loopback(_host(f"//{headers.get('host', '')}")):
         return "without tokens only this machine's own names and addresses are served"
     origin = headers.get("origin")
@@ -140,7 +154,7 @@ def _host(url: str) -> str:
 
 
 def token_of(headers: Mapping[str, str], tokens: Tokens, subprotocols: Iterable[str] = ()) -> Token | None:
-    """The token of ``Authorization: Bearer TOKEN``, or of the subprotocol ``bearer.TOKEN``.
+    """Read the token of ``Authorization: Bearer TOKEN``, or of the subprotocol ``bearer.TOKEN``.
 
     Args:
         headers: Of the request.
@@ -164,5 +178,5 @@ def _text(headers: Mapping[str, str], subprotocols: Iterable[str]) -> str:
 
 
 def subprotocol(offered: Iterable[str]) -> str | None:
-    """That of the answer: ours, if it is wanted; never the one with the token."""
+    """Choose the subprotocol of the answer: ours, if it is offered; never the one with the token."""
     return SUBPROTOCOL if SUBPROTOCOL in offered else None

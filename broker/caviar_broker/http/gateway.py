@@ -63,7 +63,7 @@ class Gateway:
             notice.
         credentials: Its key, which a broker with keys admits for the services that have a token, and that
             broker's.
-        remedy: What makes a token.
+        remedy: Command that makes a token, for refusals.
     """
 
     def __init__(
@@ -111,6 +111,7 @@ class Gateway:
     async def _refuse(self, socket: WebSocket, why: str) -> None:
         """Accept, send REFUSE, close: pages and engines cannot read the answer to a request that fails."""
         peer = socket.client.host if socket.client else "an unknown address"
+        # Throttled: a page that tries again and again must not fill the console of the run.
         await self._refused(why, f"a WebSocket from {peer} was refused: {why}")
         await socket.accept(subprotocol(socket.scope.get("subprotocols", [])))
         await _send(socket, m.Refuse(code="unauthorized", message=why))
@@ -124,6 +125,7 @@ class Gateway:
     def _dealer(self) -> zmq.asyncio.Socket:
         dealer = self._context.socket(zmq.DEALER)
         dealer.linger = LINGER_MS
+        # Few, so that a peer that does not read is felt by the broker, whose limits then apply to it.
         dealer.sndhwm = dealer.rcvhwm = QUEUE
         dealer.setsockopt(zmq.IPV6, int("[" in self._endpoint))
         if self._credentials is not None:
@@ -207,6 +209,8 @@ class _Bridge:
 
     async def _up(self) -> None:
         while True:
+            # One message after the other, and no task for each: the broker gets them in their order, and a
+            # peer that sends faster than the broker reads is held up by TCP.
             event = await self._socket.receive()
             if event["type"] == "websocket.disconnect":
                 await self._note_end(event.get("code", ABNORMAL))
@@ -301,6 +305,7 @@ class _Bridge:
             if self._awaits_welcome or not self._admitted:
                 self._read_answer(parts[0].buffer)
             frame = join_parts([part.buffer for part in parts])
+            # The frame before may still be on its way: its size counts for the time of this one.
             patience = SLOW_S + self._sent / SLOW_RATE
             try:
                 async with asyncio.timeout(patience):
@@ -329,7 +334,7 @@ class _Bridge:
 
 
 def _no_limits() -> None:
-    """What admits a peer where the server has no limits for strangers."""
+    """Admit a peer where the server has no limits for strangers."""
 
 
 async def _send(socket: WebSocket, message: m.Message) -> None:
@@ -341,6 +346,7 @@ async def _send(socket: WebSocket, message: m.Message) -> None:
 
 async def _close(socket: WebSocket, code: int, reason: str) -> None:
     """Close a WebSocket; one that does not read, or has gone, is left to end by itself."""
+    # Cut in bytes, as the limit counts, without half a character at the end.
     short = reason.encode()[:MAX_REASON].decode(errors="ignore")
     with contextlib.suppress(TimeoutError, RuntimeError, WebSocketDisconnect):
         async with asyncio.timeout(LOOK_S):

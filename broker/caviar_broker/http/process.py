@@ -59,6 +59,7 @@ class HttpProcess:
 
     def start(self, server: BrokerServer) -> None:
         """Start the process; the server's loop notes when it ends."""
+        # Of its own, so that no request takes time from the loop that serves frames.
         if not self._address:
             return
         command = [sys.executable, "-m", "caviar_broker.http", str(self._directory), "--http", self._address]
@@ -69,6 +70,7 @@ class HttpProcess:
             self._process = subprocess.Popen(  # noqa: S603  # our own module with checked arguments
                 command, stdin=subprocess.DEVNULL, stdout=file, stderr=file, start_new_session=True
             )
+        # A descriptor that is readable when the process ends, for the loop; a signal would need a handler.
         self._fd = os.pidfd_open(self._process.pid)
         server.loop.watch(self._fd, lambda: self._ended(server))
 
@@ -118,6 +120,7 @@ async def serve(run: Path, address: str, keys: Path | None) -> None:
     from caviar_broker.http.gateway import NOTE, REMEDY, Gateway
     from caviar_broker.http.server import http_server, listening_socket
 
+    # Everything is asked over the control socket, which only the broker's user can reach.
     ask = functools.partial(ask_in_thread, run)
     keys, credentials = await _keys_of_broker(ask, keys)
     host, port = http_address(address, keys)
@@ -134,6 +137,7 @@ async def serve(run: Path, address: str, keys: Path | None) -> None:
     listening = listening_socket(host, port)
     notices: set[asyncio.Task[None]] = set()
 
+    # The event loop keeps only weak references to tasks: without the set a notice might vanish unsent.
     def notify_soon(text: str) -> None:
         task = asyncio.create_task(tell("", text, NOTE))
         notices.add(task)
@@ -144,6 +148,7 @@ async def serve(run: Path, address: str, keys: Path | None) -> None:
     def end() -> None:
         server.should_exit = True
 
+    # Before the address is announced: a broker that ends in between must not leave this process behind.
     call_at_end(connect(run), end)
     await ask(do="serving", http=f"http://{_place(host, listening)}")
     try:
@@ -168,7 +173,7 @@ async def _keys_of_broker(ask: Ask, keys: Path | None) -> tuple[Path | None, Cre
 
 
 def _reachable(endpoint: str) -> str:
-    """Where this machine reaches a broker that listens at all of its addresses."""
+    """Replace the address of a broker that listens at all of this machine's by that of the loopback."""
     return endpoint.replace("//0.0.0.0:", "//127.0.0.1:").replace("//[::]:", "//[::1]:")
 
 

@@ -22,6 +22,7 @@ from caviar_protocol.host import steady_memory, trim_memory
 ADMIT = "admit"
 """Key of a WebSocket's ASGI state: what to call once the broker has accepted the peer."""
 MAX_STRANGERS = 256
+"""Connections that have not yet shown what they are: the oldest of the address with most makes room."""
 REQUEST_S = 10.0
 """[s] from the beginning of a connection, or the last answer, to the end of the next answer."""
 HELLO_S = 60.0
@@ -60,8 +61,13 @@ class Strangers:
     _looks: bool = False
 
     def add(self, transport: asyncio.Transport) -> None:
-        """A connection begins; the oldest one of the address that has most makes room where there are too
-        many, since an honest peer says at once what it wants."""
+        """Count a new connection; the oldest one of the address that has most makes room.
+
+        An honest peer says at once what it wants, so the oldest of many is the least likely to be one.
+
+        Args:
+            transport: The connection.
+        """
         name = transport.get_extra_info("peername")
         self._known[transport] = _Stranger(str(name[0]) if name else "", _now() + REQUEST_S)
         if len(self._known) > MAX_STRANGERS:
@@ -72,12 +78,12 @@ class Strangers:
         self._look_soon()
 
     def grant(self, transport: asyncio.Transport, seconds: float) -> None:
-        """A stranger gets so much time from now [s]."""
+        """Give a stranger so much time from now [s]."""
         if transport in self._known:
             self._known[transport].until = _now() + seconds
 
     def remove(self, transport: asyncio.Transport) -> None:
-        """A connection has ended, or is no stranger's any more."""
+        """Forget a connection that has ended, or is no stranger's any more."""
         self._known.pop(transport, None)
         self._freed = True
         self._look_soon()
@@ -110,7 +116,8 @@ class Strangers:
             self._look_soon()
 
     def protocols(self) -> tuple[type[asyncio.Protocol], type[asyncio.Protocol]]:
-        """The protocols of uvicorn, HTTP and WebSocket, whose connections are strangers here."""
+        """Make protocols of uvicorn, HTTP and WebSocket, whose connections are strangers here."""
+        # Classes, since uvicorn makes a protocol for each connection itself, and passes nothing of ours on.
         here = {"strangers": self}
         return type("Http", (_Http,), here), type("WebSockets", (_WebSocket,), here)
 

@@ -31,6 +31,13 @@ def is_local(endpoint: str) -> bool:
 
     ``ipc://`` and ``inproc://`` are local, of ``tcp://`` the loopback addresses of IPv4 and IPv6, the
     loopback interface, and names of which every address is one of these. What cannot be resolved is not.
+
+    Args:
+        endpoint: The address.
+
+    Example:
+        >>> is_local("tcp://127.0.0.1:5570"), is_local("tcp://0.0.0.0:5570"), is_local("ipc:///tmp/caviar")
+        (True, False, True)
     """
     transport, _, place = endpoint.partition("://")
     if transport in ("ipc", "inproc"):
@@ -42,11 +49,20 @@ def is_local(endpoint: str) -> bool:
 
 
 def check_bind(endpoint: str, keys: bool) -> None:
-    """Raises `RunError` for what is no address, and where others could reach a broker without keys.
+    """Refuse what is no address, and one where other machines could reach a broker without keys.
 
     Args:
         endpoint: Address to listen at.
         keys: Whether the broker has keys.
+
+    Raises:
+        RunError: It is refused; the error says how keys are made.
+
+    Example:
+        >>> check_bind("tcp://0.0.0.0:5570", keys=True)
+        >>> check_bind("tcp://0.0.0.0:5570", keys=False)  # doctest: +IGNORE_EXCEPTION_DETAIL
+        Traceback (most recent call last):
+        RunError: tcp://0.0.0.0:5570 can be reached from other machines
     """
     if "://" not in endpoint:
         raise RunError(f"{endpoint!r} is no address to listen at; write it as tcp://127.0.0.1:5570")
@@ -69,6 +85,7 @@ def _addresses(host: str) -> list[str]:
 
 
 def _loopback(address: str) -> bool:
+    # An address of IPv4 may be written as one of IPv6: ::ffff:127.0.0.1.
     parsed = ipaddress.ip_address(address.partition("%")[0])
     mapped = getattr(parsed, "ipv4_mapped", None)
     return (mapped or parsed).is_loopback
@@ -116,7 +133,7 @@ class Access:
         self._barred: dict[str, int] = {}
 
     def name(self, key: str) -> str:
-        """What a key is called; "" for one that is not authorized."""
+        """Name a key; "" for one that is not authorized."""
         if key == self._local_key:
             return LOCAL
         if key == self.gateway.public:
@@ -125,7 +142,7 @@ class Access:
         return entry.name if entry else ""
 
     def admits(self, key: str) -> str:
-        """Why a key may not connect at all; empty where it may."""
+        """Say why a key may not connect at all; empty where it may."""
         if not self.name(key):
             return f"the key {key} is not authorized (caviar keys authorize)"
         if self._barred.get(key, 0) > time.monotonic_ns():
@@ -133,15 +150,15 @@ class Access:
         return ""
 
     def refusal(self, key: str, name: str, role: str = "", outputs: Sequence[str] = ()) -> str:
-        """Why a key may not appear as that service; empty where it may. Without ``role`` only the name
-        counts.
+        """Say why a key may not appear as that service; empty where it may.
 
         Args:
             key: Public key of the connection, in Z85.
             name: Of the service.
-            role: Of the service; empty: not asked about.
+            role: Role of the service; empty: only the name counts.
             outputs: Topics that it declares.
         """
+        # An empty key, of a connection that is not known, equals the local key of a broker without one.
         if key and key == self._local_key:
             known = self._local.get(name)
             if known is None:
@@ -164,8 +181,13 @@ class Access:
             self._barred[key] = time.monotonic_ns() + BAR_NS
 
     def reload(self) -> str | None:
-        """Read the two files again if they changed: None if it did not, else why it cannot be used,
-        in which case nothing changes, or an empty text."""
+        """Read the two files again if they changed.
+
+        Returns:
+            None where they did not change; else why they cannot be used, in which case what stood there
+            before holds, or an empty text.
+        """
+        # Noted also for a file that cannot be used: the complaint comes once, not at every look.
         stamp = self._look()
         if stamp == self._stamp:
             return None
@@ -177,14 +199,14 @@ class Access:
         return ""
 
     def _read(self) -> None:
-        """Take in both files: each holds by itself, also where the other one cannot be used."""
+        """Read both files: each holds by itself, also where the other one cannot be used."""
         try:
             self._entries = {entry.public: entry for entry in read_authorized(self.directory)}
         finally:
             self._tokens = read_tokens(self.directory)
 
     def _look(self) -> tuple[_Stamp, _Stamp]:
-        """Changes whenever one of the files does."""
+        """Compute a value that changes whenever one of the files does."""
         return _stamp(self.directory / AUTHORIZED), _stamp(self.directory / TOKENS)
 
     def _token_refusal(self, name: str, role: str) -> str:
@@ -207,11 +229,12 @@ def _stamp(path: Path) -> _Stamp:
         found = path.stat()
     except OSError:
         return (0, 0, 0)
+    # The inode too: editors replace a file, and two versions may have the same size and instant.
     return (found.st_mtime_ns, found.st_ino, found.st_size)
 
 
 def answer(access: Access | None, request: Sequence[bytes]) -> tuple[list[bytes], str]:
-    """Reply to a request of the ZeroMQ Authentication Protocol (RFC 27), and why it is a refusal.
+    """Answer a request of the ZeroMQ Authentication Protocol (RFC 27).
 
     The user id that it gives to each message of the connection is the public key, in Z85. Without
     ``access`` every peer is let in that asks for no mechanism.

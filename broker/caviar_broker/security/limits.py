@@ -25,6 +25,11 @@ class NoticeThrottle:
     """Counts repetitions: the first of a kind passes at once, later ones together, every `PERIOD_NS`.
 
     What a peer sends must never decide how much the broker writes; what is held back is counted.
+
+    Example:
+        >>> throttle = NoticeThrottle()
+        >>> [throttle.tell("key", "refused", s * 10**9) for s in (0, 1, 2, 10)]
+        ['refused', '', '', 'refused (and 2 more of this kind)']
     """
 
     def __init__(self) -> None:
@@ -63,8 +68,7 @@ CHATTER = 1024
 
 @dataclass(frozen=True, kw_only=True)
 class PeerLimits:
-    """What a peer may use; far more than any service of a run needs, unless a scenario's ``[limits]`` say
-    otherwise."""
+    """Limits of a peer; far more than any service of a run needs, unless a scenario's ``[limits]`` differ."""
 
     connections: int = 4096
     """Open connections in all; at most half the descriptors that this process may have."""
@@ -85,7 +89,7 @@ class PeerLimits:
 
     @classmethod
     def from_scenario(cls, limits: Limits) -> PeerLimits:
-        """The limits of a scenario's ``[limits]``."""
+        """Convert a scenario's ``[limits]``."""
         return cls(
             connections=limits.connections,
             strangers=limits.connections_before_hello,
@@ -100,7 +104,7 @@ class PeerLimits:
 
 @dataclass(eq=False, slots=True)
 class _Peer:
-    """What is known of one routing id."""
+    """What the guard knows of one routing id."""
 
     route: bytes
     # The connection that had the descriptor of its first message then: its own, or a later one.
@@ -195,13 +199,15 @@ class PeerGuard:
     # --- messages ------------------------------------------------------------------------------------
 
     def admits(self, route: bytes, parts: Sequence[zmq.Frame], size: int) -> bool:
-        """Whether a message of so many bytes is to be handled; else it is dropped.
+        """Decide whether a message is to be handled; else it is dropped.
 
         Args:
             route: Routing id of the sender.
             parts: The message.
-            size: Of all its parts [B].
+            size: Size of all its parts [B].
         """
+        # The frame path, once for each message: a dictionary, two additions, a comparison. What needs the
+        # clock or the system is done when credit is used up, or in `check`.
         peer = self._peers.get(route)
         if peer is None:
             peer = self._meet(route, parts[0])
@@ -212,21 +218,33 @@ class PeerGuard:
         return peer.credit >= 0.0 or self._has_more(peer)
 
     def sent(self, route: bytes, size: int, earns: bool) -> None:
-        """A message of so many bytes was handed to libzmq; one that ``earns`` may be answered."""
+        """Count a message that was handed to libzmq.
+
+        Args:
+            route: Routing id of the receiver.
+            size: Size of the message [B].
+            earns: Whether the receiver may answer it, which gives it credit for a message.
+        """
         peer = self._peers.get(route)
         if peer is not None:
             peer.sent += size
             peer.credit += earns and peer.credit < self.limits.burst
 
     def admit_service(self, route: bytes, service: str, *, pulse: bool = False) -> None:
-        """A connection is a service's."""
+        """Give the connection of an accepted service its limits.
+
+        Args:
+            route: Routing id of the connection.
+            service: Name of the service.
+            pulse: Whether it is the heartbeat connection, over which no products come.
+        """
         peer = self._peers.get(route)
         if peer is not None:
             peer.service, peer.credit, peer.at = service, self.limits.burst, time.monotonic_ns()
             peer.limit = self.limits.stranger_bytes if pulse else self.limits.queued
 
     def refusal(self, route: bytes, name: str, role: str = "", outputs: Sequence[str] = ()) -> str:
-        """Why the key of a connection may not appear as that service; empty where it may.
+        """Say why the key of a connection may not appear as that service; empty where it may.
 
         Args:
             route: Routing id of the connection.
@@ -242,7 +260,7 @@ class PeerGuard:
         return self.access.refusal(peer.key, name, role, outputs)
 
     def address(self, route: bytes) -> str:
-        """Where a peer connects from; empty for one that is not remembered."""
+        """Return the address that a peer connects from; empty for one that is not remembered."""
         peer = self._peers.get(route)
         return peer.address if peer is not None else ""
 
@@ -253,7 +271,8 @@ class PeerGuard:
             self._cut(peer, why)
 
     def _meet(self, route: bytes, part: zmq.Frame) -> _Peer:
-        """The first message of a routing id says whose it is."""
+        """Remember a routing id at its first message."""
+        # What began or ended since the last look comes first: the descriptor may be a new connection's.
         self._connections_changed()
         fd, address = int(_property(part, "__fd") or -1), plain(_property(part, "Peer-Address"))
         key = _property(part, "User-Id") if self.access is not None else ""
@@ -312,6 +331,7 @@ class PeerGuard:
         if now < self._scan_at:
             return
         self._scan_at = now + SCAN_NS
+        # Two calls of `stat` ten times a second: a revoked key is out without an order to the broker.
         if self.access is not None and (trouble := self.access.reload()) is not None:
             if trouble:
                 self._tell("authorized", trouble)
@@ -321,6 +341,7 @@ class PeerGuard:
                 peer.ended = now
         uncertain = self._uncertain()
         wires = list(self._wires)
+        # A part of the connections at each look: TCP_INFO of thousands at once would hold up a frame.
         first = self._scan_from = self._scan_from if self._scan_from < len(wires) else 0
         self._scan_from += SCANNED
         for wire in wires[first : first + SCANNED]:

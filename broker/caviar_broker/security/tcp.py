@@ -49,8 +49,9 @@ class TcpConnection:
     """Whether the broker ended it."""
 
     def end(self) -> None:
-        """End the connection; nothing where it has ended."""
+        """End the connection; does nothing where it has ended."""
         self.dismissed = True
+        # `shutdown`, not `close`: the descriptor is libzmq's, which closes it when it reads the end.
         with self._socket() as found:
             if found is not None:
                 try:
@@ -59,8 +60,11 @@ class TcpConnection:
                     return  # it ended by itself
 
     def transferred(self) -> tuple[int, int] | None:
-        """Bytes that the peer has acknowledged, and that came from it [B]; None where the system counts none,
-        as of a socket file."""
+        """Count the bytes that the peer has acknowledged, and those that came from it [B].
+
+        Returns:
+            Both; None where the system counts none, as of a socket file.
+        """
         with self._socket() as found:
             if found is None or found.family not in (socket.AF_INET, socket.AF_INET6):
                 return None
@@ -69,6 +73,8 @@ class TcpConnection:
 
     @contextmanager
     def _socket(self) -> Iterator[socket.socket | None]:
+        # A duplicate: libzmq's thread may close its descriptor at any moment, and the number is another
+        # connection's then, which the inode shows.
         duplicate = _duplicate(self.fd)
         if duplicate is None:
             yield None
@@ -105,8 +111,12 @@ class TcpConnections:
         return len(self._open)
 
     def update(self) -> tuple[list[TcpConnection], list[TcpConnection]]:
-        """Take note of what began and ended: the new connections, and those that ended by themselves before
-        it was known whose they were, as those do that are not ZeroMQ's or have no key."""
+        """Process what began and ended since the last call.
+
+        Returns:
+            The new connections, and those that ended by themselves before their routing id was known, as
+            connections do that are not ZeroMQ's or have no key.
+        """
         fresh: dict[int, TcpConnection] = {}
         failures: list[TcpConnection] = []
         while (event := self._next()) is not None:
@@ -128,12 +138,19 @@ class TcpConnections:
         return list(fresh.values()), failures
 
     def at(self, fd: int) -> TcpConnection | None:
-        """The open connection with this descriptor."""
+        """Return the open connection with this descriptor."""
         return self._open.get(fd)
 
     def claim(self, wire: TcpConnection, address: str) -> bool:
-        """Whether a connection certainly is that of a routing id with such an address, which had a message
-        with its descriptor; no other routing id claims it from then on."""
+        """Tie a connection to a routing id that had a message with its descriptor, if that is certain.
+
+        Args:
+            wire: The connection.
+            address: Address that libzmq states for the routing id.
+
+        Returns:
+            Whether it is certain; no other routing id claims the connection then.
+        """
         if not wire.open or wire.claimed or time.monotonic_ns() < wire.unclear_until:
             return False
         if address and wire.address and address != wire.address:
@@ -175,7 +192,12 @@ class TcpConnections:
 
 
 def plain(address: str) -> str:
-    """An address as it is compared: of an IPv4 peer at an IPv6 port that of IPv4, and without a scope."""
+    """Normalise an address: of an IPv4 peer at an IPv6 port that of IPv4, and without a scope.
+
+    Example:
+        >>> plain("::ffff:10.0.0.7"), plain("fe80::1%eth0")
+        ('10.0.0.7', 'fe80::1')
+    """
     return address.removeprefix("::ffff:").partition("%")[0]
 
 

@@ -14,7 +14,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from caviar_clients.cli.plot import agent_names, choose_camera, map_data, scenery
 from caviar_clients.files import make_folder_of
 from caviar_clients.plots.film import GIF_FPS, WRITERS, Reel, find_ffmpeg, needed_ffmpeg
-from caviar_clients.plots.map import Mark, View, chosen_beam, common_prefix, receiver_mark, view_of
+from caviar_clients.plots.labels import common_prefix
+from caviar_clients.plots.map import Mark, View, chosen_beam, receiver_mark, view_of
 from caviar_clients.plots.moving import MovingMap, Plan, key_colours
 from caviar_clients.plots.rays import rays, scale
 from caviar_clients.plots.user_curves import UserSeries, choose_user, series

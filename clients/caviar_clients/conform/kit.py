@@ -198,8 +198,7 @@ def conform(
             client sends anything.
 
     Example:
-        >>> import sys
-        >>> client = f"{sys.executable} clients/minimal/agent.py {{endpoint}} {{name}}"
+        >>> client = "python -m caviar_services {name} --use agent:los-beam --broker {endpoint}"
         >>> [v.outcome for v in conform("tcp://127.0.0.1:0", command=client, names=["hello"])]
         ['pass']
     """

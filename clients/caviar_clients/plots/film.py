@@ -1,4 +1,7 @@
-"""Pictures one after another as a file: an animated GIF by Pillow, an MP4 by an ``ffmpeg`` of the machine."""
+"""Writers of video files: an animated GIF by Pillow, an MP4 by an ``ffmpeg`` of the machine.
+
+Pictures are made while they are written, so that a video of any length takes the memory of one.
+"""
 
 from __future__ import annotations
 
@@ -22,16 +25,22 @@ from caviar_protocol.errors import RunError, SetupError
 
 @dataclass(frozen=True, eq=False)
 class Reel:
-    """Pictures in sRGB, Shape ``[height, width, 3]``, all of the same even size."""
+    """Pictures of a video.
+
+    Args:
+        pictures: In sRGB, Shape ``[height, width, 3]``, all of the same even size; made while they are
+            written.
+        count: Number of pictures.
+        fps: Pictures a second.
+        samples: At least one of the pictures, for their size and colours.
+        keys: Colours that a palette has whatever else there is, Shape ``[K, 3]``.
+    """
 
     pictures: Iterator[UInt8Array]
-    """Made while they are written."""
     count: int
     fps: float
     samples: Sequence[UInt8Array]
-    """At least one of the pictures, for their size and colours."""
     keys: UInt8Array
-    """Colours that a palette has whatever else there is, Shape ``[K, 3]``."""
 
 
 Writer = Callable[[Reel, Path], None]
@@ -39,19 +48,19 @@ Writer = Callable[[Reel, Path], None]
 GIF_FPS = 50
 """Viewers slow down a GIF that is faster: its unit is 10 ms, and they take 1 for unset."""
 
+# Colours of a palette differ from its key colours by more than this in some channel.
 _APART = 8
-"""Colours of a palette differ from its key colours by more than this in some channel."""
 
+# The best first, with what sets their quality; a build of ffmpeg has the third at least.
 _ENCODERS = (
     ("libx264", ("-crf", "20", "-preset", "medium", "-tune", "animation")),
     ("libopenh264", ("-b:v", "6M")),
     ("mpeg4", ("-q:v", "3")),
 )
-"""The best first, with what sets their quality; a build of ffmpeg has the third at least."""
 
 
 def find_ffmpeg() -> str | None:
-    """The machine's ``ffmpeg``, or else that of the package ``imageio-ffmpeg`` where it is installed."""
+    """Find the machine's ``ffmpeg``, or else that of the package ``imageio-ffmpeg``; None without either."""
     found = shutil.which("ffmpeg")
     if found is None:
         try:
@@ -62,7 +71,11 @@ def find_ffmpeg() -> str | None:
 
 
 def needed_ffmpeg(file: Path) -> str:
-    """Like `find_ffmpeg`; raises `SetupError` with the command to install it, where there is none."""
+    """Find ``ffmpeg`` for a file.
+
+    Raises:
+        SetupError: There is none; the error has the command that installs it.
+    """
     found = find_ffmpeg()
     if found is None:
         raise SetupError(
@@ -73,12 +86,15 @@ def needed_ffmpeg(file: Path) -> str:
 
 
 def write_gif(reel: Reel, file: Path) -> None:
-    """An endless animated GIF with one palette for all pictures.
+    """Write an endless animated GIF with one palette for all pictures.
 
-    Raises `RunError` where the file cannot be written; then there is none.
+    Raises:
+        RunError: The file cannot be written; then there is none.
     """
     from PIL import Image
 
+    # One palette, without dithering: a palette for each picture makes areas of one colour flicker, and
+    # dithering makes noise of them, which LZW does not compress.
     palette = _palette(reel)
     images = (
         Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE)
@@ -92,7 +108,7 @@ def write_gif(reel: Reel, file: Path) -> None:
 
 
 def _palette(reel: Reel) -> Any:
-    """An image with a palette of the key colours, and for the rest those most frequent in the samples."""
+    """Make an image with a palette of the key colours and those that are most frequent in the samples."""
     from PIL import Image
 
     pixels = np.concatenate(reel.samples).reshape(-1, 3)
@@ -110,16 +126,18 @@ def _palette(reel: Reel) -> Any:
 
 
 def _cells(colours: UInt8Array) -> Int64Array:
-    """The same number for colours that hardly differ, Shape ``[N, 3]`` to ``[N]``."""
+    """Number colours so that those that hardly differ have the same number, Shape ``[N, 3]`` to ``[N]``."""
+    # Cubes of 8 levels a side, 32 of them a channel.
     cells: Int64Array = (colours >> 3).astype(np.int64) @ np.array([1 << 10, 1 << 5, 1])
     return cells
 
 
 def write_mp4(reel: Reel, file: Path) -> None:
-    """An MP4 that browsers and slides play: H.264 where ffmpeg has it, planes of 4:2:0.
+    """Write an MP4 that browsers and slides play: H.264 where ffmpeg has it, planes of 4:2:0.
 
-    Raises `SetupError` where there is no ffmpeg, `RunError` with its last line where it fails; then
-    there is no file.
+    Raises:
+        SetupError: There is no ffmpeg.
+        RunError: It fails; the error has its last line. Then there is no file.
     """
     ffmpeg = needed_ffmpeg(file)
     height, width, _ = reel.samples[0].shape
@@ -128,6 +146,7 @@ def write_mp4(reel: Reel, file: Path) -> None:
             ffmpeg, "-hide_banner", "-loglevel", "error", "-y",
             "-f", "rawvideo", "-pixel_format", "rgb24", "-video_size", f"{width}x{height}",
             "-framerate", f"{reel.fps:g}", "-i", "-", *_encoder(ffmpeg), "-pix_fmt", "yuv420p",
+            # The index first, so that a browser plays before it has the whole file.
             "-movflags", "+faststart", "-f", "mp4", str(part.resolve()),
         ]  # fmt: skip
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=log, stderr=log)  # noqa: S603  # as above
@@ -144,7 +163,7 @@ def write_mp4(reel: Reel, file: Path) -> None:
 
 
 def _feed(process: subprocess.Popen[bytes], pictures: Iterator[UInt8Array]) -> None:
-    """Write all pictures; if ffmpeg ends early, its status says so afterwards."""
+    """Write all pictures to ffmpeg; if that ends early, its status says so afterwards."""
     pipe = process.stdin
     if pipe is None:
         return
@@ -154,7 +173,7 @@ def _feed(process: subprocess.Popen[bytes], pictures: Iterator[UInt8Array]) -> N
 
 
 def _encoder(ffmpeg: str) -> list[str]:
-    """Options that choose the best encoder of a build."""
+    """Choose the best encoder of a build of ffmpeg, and return its options."""
     listed = subprocess.run(  # noqa: S603  # our own arguments
         [ffmpeg, "-hide_banner", "-encoders"], capture_output=True, text=True, check=False
     ).stdout
@@ -166,7 +185,8 @@ def _encoder(ffmpeg: str) -> list[str]:
 
 @contextmanager
 def _part_of(file: Path) -> Iterator[Path]:
-    """A place beside ``file`` to write to; it becomes ``file`` if the block ends well."""
+    """Yield a place beside ``file`` to write to; it becomes ``file`` if the block ends well."""
+    # A video that is watched while it is made anew, or whose making is stopped, stays whole.
     part = file.with_name(f".{file.name}.part")
     with writing(file):
         try:
@@ -177,10 +197,15 @@ def _part_of(file: Path) -> Iterator[Path]:
 
 
 def durations_ms(fps: float, count: int) -> list[int]:
-    """How long each picture is shown, multiples of 10 that are right on average."""
+    """Compute how long each picture is shown [ms], in multiples of 10 that are right on average.
+
+    Example:
+        >>> durations_ms(30.0, 3)
+        [30, 40, 30]
+    """
     ends = [round(100 * number / fps) for number in range(count + 1)]
     return [10 * (end - start) for start, end in pairwise(ends)]
 
 
 WRITERS: dict[str, Writer] = {".mp4": write_mp4, ".gif": write_gif}
-"""By the suffix of the file."""
+"""Writers by the suffix of the file."""

@@ -1,21 +1,32 @@
-"""The world from above: scenery, objects, rays and the beam that was chosen.
+"""Maps: the world from above with rays and the chosen beam, and radio maps with a colour for each cell.
 
-A radio map from above: cells in colour, buildings, transmitters.
+`draw_map` and `draw_values` write files. The layers of a map (`draw_scenery`, `draw_rays`, `draw_objects`,
+`draw_antennas`, `draw_beam`) draw into given axes, for videos and environments too.
 """
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from caviar_clients.plots.labels import Labels, name_objects
 from caviar_clients.plots.rays import Footprints, Rays, rays, scale
-from caviar_clients.plots.style import BLACK, GREY, LIGHT_GREY, ORANGE, SKY, VERMILION, figure, legend_below
+from caviar_clients.plots.style import (
+    BLACK,
+    GREY,
+    LIGHT_GREY,
+    ORANGE,
+    SKY,
+    VERMILION,
+    figure,
+    legend_below,
+    legend_square,
+)
 from caviar_protocol.arrays import Float64Array, Int32Array
 from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.space.scene import antennas, device_pose
@@ -33,7 +44,7 @@ OUTLINE = ((0.5, 0.5), (0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5))
 """Corners of an object's box from above, of its length and width."""
 
 BEAM_ALPHA = 0.22
-"""Opacity of the beam's area."""
+"""Opacity of the beam's area: rays and objects below it show."""
 
 TICK = 0.05
 """Length of the ticks of paths whose route is unknown, of the width of the map."""
@@ -43,7 +54,17 @@ TICK_LABEL = "path of unknown route: departure, arrival"
 
 @dataclass(frozen=True, eq=False)
 class MapData:
-    """What stands in a map; whatever is None is left out."""
+    """Contents of a map; what is None is left out.
+
+    Args:
+        scene: Objects and devices.
+        channel: Paths that are drawn as rays.
+        link: Beams that were chosen, and which receivers have a path.
+        footprints: Scenery.
+        beam_gain: Pattern of a codebook beam.
+        user: (tx, rx, carrier) whose chosen beam is shown.
+        title: Title of the map.
+    """
 
     scene: Scene
     channel: Channel | None
@@ -51,36 +72,43 @@ class MapData:
     footprints: Footprints | None
     beam_gain: BeamGain | None
     user: tuple[str, str, str] | None
-    """(tx, rx, carrier) whose chosen beam is shown."""
     title: str
 
 
-def draw_map(data: MapData, file: Path) -> None:
-    """Draw the map of one frame."""
-    beam = chosen_beam(data)
-    view = view_of(data, beam)
+@contextmanager
+def _map_figure(file: Path, view: View, title: str, columns: int = 3) -> Iterator[tuple[Any, Any]]:
+    """Make figure and axes of a map of this view, with title, labels and legend when the block ends."""
     (left, right), (bottom, top) = view
     # As high as the view needs, beside 1.5 inches for the colour bar, above 1.6 for title and legend.
     height = float(np.clip((top - bottom) / (right - left) * 8.0 + 1.6, 4.5, 11.0))
     with figure(file, 9.5, height, layout="compressed") as drawn:
         axes = drawn.subplots()
-        axes.set_xlim(view[0])
-        axes.set_ylim(view[1])
+        # Before anything is drawn: sizes of ticks and places of names are shares of the view.
+        axes.set(xlim=view[0], ylim=view[1], aspect="equal")
+        yield drawn, axes
+        axes.set(xlabel="x, east [m]", ylabel="y, north [m]", title=title)
+        legend_below(drawn, axes, columns)
+
+
+def draw_map(data: MapData, file: Path) -> None:
+    """Draw the map of one frame.
+
+    Args:
+        data: Contents of the map.
+        file: PNG that is written.
+    """
+    beam = chosen_beam(data)
+    with _map_figure(file, view_of(data, beam), data.title) as (drawn, axes):
         draw_scenery(axes, data.footprints)
         _add_rays(drawn, axes, data)
         if beam is not None:
             draw_beam(axes, beam)
         draw_objects(axes, data, Labels(marked=served_object(data)))
         draw_antennas(axes, data)
-        axes.set_aspect("equal")
-        axes.set_xlabel("x, east [m]")
-        axes.set_ylabel("y, north [m]")
-        axes.set_title(data.title)
-        legend_below(drawn, axes)
 
 
 def view_of(data: MapData, beam: Beam | None) -> View:
-    """Limits of x and y [m]: objects, devices and the beam, ray points unless far off; at least 40 m."""
+    """Choose limits of x and y [m]: objects, devices, beam, ray points unless far off; at least 40 m."""
     devices = [device_pose(data.scene, device).position[:2] for device in data.scene.devices]
     core = np.concatenate([data.scene.position[:, :2], np.array(devices).reshape(-1, 2)])
     if beam is not None:
@@ -90,6 +118,7 @@ def view_of(data: MapData, beam: Beam | None) -> View:
     low, high = core.min(axis=0), core.max(axis=0)
     if data.channel is not None:
         used = data.channel.interactions != Interaction.NONE
+        # A reflection off a distant tower must not shrink everything else to a dot.
         reach = 0.25 * float((high - low).max())
         points = np.clip(data.channel.points[used][:, :2], low - reach, high + reach)
         low, high = np.min([low, *points], axis=0), np.max([high, *points], axis=0)
@@ -100,8 +129,17 @@ def view_of(data: MapData, beam: Beam | None) -> View:
     return (left, right), (bottom, top)
 
 
-def draw_scenery(axes: Any, footprints: Footprints | None) -> None:
-    """Areas and outlines of buildings."""
+def draw_scenery(
+    axes: Any, footprints: Footprints | None, width: float = 0.6, outline_zorder: float = 1.1
+) -> None:
+    """Draw areas and outlines of buildings.
+
+    Args:
+        axes: Axes of the map.
+        footprints: Scenery; None: nothing is drawn.
+        width: Width of outlines [points].
+        outline_zorder: Place of the outlines among the layers.
+    """
     from matplotlib.collections import LineCollection, PolyCollection
 
     if footprints is None:
@@ -111,13 +149,19 @@ def draw_scenery(axes: Any, footprints: Footprints | None) -> None:
     axes.add_collection(
         PolyCollection(faces, facecolors=LIGHT_GREY, edgecolors=LIGHT_GREY, linewidths=0.4, zorder=1)
     )
-    axes.add_collection(LineCollection(edges, colors=GREY, linewidths=0.6, zorder=1.1))
+    axes.add_collection(LineCollection(edges, colors=GREY, linewidths=width, zorder=outline_zorder))
 
 
 def draw_rays(axes: Any, drawn: Rays, limits: tuple[float, float]) -> list[Any]:
-    """Every path as a line over its interaction points, or as ticks; the strongest on top.
+    """Draw every path as a line over its interaction points, or as ticks; the strongest on top.
 
-    Returns the collections, whose colours are those of ``limits`` [dB].
+    Args:
+        axes: Axes of the map, with their limits.
+        drawn: The paths.
+        limits: Gains [dB] of the ends of the colour scale.
+
+    Returns:
+        The collections, for a colour bar.
     """
     from matplotlib.collections import LineCollection
 
@@ -153,7 +197,7 @@ class Beam:
 
 
 def chosen_beam(data: MapData) -> Beam | None:
-    """The beam chosen for the user of the map; None where there is none."""
+    """Compute the outline of the beam that was chosen for the user of the map; None without one."""
     found = _chosen(data)
     if found is None or data.beam_gain is None:
         return None
@@ -169,6 +213,7 @@ def chosen_beam(data: MapData) -> Beam | None:
     azimuth = np.linspace(-np.pi, np.pi, 2881)
     around = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)
     world = np.column_stack([cosine * around, np.full_like(azimuth, sine)])
+    # Cut at the elevation of the user: in the plane of the horizon a beam that points down has no lobe.
     gain = data.beam_gain(device.array, beam, world @ rotation_matrix(pose.orientation))
     radius = max(0.6 * distance, 5.0) * gain / max(float(gain.max()), 1e-9)
     outline: Float64Array = np.array(pose.position[:2]) + radius[:, None] * around
@@ -176,7 +221,7 @@ def chosen_beam(data: MapData) -> Beam | None:
 
 
 def draw_beam(axes: Any, beam: Beam) -> None:
-    """The pattern as an area with an outline."""
+    """Draw the pattern as an area with an outline."""
     from matplotlib.collections import PolyCollection
 
     # Not `axes.fill`, which takes a tenth of a second to find the limits of so many corners.
@@ -197,21 +242,8 @@ def _chosen(data: MapData) -> tuple[AntennaDevice, int, str] | None:
     return None if device is None or beam < 0 else (device, beam, data.user[1])
 
 
-@dataclass
-class Labels:
-    """How names stand in a map; kept from frame to frame, names stay on the side where they were."""
-
-    width: float = 570.0
-    """Of the axes, about [points]."""
-    prefix: str | None = None
-    """What names leave out at their beginning; by default what all of the scene have in common."""
-    marked: str = ""
-    """Object whose name stands out."""
-    sides: dict[str, int] = field(default_factory=dict)
-
-
 def draw_objects(axes: Any, data: MapData, labels: Labels | None = None) -> None:
-    """Bounding boxes from above, a mark at the front, names where there is room."""
+    """Draw bounding boxes from above, a mark at the front, names where there is room."""
     from matplotlib.collections import PolyCollection
 
     scene = data.scene
@@ -223,6 +255,7 @@ def draw_objects(axes: Any, data: MapData, labels: Labels | None = None) -> None
     colors = [ORANGE if name in carriers else SKY for name in scene.names]
     axes.add_collection(PolyCollection(boxes, facecolors=colors, edgecolors=BLACK, linewidths=0.7, zorder=4))
     axes.add_collection(PolyCollection(fronts, facecolors=BLACK, linewidths=0, zorder=4.1))
+    # A car on a map of a kilometre is a pixel: what is smaller than 1.2 % of the view gets a square.
     (left, right), smallest = axes.get_xlim(), scene.dimensions[:, :2].max(axis=1)
     tiny = np.flatnonzero(smallest < 0.012 * (right - left))
     axes.scatter(
@@ -231,12 +264,20 @@ def draw_objects(axes: Any, data: MapData, labels: Labels | None = None) -> None
     )  # fmt: skip
     for color, label in ((ORANGE, "object with a device"), (SKY, "other object")):
         if color in colors:
-            axes.scatter([], [], marker="s", s=60, color=color, edgecolors=BLACK, linewidths=0.7, label=label)
-    _name_objects(axes, scene, boxes, carriers, labels or Labels())
+            legend_square(axes, label, color)
+    name_objects(axes, scene, boxes, carriers, labels or Labels())
 
 
 def from_above(scene: Scene, points: Sequence[Sequence[float]]) -> Float64Array:
-    """Where points x and y of a box −½…½ are on each object of a scene [m], Shape ``[N, len(points), 2]``."""
+    """Place points on each object of a scene.
+
+    Args:
+        scene: The scene with N objects.
+        points: x and y of each point on a box from −½ to ½.
+
+    Returns:
+        x and y in the world [m], Shape ``[N, len(points), 2]``.
+    """
     found = np.zeros((len(scene.names), len(points), 2))
     for i in range(len(scene.names)):
         rotation = rotation_matrix(scene.orientation[i].tolist())[:2, :2]
@@ -245,92 +286,27 @@ def from_above(scene: Scene, points: Sequence[Sequence[float]]) -> Float64Array:
 
 
 def served_object(data: MapData) -> str:
-    """The object that carries the receiver whose beam is shown; empty where none does."""
+    """Name the object that carries the receiver whose beam is shown; empty where none does."""
     receiver = data.user[1] if data.user else ""
     return next((device.parent for device in data.scene.devices if device.name == receiver), "")
 
 
-def _name_objects(axes: Any, scene: Scene, boxes: Float64Array, carriers: set[str], labels: Labels) -> None:
-    """Names without what all have in common, where there is room.
-
-    The marked one comes first, then those with a device.
-    """
-    from matplotlib.patheffects import withStroke
-
-    halo = [withStroke(linewidth=2.0, foreground="white")]
-    prefix = common_prefix(scene.names) if labels.prefix is None else labels.prefix
-    (left, right) = axes.get_xlim()
-    unit = (right - left) / labels.width
-    # As large as the mark that stands for a tiny object; a character of 8 points is about 5 points wide.
-    centre, least = scene.position[:, :2], 5.0 * unit
-    low = np.minimum(boxes.min(axis=1), centre - least)
-    high = np.maximum(boxes.max(axis=1), centre + least)
-    taken: list[Rectangle] = [(*a, *b) for a, b in zip(low.tolist(), high.tolist(), strict=True)]
-    for device in antennas(scene, "tx"):
-        if not device.parent:
-            x, y, _ = device_pose(scene, device).position
-            wide = 3.5 * len(device.name) * unit
-            taken.append((x - max(wide, 6 * unit), y - 6 * unit, x + max(wide, 6 * unit), y + 22 * unit))
-
-    def rank(i: int) -> tuple[bool, bool, str]:
-        name = scene.names[i]
-        return name != labels.marked, name not in carriers, name
-
-    for i in sorted(range(len(boxes)), key=rank):
-        name = scene.names[i]
-        text = name.removeprefix(prefix)
-        places = _places(taken[i], 5.0 * len(text) * unit, 9.0 * unit, 2.0 * unit)
-        before = labels.sides.get(name, 0)
-        for side in sorted(range(len(places)), key=lambda side: (side != before, side)):
-            inside = _within(places[side], axes.get_xlim(), axes.get_ylim())
-            if inside and not any(_overlap(places[side], other) for other in taken):
-                taken.append(places[side])
-                labels.sides[name] = side
-                standing = {"color": VERMILION, "fontweight": "bold"} if name == labels.marked else {}
-                # Not clipped: the width is an estimate, and a name that is cut is another name.
-                axes.text(*places[side][:2], text, fontsize=8, path_effects=halo, zorder=6, **standing)
-                break
-
-
-Rectangle = tuple[float, float, float, float]
-"""Left, bottom, right, top [m]."""
-
-
-def _places(box: Rectangle, width: float, height: float, gap: float) -> list[Rectangle]:
-    """Above, below, right and left of a box."""
-    x0, y0, x1, y1 = box
-    corners = (
-        ((x0 + x1 - width) / 2, y1 + gap),
-        ((x0 + x1 - width) / 2, y0 - gap - height),
-        (x1 + gap, (y0 + y1 - height) / 2),
-        (x0 - gap - width, (y0 + y1 - height) / 2),
-    )
-    return [(x, y, x + width, y + height) for x, y in corners]
-
-
-def common_prefix(names: Sequence[str]) -> str:
-    """The dotted parts that all names begin with; empty for a single name."""
-    parts = [name.split(".")[:-1] for name in names] if len(names) > 1 else []
-    same = itertools.takewhile(lambda level: len(set(level)) == 1, zip(*parts, strict=False))
-    return "".join(f"{level[0]}." for level in same)
-
-
-def _within(a: Rectangle, x: tuple[float, float], y: tuple[float, float]) -> bool:
-    return x[0] <= a[0] and a[2] <= x[1] and y[0] <= a[1] and a[3] <= y[1]
-
-
-def _overlap(a: Rectangle, b: Rectangle) -> bool:
-    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
-
-
 @dataclass(frozen=True)
 class Mark:
-    """How a device stands in a map."""
+    """How a device stands in a map.
+
+    Args:
+        label: Entry of the legend.
+        marker: Marker of Matplotlib.
+        size: Area [points²].
+        color: Colour of the area.
+        edge: Colour of the edge.
+        width: Width of the edge [points].
+    """
 
     label: str
     marker: str
     size: float
-    """[points²]"""
     color: str = BLACK
     edge: str = "white"
     width: float = 0.8
@@ -344,7 +320,7 @@ RECEIVERS = (RECEIVER, WITHOUT_LOS, WITHOUT_PATH)
 
 
 def receiver_mark(link: Link | None, receiver: str) -> Mark:
-    """Whether any transmitter reaches a receiver along the line of sight, or at all; plain where unknown."""
+    """Choose a receiver's mark: a transmitter in sight, only reflections, no path; plain where unknown."""
     users = [i for i, rx in enumerate(link.rx) if rx == receiver] if link is not None else []
     if link is None or not users or link.los[users].any():
         return RECEIVER
@@ -352,57 +328,78 @@ def receiver_mark(link: Link | None, receiver: str) -> Mark:
 
 
 def draw_antennas(axes: Any, data: MapData) -> None:
-    """Transmitters as triangles with their names, receivers as dots."""
-    from matplotlib.patheffects import withStroke
-
-    halo = [withStroke(linewidth=2.5, foreground="white")]
+    """Draw transmitters as triangles with their names, receivers as dots."""
     by_mark: dict[Mark, list[AntennaDevice]] = {TRANSMITTER: list(antennas(data.scene, "tx"))}
     for device in antennas(data.scene, "rx"):
         by_mark.setdefault(receiver_mark(data.link, device.name), []).append(device)
     for mark in (TRANSMITTER, *RECEIVERS):
-        devices = by_mark.get(mark, [])
-        if not devices:
-            continue
-        places = np.array([device_pose(data.scene, device).position[:2] for device in devices])
-        axes.scatter(
-            *places.T, marker=mark.marker, s=mark.size, color=mark.color, edgecolors=mark.edge,
-            linewidths=mark.width, zorder=5, label=mark.label,
-        )  # fmt: skip
-        for device, place in zip(devices, places, strict=True):
-            if not device.parent:
-                axes.annotate(
-                    device.name, place, xytext=(0, 10), textcoords="offset points", ha="center",
-                    fontsize=10, fontweight="bold", path_effects=halo, zorder=6, annotation_clip=True,
-                )  # fmt: skip
+        if devices := by_mark.get(mark, []):
+            places = np.array([device_pose(data.scene, device).position[:2] for device in devices])
+            # A device on an object has that object's name beside it.
+            names = ["" if device.parent else device.name for device in devices]
+            _draw_marks(axes, mark, places, names)
 
+
+def _draw_marks(axes: Any, mark: Mark, places: Float64Array, names: Sequence[str]) -> None:
+    """Draw a mark at each place, with its name above where that is not empty."""
+    from matplotlib.patheffects import withStroke
+
+    axes.scatter(
+        *places.T, marker=mark.marker, s=mark.size, color=mark.color, edgecolors=mark.edge,
+        linewidths=mark.width, zorder=5, label=mark.label,
+    )  # fmt: skip
+    for name, place in zip(names, places, strict=True):
+        if name:
+            axes.annotate(
+                name, place, xytext=(0, 10), textcoords="offset points", ha="center", fontsize=10,
+                fontweight="bold", path_effects=[withStroke(linewidth=2.5, foreground="white")], zorder=6,
+                annotation_clip=True,
+            )  # fmt: skip
+
+
+# --- radio maps -------------------------------------------------------------------------------------
 
 SERVERS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#f0e442", "#7570b3")
 """Colours of best servers, again from the first where there are more (Okabe and Ito, 2008)."""
 
+# [dB] of the colour bar at the most, below the strongest cells: a few cells deep in the shadow would take the
+# colours of those that matter.
 _SPAN_DB = 100.0
-"""Of the colour bar at the most, below the strongest cells."""
 
+# Cells without a signal are hatched, which no colour of the bar looks like.
 _HATCH, _HATCH_COLOR = "////", "#c4c4c4"
-"""Of what no signal reaches, which no colour of the bar looks like."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RadioMapView:
-    """What is drawn around the cells of a radio map."""
+    """What is drawn around the cells of a radio map.
+
+    Args:
+        area: Lowest x and y, highest x and y of the cells [m].
+        transmitters: Names of the transmitters.
+        positions: x and y of the transmitters [m], Shape ``[T, 2]``.
+        scene: Scene whose objects are drawn.
+        footprints: Scenery; None: none is drawn.
+        title: Title of the map.
+    """
 
     area: tuple[float, float, float, float]
-    """Lowest x and y, highest x and y of the cells [m]."""
     transmitters: Sequence[str]
     positions: Float64Array
-    """Of the transmitters, x and y [m], Shape ``[T, 2]``."""
     scene: Scene
-    """Its objects are drawn."""
     footprints: Footprints | None
     title: str
 
 
 def draw_values(view: RadioMapView, values: Float64Array, label: str, file: Path) -> None:
-    """Draw one number for each cell, Shape ``[ny, nx]``; NaN: no signal. ``label`` names it with its unit."""
+    """Draw one number for each cell.
+
+    Args:
+        view: What is drawn around the cells.
+        values: The numbers, Shape ``[ny, nx]`` from south to north; NaN: no signal.
+        label: Name of the quantity with its unit.
+        file: PNG that is written.
+    """
     with _radio_map(view, file) as (drawn, axes):
         shown = values[np.isfinite(values)]
         low, high, extend = colour_limits(shown)
@@ -412,7 +409,13 @@ def draw_values(view: RadioMapView, values: Float64Array, label: str, file: Path
 
 
 def draw_servers(view: RadioMapView, server: Int32Array, file: Path) -> None:
-    """Draw which transmitter serves each cell, Shape ``[ny, nx]``; −1: no signal."""
+    """Draw which transmitter serves each cell.
+
+    Args:
+        view: What is drawn around the cells.
+        server: Index of the transmitter, Shape ``[ny, nx]`` from south to north; −1: no signal.
+        file: PNG that is written.
+    """
     from matplotlib.colors import ListedColormap
 
     count = len(view.transmitters)
@@ -423,13 +426,23 @@ def draw_servers(view: RadioMapView, server: Int32Array, file: Path) -> None:
         served = max(int(np.count_nonzero(server >= 0)), 1)
         for t, (name, color) in enumerate(zip(view.transmitters, colors, strict=True)):
             label = f"served by {name}, {np.count_nonzero(server == t) / served:.0%}"
-            axes.scatter([], [], marker="s", s=60, color=color, edgecolors=BLACK, linewidths=0.7, label=label)
+            legend_square(axes, label, color)
 
 
 def colour_limits(values: Float64Array) -> tuple[float, float, str]:
-    """Ends of the colour bar [dB], and at which of them there are values beyond.
+    """Choose the ends of a colour bar.
 
-    From the strongest thousandth down to the weakest hundredth, over `_SPAN_DB` at the most.
+    From the strongest thousandth down to the weakest hundredth of the cells, over 100 dB at the most.
+
+    Args:
+        values: Values of all cells with a signal [dB].
+
+    Returns:
+        Both ends [dB], and at which of them values lie beyond: ``both``, ``min``, ``max`` or ``neither``.
+
+    Example:
+        >>> colour_limits(np.array([-90.0, -90.0]))
+        (-90.5, -89.5, 'neither')
     """
     if not len(values):
         return 0.0, 1.0, "neither"
@@ -444,28 +457,24 @@ def colour_limits(values: Float64Array) -> tuple[float, float, str]:
 
 @contextmanager
 def _radio_map(view: RadioMapView, file: Path) -> Iterator[tuple[Any, Any]]:
-    """The picture around the cells, which the block draws."""
+    """Make the picture around the cells, which the block draws."""
+    from matplotlib.collections import PolyCollection
+
     x0, y0, x1, y1 = view.area
-    # As high as the cells need, beside 1.5 inches for the colour bar, above 1.6 for title and legend.
-    height = float(np.clip((y1 - y0) / (x1 - x0) * 8.0 + 1.6, 4.5, 11.0))
-    with figure(file, 9.5, height, layout="compressed") as drawn:
-        axes = drawn.subplots()
+    with _map_figure(file, ((x0, x1), (y0, y1)), view.title, columns=4) as (drawn, axes):
         axes.patch.set(facecolor="white", hatch=_HATCH, edgecolor=_HATCH_COLOR)
         yield drawn, axes
-        _draw_buildings(axes, view.footprints)
-        _draw_objects(axes, view.scene)
-        _draw_transmitters(axes, view)
-        axes.scatter(
-            [], [], marker="s", s=60, facecolor="white", edgecolors=_HATCH_COLOR, hatch=_HATCH,
-            label="no signal",
-        )  # fmt: skip
-        axes.set_xlim(x0, x1)
-        axes.set_ylim(y0, y1)
-        axes.set_aspect("equal")
-        axes.set_xlabel("x, east [m]")
-        axes.set_ylabel("y, north [m]")
-        axes.set_title(view.title)
-        legend_below(drawn, axes, columns=4)
+        # Areas of buildings lie below the cells, so that those with a signal hide them; outlines above.
+        draw_scenery(axes, view.footprints, width=0.5, outline_zorder=3)
+        if view.footprints is not None:
+            legend_square(axes, "building", LIGHT_GREY, GREY)
+        if view.scene.names:
+            boxes: Any = from_above(view.scene, OUTLINE)
+            style: dict[str, Any] = {"facecolors": "white", "edgecolors": BLACK, "linewidths": 0.7}
+            axes.add_collection(PolyCollection(boxes, zorder=4, **style))
+            legend_square(axes, "object", "white")
+        _draw_marks(axes, TRANSMITTER, view.positions, view.transmitters)
+        legend_square(axes, "no signal", "white", _HATCH_COLOR, hatch=_HATCH)
 
 
 def _draw_cells(axes: Any, view: RadioMapView, cells: Any, **colours: Any) -> Any:
@@ -473,49 +482,3 @@ def _draw_cells(axes: Any, view: RadioMapView, cells: Any, **colours: Any) -> An
     return axes.imshow(
         cells, origin="lower", extent=(x0, x1, y0, y1), interpolation="none", zorder=2, **colours
     )
-
-
-def _draw_buildings(axes: Any, footprints: Footprints | None) -> None:
-    """Areas below the cells, so that those with a signal hide them; outlines above."""
-    from matplotlib.collections import LineCollection, PolyCollection
-
-    if footprints is None:
-        return
-    faces: Any = footprints.faces
-    edges: Any = footprints.edges
-    axes.add_collection(
-        PolyCollection(faces, facecolors=LIGHT_GREY, edgecolors=LIGHT_GREY, linewidths=0.4, zorder=1)
-    )
-    axes.add_collection(LineCollection(edges, colors=GREY, linewidths=0.5, zorder=3))
-    axes.scatter(
-        [], [], marker="s", s=60, color=LIGHT_GREY, edgecolors=GREY, linewidths=0.7, label="building"
-    )
-
-
-def _draw_objects(axes: Any, scene: Scene) -> None:
-    from matplotlib.collections import PolyCollection
-
-    if scene.names:
-        boxes: Any = from_above(scene, OUTLINE)
-        axes.add_collection(
-            PolyCollection(boxes, facecolors="white", edgecolors=BLACK, linewidths=0.7, zorder=4)
-        )
-        axes.scatter(
-            [], [], marker="s", s=60, color="white", edgecolors=BLACK, linewidths=0.7, label="object"
-        )
-
-
-def _draw_transmitters(axes: Any, view: RadioMapView) -> None:
-    from matplotlib.patheffects import withStroke
-
-    halo = [withStroke(linewidth=2.5, foreground="white")]
-    mark = TRANSMITTER
-    axes.scatter(
-        *view.positions.T, marker=mark.marker, s=mark.size, color=mark.color, edgecolors=mark.edge,
-        linewidths=mark.width, zorder=5, label=mark.label,
-    )  # fmt: skip
-    for name, place in zip(view.transmitters, view.positions, strict=True):
-        axes.annotate(
-            name, place, xytext=(0, 10), textcoords="offset points", ha="center", fontsize=10,
-            fontweight="bold", path_effects=halo, zorder=6, annotation_clip=True,
-        )  # fmt: skip

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from caviar_clients.plots.labels import Labels
 from caviar_clients.plots.map import (
     BEAM_ALPHA,
     RECEIVERS,
@@ -16,7 +17,6 @@ from caviar_clients.plots.map import (
     TICK_LABEL,
     TRANSMITTER,
     Beam,
-    Labels,
     MapData,
     Mark,
     View,
@@ -33,54 +33,60 @@ from caviar_clients.plots.style import BLACK, BLUE, GREY, LIGHT_GREY, ORANGE, SK
 from caviar_clients.plots.user_curves import UserSeries, curves, shade
 from caviar_protocol.arrays import UInt8Array
 
+# Width of a picture [inches]; all sizes below are inches too, so that texts grow with the pixels. A layout
+# engine of Matplotlib would place the panels by the texts that happen to be in the first picture.
 _WIDTH = 11.0
-"""Of a picture [inches]; all sizes below are inches too, so that texts grow with the pixels."""
 _LEFT, _RIGHT = 0.75, 0.2
+# Above the map a line of text and one more for the beam, below it the labels of its axis and the legend.
 _ABOVE, _LINE, _BELOW = 0.45, 0.28, 0.95
-"""Of the map: for a line of text, one more for the beam, and for the labels of its axis and the legend."""
+# The colour bar with its labels.
 _BAR = 0.95
-"""For the colour bar and its labels."""
+# Height of the curves, and the gap between them and the map, or the picture.
 _CURVES = 1.35
 _BETWEEN = 0.95
-"""Map and curves, or picture and curves."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Plan:
-    """What is the same in all pictures of a video."""
+    """What is the same in all pictures of a video.
+
+    Args:
+        view: Limits of the map [m].
+        gains_db: Gains of the ends of the colour scale of paths [dB]; None: there are no paths.
+        has_ticks: Whether paths of unknown route occur.
+        has_beam: Whether a chosen beam occurs.
+        kinds: Whether objects with a device (True) and others (False) occur.
+        receivers: Marks of receivers that occur.
+        prefix: What names of objects leave out.
+        user: Object of the user whose beam is shown; empty: none.
+        footprints: Scenery; None: none is drawn.
+        series: |y| in all frames of the video; None: it is not drawn.
+        agent: Name of the agent, for the legend.
+        camera: Camera whose pictures are shown; None: none is.
+        aspect: Height over width of these pictures.
+    """
 
     view: View
     gains_db: tuple[float, float] | None
-    """Limits of the colours of paths; None where there are none."""
     has_ticks: bool
-    """Paths of unknown route occur."""
     has_beam: bool
     kinds: frozenset[bool]
-    """Whether objects with a device (True) and others (False) occur."""
     receivers: frozenset[Mark]
-    """Marks of receivers that occur."""
     prefix: str
-    """What names of objects leave out."""
     user: str
-    """Object of the user whose beam is shown; empty where there is none."""
     footprints: Footprints | None
     series: UserSeries | None
-    """|y| in all frames of the video."""
     agent: str
     camera: str | None
     aspect: float = 0.75
-    """Height over width of the camera's pictures."""
 
 
 class MovingMap:
     """Draws one picture after another; what stands still is drawn once.
 
-    Parameters
-    ----------
-    plan
-        What all pictures share.
-    width
-        Pixels, even; the height follows from the content and is even too.
+    Args:
+        plan: What all pictures share.
+        width: Width [pixels], even; the height follows from the content and is even too.
     """
 
     def __init__(self, plan: Plan, width: int) -> None:
@@ -95,18 +101,18 @@ class MovingMap:
         return int(width), int(height)
 
     def draw(self, data: MapData, step: int, picture: UInt8Array | None) -> UInt8Array:
-        """The picture of one frame, Shape ``[height, width, 3]``.
+        """Draw the picture of one frame.
 
-        Parameters
-        ----------
-        data
-            Scene, channel and link of the frame.
-        step
-            Its place in the plan's series.
-        picture
-            What the camera saw; None where it has not seen anything yet.
+        Args:
+            data: Scene, channel and link of the frame.
+            step: Its place in the plan's series.
+            picture: What the camera saw; None where it has not seen anything yet.
+
+        Returns:
+            Pixels in sRGB, Shape ``[height, width, 3]``.
         """
         with styled():
+            # Axes, scenery, colour bar and legend are pixels that are copied: only what moves is drawn anew.
             self._canvas.restore_region(self._still)
             beam = chosen_beam(data)
             self._over(self._map, lambda: self._draw_map(data, beam))
@@ -187,9 +193,9 @@ class MovingMap:
         axes.set_ylim(bottom=0)
         axes.margins(x=0)
         axes.set_xlim(*axes.get_xlim())
-        axes.grid(color=LIGHT_GREY, linewidth=0.6)
+        axes.grid()
         axes.set_xlabel("Time [s]")
-        # Powers of ten stand in the label: above the axis is the legend.
+        # Powers of ten stand in the label: above the axis, where Matplotlib writes them, is the legend.
         highest = float(np.max(data.best, where=data.has_path, initial=0.0))
         power = math.floor(math.log10(highest)) if highest > 0 else 0
         if -2 <= power < 4:
@@ -203,7 +209,8 @@ class MovingMap:
         )  # fmt: skip
 
     def _over(self, axes: Any, draw: Callable[[], None]) -> None:
-        """Draw over what stands still, and forget it."""
+        """Draw over what stands still, and remove what was drawn."""
+        # Functions of a map add artists to axes and return nothing: the new ones were not there before.
         before = set(axes.get_children())
         draw()
         added = [artist for artist in axes.get_children() if artist not in before]
@@ -257,7 +264,7 @@ class _Places:
 
 
 def _places(plan: Plan) -> _Places:
-    """The camera stands right of the map and |y| below it; without a camera |y| is below the map."""
+    """Lay out the panels: the camera right of the map, |y| below it; without a camera |y| below the map."""
     beside = _BAR if plan.gains_db is not None else 0.0
     (x0, x1), (y0, y1) = plan.view
     shape = (y1 - y0) / (x1 - x0)
@@ -286,11 +293,16 @@ def _places(plan: Plan) -> _Places:
 
 
 def key_colours() -> UInt8Array:
-    """The colours that mean something, and steps from black to white, Shape ``[K, 3]``."""
+    """Collect the colours that mean something, and steps from black to white, for the palette of a GIF.
+
+    Returns:
+        sRGB, Shape ``[K, 3]``.
+    """
     from matplotlib import colormaps
     from matplotlib.colors import to_rgb
 
     named = np.array([to_rgb(color) for color in (BLACK, GREY, LIGHT_GREY, ORANGE, SKY, BLUE, VERMILION)])
+    # The beam's colour over white, as its area shows it.
     lobe = 1 + BEAM_ALPHA * (named[-1:] - 1)
     gains = colormaps["viridis"](np.linspace(0, 1, 40))[:, :3]
     steps = np.linspace(0, 1, 12)[:, None].repeat(3, axis=1)
@@ -299,7 +311,7 @@ def key_colours() -> UInt8Array:
 
 
 def _filling(view: View, shape: float) -> View:
-    """The view, made larger so that a panel of this height over width is full."""
+    """Make the view larger so that it fills a panel of this height over width."""
     (x0, x1), (y0, y1) = view
     x, y = (x0 + x1) / 2, (y0 + y1) / 2
     half = max((x1 - x0) / 2, (y1 - y0) / 2 / shape)

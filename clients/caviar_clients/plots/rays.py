@@ -1,4 +1,4 @@
-"""Layers of a map: scenery from above, and the paths of a channel."""
+"""What a map draws of the world: the paths of a channel, and scenery as footprints from above."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from caviar_protocol.topics import Channel, Scene
 from caviar_protocol.topics.channel import Interaction
 
 PATHS_OF_A_PAIR = 25
-"""Of a pair so many of the strongest paths are drawn."""
+"""Paths of a pair that are drawn, the strongest ones: diffuse scattering makes thousands."""
 
 RANGE_DB = 50.0
 """Paths weaker than the strongest by more than this have the last colour."""
 
+# Cosine of the angle by which a straight path's directions may differ from the straight line.
 _STRAIGHT = np.cos(np.radians(0.5))
-"""Cosine of the angle by which a straight path's directions may differ from the straight line."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,17 +46,22 @@ class Rays:
 
     @property
     def all_gains(self) -> Float64Array:
-        """Of lines and ticks."""
+        """Gains of lines and ticks [dB]."""
         return np.concatenate([self.gains, self.tick_gains])
 
     def ticks(self, length_m: float) -> Float64Array:
-        """Both ends of each tick in x and y [m], Shape ``[T, 2, 2]``."""
+        """Compute both ends of each tick in x and y [m], Shape ``[T, 2, 2]``."""
         result: Float64Array = np.stack([self.ends, self.ends + length_m * self.towards], axis=1)
         return result
 
 
 def rays(scene: Scene, channel: Channel | None) -> Rays:
-    """The strongest paths of each pair whose devices are in the scene."""
+    """Select the strongest paths of each pair whose devices are in the scene.
+
+    Args:
+        scene: Poses of the devices.
+        channel: The paths; None: there are none.
+    """
     lines: list[Float64Array] = []
     gains: list[float] = []
     ticks: list[Float64Array] = []
@@ -89,13 +94,14 @@ def rays(scene: Scene, channel: Channel | None) -> Rays:
 
 
 def scale(gains: Float64Array) -> tuple[float, float]:
-    """Limits of the colours [dB] for paths of these gains, of which there is at least one."""
+    """Choose the limits of the colours [dB] for paths of these gains, of which there is at least one."""
+    # A little below the weakest: equal limits, as those of a single path, are no scale.
     top = float(gains.max())
     return max(float(gains.min()), top - RANGE_DB) - 1e-9, top
 
 
 def unit_vectors(angles: Float64Array) -> Float64Array:
-    """Unit vectors of (zenith, azimuth) [rad], Shape ``[N, 2]`` to ``[N, 3]``."""
+    """Convert (zenith, azimuth) [rad] to unit vectors, Shape ``[N, 2]`` to ``[N, 3]``."""
     zenith, azimuth = angles[:, 0], angles[:, 1]
     sine = np.sin(zenith)
     return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.cos(zenith)], axis=-1)
@@ -104,7 +110,7 @@ def unit_vectors(angles: Float64Array) -> Float64Array:
 def _straight(
     start: Float64Array, end: Float64Array, leaving: Float64Array, coming: Float64Array
 ) -> BoolArray:
-    """Which paths leave towards the other end and come from where the wave started, Shape ``[N]``."""
+    """Find the paths that leave towards the other end and arrive from there, Shape ``[N]``."""
     line = end - start
     distance = float(np.linalg.norm(line))
     if distance == 0:
@@ -117,11 +123,11 @@ def _straight(
 Box = tuple[Sequence[float], Sequence[float]]
 """Lowest and highest corner [m]."""
 
+# A face is a wall where the vertical part of its unit normal is smaller.
 _STEEP = 0.1
-"""A face is a wall where the vertical part of its unit normal is smaller."""
 
+# A mesh with a smaller share of walls that reaches down to the lowest point is ground.
 _GROUND_WALLS = 0.02
-"""A mesh with a smaller share of walls that reaches down to the lowest point is ground."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +152,11 @@ class _Shape:
 
 
 def footprints(meshes: Iterable[tuple[Path, Float64Array]]) -> Footprints:
-    """Footprints of PLY meshes, each with its 4×4 transform into the world; ground is left out."""
+    """Compute the footprints of PLY meshes; ground is left out.
+
+    Args:
+        meshes: File of each mesh, and its 4×4 transform into the world.
+    """
     _, buildings = _ground_and_buildings(meshes)
     return Footprints(
         faces=np.concatenate([_level(shape) for shape in buildings] or [np.zeros((0, 3, 2))]),
@@ -155,13 +165,29 @@ def footprints(meshes: Iterable[tuple[Path, Float64Array]]) -> Footprints:
 
 
 def ground(meshes: Iterable[tuple[Path, Float64Array]]) -> Float64Array:
-    """Triangles [m] of the PLY meshes that are ground, Shape ``[F, 3, 3]``; each with its 4×4 transform."""
+    """Read the triangles of the PLY meshes that are ground.
+
+    Args:
+        meshes: File of each mesh, and its 4×4 transform into the world.
+
+    Returns:
+        Corners [m], Shape ``[F, 3, 3]``.
+    """
     found, _ = _ground_and_buildings(meshes)
     return np.concatenate([shape.corners for shape in found] or [np.zeros((0, 3, 3))])
 
 
 def with_boxes(drawn: Footprints | None, boxes: Sequence[Box]) -> Footprints:
-    """Footprints, and those of boxes along the world's axes, each its lowest and its highest corner [m]."""
+    """Add the footprints of boxes along the world's axes.
+
+    Args:
+        drawn: Footprints of meshes; None: there are none.
+        boxes: Lowest and highest corner of each box [m].
+
+    Example:
+        >>> with_boxes(None, [((0.0, 0.0, 0.0), (2.0, 1.0, 5.0))]).faces.shape
+        (2, 3, 2)
+    """
     corners = np.array([[[x0, y0], [x1, y0], [x1, y1], [x0, y1]] for (x0, y0, *_), (x1, y1, *_) in boxes])
     faces = corners[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3, 2)
     edges = np.stack([corners, np.roll(corners, -1, axis=1)], axis=2).reshape(-1, 2, 2)
@@ -217,7 +243,7 @@ def _is_level(shape: _Shape) -> bool:
 
 
 def _extent(shape: _Shape) -> Float64Array:
-    """Lowest and highest x and y [m], Shape ``[2, 2]``."""
+    """Lowest and highest x and y of a mesh [m], Shape ``[2, 2]``."""
     places = shape.corners[..., :2].reshape(-1, 2)
     return np.array([places.min(axis=0), places.max(axis=0)])
 
@@ -228,7 +254,8 @@ def _level(shape: _Shape) -> Float64Array:
 
 
 def _outline(shape: _Shape) -> Float64Array:
-    """Edges where the roof ends, and level edges of walls for buildings without a roof."""
+    """Collect edges where the roof ends, and level edges of walls for buildings without a roof."""
+    # An edge of one level face alone is where the roof ends; one of two faces is inside it.
     pairs = np.stack([shape.faces, np.roll(shape.faces, -1, axis=1)], axis=-1)
     ends = np.stack([shape.corners, np.roll(shape.corners, -1, axis=1)], axis=2)
     level = shape.steepness >= _STEEP

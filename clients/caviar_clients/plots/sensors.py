@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from caviar_clients.plots.map import OUTLINE, from_above
 from caviar_clients.plots.style import BLACK, LIGHT_GREY, ORANGE, figure, legend_below
 from caviar_protocol.arrays import BoolArray, Float32Array, Float64Array, Int32Array, UInt8Array
 from caviar_protocol.space.coordinates import rotation_matrix
@@ -20,7 +21,15 @@ from caviar_protocol.topics import Lidar, LidarDevice, LidarScan, Scene
 
 
 def draw_scan(scan: LidarScan, lidar: Lidar, scene: Scene | None, title: str, file: Path) -> None:
-    """Draw one scan; hits on moving objects stand out from the scenery."""
+    """Draw a scan from above and as the sensor sees it; hits on moving objects stand out from the scenery.
+
+    Args:
+        scan: The scan.
+        lidar: The product that it is of, for the names of objects.
+        scene: Objects and the sensor of the frame; None: neither boxes nor the range image are drawn.
+        title: Title of the picture.
+        file: PNG that is written.
+    """
     moving = _on_objects(scan, lidar, scene)
     device = _device(scan, scene)
     view = _view(scan)
@@ -41,7 +50,8 @@ def draw_scan(scan: LidarScan, lidar: Lidar, scene: Scene | None, title: str, fi
 
 
 def _view(scan: LidarScan) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Limits of x and y [m]: the sensor and nearly all hits; at least 20 m."""
+    """Choose limits of x and y [m]: the sensor and nearly all hits; at least 20 m."""
+    # Nearly: one hit on a distant tower would make the rest a dot.
     around = np.array([scan.position[:2]])
     if len(scan.range):
         around = np.vstack([around, np.percentile(scan.in_world()[:, :2], [0.2, 99.8], axis=0)])
@@ -77,23 +87,18 @@ def _draw_above(drawn: Any, axes: Any, scan: LidarScan, moving: BoolArray, scene
     axes.set_aspect("equal")
     axes.set_xlabel("x, east [m]")
     axes.set_ylabel("y, north [m]")
-    axes.grid(color=LIGHT_GREY, linewidth=0.6)
+    axes.grid()
 
 
 def _draw_boxes(axes: Any, scene: Scene) -> None:
     from matplotlib.collections import PolyCollection
 
-    outline = np.array([[0.5, 0.5], [0.5, -0.5], [-0.5, -0.5], [-0.5, 0.5]])
-    boxes = [
-        scene.position[i, :2]
-        + (outline * scene.dimensions[i, :2]) @ rotation_matrix(scene.orientation[i].tolist())[:2, :2].T
-        for i in range(len(scene.names))
-    ]
+    boxes: Any = from_above(scene, OUTLINE)
     axes.add_collection(PolyCollection(boxes, facecolors="none", edgecolors=BLACK, linewidths=0.8, zorder=4))
 
 
 def _draw_ranges(drawn: Any, axes: Any, scan: LidarScan, device: LidarDevice) -> None:
-    """Range image: azimuth as the sensor turns, ahead in the middle, left on the left."""
+    """Draw the range image: azimuth as the sensor turns, ahead in the middle, left on the left."""
     image = range_image(scan, device)
     half = 180 / device.azimuth_steps
     elevation = np.degrees([device.elevation_min, device.elevation_max])
@@ -108,9 +113,15 @@ def _draw_ranges(drawn: Any, axes: Any, scan: LidarScan, device: LidarDevice) ->
 
 
 def range_image(scan: LidarScan, device: LidarDevice) -> Float64Array:
-    """Ranges [m], Shape ``[beams, azimuth_steps]``, lowest beam first, NaN where nothing was hit.
+    """Arrange the ranges of a scan as an image.
 
-    Columns run from azimuth +180° (left of the picture) down to −180°.
+    Args:
+        scan: The scan.
+        device: Its sensor, for the numbers of beams and azimuths.
+
+    Returns:
+        Ranges [m], Shape ``[beams, azimuth_steps]``, lowest beam first, NaN where nothing was hit. Columns
+        run from azimuth +180° (left of the picture) down to −180°.
     """
     ranges = np.full(device.beams * device.azimuth_steps, np.nan)
     ranges[scan.ray] = scan.range
@@ -122,7 +133,7 @@ def range_image(scan: LidarScan, device: LidarDevice) -> Float64Array:
 
 
 def _on_objects(scan: LidarScan, lidar: Lidar, scene: Scene | None) -> BoolArray:
-    """Which hits are on objects of the scene rather than on scenery."""
+    """Find the hits on objects of the scene rather than on scenery."""
     names = set() if scene is None else set(scene.names)
     of_object = np.array([name in names for name in lidar.object_names] or [False])
     hits: BoolArray = of_object[scan.object]
@@ -139,13 +150,26 @@ def _device(scan: LidarScan, scene: Scene | None) -> LidarDevice | None:
 NAMED = 16
 """Entries of a legend at most."""
 SKY_GREY = "#eef1f4"
-"""Where nothing was hit."""
+"""Colour where nothing was hit."""
+# (√5 − 1)/2: multiples of it modulo 1 never come close to each other.
 _GOLDEN = 0.618033988749895
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraView:
-    """Images of one camera in one frame; None for what was not recorded."""
+    """Images of one camera in one frame; None for what was not recorded.
+
+    Args:
+        sensor: Name of the camera.
+        rgb: Picture in sRGB, Shape ``[height, width, 3]``.
+        depth: Depth along the optical axis [m], 0 where nothing was hit, Shape ``[height, width]``.
+        objects: Index of the object at each pixel, −1 where nothing was hit, Shape ``[height, width]``.
+        object_names: Names by that index.
+        normals: Unit normals in world axes, 0 where nothing was hit, Shape ``[height, width, 3]``.
+        materials: Index of the material at each pixel, likewise.
+        material_names: Names by that index.
+        moving: Names of the objects of the scene, which stand out from scenery.
+    """
 
     sensor: str
     rgb: UInt8Array | None = None
@@ -156,13 +180,21 @@ class CameraView:
     materials: Int32Array | None = None
     material_names: tuple[str, ...] = ()
     moving: frozenset[str] = frozenset()
-    """Names of the objects of the scene, which stand out from scenery."""
 
 
 def draw_view(view: CameraView, title: str, folder: Path, stem: str = "camera") -> list[Path]:
     """Draw every image that there is as ``STEM-KIND.png``, and all in one as ``STEM.png``.
 
-    ``STEM-rgb.png`` has the pixels of the picture and nothing else. The files, all in one first.
+    ``STEM-rgb.png`` has the pixels of the picture and nothing else.
+
+    Args:
+        view: The images.
+        title: Title of the pictures.
+        folder: Where the files go.
+        stem: Beginning of their names.
+
+    Returns:
+        The files, all in one first.
     """
     panels = list(_panels(view))
     files = [folder / f"{stem}.png"]
@@ -183,7 +215,7 @@ _Draw = Callable[[Any, Any], None]
 
 
 def _panels(view: CameraView) -> Iterator[tuple[str, str, _Draw, float]]:
-    """Kind, title, how to draw it, and height over width of each image that there is."""
+    """Yield kind, title, how to draw it, and height over width of each image that there is."""
     if (rgb := view.rgb) is not None:
         yield "rgb", "Picture", lambda _, axes: _show(axes, rgb), _aspect(rgb)
     if (depth := view.depth) is not None:
@@ -209,9 +241,15 @@ def _panels(view: CameraView) -> Iterator[tuple[str, str, _Draw, float]]:
 
 
 def object_colours(names: tuple[str, ...], moving: frozenset[str]) -> Float64Array:
-    """sRGB by index, Shape ``[names, 3]``: strong colours for what moves, pale ones for scenery.
+    """Choose a colour for each name: strong ones for what moves, pale ones for scenery.
 
-    Hues follow each other by the golden ratio, which keeps any number of them apart.
+    Args:
+        names: The names.
+        moving: Those that move.
+
+    Returns:
+        sRGB, Shape ``[names, 3]``. Hues follow each other by the golden ratio, which keeps any number of them
+        apart.
     """
     colours, counts = np.zeros((len(names), 3)), [0, 0]
     for index, name in enumerate(names):
@@ -228,7 +266,7 @@ def object_colours(names: tuple[str, ...], moving: frozenset[str]) -> Float64Arr
 
 
 def _draw_all(panels: list[tuple[str, str, _Draw, float]], title: str, file: Path) -> None:
-    """Two images a row; a legend stands beside its image, so materials have a picture of their own."""
+    """Draw two images a row; a legend stands beside its image, so materials have a picture of their own."""
     chosen = [panel for panel in panels if panel[0] != "materials"] or panels
     columns = min(2, len(chosen))
     rows = -(-len(chosen) // columns)
@@ -257,11 +295,12 @@ def _show(axes: Any, image: Any, **how: Any) -> Any:
 
 
 def _draw_depth(drawn: Any, axes: Any, depth: Float32Array) -> None:
-    """Depth on a logarithmic scale, on which near and far have the same share of colours."""
+    """Draw depth on a logarithmic scale, on which near and far have the same share of colours."""
     from matplotlib.colors import LogNorm
     from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
     hit = depth > 0
+    # Without the nearest and farthest thousandth: a ray along the ground would stretch the scale.
     near, far = np.percentile(depth[hit], [0.1, 99.9]) if hit.any() else (1.0, 10.0)
     shown = _show(
         axes,
@@ -306,7 +345,16 @@ def _draw_ids(
 
 
 def largest(ids: Int32Array, names: tuple[str, ...], first: frozenset[str]) -> list[int]:
-    """Indices of the names with most pixels, at most `NAMED`; three of four places are for ``first``."""
+    """Choose the names of a legend: those with most pixels, at most `NAMED`.
+
+    Args:
+        ids: Index of the name at each pixel, −1: none.
+        names: The names.
+        first: Names that three of four places are for.
+
+    Returns:
+        Indices of the names, those of ``first`` at the beginning.
+    """
     pixels = np.bincount(ids[ids >= 0].ravel(), minlength=len(names))
     order = [int(i) for i in np.argsort(-pixels, kind="stable") if pixels[i]]
     front = [i for i in order if names[i] in first]

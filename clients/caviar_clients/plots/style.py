@@ -1,4 +1,4 @@
-"""What all pictures share: size, colours that colour-blind readers tell apart, how they are saved."""
+"""Style of all pictures: colours that colour-blind readers distinguish, shared marks, how files are saved."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from caviar_clients.files import writing
+from caviar_protocol.arrays import BoolArray, Float64Array
 from caviar_protocol.errors import SetupError
 from caviar_protocol.host import install_command
 
@@ -19,7 +22,7 @@ OPTIMUM, AGENT, BASELINE = BLACK, VERMILION, BLUE
 """Colours of the three curves of |y|, the same in every picture."""
 
 Layout = Literal["constrained", "compressed"]
-"""Of Matplotlib: ``compressed`` for panels of equal aspect."""
+"""Layout engines of Matplotlib: ``compressed`` is for panels of equal aspect."""
 
 _SETTINGS: dict[str, Any] = {
     "font.size": 11.0,
@@ -31,6 +34,8 @@ _SETTINGS: dict[str, Any] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.axisbelow": True,
+    "grid.color": LIGHT_GREY,
+    "grid.linewidth": 0.6,
     "axes.formatter.limits": (-2, 4),
     "axes.formatter.use_mathtext": True,
     "savefig.dpi": 150,
@@ -39,7 +44,12 @@ _SETTINGS: dict[str, Any] = {
 
 @contextmanager
 def styled() -> Iterator[None]:
-    """The settings of all pictures. Raises `SetupError` where Matplotlib is missing."""
+    """Apply the settings of all pictures within a block.
+
+    Raises:
+        SetupError: Matplotlib is missing; the error has the command that installs it.
+    """
+    # For a block, not for the process: in a program of its own a user has settings of Matplotlib, too.
     try:
         from matplotlib import rc_context
     except ModuleNotFoundError as error:
@@ -52,14 +62,30 @@ def styled() -> Iterator[None]:
 
 @contextmanager
 def figure(file: Path, width: float, height: float, layout: Layout = "constrained") -> Iterator[Any]:
-    """A figure [inches] that is saved as PNG, cut to what is drawn, when the block ends.
+    """Make a figure that is saved as PNG, cut to what is drawn, when the block ends.
 
-    Raises `SetupError` with the command to install Matplotlib where it is missing, `RunError`
-    where the file cannot be written.
+    Args:
+        file: Where it is saved; folders that are missing are made.
+        width: Width [inches].
+        height: Height [inches].
+        layout: Layout engine.
+
+    Raises:
+        SetupError: Matplotlib is missing; the error has the command that installs it.
+        RunError: The file cannot be written.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     with figure(Path(folder, "line.png"), 4.0, 3.0) as drawn:
+        ...         _ = drawn.subplots().plot([0, 1], [2, 3])
+        ...     Path(folder, "line.png").read_bytes()[1:4]
+        b'PNG'
     """
     with styled():
         from matplotlib.figure import Figure
 
+        # Not by pyplot, which keeps every figure until it is closed and chooses a backend by the display.
         drawn = Figure(figsize=(width, height), layout=layout)
         yield drawn
         with writing(file):
@@ -67,7 +93,34 @@ def figure(file: Path, width: float, height: float, layout: Layout = "constraine
 
 
 def legend_below(drawn: Any, axes: Any, columns: int = 3) -> None:
-    """The legend of ``axes``, below everything else."""
+    """Draw the legend of ``axes`` below everything else; nothing where no artist has a label."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:
         drawn.legend(handles, labels, loc="outside lower center", ncols=columns)
+
+
+def legend_square(axes: Any, label: str, color: str, edge: str = BLACK, **more: Any) -> None:
+    """Add an entry to the legend: a square, which stands for areas of this colour."""
+    axes.scatter(
+        [], [], marker="s", s=60, facecolor=color, edgecolors=edge, linewidths=0.7, label=label, **more
+    )
+
+
+def shade_frames(axes: Any, time: Float64Array, mask: BoolArray, color: str, label: str = "") -> None:
+    """Colour the background of frames, half a period to either side of each.
+
+    Args:
+        axes: Axes over time [s].
+        time: Time of each frame [s], Shape ``[F]``.
+        mask: Which frames, Shape ``[F]``.
+        color: Colour of the background.
+        label: Entry of the legend; empty: none.
+    """
+    half = np.median(np.diff(time)) / 2 if len(time) > 1 else 0.5
+    # A rise and a fall of the mask for each run of frames: one area each, since edges of neighbours show.
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    for n, (first, stop) in enumerate(edges.reshape(-1, 2)):
+        axes.axvspan(
+            time[first] - half, time[stop - 1] + half, color=color, linewidth=0, zorder=0,
+            label=label if label and n == 0 else None,
+        )  # fmt: skip

@@ -1,12 +1,9 @@
-"""How a user's channel spreads in delay, Doppler shift and frequency: two pictures, from its paths.
+"""Pictures of one user through a run: |y| (Fig. 8 of the paper), dispersion, frequency response.
 
-Amplitudes are those between the reference points of both arrays, element patterns included: the figures are
+|y| of the best pair, the agent and the baseline is drawn over time, with the angle of arrival below, and over
+that angle itself. Dispersion and frequency response are computed from the paths of the channel: amplitudes
+are those between the reference points of both arrays, element patterns included, so that the figures are
 those of single elements, not of what a beam leaves of the paths.
-
-|y| of the best pair, the agent and the baseline, in the form of Fig. 8 of the paper.
-
-Two pictures: over time, with the angle of arrival below (the paper's figure), and over the
-angle of arrival itself.
 """
 
 from __future__ import annotations
@@ -31,6 +28,7 @@ from caviar_clients.plots.style import (
     VERMILION,
     figure,
     legend_below,
+    shade_frames,
 )
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array
 from caviar_protocol.errors import RecordingError
@@ -46,12 +44,13 @@ from caviar_protocol.multipath import (
 from caviar_protocol.recording import Recording
 from caviar_protocol.topics import Carrier, Link
 
+# A pale red that neither the grey of NLOS nor one of the curves looks like.
 _NO_PATH = "#f2c9b8"
 
 
 @dataclass(frozen=True, eq=False)
 class UserSeries:
-    """One user through a run, Shape ``[F]`` each; NaN and false in frames without the user."""
+    """|y| of one user through a run, Shape ``[F]`` each; NaN and false in frames without the user."""
 
     tx: str
     rx: str
@@ -69,7 +68,7 @@ class UserSeries:
 
 
 def link_source(recording: Recording) -> str:
-    """The source of topic ``link`` that pictures show: the first by name."""
+    """Choose the source of topic ``link`` that pictures show: the first by name."""
     sources = recording.topics.get("link", ())
     if not sources:
         raise RecordingError(f"{recording.path} has no link, so there is no |y| to draw")
@@ -77,15 +76,22 @@ def link_source(recording: Recording) -> str:
 
 
 def has_users(recording: Recording) -> bool:
-    """Whether any frame of a link has a user."""
+    """Whether any frame of the link has a user."""
     return any(link.rx for link in _links(recording))
 
 
 def choose_user(recording: Recording, user: str = "") -> tuple[str, str, str]:
-    """(tx, rx, carrier) of the user that was there longest, or of the one whose receiver, or whose
-    receiver's object, is named ``user``.
+    """Choose a user of the link.
 
-    Raises `RecordingError` with the names there are where nobody is named so.
+    Args:
+        recording: The recording.
+        user: Name of its receiver, or of the object with the receiver; empty: that which was there longest.
+
+    Returns:
+        (tx, rx, carrier), of several with the name the one that was there longest.
+
+    Raises:
+        RecordingError: No user has the name; the error has the names of all.
     """
     frames: Counter[tuple[str, str, str]] = Counter()
     for link in _links(recording):
@@ -100,7 +106,13 @@ def choose_user(recording: Recording, user: str = "") -> tuple[str, str, str]:
 
 
 def series(recording: Recording, user: tuple[str, str, str]) -> UserSeries:
-    """Everything about one user, frame by frame."""
+    """Read the |y| of a user, frame by frame.
+
+    Args:
+        recording: The recording.
+        user: (tx, rx, carrier).
+    """
+    # One pass over the frames: the recording's arrays would decode each link anew for every column.
     source = link_source(recording)
     time, rows = [], []
     episode, base, last = 0, 0, 0
@@ -126,7 +138,13 @@ def series(recording: Recording, user: tuple[str, str, str]) -> UserSeries:
 
 
 def draw_over_time(data: UserSeries, agent: str, file: Path) -> None:
-    """Fig. 8: |y| over time above, the angle of arrival below; NLOS shaded."""
+    """Draw Fig. 8 of the paper: |y| over time above, the angle of arrival below; NLOS shaded.
+
+    Args:
+        data: The user.
+        agent: Name of the agent, for the legend.
+        file: PNG that is written.
+    """
     with figure(file, 9.0, 6.0) as drawn:
         top, bottom = drawn.subplots(2, 1, sharex=True, height_ratios=(3, 2))
         for label, values, style in curves(data, agent):
@@ -138,7 +156,7 @@ def draw_over_time(data: UserSeries, agent: str, file: Path) -> None:
             )
         for axes in (top, bottom):
             shade(axes, data)
-            axes.grid(color=LIGHT_GREY, linewidth=0.6)
+            axes.grid()
         top.set_ylabel("|y|")
         top.set_ylim(bottom=0)
         top.set_title(f"Beam selection for {data.rx}, served by {data.tx} ({data.carrier})")
@@ -150,7 +168,7 @@ def draw_over_time(data: UserSeries, agent: str, file: Path) -> None:
 
 
 def draw_over_angle(data: UserSeries, agent: str, file: Path) -> None:
-    """|y| over the angle of arrival, a point a frame; hollow where the line of sight is blocked."""
+    """Draw |y| over the angle of arrival, a point a frame; hollow where the line of sight is blocked."""
     with figure(file, 9.0, 5.0) as drawn:
         axes = drawn.subplots()
         theta = np.degrees(_wrapped(data.theta))
@@ -164,7 +182,7 @@ def draw_over_angle(data: UserSeries, agent: str, file: Path) -> None:
             axes.scatter([], [], s=30, marker=_MARKERS[color], color=color, label=label)
         if (data.has_path & ~data.los).any():
             axes.scatter([], [], s=30, facecolors="none", edgecolors=GREY, label="hollow: NLOS")
-        axes.grid(color=LIGHT_GREY, linewidth=0.6)
+        axes.grid()
         axes.set_xlabel("AoA θ [°]")
         axes.set_ylabel("|y|")
         axes.set_ylim(bottom=0)
@@ -177,7 +195,8 @@ _SIZES = {OPTIMUM: 54, AGENT: 24, BASELINE: 7}
 
 
 def curves(data: UserSeries, agent: str) -> list[tuple[str, Float64Array, dict[str, Any]]]:
-    """Label, values and style; drawn so that curves which coincide can still be seen."""
+    """Return label, values and style of each curve."""
+    # From wide and dark to thin and dashed: curves that coincide, as those of a perfect agent, all show.
     return [
         ("optimum", data.best, {"color": OPTIMUM, "linewidth": 2.8}),
         (f"agent ({agent})", data.abs_y, {"color": AGENT, "linewidth": 1.6}),
@@ -186,18 +205,9 @@ def curves(data: UserSeries, agent: str) -> list[tuple[str, Float64Array, dict[s
 
 
 def shade(axes: Any, data: UserSeries) -> None:
-    """Background of frames without line of sight, and of those without any path."""
-    half = np.median(np.diff(data.time)) / 2 if len(data.time) > 1 else 0.5
-    for mask, color, label in (
-        (data.has_path & ~data.los, LIGHT_GREY, "NLOS"),
-        (data.present & ~data.has_path, _NO_PATH, "no path"),
-    ):
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-        for n, (first, stop) in enumerate(edges.reshape(-1, 2)):
-            axes.axvspan(
-                data.time[first] - half, data.time[stop - 1] + half,
-                color=color, linewidth=0, zorder=0, label=label if n == 0 else None,
-            )  # fmt: skip
+    """Colour the background of frames without line of sight, and of those without any path."""
+    shade_frames(axes, data.time, data.has_path & ~data.los, LIGHT_GREY, "NLOS")
+    shade_frames(axes, data.time, data.present & ~data.has_path, _NO_PATH, "no path")
 
 
 def _mean(data: UserSeries, values: Float64Array) -> float:
@@ -206,13 +216,13 @@ def _mean(data: UserSeries, values: Float64Array) -> float:
 
 
 def _wrapped(theta: Float64Array) -> Float64Array:
-    """Angles within ±π."""
+    """Wrap angles to ±π."""
     result: Float64Array = np.arctan2(np.sin(theta), np.cos(theta))
     return result
 
 
 def _without_jumps(time: Float64Array, degrees: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """The same with a gap where an angle passes ±180°, so that no line crosses the picture."""
+    """Insert a gap where an angle passes ±180°, so that no line crosses the picture."""
     jumps = np.flatnonzero(np.abs(np.diff(degrees)) > 180) + 1
     return np.insert(time, jumps, time[jumps]), np.insert(degrees, jumps, np.nan)
 
@@ -238,10 +248,11 @@ def _links(recording: Recording) -> list[Link]:
     ]
 
 
+# Frequencies that are drawn of a carrier without subcarriers.
 _POINTS = 256
-"""Frequencies that are drawn of a carrier without subcarriers."""
+# Weaker paths and deeper fades than this below the strongest are at the edge of a picture [dB]: one null of a
+# two-path channel is −∞ dB and would take all of the scale.
 _RANGE_DB = 40.0
-"""Weaker paths and deeper fades than this below the strongest are at the edge of a picture."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,7 +276,15 @@ class UserPaths:
 
 
 def user_paths(recording: Recording, user: tuple[str, str, str] | None) -> UserPaths | None:
-    """Paths of (tx, rx, carrier), by default of the first user; None where the channel has no such user."""
+    """Read the paths of a user.
+
+    Args:
+        recording: The recording, with topic ``channel``.
+        user: (tx, rx, carrier); None: the first user.
+
+    Returns:
+        Its paths; None where the channel has no such user.
+    """
     channel = recording["channel", recording.topics["channel"][0]]
     if not channel.users:
         return None
@@ -273,6 +292,7 @@ def user_paths(recording: Recording, user: tuple[str, str, str] | None) -> UserP
     if (tx, rx, carrier) not in channel.users:
         return None
     mine = channel.select(tx=tx, rx=rx, carrier=carrier)
+    # Each episode counts its time from its own start: what came before it is added up.
     begins = np.flatnonzero(np.diff(channel.episode, prepend=-1))
     period = recording.metadata.sampling_period_ns
     lasted = np.diff(np.append(begins, len(channel)))
@@ -292,7 +312,7 @@ def user_paths(recording: Recording, user: tuple[str, str, str] | None) -> UserP
 
 
 def draw_dispersion(data: UserPaths, file: Path) -> None:
-    """Delay spread, K-factor, coherence bandwidth and time over simulated time; NLOS shaded."""
+    """Draw delay spread, K-factor, coherence bandwidth and time over simulated time; NLOS shaded."""
     sigma_tau, sigma_nu = delay_spread(data.a, data.tau), doppler_spread(data.a, data.doppler)
     with np.errstate(divide="ignore"):
         k_db = 10 * np.log10(k_factor(data.a, data.tau, data.los))
@@ -305,7 +325,7 @@ def draw_dispersion(data: UserPaths, file: Path) -> None:
     with figure(file, 9.0, 8.0) as drawn:
         axes = drawn.subplots(len(rows), 1, sharex=True)
         for place, (label, values, color) in zip(axes, rows, strict=True):
-            finite = _finite(values)
+            finite = np.where(np.isfinite(values), values, np.nan)
             place.plot(data.time, finite, color=color, linewidth=1.6, marker=".", markersize=4)
             place.set_ylabel(label)
             if label.startswith("Coherence"):
@@ -313,8 +333,8 @@ def draw_dispersion(data: UserPaths, file: Path) -> None:
             if not np.isfinite(finite).any():
                 place.set_yticks([])
                 place.text(0.5, 0.5, _why_empty(values), transform=place.transAxes, ha="center", color=GREY)
-            place.grid(color=LIGHT_GREY, linewidth=0.6)
-            _shade(place, data)
+            place.grid()
+            shade_frames(place, data.time, ~data.los & np.isfinite(data.tau).any(-1), LIGHT_GREY)
         axes[0].set_title(
             f"Dispersion of {data.rx}, served by {data.tx} ({data.carrier.name}); shaded: NLOS\n"
             "coherence: correlation stays above 0.5 for at least 1/(6σ)"
@@ -324,8 +344,8 @@ def draw_dispersion(data: UserPaths, file: Path) -> None:
 
 
 def _scale(axes: Any, values: Float64Array) -> None:
-    """Make the y axis logarithmic where values span more than a decade, with numbers at 1, 2 and 5; within
-    one, such an axis has no number."""
+    """Make the y axis logarithmic where values span more than a decade, with numbers at 1, 2 and 5."""
+    # Within a decade a logarithmic axis may have no number at all: there it stays linear.
     if not len(values) or values.max() <= 10 * values.min():
         return
     from matplotlib.ticker import FuncFormatter, LogLocator
@@ -339,16 +359,20 @@ def _scale(axes: Any, values: Float64Array) -> None:
 
 
 def _why_empty(values: Float64Array) -> str:
-    """What to write where no value of a user can be drawn."""
+    """Explain why no value of a user can be drawn."""
     if np.isposinf(values).any():
         return "infinite: one path in each frame"
     return "no direct path" if np.isneginf(values).any() else "no path"
 
 
 def draw_frequency_response(data: UserPaths, shown: tuple[int, int], moment: str, file: Path) -> None:
-    """Power delay profile and |H(f)| of one frame above, |H(f)| of all frames below.
+    """Draw power delay profile and |H(f)| of one frame above, |H(f)| of all frames below.
 
-    ``shown`` is the frame's episode and number, ``moment`` its name.
+    Args:
+        data: Paths of the user.
+        shown: Episode and number of the frame.
+        moment: Its name, for the title.
+        file: PNG that is written.
     """
     frame = data.frames.index(shown)
     carrier = data.carrier
@@ -365,20 +389,20 @@ def draw_frequency_response(data: UserPaths, shown: tuple[int, int], moment: str
         response.set_xlabel("Frequency from the carrier [MHz]")
         response.set_ylabel("|H(f)|² [dB]")
         response.margins(x=0)
-        response.grid(color=LIGHT_GREY, linewidth=0.6)
+        response.grid()
         drawn.suptitle(f"{data.rx}, served by {data.tx} ({data.carrier.name}): {moment}")
         _draw_map(drawn.add_subplot(grid[1, :]), data, offsets, gain_db, frame)
 
 
 def _draw_profile(axes: Any, data: UserPaths, frame: int) -> None:
-    """Gain of each path over its delay."""
+    """Draw the gain of each path over its delay."""
     there = np.isfinite(data.tau[frame])
     delay = data.tau[frame][there] * 1e9
     with np.errstate(divide="ignore"):
         gain_db = 20 * np.log10(np.abs(data.a[frame][there]))
     axes.set_xlabel("Delay [ns]")
     axes.set_ylabel("Gain of a path [dB]")
-    axes.grid(color=LIGHT_GREY, linewidth=0.6)
+    axes.grid()
     if not len(delay) or not np.isfinite(gain_db).any():
         axes.text(0.5, 0.5, "no path", transform=axes.transAxes, ha="center", color=GREY)
         return
@@ -400,7 +424,7 @@ def _draw_profile(axes: Any, data: UserPaths, frame: int) -> None:
 
 
 def _draw_map(axes: Any, data: UserPaths, offsets: Float64Array, gain_db: Float64Array, frame: int) -> None:
-    """|H(f)|² over time and frequency."""
+    """Draw |H(f)|² over time and frequency."""
     known = gain_db[np.isfinite(gain_db)]
     if len(known):
         least, most = float(known.min()), float(known.max())
@@ -416,7 +440,7 @@ def _draw_map(axes: Any, data: UserPaths, offsets: Float64Array, gain_db: Float6
 
 
 def _gains_db(data: UserPaths, carrier: Carrier) -> Float64Array:
-    """|H(f)|² of each frame [dB], Shape ``[F, K]``; NaN in frames without a path."""
+    """Compute |H(f)|² of each frame [dB], Shape ``[F, K]``; NaN in frames without a path."""
     found = np.full((len(data.time), carrier.subcarriers), np.nan)
     for frame, (a, tau, doppler) in enumerate(zip(data.a, data.tau, data.doppler, strict=True)):
         there = np.isfinite(tau)
@@ -425,18 +449,3 @@ def _gains_db(data: UserPaths, carrier: Carrier) -> Float64Array:
             with np.errstate(divide="ignore"):
                 found[frame] = 20 * np.log10(np.abs(response))
     return np.where(np.isfinite(found), found, np.nan)
-
-
-def _finite(values: Float64Array) -> Float64Array:
-    return np.where(np.isfinite(values), values, np.nan)
-
-
-def _shade(axes: Any, data: UserPaths) -> None:
-    """Background of frames with paths and without line of sight."""
-    half = np.median(np.diff(data.time)) / 2 if len(data.time) > 1 else 0.5
-    hidden = ~data.los & np.isfinite(data.tau).any(-1)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], hidden, [False]]).astype(np.int8)))
-    for first, stop in edges.reshape(-1, 2):
-        axes.axvspan(
-            data.time[first] - half, data.time[stop - 1] + half, color=LIGHT_GREY, linewidth=0, zorder=0
-        )

@@ -1,158 +1,17 @@
-"""Plots of a comparison: time against error, error against samples; labels that do not overlap."""
+"""Plots of a comparison: time against error, error against samples."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Sequence
-from itertools import pairwise
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from msgspec.structs import replace
 
-from caviar_clients.plots.style import BLACK, BLUE, GREY, LIGHT_GREY, ORANGE, SKY, VERMILION, figure
+from caviar_clients.plots.labels import place_labels
+from caviar_clients.plots.style import BLACK, BLUE, GREY, ORANGE, SKY, VERMILION, figure
 from caviar_clients.tradeoff.errors import Row
 from caviar_clients.tradeoff.report import Point, Report
-
-DISTANCES_PT = (9.0, 16.0, 26.0, 38.0, 52.0, 68.0)
-DIRECTIONS = 16
-GAP_PX = 3.0
-LEADER_PT = 12.0
-"""A label farther away than this is tied to its point by a line."""
-
-
-CROSSING = 100.0
-"""Area [pixels²] of overlap that is as bad as a step of such a line within something else."""
-STEPS = 12
-HIDING = 10.0
-"""How much worse it is to cover a point than a label or a line."""
-
-
-class Box(NamedTuple):
-    """A rectangle [pixels]."""
-
-    left: float
-    bottom: float
-    right: float
-    top: float
-
-    def overlap(self, other: Box) -> float:
-        """Area that both cover [pixels²]."""
-        width = min(self.right, other.right) - max(self.left, other.left)
-        height = min(self.top, other.top) - max(self.bottom, other.bottom)
-        return max(0.0, width) * max(0.0, height)
-
-    def outside(self, other: Box) -> float:
-        """Area of this one that the other does not cover [pixels²]."""
-        return (self.right - self.left) * (self.top - self.bottom) - self.overlap(other)
-
-
-class Spot(NamedTuple):
-    """Where a label may stand: its centre relative to its point [points], and the rectangle."""
-
-    dx: float
-    dy: float
-    distance: float
-    box: Box
-
-
-def spots(x: float, y: float, width: float, height: float, pixels_per_point: float) -> Iterator[Spot]:
-    """Places around a point at (x, y) for a label of a size [pixels], the nearest first."""
-    for distance in DISTANCES_PT:
-        for step in range(DIRECTIONS):
-            angle = 2 * math.pi * step / DIRECTIONS
-            along, up = math.cos(angle), math.sin(angle)
-            # The distance is that of the label's edge from the point.
-            dx = along * (distance * pixels_per_point + width / 2)
-            dy = up * (distance * pixels_per_point + height / 2)
-            centre_x, centre_y = x + dx, y + dy
-            box = Box(
-                centre_x - width / 2 - GAP_PX,
-                centre_y - height / 2 - GAP_PX,
-                centre_x + width / 2 + GAP_PX,
-                centre_y + height / 2 + GAP_PX,
-            )
-            yield Spot(dx / pixels_per_point, dy / pixels_per_point, distance, box)
-
-
-def place(
-    axes: Any,
-    points: Sequence[tuple[float, float]],
-    texts: Sequence[str],
-    line: Sequence[tuple[float, float]] = (),
-    size: float = 9.0,
-) -> None:
-    """Label points of ``axes``, off a staircase too, all in data coordinates. The limits must be final."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    drawn = axes.figure
-    canvas = FigureCanvasAgg(drawn)
-    canvas.draw()  # the layout is known only then
-    pixels_per_point = drawn.dpi / 72
-    frame = Box(*axes.get_window_extent().extents)
-    pixels = [tuple(axes.transData.transform(point)) for point in points]
-    radius = 5 * pixels_per_point
-    taken = [Box(x - radius, y - radius, x + radius, y + radius) for x, y in pixels]
-    corners = [tuple(axes.transData.transform(point)) for point in line]
-    lines = [
-        Box(min(x0, x1) - 1, min(y0, y1) - 1, max(x0, x1) + 1, max(y0, y1) + 1)
-        for (x0, y0), (x1, y1) in pairwise(corners)
-    ]
-    for text, (x, y), point in sorted(zip(texts, pixels, points, strict=True), key=lambda e: -e[1][1]):
-        label = axes.annotate(
-            text,
-            point,
-            xytext=(0, 0),
-            textcoords="offset points",
-            ha="center",
-            va="center",
-            fontsize=size,
-            zorder=5,
-            bbox={"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8},
-        )
-        extent = label.get_window_extent(canvas.get_renderer())
-        found = min(
-            spots(x, y, extent.width, extent.height, pixels_per_point),
-            key=lambda spot: (
-                sum(spot.box.overlap(other) for other in (*taken, *lines))
-                + HIDING * sum(spot.box.overlap(other) for other in taken[: len(pixels)])
-                + 10 * spot.box.outside(frame)
-                + CROSSING * _crossed(x, y, spot, taken),
-                spot.distance,
-            ),
-        )
-        label.set_position((found.dx, found.dy))
-        taken.append(found.box)
-        if found.distance >= LEADER_PT:
-            _tie(axes, point, found)
-
-
-def _crossed(x: float, y: float, spot: Spot, taken: Sequence[Box]) -> int:
-    """How many labels and points the line between a point and its label would cross."""
-    if spot.distance < LEADER_PT:
-        return 0
-    centre_x, centre_y = (spot.box.left + spot.box.right) / 2, (spot.box.bottom + spot.box.top) / 2
-    beside = [box for box in taken if not (box.left <= x <= box.right and box.bottom <= y <= box.top)]
-    found = 0
-    for step in range(1, STEPS):
-        along = step / STEPS
-        here_x, here_y = x + along * (centre_x - x), y + along * (centre_y - y)
-        here = Box(here_x - 1, here_y - 1, here_x + 1, here_y + 1)
-        found += any(box.overlap(here) > 0 for box in beside)
-    return found
-
-
-def _tie(axes: Any, point: tuple[float, float], spot: Spot) -> None:
-    """A line from a point to its label, which is far."""
-    reach = spot.distance / math.hypot(spot.dx, spot.dy)
-    axes.annotate(
-        "",
-        point,
-        xytext=(spot.dx * reach, spot.dy * reach),
-        textcoords="offset points",
-        arrowprops={"arrowstyle": "-", "color": GREY, "linewidth": 0.7, "shrinkA": 0, "shrinkB": 4},
-    )
-
 
 RUNG_COLOURS = {
     "free-space": SKY,
@@ -184,7 +43,7 @@ def draw_pareto(report: Report, file: Path) -> Path:
         for axes, value in ((upper, _nmse), (lower, _gain)):
             shown = _points(rows, report.reference, value)
             points = [(row.time_ms_median, error) for row, error in shown]
-            place(axes, points, [row.setting for row, _ in shown], pareto_front(points))
+            place_labels(axes, points, [row.setting for row, _ in shown], pareto_front(points))
     return file
 
 
@@ -242,7 +101,7 @@ def _panel(axes: Any, rows: Sequence[Row], reference: str, value: Callable[[Row]
         axes.yaxis.set_major_formatter("{x:g}")
         axes.yaxis.set_minor_formatter("{x:g}")
     _widen(axes)
-    axes.grid(color=LIGHT_GREY, linewidth=0.6)
+    axes.grid()
 
 
 def _widen(axes: Any) -> None:
@@ -288,7 +147,7 @@ def draw_convergence(report: Report, file: Path) -> Path:
         for axes in (error, gain, beams):
             axes.set_xscale("log")
             axes.set_xlabel("samples of the launch")
-            axes.grid(color=LIGHT_GREY, linewidth=0.6)
+            axes.grid()
         handles, names = error.get_legend_handles_labels()
         more, more_names = gain.get_legend_handles_labels()
         drawn.legend(handles + more[-1:], names + more_names[-1:], loc="outside lower center", ncols=5)

@@ -95,9 +95,9 @@ def scenes_of(path: Path, frames: int) -> Scenes:
         RunError: The worlds fail, or no scene has both a transmitter and a receiver.
 
     Example:
-        >>> scenes = scenes_of(Path("smoke"), 2)
-        >>> [instant.frame for instant in scenes.instants]
-        [0, 99]
+        >>> scenes = scenes_of(Path("runs/smoke-20261122-101500"), 2)
+        >>> len(scenes.instants), scenes.carriers[0].name
+        (2, 'mmwave')
     """
     found = _of_recording(path, frames) if is_recording(path) else _of_scenario(path, frames)
     if not found.carriers:
