@@ -1,4 +1,5 @@
-"""Channel matrices H from the paths of a product: every array applied as plane waves."""
+"""Channel matrices H from the paths of a product: what every rung gives, and arrays applied as plane
+waves."""
 
 from __future__ import annotations
 
@@ -18,16 +19,19 @@ from caviar_services.channel.propagation.geometry import PathGeometry
 from caviar_services.channel.propagation.patterns import radiated_field
 from caviar_services.channel.wideband import Bins, superposed
 
-# Products of elements that are summed together: OpenBLAS shares twice as many out to threads.
+# Multiplications of one matrix product; OpenBLAS shares products of twice as many out to threads of its own.
 _PRODUCTS = 32_768
 
 
 def summed(receive: Complex128Array, transmit: Complex128Array) -> Complex128Array:
-    """Σ_p receive[p, m] · transmit[p, n], Shape ``[Nr, Nt]``, of Shapes ``[P, Nr]`` and ``[P, Nt]``.
+    """Σ_p receive[p, m] · transmit[p, n], Shape ``[Nr, Nt]``.
 
-    In blocks: NumPy's library shares a larger product out to threads of its own, which beside those of the
-    ray tracer wait for a processor a hundred times as long as the product takes.
+    Args:
+        receive: Of each path and receiving element, Shape ``[P, Nr]``.
+        transmit: Of each path and transmitting element, Shape ``[P, Nt]``.
     """
+    # In blocks: NumPy's library shares a larger product out to threads, which beside those of the ray tracer
+    # wait for a processor a hundred times as long as the product takes.
     total = np.zeros((receive.shape[1], transmit.shape[1]), np.complex128)
     size = max(4, _PRODUCTS // max(total.size, 1))
     for begin in range(0, len(receive), size):
@@ -43,6 +47,7 @@ class Located:
     row: Int64Array
     """Row of each in the model's `PathTable`, Shape ``[P]``."""
     pair: Int64Array
+    """As in `PathTable`, ascending, Shape ``[P]``."""
     offsets: Int64Array
     """As in `Channel`: paths of a pair are ``offsets[pair]`` to ``offsets[pair + 1]``."""
     geometry: PathGeometry
@@ -168,12 +173,13 @@ Blocks = TypeVar("Blocks", Complex64Array, Complex128Array)
 
 
 def joined(rows: list[list[Blocks]]) -> Blocks:
-    """One array of blocks between subarrays, in a row those of one receiving subarray; ``[..., M, N]``."""
+    """One array of blocks between subarrays, Shape ``[..., M, N]``; a row has those of one receiving
+    subarray."""
     return rows[0][0] if len(rows) * len(rows[0]) == 1 else np.block(rows)
 
 
 def carrier_phase(carriers: Sequence[Carrier], tau: Float64Array) -> Complex128Array:
-    """exp(−j2πfτ), Shape ``[C, P]``."""
+    """exp(−j2πfτ), Shape ``[C, P]``; delays [s] have the Shape ``[P]``."""
     frequency = np.array([carrier.frequency_hz for carrier in carriers])
     # The whole turns of f·τ go first: they are millions, and only the rest is a phase.
     turns = frequency[:, None] * tau
@@ -193,7 +199,8 @@ def subarray_amplitudes(
     Args:
         antennas: Transmitter and receiver.
         towards: Directions of departure and of arrival in world axes, Shape ``[P, 3]`` each.
-        transfer, phase: As in `PathTable` and from `carrier_phase`, of these paths.
+        transfer: As in `PathTable`, Shape ``[C, P, 3, 3]``.
+        phase: From `carrier_phase`, Shape ``[C, P]``.
     """
     sent, taken = (
         np.array([radiated_field(part.array, part.rotation, along, part.pattern) for part in end.subarrays])
@@ -206,7 +213,7 @@ def subarray_amplitudes(
 def _centre_phases(
     carrier: Carrier, antennas: tuple[Antenna, Antenna], towards: tuple[Float64Array, Float64Array]
 ) -> Complex128Array:
-    """What the phase at subarrays' centres is against those of their devices, Shape ``[R, T, P]``."""
+    """Phases between the centres of subarrays relative to those between the devices, Shape ``[R, T, P]``."""
     nearer = [
         np.array([along @ (part.position - end.position) for part in end.subarrays])
         for end, along in zip(antennas, towards, strict=True)

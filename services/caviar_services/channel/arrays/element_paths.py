@@ -21,11 +21,12 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt8Array
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.propagation.clearance import CLEARANCE
+from caviar_services.channel.propagation.geometry import Rows
 from caviar_services.channel.propagation.image_method import image_points
 
 
 class Bend(IntEnum):
-    """What fixes a path beside planes."""
+    """What fixes the points of a path beside planes."""
 
     NONE = 0
     EDGE = 1
@@ -33,7 +34,7 @@ class Bend(IntEnum):
 
 
 @dataclass(frozen=True, eq=False)
-class Surfaces:
+class Surfaces(Rows):
     """What P paths of at most D interactions meet."""
 
     types: UInt8Array
@@ -53,19 +54,6 @@ class Surfaces:
     settled: BoolArray
     """Paths that all corners of both arrays are known to have, Shape ``[P]``."""
 
-    def take(self, which: Int64Array | BoolArray) -> Surfaces:
-        """These paths."""
-        return Surfaces(
-            types=self.types[which],
-            points=self.points[which],
-            origin=self.origin[which],
-            plane=self.plane[which],
-            normal=self.normal[which],
-            edge=self.edge[which],
-            outward=self.outward[which],
-            settled=self.settled[which],
-        )
-
 
 @dataclass(frozen=True, eq=False)
 class Lengths:
@@ -80,7 +68,11 @@ class Lengths:
 
 
 class ElementPaths:
-    """Affine maps that straighten paths, and what follows from them for any pair of elements."""
+    """Lengths and points of paths between any elements, by the affine maps that straighten the paths.
+
+    Args:
+        surfaces: What the paths between the arrays' centres meet.
+    """
 
     def __init__(self, surfaces: Surfaces) -> None:
         self.surfaces = surfaces
@@ -114,10 +106,15 @@ class ElementPaths:
         return linear, offset
 
     def ends(self, start: Float64Array, end: Float64Array) -> tuple[Float64Array, Float64Array]:
-        """Where straight lines along paths from their TX and from their RX lead [m], Shape ``[P, 3]`` each:
-        to the image of the other end, or of what bends the path.
+        """Points that straight lines along paths lead to from both ends: the image of the other end, or of
+        the point that bends the path.
 
-        ``start`` and ``end`` ``[P, 3]`` are the arrays' centres.
+        Args:
+            start: Centre of the transmitter of each path [m], Shape ``[P, 3]``; ``end`` that of the receiver.
+            end: See ``start``.
+
+        Returns:
+            Points [m] from the transmitters and from the receivers, Shape ``[P, 3]`` each.
         """
         rows = np.arange(len(start))
         points = self.surfaces.points
@@ -131,7 +128,13 @@ class ElementPaths:
         return _unmapped(self._sent, from_tx), from_rx
 
     def lengths(self, rows: slice, transmit: Float64Array, receive: Float64Array) -> Lengths:
-        """Of some paths; ``transmit`` ``[p, N, 3]`` and ``receive`` ``[p, M, 3]`` are elements [m]."""
+        """Lengths of some paths between elements.
+
+        Args:
+            rows: Of the paths.
+            transmit: Transmitting elements of each path [m], Shape ``[p, N, 3]``.
+            receive: Receiving elements of each path [m], Shape ``[p, M, 3]``.
+        """
         sent = _mapped(self._sent, rows, transmit)
         if self._straight:
             length = _distances(receive, sent)
@@ -185,10 +188,16 @@ class ElementPaths:
         return out + back + between[:, None, None], spreading
 
     def corners(self, paths: Int64Array, start: Float64Array, end: Float64Array) -> Float64Array:
-        """Interaction points [m] of paths between single elements, Shape ``[Q, D, 3]``.
+        """Interaction points of paths between single elements.
 
-        ``paths`` ``[Q]`` says which paths, ``start`` and ``end`` ``[Q, 3]`` are the elements' positions.
-        Where a path has no such point (a plane seen edge-on), the point is not finite.
+        Args:
+            paths: Which paths, Shape ``[Q]``.
+            start: Position of the transmitting element of each [m], Shape ``[Q, 3]``; ``end`` of the
+                receiving one.
+            end: See ``start``.
+
+        Returns:
+            Points [m], Shape ``[Q, D, 3]``; not finite where a path has none (a plane seen edge-on).
         """
         surfaces = self.surfaces
         types, plane = surfaces.types[paths], (surfaces.origin[paths], surfaces.normal[paths])
@@ -234,7 +243,7 @@ def _mapped(
 
 
 def _unmapped(affine: tuple[Float64Array, Float64Array], points: Float64Array) -> Float64Array:
-    """Where points came from; the maps are reflections, so the transpose of each is its inverse."""
+    """Points before the maps; these are reflections, so that the transpose of each is its inverse."""
     back: Float64Array = np.einsum("pij,pi->pj", affine[0], points - affine[1])
     return back
 

@@ -26,7 +26,7 @@ from caviar_services.channel.paths import Antenna
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What is asked of a scene."""
+    """Questions that a scene answers by rays."""
 
     nearest: Callable[[Float64Array, Float64Array], tuple[Float64Array, Int64Array]]
     """Of segments ``[Q, 3]`` → ``[Q, 3]``: how much farther than its end the first surface along each is
@@ -35,7 +35,7 @@ class Look:
     """Whether there are paths by way of planes ``[Q, D]``, −1 behind the last, between ends ``[Q, 3]``."""
 
 
-# [m]; rays from face to face start this far from the first, whose points are known to some 1e-5 m.
+# [m]; rays from face to face start this far from the first face, whose points are known to some 1e-5 m.
 _OFF_SURFACE = 2e-4
 
 # [m]; rays to and from an edge pass this far outside of it.
@@ -44,11 +44,12 @@ _OFF_EDGE = 1e-3
 # [m]; a surface this near a segment's end is what stands there.
 _AT_END = 1e-2
 
-# Elements of each side of the arrays that are looked at first, at most, by the number of sides there are.
+# Elements along each side of the arrays that are tested first, at most, by the number of sides with more than
+# one: for four sides 5⁴ = 625 pairs instead of all.
 _NODES = (1, 33, 17, 7, 5)
 
 
-# Memory that looking at one pair of elements takes, for each segment that a path can have.
+# Memory [bytes] that the test of one pair of elements takes, for each segment that a path can have.
 _LANE_BYTES = 320
 
 # [bytes]; more at once is no faster.
@@ -72,8 +73,12 @@ class Elements:
 
 
 def elements(antennas: Sequence[Antenna], wavelength: float) -> Elements:
-    """Elements of antennas of uniform arrays where they stand at a wavelength [m]: arrays are given in
-    wavelengths."""
+    """Elements of antennas where they stand.
+
+    Args:
+        antennas: Of uniform arrays.
+        wavelength: That arrays are given in [m].
+    """
     sizes = np.array([antenna.array.size for antenna in antennas], np.int64)
     first = np.cumsum(sizes) - sizes
     positions = np.empty((int(sizes.sum()), 3))
@@ -84,8 +89,16 @@ def elements(antennas: Sequence[Antenna], wavelength: float) -> Elements:
 
 
 def outermost(antennas: Sequence[Antenna], wavelength: float) -> Float64Array:
-    """Elements at the arrays' corners [m], Shape ``[A, L, 3]``; L is 1 for points, 2 for lines, else 4, for
-    each subarray of the antenna that has most."""
+    """Elements at the corners of arrays.
+
+    Args:
+        antennas: A antennas.
+        wavelength: That arrays are given in [m].
+
+    Returns:
+        Positions [m], Shape ``[A, L, 3]``. L is 1 for single elements, 2 for lines and else 4, for each
+        subarray of the antenna that has most.
+    """
     if any(not antenna.array.is_uniform for antenna in antennas):
         most = max(len(antenna.subarrays) for antenna in antennas)
         # What is missing repeats the last one.
@@ -142,9 +155,16 @@ def visibility(
     look: Look,
     memory: int = _AT_ONCE,
 ) -> Visibility:
-    """Of all paths, which run between antennas ``transmitter`` and ``receiver``, Shape ``[P]`` each.
+    """Pairs of elements that each path exists for.
 
-    As many paths are looked at together as ``memory`` [bytes] allows, one at least.
+    Args:
+        paths: The paths.
+        transmitter: Index of the transmitter of each path, Shape ``[P]``.
+        receiver: Index of the receiver of each path, Shape ``[P]``.
+        transmit: Elements of all transmitters.
+        receive: Elements of all receivers.
+        look: Asks the scene.
+        memory: For paths that are tested together [bytes]; one path is tested in any case.
     """
     every: BoolArray = paths.surfaces.settled.copy()
     some: dict[int, BoolArray] = {}
@@ -169,11 +189,11 @@ def visibility(
 
 @dataclass(frozen=True, eq=False)
 class _Axis:
-    """One side of an array: where it is looked at first, and what is between."""
+    """One side of an array: elements that are tested first, and the intervals between them."""
 
     size: int
     nodes: Int64Array
-    """Elements that are looked at, Shape ``[K]``."""
+    """Elements that are tested first, Shape ``[K]``."""
     cell: Int64Array
     """Interval between nodes that each element is in, Shape ``[size]``."""
 
@@ -198,9 +218,10 @@ class _Test:
         return self.receive.arrays[self.receiver[path]], self.transmit.arrays[self.transmitter[path]]
 
     def pairs(self, paths: Int64Array, receive: AntennaArray, transmit: AntennaArray) -> BoolArray:
-        """Pairs that paths between alike arrays exist for, Shape ``[P, M, N]``.
+        """Pairs of elements for which paths between arrays of these kinds exist, Shape ``[P, M, N]``.
 
-        Looked at are some elements of each side, then all in the cells between them that are mixed.
+        Tested are some elements of each side, then all elements of the cells between them whose corners
+        differ.
         """
         # Element i is row i % rows of column i // rows.
         sizes = (receive.columns, receive.rows, transmit.columns, transmit.rows)
@@ -329,7 +350,7 @@ def _segments(
             side = np.sign(((arriving - before) * unit[:, d - 1]).sum(-1))[:, None]
             lifted = before + _OFF_SURFACE * side * unit[:, d - 1]
             start_of = np.where(edge[:, None], before + _OFF_EDGE * outward, lifted)
-            # The last segment is looked along from the receiver, which is where it says it is.
+            # The last ray goes from the receiver, whose position is exact; points on faces are rounded.
             back = np.where(edge[:, None], start_of, before)
             start_of, target = np.where(ends[:, None], end, start_of), np.where(ends[:, None], back, target)
             wanted = np.where(ends & ~edge, planes[:, d - 1], wanted)

@@ -34,14 +34,14 @@ from caviar_services.channel.wideband import Bins
 
 
 class ElementTracer:
-    """Makes the matrices of a frame, by traces between elements.
+    """Traces the paths between single antenna elements of a frame.
 
     Args:
         tracer: Set up for the options of the scenario.
         scene: Of the frame.
         velocity: Of each object of the scene [m/s], Shape ``[len(scene.names), 3]``.
         wavelengths: Of the carriers [m].
-        lanes: Candidates looked at together at most.
+        lanes: Candidates that are tested together at most.
         los: Whether straight paths count.
         foliage: Of the frame; None: there is none.
     """
@@ -95,7 +95,15 @@ class ElementTracer:
         targets: Sequence[_Element],
         absorption_db_per_km: Float64Array | None,
     ) -> _ElementPaths:
-        """What arrives from one transmitting element at M receiving ones, at a wavelength [m]."""
+        """Paths from one transmitting element to M receiving ones.
+
+        Args:
+            carrier: Index of the carrier.
+            wavelength: Its wavelength [m].
+            source: The transmitting element.
+            targets: Receiving elements; those of the source's device get no path.
+            absorption_db_per_km: By the air on each carrier; None: no atmosphere.
+        """
         others = np.flatnonzero([target.place.name != source.place.name for target in targets])
         ends = [targets[index] for index in others.tolist()]
         table = self._paths(source, ends)
@@ -110,13 +118,14 @@ class ElementTracer:
         return _ElementPaths(len(targets), target[finite], a[finite], geometry.tau[finite], doppler_hz)
 
     def _paths(self, source: _Element, ends: Sequence[_Element]) -> PathTable:
-        """Between one element and others, as between antennas."""
+        """Paths between one element and others, as between antennas of one element."""
         from_, to = source.traced.position, np.array([end.traced.position for end in ends]).reshape(-1, 3)
         corners = Corners(from_[None], to[:, None])
         traced = self._tracer.trace(from_, to, lanes=self._lanes, corners=corners)
         mirrored = ((traced.types == 0) | (traced.types == Interaction.REFLECTION)).all(1)
         traced = traced.take(~mirrored | traced.hidden | traced.settled)
-        # Its own corner is all that an element has: what that sees, the element sees.
+        # An array of one element has no corner beside its centre, so that no path is hidden from the centre
+        # alone.
         traced = replace(traced, hidden=np.zeros(len(traced.hidden), np.bool_))
         names = self._scene.names
         places = [source.place], [end.place for end in ends]
@@ -142,7 +151,7 @@ class ElementTracer:
         source: Antenna,
         targets: Sequence[Antenna],
     ) -> tuple[Complex128Array, PathGeometry]:
-        """With the phase of lengths in float64, Shape ``[P]``, and what follows from the paths' points."""
+        """Amplitudes with the phase of lengths in float64, Shape ``[P]``, and the geometry of the paths."""
         ends = np.array([target.position for target in targets]).reshape(-1, 3)[table.pair]
         start = np.broadcast_to(source.position, ends.shape)
         with np.errstate(invalid="ignore"):  # what is not finite is left out
@@ -160,6 +169,7 @@ class ElementTracer:
             number = {key: index for index, key in enumerate(parts)}
             which = np.array([number[target.name, target.part] for target in targets], np.int64)[table.pair]
             taken = antenna_fields(list(parts.values()), which, geometry.arrival)
+            # The whole turns go first: they are millions, and only the rest is a phase.
             turns = geometry.tau * SPEED_OF_LIGHT / wavelength
             phase = np.exp(-2j * np.pi * (turns - np.round(turns)))
             a: Complex128Array = np.einsum("pi,pij,pj->p", taken, table.transfer[carrier], sent) * phase
@@ -235,13 +245,13 @@ class _ElementPaths:
         return np.bincount(self.target, minlength=self.targets)
 
     def summed(self, amplitudes: Complex128Array) -> Complex128Array:
-        """What arrives at each receiving element, Shape ``[M]``."""
+        """Sum of amplitudes at each receiving element, Shape ``[M]``."""
         column = np.zeros(self.targets, np.complex128)
         np.add.at(column, self.target, amplitudes)
         return column
 
     def weighted(self, asked: Bins, pair: int, begin: int, end: int) -> Complex128Array:
-        """What arrives at the receiving elements ``begin`` to ``end``, Shape ``[J, end − begin]``."""
+        """What `Bins` ask for at the receiving elements ``begin`` to ``end``, Shape ``[J, end − begin]``."""
         mine = slice(*np.searchsorted(self.target, [begin, end]).tolist())
         weights = asked.weights(pair, self.tau[mine], self.doppler[mine]) * self.a[mine]
         response = np.zeros((len(weights), end - begin), np.complex128)
@@ -256,5 +266,6 @@ class _Element:
     """One element, as an antenna of its own."""
 
     place: Antenna
+    """Where it stands."""
     traced: Antenna
-    """Off the surface that it is at."""
+    """Where it is traced from: off the surface that it is at."""

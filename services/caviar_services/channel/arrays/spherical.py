@@ -74,7 +74,17 @@ class ElementGains:
     def of(
         self, rows: slice, transmit: AntennaArray, receive: AntennaArray
     ) -> tuple[Complex128Array, Complex128Array]:
-        """Parts of which amplitudes of paths between these arrays are sums, ``[p, N]`` and ``[p, M]``."""
+        """Two parts whose sums are the amplitudes of paths between these arrays.
+
+        Args:
+            rows: Of the paths.
+            transmit: Array of the transmitter, N elements.
+            receive: Array of the receiver, M elements.
+
+        Returns:
+            Parts of Shapes ``[p, N]`` and ``[p, M]``: the amplitude between n and m is the sum of the n-th
+            and the m-th.
+        """
         place = self._place[rows]
         sent, taken = self._parts[transmit, receive]
         return sent[place] @ _nodes(transmit)[1].T, taken[place] @ _nodes(receive)[1].T
@@ -87,7 +97,7 @@ def _fields(
     towards: Float64Array,
     wavelength: float,
 ) -> Field:
-    """Fields towards paths at the places of an array, world axes, Shape ``[P, K, 3]``."""
+    """Fields towards paths at the nodes of an array, world axes, Shape ``[P, K, 3]``."""
     nodes, _ = _nodes(array)
     rotation = np.array([antenna.rotation for antenna in antennas])[which]
     centre = np.array([antenna.position for antenna in antennas])[which]
@@ -103,7 +113,8 @@ def _fields(
 
 @lru_cache(maxsize=256)
 def _nodes(array: AntennaArray) -> tuple[Float64Array, Float64Array]:
-    """Places in the axes of an array [wavelengths], Shape ``[K, 3]``, and their weights for its elements."""
+    """Nodes in the axes of an array [wavelengths], Shape ``[K, 3]``, and their weights for its elements, at
+    which Lagrange's polynomial through the nodes is evaluated."""
     across = _axis(array.columns)
     down = _axis(array.rows)
     width = (array.columns - 1) / 2 * array.horizontal_spacing
@@ -115,14 +126,14 @@ def _nodes(array: AntennaArray) -> tuple[Float64Array, Float64Array]:
 
 
 def _axis(count: int) -> tuple[Float64Array, Float64Array]:
-    """Places along one side as parts of its half, and Lagrange's weights of each for ``count`` elements."""
+    """Nodes along one side as parts of its half, and Lagrange's weights of each for ``count`` elements."""
     if count == 1:
         return np.zeros(1), np.ones((1, 1))
     at = np.linspace(-1.0, 1.0, count)
     return np.array([-1.0, 0.0, 1.0]), np.stack([at * (at - 1) / 2, 1 - at**2, at * (at + 1) / 2], axis=1)
 
 
-# Subcarriers or taps times element pairs that are computed at once.
+# Subcarriers or taps times element pairs that are computed at once, so that memory is bounded.
 _BINS = 1 << 20
 
 # Element pairs times paths computed at once: what stays in a processor's cache.
@@ -130,7 +141,7 @@ _LANES = 1 << 15
 
 
 class SphericalWaves:
-    """Makes the matrices of a frame.
+    """Makes the matrices of a frame by exact lengths between elements.
 
     Coefficients of reflection, transmission, diffraction and scattering are those of the path between the
     arrays' centres, as in ``siso-rt``. Pattern and polarisation are each element's own, to first order in the
@@ -370,7 +381,8 @@ def _far_enough(
     ends: tuple[Elements, Elements],
     wavelength: float,
 ) -> Visibility:
-    """Without direct paths of elements closer than one wavelength, which antennas have none of either."""
+    """Visibility without direct paths between elements closer than one wavelength, where far-field gains do
+    not hold: pairs of antennas have none there either."""
     every, some = seen.every.copy(), dict(seen.some)
     transmit, receive = ends
     for path in np.flatnonzero((paths.surfaces.types == 0).all(1)).tolist():
@@ -392,7 +404,10 @@ def _positions(antennas: Sequence[Antenna]) -> Float64Array:
 def _groups(
     offsets: Int64Array, transmit: Elements, receive: Elements
 ) -> Iterator[tuple[range, tuple[int, int]]]:
-    """Consecutive pairs of the same arrays, as many as are computed at once, and these sizes."""
+    """Runs of consecutive pairs of the same arrays that are computed at once, and the sizes of their arrays.
+
+    A matrix of few elements takes less time than the calls that make it: a run makes many in the same calls.
+    """
     arrays = [(rx, tx) for tx in transmit.arrays for rx in receive.arrays]
     begin = 0
     while begin < len(arrays):

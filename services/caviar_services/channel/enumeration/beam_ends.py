@@ -21,17 +21,18 @@ from caviar_services.channel.enumeration.image_beams import (
     filtered,
     first_beams,
     gathered,
+    indices,
     lights_corner,
     lit_bodies,
     near_bodies,
     next_beams,
     numbers,
     pairs,
+    places,
     reflected_beams,
     scenery_beams,
 )
 from caviar_services.channel.propagation.geometry import ranges
-from caviar_services.ray_tracing import aligned_indices, positions, several
 
 # Beams of one group that lanes test together: groups are filled up to a multiple of it, so that a lane finds
 # its beam by a division and not by a search.
@@ -54,13 +55,13 @@ class SceneryViews:
 
 def receiver_beams(targets: Targets, receivers: Float64Array, faces: Int64Array) -> Beams:
     """The beam of what a receiver [m] sees in a face of scenery, of Shapes ``[W, 3]`` and ``[W]``."""
-    return reflected_beams(targets, faces[:, None], positions(receivers[several(len(faces))]), None)
+    return reflected_beams(targets, faces[:, None], places(receivers), None)
 
 
 def ends_at(targets: Targets, beams: Beams, receivers: Float64Array) -> tuple[Int64Array, Int64Array]:
     """Beam and receiver of each pair where the beam lights the receiver; receivers [m] have the Shape
     ``[R, 3]``."""
-    place = positions(receivers[several(len(receivers))])
+    place = places(receivers)
 
     def near(beam: Any, receiver: Any) -> Any:
         return beams.light_cone(beam, gathered(place, receiver), 0.0, targets.slack)
@@ -85,7 +86,7 @@ def ends_by_bodies(
     import drjit as dr
 
     beam, face = lit_bodies(targets, beams)
-    place = positions(receivers[several(len(receivers))])
+    place = places(receivers)
 
     def crosses(way: Any, receiver: Any) -> Any:
         image = gathered(beams.image, gathered(beam, way))
@@ -116,7 +117,6 @@ def ends_by_scenery(
         receivers: Positions [m], Shape ``[R, 3]``.
         scenery: Which faces the receivers see.
     """
-    import mitsuba as mi
 
     none = np.zeros(0, np.int64)
     first = beams.first_by_body
@@ -136,12 +136,8 @@ def ends_by_scenery(
     begin = np.cumsum(sizes) - sizes
     own, block = ranges(np.zeros(len(group), np.int64), -(-sizes[group] // _BLOCK))
     start = begin[group[own]] + block * _BLOCK
-    columns = [
-        mi.UInt(aligned_indices(column[several(len(own))]))
-        for column in (view[own], start, (begin + sizes)[group[own]])
-    ]
-    by_group = mi.UInt(aligned_indices(first + order[several(len(order))]))
-    place = positions(receivers[scenery.receiver[several(len(views))]])
+    columns = [indices(column) for column in (view[own], start, (begin + sizes)[group[own]])]
+    by_group, place = indices(first + order), places(receivers[scenery.receiver])
 
     def beam_of(block: Any, number: Any) -> tuple[Any, Any]:
         there = gathered(columns[1], block) + number
@@ -185,10 +181,9 @@ def shown_scenery(targets: Targets, views: Beams, scenery: SceneryViews) -> tupl
     sizes = np.bincount(scenery.sights[:, 0], minlength=len(scenery.faces))
     own, rows = ranges((np.cumsum(sizes) - sizes)[scenery.place], sizes[scenery.place])
     other = scenery.sights[rows, 1]
-    lanes = several(len(own))
-    if not len(lanes):
+    if not len(own):
         return own, other
-    view, face = (mi.UInt(aligned_indices(column[lanes])) for column in (own, scenery.faces[other]))
+    view, face = indices(own), indices(scenery.faces[other])
 
     def near(pair: Any) -> Any:
         shown = gathered(face, pair)
@@ -198,7 +193,7 @@ def shown_scenery(targets: Targets, views: Beams, scenery: SceneryViews) -> tupl
     def lights(pair: Any) -> Any:
         return lights_corner(targets, views, gathered(view, pair), gathered(face, pair))
 
-    kept = dr.compress(near(dr.arange(mi.UInt, len(lanes))))
+    kept = dr.compress(near(dr.arange(mi.UInt, dr.width(view))))
     if dr.width(kept):
         kept = gathered(kept, dr.compress(lights(kept)))
     pair = numbers(kept)

@@ -26,15 +26,18 @@ from caviar_services.channel.enumeration.image_beams import (
     Beams,
     Targets,
     by_scenery,
+    columns,
     filtered,
     first_beams,
     gathered,
+    indices,
     lights_corner,
     lit_bodies,
     longer_beams,
     next_beams,
     numbers,
     pairs,
+    places,
     reflected_beams,
     scenery_beams,
 )
@@ -42,7 +45,6 @@ from caviar_services.channel.enumeration.scene_faces import FaceRectangles
 from caviar_services.channel.propagation.geometry import ranges
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.scene import SionnaScene
-from caviar_services.ray_tracing import aligned_columns, aligned_indices, positions, several
 
 # Edges of scenery over which paths by way of bodies are enumerated; with more, rays look for such paths.
 _FEW = 512
@@ -95,11 +97,10 @@ class EdgeTargets:
         line = self.ends[:, 1] - self.ends[:, 0]
         length = np.sqrt((line**2).sum(1, keepdims=True))
         rows = [self.ends[:, 0], self.ends[:, 1], line / length, length, *np.moveaxis(self.normals, 1, 0)]
-        every = np.concatenate(rows, axis=1)[several(len(self))].T
-        columns = [mi.Float(column) for column in aligned_columns(every)]
-        self.a, self.b, self.along = (mi.Vector3f(*columns[i : i + 3]) for i in (0, 3, 6))
-        self.length = columns[9]
-        self.one, self.other = mi.Vector3f(*columns[10:13]), mi.Vector3f(*columns[13:])
+        column = columns(np.concatenate(rows, axis=1).T)
+        self.a, self.b, self.along = (mi.Vector3f(*column[i : i + 3]) for i in (0, 3, 6))
+        self.length = column[9]
+        self.one, self.other = mi.Vector3f(*column[10:13]), mi.Vector3f(*column[13:])
 
     def __len__(self) -> int:
         return len(self.number)
@@ -121,7 +122,6 @@ class _Groups:
     """Edges in a hierarchy of spheres: pieces, and within these groups of neighbours."""
 
     def __init__(self, edges: EdgeTargets, wanted: BoolArray) -> None:
-        import mitsuba as mi
 
         rows = np.flatnonzero(wanted)
         _, first, sizes = np.unique(edges.piece[rows], return_index=True, return_counts=True)
@@ -139,11 +139,9 @@ class _Groups:
         of, number = ranges(np.zeros(self.pieces, np.int64), counts)
         begin = first[of] + number * _GROUP
         size = np.minimum(first[of] + sizes[of] - begin, _GROUP)
-        self.edge = mi.UInt(aligned_indices(rows[several(len(rows))]))
-        columns = (np.cumsum(counts) - counts, counts, begin, size)
-        self.first_group, self.groups, self.begin, self.size = (
-            mi.UInt(aligned_indices(column[several(len(column))])) for column in columns
-        )
+        self.edge = indices(rows)
+        self.first_group, self.groups = indices(np.cumsum(counts) - counts), indices(counts)
+        self.begin, self.size = indices(begin), indices(size)
         self.piece_sphere, self.group_sphere = (
             _spheres(edges.ends[rows], column) for column in (first, begin)
         )
@@ -151,12 +149,9 @@ class _Groups:
 
 def _spheres(ends: Float64Array, begin: Int64Array) -> tuple[Any, Any]:
     """Centres and radii of spheres around runs of edges that begin at these, in the ray tracer's arrays."""
-    import mitsuba as mi
-
     low, high = np.minimum.reduceat(ends.min(1), begin), np.maximum.reduceat(ends.max(1), begin)
-    some = several(len(begin))
     radius = np.sqrt(((high - low) ** 2).sum(1)) / 2
-    return positions(((low + high) / 2)[some]), mi.Float(aligned_columns(radius[None, some])[0])
+    return places((low + high) / 2), columns(radius[None])[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,7 +258,7 @@ def _from_receivers(
     receiver, place = np.nonzero((height > 0) | faces.two_sided[bodies])
     owner = np.concatenate([views.receiver, receiver])
     chain = np.concatenate([views.faces[views.place], bodies[place]])[:, None]
-    beams = reflected_beams(targets, chain, positions(receivers[owner[several(len(owner))]]), None)
+    beams = reflected_beams(targets, chain, places(receivers[owner]), None)
     yield beams, owner
     for n in range(2, depth):
         if not len(beams):
@@ -291,24 +286,17 @@ def _onward(targets: Targets, beams: Beams, views: SceneryViews) -> tuple[Int64A
 
 def _source_beams(points: Float64Array) -> Beams:
     """Beams without a reflection, which light everything around points [m], Shape ``[N, 3]``."""
-    import mitsuba as mi
-
     count = len(points)
-    lanes = several(count)
-    none = positions(np.zeros((len(lanes), 3)))
-    axis = positions(np.tile([0.0, 0.0, 1.0], (len(lanes), 1)))
-    cosine, lit_from = (
-        mi.Float(aligned_columns(np.full((1, len(lanes)), number))[0]) for number in (-1.0, _EVERYWHERE)
-    )
-    last = mi.UInt(aligned_indices(np.zeros(len(lanes), np.int64)))
+    none = places(np.zeros((count, 3)))
+    cosine, lit_from = columns(np.tile([[-1.0], [_EVERYWHERE]], count))
     return Beams(
         chain=np.zeros((count, 0), np.int64),
         by_body=np.zeros(count, np.bool_),
-        image=positions(points[lanes]),
+        image=places(points),
         sides=(none,),
-        axis=axis,
+        axis=places(np.tile([0.0, 0.0, 1.0], (count, 1))),
         cosine=cosine,
-        last=last,
+        last=indices(np.zeros(count, np.int64)),
         lit=none,
         lit_from=lit_from,
     )
@@ -386,7 +374,6 @@ def _in_beam(targets: Targets, edges: EdgeTargets, beams: Beams, beam: Any, edge
 
 def _meeting(targets: Targets, edges: EdgeTargets, one: _Lit, other: _Lit) -> Iterator[EdgeChains]:
     """Pairs of a beam from each side that meet at an edge within both beams."""
-    import mitsuba as mi
 
     order = np.argsort(other.edge, kind="stable")
     sizes = np.bincount(other.edge, minlength=len(edges))
@@ -402,11 +389,8 @@ def _meeting(targets: Targets, edges: EdgeTargets, one: _Lit, other: _Lit) -> It
         first, second = first[moving], second[moving]
         if not len(first):
             continue
-        lanes = several(len(first))
-        sent, taken, edge = (
-            mi.UInt(aligned_indices(column[lanes]))
-            for column in (one.beam[first], other.beam[second], one.edge[first])
-        )
+        sent, taken = indices(one.beam[first]), indices(other.beam[second])
+        edge = indices(one.edge[first])
         kept = _kept(targets, edges, (one.beams, sent), (other.beams, taken), edge)
         kept = kept[kept < len(first)]
         first, second = first[kept], second[kept]

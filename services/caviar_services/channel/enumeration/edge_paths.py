@@ -11,6 +11,7 @@ from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_services.channel.enumeration.edge_beams import EdgeChains, EdgeTargets
 from caviar_services.channel.enumeration.image_paths import AT_END, OFF_SURFACE, in_front, reflection_points
 from caviar_services.channel.enumeration.scene_faces import FaceRectangles
+from caviar_services.channel.propagation.geometry import Rows
 from caviar_services.channel.propagation.image_method import keller_point
 from caviar_services.channel.propagation.utd import beyond_edges
 from caviar_services.channel.sionna.candidate_visibility import Faces
@@ -18,7 +19,7 @@ from caviar_services.channel.sionna.scene import SionnaScene
 
 
 @dataclass(frozen=True, eq=False)
-class EdgePaths:
+class EdgePaths(Rows):
     """P paths of at most D interactions, one of which is a diffraction."""
 
     chain: Int64Array
@@ -33,17 +34,6 @@ class EdgePaths:
     """Shape ``[P]``."""
     points: Float64Array
     """The receiver behind the last [m], Shape ``[P, D, 3]``."""
-
-    def take(self, which: BoolArray | Int64Array) -> EdgePaths:
-        """These paths."""
-        return EdgePaths(
-            self.chain[which],
-            self.bend[which],
-            self.count[which],
-            self.edge[which],
-            self.receiver[which],
-            self.points[which],
-        )
 
 
 def edge_paths(

@@ -80,6 +80,25 @@ def gathered(column: Any, index: Any) -> Any:
     return dr.gather(type(column), column, index)
 
 
+def indices(values: Int64Array | BoolArray) -> Any:
+    """Indices, Shape ``[N]``, as `mitsuba.UInt`, a single one twice (`several`)."""
+    import mitsuba as mi
+
+    return mi.UInt(aligned_indices(values[several(len(values))]))
+
+
+def columns(rows: Float64Array) -> list[Any]:
+    """Rows, Shape ``[R, N]``, as one `mitsuba.Float` each, of a single number twice (`several`)."""
+    import mitsuba as mi
+
+    return [mi.Float(column) for column in aligned_columns(rows[:, several(rows.shape[1])])]
+
+
+def places(points: Float64Array) -> Any:
+    """Positions, Shape ``[N, 3]``, as `mitsuba.Point3f`, a single one twice (`several`)."""
+    return positions(points[several(len(points))])
+
+
 def opaque(number: int) -> Any:
     """A number that a kernel reads from memory: as a literal, each number would be another kernel."""
     import drjit as dr
@@ -134,15 +153,14 @@ class Targets:
             ],
             axis=1,
         ).T
-        columns = [mi.Float(column) for column in aligned_columns(rows[:, several(len(faces))])]
-        self.normal, self.centre, self.u, self.v = (mi.Vector3f(*columns[i : i + 3]) for i in (0, 3, 6, 9))
-        self.offset, self.radius = columns[12:]
-        self.two_sided = mi.Bool(mi.UInt(aligned_indices(faces.two_sided[several(len(faces))])))
-        some = several(self.bodies)
-        self.body_centre = positions(centre[some])
-        self.body_radius = mi.Float(aligned_columns(reach[None, some])[0])
+        column = columns(rows)
+        self.normal, self.centre, self.u, self.v = (mi.Vector3f(*column[i : i + 3]) for i in (0, 3, 6, 9))
+        self.offset, self.radius = column[12:]
+        self.two_sided = mi.Bool(indices(faces.two_sided))
+        self.body_centre = places(centre)
+        self.body_radius = columns(reach[None])[0]
         begin = self.first_body + np.cumsum(sizes) - sizes
-        self.body_begin, self.body_size = (mi.UInt(aligned_indices(part[some])) for part in (begin, sizes))
+        self.body_begin, self.body_size = indices(begin), indices(sizes)
         slack = _SLACK + _RELATIVE_SLACK * float(np.abs(faces.centre).max(initial=0.0))
         self.slack = dr.opaque(mi.Float, slack)
         """By which every target is larger in tests [m], as an opaque `mitsuba.Float`."""
@@ -244,8 +262,7 @@ def first_beams(targets: Targets, source: Float64Array, scenery: Int64Array) -> 
     bodies = np.arange(targets.first_body, len(faces))
     shown = faces.height(np.broadcast_to(source, (len(bodies), 3)), bodies) > 0
     first = np.concatenate([scenery, bodies[shown | faces.two_sided[bodies]]])
-    image = positions(np.broadcast_to(source, (len(several(len(first))), 3)))
-    return reflected_beams(targets, first[:, None], image, None)
+    return reflected_beams(targets, first[:, None], places(np.tile(source, (len(first), 1))), None)
 
 
 def next_beams(targets: Targets, beams: Beams, scenery: Int64Array, known: Int64Array) -> Beams:
@@ -283,18 +300,15 @@ def scenery_beams(targets: Targets, beams: Beams, known: Int64Array) -> Beams:
 
 def longer_beams(targets: Targets, beams: Beams, parent: Int64Array, chain: Int64Array) -> Beams:
     """Beams of chains, Shape ``[B, n + 1]``, each one face longer than the chain of its parent beam."""
-    import mitsuba as mi
-
-    index = mi.UInt(aligned_indices(parent[several(len(parent))]))
+    index = indices(parent)
     return reflected_beams(targets, chain, gathered(beams.image, index), gathered(beams.last, index))
 
 
 def by_scenery(targets: Targets, beams: Beams, scenery: Int64Array) -> tuple[Any, Any]:
     """Pairs of a beam by way of a body and a face of scenery that it lights, as `mitsuba.UInt`."""
     import drjit as dr
-    import mitsuba as mi
 
-    faces = mi.UInt(aligned_indices(scenery[several(len(scenery))]))
+    faces = indices(scenery)
     begin = beams.first_by_body
     first = opaque(begin)
 
@@ -355,11 +369,10 @@ def reflected_beams(targets: Targets, chain: Int64Array, image: Any, before: Any
         before: Face of the reflection before that one, which bounds the beam, too; None: there is none.
     """
     import drjit as dr
-    import mitsuba as mi
 
     if not len(chain):  # kernels of no lanes do not exist
         return Beams(chain, np.zeros(0, np.bool_), None, (), None, None, None, None, None)
-    last = mi.UInt(aligned_indices(chain[several(len(chain)), -1]))
+    last = indices(chain[:, -1])
     normal, offset = gathered(targets.normal, last), gathered(targets.offset, last)
 
     def mirrored(point: Any) -> Any:

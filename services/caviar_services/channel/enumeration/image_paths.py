@@ -18,6 +18,7 @@ from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_services.channel.enumeration.beam_ends import ChainPairs
 from caviar_services.channel.enumeration.scene_faces import FaceRectangles
 from caviar_services.channel.propagation.fresnel import slab
+from caviar_services.channel.propagation.geometry import Rows
 from caviar_services.channel.sionna.candidate_visibility import Faces
 from caviar_services.channel.sionna.coplanar_faces import COPLANAR, COPLANAR_RELATIVE
 from caviar_services.channel.sionna.materials import DRAWN
@@ -35,7 +36,7 @@ AT_END = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class ImagePaths:
+class ImagePaths(Rows):
     """P paths of at most D reflections."""
 
     chain: Int64Array
@@ -44,10 +45,6 @@ class ImagePaths:
     """Index of the receiver, Shape ``[P]``."""
     points: Float64Array
     """Points of the reflections, the receiver's position behind the last [m], Shape ``[P, D, 3]``."""
-
-    def take(self, which: BoolArray | Int64Array) -> ImagePaths:
-        """These paths."""
-        return ImagePaths(self.chain[which], self.receiver[which], self.points[which])
 
 
 def image_paths(
@@ -205,7 +202,7 @@ _PASSED_TWICE = 2
 
 
 @dataclass(frozen=True, eq=False)
-class Crossings:
+class Crossings(Rows):
     """M places where segments of paths go through a surface, along each path in turn."""
 
     path: Int64Array
@@ -275,10 +272,8 @@ def crossings(
     path = segments.path[rows]
     count = np.bincount(path, minlength=len(good))
     good &= (count <= most) & (count > 0)
-    kept = good[path]
-    order = np.lexsort((along[kept], segments.number[rows[kept]], path[kept]))
-    columns = (path, segments.number[rows], along, points, triangle)
-    return Crossings(*(column[kept][order] for column in columns)), good
+    places = Crossings(path, segments.number[rows], along, points, triangle).take(good[path])
+    return places.take(np.lexsort((places.along, places.segment, places.path))), good
 
 
 @dataclass(frozen=True, eq=False)

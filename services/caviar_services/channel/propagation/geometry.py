@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from caviar_protocol.arrays import Float64Array, Int64Array
+from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
+
+
+class Rows:
+    """Base of dataclasses whose fields are arrays with a row for each of the same things."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    def take(self, which: Int64Array | BoolArray) -> Self:
+        """These rows, by index in this order, or by a mask."""
+        return type(self)(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
 
 
 def cross(one: Float64Array, other: Float64Array) -> Float64Array:

@@ -40,7 +40,7 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int64Array, UInt8Array
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.propagation.fresnel import Media, Wall
-from caviar_services.channel.propagation.geometry import unit
+from caviar_services.channel.propagation.geometry import Rows, unit
 
 IN_PLANE = 1e-8
 """[rad]; a ray this near the plane of a face is in it, and this near a shadow boundary on its lit side."""
@@ -54,7 +54,7 @@ _SIGN = -1.0
 
 
 @dataclass(frozen=True, eq=False)
-class Faces:
+class Faces(Rows):
     """The two faces of P wedges; the first of them is counted from."""
 
     normals: Float64Array
@@ -69,10 +69,6 @@ class Faces:
         cosine, sine = -(first * second).sum(-1), _sine(first, second)
         exterior: Float64Array = 2 * np.pi - np.arctan2(sine, cosine)
         return exterior
-
-    def take(self, which: Int64Array | BoolArray) -> Faces:
-        """Those of these wedges."""
-        return Faces(self.normals[which], self.edge[which])
 
     def turned(self, swap: BoolArray) -> Faces:
         """The same, counted from the other face where ``swap`` is true."""
