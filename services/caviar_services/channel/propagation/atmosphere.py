@@ -17,7 +17,7 @@ from caviar_protocol.errors import ScenarioError
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 
 FREQUENCIES_GHZ = (1.0, 1000.0)
-"""Where Annex 1 is defined."""
+"""Lowest and highest frequency that Annex 1 is defined for [GHz]."""
 
 # ρ·T/e of water vapour [g·K/(m³·hPa)] (eq. 4).
 _SPECIFIC_GAS = 216.7
@@ -41,9 +41,21 @@ class Atmosphere(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
 
 def specific_attenuation(atmosphere: Atmosphere, frequency_hz: float) -> float:
-    """γ [dB/km] of air at a frequency (P.676-13, eq. 1).
+    """Specific attenuation γ of air (P.676-13, eq. 1).
 
-    Raises `ScenarioError` outside 1 to 1000 GHz.
+    Args:
+        atmosphere: Temperature, pressure and humidity.
+        frequency_hz: From 1 to 1000 GHz [Hz].
+
+    Returns:
+        γ [dB/km].
+
+    Raises:
+        ScenarioError: The frequency is outside of that range.
+
+    Example:
+        >>> round(specific_attenuation(Atmosphere(), 60e9), 1)  # the oxygen lines around 60 GHz
+        14.8
     """
     f = frequency_hz / 1e9
     low, high = FREQUENCIES_GHZ
@@ -60,7 +72,7 @@ def specific_attenuation(atmosphere: Atmosphere, frequency_hz: float) -> float:
 
 
 def amplitude_factor(db_per_km: Float64Array, tau: Float64Array) -> Float64Array:
-    """What absorption leaves of amplitudes: 10^(−γ·d/20) with d = c·τ.
+    """Factors of amplitudes by absorption: 10^(−γ·d/20) with d = c·τ.
 
     Args:
         db_per_km: γ of each carrier [dB/km], Shape ``[C]``.

@@ -64,12 +64,12 @@ class Boxes:
 
 
 CLEARANCE = 0.02
-"""[m]"""
+"""[m] from a surface that an antenna is traced from at least."""
 
 NEAR_PAIR = 0.05
 """[m]; pairs nearer than this have their line of sight by formula, not from the ray tracer."""
 
-# [m]; nearer to a surface, the side that an antenna is on is not told by its position.
+# [m]; nearer to a surface, rounding of the position decides which side an antenna is on.
 _ON_SURFACE = 1e-6
 
 # [m] beyond the edges of a triangle that still are at it.
@@ -83,7 +83,7 @@ _RISING = np.stack([np.cos(_TURNS), np.sin(_TURNS), np.tan(_RISES)], axis=-1)
 
 
 class Surfaces:
-    """Triangles, to be asked what is near a point and what stands in the way.
+    """Triangles of a scene: which are near a point, on a segment, above a point.
 
     Args:
         triangles: Corners [m], Shape ``[F, 3, 3]``.
@@ -96,13 +96,13 @@ class Surfaces:
         self._low, self._high = np.moveaxis(_boxes(self._triangles), -1, 0)
 
     def move(self, rows: Int64Array, triangles: Float64Array) -> None:
-        """Put triangles in the place of those of these numbers."""
+        """Replace the triangles of these numbers, Shape ``[N]``, by others [m], Shape ``[N, 3, 3]``."""
         self._triangles[rows] = triangles
         boxes = _boxes(triangles)
         self._low[:, rows], self._high[:, rows] = boxes[..., 0], boxes[..., 1]
 
     def cleared(self, position: Float64Array) -> Float64Array:
-        """The position [m], Shape ``[3]``, moved away from surfaces that it is at."""
+        """A position [m], Shape ``[3]``, moved to `CLEARANCE` from surfaces that it is nearer to."""
         for index in self._within(position, position, CLEARANCE).tolist():
             corners = self._triangles[index]
             normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
@@ -135,7 +135,8 @@ class Surfaces:
         return False
 
     def met_between(self, start: Float64Array, end: Float64Array) -> Int64Array:
-        """Triangles on the segment between two points [m], nearest first: each to its very border."""
+        """Triangles on the segment between two points [m], nearest first, without a margin at their
+        borders."""
         near = self._within(np.minimum(start, end), np.maximum(start, end), 0.0)
         behind = set(_met(self._triangles[near], end, end - start).tolist())
         met = [row for row in _met(self._triangles[near], start, end - start).tolist() if row not in behind]
@@ -207,8 +208,14 @@ def _covers(corners: Float64Array, normal: Float64Array, foot: Float64Array) -> 
 def spread_anew(
     transfer: Complex128Array, specular: BoolArray, traced: Float64Array, length: Float64Array
 ) -> Complex128Array:
-    """Dyads ``[C, P, 3, 3]`` of paths that were traced with one length [m] and have another, Shape ``[P]``:
-    the field of a specular path falls as one over its length."""
+    """Dyads of paths that were traced with one length and have another.
+
+    Args:
+        transfer: As traced, Shape ``[C, P, 3, 3]``.
+        specular: Paths of reflections and transmissions, whose field falls as one over the length, ``[P]``.
+        traced: Length as traced [m], Shape ``[P]``.
+        length: Length of the path [m], Shape ``[P]``.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         factor = np.where(specular & (length > 0), traced / length, 1.0)
     scaled: Complex128Array = transfer * factor[None, :, None, None]
@@ -223,11 +230,21 @@ def with_near_pairs(
     wavelengths: Float64Array,
     surfaces: Surfaces,
 ) -> tuple[PathTable, int]:
-    """Paths with the lines of sight of near pairs by formula, and how many pairs are too close for one.
+    """Paths with the lines of sight of near pairs by formula.
 
-    A pair closer than one wavelength of a carrier is outside the far field that λ/(4πd) holds in, and has
-    no direct path; what surfaces bring from one to the other stays. ``los``, Shape ``[T·R]``, is corrected
-    in place.
+    A pair closer than one wavelength of a carrier is outside of the far field in which λ/(4πd) holds, and has
+    no direct path; paths by way of surfaces stay.
+
+    Args:
+        table: Paths of all pairs.
+        los: Whether the line of sight of each pair is free, Shape ``[T·R]``; corrected in place.
+        transmitters: T antennas.
+        receivers: R antennas.
+        wavelengths: Of the carriers [m], Shape ``[C]``.
+        surfaces: Of the scene.
+
+    Returns:
+        The paths, and the number of pairs that are too close for a direct one.
     """
     start = np.array([antenna.position for antenna in transmitters]).reshape(-1, 1, 3)
     end = np.array([antenna.position for antenna in receivers]).reshape(1, -1, 3)
@@ -256,7 +273,15 @@ def with_near_pairs(
 def with_direct(
     table: PathTable, pairs: Int64Array, hidden: BoolArray, distance: Float64Array, wavelengths: Float64Array
 ) -> PathTable:
-    """The table and a direct path for each of these N pairs, over these distances [m]."""
+    """Paths with a direct one for each of N more pairs.
+
+    Args:
+        table: Paths.
+        pairs: Numbers of the pairs, Shape ``[N]``.
+        hidden: Whether only elements beside the centres have the direct path, Shape ``[N]``.
+        distance: Of each pair [m], Shape ``[N]``.
+        wavelengths: Of the carriers [m], Shape ``[C]``.
+    """
     depth = table.types.shape[1]
     spreading = wavelengths[:, None] / (4 * np.pi * distance)
     made = spreading[:, :, None, None] * np.eye(3, dtype=np.complex128)

@@ -5,12 +5,11 @@ with the length d within it [m], the specific attenuation γ [dB/m] for very sho
 attenuation A_m [dB] of what arrives by other ways than straight through. Without a maximum that is γ·d.
 Amplitudes fall by 10^(−A/20), phases and directions stay.
 
-Volumes within closed meshes, and how far straight lines run inside of them, in float64.
-
-A point is inside where the surfaces around it wind about it: a line that enters as often as it leaves is
-outside (winding number, here of the crossings before a point). So surfaces may overlap and enclose cavities.
-A line through an edge or a corner crosses what a line infinitesimally beside it crosses (H. Edelsbrunner and
-E. P. Mücke, "Simulation of simplicity", ACM Trans. Graph. 9(1), 1990).
+The length d is that of a straight line within closed meshes (`MeshVolumes`), in float64. A point is inside
+where the surfaces around it wind about it: a line that enters as often as it leaves is outside (winding
+number, here of the crossings before a point). So surfaces may overlap and enclose cavities. A line through an
+edge or a corner crosses what a line infinitesimally beside it crosses (H. Edelsbrunner and E. P. Mücke,
+"Simulation of simplicity", ACM Trans. Graph. 9(1), 1990).
 """
 
 from __future__ import annotations
@@ -44,11 +43,16 @@ _AT_ONCE = 1 << 16
 
 
 def outward(mesh: Mesh) -> Float64Array:
-    """Corners [m] of a closed mesh's triangles, Shape ``[F, 3, 3]``, as seen from outside counter-clockwise.
+    """Triangles of a closed mesh, all with their outside in front.
 
-    Corners at exactly one place are one.
+    Args:
+        mesh: Corners at exactly one place count as one.
 
-    Raises `ValueError` that says how many edges are open, or have both triangles on one side.
+    Returns:
+        Corners [m], counter-clockwise as seen from outside, Shape ``[F, 3, 3]``.
+
+    Raises:
+        ValueError: Edges are open, or have both triangles on one side; says how many.
     """
     _, place = np.unique(mesh.vertices, axis=0, return_inverse=True)
     corners = place.reshape(-1)[mesh.faces]
@@ -79,7 +83,11 @@ class MeshVolumes:
 
     @classmethod
     def of(cls, surfaces: Sequence[tuple[Float64Array, int]]) -> MeshVolumes:
-        """Within surfaces (`outward`), each around a volume of a kind."""
+        """Volumes within surfaces.
+
+        Args:
+            surfaces: Triangles of each (`outward`), and the kind of its volume.
+        """
         triangles = np.concatenate([np.zeros((0, 3, 3)), *(corners for corners, _ in surfaces)])
         kind = np.repeat(
             np.array([kind for _, kind in surfaces], np.int64), [len(corners) for corners, _ in surfaces]
@@ -103,11 +111,17 @@ class MeshVolumes:
     def crossings(
         self, start: Float64Array, direction: Float64Array
     ) -> Iterator[tuple[Int64Array, Int64Array, Float64Array, Int64Array]]:
-        """Where lines through Q points along Q directions, Shape ``[Q, 3]``, enter and leave.
+        """Where lines enter and leave volumes.
 
-        Yields of some lines at a time: line, kind, multiple of the direction, and 1 for entering or −1 for
-        leaving, Shape ``[N]`` each. Left out are lines that miss all volumes from 0 to 1 or are not finite,
-        and some crossings beyond 1.
+        Args:
+            start: A point of each of Q lines [m], Shape ``[Q, 3]``.
+            direction: Along each line [m], Shape ``[Q, 3]``.
+
+        Yields:
+            For some lines at a time: line, kind, multiple of the direction, and 1 for entering or −1 for
+                leaving,
+            Shape ``[N]`` each. Left out are lines that miss all volumes from 0 to 1 or are not finite, and
+            some crossings beyond 1.
         """
         if not len(self.kind):
             return
@@ -137,12 +151,13 @@ class MeshVolumes:
 def lengths_inside(
     volumes: Sequence[MeshVolumes], start: Float64Array, end: Float64Array, kinds: int
 ) -> Float64Array:
-    """How far each of Q segments runs within the union of all volumes of each of K kinds.
+    """Lengths of segments within the union of all volumes of each kind.
 
     Args:
         volumes: Of all kinds, numbered from 0.
-        start, end: Of the segments [m], Shape ``[Q, 3]``.
-        kinds: K.
+        start: Start of each of Q segments [m], Shape ``[Q, 3]``; ``end`` likewise.
+        end: See ``start``.
+        kinds: Number of kinds, K.
 
     Returns:
         Lengths [m], Shape ``[Q, K]``.
@@ -280,7 +295,7 @@ class FoliageKind:
     """Of the values, by carrier."""
 
     def attenuation_db(self, length: Float64Array) -> Float64Array:
-        """A [dB], Shape ``[C, P]``, of paths that run over these lengths [m] within it, Shape ``[P]``
+        """Attenuation A [dB], Shape ``[C, P]``, of paths of these lengths within it [m], Shape ``[P]``
         (P.833-10, eq. 1)."""
         straight: Float64Array = self.attenuation_db_per_m[:, None] * length
         most = np.where(np.isfinite(self.maximum_db), self.maximum_db, 1.0)[:, None]
@@ -288,7 +303,7 @@ class FoliageKind:
         return np.where(np.isfinite(self.maximum_db)[:, None], saturating, straight)
 
     def briefs(self, carriers: Sequence[Carrier]) -> tuple[str, ...]:
-        """What products state of it, carrier by carrier."""
+        """Lines that products state about it, carrier by carrier."""
         return tuple(
             f"{self.key}@{carrier.name}: {gamma:g} dB/m"
             + (f", at most {most:g} dB" if np.isfinite(most) else "")
@@ -300,7 +315,7 @@ class FoliageKind:
 
 
 class Foliage:
-    """What of a scene is foliage, and what paths lose in it.
+    """The foliage of a scene, and the attenuation of paths in it.
 
     The volume of a piece of scenery is within its mesh, that of an object is its bounding box. A path loses,
     to each kind, A of the length that all of its legs run within the union of all volumes of this kind.
@@ -335,7 +350,14 @@ class Foliage:
         self._still = self._moving = MeshVolumes.of([])
 
     def stand(self, pieces: Mapping[str, Mesh]) -> None:
-        """Let these pieces of scenery be foliage, by name. Raises `AssetError` for one that is not closed."""
+        """Take pieces of scenery for foliage.
+
+        Args:
+            pieces: Meshes by name; a name has the kind that the settings give it.
+
+        Raises:
+            AssetError: A mesh is not closed.
+        """
         surfaces = []
         for name, mesh in pieces.items():
             try:
@@ -348,7 +370,7 @@ class Foliage:
         self._still = MeshVolumes.of(surfaces)
 
     def move(self, scene: Scene) -> None:
-        """Let the foliage among the objects of a scene be where they are."""
+        """Move the foliage among the objects of a scene to where they are."""
         boxes = [
             (placed(self._box, scene.dimensions[i], object_pose(scene, i))[self._box.faces], kind)
             for i, (name, cls) in enumerate(zip(scene.names, scene.classes, strict=True))
@@ -359,11 +381,16 @@ class Foliage:
     def amplitude_factor(
         self, start: Float64Array, points: Float64Array, end: Float64Array, types: UInt8Array
     ) -> Float64Array:
-        """What foliage leaves of amplitudes: 10^(−A/20), Shape ``[C, P]``.
+        """Factors of amplitudes by foliage: 10^(−A/20).
 
         Args:
-            start, end: TX and RX position of each path [m], Shape ``[P, 3]``.
-            points, types: As in `PathTable`, Shape ``[P, D, 3]`` and ``[P, D]``.
+            start: Position of TX of each path [m], Shape ``[P, 3]``; ``end`` that of RX.
+            points: As in `PathTable`, Shape ``[P, D, 3]``; ``types`` of Shape ``[P, D]``.
+            end: See ``start``.
+            types: See ``points``.
+
+        Returns:
+            Factors of Shape ``[C, P]``.
         """
         corners = path_corners(start, points, end, (types != 0).sum(1))
         paths, legs = len(corners), corners.shape[1] - 1
@@ -374,7 +401,7 @@ class Foliage:
         return 10 ** (-np.asarray(lost) / 20)
 
     def attenuated(self, table: PathTable, start: Float64Array, end: Float64Array) -> PathTable:
-        """The paths, between these positions [m], Shape ``[P, 3]``, with what foliage leaves of them."""
+        """Paths with the attenuation by foliage; positions of TX and RX of each [m], Shape ``[P, 3]``."""
         factor = self.amplitude_factor(start, table.points, end, table.types)
         return replace(table, transfer=_scaled(table.transfer, factor))
 

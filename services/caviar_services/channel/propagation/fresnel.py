@@ -51,7 +51,7 @@ def slab(
 
 @dataclass(frozen=True, eq=False)
 class Media:
-    """What surfaces at the interactions of P paths are made of, on C carriers."""
+    """Materials of the surfaces at the interactions of P paths, on C carriers."""
 
     permittivity: Float64Array
     """Relative, Shape ``[C, P, D]``."""
@@ -75,12 +75,12 @@ class Wall:
 
     @classmethod
     def of(cls, media: Media, carrier: int, d: int, wavelength: float) -> Wall:
-        """What is at interaction ``d`` of paths."""
+        """Slabs at interaction ``d`` of paths on a carrier, by its index and wavelength [m]."""
         constants = media.permittivity[carrier, :, d], media.conductivity[carrier, :, d]
         return cls(*constants, media.thickness[:, d], media.scattering[:, d], wavelength)
 
     def where(self, which: BoolArray, other: Wall) -> Wall:
-        """These where ``which`` is true, and elsewhere those of another."""
+        """These slabs where ``which`` is true, and those of another elsewhere."""
         return Wall(
             np.where(which, self.permittivity, other.permittivity),
             np.where(which, self.conductivity, other.conductivity),
@@ -90,7 +90,7 @@ class Wall:
         )
 
     def take(self, rows: Int64Array) -> Wall:
-        """Those of these rays."""
+        """Slabs of these rays."""
         return Wall(
             self.permittivity[rows],
             self.conductivity[rows],
@@ -100,7 +100,16 @@ class Wall:
         )
 
     def dyad(self, k: Float64Array, normal: Float64Array, through: BoolArray) -> Complex128Array:
-        """From the field that comes in along ``k`` to what is reflected, or goes through."""
+        """Dyads from the incoming field to the reflected one, or to that which goes through.
+
+        Args:
+            k: Unit vectors along incoming waves, Shape ``[P, 3]``.
+            normal: Unit normals, Shape ``[P, 3]``.
+            through: Waves that go through, Shape ``[P]``; the others are reflected, weaker by what scatters.
+
+        Returns:
+            Dyads of Shape ``[P, 3, 3]``.
+        """
         across = (k * normal).sum(-1)
         frequency = SPEED_OF_LIGHT / self.wavelength
         back, passed = slab(np.abs(across), (self.permittivity, self.conductivity), self.thickness, frequency)
@@ -118,16 +127,18 @@ def reflection_fields(
     media: Media,
     wavelengths: Sequence[float],
 ) -> Complex128Array:
-    """Dyads of `PathTable`, Shape ``[C, P, 3, 3]``, with the spreading of the paths' lengths.
+    """Fields of reflected and transmitted paths.
 
     Args:
-        corners: TX, points of interactions, and RX in all places behind the last one [m], Shape ``[P, D + 2,
-            3]``.
+        corners: TX, points of interactions, and RX in all places behind the last one [m], ``[P, D + 2, 3]``.
         count: Interactions of each path, Shape ``[P]``.
-        normals: Unit, of the plane at each point, Shape ``[P, D, 3]``.
+        normals: Unit normal of the plane at each point, Shape ``[P, D, 3]``.
         through: Which of them let the wave through, Shape ``[P, D]``; the others reflect it.
-        media: At each point.
+        media: Materials at each point.
         wavelengths: Of the carriers [m].
+
+    Returns:
+        Dyads of `PathTable` with the spreading λ/(4πd) of the paths' lengths, Shape ``[C, P, 3, 3]``.
     """
     steps = np.diff(corners, axis=1)
     lengths = np.sqrt(np.einsum("pdc,pdc->pd", steps, steps))
@@ -154,7 +165,7 @@ def reflection_fields(
 
 
 def _perpendicular(k: Float64Array, normal: Float64Array) -> Float64Array:
-    """A direction across both; any across ``k`` where both are one."""
+    """Directions across both vectors; any direction across ``k`` where both are parallel."""
     across = cross(k, normal)
     axis = np.eye(3)[np.argmin(np.abs(k), axis=-1)]
     lost = (across**2).sum(-1, keepdims=True) < _ALONG**2

@@ -1,4 +1,5 @@
-"""Delays, directions and Doppler shifts of paths from their corner points; vector products; in float64."""
+"""Geometry in float64: delays, directions and Doppler shifts of paths from their corner points; vectors and
+rows."""
 
 from __future__ import annotations
 
@@ -22,8 +23,8 @@ class Rows:
 
 
 def cross(one: Float64Array, other: Float64Array) -> Float64Array:
-    """Cross products of vectors of one shape, ``[…, 3]``: to the bit those of NumPy, in less than half of its
-    time."""
+    """Cross products of vectors of one shape, ``[…, 3]``."""
+    # To the bit those of `numpy.cross`, in less than half of its time.
     product = np.empty(one.shape)
     for axis in range(3):
         i, j = (axis + 1) % 3, (axis + 2) % 3
@@ -37,14 +38,26 @@ def unit(vectors: Float64Array) -> Float64Array:
 
 
 def ranges(begin: Int64Array, sizes: Int64Array) -> tuple[Int64Array, Int64Array]:
-    """The numbers of N ranges, one range after the other: the range that each is of, and the numbers."""
+    """All numbers of N ranges, one range after the other.
+
+    Args:
+        begin: First number of each range, Shape ``[N]``.
+        sizes: Count of numbers of each range, Shape ``[N]``.
+
+    Returns:
+        The range that each number is of, and the numbers.
+
+    Example:
+        >>> [part.tolist() for part in ranges(np.array([5, 0]), np.array([2, 3]))]
+        [[0, 0, 1, 1, 1], [5, 6, 0, 1, 2]]
+    """
     own = np.repeat(np.arange(len(begin)), sizes)
     return own, np.arange(len(own)) - np.repeat(np.cumsum(sizes) - sizes - begin, sizes)
 
 
 @dataclass(frozen=True, eq=False)
 class PathGeometry:
-    """What follows from the corner points of P paths."""
+    """Delays, directions and Doppler shifts of P paths."""
 
     tau: Float64Array
     """Absolute delay [s], Shape ``[P]``."""
@@ -68,10 +81,13 @@ def path_geometry(
     """Geometry of paths start → points → end.
 
     Args:
-        start, end: TX and RX position of each path [m], Shape ``[P, 3]``; likewise their velocities [m/s].
-        points: Interaction points [m], Shape ``[P, D, 3]``; entries from ``count`` on are ignored. Likewise
-            ``point_velocity``, the velocity [m/s] of what stands at each point.
+        start: Position of TX of each path [m], Shape ``[P, 3]``; ``end`` that of RX.
+        points: Interaction points [m], Shape ``[P, D, 3]``; entries from ``count`` on are ignored.
+        end: See ``start``.
         count: Number of interactions of each path, Shape ``[P]``.
+        start_velocity: Of TX [m/s], Shape ``[P, 3]``; ``end_velocity`` that of RX.
+        point_velocity: Of the surface at each point [m/s], Shape ``[P, D, 3]``.
+        end_velocity: See ``start_velocity``.
 
     Doppler shift to first order in v/c, with unit vector k_i of the segment behind corner i:
     f_D / f = Σ_i (v_i − v_{i+1})·k_i / c (a source that approaches raises the frequency).

@@ -1,4 +1,4 @@
-"""Interaction points in float64: of planes by images, of edges by Keller's law.
+"""The image method: interaction points in float64, at planes by images, at edges by Keller's law.
 
 A ray tracer's points are float32: some 1e-5 m at 100 m, which is 0.01 rad of phase at 60 GHz and grows with
 the coordinates. Which triangles a path meets is known exactly, so its points can be computed again:
@@ -55,8 +55,9 @@ def refined_points(
     traced one) stays as traced.
 
     Args:
-        start, end: TX and RX position [m], Shape ``[P, 3]``.
+        start: Position of TX [m], Shape ``[P, 3]``; ``end`` that of RX.
         points: Traced points [m], Shape ``[P, D, 3]``.
+        end: See ``start``.
         types: `Interaction` at each, Shape ``[P, D]``; diffraction at most once in a path.
         triangles: Corners [m] of the triangle at each interaction, Shape ``[P, D, 3, 3]``.
         edges: Both ends [m] of the edge of each path that is diffracted, Shape ``[P, 2, 3]``; None: none is.
@@ -85,10 +86,23 @@ def refined_points(
 def image_points(
     start: Float64Array, end: Float64Array, types: UInt8Array, origin: Float64Array, normal: Float64Array
 ) -> Float64Array:
-    """Points where paths start → end meet their planes, Shape ``[P, D, 3]``; 0 where ``types`` is.
+    """Points where paths of reflections and transmissions meet their planes, by images.
 
-    The parameters are those of `refined_points`, with a point and the normal of each plane, without
-    diffraction and scattering. Not finite at a plane seen edge-on.
+    Args:
+        start: Position of TX [m], Shape ``[P, 3]``; ``end`` that of RX.
+        end: See ``start``.
+        types: `Interaction` at each point, 0 behind the last, Shape ``[P, D]``.
+        origin: A point of each plane [m], Shape ``[P, D, 3]``.
+        normal: Of each plane, of any length, Shape ``[P, D, 3]``.
+
+    Returns:
+        Points [m], Shape ``[P, D, 3]``: 0 behind the last one, not finite at a plane seen edge-on.
+
+    Example:
+        >>> ends = np.array([[0.0, 0.0, 1.0]]), np.array([[4.0, 0.0, 3.0]])
+        >>> ground = np.zeros((1, 1, 3)), np.array([[[0.0, 0.0, 1.0]]])
+        >>> image_points(*ends, np.array([[Interaction.REFLECTION]], np.uint8), *ground).tolist()
+        [[[1.0, 0.0, 0.0]]]
     """
     nowhere = np.zeros((*types.shape, 3))
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -99,7 +113,8 @@ def image_points(
 def path_lengths(
     start: Float64Array, points: Float64Array, end: Float64Array, types: UInt8Array
 ) -> Float64Array:
-    """Lengths [m] of the paths start → points → end, Shape ``[P]``."""
+    """Lengths [m] of the paths start → points → end, Shape ``[P]``; the arguments are those of
+    `refined_points`."""
     unused = (types == 0)[..., None]
     corners = np.concatenate([start[:, None], np.where(unused, end[:, None], points), end[:, None]], axis=1)
     length: Float64Array = np.sqrt((np.diff(corners, axis=1) ** 2).sum(-1)).sum(-1)
@@ -159,6 +174,7 @@ def _traced_back(
         met = here + _not_nothing(along[:, None] * line, line)
         met = np.where(_is_fixed(kind), fixed[:, d], met)
         if d == 0:
+            # The first segment of a reflected path runs from the start itself, which may be on the surface.
             out = here - met
             in_ = out - 2 * (out * normal[:, 0]).sum(-1, keepdims=True) / _square(normal[:, 0]) * normal[:, 0]
             met = np.where(kind == Interaction.REFLECTION, start + _not_nothing(met - start, in_), met)
@@ -170,7 +186,7 @@ def _traced_back(
 def _same(
     start: Float64Array, traced: Float64Array, found: Float64Array, end: Float64Array, types: UInt8Array
 ) -> BoolArray:
-    """Whether what was found is the path that was traced, but for rounding."""
+    """Whether the points found are those of the traced path, except for rounding."""
     shift = np.where(types != 0, np.abs(found - traced).max(-1), 0.0).max(-1)
     length = path_lengths(start, traced, end, types)
     longer = np.abs(path_lengths(start, found, end, types) - length)
@@ -208,11 +224,17 @@ def _square(vectors: Float64Array) -> Float64Array:
 
 
 def keller_point(source: Float64Array, target: Float64Array, edges: Float64Array) -> Float64Array:
-    """Where the shortest path from source to target over the line of an edge meets it [m].
+    """Points where the shortest paths over the lines of edges meet them: both rays make the same angle with
+    the edge.
 
     Args:
-        source, target: [m], Shape ``[P, 3]``.
-        edges: Both ends of each [m], Shape ``[P, 2, 3]``.
+        source: Start of each path, or its image [m], Shape ``[P, 3]``; ``target`` the end.
+        target: See ``source``.
+        edges: Both ends of each edge [m], Shape ``[P, 2, 3]``.
+
+    Returns:
+        Points [m], Shape ``[P, 3]``, beyond an end of the edge or not; not finite where source and target are
+        both on the line.
     """
     origin, along = edges[:, 0], edges[:, 1] - edges[:, 0]
     along = along / np.sqrt(_square(along))
@@ -225,14 +247,24 @@ def keller_point(source: Float64Array, target: Float64Array, edges: Float64Array
 
 
 def distinct(pair: Int64Array, types: UInt8Array, points: Float64Array) -> BoolArray:
-    """Which paths are no repetition of one before, Shape ``[P]``, from pairs, types and refined points.
+    """Paths that do not repeat an earlier one.
 
     A ray tracer that takes two triangles of one wall for two planes finds one reflection twice. Paths with
     scattering are samples, and each counts.
+
+    Args:
+        pair: TX and RX of each path as one number, Shape ``[P]``.
+        types: `Interaction` at each point, Shape ``[P, D]``.
+        points: Refined points [m], Shape ``[P, D, 3]``.
+
+    Returns:
+        Which paths are kept, Shape ``[P]``.
     """
     kept: BoolArray = (types == Interaction.SCATTERING).any(1)
     some = np.flatnonzero(~kept)
     used = (types[some] != 0)[..., None]
+    # The grid is off the origin by an odd part of a cell: coordinates are often round numbers, and would lie
+    # on the border of two cells.
     cells = np.where(used, np.floor(points[some] / _SAME_PLACE + 0.271828), 0.0)
     keys = np.concatenate(
         [pair[some, None], types[some], cells.reshape(len(some), 3 * types.shape[1])], axis=1

@@ -1,4 +1,4 @@
-"""What one antenna element radiates, as a field vector in world axes."""
+"""Antenna patterns: the far field of one element, as a vector in world axes."""
 
 from __future__ import annotations
 
@@ -19,14 +19,24 @@ Field = Float64Array | Complex128Array
 """Complex where an element is circularly polarized, or its file says so."""
 
 
-# [dBi]; mean gain over the sphere that is not remarked on: files round, and sum cuts.
+# [dBi]; mean gain over the sphere up to which no note is made: files round their values.
 _TOLERANCE_DBI = 2.0
 
 
 def spherical_basis(directions: Float64Array, pole: float = 0.0) -> tuple[Float64Array, Float64Array]:
-    """Unit vectors θ̂ and φ̂ at unit vectors ``directions``; each of Shape ``[..., 3]``.
+    """Unit vectors θ̂ and φ̂ of spherical coordinates.
 
-    Where the horizontal part is not longer than ``pole``, they are those of azimuth 0.
+    Args:
+        directions: Unit vectors, Shape ``[..., 3]``.
+        pole: Length of the horizontal part up to which the azimuth counts as 0.
+
+    Returns:
+        θ̂ and φ̂, Shape ``[..., 3]`` each.
+
+    Example:
+        >>> theta_hat, phi_hat = spherical_basis(np.array([1.0, 0.0, 0.0]))
+        >>> theta_hat.tolist(), phi_hat.tolist()
+        ([0.0, 0.0, -1.0], [-0.0, 1.0, 0.0])
     """
     x, y, z = directions[..., 0], directions[..., 1], directions[..., 2]
     horizontal = np.hypot(x, y)
@@ -40,17 +50,25 @@ def spherical_basis(directions: Float64Array, pole: float = 0.0) -> tuple[Float6
 
 
 class ElementPattern(ABC):
-    """Far field of a vertically polarized element, before `polarized_field` turns it."""
+    """Far field of a vertically polarized element, before `polarized_field` turns it.
+
+    A subclass implements `along_theta_phi`.
+    """
 
     @abstractmethod
     def along_theta_phi(self, local: Float64Array) -> tuple[Field, Field | None]:
-        """E_θ and E_φ towards unit vectors in device axes, Shape ``[P]`` each; None: no E_φ.
+        """Components of the field, so that ``|E_θ|² + |E_φ|²`` is the gain as a factor.
 
-        ``|E_θ|² + |E_φ|²`` is the gain as a factor.
+        Args:
+            local: Unit vectors in device axes, Shape ``[P, 3]``.
+
+        Returns:
+            E_θ and E_φ, Shape ``[P]`` each; E_φ may be None for 0 everywhere.
         """
 
     def amplitude(self, local: Float64Array) -> Float64Array:
-        """Root of the gain, whatever the polarization, Shape ``[P]``."""
+        """Root of the gain of both polarizations together towards unit vectors in device axes, Shape
+        ``[P]``."""
         along_theta, along_phi = self.along_theta_phi(local)
         amplitude: Float64Array = np.abs(along_theta)
         return amplitude if along_phi is None else np.hypot(amplitude, np.abs(along_phi))
@@ -68,7 +86,7 @@ class FormulaPattern(ElementPattern):
 
 @dataclass(frozen=True, eq=False)
 class TabulatedPattern(ElementPattern):
-    """A pattern from a file."""
+    """A pattern from a file, interpolated."""
 
     table: PatternTable
 
@@ -82,13 +100,18 @@ class TabulatedPattern(ElementPattern):
 
 
 class Patterns:
-    """Patterns of the elements of arrays, with those from files by the names of their assets."""
+    """Patterns of the elements of arrays: by formula, or from files.
+
+    Args:
+        tables: Patterns of files, by name of the asset.
+    """
 
     def __init__(self, tables: Mapping[str, PatternTable] | None = None) -> None:
         self._tabulated = {name: TabulatedPattern(table) for name, table in (tables or {}).items()}
 
     def notes(self) -> tuple[str, ...]:
-        """What is to be said about patterns that radiate more than they are fed with."""
+        """Notes on patterns whose mean gain over the sphere is above 0 dBi: they radiate more than they are
+        fed."""
         means = {name: pattern.table.mean_gain_dbi for name, pattern in self._tabulated.items()}
         return tuple(
             f"pattern {name!r} has a mean gain of {mean:.1f} dBi over the sphere; an antenna has 0 dBi less "
@@ -98,7 +121,15 @@ class Patterns:
         )
 
     def of(self, array: AntennaArray) -> ElementPattern:
-        """The pattern of an array's elements. Raises `AssetError` for a file that no world brought."""
+        """The pattern of an array's elements.
+
+        Raises:
+            AssetError: The pattern is from a file that is not among the assets of the run.
+
+        Example:
+            >>> Patterns().of(AntennaArray(pattern="dipole")).amplitude(np.array([[1.0, 0.0, 0.0]])).round(3)
+            array([1.225])
+        """
         if not array.pattern_file:
             return _formula(array.pattern)
         try:
@@ -136,10 +167,18 @@ def radiated_field(
 
 
 def polarized_field(pattern: ElementPattern, polarization: str, local: Float64Array) -> Field:
-    """Far field of one element in its own axes towards unit vectors, Shape ``[P, 3]`` to ``[P, 3]``.
+    """Far field of one element in its own axes.
 
     Linear polarizations are model 2 of 3GPP TR 38.901, section 7.3.2: the field of the vertical element is
     turned about the direction by the slant. Of a circular one the horizontal part follows, or leads, by 90°.
+
+    Args:
+        pattern: Of the element.
+        polarization: As `AntennaArray` has it, a single one.
+        local: Unit vectors in device axes, Shape ``[P, 3]``.
+
+    Returns:
+        Fields in device axes, Shape ``[P, 3]``.
     """
     theta_hat, phi_hat = spherical_basis(local)
     cosine, sine = jones(polarization)
@@ -152,11 +191,21 @@ def polarized_field(pattern: ElementPattern, polarization: str, local: Float64Ar
 
 
 def element_amplitude(pattern: str, local: Float64Array) -> Float64Array:
-    """Root of the gain of an element pattern towards unit vectors in device axes, Shape ``[P]``.
+    """Root of the gain of an element pattern by formula.
 
-    ``iso``: 1. ``dipole``: short dipole along z (Balanis, Antenna Theory, eq. 4-26a, gain 1.5).
-    ``hw_dipole``: half-wave dipole along z (eq. 4-84, gain 1.643). ``tr38901``: 3GPP TR 38.901,
-    table 7.3-1 (gain 8 dBi, 65° beams, 30 dB floor).
+    Args:
+        pattern: ``iso``: 1. ``dipole``: short dipole along z (Balanis, Antenna Theory, eq. 4-26a, gain 1.5).
+            ``hw_dipole``: half-wave dipole along z (eq. 4-84, gain 1.643). ``tr38901``: 3GPP TR 38.901, table
+            7.3-1 (gain 8 dBi, 65° beams, 30 dB floor).
+        local: Unit vectors in device axes, Shape ``[P, 3]``; x is the boresight.
+
+    Returns:
+        Amplitudes, Shape ``[P]``.
+
+    Example:
+        >>> boresight = np.array([[1.0, 0.0, 0.0]])
+        >>> 20 * np.log10(element_amplitude("tr38901", boresight))
+        array([8.])
     """
     sin_theta = np.hypot(local[:, 0], local[:, 1])
     if pattern == "iso":

@@ -1,6 +1,7 @@
-"""Fields of diffracted paths, in float64 from the meshes' own corners.
+"""Diffraction at edges by the uniform theory of diffraction (UTD), in float64 from the meshes' own corners.
 
-Those of the ray tracer change by 10 dB and more with where a scene stands, for the first two reasons:
+The ray tracer's diffracted fields change by 10 dB and more with the place of a scene, for the first two
+reasons:
 
 - Of a path with fewer interactions than the solver's depth, it counts the way from the last point to the
   origin of coordinates, and from there to the receiver, as the length behind the edge.
@@ -55,7 +56,7 @@ _SIGN = -1.0
 
 @dataclass(frozen=True, eq=False)
 class Faces(Rows):
-    """The two faces of P wedges; the first of them is counted from."""
+    """Both faces of P wedges; angles are counted from the first one."""
 
     normals: Float64Array
     """Unit, outward, Shape ``[P, 2, 3]``."""
@@ -71,7 +72,7 @@ class Faces(Rows):
         return exterior
 
     def turned(self, swap: BoolArray) -> Faces:
-        """The same, counted from the other face where ``swap`` is true."""
+        """The same wedges, with the other face first where ``swap`` is true."""
         return Faces(
             np.where(swap[:, None, None], self.normals[:, ::-1], self.normals),
             np.where(swap[:, None], -self.edge, self.edge),
@@ -104,24 +105,24 @@ def faces_of(ends: Float64Array, apexes: Float64Array) -> tuple[Faces, BoolArray
 
 @dataclass(frozen=True, eq=False)
 class Bends:
-    """How P paths go over their edges."""
+    """Directions, legs and wedges of P paths at their edges."""
 
     at: Int64Array
-    """Which interaction that is, Shape ``[P]``."""
+    """Interaction that is the diffraction, Shape ``[P]``."""
     k: Float64Array
-    """Unit vectors along which waves come in, Shape ``[P, 3]``."""
+    """Unit vectors along incoming waves, Shape ``[P, 3]``."""
     out: Float64Array
-    """Along which they go on, Shape ``[P, 3]``."""
+    """Unit vectors along outgoing waves, Shape ``[P, 3]``."""
     legs: tuple[Float64Array, Float64Array]
     """Lengths before and behind the edge [m], each of Shape ``[P]``."""
     faces: Faces
-    """Counted from that which waves meet more steeply."""
+    """First the face that waves meet more steeply."""
     swapped: BoolArray
-    """Whether that is the second one of those that were given, Shape ``[P]``."""
+    """Whether that is the second one of the faces as given, Shape ``[P]``."""
 
     @classmethod
     def of(cls, corners: Float64Array, types: UInt8Array, faces: Faces) -> Bends:
-        """Those of paths; the parameters are those of `edge_fields`."""
+        """Those of paths; the arguments are those of `edge_fields`."""
         steps = np.diff(corners, axis=1)
         lengths = np.sqrt((steps**2).sum(-1))
         bent = types == Interaction.DIFFRACTION
@@ -135,7 +136,7 @@ class Bends:
 
     @property
     def angles(self) -> tuple[Float64Array, Float64Array]:
-        """Of the ray that comes in and of that which goes on, from the first face [rad], each ``[P]``."""
+        """Angles of the incoming and of the outgoing ray from the first face [rad], Shape ``[P]`` each."""
         exterior = self.faces.exterior
         return _angle(-self.k, self.faces, exterior), _angle(self.out, self.faces, exterior)
 
@@ -156,7 +157,7 @@ class Bends:
         return spread
 
     def take(self, rows: Int64Array) -> Bends:
-        """Those of these paths."""
+        """Bends of these paths."""
         return Bends(
             self.at[rows],
             self.k[rows],
@@ -177,8 +178,7 @@ def edge_fields(
     wavelengths: Sequence[float],
     lit: Int64Array | None = None,
 ) -> Complex128Array:
-    """Dyads of `PathTable` of paths that are diffracted once, Shape ``[C, P, 3, 3]``; not finite where the
-    geometry leaves none.
+    """Fields of paths that are diffracted once.
 
     Args:
         corners: TX, interaction points, and RX in all places behind the last one [m], Shape ``[P, D + 2,
@@ -186,9 +186,9 @@ def edge_fields(
         types: `Interaction` at each point, Shape ``[P, D]``: reflections, transmissions, and one
             diffraction.
         normals: Of the triangle at each point, of any length, Shape ``[P, D, 3]``.
-        faces: Of the wedge.
-        media: At each point; at the edge, that of the first face.
-        second: Of the second face, Shape ``[C, P, 1]`` or ``[P, 1]``.
+        faces: Of the wedges.
+        media: Materials at each point; at the edge, that of the first face.
+        second: Materials of the second face, Shape ``[C, P, 1]`` or ``[P, 1]``.
         wavelengths: Of the carriers [m].
         lit: Which of the waves of `Bends.margins` there are: 1, −1 for none, 0 where angles tell; ``[P,
             3]``.
@@ -246,8 +246,8 @@ def _diffracted(bends: Bends, walls: tuple[Wall, Wall], lit: Int64Array) -> Comp
 
 
 def _angle(direction: Float64Array, faces: Faces, exterior: Float64Array) -> Float64Array:
-    """Angle about the edge from the first face [rad], within the exterior: what rounding puts inside the
-    wedge is at the nearer face."""
+    """Angles about the edge from the first face [rad], within the exterior: a direction that rounding puts
+    inside of the wedge is at the nearer face."""
     normal = faces.normals[:, 0]
     into = np.cross(normal, faces.edge)
     angle = np.arctan2((direction * normal).sum(-1), (direction * into).sum(-1)) % (2 * np.pi)
@@ -268,7 +268,7 @@ def _coefficients(
     wavelength: float,
     lit: Int64Array,
 ) -> tuple[Complex128Array, Complex128Array]:
-    """D1 − D4 and D2 − D3; ``length`` is L [m], and ``lit`` that of the faces in their order."""
+    """D1 − D4 and D2 − D3; ``length`` is L [m], ``lit`` is in the order of the wedge's faces."""
     k, n = 2 * np.pi / wavelength, exterior / np.pi
     factor = -np.exp(-0.25j * np.pi) / (2 * n * np.sqrt(2 * np.pi * k) * sine)
     apart, both = angle_out - angle_in, angle_out + angle_in
@@ -311,7 +311,7 @@ def _sine(one: Float64Array, other: Float64Array) -> Float64Array:
 
 
 def _across(vectors: Float64Array, axis: Float64Array) -> Float64Array:
-    """What of vectors is across unit vectors."""
+    """Components of vectors across unit vectors."""
     across: Float64Array = vectors - (vectors * axis).sum(-1, keepdims=True) * axis
     return across
 
@@ -325,14 +325,14 @@ _GRAZING = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Chains:
-    """What P paths meet."""
+    """Interactions and planes of P paths."""
 
     pair: Int64Array
     """Shape ``[P]``."""
     types: UInt8Array
     """`Interaction` of each point, Shape ``[P, D]``."""
     planes: Int64Array
-    """Plane that is met there, Shape ``[P, D]``; anything at an edge."""
+    """Plane at each point, Shape ``[P, D]``; undefined at an edge."""
 
     def key(self, path: int) -> tuple[tuple[int, int], ...]:
         """Type and plane of each interaction of a path."""
@@ -342,24 +342,24 @@ class Chains:
 
 @dataclass(frozen=True)
 class Sight:
-    """The line of sight of a pair that passes edges closely."""
+    """A line of sight that passes edges closely."""
 
     lit: bool
-    """Whether it does so on the lit side of each."""
+    """Whether it passes on the lit side of each edge."""
     passed: frozenset[int]
-    """The planes of their faces."""
+    """Planes of the edges' faces."""
 
 
 def waves_beside(
     bends: Bends, faces: Int64Array, bent: Int64Array, chains: Chains
 ) -> tuple[Int64Array, dict[int, Sight]]:
-    """Which of the waves there are that end near diffracted paths.
+    """Whether the waves exist that end near diffracted paths.
 
     Args:
         bends: Of B diffracted paths.
-        faces: Planes of the two faces that each goes over, Shape ``[B, 2]``.
-        bent: Which of all paths these are, Shape ``[B]``.
-        chains: Of all paths; those of pair −1 count for none.
+        faces: Planes of both faces of the edge of each, Shape ``[B, 2]``.
+        bent: Index of each among all paths, Shape ``[B]``.
+        chains: Of all paths; a path of pair −1 is left out.
 
     Returns:
         ``lit`` of `edge_fields`, Shape ``[B, 3]``, and the lines of sight that pass edges closely, by pair.
@@ -388,23 +388,28 @@ def waves_beside(
 
 
 def _steep(bends: Bends) -> BoolArray:
-    """Which of both faces, as they were given, rays do not merely graze, Shape ``[B, 2]``."""
+    """Which faces, as given, rays meet steeper than `_GRAZING`, Shape ``[B, 2]``."""
     met = np.abs((bends.faces.normals * bends.k[:, None]).sum(-1)) > _GRAZING
     steep: BoolArray = np.where(bends.swapped[:, None], met[:, ::-1], met)
     return steep
 
 
 def _without_edge(key: Sequence[tuple[int, int]], face: int | None) -> tuple[tuple[int, int], ...]:
-    """The chain with a reflection at a face in place of the edge, or with nothing."""
+    """The chain with a reflection at a face in place of the diffraction, or, for None, without it."""
     instead = [] if face is None else [(int(Interaction.REFLECTION), face)]
     bent = next(d for d, (kind, _) in enumerate(key) if kind == Interaction.DIFFRACTION)
     return (*key[:bent], *instead, *key[bent + 1 :])
 
 
 def beyond_edges(points: Float64Array, ends: Float64Array) -> BoolArray:
-    """Which points [m], Shape ``[B, 3]``, on the lines of edges ``[B, 2, 3]`` are beyond their ends.
+    """Points on the lines of edges that are beyond the edges' ends.
 
-    An edge has its first end and not its last one, so that of two in one line one has the place between.
+    The first end belongs to an edge and the last one does not, so that of two edges in one line one has the
+    point between them.
+
+    Args:
+        points: Points [m], Shape ``[B, 3]``.
+        ends: Both ends of the edges [m], Shape ``[B, 2, 3]``.
     """
     line = ends[:, 1] - ends[:, 0]
     along = ((points - ends[:, 0]) * line).sum(1)
