@@ -126,7 +126,7 @@ def test_fewer_frames_are_the_first_instants_and_more_are_refused() -> None:
         ("instants_s = [-1.0, 0.0]", "run.instants_s[0]", "is -1.0, write seconds ≥ 0"),
         ("instants_s = [0.0, inf]", "run.instants_s[1]", "is inf, write seconds ≥ 0"),
         ("instants_s = [nan]", "run.instants_s[0]", "is nan, write seconds ≥ 0"),
-        ("instants_s = []", "run.instants_s", "is empty, write the instant of each frame"),
+        ("instants_s = []", "run.instants_s", "is [], write the instant of each frame"),
         ("instants_s = 3", "run.instants_s", "is 3, write"),
         ("instants_s = [0.0, true]", "run.instants_s[1]", "is true, write a number"),
         ("instants_ns = [0, 3, 2]", "run.instants_ns[2]", "2 does not come after 3"),

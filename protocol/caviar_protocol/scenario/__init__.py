@@ -14,12 +14,12 @@ import difflib
 import math
 import re
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from decimal import Decimal, InvalidOperation
+from functools import partial
 from importlib import resources
-from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import msgspec
 
@@ -322,6 +322,10 @@ REPLACED = ("frames", "sampling_period_ns")
 """Keys that follow from the instants."""
 
 _LATEST_S = 2**63 // 10**9
+_EXAMPLES = {KEY: "[0.0, 0.1, 0.35]", NANOSECONDS: "[0, 100_000_000, 350_000_000]"}
+
+Refuse: TypeAlias = Callable[[str], ScenarioError]
+"""Makes the error about a value, with its place."""
 
 
 def instants_ns(instants_s: Iterable[float]) -> tuple[int, ...]:
@@ -362,97 +366,67 @@ def with_instants(table: Mapping[str, Any], place: Place, folder: Path = Path())
         >>> table["frames"], table["sampling_period_ns"]
         (3, 50000000)
     """
-    if NANOSECONDS in table:
-        return with_instants(_in_seconds(table, place), place, folder)
-    values = table.get(KEY)
+    key = NANOSECONDS if NANOSECONDS in table else KEY
+    values, here = table.get(key), place.at(key)
     if values is None:
         return dict(table)
-    for key in REPLACED:
-        if key in table:
-            raise place.at(key).error(f"follows from {KEY}; remove one of both keys")
-    if isinstance(values, str) and values.startswith(FILE):
-        values = _from_file(folder / values.removeprefix(FILE), place.at(KEY))
-        table = {**table, KEY: values}
-    if not isinstance(values, list) or not all(type(value) in (int, float) for value in values):
+    for other in (KEY, *REPLACED):
+        if other in table and other != key:
+            raise place.at(other).error(f"follows from {key}; remove one of both keys")
+    if key == KEY and isinstance(values, str) and values.startswith(FILE):
+        written = _lines_of(folder / values.removeprefix(FILE), here)
+    elif key == KEY and (not isinstance(values, list) or any(type(v) not in (int, float) for v in values)):
         return {**table, "frames": 1}  # so that its own type is what is found wrong
-    here = place.at(KEY)
     # An empty list would be a run without a frame, which nothing downstream expects.
-    if not values:
-        raise here.error("is empty, write the instant of each frame: [0.0, 0.1, 0.35]")
-    for index, value in enumerate(values):
-        if not 0 <= value < _LATEST_S or _nanoseconds(value) % 1:
-            raise here.at(index).error(f"is {value}, write seconds ≥ 0 with at most 9 decimals")
-    for index, (before, value) in enumerate(pairwise(values), 1):
-        if value <= before:
-            raise here.at(index).error(f"{value} does not come after {before}; order the instants by time")
+    elif not isinstance(values, list) or not values:
+        raise here.error(f"is {values!r}, write the instant of each frame: {_EXAMPLES[key]}")
+    else:
+        written = [(value, here.at(index).error) for index, value in enumerate(values)]
+    seconds: list[float] = []
+    for index, (value, refuse) in enumerate(written):
+        seconds.append(_instant(value, key, refuse))
+        if index and seconds[index] <= seconds[index - 1]:
+            raise refuse(f"{value} does not come after {written[index - 1][0]}; order the instants by time")
     # By their shortest decimal form, as it stands in the file: 0.1 s is 100,000,000 ns and not a bit more.
-    instants = instants_ns(values)
+    instants = instants_ns(seconds)
     period = math.gcd(*instants)
-    return {**table, "frames": len(instants), **({"sampling_period_ns": period} if period else {})}
+    rest = {name: value for name, value in table.items() if name != key}
+    return rest | {KEY: seconds, "frames": len(instants)} | ({"sampling_period_ns": period} if period else {})
 
 
-def _in_seconds(table: Mapping[str, Any], place: Place) -> dict[str, Any]:
-    """The table with `KEY` for `NANOSECONDS`, checked for what seconds would not show."""
-    here, values = place.at(NANOSECONDS), table[NANOSECONDS]
-    for key in (KEY, *REPLACED):
-        if key in table:
-            raise place.at(key).error(f"follows from {NANOSECONDS}; remove one of both keys")
-    if not isinstance(values, list) or not values:
-        raise here.error(f"is {values!r}, write the instant of each frame: [0, 100_000_000, 350_000_000]")
-    for index, value in enumerate(values):
-        if type(value) is not int or value < 0:
-            raise here.at(index).error(f"is {value!r}, write whole nanoseconds ≥ 0")
-        if value >= 2**63 or instants_ns([value / 1e9]) != (value,):
-            raise here.at(index).error(
-                f"is {value}, so late that nanoseconds are not distinguished; write at most {10**15}"
-            )
-        if index and value <= values[index - 1]:
-            raise here.at(index).error(
-                f"{value} does not come after {values[index - 1]}; order the instants by time"
-            )
-    rest = {key: value for key, value in table.items() if key != NANOSECONDS}
-    return {**rest, KEY: [value / 1e9 for value in values]}
-
-
-def _from_file(path: Path, place: Place) -> list[float]:
-    """Instants [s] of a CSV file, one a line; errors name file and line."""
+def _lines_of(path: Path, place: Place) -> list[tuple[Any, Refuse]]:
+    """Lines of a CSV file of instants, each with the error about it, which names file and line."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise place.error(f"{path} cannot be read: {why}; name a CSV file") from error
-    found: list[float] = []
-    header = ""
-    for number, text in enumerate(map(str.strip, lines), 1):
-        if not text or text.startswith("#"):
-            continue
-        if not header:
-            header = text
-            if header != COLUMN:
-                raise ScenarioError(f"the first line is {text!r}; write {COLUMN}", str(path), line=number)
-            continue
-        found.append(_instant(text, str(path), number))
-        if len(found) > 1 and found[-1] <= found[-2]:
-            raise ScenarioError(
-                f"{found[-1]} does not come after {found[-2]}; order the instants by time",
-                str(path),
-                line=number,
-            )
-    if not found:
+    found: list[tuple[Any, Refuse]] = [
+        (text, partial(ScenarioError, file=str(path), line=number))
+        for number, text in enumerate(map(str.strip, lines), 1)
+        if text and not text.startswith("#")
+    ]
+    if found and found[0][0] != COLUMN:
+        raise found[0][1](f"the first line is {found[0][0]!r}; write {COLUMN}")
+    if len(found) < 2:
         raise ScenarioError(f"holds no instant; write {COLUMN}, then one a line", str(path), place.key)
-    return found
+    return found[1:]
 
 
-def _instant(text: str, file: str, line: int) -> float:
+def _instant(value: Any, key: str, refuse: Refuse) -> float:
+    """Seconds of an instant as it is written: a number, or a line of a file."""
+    if key == NANOSECONDS and (type(value) is not int or value < 0):
+        raise refuse(f"is {value!r}, write whole nanoseconds ≥ 0")
     try:
-        exact = Decimal(text)
+        exact = Decimal(str(value)).scaleb(-9 if key == NANOSECONDS else 0)
     except InvalidOperation as error:
-        raise ScenarioError(f"{text!r} is no number; write seconds", file, line=line) from error
+        raise refuse(f"{value!r} is no number; write seconds") from error
+    # The range first: of 1e300 a remainder cannot be computed.
     is_whole = exact.is_finite() and 0 <= exact < _LATEST_S and not exact.scaleb(9) % 1
-    if not is_whole or instants_ns([float(exact)])[0] != exact.scaleb(9):
-        raise ScenarioError(
-            f"{text} is no instant; write seconds ≥ 0 with at most 9 decimals", file, line=line
-        )
+    if not is_whole and key == KEY:
+        raise refuse(f"is {value}, write seconds ≥ 0 with at most 9 decimals")
+    if not is_whole or _nanoseconds(float(exact)) != exact.scaleb(9):
+        raise refuse(f"is {value}, so late that nanoseconds are not distinguished; write at most 1e6 s")
     return float(exact)
 
 
