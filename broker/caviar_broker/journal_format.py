@@ -8,7 +8,6 @@ log, and so do zeros, which a file system may leave at the end of a file after a
 
 from __future__ import annotations
 
-import mmap
 import struct
 import zlib
 from array import array
@@ -20,7 +19,7 @@ import msgspec
 
 from caviar_broker.core.run import Snapshot
 from caviar_protocol.errors import RecordingError
-from caviar_protocol.files import open_regular
+from caviar_protocol.files import map_regular
 from caviar_protocol.messages import GrantInput
 
 MAGIC = b"CAVIAR journal 2\n"
@@ -72,7 +71,11 @@ class JournalReader:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.problem = ""
-        self._data = _mapped(path)
+        try:
+            self._data = map_regular(path)
+        except (OSError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise RecordingError(f"cannot read the journal {path}: {reason}") from error
         self.size = len(self._data)
         """Of the file [B]."""
         self.end, self.crc = 0, MAGIC_CRC
@@ -147,17 +150,6 @@ def read_journal(path: Path) -> Iterator[JournalEntry]:
         RecordingError: The file cannot be read or is a journal of another format.
     """
     return iter(JournalReader(path))
-
-
-def _mapped(path: Path) -> memoryview:
-    try:
-        with open_regular(path) as file:
-            if not file.seek(0, 2):
-                return memoryview(b"")
-            return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise RecordingError(f"cannot read the journal {path}: {reason}") from error
 
 
 class EntryLocation(NamedTuple):

@@ -11,6 +11,7 @@ machine that dies loses what was not synchronised yet, so ``run.durability`` say
 from __future__ import annotations
 
 import errno
+import mmap
 import os
 import stat
 from dataclasses import dataclass
@@ -124,6 +125,22 @@ def read_regular(path: Path, remedy: str = PUT_BACK) -> bytes:
     """
     with open_regular(path, remedy) as file:
         return file.read()
+
+
+def map_regular(path: Path) -> memoryview:
+    """Map a regular file into memory, to be read; nothing of it is read before it is looked at.
+
+    Args:
+        path: The file.
+
+    Raises:
+        OSError: It cannot be read, or is no file; ``strerror`` says what it is and what mends it.
+    """
+    with open_regular(path) as file:
+        # An empty file cannot be mapped; it is what a writer leaves that is killed as it opens one.
+        if not file.seek(0, os.SEEK_END):
+            return memoryview(b"")
+        return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
 
 
 def open_to_append(path: Path) -> FileIO:

@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from caviar_protocol.errors import RecordingError
-from caviar_protocol.files import open_regular
+from caviar_protocol.files import map_regular
 from caviar_protocol.recording import FRAME_TOPIC, METADATA_NAME, PROFILE, FrameEntry, SegmentRecord
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -119,7 +119,10 @@ class Segment:
         # Place and CRC-32 of each seal.
         self._seals: list[tuple[int, int]] = []
         self._data_end = (0, 0)
-        self._data = _mapped(path)
+        try:
+            self._data = map_regular(path)
+        except OSError as error:
+            raise RecordingError(f"{path} cannot be read: {error.strerror} (errno {error.errno})") from error
         self._scan()
         if not self.finished and self._seals:
             self._cut_behind_last_good_seal()
@@ -363,18 +366,6 @@ def _find(data: memoryview, pattern: bytes, start: int) -> int:
     # A memoryview has no `find`, the map behind it does, without a copy.
     source = data.obj
     return source.find(pattern, start) if isinstance(source, mmap.mmap) else -1
-
-
-def _mapped(path: Path) -> memoryview:
-    try:
-        with open_regular(path) as stream:
-            stream.seek(0, 2)
-            # An empty file cannot be mapped; it is what a recorder leaves that is killed as it opens one.
-            if stream.tell() == 0:
-                return memoryview(b"")
-            return memoryview(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
-    except OSError as error:
-        raise RecordingError(f"{path} cannot be read: {error.strerror} (errno {error.errno})") from error
 
 
 def _library_record(kind: str, content: memoryview, path: Path, offset: int) -> Any:
