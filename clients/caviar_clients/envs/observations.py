@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any, ClassVar
@@ -18,11 +18,13 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from caviar_clients.session.base import Frame
+from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.messages import Input
 from caviar_protocol.scenario import DeviceSpec, Scenario
 from caviar_protocol.scenario.rules import patterns_overlap
 from caviar_protocol.scenario.schema import owned_by
+from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.space.scene import Pair, device_pose, device_velocity, directions, pairs_of
 from caviar_protocol.topics import AntennaArray, Camera, Depth, Lidar, Link, Scene
 
@@ -44,11 +46,21 @@ class Users:
     """Places for all pairs that a scenario can have, by transmitter, then receiver.
 
     A device on a pattern (``on = "car.*"``, ``count = 10``) has ``count`` places; the pairs that are there
-    fill them in the order of their names, and what is left stays empty.
+    fill them in the order of their names, and what is left stays empty. So spaces keep their size while
+    users come and go.
 
     Args:
         scenario: Names the devices.
         patterns: Receivers that are served, as names with ``*`` and ``?``.
+
+    Raises:
+        ScenarioError: The patterns match no receiver; the text has those there are.
+
+    Example:
+        >>> from caviar_protocol.scenario import load_scenario
+        >>> users = Users(load_scenario("geometric"), ("*",))
+        >>> len(users), users.places[0].beam_pairs
+        (1, 64)
     """
 
     def __init__(self, scenario: Scenario, patterns: Sequence[str]) -> None:
@@ -77,7 +89,12 @@ class Users:
         return len(self.places)
 
     def present(self, scene: Scene) -> tuple[tuple[int, Pair], ...]:
-        """(place, pair) of the pairs of a scene that are served."""
+        """Find the pairs of a scene that are served.
+
+        Returns:
+            Place and pair, in the order of the scene's pairs.
+        """
+        # A world makes a new tuple of devices where one comes or goes, and passes on the same one else.
         if scene.devices is not self._devices:
             self._devices, self._found = scene.devices, tuple(self._seated(scene))
         return self._found
@@ -92,7 +109,7 @@ class Users:
                 yield place, pair
 
     def _may_serve(self, rx: DeviceSpec) -> bool:
-        """Whether a receiver of this device may match; names of objects are only known later."""
+        # Names of objects are known at run time: two patterns are compared with each other here.
         return any(patterns_overlap(_full_name(rx), pattern) for pattern in self._patterns)
 
 
@@ -115,14 +132,14 @@ def _array(device: DeviceSpec) -> AntennaArray:
 
 
 class Moment(msgspec.Struct, frozen=True):
-    """What is known at a frame."""
+    """What is known at a frame, from which observations are read."""
 
     frame: Frame
     scene: Scene
     link: Link | None
     """Of the frame before; None in frame 0."""
     users: tuple[tuple[int, Pair], ...]
-    """(place, pair) of those who are there."""
+    """Place and pair of the users that are there."""
 
 
 FAR = 1e6
@@ -130,7 +147,13 @@ FAR = 1e6
 
 
 class Part(ABC):
-    """One part of the observation. ``sensor`` is what stands behind the colon of its name."""
+    """One part of the observation.
+
+    Args:
+        scenario: Has the devices and their settings.
+        users: The places.
+        sensor: What stands behind the colon of the part's name; empty: nothing.
+    """
 
     inputs: ClassVar[tuple[Input, ...]] = ()
     """What it needs beside the scene and the link of the frame before."""
@@ -143,11 +166,15 @@ class Part(ABC):
     @property
     @abstractmethod
     def space(self) -> spaces.Box:
-        """Its shape and bounds."""
+        """Shape and bounds of its values."""
 
     @abstractmethod
     def read(self, moment: Moment) -> NDArray[Any] | None:
-        """Its value at a frame; None where it is not known: zeros then."""
+        """Read its value at a frame.
+
+        Returns:
+            A value of `space`; None where it is not known, and zeros are observed.
+        """
 
 
 class _PerUser(Part):
@@ -158,14 +185,19 @@ class _PerUser(Part):
 
     @property
     def space(self) -> spaces.Box:
-        return spaces.Box(-self.bound, self.bound, self._shape, np.float32)
+        return spaces.Box(-self.bound, self.bound, (len(self.users) * self.width,), np.float32)
 
-    @property
-    def _shape(self) -> tuple[int, ...]:
-        return (len(self.users) * self.width,)
+    def read(self, moment: Moment) -> NDArray[np.float32]:
+        width = self.width
+        values = np.zeros(len(self.users) * width, np.float32)
+        # Slice by slice: with few users that is quicker than indices of NumPy.
+        for (place, _), found in zip(moment.users, self._values(moment), strict=True):
+            values[place * width : (place + 1) * width] = found
+        return values
 
-    def _blank(self) -> NDArray[np.float32]:
-        return np.zeros(self._shape, np.float32)
+    @abstractmethod
+    def _values(self, moment: Moment) -> Iterable[float | Vector | Float64Array]:
+        """The numbers of each user that is there, one or three, in the order of ``moment.users``."""
 
 
 class AngleOfArrival(_PerUser):
@@ -174,13 +206,9 @@ class AngleOfArrival(_PerUser):
 
     bound = math.pi
 
-    def read(self, moment: Moment) -> NDArray[np.float32]:
-        values = self._blank()
-        pairs = [pair for _, pair in moment.users]
-        _, at_rx = directions(moment.scene, pairs)
-        for (place, _), (x, y, _) in zip(moment.users, at_rx, strict=True):
-            values[place] = math.atan2(y, x)
-        return values
+    def _values(self, moment: Moment) -> Iterable[float | Vector | Float64Array]:
+        _, at_rx = directions(moment.scene, [pair for _, pair in moment.users])
+        return [math.atan2(y, x) for x, y, _ in at_rx]
 
 
 class AngleOfDeparture(_PerUser):
@@ -189,13 +217,9 @@ class AngleOfDeparture(_PerUser):
 
     bound = math.pi
 
-    def read(self, moment: Moment) -> NDArray[np.float32]:
-        values = self._blank()
-        pairs = [pair for _, pair in moment.users]
-        at_tx, _ = directions(moment.scene, pairs)
-        for (place, _), (x, y, _) in zip(moment.users, at_tx, strict=True):
-            values[place] = math.atan2(y, x)
-        return values
+    def _values(self, moment: Moment) -> Iterable[float | Vector | Float64Array]:
+        at_tx, _ = directions(moment.scene, [pair for _, pair in moment.users])
+        return [math.atan2(y, x) for x, y, _ in at_tx]
 
 
 class Position(_PerUser):
@@ -203,11 +227,8 @@ class Position(_PerUser):
 
     width = 3
 
-    def read(self, moment: Moment) -> NDArray[np.float32]:
-        values = self._blank()
-        for place, pair in moment.users:
-            values[3 * place : 3 * place + 3] = device_pose(moment.scene, pair.rx).position
-        return values
+    def _values(self, moment: Moment) -> Iterable[float | Vector | Float64Array]:
+        return [device_pose(moment.scene, pair.rx).position for _, pair in moment.users]
 
 
 class Velocity(_PerUser):
@@ -215,29 +236,22 @@ class Velocity(_PerUser):
 
     width = 3
 
-    def read(self, moment: Moment) -> NDArray[np.float32]:
-        values = self._blank()
-        for place, pair in moment.users:
-            values[3 * place : 3 * place + 3] = device_velocity(moment.scene, pair.rx)
-        return values
+    def _values(self, moment: Moment) -> Iterable[float | Vector | Float64Array]:
+        return [device_velocity(moment.scene, pair.rx) for _, pair in moment.users]
 
 
 class LastMagnitude(_PerUser):
     """|y| of the frame before, the mean over carriers; 0 in frame 0. Shape ``[U]``."""
 
-    def read(self, moment: Moment) -> NDArray[np.float32]:
-        values = self._blank()
-        link = moment.link
-        if link is None:
-            return values
+    def _values(self, moment: Moment) -> Iterable[float | Vector | Float64Array]:
         of_pair: dict[tuple[str, str], list[float]] = {}
-        for tx, rx, abs_y in zip(link.tx, link.rx, link.abs_y.tolist(), strict=True):
-            of_pair.setdefault((tx, rx), []).append(abs_y)
-        for place, pair in moment.users:
-            found = of_pair.get((pair.tx.name, pair.rx.name))
-            if found:
-                values[place] = sum(found) / len(found)
-        return values
+        link = moment.link
+        if link is not None:
+            for tx, rx, abs_y in zip(link.tx, link.rx, link.abs_y.tolist(), strict=True):
+                of_pair.setdefault((tx, rx), []).append(abs_y)
+        # A pair that came in this frame has no link yet.
+        found = (of_pair.get((pair.tx.name, pair.rx.name), [0.0]) for _, pair in moment.users)
+        return [sum(values) / len(values) for values in found]
 
 
 class LidarGrid(Part):
@@ -257,7 +271,7 @@ class LidarGrid(Part):
     def read(self, moment: Moment) -> NDArray[np.int8] | None:
         for lidar in moment.frame.payloads("lidar", Lidar).values():
             for scan in lidar.scans:
-                if scan.sensor.rpartition("/")[2] == self.sensor and scan.grid is not None:
+                if _spec_name(scan.sensor) == self.sensor and scan.grid is not None:
                     return scan.grid.occupancy
         return None
 
@@ -280,7 +294,7 @@ class DepthImage(Part):
     def read(self, moment: Moment) -> NDArray[np.float32] | None:
         for depth in moment.frame.payloads("depth", Depth).values():
             for image in depth.images:
-                if image.sensor.rpartition("/")[2] == self.sensor:
+                if _spec_name(image.sensor) == self.sensor:
                     return image.depth
         return None
 
@@ -297,7 +311,7 @@ class CameraImage(DepthImage):
     def read(self, moment: Moment) -> NDArray[Any] | None:
         for camera in moment.frame.payloads("camera", Camera).values():
             for image in camera.images:
-                if image.sensor.rpartition("/")[2] == self.sensor:
+                if _spec_name(image.sensor) == self.sensor:
                     return image.rgb
         return None
 
@@ -316,7 +330,16 @@ PARTS: Mapping[str, Callable[[Scenario, Users, str], Part]] = {
 
 
 def part(scenario: Scenario, users: Users, name: str) -> Part:
-    """The part of that name. `ScenarioError` for one that does not exist, or whose sensor does not."""
+    """Make a part of the observation.
+
+    Args:
+        scenario: Has the devices.
+        users: The places.
+        name: Of the part, as in `PARTS`; of a sensor's, the sensor may stand behind a colon.
+
+    Raises:
+        ScenarioError: The part does not exist, or its sensor does not; the text has those there are.
+    """
     kind, _, sensor = name.partition(":")
     cls: Any = PARTS.get(kind)
     if cls is None:
@@ -341,7 +364,7 @@ def part(scenario: Scenario, users: Users, name: str) -> Part:
 
 
 def _grid_shape(scenario: Scenario) -> tuple[int, int, int]:
-    """Shape of the grid as the LIDAR's settings have it."""
+    """Shape of the grid as the LIDAR's settings have it, before there is a scan."""
     for spec in scenario.services.values():
         grid = spec.settings.get("grid") if spec.role == "sensors" else None
         if grid is None:
