@@ -1,4 +1,5 @@
-"""A bound on the error of each pair on one rung, learned from frames that the reference computes too.
+"""Calibration of stated errors: bounds on each pair's error on a rung, from frames that the reference
+computes, too.
 
 The error of a pair is the normalised mean square error of its matrices on all carriers against those of the
 reference, Σ‖H − Hᵣ‖² / Σ‖Hᵣ‖², in dB. Two things tell pairs apart before it is known:
@@ -36,7 +37,7 @@ from caviar_services.channel.adaptive.settings import Rung
 from caviar_services.channel.base import Modelled
 
 SHARE = 0.9
-"""Of errors that bounds shall hold for."""
+"""Share of errors that bounds shall hold for."""
 
 FLOOR_DB, CEILING_DB = -60.0, 20.0
 """Errors and scores beyond are taken for these: below, matrices are equal for all that links do with them."""
@@ -52,7 +53,7 @@ _MOST_AT_ONCE = 50
 
 # Errors that count as measured before the first check: twice as much power as there is, and four times.
 _ASSUMED_DB = (3.0, 6.0)
-# Behind it: that much above the largest one that was measured, where this is less.
+# After it: the assumed errors are at most that much above the largest measured one.
 _ASSUMED_ABOVE_DB = (1.0, 3.0)
 # Measured errors up to which each of the assumed ones weighs as much as one of them; of n its weight is
 # (10/n)³, so that bounds are wide in the first frames alone.
@@ -60,7 +61,7 @@ _ASSUMED_UNTIL = 10
 
 # Distance of scores, or of last errors, at which a measured error weighs exp(−1/2).
 _WIDTH_DB = 8.0
-# Of an error that was measured of quite another channel.
+# Weight of an error that was measured of quite another channel.
 _LEAST_WEIGHT = 0.02
 # Squared distance, in widths, to a last error that is not known.
 _UNKNOWN = 0.5
@@ -82,9 +83,14 @@ _LEVEL_STEPS = 10_000
 
 
 def errors_db(channel: Channel, reference: Channel) -> Float64Array:
-    """NMSE of each pair's matrices [dB], Shape ``[T·R]``; NaN where the reference has no path.
+    """Errors of a channel's matrices.
 
-    Both are of the same scene, with matrices.
+    Args:
+        channel: With matrices.
+        reference: The channel of the same scene that counts as exact, with matrices.
+
+    Returns:
+        NMSE of each pair over all carriers [dB], Shape ``[T·R]``; NaN where the reference has no path.
     """
     error, power = np.zeros((2, len(channel.tx) * len(channel.rx)))
     for mine, true in zip(channel.h, reference.h, strict=True):
@@ -96,7 +102,7 @@ def errors_db(channel: Channel, reference: Channel) -> Float64Array:
 
 
 def scores_db(modelled: Modelled) -> Float64Array:
-    """What tells how far each pair's channel may be off [dB], Shape ``[T·R]``; see above."""
+    """Scores of pairs that say how far their channels may be off [dB], Shape ``[T·R]``; see above."""
     if modelled.split_nmse is not None:
         return in_db(modelled.split_nmse.ravel())
     channel = modelled.channel
@@ -112,13 +118,14 @@ def pair_powers(channel: Channel) -> Float64Array:
 
 
 def _of_pairs(channel: Channel, values: Float64Array) -> Float64Array:
-    """Sums over the paths of each pair, each by itself: beside a strong pair a weak one keeps its digits."""
+    """Sums of values over the paths of each pair, Shape ``[P]`` to ``[T·R]``."""
+    # Each pair is summed by itself: as differences of one running sum, weak pairs would lose their digits.
     pair = np.repeat(np.arange(len(channel.offsets) - 1), np.diff(channel.offsets))
     return np.bincount(pair, weights=values, minlength=len(channel.offsets) - 1).astype(np.float64)
 
 
 def in_db(ratio: Float64Array) -> Float64Array:
-    """Ratios of powers in dB, between floor and ceiling."""
+    """Levels of ratios of powers [dB], limited to the range from `FLOOR_DB` to `CEILING_DB`."""
     least, most = 10 ** (FLOOR_DB / 10), 10 ** (CEILING_DB / 10)
     found: Float64Array = 10 * np.log10(np.clip(ratio, least, most))
     return found
@@ -133,7 +140,7 @@ class BoundState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
 
 class ErrorBound:
-    """Bounds of one rung.
+    """Bounds on the errors of one rung.
 
     Args:
         declared_db: Error that the scenario expects [dB]; it takes the place of what is assumed before the
@@ -147,7 +154,7 @@ class ErrorBound:
         self.reset()
 
     def reset(self) -> None:
-        """Know nothing."""
+        """Forget everything."""
         self.measured = 0
         self._level = SHARE
         # Score, last error and error of what was measured, in steps, Shape ``[N, 3]``.
@@ -155,21 +162,24 @@ class ErrorBound:
         self.forget_pairs()
 
     def forget_pairs(self) -> None:
-        """Another episode: pairs are elsewhere, whatever their names."""
+        """Forget the last errors of pairs: in another episode a name may be another vehicle's."""
         self._last: dict[str, tuple[int, float]] = {}
 
     @property
     def level(self) -> float:
-        """Of the quantile that is stated."""
+        """Level of the quantile that is stated."""
         return self._level
 
     def bounds_db(self, frame: int, pairs: Sequence[str], scores: Float64Array) -> Float64Array:
-        """What is stated of pairs [dB], rounded up to 0.1 dB.
+        """Bounds that are stated for pairs.
 
         Args:
-            frame: Its number in the episode.
-            pairs: Their names.
-            scores: Of their channels [dB], Shape ``[len(pairs)]``.
+            frame: Number of the frame in its episode.
+            pairs: Names of the pairs.
+            scores: Scores of their channels [dB], Shape ``[len(pairs)]``.
+
+        Returns:
+            Bounds [dB], rounded up to 0.1 dB, Shape ``[len(pairs)]``.
         """
         values, last = self._known * STEP_DB + FLOOR_DB, self._last_errors(frame, pairs)
         count = len(values)
@@ -194,7 +204,17 @@ class ErrorBound:
         return rounded
 
     def check(self, frame: int, pairs: Sequence[str], scores: Float64Array, errors: Float64Array) -> int:
-        """Take note of the errors of pairs [dB]; how many were within their bounds."""
+        """Learn the measured errors of pairs.
+
+        Args:
+            frame: As in `bounds_db`; likewise ``pairs`` and ``scores``.
+            pairs: See ``frame``.
+            scores: See ``frame``.
+            errors: Of the pairs [dB], Shape ``[len(pairs)]``.
+
+        Returns:
+            How many errors were within their bounds.
+        """
         held = errors <= self.bounds_db(frame, pairs, scores) + _ROUNDING_DB
         if self.measured and len(errors):
             missed = 1 - held.mean()
@@ -226,7 +246,11 @@ class ErrorBound:
         return base64.b64encode(level + self._known.tobytes()).decode("ascii")
 
     def learn(self, text: str) -> None:
-        """Know what another one had `learned`. Raises `ValueError` where that is no such text."""
+        """Continue from the text of `learned`.
+
+        Raises:
+            ValueError: It is no such text.
+        """
         self.reset()
         if not text:
             return
@@ -243,7 +267,7 @@ class ErrorBound:
         return BoundState(learned=self.learned, last=dict(self._last), measured=self.measured)
 
     def go_on(self, state: BoundState) -> None:
-        """Know what another one knew."""
+        """Continue from the state of another bound."""
         self.learn(state.learned)
         self._last, self.measured = dict(state.last), state.measured
 
@@ -291,7 +315,7 @@ class Calibration:
     # --- from episode to episode ---------------------------------------------------------------------
 
     def reset(self, episode: int) -> None:
-        """What was learned outlives an episode, but where episodes begin to be counted again."""
+        """Begin an episode: what was learned outlives the one before, unless episodes are counted anew."""
         follows = self._episode is not None and episode == self._episode + 1
         for bound in self.bounds:
             if follows:
@@ -301,9 +325,14 @@ class Calibration:
         self._episode, self._begins = episode, True
 
     def begin(self, imposed: Mapping[str, str]) -> dict[str, str]:
-        """Decisions of a frame beside its rung: where an episode begins, what is known from those before.
+        """Decisions of a frame beside its rung: in the first one of an episode, what is known from those
+        before.
 
-        Raises `ScenarioError` where something else is imposed.
+        Args:
+            imposed: Decisions that a replay imposes.
+
+        Raises:
+            ScenarioError: What is imposed cannot be read, or is about another ladder.
         """
         begins, self._begins = self._begins, False
         if DECISION in imposed:
@@ -330,7 +359,13 @@ class Calibration:
     # --- from frame to frame -------------------------------------------------------------------------
 
     def stated(self, rung: int, number: int, made: Modelled) -> Channel:
-        """The product of a rung with bounds on its errors, where it has some, before these are measured."""
+        """The product of a rung with bounds on its errors, before these are measured.
+
+        Args:
+            rung: Number of the rung.
+            number: Of the frame.
+            made: What the rung's model made.
+        """
         channel, bound = made.channel, self.bounds[rung]
         if rung == self.reference or not (
             self._every or bound.measured or self._rungs[rung].expected_error_db is not None
@@ -353,9 +388,16 @@ class Calibration:
         return min(range(self.reference), key=lambda rung: self.bounds[rung].measured)
 
     def check(self, rung: int, number: int, made: Modelled, reference: Channel) -> dict[str, int]:
-        """Measure the errors of a rung; how many pairs were checked, and how many were within their bounds.
+        """Measure the errors of a rung.
 
-        Both channels have their matrices.
+        Args:
+            rung: Number of the rung.
+            number: Of the frame.
+            made: What the rung's model made, with matrices.
+            reference: The reference's product of that frame, with matrices.
+
+        Returns:
+            Counts of pairs that were checked, and of those within their bounds.
         """
         errors = errors_db(made.channel, reference)
         known = np.isfinite(errors)
@@ -373,14 +415,14 @@ class Calibration:
         return CalibrationState(bounds=bounds, episode=self._episode, begins=self._begins)
 
     def go_on(self, state: CalibrationState) -> None:
-        """Know what another one knew."""
+        """Continue from the state of another calibration."""
         for bound, known in zip(self.bounds, state.bounds, strict=True):
             bound.go_on(known)
         self._episode, self._begins = state.episode, state.begins
 
 
 def _pairs(channel: Channel) -> list[str]:
-    """A name for each pair, transmitters slowest."""
+    """Names of the pairs, transmitters slowest."""
     return [f"{tx} > {rx}" for tx in channel.tx for rx in channel.rx]
 
 

@@ -66,7 +66,8 @@ class _State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 class AdaptiveChannel(Service[AdaptiveSettings]):
-    """A ladder of channel models, one of which computes a frame."""
+    """A ladder of channel models, one of which computes a frame; the settings say which
+    (`AdaptiveSettings`)."""
 
     role: ClassVar[Role] = "channel"
     inputs: ClassVar[tuple[Input, ...]] = (Input(topic="scene"),)
@@ -135,7 +136,7 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
         ]
 
     def _timed(self, rung: Rung, number: int, scene: Scene) -> int:
-        """How long a rung takes for a scene that it has not seen [ns]."""
+        """Duration of a rung for a scene that it has not seen [ns]."""
         rung.model.reset(0, self.run.seed, 0)
         frame = Frame(episode=0, number=number, t_ns=0, service=self.run.name, seed=self.run.seed)
         return self._modelled(rung, frame, scene, (antennas(scene, "tx"), antennas(scene, "rx")))[1]
@@ -235,7 +236,9 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
         return made, self.clock() - began
 
     def _observe(self, rung: int, work: Workload, taken: int, calibrates: bool) -> None:
-        if self._with_h or not calibrates:  # else it did more than frames ask for
+        # Calibration makes matrices: where frames do not ask for them, its duration says nothing about
+        # theirs.
+        if self._with_h or not calibrates:
             self.costs.observe(rung, work, taken)
 
     def _calibrate(
@@ -327,7 +330,8 @@ def rehearsal_scene(
     is_free: Free = lambda place: True,
     step: int = 0,
 ) -> Scene:
-    """All antennas that a scenario announces, and traffic: bodies that carry them, and as many that do not.
+    """A scene to time rungs on: all antennas that a scenario announces on bodies that drive, and as many
+    bodies without.
 
     Args:
         devices: Of the scenario.

@@ -1,4 +1,5 @@
-"""The rung that the next frame runs on: down at once, up with patience, from a model of what rungs cost.
+"""The cost model of rungs, and the controller that picks the next frame's rung: down at once, up with
+patience.
 
 Cost of a rung, learned while running from measured durations:
 
@@ -43,32 +44,34 @@ REVERSION = 128
 OBJECTS = 10.0
 """Moving objects whose cost is compared with that of a scene without."""
 
-# Older ratios weigh less than two percent together.
+# Frames that are remembered; older ones would weigh less than two percent together.
 _WINDOW = 6 * HALF_LIFE
 
-# Frames that are taken to have gone by before the first, so that it alone decides little.
+# Frames that are assumed before the first one, so that the first ratios alone decide little.
 _ASSUMED = 32
-# Their standard deviation: what a machine with other things to do showed.
+# Standard deviation of their ratios in the logarithm, as seen on a machine with other things to do.
 _ASSUMED_SCATTER = 0.15
 
+# Mean and standard deviation of bias, α and β before the first frame: half of a frame grows with its pairs, a
+# little with its objects.
 _PRIOR = np.array([0.0, 0.5, 0.1])
-# Of bias, α and β: half of a frame grows with its pairs, a little with its objects.
 _PRIOR_DEVIATION = np.array([0.2, 0.3, 0.2])
 
-# Of load before the first frame: the timings are of another scene.
+# Standard deviation of load before the first frame: the timings are of another scene.
 _LOAD_DEVIATION = 0.3
-# Standard deviation of what load changes from one frame to the next.
+# Standard deviation of the change of load from one frame to the next.
 _LOAD_STEP = 0.06
-# Standard deviation of a frame, as far as it decides how fast is learned.
+# Standard deviation of a frame's duration in the logarithm that the filter assumes; it sets how fast it
+# learns.
 _SCATTER = 0.1
-# One frame that is so far from what was expected says only that it was slower or faster, not how much; the
-# second in a row, that something has changed.
+# A frame that is further off than that counts as only so far: one outlier would throw the filter off. A
+# second one in a row on the same side is a change, and is learned at once.
 _SURPRISE = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
 class Workload:
-    """What the cost of a frame depends on."""
+    """Numbers that the cost of a frame depends on."""
 
     pairs: int
     """Transmitters times receivers."""
@@ -94,12 +97,18 @@ class CostState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
 
 class CostModel:
-    """Durations of the next frame on every rung, as quantiles.
+    """Predicts the duration of the next frame on every rung, as a quantile.
 
     Args:
-        timings_ns: What each rung took before the first frame [ns], a few times each.
-        work: What those timings are of.
+        timings_ns: Durations of each rung before the first frame [ns], a few of each.
+        work: Pairs and objects in those frames.
         quantile: That predictions state, in (0, 1).
+
+    Example:
+        >>> work = Workload(pairs=10, objects=0)
+        >>> model = CostModel([[1_000_000] * 5, [8_000_000] * 5], work, quantile=0.95)
+        >>> [round(ns / 1e6) for ns in model.expect(work)]
+        [1, 8]
     """
 
     def __init__(self, timings_ns: Sequence[Sequence[int]], work: Workload, quantile: float) -> None:
@@ -111,14 +120,15 @@ class CostModel:
         self._covariance = np.diag(np.concatenate([[_LOAD_DEVIATION], deviation]) ** 2)
         kept = 0.5 ** (1 / REVERSION)
         self._kept = np.concatenate([[1.0], np.full(3 * count, kept)])
-        # What makes the prior the spread that a rung goes back to.
+        # With this drift, the variance of a rung that is not seen any more goes back to that of the prior.
         self._drift = np.diag(np.concatenate([[_LOAD_STEP], deviation * math.sqrt(1 - kept**2)]) ** 2)
-        # Of the last frame: 1 slower than expected by far, −1 faster by far.
+        # Outlier of the last frame: 1 slower, −1 faster, 0 none.
         self._side = 0
-        # What has changed if the next one is so, too: the load, or the bias of the rung that came.
+        # State that has changed if the next frame is such an outlier, too: the load, or the bias of a new
+        # rung.
         self._changed = 0
         self._rung: int | None = None
-        # Logarithm of what the stated quantile is raised by.
+        # Logarithm of the factor by which tracking raises the stated quantile.
         self._raised = 0.0
         self._rows: deque[Float64Array] = deque(maxlen=_WINDOW)
         self._measured: deque[float] = deque(maxlen=_WINDOW)
@@ -126,7 +136,7 @@ class CostModel:
         self._assume(timings_ns)
 
     def _assume(self, timings_ns: Sequence[Sequence[int]]) -> None:
-        """Frames as those timings, with the scatter that frames are assumed to have."""
+        """Begin with frames like the timings, with the scatter that frames are assumed to have."""
         rows = [self._row(rung, self._timed) for rung in range(len(timings_ns))]
         timed = [
             (rung, math.log(max(duration, 1)) - float(self._timing[rung]))
@@ -144,7 +154,7 @@ class CostModel:
 
     @property
     def state(self) -> CostState:
-        """All that was learned, and what it is relative to."""
+        """All that was learned, and the timings that it is relative to."""
         return CostState(
             timing=Packed.of(self._timing, "<f8"),
             pairs=self._timed.pairs,
@@ -161,10 +171,10 @@ class CostModel:
         )
 
     def go_on(self, state: CostState) -> None:
-        """Predict what another one would have, of the same ladder.
+        """Continue from the state of another model of the same ladder.
 
-        Its timings come with what it learned, which is relative to them; how this machine differs from
-        the other's is learned as a change of load.
+        Its timings come with what it learned, which is relative to them. A difference between both machines
+        is learned as a change of load.
         """
         self._timing = state.timing.array(np.float64)
         self._timed = Workload(pairs=state.pairs, objects=state.objects)
@@ -177,7 +187,7 @@ class CostModel:
 
     @property
     def load(self) -> float:
-        """How much longer than before the first frame everything takes now."""
+        """Factor by which all rungs take longer now than before the first frame."""
         return math.exp(self._mean[0])
 
     def expect(self, work: Workload) -> list[float]:
@@ -202,7 +212,13 @@ class CostModel:
         return min(then, now) + self._raised
 
     def observe(self, rung: int, work: Workload, duration_ns: int) -> None:
-        """A frame on this rung took so long."""
+        """Learn from a frame.
+
+        Args:
+            rung: That computed it, by its place on the ladder.
+            work: Pairs and objects in it.
+            duration_ns: That it took [ns].
+        """
         self._mean = self._prior + self._kept * (self._mean - self._prior)
         covariance = self._kept[:, None] * self._covariance * self._kept + self._drift
         row, measured = self._row(rung, work), math.log(max(duration_ns, 1)) - float(self._timing[rung])
@@ -227,7 +243,7 @@ class CostModel:
         self._expected.append(expected)
 
     def _row(self, rung: int, work: Workload) -> Float64Array:
-        """What load, and bias, α and β of every rung are multiplied with."""
+        """Factors of load, and of bias, α and β of every rung, whose sum is the logarithm of a duration."""
         row = np.zeros(len(self._prior))
         row[0] = 1.0
         row[1 + 3 * rung : 4 + 3 * rung] = (
@@ -239,7 +255,7 @@ class CostModel:
 
 
 def _weighted_quantile(values: Float64Array, quantile: float) -> float:
-    """Quantile of values of which the last one counts most."""
+    """Quantile of values with weights that halve every `HALF_LIFE` values, the last one counting most."""
     order = np.argsort(values, kind="stable")
     share = np.cumsum(0.5 ** (np.arange(len(values))[::-1] / HALF_LIFE)[order])
     index = int(np.searchsorted(share, quantile * share[-1]))
@@ -263,16 +279,21 @@ class ControllerState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
 
 
 class Controller:
-    """The most accurate rung whose predicted duration fits, with hysteresis.
+    """Picks the most accurate rung whose predicted duration fits, with hysteresis.
 
-    A predicted miss leads down in the same frame. Up it goes only to a rung that would have fitted, with
-    ``margin`` to spare, in each of the last ``patience`` frames. So noise about a border does not make the
+    A predicted miss leads down in the same frame. Up leads only a rung that would have fitted, with
+    ``margin`` to spare, in each of the last ``patience`` frames. So noise about a border does not make
     products change their quality from frame to frame.
 
     Args:
         share: Of the budget that a prediction may take: the rest is for decoding, encoding, and surprises.
         margin: Share of that which must be spare before going up.
         patience: Frames in a row that must have it.
+
+    Example:
+        >>> controller = Controller(share=0.8, margin=0.1, patience=2)
+        >>> [controller.choose([1e6, slow], budget_ns=10_000_000).rung for slow in (5e6, 9e6, 5e6, 5e6)]
+        [1, 0, 0, 1]
     """
 
     def __init__(self, share: float, margin: float, patience: int) -> None:
@@ -286,22 +307,25 @@ class Controller:
 
     @property
     def state(self) -> ControllerState:
-        """The rung, and for how long others would have fitted."""
+        """The rung, and for how many frames each rung would have fitted."""
         return ControllerState(current=self._current, streaks=tuple(self._streaks))
 
     def go_on(self, state: ControllerState) -> None:
-        """Be where another one was."""
+        """Continue from the state of another controller."""
         self._current, self._streaks = state.current, list(state.streaks)
 
     def choose(self, predicted_ns: Sequence[float], budget_ns: int) -> Choice:
-        """The rung for a frame, from the duration predicted for each, lowest rung first.
+        """The rung for a frame.
 
-        ``budget_ns`` 0 is no limit.
+        Args:
+            predicted_ns: Duration predicted for each rung [ns], lowest rung first.
+            budget_ns: Time that the frame has [ns]; 0: no limit.
         """
         limit = budget_ns * self._share if budget_ns else float("inf")
         fits = [predicted <= limit for predicted in predicted_ns]
         spare = [predicted <= limit * (1 - self._margin) for predicted in predicted_ns]
-        streaks = self._streaks or [self._patience] * len(fits)  # nothing is known: what fits may be taken
+        # In the first frame nothing is known: a rung that fits is taken without patience.
+        streaks = self._streaks or [self._patience] * len(fits)
         self._streaks = [streak + 1 if ok else 0 for streak, ok in zip(streaks, spare, strict=True)]
         if self._current is None:
             return self._take(self._highest(fits), fits)
@@ -311,7 +335,7 @@ class Controller:
         return self._take(max(current, self._highest([s >= self._patience for s in self._streaks])), fits)
 
     def impose(self, rung: int) -> None:
-        """This rung was computed, whoever decided it."""
+        """Take note that a frame was computed on this rung by a decision from outside."""
         if rung != self._current:
             self._streaks = [0] * len(self._streaks)
         self._current = rung

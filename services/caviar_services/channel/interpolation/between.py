@@ -51,12 +51,14 @@ OF_COEFFICIENTS = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
-    """A channel that was traced, when it was, and in which scene.
+    """A channel that was traced, its time and its scene.
 
-    Raises `PayloadError` where the scene lacks a device of the channel.
+    Raises:
+        PayloadError: The scene lacks a device of the channel.
     """
 
     t_s: float
+    """Time [s]."""
     channel: Channel
     scene: Scene | None = None
     """Absent: motion is known from Doppler shifts alone."""
@@ -85,13 +87,32 @@ class Between:
 class Interpolation:
     """Channels between two keyframes.
 
-    Paths of both, by TX, RX and id, go on between them. The amplitude without carrier phase and 1/τ is
-    interpolated as a complex number: in magnitude and phase it would have to guess turns, and could not
-    pass through zero as Brewster's angle asks. The phase comes from the delay, see `course`. Paths of
-    one keyframe fade towards the other: where the instant of the change is unknown, that has 2/3 of the mean
-    squared error of switching in the middle, and no jump. Devices that one keyframe lacks are left out.
+    Paths of both keyframes, by TX, RX and id, exist all the time between them. The amplitude without carrier
+    phase and 1/τ is interpolated as a complex number: in magnitude and phase it would have to guess turns,
+    and could not pass through zero as it does at Brewster's angle. The phase comes from the delay, see
+    `course`. A path of one keyframe fades towards the other: where the instant of the change is unknown, that
+    has 2/3 of the mean
+        squared
+    error of switching in the middle, and no jump. Devices that one keyframe lacks are left out.
 
-    Raises `PayloadError` for keyframes in the wrong order, of different rungs or carriers.
+    Args:
+        before: The earlier keyframe.
+        after: The later one, of the same rung and carriers.
+
+    Raises:
+        PayloadError: The keyframes are in the wrong order, or of different rungs or carriers.
+
+    Example:
+        >>> from caviar_services.channel.stability.lab import Thing, antenna, free_space, measure, scene
+        >>> devices = [antenna("bs", "tx", (0, 0, 9)), antenna("rx", "rx", (0, 0, 1), parent="car")]
+        >>> def street(t_s):  # a car at 10 m/s
+        ...     return scene(devices, [Thing("car", (50 + 10 * t_s, 5, 1), velocity=(10, 0, 0))])
+        >>> model = free_space(28e9)
+        >>> ends = [Keyframe(t, measure(model, street(t)), street(t)) for t in (0.0, 0.1)]
+        >>> made = Interpolation(*ends).at(0.04, street(0.04))
+        >>> exact = measure(model, street(0.04)).tau
+        >>> bool(abs(made.channel.tau - exact).max() < 1e-15), bool((made.bound_db < -40).all())
+        (True, True)
     """
 
     def __init__(self, before: Keyframe, after: Keyframe) -> None:
@@ -110,15 +131,19 @@ class Interpolation:
         self._frequency = np.array([carrier.frequency_hz for carrier in before.channel.carriers])
 
     def at(self, t_s: float, scene: Scene | None = None, with_h: bool = False) -> Between:
-        """The channel at a time [s] between both keyframes.
+        """The channel at a time between both keyframes.
 
         Points of paths are on the straight line between those at both keyframes.
 
-        ``scene`` is that of the instant, where it is known: with the keyframes' own it tells how ends and
-        objects moved, whatever their acceleration; and matrices need the antennas in it.
+        Args:
+            t_s: Time [s].
+            scene: Of that time, where it is known: with those of the keyframes it gives the motion of ends
+                and objects, whatever their acceleration. Matrices need the antennas in it.
+            with_h: Whether matrices are made.
 
-        Raises `PayloadError` for a time outside the interval, for matrices without a scene or of a
-        rung whose matrices do not follow from its paths, and for antennas with several subarrays.
+        Raises:
+            PayloadError: The time is outside of the interval; matrices are asked for without a scene, or of a
+                rung whose matrices do not follow from its paths; or an antenna has several subarrays.
         """
         before, after = self._keyframes
         if not before.t_s <= t_s <= after.t_s:
@@ -275,7 +300,8 @@ class Interpolation:
 
 
 def _refuse_subarrays(scene: Scene) -> None:
-    """Amplitudes of a product are those between two subarrays, which may be others at the next keyframe."""
+    """Raise `PayloadError` for an antenna with several subarrays: amplitudes of a product are those between
+    two of them, which may be others at the next keyframe."""
     for device in scene.devices:
         if isinstance(device, AntennaDevice) and not device.array.is_uniform:
             raise PayloadError(
@@ -297,9 +323,10 @@ def _span(antenna: Antenna) -> float:
 
 
 def join(before: Channel, after: Channel) -> Joined:
-    """Paths by TX, RX and id.
+    """Paths of two products side by side, by TX, RX and id.
 
-    Raises `PayloadError` for products with other carriers or of other rungs.
+    Raises:
+        PayloadError: The products have different carriers or rungs.
     """
     if before.carriers != after.carriers or before.rung != after.rung:
         raise PayloadError(
@@ -383,7 +410,7 @@ class _Table:
 
 
 def _end(tables: Sequence[_Table], rows: Int64Array) -> End:
-    """Rows of both tables, one after the other."""
+    """What one keyframe says: ``rows`` are those of both tables, one after the other."""
     channels = [table.channel for table in tables]
     frequency = np.array([carrier.frequency_hz for carrier in channels[0].carriers])[:, None]
     tau = np.concatenate([channel.tau for channel in channels])[rows]
@@ -400,7 +427,7 @@ def _end(tables: Sequence[_Table], rows: Int64Array) -> End:
 
 
 def unit_vectors(angles: Float64Array) -> Float64Array:
-    """Of directions (zenith, azimuth) [rad], Shape ``[K, 2]`` to ``[K, 3]``."""
+    """Unit vectors of directions (zenith, azimuth) [rad], Shape ``[K, 2]`` to ``[K, 3]``."""
     zenith, azimuth = angles[:, 0], angles[:, 1]
     sine = np.sin(zenith)
     return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.cos(zenith)], axis=-1)

@@ -119,7 +119,8 @@ class Places:
 def ends_of(scene: Scene, joined: Joined) -> tuple[list[Antenna], list[Antenna]]:
     """Transmitters and receivers of the joined paths in a scene.
 
-    Raises `PayloadError` where it lacks one of them.
+    Raises:
+        PayloadError: The scene lacks one of them.
     """
     found = []
     for role, names in (("tx", joined.tx), ("rx", joined.rx)):
@@ -165,7 +166,7 @@ def corners(places: Places, points: Float64Array, joined: Joined) -> Float64Arra
 
 
 def normals(corners: Float64Array, joined: Joined) -> Float64Array:
-    """Of the mirrors, from the way the wave turns there; 0 where nothing is reflected: ``[K, D, 3]``."""
+    """Normals of mirrors, from the turn of the path there; 0 where nothing is reflected; ``[K, D, 3]``."""
     segment = np.diff(corners, axis=1)
     length = np.linalg.norm(segment, axis=-1, keepdims=True)
     along = segment / np.where(length > 0, length, 1.0)
@@ -204,7 +205,7 @@ OF_THE_CORRECTION = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """K paths at an instant."""
+    """Lengths and directions of K paths at an instant, and bounds on their errors."""
 
     length: Float64Array
     """[m], Shape ``[K]``."""
@@ -220,15 +221,18 @@ class Course:
 
     @classmethod
     def of(cls, to_end: Float64Array, to_start: Float64Array) -> Course:
-        """With the lengths of the images' vectors [m], Shape ``[K, 3]`` each; no rate, no errors."""
+        """From the vectors to the images of both ends [m], Shape ``[K, 3]`` each; no rate, no errors."""
         nothing = np.zeros(len(to_end))
         return cls(np.linalg.norm(to_end, axis=-1), _unit(to_end), _unit(to_start), nothing, nothing, nothing)
 
 
 class Courses:
-    """The courses of joined paths.
+    """Lengths and directions of joined paths between both keyframes.
 
-    ``at_ends`` are positions at both keyframes, without which the Doppler shifts tell of the motion.
+    Args:
+        joined: The paths.
+        seconds: From one keyframe to the other [s].
+        at_ends: Positions at both keyframes; None: the motion is taken from the Doppler shifts.
     """
 
     def __init__(self, joined: Joined, seconds: float, at_ends: tuple[Places, Places] | None) -> None:
@@ -245,7 +249,7 @@ class Courses:
         moved = self._to_end[1] - self._to_end[0]
         chord = [(_unit(vector) * moved).sum(-1) / seconds for vector in self._to_end]
         self._slopes = [rate - along for rate, along in zip(self._rates(), chord, strict=True)]
-        # As of the path itself, so of the straight line that is taken from it.
+        # The remainder of Hermite holds for the path and for the straight line that is taken from it.
         speed = np.linalg.norm(moved, axis=-1) / seconds
         bends = 3 * speed**4 / np.maximum(_closest(*self._to_end), ROUNDING_M) ** 3 + self._of_legs()
         self._remainder = np.where(self._specular, 0.0, seconds**4 / 384 * bends)
@@ -257,7 +261,12 @@ class Courses:
         return self._turn
 
     def at(self, s: float, now: Places | None) -> Course:
-        """The course at the share ``s`` of the interval, for paths of both keyframes and of one."""
+        """The course at an instant, for paths of both keyframes and of one.
+
+        Args:
+            s: Share of the interval that is over, from 0 to 1.
+            now: Positions at the instant; None: they are not known.
+        """
         if now is not None and self._at_ends is not None:
             course = self._known(s, now, self._at_ends)
         else:
@@ -285,7 +294,7 @@ class Courses:
         """Bound on the fourth derivative of the way along points that stay on their surfaces [m/s⁴]."""
         if self._specular.all():
             return np.zeros(len(self._specular))
-        if self._at_ends is None:  # nobody knows the legs: as if each were half of the path
+        if self._at_ends is None:  # the legs are unknown: as if each were half of the path
             speed = np.linalg.norm(self._to_end[1] - self._to_end[0], axis=-1) / self._h
             halves: Float64Array = 2 * 3 * speed**4 / (self._shortest / 2) ** 3
             return halves
@@ -308,7 +317,8 @@ class Courses:
         to_end, _ = image_moves(after - before, self._normals)
         off: Float64Array = np.linalg.norm(self._to_end[0] + to_end - self._to_end[1], axis=-1)
         off = np.where(self._specular & self._kept, off, 0.0)
-        # What is true of one path off an object may hold for another that shows it at neither keyframe.
+        # An error of one path by way of an object may be that of another one that shows it at neither
+        # keyframe.
         of_object = np.zeros(len(self._joined.object_names) + 1)
         for objects in self._joined.objects.T:
             np.maximum.at(of_object, objects, off)
@@ -382,7 +392,7 @@ class Courses:
         )
 
     def _hermite(self, s: float) -> tuple[Float64Array, Float64Array]:
-        """What has the slopes at both ends and is 0 there [m], and its slope [m/s]."""
+        """Hermite's cubic that is 0 at both ends and has their slopes [m], and its slope [m/s]."""
         first, last = self._slopes
         value = self._h * (first * s * (1 - s) ** 2 - last * s**2 * (1 - s))
         slope = first * (1 - s) * (1 - 3 * s) - last * s * (2 - 3 * s)
@@ -390,7 +400,7 @@ class Courses:
 
 
 def first_order(places: Places, points: Float64Array, moves: Places, joined: Joined) -> Float64Array:
-    """Change of the lengths to first order in moves [m], or with velocities in time [m/s]; Shape ``[K]``."""
+    """Change of lengths to first order in moves [m] or, for velocities, in time [m/s]; Shape ``[K]``."""
     geometry = path_geometry(
         start=places.start,
         points=points,

@@ -80,12 +80,16 @@ class Faces(Rows):
 
 
 def faces_of(ends: Float64Array, apexes: Float64Array) -> tuple[Faces, BoolArray]:
-    """Faces of wedges, and where there are any: not where an edge has no length or a face no width.
+    """Faces of wedges from points of a mesh.
 
     Args:
-        ends: Of the edges [m], Shape ``[P, 2, 3]``.
+        ends: Both ends of the edges [m], Shape ``[P, 2, 3]``.
         apexes: A point of each face that is not on the edge [m], Shape ``[P, 2, 3]``; of a single face,
             twice.
+
+    Returns:
+        The wedges, and which of them are any, Shape ``[P]``: not where an edge has no length or a face no
+        width.
     """
     begin, end = ends[:, 0], ends[:, 1]
     with np.errstate(invalid="ignore", divide="ignore"):  # of what is no wedge
@@ -181,17 +185,18 @@ def edge_fields(
     """Fields of paths that are diffracted once.
 
     Args:
-        corners: TX, interaction points, and RX in all places behind the last one [m], Shape ``[P, D + 2,
-            3]``.
-        types: `Interaction` at each point, Shape ``[P, D]``: reflections, transmissions, and one
-            diffraction.
+        corners: TX, interaction points, and RX in all places behind the last one [m], ``[P, D + 2, 3]``.
+        types: `Interaction` at each point, Shape ``[P, D]``: reflections, transmissions, one diffraction.
         normals: Of the triangle at each point, of any length, Shape ``[P, D, 3]``.
         faces: Of the wedges.
         media: Materials at each point; at the edge, that of the first face.
         second: Materials of the second face, Shape ``[C, P, 1]`` or ``[P, 1]``.
         wavelengths: Of the carriers [m].
-        lit: Which of the waves of `Bends.margins` there are: 1, −1 for none, 0 where angles tell; ``[P,
-            3]``.
+        lit: Whether the waves of `Bends.margins` exist: 1, −1 if not, 0 where angles decide; ``[P, 3]``.
+            None: angles decide everywhere.
+
+    Returns:
+        Dyads of `PathTable`, Shape ``[C, P, 3, 3]``; not finite where the geometry leaves none.
     """
     steps = np.diff(corners, axis=1)
     bends = Bends.of(corners, types, faces)
