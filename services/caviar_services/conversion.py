@@ -156,9 +156,10 @@ def plain_done(
 ) -> tuple[m.Done, tuple[Payload, ...]]:
     """DONE without digests, and the products as they are, for a consumer in this process.
 
-    Decisions, counts and times are left out: only a recorder gets them, and there is none. Raises
-        `PayloadError` for a
-    product that is not its topic's.
+    Decisions, counts and times are left out: only a recorder gets them, and there is none.
+
+    Raises:
+        PayloadError: A product is not its topic's.
     """
     products = _products(use, result)
     done = m.Done(
