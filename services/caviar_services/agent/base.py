@@ -84,6 +84,7 @@ class Agent(Service[S]):
                     f"{text!r} is no beam, and this agent steers {known} only; write 'beam:<receiver>'",
                     key=f"services.{run.name}.users",
                 )
+        # Patterns, not names: who is there changes from frame to frame.
         self._owned = _receivers(settings.users)
         self._others = _receivers(settings.except_users)
 

@@ -38,21 +38,16 @@ from caviar_services.antenna_arrays import dft_beam, steering_vector
 from caviar_services.link.base import (
     Choices,
     LinkModel,
-    User,
     UserChannels,
     Users,
     channels_of,
     choices_of,
+    noise_power,
     require_channel,
+    transmit_power,
     users_of,
 )
 from caviar_services.service import Frame, StepResult
-
-BOLTZMANN = 1.380649e-23
-"""[J/K], exact (SI)."""
-
-MAX_POWER_DBM = 200.0
-"""A transmit power beyond this, either way, is a mistake of units and would overflow the SNR."""
 
 RewardKind = Literal["abs_y", "normalised", "snr", "spectral_efficiency"]
 
@@ -195,39 +190,6 @@ class _Budget:
         )
 
 
-def noise_power(carrier: Carrier, noise_figure_db: float, temperature_k: float) -> float:
-    """Thermal noise k·T·B·F [W] in the carrier's bandwidth (Recommendation ITU-R P.372, noise factor).
-
-    Args:
-        carrier: The carrier, with its bandwidth.
-        noise_figure_db: Noise figure of the receiver [dB].
-        temperature_k: Temperature of the thermal noise [K].
-
-    Example:
-        >>> carrier = Carrier(name="mmwave", frequency_hz=28e9, bandwidth_hz=100e6)
-        >>> round(10 * math.log10(noise_power(carrier, 9.0, 290.0)) + 30, 1)  # [dBm]
-        -85.0
-    """
-    return BOLTZMANN * temperature_k * carrier.bandwidth_hz * 10 ** (noise_figure_db / 10)
-
-
-def transmit_power(user: User) -> float:
-    """Transmit power [W] of a user's transmitter.
-
-    Args:
-        user: The user.
-
-    Raises:
-        PayloadError: The power is beyond ±`MAX_POWER_DBM`; names the device.
-    """
-    if not abs(user.tx.power_dbm) <= MAX_POWER_DBM:
-        raise PayloadError(
-            f"device {user.tx.name!r} transmits {user.tx.power_dbm} dBm; "
-            f"power_dbm must lie within ±{MAX_POWER_DBM:g}"
-        )
-    return 10 ** ((user.tx.power_dbm - 30) / 10)
-
-
 class _Scores(msgspec.Struct, frozen=True):
     """Fields of `Link` that come out of the sweep."""
 
@@ -243,6 +205,7 @@ class _Scores(msgspec.Struct, frozen=True):
 def _score(scene: Scene, users: Users, choices: Choices, channels: UserChannels, top_k: int) -> _Scores:
     """Sweep all pairs of all users and read off the chosen, the best and the baseline pairs."""
     towards_rx, towards_tx = directions(scene, users)
+    # Users with fewer pairs than others fill up with −1 (`_listed`), so that the lists are one array.
     k = min(top_k, max((user.tx.array.size * user.rx.array.size for user in users), default=0))
     chosen, baseline = [0.0] * len(users), [0.0] * len(users)
     tx_beams, rx_beams = choices.tx_beam.tolist(), choices.rx_beam.tolist()
@@ -379,6 +342,8 @@ def best_pairs(abs_y: Float64Array, k: int) -> Pairs:
 
 def _best_of_many(flat: Float64Array, k: int) -> Int64Array:
     """Indices of the ``k`` greatest, found without sorting all."""
+    # A partition is linear in the number of pairs; only what reaches the k-th is sorted, equal ones included,
+    # so that the order among them is that of a stable sort of all.
     threshold = np.partition(flat, flat.size - k)[flat.size - k]
     candidates = np.flatnonzero(flat >= threshold)
     order: Int64Array = candidates[np.argsort(-flat[candidates], kind="stable")][:k]
@@ -402,6 +367,12 @@ def sweep_users(users: Users, h: Sequence[Complex128Array | None]) -> list[Swept
 
     Returns:
         A batch for each combination of arrays.
+
+    Example:
+        >>> from caviar_services.testing.samples import CARRIERS, product, scene
+        >>> users = users_of(scene(0), CARRIERS)
+        >>> [batch.abs_y.shape for batch in sweep_users(users, channels_of(product("channel", 0), users).h)]
+        [(1, 16, 3), (1, 16, 2)]
     """
     groups: dict[int, list[int]] = defaultdict(list)
     for index, (matrix, group) in enumerate(zip(h, users.array_groups, strict=True)):
@@ -441,6 +412,7 @@ def beam_responses(
         >>> [y.shape for y in responses]  # slots × subcarriers of the carrier
         [(2, 5), (2, 5)]
     """
+    # Asked for by a service that needs it (part `hf`), so mostly there are none.
     matrices = {(response.carrier, response.tx, response.rx): response.h for response in channel.hf}
     rotations: dict[str, Float64Array] = {}
     found = []

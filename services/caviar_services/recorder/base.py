@@ -252,6 +252,13 @@ def copy_assets(assets: Mapping[str, Path], folder: Path, *, sync: bool = False)
     Raises:
         AssetError: A name leads out of ``folder``.
         OSError: A file cannot be read or written.
+
+    Example:
+        >>> copy_assets({"../wall.ply": Path("wall.ply")}, Path("assets"))
+        Traceback (most recent call last):
+            ...
+        caviar_protocol.errors.AssetError: asset '../wall.ply' leads out of the recording; use a relative \
+path without '..'
     """
     copied = []
     for name, source in sorted(assets.items()):

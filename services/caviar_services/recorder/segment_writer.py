@@ -127,6 +127,8 @@ class SegmentWriter:
         """
         frame_channel = self._channel(FRAME_TOPIC, "")
         keyed = [(self._channel(p.provenance.topic, p.provenance.source), p) for p in products]
+        # One log time for all that a frame brought, also for what was computed for an earlier one: a reader
+        # that seeks by time finds the whole frame.
         log_time = base_ns + entry.t_ns
 
         def add(channel: int, sequence: int, t_ns: int, data: bytes) -> None:

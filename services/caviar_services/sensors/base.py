@@ -104,6 +104,7 @@ class Sensors(Service[S]):
             AssetError: The scene description or a mesh is broken or missing.
             SetupError: Mitsuba is not installed, or there is no library to compile kernels with.
         """
+        # Before Mitsuba is looked for: an agent's run without sensors needs no ray tracer.
         if not preparation.demand.keys() & set(self.outputs):
             return Prepared(notes=("no service asks for what these sensors see: not run",))
         if importlib.util.find_spec("mitsuba") is None:
@@ -115,6 +116,7 @@ class Sensors(Service[S]):
         # would change it twice a frame, which costs Sionna RT half of the frame.
         self.variant = choose_variant()
         limit_threads()
+        # Large scenery and kernels may take longer than the scenario's `stall_s`, so a grace is asked for.
         self.run.progress("loading scenery", 60.0)
         with active_variant(self.variant) as mi:
             self.traced = self._load(mi, preparation.assets)
@@ -163,7 +165,7 @@ class Sensors(Service[S]):
             Product by topic, of the topics in demand alone (contract, clause 5).
 
         Raises:
-            PayloadError: A sensor sits inside its carrier (`pose_outside`).
+            PayloadError: A sensor sits inside its carrier (`sensor_poses`).
         """
 
     @abstractmethod
@@ -214,7 +216,7 @@ def sensor_poses(traced: TracedScene, scene: Scene, kind: type[D]) -> list[tuple
     """Find the devices of a kind and their world poses.
 
     Args:
-        traced: The scene for rays.
+        traced: The scene for rays, moved to where ``scene`` has the objects.
         scene: The scenes of all worlds as one.
         kind: Class of the devices, such as `caviar_protocol.topics.LidarDevice`.
 
@@ -222,33 +224,23 @@ def sensor_poses(traced: TracedScene, scene: Scene, kind: type[D]) -> list[tuple
         Device and pose, sorted by the name of the device.
 
     Raises:
-        PayloadError: A sensor is inside its carrier (`pose_outside`).
+        PayloadError: A sensor sits inside the mesh that carries it; the text names both and the remedy.
     """
-    devices = [device for device in scene.devices if isinstance(device, kind)]
-    devices.sort(key=lambda device: device.name)
-    return [(device, pose_outside(traced, scene, device)) for device in devices]
-
-
-def pose_outside(traced: TracedScene, scene: Scene, device: Device) -> Pose:
-    """World pose of a sensor, which must not sit inside the mesh that carries it.
-
-    Args:
-        traced: The scene for rays.
-        scene: Where the carrier is.
-        device: The sensor.
-
-    Raises:
-        PayloadError: The sensor is inside its carrier; the text names both and the remedy.
-    """
-    if device.parent and device.parent in scene.names:
-        parent = scene.names.index(device.parent)
-        if traced.is_inside(scene.assets[parent], scene.dimensions[parent], device.position):
-            kind = type(device).__struct_config__.tag
-            raise PayloadError(
-                f"{kind} {device.name!r} sits inside its carrier {device.parent!r} and would see only that; "
-                'mount it outside the mesh, for example with mount = "roof" and a position_m above it'
-            )
-    return device_pose(scene, device)
+    found = []
+    for device in scene.devices:
+        if not isinstance(device, kind):
+            continue
+        # A mounted device whose object is not in the scene has no pose, which `device_pose` says.
+        if device.parent and device.parent in scene.names:
+            parent = scene.names.index(device.parent)
+            if traced.is_inside(scene.assets[parent], scene.dimensions[parent], device.position):
+                tag = type(device).__struct_config__.tag
+                raise PayloadError(
+                    f"{tag} {device.name!r} sits inside its carrier {device.parent!r} and would see only that; "
+                    'mount it outside the mesh, for example with mount = "roof" and a position_m above it'
+                )
+        found.append((device, device_pose(scene, device)))
+    return sorted(found, key=lambda sensor: sensor[0].name)
 
 
 @contextmanager
@@ -280,6 +272,15 @@ def load_unit_mesh(file: Path) -> Mesh:
 
     Raises:
         AssetError: The file is no mesh, or its bounding box is not −½…½ on every axis.
+
+    Example:
+        >>> import tempfile
+        >>> from caviar_services.mesh.shapes import ply
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     file = Path(folder, "box.ply")
+        ...     _ = file.write_bytes(ply(unit_box()))
+        ...     len(load_unit_mesh(file).faces)
+        12
     """
     vertices, faces = read_ply(file)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
@@ -311,6 +312,7 @@ class _Part:
         """Put another mesh in place of this one, of any size."""
         (column,) = aligned_columns(mesh.vertices.reshape(1, -1))
         self._parameters[self._keys[0]] = mi.Float(column)
+        # In most frames the same objects are there: then only vertices move.
         if not np.array_equal(mesh.faces, self._faces):
             self._parameters[self._keys[1]] = mi.UInt32(aligned_indices(mesh.faces.ravel()))
             self._faces = mesh.faces
@@ -408,6 +410,7 @@ class TracedScene:
         if self._scenery is None:
             return hit.t, hit.prim_index
         fixed = self._scenery.scene.ray_intersect_preliminary(ray, coherent=True)
+        # Faces of scenery come first in the tables (`face_owner`), so those of bodies are counted on.
         moving = hit.t < fixed.t
         face = dr.select(moving, hit.prim_index + mi.UInt32(self.scenery_faces), fixed.prim_index)
         return dr.select(moving, hit.t, fixed.t), face
@@ -477,6 +480,7 @@ def visible_names(
     name_of = {owner: of_owner[owner] for owner in np.flatnonzero(seen).tolist()}
     names = tuple(sorted(set(name_of.values())))
     place = {name: position for position, name in enumerate(names)}
+    # Names, not owners, are listed: several shapes of a scenery may have one material.
     index = np.full(len(seen), NO_HIT, dtype=np.int32)
     for owner, name in name_of.items():
         index[owner] = place[name]

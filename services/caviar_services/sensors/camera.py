@@ -108,6 +108,7 @@ class CameraSensors(Sensors[CameraSettings]):
         products: dict[str, Payload] = {}
         if "camera" in self._demand:
             products["camera"] = self._pictures(mi, traced, scene, views)
+        # Both come of the same rays, one a pixel; pictures have more, and shadows.
         if self._demand.keys() & {"depth", "segmentation"}:
             hits = [_first_hits(mi, traced, view) for view in views]
             if "depth" in self._demand:
@@ -126,6 +127,7 @@ class CameraSensors(Sensors[CameraSettings]):
                 math.sin(elevation),
             ]
         )
+        # One painter for all cameras of a frame: normals and colours of all faces are uploaded once.
         painter = Painter(mi, traced, self._albedo(traced, scene), sun)
         return Camera(images=tuple(CameraImage(**view.fields, rgb=painter.paint(view)) for view in views))
 

@@ -111,6 +111,7 @@ class LidarSensors(Sensors[LidarSettings]):
 
     def step(self, frame: Frame) -> StepResult:
         """See `Sensors.step`."""
+        # By the number of the frame, not counted: a service that was started again goes on in step.
         self._with_points = frame.number % self.settings.points_every == 0
         return super().step(frame)
 
@@ -131,6 +132,7 @@ class LidarSensors(Sensors[LidarSettings]):
             self._rays = _rays(mi, patterns)
         with_world = self._with_grid or (self._with_points and self.settings.points_world)
         returns = _trace(mi, traced, self._rays, sensors, with_world)
+        # Faces, not rays, are looked up: there are fewer of them, and most rays share theirs.
         hit = np.zeros(len(traced.face_owner), dtype=np.bool_)
         hit[returns.face if self._with_points else slice(0)] = True
         names, index = visible_names(traced.owner_names, [traced.face_owner[hit]])
@@ -237,6 +239,7 @@ def _trace(
     of_ray = [dr.gather(mi.Float64, row, rays.sensor) for row in mounts[9:]]
     direction = turned(rays.local, rays.sensor)
     ray = mi.Ray3f(mi.Point3f(*map(mi.Float, of_ray[:3])), mi.Vector3f(*map(mi.Float, direction)))
+    # A hit nearer than the least range is not looked through: what is there hides the rest (`LidarSensors`).
     nearest, farthest = of_ray[3:]
     # A little more than the range, which is applied exactly to what is found.
     ray.maxt = mi.Float(farthest * (1 + 1e-6))
@@ -417,6 +420,14 @@ def antenna_positions(
 
     Returns:
         World positions [m] of the transmitters, and of the receivers.
+
+    Example:
+        >>> from caviar_services.testing.samples import scene
+        >>> street = scene(0)
+        >>> lidar = next(device for device in street.devices if isinstance(device, LidarDevice))
+        >>> grid = GridSettings(minimum_m=(0, 0, 0), maximum_m=(1, 1, 1), cells=(1, 1, 1), tx="bs")
+        >>> [len(positions) for positions in antenna_positions(street, lidar, grid)]
+        [1, 1]
     """
     receivers = [
         device

@@ -200,6 +200,8 @@ class Painter:
         index = dr.arange(mi.Int32, view.device.width * view.device.height)
         row = index // width
         column = index - row * width
+        # The 16 pixels of a tile have looked in 16 sets of six directions, so their mean is that of 96. It
+        # stops at edges: light does not leak from one surface to another.
         total, count, edge = mi.Color3f(seen.ambient), mi.Float(1.0), mi.Bool(False)
         for dy in range(-TILE // 2, TILE // 2):
             for dx in range(-TILE // 2, TILE // 2):
@@ -239,6 +241,7 @@ class _Seen:
 
         between = dr.gather(mi.Float, self.distance, other) * dr.gather(mi.Vector3f, self.direction, other)
         between -= self.distance * self.direction
+        # In one plane, within what a curved surface bends between two pixels that far away.
         flat = dr.abs(dr.dot(between, self.normal)) < 0.02 + 2e-3 * self.distance
         alike = dr.dot(dr.gather(mi.Vector3f, self.normal, other), self.normal) > 0.9
         return self.hit & dr.gather(mi.Bool, self.hit, other) & flat & alike
@@ -415,6 +418,11 @@ def shaded(colour: Float64Array, name: str, share: float) -> Float64Array:
 
     Returns:
         Linear sRGB, Shape ``[3]``.
+
+    Example:
+        >>> grey = np.array([0.5, 0.5, 0.5])
+        >>> bool((shaded(grey, "car.1", 0.2) == shaded(grey, "car.1", 0.2)).all())
+        True
     """
     # CRC-32, not `hash`, which Python makes different in each process.
     value = zlib.crc32(name.encode())

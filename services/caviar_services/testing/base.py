@@ -118,6 +118,7 @@ class ServiceConformance:
     episodes: ClassVar[tuple[int, ...]] = (0, 0)
     """Episodes of a life; by default the same one twice."""
 
+    # pytest collects whatever class a test file imports; the bases have nothing to test.
     def __init_subclass__(cls) -> None:
         cls.__test__ = hasattr(cls, "service_class")
 
@@ -142,7 +143,7 @@ class ServiceConformance:
         run = RunInfo(
             name=cls.service_class.role,
             run="conformance",
-            seed=3,
+            seed=3,  # another one than the episode's: a service that takes the wrong one shows
             sampling_period_ns=samples.SAMPLING_PERIOD_NS,
             frames=FRAMES,
             carriers=cls.carriers,

@@ -188,6 +188,7 @@ def product(topic: str, frame: int) -> Payload:
             return scene(frame)
         case "channel":
             channel = FreeSpaceChannel(FreeSpaceSettings(), _run("channel"))
+            # Free space: closed form, no ray tracer, and a path to each receiver whatever stands around.
             channel.prepare(Preparation(demand={"channel": frozenset(PARTS["channel"])}))
             return channel.step(granted(channel.inputs, frame, "channel")).products["channel"]
         case "action":
@@ -237,6 +238,7 @@ def source(topic: str) -> str:
 
 
 def _input(topic: str, computed: int, age: int, cause: str) -> FrameInput:
+    # As in a run: a lagged input of the first frame is of the one before it, which there is not.
     if computed < 0:
         cause = "no frame before the first"
     if cause:

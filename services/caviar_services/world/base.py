@@ -242,6 +242,7 @@ class World(Service[W]):
         # Before they are sorted: devices go to the objects that came first, which a world lists in front.
         devices = self._mounts.devices([(state.name, state.dimensions) for state in states])
         states = sorted(states)
+        # Sorted, so neighbours: consumers look objects up by name, and would take one of the two.
         names = tuple(state.name for state in states)
         if len(set(names)) < len(names):
             twice = next(name for name, following in pairwise(names) if name == following)
@@ -317,7 +318,8 @@ class Mounts:
         self._objects: Sequence[tuple[str, Vector]] | None = None
         self.without_object: tuple[str, ...] = ()
         """Devices that found no object to stand on in the last frame."""
-        # Of the objects of the frame before, which mostly are those of the next one.
+        # Of the objects of the frame before, which mostly are those of the next one: devices are made anew
+        # only when an object comes or goes.
         self._devices: tuple[Device, ...] = ()
 
     @property

@@ -156,6 +156,7 @@ class FlightWorld(TrajectoryWorld):
                 "flown to is lost with the process that knew it; have states saved "
                 "(run.checkpoint_frames above 0), and start the run again"
             )
+        # `restore` sets it too: where states are saved, a world that is started again is not lost.
         self._begun = True
         motions = self._motions(frame)
         self._place(motions)
@@ -203,6 +204,7 @@ class FlightWorld(TrajectoryWorld):
                     continue
                 name = command.object
                 if name not in self._flyers:
+                    # It may be meant for another world of the run; alone, no other can fly it.
                     if not self._alone and not name.startswith(self.prefixes()):
                         continue
                     known = ", ".join(map(repr, self._flyers)) or "none"

@@ -200,6 +200,7 @@ class Flyer:
         state, events = self.state, set[str]()
         wanted = motion or _HOVER
         asked = math.hypot(*wanted.velocity) if wanted.target is None else wanted.speed
+        # Counted, not refused: an agent that learns may ask for anything, and sees what came of it.
         if asked > self.limits.speed * (1 + _ROUNDING):
             events.add(LIMITED_SPEED)
         # The same command again, as agents send it in each frame, does not restart the count: so it makes no

@@ -244,6 +244,7 @@ class SumoWorld(World[SumoSettings]):
             ("--additional-files", _tuple(s.additional)),
         ):
             arguments += [option, ",".join(files)] if files else []
+        # Warnings too, which are many; what SUMO would leave out is found before (`sumo_process.check_file`).
         quiet = ["--no-step-log", "--duration-log.disable", "--no-warnings"]
         step = ["--step-length", f"{self._step_ms / 1000:.3f}", "--seed", str(seed)]
         return [*arguments, *quiet, *step, *s.options]

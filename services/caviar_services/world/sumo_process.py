@@ -125,6 +125,10 @@ class Simulation:
 
     Args:
         libsumo: What `load_libsumo` gives.
+
+    Example:
+        >>> simulation = Simulation(load_libsumo())
+        >>> simulation.close()  # nothing runs: does nothing
     """
 
     def __init__(self, libsumo: ModuleType) -> None:
@@ -140,6 +144,7 @@ class Simulation:
         Raises:
             SetupError: SUMO refuses, or runs in this process already; has SUMO's own words.
         """
+        # `close` ends only what was started here: a simulation of another world in this process stays.
         self.close()
         if self.api.isLoaded():
             raise SetupError(

@@ -126,6 +126,7 @@ class TrajectoryWorld(World[TrajectorySettings]):
     def objects_at(self, elapsed_ns: int) -> Iterable[ObjectState]:
         """All objects, at all times."""
         t = elapsed_ns / 1e9
+        # The velocity once for all three that need it.
         for name, (thing, track) in self._tracks.items():
             velocity = track.velocity(t)
             yield ObjectState(
