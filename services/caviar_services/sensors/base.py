@@ -236,8 +236,9 @@ def sensor_poses(traced: TracedScene, scene: Scene, kind: type[D]) -> list[tuple
             if traced.is_inside(scene.assets[parent], scene.dimensions[parent], device.position):
                 tag = type(device).__struct_config__.tag
                 raise PayloadError(
-                    f"{tag} {device.name!r} sits inside its carrier {device.parent!r} and would see only that; "
-                    'mount it outside the mesh, for example with mount = "roof" and a position_m above it'
+                    f"{tag} {device.name!r} sits inside its carrier {device.parent!r} and would see only "
+                    'that; mount it outside the mesh, for example with mount = "roof" and a position_m above'
+                    " it"
                 )
         found.append((device, device_pose(scene, device)))
     return sorted(found, key=lambda sensor: sensor[0].name)
