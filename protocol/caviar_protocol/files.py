@@ -44,7 +44,7 @@ def replace_file(
     mode: int = 0o666,
     concurrent: bool = False,
 ) -> None:
-    """Write a file atomically: a reader, and a machine that died, have the whole of it or what was before.
+    """Write a file atomically: readers see all of it or the earlier content, after a loss of power too.
 
     Args:
         path: The file; its folder exists.
@@ -308,7 +308,7 @@ def newest_run(root: str | Path = "runs", name: str = "*") -> Path:
         >>> newest_run(name="smoke-2*").name
         'smoke-20261122-101500'
     """
-    # The newest file counts, not the newest name: a run of yesterday may have been gone on with.
+    # The newest file counts, not the newest name: a run of yesterday may have been resumed since.
     written = {
         file.parent: file.stat().st_mtime_ns for file in sorted(Path(root).glob(f"{name}/{SEGMENT_PATTERN}"))
     }

@@ -324,7 +324,7 @@ def write_tokens(directory: Path, entries: Sequence[Token]) -> None:
 
 
 class Credentials(msgspec.Struct, frozen=True):
-    """What a service shows its broker, and by what it recognises the broker.
+    """The keys of a service and the public key of its broker.
 
     Args:
         pair: The service's own keys.

@@ -309,24 +309,24 @@ def _first_difference(key: str, expected: object, got: object) -> tuple[str, obj
         fields = expected.__struct_fields__
         found = (_first_difference(f"{key}.{f}", getattr(expected, f), getattr(got, f)) for f in fields)
         return next(filter(None, found), None)
-    return None if _close(expected, got) else (key, got, expected)
+    return None if _nearly_equal(expected, got) else (key, got, expected)
 
 
-def _close(expected: object, got: object) -> bool:
+def _nearly_equal(expected: object, got: object) -> bool:
     """Equal, but for how a client rounds numbers."""
     if isinstance(expected, float) and isinstance(got, float):
         return math.isclose(expected, got, **MOUNT_TOLERANCE)
     if isinstance(expected, tuple) and isinstance(got, tuple):
-        return len(expected) == len(got) and all(map(_close, expected, got))
+        return len(expected) == len(got) and all(map(_nearly_equal, expected, got))
     if isinstance(expected, msgspec.Struct) and isinstance(got, msgspec.Struct):
-        return _close(msgspec.structs.astuple(expected), msgspec.structs.astuple(got))
+        return _nearly_equal(msgspec.structs.astuple(expected), msgspec.structs.astuple(got))
     return expected == got
 
 
 def _not_as(device: Device, field: str, got: object, expected: object) -> str:
-    return f"device {device.name!r}: {field} {_shown(got)}, by the scenario it is {_shown(expected)}"
+    return f"device {device.name!r}: {field} {_text_of(got)}, by the scenario it is {_text_of(expected)}"
 
 
-def _shown(value: object) -> str:
+def _text_of(value: object) -> str:
     is_numbers = isinstance(value, tuple) and value and all(isinstance(v, float | int) for v in value)
     return _numbers(cast(tuple[float, ...], value)) if is_numbers else repr(value)

@@ -355,7 +355,7 @@ class PartCheck:
         if isinstance(payload, Channel):
             return self._wrong_channel(payload, demand)
         for part in sorted(demand):
-            if sensor := _without(payload, part):
+            if sensor := _first_without(payload, part):
                 return f"{_undelivered(part)} of {sensor!r}"
         return ""
 
@@ -394,7 +394,9 @@ class PartCheck:
     def _size(self, name: str) -> int | None:
         """Elements of a device's array by the scenario."""
         if name not in self._sizes:
-            self._sizes[name] = next((_elements(spec) for spec in self._devices if _is(spec, name)), None)
+            self._sizes[name] = next(
+                (_elements(spec) for spec in self._devices if _is_made_by(spec, name)), None
+            )
         return self._sizes[name]
 
 
@@ -406,10 +408,10 @@ def _wrong_entries(
         return problem
     for entry, place in zip(entries, places, strict=True):
         shape = expected[place]
-        if entry.h.shape != shape and not _fits(entry.h.shape, shape):
+        if entry.h.shape != shape and not _has_shape(entry.h.shape, shape):
             wanted = ", ".join("any" if size is None else str(size) for size in shape)
             return (
-                f"{part} of {_named(place, channel)} has shape {entry.h.shape}, by the scenario it is "
+                f"{part} of {_pair_name(place, channel)} has shape {entry.h.shape}, by the scenario it is "
                 f"({wanted}): {_AXES[part]}RX elements × TX elements"
             )
     return ""
@@ -422,14 +424,13 @@ def _wrong_places(
     known = {*places}
     for place in expected:
         if place not in known and channel.tx[place[1]] != channel.rx[place[2]]:
-            return f"{_undelivered(part)} for {_named(place, channel)}"
+            return f"{_undelivered(part)} for {_pair_name(place, channel)}"
     for index, place in enumerate(places):
         if place not in expected:
             return f"{part}[{index}] is of carrier, tx and rx {place}, for which there is no part {part!r}"
         if index and place <= places[index - 1]:
-            return (
-                f"{part}[{index}] is of {_named(place, channel)}, behind {_named(places[index - 1], channel)}"
-            )
+            earlier = _pair_name(places[index - 1], channel)
+            return f"{part}[{index}] is of {_pair_name(place, channel)}, behind {earlier}"
     return ""
 
 
@@ -437,17 +438,17 @@ def _undelivered(part: str) -> str:
     return f"part {part!r} is in demand (PREPARE said so), and there is none"
 
 
-def _fits(shape: tuple[int, ...], expected: tuple[int | None, ...]) -> bool:
+def _has_shape(shape: tuple[int, ...], expected: tuple[int | None, ...]) -> bool:
     """Whether a shape is as expected, as far as that is known."""
     return len(shape) == len(expected) and all(b in (a, None) for a, b in zip(shape, expected, strict=True))
 
 
-def _named(place: Indices, channel: Channel) -> str:
+def _pair_name(place: Indices, channel: Channel) -> str:
     c, t, r = place
     return f"{channel.tx[t]} → {channel.rx[r]} on {channel.carriers[c].name!r}"
 
 
-def _is(spec: DeviceSpec, name: str) -> bool:
+def _is_made_by(spec: DeviceSpec, name: str) -> bool:
     """Whether a device of a scene is one that the scenario says is made by ``spec``."""
     if not spec.on:
         return name == spec.name
@@ -459,7 +460,7 @@ def _elements(spec: DeviceSpec) -> int:
     return 1 if spec.array is None else spec.array.size
 
 
-def _without(payload: Payload, part: str) -> str:
+def _first_without(payload: Payload, part: str) -> str:
     """The first sensor without a part that is in demand; empty: each has it."""
     match payload, part:
         case Lidar(), "grid":

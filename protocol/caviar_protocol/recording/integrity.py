@@ -34,10 +34,16 @@ _READINGS = 8
 class RecordedSegments:
     """A recording up to the first segment that is missing or broken.
 
-    A recorder that goes on with it meanwhile replaces manifest and segments: where they contradict each other
+    A recorder that continues it meanwhile replaces manifest and segments: where they contradict each other
     and the manifest is another one by then, everything is read again.
 
-    Raises `RecordingError` where there is no recording, or nothing of it can be read.
+    Raises:
+        RecordingError: There is no recording, or nothing of it can be read.
+
+    Example:
+        >>> found = RecordedSegments(Path("runs/smoke-20261122-101500"))
+        >>> found.closed, found.damage, len(found.instants)
+        (True, [], 100)
     """
 
     path: Path
@@ -86,7 +92,7 @@ class RecordedSegments:
         # The manifest knows of segments that were removed; the folder of those begun after its last save.
         expected = files if alone else _expected(self._folder, files, self._listed)
         if self.trusted_before is not None:
-            self._trust(expected, self._listed, self.trusted_before)
+            self._trust_finished(expected, self._listed, self.trusted_before)
         for number, file in enumerate(expected):
             if number < len(self.trusted):
                 continue
@@ -125,7 +131,9 @@ class RecordedSegments:
         found = next((record for record in records if record.name == segment.path.name), None)
         return found if found is not None and found.finished else None
 
-    def _trust(self, files: list[Path], known: dict[str, SegmentRecord], before: tuple[int, int]) -> None:
+    def _trust_finished(
+        self, files: list[Path], known: dict[str, SegmentRecord], before: tuple[int, int]
+    ) -> None:
         for file, later in pairwise(files):
             record = known.get(file.name)
             if record is None or record.last is None or record.last >= before or not later.exists():
@@ -142,18 +150,18 @@ class RecordedSegments:
                 raise RecordingError(f"{file} is missing, although {_first_there(later)} is there")
             if record is None and not any(path.exists() for path in later):
                 return False  # only the manifest of another run has it, or its recorder removed it just now
-            self._lost(f"{file} is missing", record, later)
+            self._report_loss(f"{file} is missing", record, later)
             return False
         try:
             segment = _opened(file)
-            if strange := self._strange(segment):
-                self._lost(strange, record, later)
+            if strange := self._other_run(segment):
+                self._report_loss(strange, record, later)
                 return False
         except RecordingError as error:
             if self._has_nothing and not self.past_gaps:
                 raise
             if record is not None or later:  # else it was killed while it opened this segment
-                self._lost(str(error), record, later)
+                self._report_loss(str(error), record, later)
             return False
         record = self._listed.get(file.name)
         self.segments.append(segment)
@@ -169,20 +177,22 @@ class RecordedSegments:
             self.damage.append(f"{what}: its index is damaged, and no frame is lost")
             return True
         if what:
-            self._lost(what, record, later)
+            self._report_loss(what, record, later)
             return False
         if not segment.finished and later:
-            self._lost(f"{file} breaks off at byte {segment.readable}", record, later)
+            self._report_loss(f"{file} breaks off at byte {segment.readable}", record, later)
             return False
         if not segment.finished and segment.damage:
-            self._lost(f"{file} is readable up to byte {segment.readable} of {len(segment)}", record, later)
+            self._report_loss(
+                f"{file} is readable up to byte {segment.readable} of {len(segment)}", record, later
+            )
         return True
 
     @property
     def _has_nothing(self) -> bool:
         return not self.segments and not self.trusted
 
-    def _strange(self, segment: Segment) -> str:
+    def _other_run(self, segment: Segment) -> str:
         """What is said of a segment of another run than those before it; empty where it is of the same.
 
         The recording is of the run of its first segment. A manifest of another run is left aside.
@@ -201,7 +211,7 @@ class RecordedSegments:
             self.manifest, self._listed = None, {}
         return ""
 
-    def _lost(self, what: str, record: SegmentRecord | None, later: list[Path]) -> None:
+    def _report_loss(self, what: str, record: SegmentRecord | None, later: list[Path]) -> None:
         """Say what is lost, and from which frame."""
         if self.past_gaps and any(path.exists() for path in later):
             extent = f", {record.extent}" if record is not None else ""

@@ -245,7 +245,7 @@ class Recording:
             entry = product.provenance
             if (entry.topic, entry.source) == (topic, source) and entry.status is not Status.LATE:
                 return product.payload
-        raise RecordingError(f"{self._at(episode, frame)} has no {topic} of {source!r}")
+        raise RecordingError(f"{self._frame_place(episode, frame)} has no {topic} of {source!r}")
 
     def products(self, topic: str) -> Iterator[tuple[RecordedFrame, RecordedProduct]]:
         """Every fresh or held product of a topic, with its frame.
@@ -339,7 +339,7 @@ class Recording:
         self, index: int, item: GrantInput, own: Mapping[tuple[Channel, int], memoryview]
     ) -> RecordedProduct:
         entry, key = self.entry(index), (Channel(item.topic, item.source), item.frame)
-        place = f"{self._at(entry.episode, entry.frame)}, {item.topic} of {item.source!r}"
+        place = f"{self._frame_place(entry.episode, entry.frame)}, {item.topic} of {item.source!r}"
         data = own.get(key)
         # A held product is stored once, in the frame it was computed for, or where it came late.
         if data is None and item.status is Status.HELD:
@@ -361,7 +361,7 @@ class Recording:
         if segment.damaged(chunk):
             entry = segment.entries[place]
             raise RecordingError(
-                f"{self._at(entry.episode, entry.frame)}: the chunk at offset {chunk.offset} of "
+                f"{self._frame_place(entry.episode, entry.frame)}: the chunk at offset {chunk.offset} of "
                 f"{segment.path} is damaged, its CRC-32 differs; `caviar inspect --digest` names the product"
             )
         return self._stored(index)
@@ -401,7 +401,7 @@ class Recording:
                 )
         return found[0]
 
-    def _at(self, episode: int, frame: int) -> str:
+    def _frame_place(self, episode: int, frame: int) -> str:
         return f"{self.path}: episode {episode}, frame {frame}"
 
 

@@ -192,7 +192,7 @@ class Segment:
             is_cut = start + length > len(data)
             fault = "does not fit" if is_cut else ""
             try:
-                fault = fault or self._take(opcode, start, start + length)
+                fault = fault or self._read_record(opcode, start, start + length)
             except RecordingError as error:
                 if not self.metadata:
                     raise
@@ -231,10 +231,10 @@ class Segment:
         if not self.chunks and not good:
             self.metadata = {}
 
-    def _take(self, opcode: int, start: int, stop: int) -> str:
-        """Keep of a record what is needed; what is wrong with it."""
+    def _read_record(self, opcode: int, start: int, stop: int) -> str:
+        """Read one record into `metadata`, `channels`, `chunks` or the seals; what is wrong with it."""
         if opcode == _CHUNK_OPCODE:
-            return self._take_chunk(start, stop)
+            return self._read_chunk(start, stop)
         if opcode == _HEADER:
             profile = _library_record("Header", self._data[start:stop], self.path, start).profile
             if profile != PROFILE:
@@ -266,7 +266,7 @@ class Segment:
         covered = self._data[start : footer + _FOOTER_CONTENT.size - 4]
         return start == data_end + _RECORD.size + 4 and (not crc or zlib.crc32(covered) == crc)
 
-    def _take_chunk(self, start: int, stop: int) -> str:
+    def _read_chunk(self, start: int, stop: int) -> str:
         offset = start - _RECORD.size
         try:
             log_time, _, size, crc, name_length = _CHUNK.unpack_from(self._data, start)

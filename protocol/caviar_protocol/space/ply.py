@@ -133,7 +133,7 @@ class _Text:
 
     def columns(self, element: _Element) -> Float64Array:
         width = len(element.numbers)
-        rows = self._take(element.count * width)
+        rows = self._next(element.count * width)
         names = [name for name, _ in element.numbers]
         # Rows in double precision, whatever the header says: what is written is what is meant.
         table = np.array(rows, dtype=np.float64).reshape(element.count, width)
@@ -142,11 +142,11 @@ class _Text:
     def triangles(self, element: _Element) -> Int64Array:
         polygons, first = [], _first_list(element)
         for _ in range(element.count):
-            row = [self._take(int(self._take(1)[0]) if length else 1) for _, length, _ in element.properties]
+            row = [self._next(int(self._next(1)[0]) if length else 1) for _, length, _ in element.properties]
             polygons.append([int(word) for word in row[first]])
         return _fans(polygons)
 
-    def _take(self, count: int) -> list[bytes]:
+    def _next(self, count: int) -> list[bytes]:
         words = self._words[self._at : self._at + count]
         if len(words) < count:
             raise ValueError("it breaks off")
@@ -162,7 +162,7 @@ class _Binary:
 
     def columns(self, element: _Element) -> Float64Array:
         row = np.dtype([(name, self._order + kind) for name, kind in element.numbers])
-        table = self._take(row, element.count)
+        table = self._next(row, element.count)
         if not element.axes:
             return np.empty((element.count, 0))
         return np.stack([table[axis].astype(np.float64) for axis in element.axes], axis=-1)
@@ -183,13 +183,13 @@ class _Binary:
         polygons, first = [], _first_list(element)
         for _ in range(element.count):
             row = [
-                self._take(item, 1 if length is None else int(self._take(length, 1)[0]))
+                self._next(item, 1 if length is None else int(self._next(length, 1)[0]))
                 for _, length, item in properties
             ]
             polygons.append(row[first].tolist())
         return _fans(polygons)
 
-    def _take(self, kind: np.dtype[Any], count: int) -> NDArray[Any]:
+    def _next(self, kind: np.dtype[Any], count: int) -> NDArray[Any]:
         values = (
             np.frombuffer(self._data, kind, count, self._at)
             if count * kind.itemsize

@@ -229,13 +229,13 @@ def directions(scene: Scene, pairs: Sequence[Pair]) -> tuple[list[Vector], list[
         names = pair.tx.name, pair.rx.name
         entry = known.get(names)
         if entry is None or entry[0].tx is not pair.tx or entry[0].rx is not pair.rx:
-            entry = known[names] = (pair, *_along(scene, pair))
+            entry = known[names] = (pair, *_straight_directions(scene, pair))
         at_tx.append(entry[1])
         at_rx.append(entry[2])
     return at_tx, at_rx
 
 
-def _along(scene: Scene, pair: Pair) -> tuple[Vector, Vector]:
+def _straight_directions(scene: Scene, pair: Pair) -> tuple[Vector, Vector]:
     tx, rx = device_pose(scene, pair.tx), device_pose(scene, pair.rx)
     (x0, y0, z0), (x1, y1, z1) = tx.position, rx.position
     dx, dy, dz = x1 - x0, y1 - y0, z1 - z0
