@@ -18,11 +18,12 @@ from caviar_services.channel.stability.lab import Lab
 
 
 class Outcome(msgspec.Struct, frozen=True, kw_only=True):
-    """What a case found."""
+    """Expected and given answer of a case."""
 
     expected: str
     """From a formula, or the class of the error that is the documented answer."""
     got: str
+    """From a model."""
     right: bool
 
 
@@ -58,7 +59,13 @@ CASES: list[Case] = []
 
 
 def case(group: str, name: str, traced: bool = True) -> Callable[[Ask], Ask]:
-    """Put a function among the cases."""
+    """Decorate a function that asks a question, to put it among the cases.
+
+    Args:
+        group: One of `GROUPS`.
+        name: In the group.
+        traced: Whether the case needs the ray tracer.
+    """
 
     def register(ask: Ask) -> Ask:
         CASES.append(Case(group=group, name=name, ask=ask, traced=traced))
@@ -73,7 +80,19 @@ Ask = Callable[[Lab], Outcome]
 def close(
     unit: str, expected: float | complex, got: float | complex, relative: float = 0.0, absolute: float = 0.0
 ) -> Outcome:
-    """Whether a number is as expected, within the larger of two tolerances."""
+    """Whether a number is as expected, within the larger of two tolerances.
+
+    Args:
+        unit: Of the numbers, for the table.
+        expected: From a formula.
+        got: From a model.
+        relative: Tolerance as a part of the expected number.
+        absolute: Tolerance in the unit.
+
+    Example:
+        >>> close("m", 2.0, 2.01, relative=0.01)
+        Outcome(expected='2 m ± 1 %', got='2.01 m', right=True)
+    """
     limit = max(relative * abs(expected), absolute)
     tolerance = f"± {absolute:.2g}" if absolute >= relative * abs(expected) else f"± {100 * relative:.2g} %"
     return Outcome(
@@ -91,7 +110,7 @@ def equal(expected: object, got: object, what: str = "") -> Outcome:
 
 
 def refused(error: type[CaviarError], words: str, call: Callable[[], object]) -> Outcome:
-    """Whether a call raises this error, with a text that holds these words."""
+    """Whether a call raises an error of exactly this class, with these words in its text."""
     expected = f"{error.__name__}: … {words} …"
     try:
         answer = call()
@@ -102,7 +121,7 @@ def refused(error: type[CaviarError], words: str, call: Callable[[], object]) ->
 
 
 def all_of(*outcomes: Outcome) -> Outcome:
-    """Several answers to one question."""
+    """Several answers to one question, all of which have to be right."""
     return Outcome(
         expected="; ".join(o.expected for o in outcomes),
         got="; ".join(o.got for o in outcomes),
@@ -111,7 +130,14 @@ def all_of(*outcomes: Outcome) -> Outcome:
 
 
 def worst(errors: Sequence[float], limit: float, unit: str, what: str) -> Outcome:
-    """Whether all of many errors are within a limit."""
+    """Whether all of many errors are within a limit.
+
+    Args:
+        errors: Without a sign; none or a NaN among them is wrong.
+        limit: That none may exceed.
+        unit: Of both.
+        what: Has these errors, for the table.
+    """
     largest = float(np.max(errors)) if len(errors) else float("nan")
     return Outcome(
         expected=f"{what}: error ≤ {limit:.2g} {unit}".strip(),
@@ -159,10 +185,15 @@ def cases() -> Sequence[Case]:
 
 
 def run(chosen: Sequence[Case], progress: Callable[[int, Case], None] | None = None) -> list[Result]:
-    """Ask the chosen cases, one after the other; one that raises an error of its own is wrong.
+    """Ask the chosen cases, one after the other.
 
-    Cases that trace are ``not run`` where the ray tracer is not installed: that says nothing about physics.
-    ``progress`` is called with number and case before each case that runs.
+    A case that raises an error of its own is wrong. Cases that trace are ``not run`` where the ray tracer is
+    not
+    installed: that says nothing about physics.
+
+    Args:
+        chosen: Of `cases`.
+        progress: Called with number and case before each case that runs.
     """
     has_tracer = has_extra(EXTRA)
     results: list[Result] = []
@@ -209,7 +240,7 @@ def _asked(case: Case, lab: Lab) -> Outcome:
 
 
 def wrong(results: Sequence[Result]) -> list[Result]:
-    """Those with another answer than expected."""
+    """Results with another answer than expected."""
     return [result for result in results if result.verdict == "wrong"]
 
 

@@ -21,12 +21,18 @@ EPSILON_0 = 8.8541878128e-12
 
 
 def friis(distance: float, frequency: float) -> float:
-    """Amplitude λ/(4πd) between isotropic antennas (Friis, 1946)."""
+    """Amplitude λ/(4πd) between isotropic antennas (Friis, 1946), for a distance [m] and a frequency [Hz].
+
+    Example:
+        >>> round(-20 * math.log10(friis(100.0, 28e9)), 2)  # path loss [dB]
+        101.39
+    """
     return C / frequency / (4 * math.pi * distance)
 
 
 def phase(length: float, frequency: float) -> complex:
-    """exp(−j2πfd/c), of the fraction of a wavelength that is left over."""
+    """exp(−j2πfd/c) for a length [m] and a frequency [Hz]."""
+    # Of the fraction of a wavelength that is left over: of millions of turns, rounding would take the digits.
     return cmath.exp(-2j * math.pi * ((length * frequency / C) % 1.0))
 
 
@@ -36,7 +42,7 @@ def spherical_wave(length: float, frequency: float) -> complex:
 
 
 def doppler(closing_speed: float, frequency: float) -> float:
-    """Shift f·v/c [Hz] of a path that shortens by v [m/s], to first order."""
+    """Shift f·v/c [Hz] of a path that shortens by v [m/s], to first order in v/c."""
     return frequency * closing_speed / C
 
 
@@ -47,7 +53,8 @@ def vegetation(length: float, gamma: float, most: float = math.inf) -> float:
 
 
 def permittivity(relative: float, conductivity: float, frequency: float) -> complex:
-    """Complex relative permittivity ε_r − jσ/(2πfε₀)."""
+    """Complex relative permittivity ε_r − jσ/(2πfε₀), with the conductivity σ [S/m] and the frequency f
+    [Hz]."""
     return complex(relative, -conductivity / (2 * math.pi * frequency * EPSILON_0))
 
 

@@ -18,14 +18,20 @@ from caviar_services.channel.paths import Antenna, PathTable
 
 
 class FreeSpaceSettings(ChannelSettings, frozen=True, kw_only=True):
-    """What all channel models have; nothing of its own."""
+    """Settings of the channel ``free-space``: those of all channel models."""
 
 
 class FreeSpaceChannel(PathModel[FreeSpaceSettings]):
-    """One path for each TX/RX pair.
+    """One path for each TX/RX pair: the line of sight.
 
     A pair closer than one wavelength of a carrier, so also a device and itself, is outside the
     far field that the formula holds in: it has no path and counts as ``too_close``.
+
+    Example:
+        >>> from caviar_services.channel.stability.lab import free_space, link
+        >>> channel = link(free_space(28e9), (0, 0, 10), (60, 80, 10))  # 100 m
+        >>> round(float(-20 * np.log10(abs(channel.a[0, 0]))), 2)  # path loss [dB]
+        101.39
     """
 
     Settings: ClassVar[type[ChannelSettings]] = FreeSpaceSettings
@@ -41,7 +47,7 @@ class FreeSpaceChannel(PathModel[FreeSpaceSettings]):
         spreading = wavelength[:, None] / (4 * np.pi * distance[far])
         table = PathTable(
             pair=far,
-            # Both fields are transverse to the line, so what arrives is what was sent.
+            # Both fields are transverse to the line, so the dyad of the line is that of the field.
             transfer=spreading[:, :, None, None] * np.eye(3, dtype=np.complex128),
             types=np.zeros((len(far), 0), np.uint8),
             objects=np.zeros((len(far), 0), np.int32),

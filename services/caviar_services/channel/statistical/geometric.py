@@ -91,6 +91,12 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
 
     Paths have no interaction points: none are known. Under ``path-loss`` a pair closer than one
     wavelength, under ``unit`` one at the same point, has no path and counts as ``too_close``.
+
+    Example:
+        >>> from caviar_services.channel.stability.lab import geometric, link
+        >>> channel = link(geometric(28e9, components=3, k_factor_db=10.0), (0, 0, 10), (30, 40, 1.5))
+        >>> len(channel.tau), round(float(abs(channel.a[0, 0]) ** 2), 3)  # the straight path has K / (K + 1)
+        (3, 0.909)
     """
 
     Settings = GeometricSettings
@@ -120,7 +126,11 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         return ChannelOptions(reflection=self.settings.components > 1, max_depth=1)
 
     def load(self, preparation: Preparation) -> tuple[str, ...]:
-        """Raises `ScenarioError` for an array that the model has no waves for."""
+        """Check the arrays of the run's devices.
+
+        Raises:
+            ScenarioError: An array has dual polarization or several panels.
+        """
         for spec in self.run.devices:
             if spec.array is not None and not spec.array.is_uniform:
                 place = Place("devices").at(spec.name).at("array")
@@ -161,7 +171,7 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
     # --- the line of sight -----------------------------------------------------------------------
 
     def _blocks(self, scene: Scene) -> Callable[[Line], bool]:
-        """What says of a line of this scene whether something blocks it."""
+        """A function that says whether something in the scene blocks a line."""
         settings = self.settings
         if settings.nlos_azimuth_deg is not None:
             low, high = settings.nlos_azimuth_deg
@@ -170,6 +180,7 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         if settings.nlos == "never":
             return lambda pair: False
         boxes = Boxes.of(scene)
+        # An antenna stands on its own vehicle, whose box must not block it.
 
         def hidden(pair: Line) -> bool:
             ends = np.array([pair.start, pair.end])[:, None]
@@ -184,10 +195,9 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
     # --- waves -----------------------------------------------------------------------------------------
 
     def _add(self, waves: Waves, frame: Frame, pair: Line, free: bool) -> None:
-        """The components of a pair.
-
-        Numbers, not arrays: there are a handful of waves, and an array of three costs as much as ten numbers.
-        """
+        """Add the components of a pair."""
+        # Numbers, not arrays: there are a handful of waves, and an array of three costs as much as ten
+        # numbers.
         gains, excess, deviations = self._drawn(frame, pair.tx.name, pair.rx.name, free)
         scale = self._behind_straight if free else self._reflected
         delay = pair.length / SPEED_OF_LIGHT
@@ -204,7 +214,8 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
             waves.tau.append(tau)
             waves.departure.append(departure)
             waves.arrival.append(arrival)
-            # A source that moves along its wave, and a receiver that moves against it, raise the frequency.
+            # To first order in v/c: motion of either end along its own direction outwards raises the
+            # frequency.
             approach = dot(pair.velocity[0], departure) + dot(pair.velocity[1], arrival)
             waves.doppler_ratio.append(approach / SPEED_OF_LIGHT)
         waves.id += self._ids[free]
@@ -217,6 +228,7 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
 
         Where the line of sight is ``free``, component 0 stands in front and its delay is not used.
         """
+        # Blocks begin at fixed numbers, so that a frame has the same draws wherever a run or a replay begins.
         whole_episode = self.settings.redraw == "episode"
         block, row = (0, 0) if whole_episode else divmod(frame.number, BLOCK)
         if block != self._block or (whole_episode and len(self._draws) >= KEPT):
@@ -337,7 +349,7 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
 
 
 class _Constant(NamedTuple):
-    """What changes only when a line of sight does."""
+    """Arrays of a product that change only when a line of sight does."""
 
     los: BoolArray
     offsets: Int64Array

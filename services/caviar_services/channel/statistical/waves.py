@@ -86,20 +86,21 @@ class GeometricSettings(ChannelSettings, frozen=True, kw_only=True):
 
 
 class PairWaves(msgspec.Struct, frozen=True):
-    """A pair, and which of the waves are its own."""
+    """A pair of devices, and which of the waves are its own."""
 
     tx: AntennaDevice
     rx: AntennaDevice
     tx_pose: Pose
     rx_pose: Pose
     mine: slice
+    """Rows of `Waves`."""
 
     def departures(self, waves: Waves) -> Float64Array:
-        """In the axes of TX, Shape ``[L, 3]``."""
+        """Directions of departure in the axes of TX, Shape ``[L, 3]``."""
         return _in_axes(self.tx_pose, waves.departure[self.mine])
 
     def arrivals(self, waves: Waves) -> Float64Array:
-        """In the axes of RX, Shape ``[L, 3]``."""
+        """Directions of arrival in the axes of RX, Shape ``[L, 3]``."""
         return _in_axes(self.rx_pose, waves.arrival[self.mine])
 
 
@@ -109,8 +110,18 @@ def _in_axes(pose: Pose, vectors: Sequence[Vector]) -> Float64Array:
 
 
 class Line:
-    """The straight line of a pair."""
+    """The straight line between the devices of a pair.
 
+    Args:
+        tx: The transmitter, with its pose and velocity [m/s]; ``rx`` likewise.
+        rx: See ``tx``.
+        tx_pose: See ``tx``.
+        rx_pose: See ``tx``.
+        tx_speed: See ``tx``.
+        rx_speed: See ``tx``.
+    """
+
+    # One is made for each pair of each frame: slots are quicker to fill than the fields of a dataclass.
     __slots__ = (
         "along",
         "azimuth",
@@ -152,24 +163,25 @@ class Line:
 
 
 class Waves:
-    """Waves as they are added, pair after pair."""
+    """Waves of all pairs, added pair after pair as plain numbers."""
 
     def __init__(self) -> None:
         self.amplitude: list[complex] = []
         """Without carrier phase and path gain."""
         self.tau: list[float] = []
+        """[s]."""
         self.departure: list[Vector] = []
         """Unit vectors in world axes; ``arrival`` from RX towards the wave."""
         self.arrival: list[Vector] = []
         self.doppler_ratio: list[float] = []
         self.id: list[int] = []
         self.length: list[float] = []
-        """Of the pair's straight line [m]."""
+        """Length of the pair's straight line [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Draws:
-    """Draws of one pair for some frames, as lists; within a frame sorted by delay."""
+    """Random draws of one pair for some frames, as lists; within a frame sorted by delay."""
 
     gain: list[list[complex]]
     """Of mean power 1, by frame and component."""
@@ -182,6 +194,15 @@ class Draws:
 
     @classmethod
     def of(cls, random: np.random.Generator, frames: int, settings: GeometricSettings) -> Draws:
+        """Draws for so many frames.
+
+        Args:
+            random: Generator of the pair and block.
+            frames: Number of frames.
+            settings: Distributions.
+        """
+        # The order of draws is fixed: each is as many numbers of the generator, and products follow from
+        # them.
         shape = (frames, settings.components)
         gain = random.normal(0.0, math.sqrt(0.5), (*shape, 2)).view(np.complex128)[..., 0]
         excess = random.exponential(settings.delay_spread_ns * 1e-9, shape)
@@ -200,7 +221,7 @@ class Draws:
 
 
 def with_phase(waves: Waves, frequency: float) -> list[complex]:
-    """Amplitudes with exp(−j2πfτ)."""
+    """Amplitudes times exp(−j2πfτ) at a frequency [Hz]."""
     # The whole turns of f·τ go first: they are millions, and only the rest is a phase.
     turns = [frequency * tau for tau in waves.tau]
     phases = [cmath.rect(1.0, -2 * math.pi * (turn - round(turn))) for turn in turns]
@@ -208,6 +229,7 @@ def with_phase(waves: Waves, frequency: float) -> list[complex]:
 
 
 def velocity(scene: Scene, device: AntennaDevice) -> Vector:
+    """Velocity of a device in world axes [m/s]."""
     if not device.parent:
         return (0.0, 0.0, 0.0)
     x, y, z = device_velocity(scene, device).tolist()
@@ -221,10 +243,11 @@ def direction(zenith: float, azimuth: float) -> Vector:
 
 
 def angles(vector: Vector) -> tuple[float, float]:
-    """(zenith, azimuth) [rad]."""
+    """Zenith and azimuth of a vector [rad]."""
     x, y, z = vector
     return (math.atan2(math.hypot(x, y), z), math.atan2(y, x))
 
 
 def dot(a: Vector, b: Vector) -> float:
+    """Inner product."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
