@@ -136,6 +136,7 @@ class _Steered:
 
     def h(self, index: int, carrier: Carrier) -> Complex128Array:
         """H on a carrier, which is the ``index``-th."""
+        # A sum of outer products is one matrix product over the paths.
         a = self._amplitudes(index, carrier)
         return joined(
             [
@@ -160,6 +161,7 @@ class _Steered:
     def _amplitudes(self, index: int, carrier: Carrier) -> Complex128Array:
         """Of the paths between each subarray of the receiver and each of the transmitter, ``[R, T, p]``."""
         located, mine = self.located, self.mine
+        # The usual case: amplitudes of the product are those between the only subarrays.
         if len(self.transmit) * len(self.receive) == 1:
             return located.a[None, None, index, mine]
         geometry = located.geometry

@@ -88,6 +88,8 @@ class ElementPaths:
             (types == Interaction.DIFFRACTION).any(1), Bend.EDGE, np.where(bent, Bend.POINTS, Bend.NONE)
         )
         mirror = types == Interaction.REFLECTION
+        # A path that bends is straightened from both ends up to the bend; another one from the transmitter's
+        # end alone.
         self._sent = self._map(mirror & (place < self.first[:, None]), range(depth))
         self._taken = self._map(mirror & (place > self.last[:, None]), reversed(range(depth)))
         self._straight = bool((self.bend == Bend.NONE).all())
@@ -97,6 +99,7 @@ class ElementPaths:
         linear = np.tile(np.eye(3), (len(mirror), 1, 1))
         offset = np.zeros((len(mirror), 3))
         for d in order:
+            # Householder: I − 2nnᵀ/n², the identity where nothing is mirrored.
             normal = np.where(mirror[:, d, None], self.surfaces.normal[:, d], 0.0)
             square = (normal**2).sum(-1)
             scaled = 2 * normal / np.where(square > 0, square, 1.0)[:, None]
@@ -153,6 +156,7 @@ class ElementPaths:
         self, paths: Int64Array, sent: Float64Array, taken: Float64Array
     ) -> tuple[Float64Array, Float64Array]:
         (z, rho), (height, radius) = (self._around_edge(paths, ends) for ends in (sent, taken))
+        # Turned about the edge into one plane, both ends are on opposite sides of it.
         across = radius[:, :, None] + rho[:, None]
         length = np.hypot(across, height[:, :, None] - z[:, None])
         # s and s' share the length as the distances from the edge do
@@ -255,6 +259,7 @@ def _one_over(length: Float64Array) -> Float64Array:
 
 def _distances(receive: Float64Array, transmit: Float64Array) -> Float64Array:
     """Shape ``[p, M, N]``."""
+    # Axis by axis and in place: an array of differences of three axes would leave the cache.
     square = np.zeros((len(receive), receive.shape[1], transmit.shape[1]))
     for axis in range(3):
         apart = receive[:, :, None, axis] - transmit[:, None, :, axis]

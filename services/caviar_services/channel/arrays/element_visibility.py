@@ -168,6 +168,7 @@ def visibility(
     """
     every: BoolArray = paths.surfaces.settled.copy()
     some: dict[int, BoolArray] = {}
+    # Paths between arrays of one kind are tested together, as many as memory allows.
     left = np.flatnonzero(~every)
     test = _Test(paths, transmitter, receiver, transmit, receive, look)
     while len(left):
@@ -232,6 +233,7 @@ class _Test:
         seen = self._at(paths, sizes, [part.ravel() for part in index]).reshape(index[0].shape)
         if all(len(axis.nodes) == axis.size for axis in axes):
             return seen.reshape(len(paths), receive.size, transmit.size)
+        # A cell is full or empty where all of its corners agree; the rest is mixed.
         full, any_ = seen, seen
         for number, axis in enumerate(axes, start=1):
             if len(axis.nodes) > 1:
@@ -255,6 +257,7 @@ class _Test:
         """Whether the paths between single positions exist, Shape ``[Q]``."""
         good = np.zeros(len(path), bool)
         types = self.paths.surfaces.types
+        # Chains of reflections are asked for as candidates of the tracer are, others by their segments.
         mirrored = ((types == 0) | (types == Interaction.REFLECTION)).all(1)[path]
         for which, ask in ((mirrored, self._mirrored), (~mirrored, self._others)):
             if which.any():
@@ -294,6 +297,7 @@ class _Test:
             axis = edge[:, 1] - edge[:, 0]
             point = points[over, self.paths.first[path[over]]]
             along = ((point - edge[:, 0]) * axis).sum(-1)
+            # Beyond the end of an edge, the path that is shortest over its line does not exist.
             within[over] = (along > 0) & (along < (axis**2).sum(-1))
         return within
 

@@ -79,6 +79,7 @@ class ElementTracer:
 
     def elements(self, antennas: Sequence[Antenna], wavelength: float) -> list[_Element]:
         """All elements of antennas, in order; arrays are given in wavelengths [m]."""
+        # A subarray has a pattern and axes of its own, so that each element stands for itself.
         parts = [part for antenna in antennas for part in antenna.subarrays]
         placed = elements(parts, wavelength)
         return [
@@ -122,6 +123,7 @@ class ElementTracer:
         from_, to = source.traced.position, np.array([end.traced.position for end in ends]).reshape(-1, 3)
         corners = Corners(from_[None], to[:, None])
         traced = self._tracer.trace(from_, to, lanes=self._lanes, corners=corners)
+        # Paths of reflections alone have been asked for once more, exactly: those that failed are dropped.
         mirrored = ((traced.types == 0) | (traced.types == Interaction.REFLECTION)).all(1)
         traced = traced.take(~mirrored | traced.hidden | traced.settled)
         # An array of one element has no corner beside its centre, so that no path is hidden from the centre

@@ -50,6 +50,7 @@ class ElementGains:
         wavelength: float,
     ) -> None:
         self._parts: dict[tuple[AntennaArray, AntennaArray], tuple[Complex128Array, Complex128Array]] = {}
+        # Paths between arrays of one kind are computed together; most scenes have few kinds.
         self._place = np.zeros(len(transfer), np.int64)
         for arrays in {(tx.array, rx.array) for tx in antennas[0] for rx in antennas[1]}:
             ends = [
@@ -62,9 +63,11 @@ class ElementGains:
                 _fields(array, side, index[rows], to[rows], wavelength)
                 for array, side, index, to in zip(arrays, antennas, which, towards, strict=True)
             )
+            # Nodes are odd in number along each side, so the middle one is the array's centre.
             middle_sent, middle_taken = (field[:, field.shape[1] // 2] for field in (sent, taken))
             onward = (middle_taken[:, None] @ transfer[rows])[:, 0]
             back = (transfer[rows] @ middle_sent[:, :, None])[:, :, 0]
+            # Gains of both ends add up to first order; the centre is in both parts and is taken off once.
             centre = (onward * middle_sent).sum(-1)[:, None]
             self._parts[arrays] = (
                 (sent @ onward[:, :, None])[:, :, 0],
@@ -104,7 +107,7 @@ def _fields(
     away = (towards - centre)[:, None] @ rotation - wavelength * nodes
     length = np.sqrt((away**2).sum(-1, keepdims=True))
     local = (away / np.where(length > 0, length, 1.0)).reshape(-1, 3)
-    # Antennas of one array have the same pattern.
+    # Antennas of one array have the same pattern, as an array names its file.
     pattern = next((antenna.pattern for antenna in antennas if antenna.array == array), None)
     field = polarized_field(pattern or FormulaPattern(array.pattern), array.polarization, local)
     world: Field = field.reshape(*away.shape) @ rotation.transpose(0, 2, 1)
@@ -253,6 +256,7 @@ class _Split:
     @classmethod
     def of(cls, transmitters: Sequence[Antenna], receivers: Sequence[Antenna], pair: Int64Array) -> _Split:
         of_transmitter, of_receiver = _ranges(transmitters), _ranges(receivers)
+        # Paths are sorted by pair of devices; each is repeated for every pair of their subarrays.
         bounds = np.searchsorted(pair, np.arange(len(transmitters) * len(receivers) + 1))
         found, sizes, sent, taken = [np.zeros(0, np.int64)], [0], list[int](), list[int]()
         for t, sending in enumerate(of_transmitter):
@@ -320,6 +324,7 @@ class _Field:
         for pairs, sizes in _groups(offsets, self.transmit, self.receive):
             begin, end = int(offsets[pairs.start]), int(offsets[pairs.stop])
             at_once = max(1, _LANES // (sizes[0] * sizes[1]))
+            # One large matrix in parts that fit a cache, or many small ones in one call.
             if pairs.stop - pairs.start == 1:
                 h = np.zeros(sizes, np.complex128)
                 for row in range(begin, end, at_once):
@@ -357,6 +362,7 @@ class _Field:
         """What each of some paths adds to H, Shape ``[p, M, N]``."""
         tx, rx = self.transmitter[rows], self.receiver[rows]
         between = self._between(rows, sizes)
+        # In place: these arrays are the largest of a frame.
         turns = between.length
         turns *= -1 / self.wavelength
         turns -= np.round(turns)
@@ -387,6 +393,7 @@ def _far_enough(
     transmit, receive = ends
     for path in np.flatnonzero((paths.surfaces.types == 0).all(1)).tolist():
         sent, taken = transmit.of(antennas[0][path]), receive.of(antennas[1][path])
+        # Bounding boxes first: only arrays that nearly touch need all distances.
         low = np.maximum(sent.min(0), taken.min(0))
         high = np.minimum(sent.max(0), taken.max(0))
         if (low - high).max() >= wavelength:

@@ -94,6 +94,7 @@ def ends_by_bodies(
 
     def lit(way: Any, receiver: Any) -> Any:
         last, point = gathered(face, way), gathered(place, receiver)
+        # Instead of a beam through the last face, the receiver's image in it is held against the beam before.
         image = point - 2.0 * targets.height(point, last) * gathered(targets.normal, last)
         return beams.light(gathered(beam, way), image, targets.slack)
 
@@ -131,6 +132,7 @@ def ends_by_scenery(
     of_body = last >= targets.first_body
     place_of = np.searchsorted(scenery.faces, last)
     group_of = np.where(of_body, targets.body_of(last), targets.bodies + place_of)
+    # Beams group by group of what reflected them last: a body, or a face of scenery behind the bodies.
     order = np.argsort(group_of, kind="stable")
     sizes = np.bincount(group_of, minlength=targets.bodies + len(scenery.faces))
     begin = np.cumsum(sizes) - sizes
@@ -157,6 +159,7 @@ def ends_by_scenery(
         crosses = _crosses(targets, image, gathered(views.last, seen), point)
         return crosses & beams.light(beam, gathered(views.image, seen), targets.slack)
 
+    # Lanes beyond the end of a group look at the first beam of all, and `within` drops them.
     found = filtered(lit, pairs(len(own), _BLOCK, near))
     block, number = (numbers(part) for part in found)
     seen = view[own[block]]
@@ -207,6 +210,7 @@ def _crosses(targets: Targets, image: Any, face: Any, point: Any) -> Any:
 
     there, here = targets.height(image, face), targets.height(point, face)
     crosses = (there * here > 0.0) & ((here > 0.0) | gathered(targets.two_sided, face))
+    # The line from the point to the image meets the plane at the share here / (there + here) of its length.
     beside = dr.fma(image - point, here / (there + here), point) - gathered(targets.centre, face)
     for side in (gathered(targets.u, face), gathered(targets.v, face)):
         square = dr.squared_norm(side)
@@ -260,6 +264,7 @@ def chain_pairs(
         receivers: Positions [m], Shape ``[R, 3]``.
     """
     depth = scenery.shape[1]
+    # The chain without a reflection is a candidate for every receiver: the line of sight.
     every = np.arange(len(receivers))
     found = [(np.zeros((len(receivers), 0), np.int64), every)]
     if not (depth and len(targets.faces) and len(receivers)):

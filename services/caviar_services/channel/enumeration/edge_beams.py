@@ -73,6 +73,7 @@ class EdgeTargets:
     def __init__(self, scene: SionnaScene, edges: SceneEdges, faces: FaceRectangles) -> None:
         import mitsuba as mi
 
+        # Parked bodies are far below the scene; their edges would be tested in vain.
         number, piece = edges.of_bodies
         standing = np.array(scene.standing_bodies, np.int64) + scene.first_body_piece
         kept = np.isin(piece, standing)
@@ -131,6 +132,7 @@ class _Groups:
         ends = edges.ends[rows]
         low, high = np.minimum.reduceat(ends.min(1), first), np.maximum.reduceat(ends.max(1), first)
         own = np.repeat(np.arange(self.pieces), sizes)
+        # Neighbours: edges of a piece in the order of their middles along the piece's longest side.
         along = ends.sum(1)[np.arange(len(rows)), np.argmax(high - low, axis=1)[own]]
         rows = rows[np.lexsort((along, own))]
         counts = -(-sizes // _GROUP)
@@ -189,6 +191,7 @@ def edge_chains(
     depth = scenery.shape[1]
     if not (depth and len(edges) and len(receivers)):
         return []
+    # Reflections of both sides and the diffraction together are at most ``depth`` interactions.
     sources = list(_from_transmitter(targets, scenery, views, transmitter))
     sinks = list(_from_receivers(targets, views, receivers, depth))
     every = _Groups(edges, np.ones(len(edges), np.bool_))
@@ -254,6 +257,7 @@ def _from_receivers(
         return
     faces = targets.faces
     bodies = np.arange(targets.first_body, len(faces))
+    # Every receiver with every face of a body that it sees from the reflecting side; scenery by its views.
     height = receivers @ faces.normal[bodies].T - faces.offset[bodies]
     receiver, place = np.nonzero((height > 0) | faces.two_sided[bodies])
     owner = np.concatenate([views.receiver, receiver])
@@ -344,6 +348,7 @@ def _lit(targets: Targets, edges: EdgeTargets, groups: _Groups, beams: Beams, ow
     edge = gathered(groups.edge, gathered(groups.begin, gathered(group, pair)) + place)
     of, at = (numbers(part) for part in filtered(within, (gathered(beam, pair), edge)))
     if beams.chain.shape[1]:
+        # An edge of the mirror itself lies in the mirror's plane: no wave goes from there to it.
         last = edges.surface_of_face[beams.chain[of, -1]]
         own = (last[:, None] == edges.surfaces[at]).any(1)
         of, at = of[~own], at[~own]
@@ -384,6 +389,7 @@ def _meeting(targets: Targets, edges: EdgeTargets, one: _Lit, other: _Lit) -> It
         if not len(own):
             continue
         first, second = rows[own], order[place]
+        # Chains of scenery alone over an edge of scenery are left to rays.
         moving = edges.piece[one.edge[first]] >= 0
         moving |= one.beams.by_body[one.beam[first]] | other.beams.by_body[other.beam[second]]
         first, second = first[moving], second[moving]
@@ -412,6 +418,7 @@ def _kept(
     (s, from_source), (t, from_target) = (
         _unfolded(gathered(beams.image, beam) - origin, along) for beams, beam in (one, other)
     )
+    # Keller's law: s − place over from_source is place − t over from_target.
     place = (s * from_target + t * from_source) / (from_source + from_target)
     meets = (place > -targets.slack) & (place < gathered(edges.length, edge) + targets.slack)
     point = origin + place * along

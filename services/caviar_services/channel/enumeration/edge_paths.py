@@ -67,6 +67,7 @@ def edge_paths(
             for name in ("chain", "bend", "count", "edge", "receiver", "points")
         )
     )
+    # Surfaces instead of faces: coplanar faces that touch give the same path once each.
     keys = np.column_stack(
         [found.receiver, found.count, edges.number[found.edge], found.bend, _surfaces(edges, found.chain)]
     )
@@ -99,12 +100,15 @@ def _with_points(
     with np.errstate(invalid="ignore", divide="ignore"):  # of what lies on the line of an edge
         place = keller_point(source, target, wedge)
         good = np.isfinite(place).all(1) & ~beyond_edges(place, wedge)
+    # Both rays at the edge have to run outside of the wedge, in front of one of its faces at least.
     good &= edges.outside(source, chains.edge) & edges.outside(target, chains.edge)
     rows = np.flatnonzero(good)
     before, one = reflection_points(faces, chains.before[rows], start[rows], place[rows])
     rows, before = rows[one], before[one]
     behind, other = reflection_points(faces, chains.behind[rows], ends[rows], place[rows])
     rows, before, behind = rows[other], before[other], behind[other]
+    # In the order of the path: reflections before, the edge, reflections behind, which count from the
+    # receiver.
     i, j = before.shape[1], behind.shape[1]
     chain = np.full((len(rows), depth), -1)
     chain[:, :i], chain[:, i + 1 : i + 1 + j] = chains.before[rows], chains.behind[rows, ::-1]

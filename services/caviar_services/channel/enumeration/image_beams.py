@@ -159,6 +159,7 @@ class Targets:
         self.two_sided = mi.Bool(indices(faces.two_sided))
         self.body_centre = places(centre)
         self.body_radius = columns(reach[None])[0]
+        # Faces of a body are consecutive, so that a lane finds the n-th face of a body by an addition.
         begin = self.first_body + np.cumsum(sizes) - sizes
         self.body_begin, self.body_size = indices(begin), indices(sizes)
         slack = _SLACK + _RELATIVE_SLACK * float(np.abs(faces.centre).max(initial=0.0))
@@ -237,6 +238,7 @@ class Beams:
         axis, cosine = gathered(self.axis, beam), gathered(self.cosine, beam)
         towards = centre - gathered(self.image, beam)
         along = dr.dot(axis, towards)
+        # Distance of the sphere's centre from the cone's mantle, positive outside: across·cos − along·sin.
         across = dr.sqrt(dr.maximum(dr.squared_norm(towards) - along * along, 0.0))
         sine = dr.sqrt(dr.maximum(1.0 - cosine * cosine, 0.0))
         before = dr.dot(gathered(self.lit, beam), centre) - gathered(self.lit_from, beam)
@@ -281,6 +283,7 @@ def next_beams(targets: Targets, beams: Beams, scenery: Int64Array, known: Int64
 
     beam, face = by_scenery(targets, beams, scenery)
     of_body = filtered(partial(lights_corner, targets, beams), lit_bodies(targets, beams))
+    # Beams of scenery alone come first, as everywhere: `Beams.first_by_body` divides the list.
     chain = np.concatenate(
         [
             known,
@@ -309,6 +312,7 @@ def by_scenery(targets: Targets, beams: Beams, scenery: Int64Array) -> tuple[Any
     import drjit as dr
 
     faces = indices(scenery)
+    # Only beams by way of a body: which chains of scenery alone exist is known (`scenery_chains`).
     begin = beams.first_by_body
     first = opaque(begin)
 
@@ -342,9 +346,10 @@ def lit_bodies(targets: Targets, beams: Beams) -> tuple[Any, Any]:
     def shows(pair: Any, number: Any) -> Any:
         there = number < gathered(targets.body_size, gathered(body, pair))
         of, face = gathered(beam, pair), dr.select(there, face_of(pair, number), 0)
+        # A face of a closed body reflects on its outside only, which the image has to be in front of.
         height = targets.height(gathered(beams.image, of), face)
         there &= (height > -slack) | gathered(targets.two_sided, face)
-        there &= face != gathered(beams.last, of)
+        there &= face != gathered(beams.last, of)  # a plane does not reflect twice in a row
         centre, radius = gathered(targets.centre, face), gathered(targets.radius, face)
         return there & beams.light_cone(of, centre, radius, slack)
 
@@ -383,11 +388,14 @@ def reflected_beams(targets: Targets, chain: Int64Array, image: Any, before: Any
     axis, cosine = _cone(image, corners)
     sides = _sides(image, corners)
     if before is not None:
+        # The beam has passed the rectangle before this one, too, whose mirror image bounds it from the new
+        # image.
         mirrored_corners = [mirrored(corner) for corner in targets.corners(before)]
         other_axis, other_cosine = _cone(image, mirrored_corners)
         narrower = other_cosine > cosine
         axis, cosine = dr.select(narrower, other_axis, axis), dr.maximum(cosine, other_cosine)
         sides += _sides(image, mirrored_corners)
+    # The image is behind the mirror, so the lit side is the other one.
     away = dr.select(dr.dot(image, normal) > offset, -1.0, 1.0)
     lit, lit_from = normal * away, offset * away
     dr.eval(image, axis, cosine, sides, lit, lit_from, last)
@@ -416,6 +424,8 @@ def lights_corner(targets: Targets, beams: Beams, beam: Any, face: Any) -> Any:
     import drjit as dr
 
     corners, image = targets.corners(face), gathered(beams.image, beam)
+    # Separating planes of a convex pyramid and a convex rectangle: conservative, as only the pyramid's are
+    # tried.
     lit = _some(corners, gathered(beams.lit, beam), gathered(beams.lit_from, beam) + targets.slack)
     for side in beams.sides:
         normal = gathered(side, beam)
@@ -440,6 +450,8 @@ def _sides(image: Any, corners: list[Any]) -> list[Any]:
     sides = []
     for one, other in zip(edges, [*edges[1:], edges[0]], strict=True):
         normal = dr.cross(one, other)
+        # Of an image in the plane of its rectangle the pyramid is flat, and a side has no direction of its
+        # own.
         normal *= dr.rsqrt(dr.maximum(dr.squared_norm(normal), 1e-20))
         sides.append(dr.select(dr.dot(normal, middle) < 0.0, -normal, normal))
     return sides

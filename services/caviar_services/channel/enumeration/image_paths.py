@@ -62,6 +62,7 @@ def image_paths(
         Paths sorted by receiver, number of reflections and chain, whether or not an obstacle hides them.
     """
     chain, count = pairs.chain, (pairs.chain >= 0).sum(1)
+    # A fixed order, whatever order kernels found the pairs in: products have to be equal to the bit.
     order = np.lexsort((*chain.T[::-1], count, pairs.receiver))
     chain, receiver = chain[order], pairs.receiver[order]
     points, good = reflection_points(
@@ -102,6 +103,7 @@ def reflection_points(
         rows = np.flatnonzero(good & (count > d))
         face, towards = chain[rows, d], images[d + 1][rows]
         near, far = faces.height(here[rows], face), faces.height(towards, face)
+        # The line has to cross the plane between the end and the image, from the side that reflects.
         crosses = (near * far < 0) & ((near > 0) | faces.two_sided[face])
         good[rows[~crosses]] = False
         rows, face, towards, near, far = (part[crosses] for part in (rows, face, towards, near, far))
@@ -240,6 +242,7 @@ def crossings(
     Returns:
         The crossings, and which paths cross at most so many surfaces and no opaque one, Shape ``[P]``.
     """
+    # Ray by ray from surface to surface, all segments at once, until each has reached its end.
     segments = _Segments.of(scene, faces, paths, transmitter, receivers)
     good = most > 0
     start, alive = segments.lifted.copy(), np.arange(len(segments.path))
@@ -270,6 +273,7 @@ def crossings(
     none = (np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0, np.int64))
     rows, along, points, triangle = (np.concatenate(column) for column in zip(none, *found, strict=True))
     path = segments.path[rows]
+    # A hidden path crosses something: one that crosses nothing is hidden by rounding at a face.
     count = np.bincount(path, minlength=len(good))
     good &= (count <= most) & (count > 0)
     places = Crossings(path, segments.number[rows], along, points, triangle).take(good[path])

@@ -83,11 +83,13 @@ class EnumeratedTracer:
         scene = self._scene
         if not len(receivers):
             return nothing(len(scene.wavelengths), self._depth, 0)
+        # The ray tracer's coordinates are relative to the middle of the scene: float32 has 7 digits.
         start, ends = transmitter - scene.centre, receivers - scene.centre
         of_bodies, sizes = self._standing()
         planes, sights = scenery.chains.astype(np.int64), scenery.sights.astype(np.int64)
         of_scenery = self._faces.scenery(planes[planes >= 0])
         faces = of_scenery.and_those(of_bodies)
+        # A chain by way of a plane without area has no face to be mirrored in.
         planes = planes[(np.isin(planes, of_scenery.plane) | (planes < 0)).all(1)]
         chains = np.where(planes >= 0, np.searchsorted(of_scenery.plane, planes), -1)
         views = self._views(of_scenery, sights, ends)
@@ -160,6 +162,7 @@ class EnumeratedTracer:
         found, through = crossings(self._scene, self._look, faces, paths, start, ends, self._depth - count)
         number = np.cumsum(through) - 1
         paths, count, crossing = paths.take(through), count[through], number[found.path]
+        # Transmissions stand between the reflections: each moves what follows by one place.
         crossed = np.zeros((len(count), paths.chain.shape[1] + 1), np.int64)
         np.add.at(crossed, (crossing, found.segment), 1)
         before = np.cumsum(crossed, axis=1)
@@ -264,6 +267,7 @@ class EnumeratedTracer:
             over_edges: See ``scenery``.
         """
         scene = self._scene
+        # A reflection that both have found is the enumerated one: of equal rows, `unique` keeps the first.
         surfaces = _surfaces(launched, scene)
         keys = np.concatenate(
             [
@@ -293,6 +297,7 @@ class EnumeratedTracer:
         through, mirrors = types == Interaction.TRANSMISSION, types == Interaction.REFLECTION
         kind = through.any(1) & (through | mirrors | (types == 0)).all(1)
         kind &= mirrors.sum(1) <= chains.shape[1]
+        # Transmissions do not bend a path: its chain is that of its reflections.
         order = np.argsort(~mirrors, axis=1, kind="stable")
         chain = np.where(np.take_along_axis(mirrors, order, 1), np.take_along_axis(surfaces, order, 1), -1)
         by_body = (chain >= self._scene.first_moving_plane).any(1)
@@ -310,6 +315,7 @@ class EnumeratedTracer:
         bent, mirrors = (traced.types == kind for kind in (Interaction.DIFFRACTION, Interaction.REFLECTION))
         used = traced.types != 0
         of_scenery = surfaces < self._scene.first_moving_plane
+        # Edges of bodies stand behind those of scenery.
         of_body = traced.edge >= len(edges) - len(edges.of_bodies[0])
         if enumerated_scenery(edges):
             of_body |= (traced.edge >= 0) & (mirrors & ~of_scenery).any(1)

@@ -84,6 +84,7 @@ class FaceRectangles:
             return cls.none()
         origin = triangles[along // 3, along % 3]
         side = triangles[along // 3, (along + 1) % 3] - origin
+        # Corners lie in the plane to rounding only; the axes have to lie in it exactly.
         side = side - np.einsum("fc,fc->f", side, normal)[:, None] * normal
         side /= np.sqrt(np.einsum("fc,fc->f", side, side))[:, None]
         axes = np.stack([side, cross(normal, side)], axis=1)
@@ -164,6 +165,8 @@ class FaceRectangles:
         across = sides[..., 0] * towards[..., 1] - sides[..., 1] * towards[..., 0]
         area = sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]
         length = np.sqrt((sides**2).sum(-1))
+        # Twice the area of the triangle of point and side over the side's length is the distance from the
+        # side.
         within = (across * np.sign(area)[:, None] >= -RIM * length).all(1) & (area != 0)
         held = np.zeros(len(faces), np.bool_)
         held[own[within]] = True
@@ -251,6 +254,7 @@ class SceneFaces:
 
     def bodies(self) -> tuple[FaceRectangles, Int64Array]:
         """Faces of all standing bodies, body after body, and how many each of these has."""
+        # Which rows are needed follows from which bodies stand, and is kept while these are the same.
         scene, standing = self._scene, self._scene.standing_bodies
         if standing != self._standing:
             planes = np.flatnonzero(np.isin(self._body_of, np.array(standing, np.int64)))
@@ -326,6 +330,7 @@ def visible_pairs(look: Faces, faces: FaceRectangles, rays: int, seed: int) -> I
         start = _points(faces.take(some), rays, rng)
         direction = rng.standard_normal((len(face), 3))
         direction /= np.sqrt((direction**2).sum(1))[:, None]
+        # A ray leaves on the side of its plane that it points to.
         off = np.sign((direction * faces.normal[face]).sum(1))[:, None] * faces.normal[face] * _OFF_PLANE
         behind, plane = look.nearest(start + off, start + off + direction)
         hit = np.isfinite(behind)

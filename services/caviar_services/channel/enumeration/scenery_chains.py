@@ -101,6 +101,7 @@ class ChainTree:
         for length in range(depth):
             planes[:, length] = faces.plane[face]
             levels.append(_Level(parent, face, planes))
+            # The number grows with a power of the faces that each one sees: give up before memory does.
             if sum(len(level.face) for level in levels) > MOST_CHAINS:
                 return None
             begin, end = (np.searchsorted(seen[:, 0], face, side) for side in ("left", "right"))
@@ -119,6 +120,7 @@ class ChainTree:
         faces, level = self._faces, self._levels[0]
         rows = last = np.flatnonzero(seen)
         image = faces.mirrored(np.broadcast_to(source, (len(rows), 3)), last)
+        # The rectangle before the last one, mirrored in the last one: it bounds a beam, too.
         through: Float64Array | None = None
         found = [level.planes[rows]]
         for shorter, level in pairwise(self._levels):
@@ -253,11 +255,13 @@ class SceneryChains:
     def of(self, name: str, transmitter: Float64Array) -> KnownScenery:
         """Those of the transmitter ``name`` at a position in the world [m], Shape ``[3]``, in the scene as it
         stands."""
+        # What one launch of many rays has found holds as long as the transmitter stands there.
         if name in self._known:
             known, scenery = self._known[name]
             if np.all(np.abs(known - transmitter) <= _ROUNDING * np.abs(known)):
                 return scenery
         place = transmitter - self._scene.centre
+        # Kept while neither the transmitter nor the scene has moved.
         last = self._last
         if last is None or last[:2] != (place.tobytes(), self._scene.version):
             last = self._last = place.tobytes(), self._scene.version, self._now(place)
@@ -325,6 +329,8 @@ def launched_chains(
     part = options.rays_at_once
     parts = -(-launch.samples // part)
     found = np.full((0, options.max_depth), -1, np.int32)
+    # Parts outside, launches inside: a part has rays of its own, and each launch turns them, so that memory
+    # holds one part at a time.
     for index in range(parts):
         rays = (index * part, min((index + 1) * part, launch.samples))
         launcher = Launcher(scene.mi_scene, reflected, rays)
@@ -400,6 +406,7 @@ class ChainCache:
             file = msgspec.msgpack.decode(data, type=_ChainFile)
             tables: tuple[Int32Array, ...] = tuple([table.array(np.int32) for table in file.tables])
             intact = file.key == key and file.digest == _digest(file.tables)
+        # Whatever is wrong with a file, launching again is right: its name says what its content has to be.
         except (msgspec.MsgspecError, UnicodeDecodeError, ValueError):
             intact = False
         if intact and [table.shape[1:] for table in tables] == [(width,) for width in widths]:
@@ -425,6 +432,7 @@ def cache_key(*parts: bytes) -> str:
     """Digest of all that chains follow from."""
     digest = hashlib.blake2b(digest_size=20)
     for part in (_FORMAT.encode(), *parts):
+        # With lengths: else two parts could be divided in another place and have the same digest.
         digest.update(len(part).to_bytes(8, "little"))
         digest.update(part)
     return digest.hexdigest()

@@ -121,7 +121,7 @@ def _shape(f: float, centre: Float64Array, width: Float64Array, interference: Fl
 def _continuum(f: float, p: float, e: float, theta: float) -> float:
     """N″ of the dry continuum: Debye spectrum of oxygen, pressure-induced nitrogen (eqs. 8 and 9)."""
     d = 5.6e-4 * (p + e) * theta**0.8
-    if d == 0:
+    if d == 0:  # no air: the width of the Debye spectrum, which is divided by, is 0
         return 0.0
     debye = 6.14e-5 / (d * (1 + (f / d) ** 2))
     nitrogen = 1.4e-12 * p * theta**1.5 / (1 + 1.9e-5 * f**1.5)

@@ -126,7 +126,7 @@ class Surfaces:
             corners = self._triangles[index]
             normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
             across = float(line @ normal)
-            if across == 0:
+            if across == 0:  # the segment is parallel to the triangle
                 continue
             along = float((corners[0] - start) @ normal) / across
             unit = normal / np.linalg.norm(normal)
@@ -155,6 +155,7 @@ class Surfaces:
 
         All rising rays but one cross them an odd number of times then.
         """
+        # A ray may graze an edge and be counted wrong: one dissenting ray is allowed.
         even = 0
         for met in self.above(position):
             even += len(met) % 2 == 0
@@ -164,6 +165,7 @@ class Surfaces:
 
     def _within(self, low: Float64Array, high: Float64Array, reach: float) -> Int64Array:
         """Triangles whose bounding box meets a box."""
+        # Axis by axis, so that later comparisons see few triangles.
         found = np.flatnonzero((self._low[0] <= high[0] + reach) & (self._high[0] >= low[0] - reach))
         for axis in (1, 2):
             below = self._low[axis, found] <= high[axis] + reach

@@ -59,6 +59,7 @@ def outward(mesh: Mesh) -> Float64Array:
     sides = np.stack([corners, np.roll(corners, -1, axis=1)], axis=-1).reshape(-1, 2)
     sides = sides[sides[:, 0] != sides[:, 1]]
     edges, edge, count = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True)
+    # Two triangles with the same outside run along their common edge in opposite directions.
     ways = np.bincount(edge.reshape(-1), np.where(sides[:, 0] < sides[:, 1], 1, -1), minlength=len(edges))
     is_open = np.count_nonzero(count % 2)
     if is_open or not len(edges):
@@ -67,6 +68,7 @@ def outward(mesh: Mesh) -> Float64Array:
         turned = np.count_nonzero(ways)
         raise ValueError(f"at {turned} of its {len(edges)} edges one triangle faces out and the other in")
     triangles: Float64Array = mesh.vertices[mesh.faces]
+    # Six times the volume, relative to a corner: at UTM coordinates the digits would be lost.
     a, b, c = np.moveaxis(triangles - triangles[0, 0], 1, 0)
     volume = float((np.cross(a, b) * c).sum())
     return triangles[:, ::-1] if volume < 0 else triangles
@@ -130,6 +132,7 @@ class MeshVolumes:
             slabs = np.ascontiguousarray(start.T), 1 / np.ascontiguousarray(direction.T)
         root = np.zeros(len(lines), np.int64)
         met = _meets(slabs, lines, self._boxes[-1], root, (0.0, 1.0))
+        # Depth first, and large levels in halves, so that few pairs of lines and boxes exist at a time.
         pending = [(len(self._boxes) - 1, lines[met], root[met])]
         while pending:
             level, lines, boxes = pending.pop()
@@ -167,6 +170,7 @@ def lengths_inside(
     if not found:
         return np.zeros((len(start), kinds))
     line, kind, along, step = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    # Along each line and kind, the running sum of +1 and −1 is the winding number behind each crossing.
     pair, along = line * kinds + kind, np.clip(along, 0.0, 1.0)
     order = np.lexsort((step, along, pair))
     pair, along, around = pair[order], along[order], np.cumsum(step[order])
@@ -228,6 +232,7 @@ def _crossed(
     intersection", JCGT 2(1), 2013): the sign of the product of two corners is opposite for the two triangles
     at an edge, and right or zero.
     """
+    # The longest component of the direction becomes the third axis, so that the shear is well conditioned.
     axis = np.argmax(np.abs(direction), axis=1)
     axes = (axis[:, None] + np.array([1, 2, 0])) % 3
     towards = np.take_along_axis(direction, axes, axis=1)
@@ -299,6 +304,7 @@ class FoliageKind:
         (P.833-10, eq. 1)."""
         straight: Float64Array = self.attenuation_db_per_m[:, None] * length
         most = np.where(np.isfinite(self.maximum_db), self.maximum_db, 1.0)[:, None]
+        # `expm1`: for short ways 1 − exp(…) would lose its digits.
         saturating = -most * np.expm1(-straight / most)
         return np.where(np.isfinite(self.maximum_db)[:, None], saturating, straight)
 
@@ -453,6 +459,7 @@ def _on_carrier(settings: FoliageSettings, carrier: Carrier, place: Place) -> tu
             f"lacks carrier {carrier.name!r} at {megahertz:g} MHz, and table 1 of ITU-R P.833 is for "
             f"{low:g}–{high:g} MHz; write {_REMEDY.format(carrier=carrier.name)}"
         )
+    # Between the rows of the table, straight in logarithms of all three.
     gamma, most = (
         float(np.exp(np.interp(np.log(megahertz), np.log(_TABLE_1[:, 0]), np.log(_TABLE_1[:, column]))))
         for column in (1, 2)

@@ -43,6 +43,7 @@ def slab(
     permittivity, conductivity = constants
     eta = permittivity - 1j * conductivity / (2 * np.pi * frequency_hz * EPSILON_0)
     root = np.sqrt(eta - (1 - cosine**2))
+    # Coefficients of one face (eq. 37), then all bounces between both faces (eqs. 43 and 44).
     single = np.stack([(cosine - root) / (cosine + root), (eta * cosine - root) / (eta * cosine + root)])
     through = np.exp(-2j * np.pi * thickness_m * frequency_hz / SPEED_OF_LIGHT * root)
     many = 1 - (single * through) ** 2
@@ -113,6 +114,7 @@ class Wall:
         across = (k * normal).sum(-1)
         frequency = SPEED_OF_LIGHT / self.wavelength
         back, passed = slab(np.abs(across), (self.permittivity, self.conductivity), self.thickness, frequency)
+        # What a surface scatters is missing from the reflected field alone.
         te, tm = np.where(through, passed, back * np.sqrt(1 - self.scattering**2))
         s = unit(_perpendicular(k, normal))
         out = np.where(through[:, None], k, k - 2 * across[:, None] * normal)
@@ -145,6 +147,7 @@ def reflection_fields(
     directions = steps / np.where(lengths > 0, lengths, 1.0)[..., None]
     total = lengths.sum(1)
     first = directions[:, 0]
+    # A field has no component along its direction.
     transverse = np.eye(3) - first[:, :, None] * first[:, None]
     fields = np.empty((len(wavelengths), len(count), 3, 3), np.complex128)
     for carrier, wavelength in enumerate(wavelengths):

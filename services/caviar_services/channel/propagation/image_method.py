@@ -72,6 +72,8 @@ def refined_points(
         one, other = (start, end) if traced_ends is None else traced_ends
         found = _found(one[some], traced, other[some], kind, triangles[some], edges[some])
         good = _same(one[some], traced, found, other[some], kind)
+        # Antennas at surfaces are traced from beside their place: the points found there are known to be the
+        # path's, and serve as a start for those of the true positions.
         moved = good & ((one != start) | (other != end)).any(1)[some]
         there = some[moved]
         found[moved] = _found(
@@ -139,6 +141,7 @@ def _found(
     diffracted = types == Interaction.DIFFRACTION
     if diffracted.any():
         paths, at = np.nonzero(diffracted)
+        # Both sides of the edge are straightened by images, then Keller's point joins them.
         before = _images(start, fixed, types, origin, normal)
         behind = _images(end, fixed[:, ::-1], types[:, ::-1], origin[:, ::-1], normal[:, ::-1])
         fixed[paths, at] = keller_point(before[at, paths], behind[depth - 1 - at, paths], edges[paths])

@@ -207,6 +207,7 @@ def element_amplitude(pattern: str, local: Float64Array) -> Float64Array:
         >>> 20 * np.log10(element_amplitude("tr38901", boresight))
         array([8.])
     """
+    # Of the components, not by arccos: near the poles that loses half of the digits.
     sin_theta = np.hypot(local[:, 0], local[:, 1])
     if pattern == "iso":
         return np.ones(len(local))
@@ -214,6 +215,7 @@ def element_amplitude(pattern: str, local: Float64Array) -> Float64Array:
         short: Float64Array = np.sqrt(1.5) * sin_theta
         return short
     if pattern == "hw_dipole":
+        # On the axis cos(π/2·cos θ)/sin θ is 0/0; its limit is 0.
         on_axis = sin_theta < 1e-9
         along = np.abs(np.cos(np.pi / 2 * local[:, 2])) / np.where(on_axis, 1.0, sin_theta)
         half_wave: Float64Array = np.sqrt(1.643) * np.where(on_axis, 0.0, along)

@@ -135,6 +135,7 @@ class Bends:
         legs = lengths[:, 0] + (lengths[:, 1:] * ~behind).sum(1), (lengths[:, 1:] * behind).sum(1)
         k, out = unit(steps[rows, at]), unit(steps[rows, at + 1])
         met = -(faces.normals * k[:, None]).sum(-1)
+        # By more than rounding: else a symmetric wedge would be counted from one face or the other by chance.
         swap = met[:, 1] > met[:, 0] + IN_PLANE
         return cls(at, k, out, legs, faces.turned(swap), swap)
 
@@ -149,6 +150,7 @@ class Bends:
         """How far [rad] the outgoing ray is within the wave that passes the edge, and within those that the
         faces reflect, first and second as they were given; negative where these have ended; ``[P, 3]``."""
         angle_in, angle_out = self.angles
+        # The reflections of both faces end at φ + φ' = π and at φ + φ' = 2nπ − π.
         both = angle_in + angle_out
         first, second = np.pi - both, both - (2 * self.faces.exterior - np.pi)
         first, second = np.where(self.swapped, (second, first), (first, second))
@@ -208,6 +210,7 @@ def edge_fields(
         field = np.eye(3) - k[:, :, None] * k[:, None] + 0j
         other = Wall.of(second, carrier, 0, wavelength)
         for d in range(types.shape[1]):
+            # Behind the last interaction nothing changes any more.
             going = types[:, d] != 0
             out = np.where(going[:, None], unit(steps[:, d + 1]), k)
             wall = Wall.of(media, carrier, d, wavelength)
@@ -218,6 +221,7 @@ def edge_fields(
                 flat[rows] = _diffracted(bends.take(rows), walls, lit[rows])
             field = np.where(going[:, None, None], flat @ field, field)
             k = out
+        # Of a spherical wave at an edge: 1/s' before it, sqrt(s' / (s·(s' + s))) behind it.
         spreading = 1 / np.sqrt(s_in * s_out * (s_in + s_out))
         fields.append(field * (wavelength / (4 * np.pi) * spreading)[:, None, None])
     return np.stack(fields)
@@ -227,6 +231,8 @@ def _diffracted(bends: Bends, walls: tuple[Wall, Wall], lit: Int64Array) -> Comp
     """Dyads of diffraction, without spreading; ``walls`` and ``lit`` are those of the faces as given."""
     k, out, edge = bends.k, bends.out, bends.faces.edge
     exterior, (angle_in, angle_out) = bends.faces.exterior, bends.angles
+    # ``lit`` and ``walls`` are in the order of the faces as given, angles count from the one met more
+    # steeply.
     swap = bends.swapped
     lit = np.where(swap[:, None], lit[:, [0, 2, 1]], lit)
     walls = walls[1].where(swap, walls[0]), walls[0].where(swap, walls[1])
@@ -234,6 +240,7 @@ def _diffracted(bends: Bends, walls: tuple[Wall, Wall], lit: Int64Array) -> Comp
     wavelength = walls[0].wavelength
     d14, d23 = _coefficients(angle_in, angle_out, exterior, _sine(k, edge), legs, wavelength, lit)
     s_in, s_out = unit(np.cross(k, edge)), -unit(np.cross(out, edge))
+    # Edge-fixed bases (Kouyoumjian and Pathak, 1974): one vector in the plane of ray and edge, one across it.
     incoming = np.stack([s_in, np.cross(k, s_in)], axis=1)
     outgoing = np.stack([s_out, np.cross(out, s_out)], axis=1)
     no = np.zeros(len(k), np.bool_)
@@ -278,6 +285,7 @@ def _coefficients(
     factor = -np.exp(-0.25j * np.pi) / (2 * n * np.sqrt(2 * np.pi * k) * sine)
     apart, both = angle_out - angle_in, angle_out + angle_in
     passes = lit[:, 0]
+    # The wave that passes the edge ends in D1 or in D2, whichever side the outgoing ray is on.
     terms = (
         (apart, np.where(apart < 0, passes, 0)),
         (-apart, np.where(apart < 0, 0, passes)),
@@ -372,12 +380,14 @@ def waves_beside(
     margins = bends.margins
     lit = np.zeros(margins.shape, np.int64)
     sights: dict[int, Sight] = {}
+    # An angle times the spreading length is how far the path passes from the boundary.
     near = np.abs(margins) * bends.spread[:, None] < _UNSURE
     near[:, 1:] &= _steep(bends)
     rows, waves = np.nonzero(near)
     if not len(rows):
         return lit, sights
     same = np.flatnonzero(np.isin(chains.pair, chains.pair[bent[rows]]))
+    # The wave exists if the same pair has a path of the same chain without the edge.
     there = {(int(chains.pair[path]), chains.key(path)) for path in same.tolist()}
     for row, wave in zip(rows.tolist(), waves.tolist(), strict=True):
         path = int(bent[row])
