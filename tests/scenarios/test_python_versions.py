@@ -35,7 +35,7 @@ NEWEST_ALONE = [
 """The others are left to the long form."""
 """The newest requirements on this Python are those of the tests at large."""
 CACHE = ROOT / ".venvs"
-GENERATED = ("codec", "keys", "messages", "multipath_changes", "recording_reader")
+GENERATED = ("codec", "keys", "messages", "multipath", "recording_reader")
 """Modules of the protocol whose tests generate inputs for most of a minute."""
 WIRE = (
     "arrays",

@@ -1,18 +1,26 @@
-"""The response of two paths against its closed form, and the numerology that a scenario's keys make."""
+"""Figures of a channel's paths: OFDM responses and taps by their formulas, spreads, births and deaths."""
 
 from __future__ import annotations
 
 import cmath
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from caviar_protocol.arrays import Complex128Array
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.multipath import (
     TAPS_BEFORE,
+    changes,
+    coherence,
+    delay_spread,
+    doppler_spread,
     first_tap,
+    k_factor,
     slot_offsets,
     subcarrier_offsets,
     subcarrier_weights,
@@ -20,7 +28,7 @@ from caviar_protocol.multipath import (
 )
 from caviar_protocol.scenario import parse_scenario, with_numerology
 from caviar_protocol.scenario.conversion import Place
-from caviar_protocol.topics import Carrier
+from caviar_protocol.topics import Carrier, Channel
 
 FREQUENCY = 28e9
 TAU = np.array([211.37e-9, 268.91e-9])
@@ -198,3 +206,104 @@ def test_a_scenario_states_what_follows_from_its_keys() -> None:
         SCENARIO.format(keys=keys, record="channel.hf", run="frames = 3\nsampling_period_ns = 1_000_000"), ""
     ).carriers
     assert (carrier.subcarriers, carrier.slot_duration_s) == (1333, 1e-4)
+
+
+NAN = float("nan")
+
+
+def test_two_paths_have_the_spread_of_their_distance() -> None:
+    """σ = √(p₁·p₂)/(p₁ + p₂)·|τ₁ − τ₂|."""
+    a = np.array([3e-6, 1e-6j, 0.0])
+    tau = np.array([200e-9, 290e-9, 900e-9])
+    assert delay_spread(a, tau) == pytest.approx(math.sqrt(9 * 1) / 10 * 90e-9)
+    assert doppler_spread(a, np.array([100.0, -60.0, 5000.0])) == pytest.approx(0.3 * 160.0)
+
+
+def test_users_without_paths_have_no_figures_and_padding_does_not_count() -> None:
+    a = np.array([[1e-6, complex(NAN, NAN)], [complex(NAN, NAN)] * 2])
+    tau = np.array([[1e-7, NAN], [NAN, NAN]])
+    assert delay_spread(a, tau)[0] == 0.0
+    assert math.isnan(delay_spread(a, tau)[1])
+    k = k_factor(a, tau, np.array([True, True]))
+    assert k[0] == math.inf
+    assert math.isnan(k[1])
+    assert np.isnan(k_factor(a[:, :0], tau[:, :0], np.array([True, True]))).all()
+
+
+def test_the_k_factor_is_the_earliest_path_over_the_others_with_line_of_sight_alone() -> None:
+    a = np.array([1e-6, 4e-6, 2e-6j])
+    tau = np.array([3e-7, 1e-7, 2e-7])
+    assert k_factor(a, tau, np.array(True)) == pytest.approx(16 / 5)
+    assert np.isnan(k_factor(a, tau, np.array(False)))
+
+
+@pytest.mark.parametrize("powers", [(1.0, 1.0), (9.0, 1.0), (5.0, 3.0, 1.0, 1.0)])
+def test_correlation_stays_above_a_half_within_the_coherence_bandwidth(powers: tuple[float, ...]) -> None:
+    """|R(Δf)| = |Σ p·exp(−j2πΔfτ)|/Σ p of uncorrelated paths; two equal ones meet the bound exactly."""
+    p, tau = np.array(powers), np.array([0.0, 70e-9, 30e-9, 200e-9])[: len(powers)]
+    bandwidth = float(coherence(delay_spread(np.sqrt(p).astype(complex), tau)))
+    offsets = np.linspace(0.0, bandwidth, 101)
+    correlation = np.abs(np.exp(-2j * np.pi * offsets[:, None] * tau) @ p) / p.sum()
+    assert correlation.min() >= 0.5 - 1e-12
+    if powers == (1.0, 1.0):
+        assert correlation[-1] == pytest.approx(0.5)
+
+
+def test_a_single_path_is_coherent_everywhere() -> None:
+    assert coherence(delay_spread(np.array([1j]), np.array([1e-7]))) == math.inf
+
+
+def product(rx: Sequence[str], ids: Sequence[Sequence[int]]) -> Channel:
+    """A product of one transmitter with these ids of paths to each receiver."""
+    flat = [number for pair in ids for number in pair]
+    count = len(flat)
+    return Channel(
+        rung="siso-rt",
+        carriers=(Carrier(name="c", frequency_hz=28e9),),
+        tx=("t",),
+        rx=tuple(rx),
+        los=np.zeros((1, len(rx)), np.bool_),
+        offsets=np.cumsum([0, *(len(pair) for pair in ids)]).astype(np.int64),
+        id=np.array(flat, np.uint64),
+        a=np.zeros((1, count), np.complex128),
+        tau=np.zeros(count),
+        aod=np.zeros((count, 2)),
+        aoa=np.zeros((count, 2)),
+        doppler=np.zeros((1, count)),
+        interactions=np.zeros((count, 0), np.uint8),
+        points=np.zeros((count, 0, 3)),
+        objects=np.zeros((count, 0), np.int32),
+    )
+
+
+def test_paths_are_born_and_die_within_their_pair() -> None:
+    """An id that moves from one receiver to another is a death and a birth."""
+    turnover = changes(product(["r", "s"], [[1, 2, 3], [4]]), product(["r", "s"], [[1, 3], [2, 4]]))
+    assert turnover.born.tolist() == [False, False, True, False]
+    assert turnover.died.tolist() == [False, True, False, False]
+    assert (turnover.births, turnover.deaths) == (1, 1)
+
+
+def test_a_pair_that_comes_or_leaves_takes_its_paths_along() -> None:
+    turnover = changes(product(["a", "b"], [[7], [8, 9]]), product(["b", "c"], [[9, 8], [7]]))
+    assert turnover.born.tolist() == [False, False, True]
+    assert turnover.died.tolist() == [True, False, False]
+
+
+def test_nothing_changes_between_equal_products() -> None:
+    turnover = changes(product(["r"], [[5, 6]]), product(["r"], [[5, 6]]))
+    assert (turnover.births, turnover.deaths) == (0, 0)
+
+
+_IDS = st.lists(st.lists(st.integers(0, 2**64 - 1), unique=True, max_size=6), min_size=3, max_size=3)
+
+
+@given(_IDS, _IDS)
+def test_what_was_is_what_remains_with_what_died(before: list[list[int]], after: list[list[int]]) -> None:
+    """Balance of each pair, and the two directions of time mirror each other."""
+    names = ["r", "s", "u"]
+    one, other = product(names, before), product(names, after)
+    forth, back = changes(one, other), changes(other, one)
+    assert len(one.id) - forth.deaths + forth.births == len(other.id)
+    assert np.array_equal(forth.born, back.died)
+    assert np.array_equal(forth.died, back.born)
