@@ -120,9 +120,9 @@ class MeshVolumes:
             direction: Along each line [m], Shape ``[Q, 3]``.
 
         Yields:
-            For some lines at a time: line, kind, multiple of the direction, and 1 for entering or −1 for leaving,
-            Shape ``[N]`` each. Left out are lines that miss all volumes from 0 to 1 or are not finite, and
-            some crossings beyond 1.
+            For some lines at a time: line, kind, multiple of the direction, and 1 for entering or −1 for
+            leaving, Shape ``[N]`` each. Left out are lines that miss all volumes from 0 to 1 or are not
+            finite, and some crossings beyond 1.
         """
         if not len(self.kind):
             return
