@@ -20,15 +20,15 @@ from caviar_protocol.messages import Hello, Policy
 
 POLICIES: tuple[Policy, ...] = ("wait", "hold", "drop")
 MARGIN = 0.2
-"""Beyond the 99th percentile that a suggested budget leaves."""
+"""Share of the 99th percentile that a suggested budget leaves beyond it."""
 TOLERANCE = 0.15
-"""By which prediction and measurement may differ without a word."""
+"""Relative difference of prediction and measurement from which a note says so."""
 FACTOR_STEPS = 12
-"""Halvings in the search for how much faster a service has to be."""
+"""Halvings in the search for how much faster a service has to be: a step of 1/4096 of its time."""
 
 
 class ServiceForecast(msgspec.Struct, frozen=True, kw_only=True):
-    """One service."""
+    """What a service takes, and what the run would be without it."""
 
     name: str
     p50_ms: float
@@ -70,9 +70,21 @@ class Forecast(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def forecast(run: RecordedRun, margin: float = MARGIN) -> Forecast:
-    """Play a recorded run under each policy, with its latencies as times of the services.
+    """Play a recorded run under each late policy, with its latencies as times of the services.
 
-    Raises `RecordingError` where there are no latencies beside the recording.
+    Args:
+        run: What was recorded.
+        margin: Share of the 99th percentile that a suggested budget leaves beyond it.
+
+    Raises:
+        RecordingError: There are no latencies beside the recording.
+        RunError: The run in virtual time ends early.
+
+    Example:
+        >>> from caviar_protocol.recording import Recording
+        >>> found = forecast(RecordedRun(Recording("runs/smoke-20261122-101500")))
+        >>> sorted(found.rates)
+        ['drop', 'hold', 'wait']
     """
     timings = timings_of(run)
     stage = _Stage(run, timings)
@@ -81,6 +93,7 @@ def forecast(run: RecordedRun, margin: float = MARGIN) -> Forecast:
     alone = {name: stage.play("wait", {n: 0.0 for n in timings if n != name}).rate for name in timings}
     rate, measured, predicted = played["wait"].rate, measured_rate(run), stage.play(None).rate
     realtime = 1e9 / run.scenario.run.sampling_period_ns
+    # Of services without which the run is equally fast, the one that is slowest alone.
     slowest = max(timings, key=lambda name: (without[name], -alone[name]))
     return Forecast(
         run=run.recording.metadata.run,
@@ -113,8 +126,14 @@ def forecast(run: RecordedRun, margin: float = MARGIN) -> Forecast:
 
 
 def rounded_up(value: float) -> float:
-    """To two digits, at least 0.1."""
+    """Round up to two digits, and to 0.1 at least.
+
+    Example:
+        >>> rounded_up(12.31), rounded_up(0.03)
+        (13.0, 0.1)
+    """
     step = 10.0 ** (math.floor(math.log10(max(value, 0.1))) - 1)
+    # Less a billionth: 0.12 / 0.01 is a little more than 12.
     return round(math.ceil(max(value, 0.1) / step - 1e-9) * step, 6)
 
 
@@ -129,12 +148,16 @@ class _Stage:
         self.frames = min(sum(run.lengths.values()), self._plan.frames * self._plan.episodes)
 
     def _served(self, name: str) -> Hello:
-        """What it declares; parts are of no matter here, and grants queue as far as the scenario says."""
+        """HELLO of a service, which takes as many grants in flight as the scenario allows."""
         return replace(self._run.hellos[name], max_in_flight=64)
 
     def play(self, policy: Policy | None, factors: Mapping[str, float] | None = None) -> Played:
-        """``policy``: of all services that may have it, or None for those of the scenario; ``factors``: by
-        which a service's times are multiplied."""
+        """Play the run.
+
+        Args:
+            policy: Of all services that may have it; None: those of the scenario.
+            factors: What the times of services are multiplied by.
+        """
         factors = factors or {}
 
         def takes(name: str, episode: int, frame: int) -> int:
@@ -143,7 +166,16 @@ class _Stage:
         return VirtualRun(under_policy(self._plan, policy), self._hellos, self._lengths, takes).run()
 
     def factor(self, name: str, target: float, rate: float) -> float | None:
-        """How many times as fast a service has to be for a frame rate; None: no factor suffices."""
+        """Search how many times as fast a service has to be for a frame rate.
+
+        Args:
+            name: Of the service.
+            target: Frame rate that is wanted [1/s].
+            rate: Frame rate under wait as it is [1/s].
+
+        Returns:
+            1 where it is fast enough; None where no factor suffices.
+        """
         if rate >= target:
             return 1.0
         if self.play("wait", {name: 0.0}).rate < target:

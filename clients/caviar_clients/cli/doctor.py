@@ -23,9 +23,10 @@ from pathlib import Path
 import zmq
 from packaging.requirements import Requirement
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from caviar_broker.core.events import Finished
+from caviar_clients.cli.shared import print_line
 from caviar_clients.cli.summary import recorded_figures
 from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.embedded import EmbeddedRun
@@ -76,16 +77,14 @@ class Check:
     """The extra that brings it, where the base install does without."""
 
 
-@dataclass(frozen=True)
-class _Outcome:
-    """How a command ended."""
-
-    ok: bool
-    text: str
-
-
 def doctor() -> list[Check]:
-    """Look at everything that a shipped scenario needs. Takes a few seconds; imports nothing heavy."""
+    """Look at everything that a shipped scenario needs.
+
+    It takes a few seconds and imports nothing heavy.
+
+    Returns:
+        What was found, in the order of the table.
+    """
     checks = [check_python(), check_base()]
     checks += [check_frames()]
     checks += [check_extra(extra) for extra in EXTRAS]
@@ -95,16 +94,14 @@ def doctor() -> list[Check]:
 
 
 def exit_status(checks: list[Check]) -> int:
-    """1 where something is wrong, else 0; an extra that is not installed is optional."""
+    """Work out the exit status: 1 where something is wrong. An extra that is not installed is optional."""
     return 0 if all(check.ok or check.extra for check in checks) else 1
 
 
 def render(checks: list[Check], console: Console) -> None:
     """Print the checks as a table, and below it the commands that mend what is wrong."""
-    table = Table(box=None, pad_edge=False)
-    table.add_column("")
-    table.add_column("what", no_wrap=True)
-    table.add_column("found", overflow="fold")
+    columns = ("", Column("what", no_wrap=True), Column("found", overflow="fold"))
+    table = Table(*columns, box=None, pad_edge=False)
     for check in checks:
         mark = "[green]ok[/]" if check.ok else "[yellow]optional[/]" if check.extra else "[bold red]--[/]"
         table.add_row(mark, check.name, check.found)
@@ -113,36 +110,31 @@ def render(checks: list[Check], console: Console) -> None:
     lacking = dict.fromkeys(check.extra for check in checks if not check.ok and check.extra)
     for check in wrong:
         console.print(f"\n[bold red]{check.name}[/]: mend it with")
-        _print_command(console, check.remedy)
+        print_line(console, f"  {check.remedy}")
     if lacking:
         console.print(
             f"\noptional: {', '.join(lacking)}; `caviar scenarios` says what needs which. To add them:"
         )
-        _print_command(console, install_command(*lacking))
+        print_line(console, f"  {install_command(*lacking)}")
     if not wrong:
         needed = "the base install" if lacking else "the shipped scenarios"
         console.print(f"\nEverything that {needed} needs is here.")
 
 
-def _print_command(console: Console, command: str) -> None:
-    """Print it as it is, so that it can be copied even where it is longer than the terminal."""
-    console.print(f"  {command}", soft_wrap=True, markup=False, highlight=False)
-
-
 def check_python() -> Check:
-    """Version of the interpreter."""
+    """Check the version of the interpreter."""
     version = ".".join(map(str, sys.version_info[:3]))
     remedy = "sudo apt-get install -y python3.11 python3.11-venv && make clean setup PYTHON=python3.11"
     return _check("Python", sys.version_info >= MINIMUM_PYTHON, f"{version} ({sys.executable})", remedy)
 
 
 def check_base() -> Check:
-    """The packages that every part needs."""
+    """Check the packages that every part needs."""
     return _check_requirements("base install", "")
 
 
 def check_frames() -> Check:
-    """Two frames of `smoke` in this process: that the base install computes, and computes the right thing."""
+    """Check that the base install computes, and computes the right thing: two frames of `smoke`, here."""
     remedy = f"{sys.executable} -m pip install --upgrade --upgrade-strategy eager {DISTRIBUTION}"
     try:
         with tempfile.TemporaryDirectory(prefix="caviar-doctor-") as folder:
@@ -171,12 +163,12 @@ def _two_frames(folder: Path) -> tuple[Finished, float]:
 
 
 def check_extra(extra: str) -> Check:
-    """The packages of one extra."""
+    """Check the packages of one extra."""
     return _check_requirements(f"extra {extra}", extra)
 
 
 def check_llvm() -> Check:
-    """The LLVM that the ray tracer would use, and that it compiles."""
+    """Check the LLVM that the ray tracer would use: that it is there, and compiles."""
     tracer = importlib.util.find_spec("drjit") is not None
     try:
         library = ray_tracing.choose_llvm()
@@ -186,42 +178,41 @@ def check_llvm() -> Check:
         return Check("LLVM", False, str(error), ray_tracing.INSTALL)
     if not tracer:
         return Check("LLVM", True, f"{library}; not tried, Dr.Jit is not installed")
-    outcome = _run([sys.executable, "-c", _KERNEL], {ray_tracing.ENVIRONMENT: str(library.path)})
-    if outcome.ok:
-        return Check("LLVM", True, f"{library}; compiled a kernel")
-    return Check("LLVM", False, f"{library} cannot compile: {outcome.text}", ray_tracing.INSTALL)
+    ok, text = _run([sys.executable, "-c", _KERNEL], {ray_tracing.ENVIRONMENT: str(library.path)})
+    found = f"{library}; compiled a kernel" if ok else f"{library} cannot compile: {text}"
+    return _check("LLVM", ok, found, ray_tracing.INSTALL)
 
 
 def check_gpu() -> Check:
-    """CUDA devices; none is fine."""
+    """Count CUDA devices; none is fine."""
     count = ray_tracing.cuda_devices()
     return Check("CUDA", True, f"{count} device(s)" if count else "none, the CPU computes")
 
 
 def check_sumo() -> Check:
-    """The traffic simulator: its programs and its library load."""
+    """Check that programs and library of the traffic simulator load."""
     spec = importlib.util.find_spec("sumo")
     if spec is None or not spec.submodule_search_locations:
         return Check("SUMO", False, "not installed", install_command("world"), extra="world")
     home = Path(next(iter(spec.submodule_search_locations)))
     for command in ([str(home / "bin" / "netconvert"), "--version"], [sys.executable, "-c", _SUMO]):
-        outcome = _run(command, {"SUMO_HOME": str(home)})
-        if not outcome.ok:
-            return Check("SUMO", False, f"does not load: {outcome.text}", SUMO_LIBRARIES)
-    return Check("SUMO", True, f"{outcome.text}, SUMO_HOME {home}")
+        ok, text = _run(command, {"SUMO_HOME": str(home)})
+        if not ok:
+            return Check("SUMO", False, f"does not load: {text}", SUMO_LIBRARIES)
+    return Check("SUMO", True, f"{text}, SUMO_HOME {home}")
 
 
 def check_zmq() -> Check:
-    """ZeroMQ, with encryption."""
+    """Check that ZeroMQ is here, with encryption."""
     found = f"libzmq {zmq.zmq_version()}, pyzmq {zmq.pyzmq_version()}"
-    if zmq.has("curve"):
-        return Check("ZeroMQ", True, f"{found}, with CURVE")
+    # Wheels bring a libzmq with CURVE; one that was built here takes what the system has.
     remedy = f"{sys.executable} -m pip install --force-reinstall --only-binary :all: pyzmq"
-    return Check("ZeroMQ", False, f"{found}, built without CURVE", remedy)
+    encrypts = bool(zmq.has("curve"))
+    return _check("ZeroMQ", encrypts, f"{found}, {'with' if encrypts else 'built without'} CURVE", remedy)
 
 
 def check_loopback() -> Check:
-    """That services and broker of one machine can talk over TCP."""
+    """Check that services and broker of one machine can talk over TCP."""
     try:
         with socket.create_server(("127.0.0.1", 0)) as server:
             address = server.getsockname()
@@ -232,14 +223,14 @@ def check_loopback() -> Check:
 
 
 def check_disk(folder: Path) -> Check:
-    """Room for recordings, which go to ``runs/`` of the folder."""
+    """Check the room for recordings, which go to ``runs/`` of a folder."""
     free = shutil.disk_usage(folder).free / 1e9
     remedy = "caviar run SCENARIO --out DIR, with DIR on a larger disk; or delete old runs"
     return _check("disk", free >= MINIMUM_FREE_GB, f"{free:.1f} GB free in {folder}", remedy)
 
 
 def check_kernel_cache(home: Path) -> Check:
-    """That compiled kernels can be kept: without, every start compiles for seconds."""
+    """Check that compiled kernels can be kept: else every start compiles for seconds."""
     cache = home / ".drjit"
     nearest = cache if cache.exists() else home
     writable = os.access(nearest, os.W_OK | os.X_OK)
@@ -248,7 +239,7 @@ def check_kernel_cache(home: Path) -> Check:
 
 
 def check_open_files() -> Check:
-    """The limit of open files; every connection of the broker takes some."""
+    """Check the limit of open files, of which every connection of the broker takes some."""
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     unlimited = soft == resource.RLIM_INFINITY
     found = "unlimited" if unlimited else f"at most {soft}"
@@ -260,7 +251,7 @@ def _check(name: str, ok: bool, found: str, remedy: str) -> Check:
 
 
 def _requirements(extra: str) -> list[Requirement]:
-    """What an extra asks for, or the base install with ``""``; on this platform, itself left out."""
+    """What an extra, or with ``""`` the base install, requires on this platform beside this distribution."""
     try:
         lines = metadata.requires(DISTRIBUTION) or []
     except metadata.PackageNotFoundError:
@@ -269,6 +260,7 @@ def _requirements(extra: str) -> list[Requirement]:
     for line in lines:
         requirement = Requirement(line)
         marker = requirement.marker
+        # Evaluated for one extra, a marker lets requirements of the base install pass, too.
         belongs = marker is not None and "extra" in str(marker)
         wanted = marker is None or marker.evaluate({"extra": extra})
         if wanted and belongs == bool(extra) and requirement.name != DISTRIBUTION:
@@ -306,8 +298,8 @@ def _pip_install(requirements: list[Requirement]) -> str:
     return f"{sys.executable} -m pip install {wanted}"
 
 
-def _run(command: list[str], environment: Mapping[str, str]) -> _Outcome:
-    """First line a command prints, or why it failed."""
+def _run(command: list[str], environment: Mapping[str, str]) -> tuple[bool, str]:
+    """Whether a command succeeded, and the first line that it printed, or why it failed."""
     try:
         done = subprocess.run(  # noqa: S603 - the commands are those above
             command,
@@ -318,13 +310,13 @@ def _run(command: list[str], environment: Mapping[str, str]) -> _Outcome:
             check=False,
         )
     except OSError as error:
-        return _Outcome(False, str(error))
+        return False, str(error)
     except subprocess.TimeoutExpired:
-        return _Outcome(False, "no end after 120 s")
+        return False, "no end after 120 s"
     if done.returncode == 0:
-        return _Outcome(True, done.stdout.partition("\n")[0].strip())
+        return True, done.stdout.partition("\n")[0].strip()
     last = (done.stderr.strip() or done.stdout.strip()).rpartition("\n")[2]
     how = f"status {done.returncode}"
     if done.returncode < 0:
         how = f"killed by {signal.Signals(-done.returncode).name}"
-    return _Outcome(False, f"{how}: {last}" if last else how)
+    return False, f"{how}: {last}" if last else how

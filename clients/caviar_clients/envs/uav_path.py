@@ -34,7 +34,13 @@ class FlightEnv(SessionEnv[NDArray[np.float32]]):
     ±1; one longer than 1 is shortened to 1. The world bounds acceleration too, and keeps the object clear of
     buildings. Beams of receivers that the agent owns beside the motion point along the straight line.
 
-    Parameters as `SessionEnv`, and ``vehicle``, the name of the flown object; None: the only one.
+    Args:
+        scenario: Scenario file, or the name of a scenario that ships.
+        vehicle: Name of the flown object; None: the only one.
+        options: The other arguments of `SessionEnv`.
+
+    Raises:
+        ScenarioError: The scenario has no such object, or the agent does not own its motion.
     """
 
     def __init__(self, scenario: str | Path, vehicle: str | None, **options: Any) -> None:
@@ -45,7 +51,8 @@ class FlightEnv(SessionEnv[NDArray[np.float32]]):
         self.action_space = spaces.Box(-1.0, 1.0, (3,), np.float32)
 
     def _flown_object(self, vehicle: str | None) -> tuple[str, dict[str, Any]]:
-        """Name and settings of the object."""
+        """Name of the object in the run, and its settings."""
+        # Of several worlds each has a prefix for the names of its objects.
         worlds = [spec.settings for spec in self.scenario.services.values() if spec.role == "world"]
         found = {
             str(settings.get("prefix") or "") + thing["name"]: thing
@@ -61,6 +68,7 @@ class FlightEnv(SessionEnv[NDArray[np.float32]]):
 
     def _receivers_of_agent(self) -> tuple[str, ...]:
         """Patterns of the receivers whose beams the agent owns."""
+        # Without `users` an agent owns every actuator of the run (contract, clause 17).
         users = self.scenario.services[self.agent].users or ("*",)
         if users != ("*",) and not owned_by(
             (u for u in users if u.startswith(MOTION)), MOTION + self.vehicle
@@ -75,6 +83,7 @@ class FlightEnv(SessionEnv[NDArray[np.float32]]):
         if share is None:
             raise PayloadError(f"the action is {action}; write three numbers within -1 and 1")
         x, y, z = share
+        # The corners of the box of actions are √3 long; the object flies at its greatest speed there.
         speed = self._max_speed / max(1.0, math.hypot(x, y, z))
         flight = VelocityCommand(object=self.vehicle, velocity=(x * speed, y * speed, z * speed))
         return [*self._beams(moment), flight]
@@ -96,7 +105,15 @@ class FlightEnv(SessionEnv[NDArray[np.float32]]):
 
 
 def point(numbers: Any) -> Vector | None:
-    """Three finite numbers; None where it is something else."""
+    """Read a point, or another vector of three numbers.
+
+    Returns:
+        Three finite numbers; None where it is something else.
+
+    Example:
+        >>> point([1, 2, 3.5]), point("here")
+        ((1.0, 2.0, 3.5), None)
+    """
     try:
         found = np.asarray(numbers, np.float64)
     except (TypeError, ValueError):
@@ -108,16 +125,26 @@ def point(numbers: Any) -> Vector | None:
 
 
 class UavPathEnv(FlightEnv):
-    """A flight with a reward of |y| and of metres; the radio is 5·10⁻⁵ of it beside 0.75 for the way, so
-    that hardly any learner hears it. `uav_path_v1.UavPathV1Env` has parts of comparable size.
+    """Fly to a goal, rewarded by |y| and by metres: ``caviar/UavPath-v0``.
 
-    Parameters as `FlightEnv`, and:
+    The radio is 5·10⁻⁵ of the reward beside 0.75 for the way, so that hardly any learner hears it.
+    `uav_path_v1.UavPathV1Env` has parts of comparable size. This one is kept for what was learned in it.
 
     Args:
+        scenario, vehicle, options: As of `FlightEnv`.
         goal_m: Where to fly [m]; the episode terminates when it is reached. The observation has ``goal``
             then, the way that is left [m], Shape ``[3]``. None: there is none.
         reach_m: Distance at which the goal is reached [m].
-        progress_weight: Reward for each metre that the goal has come nearer, beside that of the link.
+        progress_weight: Reward for each metre that the goal has come nearer, beside that of the link [1/m].
+        observe: Parts of the observation, as of `SessionEnv`.
+
+    Raises:
+        ScenarioError: An argument is wrong; the text has value and remedy.
+
+    Example:
+        >>> env = UavPathEnv("uav-path", goal_m=(60.0, 40.0, 30.0))
+        >>> sorted(env.observation_space.spaces)
+        ['goal', 'last_abs_y', 'position', 'velocity']
     """
 
     def __init__(
@@ -141,7 +168,7 @@ class UavPathEnv(FlightEnv):
         self._reach, self._progress_weight = reach_m, progress_weight
 
     def _way(self, moment: Moment) -> NDArray[np.float64]:
-        """What is left to the goal [m], Shape ``[3]``."""
+        """The way that is left to the goal [m], Shape ``[3]``."""
         way: NDArray[np.float64] = np.asarray(self._goal) - self._position(moment)
         return way
 

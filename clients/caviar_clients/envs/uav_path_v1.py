@@ -36,7 +36,7 @@ _MARGIN = 0.01
 
 
 class Weights(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What each part of the reward counts."""
+    """What each part of the reward counts, from 0 on."""
 
     progress: float = 1.0
     radio: float = 1.0
@@ -57,7 +57,7 @@ class RewardParts(msgspec.Struct, frozen=True, kw_only=True):
     """1 in the step that reaches the goal, else 0."""
 
     def weighted(self, weights: Weights) -> float:
-        """Their weighted sum."""
+        """Sum up the parts, each times its weight."""
         return (
             weights.progress * self.progress
             + weights.radio * self.radio
@@ -89,9 +89,8 @@ class UavPathV1Env(FlightEnv):
     −3…11. Radio and outage are never above 0, so that nothing is gained by staying on the way; progress sums
     up to the same on every way to the goal.
 
-    Parameters as `SessionEnv` but for ``reward``, and:
-
     Args:
+        scenario: Scenario file, or the name of a scenario that ships.
         vehicle: Name of the flown object; None: the only one.
         reach_m: Distance at which the goal is reached [m].
         box_m: Two corners [m] within which start and goal are drawn; None: the object's bounds.
@@ -99,12 +98,23 @@ class UavPathV1Env(FlightEnv):
             the way that the object can fly in an episode.
         efficiency_bit_s_hz: Spectral efficiency that is a radio part of 0: the best one that counts.
         outage_snr_db: A user with a lower SNR [dB] is in outage.
-        weights: Of the parts: `Weights`, by name.
+        weights: Of the parts: `Weights`, by name; what is left out has its default.
         observe: Further parts: `caviar_clients.envs.observations.PARTS`; their bounds are their own.
+        options: The other arguments of `SessionEnv`, but for ``reward``.
 
     Raises:
         ScenarioError: The object has no bounds (``minimum_m``, ``maximum_m``), the scenario fewer than two
             frames, or an argument or an option is out of its range.
+
+    Example:
+        >>> env = UavPathV1Env("uav-path", weights={"radio": 2.0})
+        >>> observation, info = env.reset(seed=3)
+        >>> sorted(observation)
+        ['goal', 'outage', 'position', 'rate', 'velocity']
+        >>> *_, info = env.step(env.action_space.sample())
+        >>> sorted(info["reward_parts"])
+        ['arrival', 'outage', 'progress', 'radio']
+        >>> env.close()
     """
 
     reset_options = ("start", "goal")
@@ -149,7 +159,7 @@ class UavPathV1Env(FlightEnv):
             }
         )
 
-    # --- what is set -------------------------------------------------------------------------------
+    # --- arguments ---------------------------------------------------------------------------------
 
     def _bounds(self) -> tuple[Vector, Vector]:
         low, high = (point(self._flown.get(key)) for key in ("minimum_m", "maximum_m"))
@@ -178,6 +188,7 @@ class UavPathV1Env(FlightEnv):
 
     def _distances(self, distance_m: tuple[float, float] | None) -> tuple[float, float]:
         if distance_m is None:
+            # Frame 0 puts the object at its start: it flies in the others.
             way = self._step_way * (self.scenario.run.frames - 1)
             low, high = SHARE_OF_WAY
             return max(low * way, 2 * self._reach), max(high * way, 4 * self._reach)
@@ -203,6 +214,7 @@ class UavPathV1Env(FlightEnv):
 
     def _start_and_goal(self, moment: Moment, options: Mapping[str, Any]) -> tuple[Vector, Vector]:
         frame = moment.frame
+        # From the seed of the episode, which a broker elsewhere has, too, and not from gymnasium's generator.
         random = generator(frame.seed, frame.seed_episode, f"{self.agent}/start-and-goal")
         bounds, box = self._space((self._low, self._high)), self._space(self._drawn_in)
         given = {name: self._given(bounds, name, options.get(name)) for name in self.reset_options}
@@ -222,6 +234,7 @@ class UavPathV1Env(FlightEnv):
         return start, goal
 
     def _space(self, box: tuple[Vector, Vector]) -> Airspace:
+        # Made once: scenery is known behind the first reset, and it stays.
         if self._airspace is None and self._session is not None:
             clearance = float(self._flown.get("clearance_m", 1.0)) + _MARGIN
             self._airspace = Airspace(self._low, self._high, clearance, self._session.scenery)
@@ -240,21 +253,23 @@ class UavPathV1Env(FlightEnv):
             )
         return place
 
-    # --- what a step gives ---------------------------------------------------------------------------
+    # --- a step --------------------------------------------------------------------------------------
 
     def _rewarded(self, before: Moment, now: Moment, link: Link) -> float:
         efficiency, outage = self._radio(before, link)
         nearer = self._left(before) - self._left(now)
         self._parts_now = RewardParts(
+            # Beyond ±1 only by rounding: the world bounds the speed.
             progress=min(1.0, max(-1.0, nearer / self._step_way)),
             radio=efficiency - 1.0,
-            outage=0.0 - outage,
+            outage=0.0 - outage,  # and not -outage, which is −0.0 without one
             arrival=float(self._terminated(now)),
         )
         return self._parts_now.weighted(self._weights)
 
     def _radio(self, moment: Moment, link: Link | None) -> tuple[float, float]:
-        """Mean spectral efficiency of the users over the best one that counts, and the share in outage."""
+        """Mean spectral efficiency of the users over the best one that counts, and the share in outage; both
+        0 before the first link, and all in outage where there is no user."""
         served = {(pair.tx.name, pair.rx.name) for _, pair in moment.users}
         if link is None:
             return 0.0, 0.0
@@ -299,7 +314,7 @@ def _clipped(values: Float64Array) -> NDArray[np.float32]:
 
 
 def _is_number(value: object) -> bool:
-    """Whether it is a finite number; NaN compares false with everything, so a range alone does not tell."""
+    """Whether it is a finite number. NaN compares false with everything: a range alone would let it pass."""
     return isinstance(value, numbers.Real) and math.isfinite(value)
 
 

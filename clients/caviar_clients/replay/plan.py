@@ -23,7 +23,7 @@ from caviar_protocol.scenario.toml import parse_toml, toml_text
 
 @dataclass(frozen=True, kw_only=True)
 class Request:
-    """Options of `caviar replay`; services by name."""
+    """Options of ``caviar replay``, with services by their names."""
 
     replace: Mapping[str, str] = field(default_factory=dict)
     """Implementation in place of the recorded one."""
@@ -50,9 +50,23 @@ def request_of(
     recorded: Iterable[str] = (),
     again: bool = False,
 ) -> Request:
-    """The options as given on the command line, with roles resolved to names.
+    """Read the options of ``caviar replay``.
 
-    Raises `RunError` naming the option, what is wrong, and what there is.
+    Args:
+        services: Of the recorded run, by name.
+        replace: ``SERVICE=IMPLEMENTATION`` each; a service by name, or by a role that it alone has.
+        settings: ``SERVICE.SETTING=VALUE`` each, values as in TOML.
+        keep, recorded: Services.
+        again: Whether everything runs again.
+
+    Raises:
+        RunError: An option names nothing, or two exclude each other; the text has the option and what there
+            is.
+
+    Example:
+        >>> spec = ServiceSpec(role="channel", use="free-space", budget_ms=10.0)
+        >>> request_of({"radio": spec}, replace=["channel=geometric"]).replace
+        {'radio': 'geometric'}
     """
     found = Request(
         replace={
@@ -73,7 +87,16 @@ def request_of(
 
 
 def service_named(services: Mapping[str, ServiceSpec], name: str, option: str) -> str:
-    """The service of that name, or the only one of that role."""
+    """Find a service by its name, or by a role that it alone has.
+
+    Args:
+        services: Of the recorded run, by name.
+        name: Name or role.
+        option: The option as it was written, for the error.
+
+    Raises:
+        RunError: There is none, or several have the role.
+    """
     if name in services:
         return name
     of_role = [service for service, spec in services.items() if spec.role == name]
@@ -111,7 +134,7 @@ def _settings(services: Mapping[str, ServiceSpec], texts: Sequence[str]) -> dict
 
 
 def _value(text: str) -> Any:
-    """A value as TOML writes it; what is none is text."""
+    """Read a value as TOML; what is no TOML is text, so that names need no quotation marks."""
     try:
         return parse_toml(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
@@ -119,7 +142,12 @@ def _value(text: str) -> Any:
 
 
 def typed(changes: Mapping[str, Any], cls: type[msgspec.Struct]) -> dict[str, Any]:
-    """What was typed, as TOML values, but where only text fits: ``1e3``, the name of a rung."""
+    """Read settings that were typed on the command line.
+
+    Args:
+        changes: Texts by key, in nested tables.
+        cls: Type of the settings: where only text fits a field, ``1e3`` stays text, as the name of a rung.
+    """
     types = {field.encode_name: field.type for field in msgspec.structs.fields(cls)}
     return {key: _typed(value, types.get(key, Any)) for key, value in changes.items()}
 
@@ -140,7 +168,12 @@ def _fits(value: Any, expected: Any) -> bool:
 
 
 def merged(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings with some replaced, tables within tables too."""
+    """Replace some settings, tables within tables key by key.
+
+    Example:
+        >>> merged({"a": {"b": 1, "c": 2}}, {"a": {"c": 3}})
+        {'a': {'b': 1, 'c': 3}}
+    """
     found = dict(settings)
     for key, value in changes.items():
         known = found.get(key)
@@ -176,7 +209,17 @@ class ReplayPlan:
 
 
 def plan_replay(run: RecordedRun, request: Request, frames: int | None = None) -> ReplayPlan:
-    """Plan of a replay. Raises `RunError` where somebody needs what was not recorded and does not run."""
+    """Plan a replay.
+
+    Args:
+        run: What was recorded.
+        request: What is asked for.
+        frames: Of each episode, at most; None: as many as were recorded.
+
+    Raises:
+        RunError: A service that runs needs what was not recorded and no service makes, or there are not so
+            many frames; the text has the remedy.
+    """
     roles = tuple(_role(name, spec, run, request) for name, spec in run.scenario.services.items())
     services = {role.name: _spec(role, run, request) for role in roles if role.part != "left out"}
     hellos = {name: _declared(name, spec, run) for name, spec in services.items()}
@@ -217,7 +260,7 @@ def plan_replay(run: RecordedRun, request: Request, frames: int | None = None) -
 
 
 def _role(name: str, spec: ServiceSpec, run: RecordedRun, request: Request) -> Role:
-    """What becomes of a service. Whoever takes what a changed one makes runs again, and so on downstream."""
+    """What becomes of a service. The order is that of precedence: options before what follows from them."""
     if name in request.replace:
         return Role(name, "replaced", request.replace[name], f"in place of {spec.use}")
     if name in request.settings:
@@ -238,7 +281,7 @@ def _role(name: str, spec: ServiceSpec, run: RecordedRun, request: Request) -> R
 
 
 def _spec(role: Role, run: RecordedRun, request: Request) -> ServiceSpec:
-    """Everybody waits: a replay is not to depend on how fast this machine is."""
+    # All services wait: a replay does not depend on how fast this machine is.
     spec = replace(run.scenario.services[role.name], policy="wait")
     if role.part == "recorded":
         return served_from_recording(spec, run.topics[role.name], run.recording.directory)
@@ -251,12 +294,12 @@ def _spec(role: Role, run: RecordedRun, request: Request) -> ServiceSpec:
 
 
 def _declared(name: str, spec: ServiceSpec, run: RecordedRun) -> Hello:
-    """Of what runs; `DeclarationError` where that is not registered."""
+    """HELLO of a service that runs; `DeclarationError` where its implementation is not registered."""
     return run.hellos[name] if spec.remote else declared_hello(name, spec)
 
 
 def _check_needs(hellos: dict[str, Hello], roles: tuple[Role, ...], run: RecordedRun) -> None:
-    """Whoever runs has to find what it needs, from one that runs or in the recording."""
+    """Raise `RunError` where a service that runs needs what no service makes and no recording has."""
     recorded = {role.name for role in roles if role.part == "recorded"}
     for name, hello in hellos.items():
         for item in hello.inputs:
@@ -265,6 +308,7 @@ def _check_needs(hellos: dict[str, Hello], roles: tuple[Role, ...], run: Recorde
             sources = [other for other, its in hellos.items() if item.topic in its.outputs]
             if not sources and item.required:
                 raise RunError(_not_recorded(name, item, run))
+            # Only a source that runs can make parts that were not recorded.
             if sources and run.parts_are_known and recorded.issuperset(sources):
                 _check_parts(name, item, sources[0], run)
 
@@ -331,10 +375,17 @@ def _notes(run: RecordedRun, roles: tuple[Role, ...], missed: list[str]) -> list
 
 
 def scenario_text(scenario: Scenario) -> str:
-    """What `caviar_protocol.scenario.load_scenario` reads as this scenario."""
+    """Write a scenario as TOML, which `caviar_protocol.scenario.load_scenario` reads as this scenario.
+
+    Example:
+        >>> from caviar_protocol.scenario import load_scenario, parse_scenario
+        >>> scenario = load_scenario("smoke")
+        >>> parse_scenario(scenario_text(scenario)).services == scenario.services
+        True
+    """
     table = plain(scenario, defaults=False)
     table.pop("source", None)
-    if table["run"].get("instants_s"):  # which tell the others
+    if table["run"].get("instants_s"):  # their number and distances are those of frames
         table["run"].pop("frames", None)
         table["run"].pop("sampling_period_ns", None)
     return toml_text(table)

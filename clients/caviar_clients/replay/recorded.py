@@ -24,7 +24,16 @@ from caviar_protocol.scenario import Scenario, ServiceSpec
 class RecordedRun:
     """The run that a recording holds.
 
-    Raises `RecordingError` where it holds no frame, or a scenario that this version does not read.
+    Args:
+        recording: Open.
+
+    Raises:
+        RecordingError: It holds no frame, or a scenario that this version does not read.
+
+    Example:
+        >>> run = RecordedRun(Recording("runs/smoke-20261122-101500"))
+        >>> run.topics["link"]
+        ('link',)
     """
 
     def __init__(self, recording: Recording) -> None:
@@ -43,6 +52,7 @@ class RecordedRun:
     @cached_property
     def topics(self) -> Mapping[str, tuple[str, ...]]:
         """Recorded topics of each service; one that was not run has none."""
+        # The first and the last frame: a service may join late, or be given up.
         entries = (self.recording.entry(index) for index in (0, len(self.recording) - 1))
         pairs = {(item.source, item.topic) for entry in entries for item in entry.inputs}
         return {
@@ -52,7 +62,7 @@ class RecordedRun:
 
     @cached_property
     def hellos(self) -> Mapping[str, Hello]:
-        """What each service declared; of one whose implementation is not here, what the recording tells."""
+        """HELLO of each service; without its implementation, with the topics that were recorded."""
         return {name: self._hello(name, spec) for name, spec in self.scenario.services.items()}
 
     def _hello(self, name: str, spec: ServiceSpec) -> Hello:
@@ -63,7 +73,7 @@ class RecordedRun:
 
     @cached_property
     def demand(self) -> tuple[str, ...]:
-        """Topics that the run produced, and the parts asked of them, as entries of ``run.record``."""
+        """Topics that the run produced, and the parts demanded of them, as entries of ``run.record``."""
         found = demanded(self.hellos, self.scenario.run.record)
         recorded = {topic for topics in self.topics.values() for topic in topics}
         return tuple(sorted(entry for entry in found | recorded if entry.partition(".")[0] in recorded))
@@ -83,7 +93,14 @@ class RecordedRun:
         return found
 
     def after(self, names: Iterable[str]) -> set[str]:
-        """Services that take something of these, at any lag, or of such a service, without recorders."""
+        """Find the services downstream: those that take a product of these, at any lag, or of such a service.
+
+        Args:
+            names: Services to start from.
+
+        Returns:
+            Names of services, without recorders and services of which nothing was recorded.
+        """
         found: set[str] = set()
         todo = list(names)
         while todo:
@@ -97,13 +114,13 @@ class RecordedRun:
         return found
 
     def misses(self, name: str) -> int:
-        """Frames in which a service's products were held or absent."""
+        """Count the frames in which a service's products were held or absent."""
         statuses = (Status.HELD, Status.ABSENT)
         entries = (self.recording.entry(index) for index in range(len(self.recording)))
         return sum(any(i.source == name and i.status in statuses for i in entry.inputs) for entry in entries)
 
     def digest(self, frames: int) -> str:
-        """Digest of the run, had its episodes had so many frames at most."""
+        """Work out the digest of the run, had its episodes had ``frames`` frames at most."""
         chain = RunDigest()
         for index in range(len(self.recording)):
             entry = self.recording.entry(index)
@@ -132,20 +149,24 @@ class Timing:
     """Whether each latency could be assigned to its frame."""
 
     def at(self, episode: int, frame: int) -> int:
-        """What a frame took; where it did not happen, the median."""
+        """Look up what a frame took [ns]; the median where the service had no part in it."""
         return self.times.get((episode, frame), self.typical)
 
 
 def timings_of(run: RecordedRun) -> dict[str, Timing]:
-    """Timing of each service that was run.
+    """Assign the latencies beside a recording to frames.
 
-    Raises `RecordingError` where there are no latencies beside the recording.
+    Returns:
+        Timing of each service that was run, by name.
+
+    Raises:
+        RecordingError: There are no latencies beside the recording, or they cannot be read.
     """
     return {name: _timing(run, name, values) for name, values in _latencies(run).items() if len(values)}
 
 
 def measured_rate(run: RecordedRun) -> float:
-    """Frames a second of the recorded run, behind its warm-up frames [1/s]; 0 if unknown."""
+    """Work out the frame rate of a recorded run after its warm-up frames [1/s]; 0 where it is unknown."""
     finished = _archive(run)["finished_ns"]
     first = min(10, len(finished) // 10)
     if len(finished) - first < 2 or finished[-1] == finished[first]:
@@ -154,7 +175,11 @@ def measured_rate(run: RecordedRun) -> float:
 
 
 def outcomes_of(run: RecordedRun, name: str) -> Iterator[tuple[At, Outcome]]:
-    """What became of each frame, and of an agent's final grants, in the order of frames."""
+    """Find out what became of a service's part of each frame, and of an agent's final grants.
+
+    Yields:
+        Episode and frame, and the outcome, in the order of frames.
+    """
     agent = run.hellos[name].role == "agent"
     for index in range(len(run.recording)):
         entry = run.recording.entry(index)
@@ -168,6 +193,7 @@ def _outcome(entry: FrameEntry, name: str) -> Outcome:
     for item in _not_fresh(entry.inputs, name):
         if item.cause.startswith(missed):
             return "busy" if ", still busy with frame" in item.cause else "late"
+        # A product that lacks for another reason than the service's lacks since its input did.
         if not item.cause.startswith((f"{name} failed", f"{name} produced")):
             return "skipped"
     return "answered"
@@ -192,7 +218,8 @@ def _timing(run: RecordedRun, name: str, values: npt.NDArray[np.int64]) -> Timin
 
 
 def _in_order_of_latencies(outcomes: Iterable[tuple[At, Outcome]]) -> list[At]:
-    """A late frame's latency is known when it is answered, behind those of the frames missed meanwhile."""
+    """Bring frames into the order in which their latencies were noted: that of a late frame is known when it
+    is answered, after the frames missed meanwhile."""
     found: list[At] = []
     late: At | None = None
     for at, outcome in outcomes:
