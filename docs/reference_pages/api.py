@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, get_origin
 
 import msgspec
-from sphinx.ext.napoleon import GoogleDocstring, NumpyDocstring
+from sphinx.ext.napoleon import GoogleDocstring
 
 from caviar_protocol.spec import rows
 
@@ -101,8 +101,7 @@ def finish_docstring(app: Any, kind: str, name: str, member: Any, options: Any, 
     """Make reStructuredText of a docstring: sections of parameters, and the fields of a struct as a table."""
     text = list(_with_plain_characters(lines))
     if kind not in ("attribute", "data", "property"):  # there Napoleon reads «x: y» as a type
-        for style in (NumpyDocstring, GoogleDocstring):
-            text = style(text, app.config, app, kind, name, member, options).lines()
+        text = GoogleDocstring(text, app.config, app, kind, name, member, options).lines()
     if _is_struct(member) and member.__struct_fields__:
         text += ["", *_field_table(member)]
     lines[:] = text

@@ -47,10 +47,8 @@ class Verdict:
 class PathCheck:
     """Judges paths in the scene as it stands.
 
-    Parameters
-    ----------
-    scene
-        Gives the corners of its triangles, in world coordinates; that is all that is asked of it.
+    Args:
+        scene: Gives the corners of its triangles, in world coordinates; nothing else is read from it.
     """
 
     def __init__(self, scene: SionnaScene) -> None:
