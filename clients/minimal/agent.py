@@ -43,7 +43,7 @@ def done(grant, parts):
 threading.excepthook = lambda end: os._exit(os.write(2, f"{NAME}: {end.exc_value!r}\n".encode()) and 1)
 leaving = set()  # by SIGTERM, which may come amid the parts of a message: BYE goes behind them, from the loop
 with zmq.Context() as context, dealer(context) as broker:
-    broker.linger = 1000  # [ms] at the end, so that a broker that is gone holds nobody up
+    broker.linger = 1000  # [ms] at the end, so that a broker that is gone does not hold it up
     broker.send(msgpack.packb({"type": "HELLO", **message}))
     while message.get("type") != "SHUTDOWN" and not leaving:
         if not broker.poll(100):  # [ms], as a signal need not end the wait

@@ -76,7 +76,7 @@ def nursery(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Clients in Python are forks of one process, and scenery of the kit goes to a folder of the tests."""
     Forked.nursery = Nursery()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("caviar_clients.conform.kit.Started", Forked)
+        patch.setattr("caviar_clients.conform.Started", Forked)
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         yield
     Forked.nursery.close()

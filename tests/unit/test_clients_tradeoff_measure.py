@@ -137,7 +137,7 @@ def channel(scale: float, ranked: list[int], los: bool = True) -> UserChannel:
         los=los,
         path_gain_db=20 * float(np.log10(scale)),
         delay_spread_s=scale * 1e-9,
-        angular_spread_rad=(0.0, scale, 0.0, 0.0),
+        angular_spread_rad=np.array([0.0, scale, 0.0, 0.0]),
         h=h,
         capacity_bps_hz=scale,
         abs_y=scale * np.array([[0.5, 1.0], [0.25, 0.125]]),
@@ -145,16 +145,7 @@ def channel(scale: float, ranked: list[int], los: bool = True) -> UserChannel:
     )
 
 
-NOTHING = UserChannel(
-    los=False,
-    path_gain_db=-np.inf,
-    delay_spread_s=None,
-    angular_spread_rad=None,
-    h=None,
-    capacity_bps_hz=0.0,
-    abs_y=None,
-    ranked=[],
-)
+NOTHING = UserChannel(los=False)
 
 
 def test_a_users_channel_is_compared_with_the_references() -> None:

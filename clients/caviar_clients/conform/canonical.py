@@ -113,6 +113,7 @@ def _walk(got: _Node, right: _Node | None, path: str, ignored: frozenset[str] = 
 
 def _walk_map(got: _Node, right: _Node | None, path: str, ignored: frozenset[str]) -> str:
     place = f"{path}: " if path else ""
+    # First of all: of two values under one key a decoder keeps either.
     for number, key in enumerate(got.keys):
         if key in got.keys[:number]:
             return f"{place}the key {key!r} occurs twice"
@@ -226,6 +227,7 @@ def check_products(done: Fields, parts: list[bytes], outputs: list[str]) -> dict
                 "the header and the body",
                 str(entry["digest"]) or "none",
             )
+        # Of payloads the product's own types are the judge: their codec is held to the vectors by its tests.
         try:
             payload = decode_payload(topic, header, body)
             again = encode_payload(payload)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 import msgspec
 
 if TYPE_CHECKING:
-    from caviar_clients.conform.kit import Kit
+    from caviar_clients.conform import Kit
 
 
 Outcome = Literal["pass", "fail", "not applicable"]

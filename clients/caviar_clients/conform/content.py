@@ -23,7 +23,7 @@ from caviar_protocol.topics.channel import PLANE_WAVES
 from caviar_protocol.validation import PartCheck
 
 if TYPE_CHECKING:
-    from caviar_clients.conform.kit import Kit
+    from caviar_clients.conform import Kit
 
 FRAMES = 4
 # Between two frames [rad]: behind half a turn (π) the other way round is the shorter one, and the rotation
@@ -143,6 +143,7 @@ def carriers(kit: Kit) -> str:
     _, found = _published(kit)
     for before, after in pairwise(found):
         there = {device.name for device in after.devices}
+        # Its object may leave, and the device with it; another one may then get the device.
         for device in before.devices:
             if device.name not in there and device.parent in after.names:
                 raise Failed(
@@ -164,6 +165,7 @@ def turning(kit: Kit) -> str:
         for name in set(before.names) & set(after.names):
             i, j = before.names.index(name), after.names.index(name)
             turned = _rotation(before.orientation[i], after.orientation[j])
+            # The mean of both ends: exact for a turn that speeds up evenly.
             stated = (before.angular_velocity[i] + after.angular_velocity[j]) / 2 * street.PERIOD_NS / 1e9
             largest = max(np.linalg.norm(turned), np.linalg.norm(stated))
             if np.linalg.norm(turned) > AMBIGUOUS_RAD:
@@ -219,10 +221,12 @@ def consistency(kit: Kit) -> str:
     # The right answer is computed from the client's own paths: the kit does not know which paths are right.
     _, scene, channel = _channel(kit)
     whole = {(entry.carrier, entry.tx, entry.rx): entry.h for entry in channel.h}
+    # On every rung, since both are of the client: a factor or a conjugate that one of them lacks shows.
     for entry in channel.hf:
         # The middle subcarrier stands at the carrier's frequency, where the response is H itself.
         middle = entry.h[0, channel.carriers[entry.carrier].subcarriers // 2]
         _compare("hf of the middle subcarrier in slot 0", middle, whole[entry.carrier, entry.tx, entry.rx])
+    # Other rungs have a path length for each pair of elements, which the paths of the product do not state.
     if channel.rung not in PLANE_WAVES:
         return f"hf agrees with h; {channel.rung!r} has no plane waves"
     for part, expected in street.parts_of(channel, scene).items():

@@ -15,7 +15,7 @@ from caviar_clients.conform.session import ACTIVE, Answer, Session
 from caviar_clients.conform.street import HELD_FOR, Inputs
 
 if TYPE_CHECKING:
-    from caviar_clients.conform.kit import Kit
+    from caviar_clients.conform import Kit
 
 
 FRAMES = 4
@@ -70,6 +70,7 @@ def _what_differs(first: Answer, second: Answer) -> str:
 @case("heartbeats-in-frames", "clause 15", "HEARTBEATs as often as asked while frames are computed")
 def heartbeats_in_frames(kit: Kit) -> str:
     """Work does not hold heartbeats up."""
+    # A client that answers in one thread with its heartbeats stops beating while it computes.
     session = kit.at(ACTIVE)
     since, period = len(session.pulse.beats), session.heartbeat_s
     for _ in range(BEATS):
@@ -99,6 +100,7 @@ def cancel(kit: Kit) -> str:
 def queued_grants(kit: Kit) -> str:
     """Grants that are queued are answered in their order."""
     session = kit.at(ACTIVE)
+    # All are sent before any answer is read: a client that takes the newest message first gives itself away.
     depth = session.hello.get("max_in_flight", 1)
     if depth == 1:
         raise NotApplicable("it queues no grants: max_in_flight is 1")
@@ -116,6 +118,7 @@ def gap(kit: Kit) -> str:
     """Frames may be left out: previous_frame says which was completed last."""
     session = kit.at(ACTIVE)
     session.step()
+    # As a broker does in a real-time run, whose clock goes on while a service is late.
     frame = session.frame + 3
     session.done(session.grant(frame))
     return f"DONE of frame {frame}, where frame {frame - 4} was the last before it"
@@ -151,6 +154,7 @@ def held_inputs(kit: Kit) -> str:
     session = kit.at(ACTIVE)
     if not session.hello.get("inputs"):
         raise NotApplicable("it has no inputs")
+    # An older product needs frames before it.
     while session.frame < HELD_FOR + 1:
         session.step()
     session.step(Inputs(held=True))
@@ -221,6 +225,7 @@ def final_grant(kit: Kit) -> str:
 def _end_episode(session: Session) -> None:
     frames_done = session.completed + 1
     if session.hello["role"] == "agent":
+        # The agent gets what its last action led to, of the frame before, and nothing of this one.
         declared = [item for item in session.hello.get("inputs", []) if item.get("lag", 0)]
         entries, parts = Inputs().of(declared, session.frame)
         fields, _ = session.granting(session.frame, Inputs(), final=True)

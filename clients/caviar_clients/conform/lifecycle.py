@@ -15,7 +15,7 @@ from caviar_clients.conform.session import ACTIVE, ATTEMPT, CONNECTING, EPOCH, J
 from caviar_protocol.topics import PAYLOADS
 
 if TYPE_CHECKING:
-    from caviar_clients.conform.kit import Kit
+    from caviar_clients.conform import Kit
 
 
 BEATS = 10
@@ -51,6 +51,7 @@ def _check_topics(said: Fields) -> None:
     for topic in outputs:
         if topic not in PAYLOADS:
             raise Failed(f"topics among {', '.join(PAYLOADS)}", f"the output {topic!r}")
+    # With another lag a topic may be there twice: now, and as it was a frame before.
     if len(set(inputs)) < len(inputs) or len(set(outputs)) < len(outputs):
         raise Failed("each topic once", f"inputs {inputs}, outputs {outputs}")
 
@@ -90,6 +91,7 @@ def heartbeats(kit: Kit) -> str:
     session = kit.at(JOINED)
     attached_heart(session)
     session.listen(BEATS / 2 * session.heartbeat_s)
+    # A late acknowledgement, as of a broker that was busy: the client has sent others since.
     session.beat_back("HEARTBEAT_ACK", {"sequence": 0})
     session.listen(BEATS / 2 * session.heartbeat_s)
     return check_beats(session, 0)
@@ -163,6 +165,7 @@ def _world_scenery(session: Session) -> str:
     session.expect_error("unknown-asset", "ERROR unknown-asset for a digest that it did not offer")
     if not session.offered:
         return "offers none, and says so when asked"
+    # From the middle, as one that resumes asks, and from the end, where a part without a byte is right.
     name, data = max(session.offered.items(), key=lambda item: len(item[1]))
     digest = hashlib.sha256(data).hexdigest()
     for offset in (len(data) // 2, len(data)):
@@ -183,6 +186,7 @@ def _world_scenery(session: Session) -> str:
 def early_grant(kit: Kit) -> str:
     """A GRANT that comes before RESET is not used."""
     session = kit.at(READY)
+    # Of the episode that the next RESET begins: only its order is wrong.
     session.episode = 0
     session.grant(0)
     session.expect_error("unexpected")
@@ -280,6 +284,7 @@ def silence(kit: Kit) -> str:
 def other_major(kit: Kit) -> str:
     """WELCOME of another major version, of which only type and version can be read, is the end."""
     session = kit.fresh()
+    # Without epoch or scenario: what else a later version has there cannot be known.
     session.send("WELCOME", {"version": [2, 0], "era": "a later one"})
     end = session.ended(session.rules.timeout_s, "an end with a status other than 0")
     return end.check_failure("a status other than 0")

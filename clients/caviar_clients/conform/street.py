@@ -210,6 +210,7 @@ def _place(frame: int) -> tuple[float, float, float]:
 def _scene(source: str, frame: int) -> Scene:
     car = source != "air"
     name = "car.1" if car else "uav.1"
+    # Written out and not mounted by the product's code, which the kit is there to be independent of.
     devices: list[Any] = [
         AntennaDevice(
             name=f"{name}/rx", parent=name, position=(0.2, 0.0, 0.9), role="rx", array=AntennaArray(columns=2)

@@ -13,7 +13,7 @@ from caviar_clients.conform.session import ACTIVE, ATTEMPT, EPOCH, Answer, Sessi
 from caviar_clients.conform.street import Inputs
 
 if TYPE_CHECKING:
-    from caviar_clients.conform.kit import Kit
+    from caviar_clients.conform import Kit
 
 # Written out rather than imported: the kit is a second reading of SPEC.md, section Limits.
 MAX_HEADER = 1 << 20
@@ -91,6 +91,7 @@ def garbage(kit: Kit) -> str:
 @case("truncated", "Transport; Wrong things", GOES_ON)
 def truncated(kit: Kit) -> str:
     """A multipart message with parts too few or too many is refused."""
+    # Without inputs there is nothing to leave out.
     session = kit.at(ACTIVE)
     _, parts = session.granting(session.frame, Inputs())
 
@@ -188,6 +189,7 @@ def undecodable_input(kit: Kit) -> str:
         ways[_faulted(session, frame, _victim(fields, parts))] = None
     if not ways:
         raise NotApplicable("it has no inputs in every frame")
+    # A client need not read what it does not use: then it cannot find anything wrong with it.
     if set(ways) == {"DONE"}:
         raise NotApplicable("it did not read the product: it answered DONE")
     return "; ".join(ways)
@@ -213,6 +215,7 @@ def _faulted(session: Session, frame: int, names: list[str]) -> str:
     session.check_identity(got)
     if sum(name in got.fields["message"] for name in names) < 2:
         raise Failed(expected, repr(got.fields["message"]))
+    # The frame is decided by its FAULT, so the next GRANT is of the next frame.
     session.frame += 1
     session.step()
     return "FAULT, and the next frame"
@@ -221,6 +224,7 @@ def _faulted(session: Session, frame: int, names: list[str]) -> str:
 @case("stale-grant", "clause 1; Wrong things", "ERROR unexpected; the GRANT is not used")
 def stale_grant(kit: Kit) -> str:
     """A GRANT of another epoch or attempt is not used."""
+    # Earlier and later ones: a client may compare by < where it has to compare by ≠.
     others: list[Fields] = [{"epoch": EPOCH - 1}, {"attempt": ATTEMPT - 1}, {"epoch": EPOCH + 1}]
     for other in others:
         session = kit.at(ACTIVE)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
@@ -33,6 +33,7 @@ def spread_order(count: int) -> list[int]:
         [0, 4, 2, 6, 1, 5, 3, 7]
     """
     digits = max(1, (count - 1).bit_length())
+    # However early time runs out, the scenes that were seen are spread over the episode.
     return sorted(range(count), key=lambda i: int(f"{i:0{digits}b}"[::-1], 2))
 
 
@@ -85,6 +86,7 @@ def predicted_s(setting: Setting, known: Sequence[Cost]) -> float | None:
     if not column:
         return None
     last = column[-1]
+    # The first column is measured first, and its rows cost as the others' do relative to each other.
     first = known[0].setting.column
     by_row = {cost.setting.row: cost.seconds for cost in known if cost.setting.column == first}
     ratios = [
@@ -93,6 +95,7 @@ def predicted_s(setting: Setting, known: Sequence[Cost]) -> float | None:
     ]
     if by_row.get(last.setting.row) and setting.row in by_row:
         ratios.append(by_row[setting.row] / by_row[last.setting.row])
+    # The greatest: a prediction that is too short costs the time of all others, one too long a cell.
     return last.seconds * max(ratios)
 
 
@@ -107,7 +110,7 @@ def _samples(setting: Setting) -> int:
 
 
 ROUNDS = 3
-"""Times that each scene is measured, where time allows: for the 99th percentile."""
+"""Times that each scene is measured, where time allows: a 99th percentile needs many measurements."""
 TOGETHER = 3
 """Settings that are loaded at a time, beside the baseline: each holds a scene of its own in memory."""
 PATIENCE = 4.0
@@ -129,56 +132,51 @@ class Skipped(msgspec.Struct, frozen=True, kw_only=True):
     reason: str
 
 
-@dataclass(kw_only=True, eq=False)
 class Measured:
-    """What was found of one setting."""
+    """Measurements of one setting.
 
-    setting: Setting
-    rung: str
-    prepare_s: float
-    loaded_mib: float | None
-    times_ms: list[float] = field(default_factory=list)
-    memory_mib: list[float] = field(default_factory=list)
-    frames: list[int] = field(default_factory=list)
-    """Of the scenes that were measured, each once."""
-    receivers: list[int] = field(default_factory=list)
-    """Of each of these scenes; likewise the paths."""
-    paths: list[int] = field(default_factory=list)
-    lost: int = 0
-    """Measurements in which paths were lost."""
-    users: dict[Key, UserChannel] = field(default_factory=dict)
-    baseline_ms: float = 0.0
-    """Median time of the baseline, measured by turns with this one."""
-    notes: list[str] = field(default_factory=list)
+    Args:
+        worker: Has the setting loaded.
+    """
+
+    def __init__(self, worker: Worker) -> None:
+        self.setting, self.loaded = worker.setting, worker.loaded
+        self.baseline_ms = 0.0
+        """Median time [ms] of the baseline, measured by turns with this setting."""
+        self.notes: list[str] = []
+        """What a reader of the table should know."""
+        self.samples: list[Sample] = []
+        """All measurements; a scene that is measured again has no users there."""
+        self.scenes: dict[int, Sample] = {}
+        """The first measurement of each scene, by its frame."""
 
     def add_sample(self, frame: int, sample: Sample) -> None:
-        """Add a measurement; the channels of its users only where the scene is new."""
-        self.times_ms.append(sample.time_ms)
-        self.lost += sample.lost_paths
-        if sample.memory_mib is not None:
-            self.memory_mib.append(sample.memory_mib)
-        if frame not in self.frames:
-            self.frames.append(frame)
-            self.receivers.append(sample.receivers)
-            self.paths.append(sample.paths)
-            self.users.update(sample.users)
+        """Add a measurement of a scene."""
+        if frame in self.scenes:
+            # The channels of a scene are the same at each measurement, and megabytes.
+            sample = replace(sample, users={})
+        self.samples.append(sample)
+        self.scenes.setdefault(frame, sample)
 
     def absorb(self, other: Measured) -> None:
         """Add the measurements of the same setting from another wave."""
-        self.times_ms += other.times_ms
-        self.memory_mib += other.memory_mib
-        self.lost += other.lost
-        for frame, receivers, paths in zip(other.frames, other.receivers, other.paths, strict=True):
-            if frame not in self.frames:
-                self.frames.append(frame)
-                self.receivers.append(receivers)
-                self.paths.append(paths)
-        self.users.update(other.users)
+        self.samples += other.samples
+        self.scenes = other.scenes | self.scenes
+
+    @property
+    def times_ms(self) -> list[float]:
+        """Times of all measurements [ms]."""
+        return [sample.time_ms for sample in self.samples]
 
     @property
     def median_ms(self) -> float:
-        """Median time of all measurements [ms]; 0 where there is none."""
-        return float(np.median(self.times_ms)) if self.times_ms else 0.0
+        """Median of these times [ms]; 0 where there is none."""
+        return float(np.median(self.times_ms)) if self.samples else 0.0
+
+    @property
+    def users(self) -> dict[Key, UserChannel]:
+        """Channels of all users of all scenes."""
+        return {key: user for sample in self.scenes.values() for key, user in sample.users.items()}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,14 +190,13 @@ class Progress:
     """[s] that it may still take."""
 
 
-@dataclass(eq=False)
 class _Entry:
     """A setting that is loaded."""
 
-    worker: Worker
-    measured: Measured
-    # Measurements that it gets.
-    count: int = 0
+    def __init__(self, worker: Worker) -> None:
+        self.worker, self.measured = worker, Measured(worker)
+        # Measurements that it gets.
+        self.count = 0
 
     @property
     def cost_s(self) -> float:
@@ -262,7 +259,8 @@ class Campaign:
         """
         begun = time.monotonic()
         until, costs, found = begun + share * self._left_s, list[Cost](), dict[Setting, Measured]()
-        own = self._entry(self._baseline).measured
+        own = Measured(self._baseline)
+        # Waves of a few: every setting that is loaded holds its scene, and kernels of Dr.Jit, in memory.
         waves = [settings[i : i + TOGETHER] for i in range(0, len(settings), TOGETHER)]
         for number, wave in enumerate(waves):
             now = time.monotonic()
@@ -271,9 +269,10 @@ class Campaign:
                 entries = self._loaded(name, wave, costs, (until, behind), stack)
                 self._by_turns(name, entries, now + max(0.0, until - now) / (len(waves) - number))
             baseline, *others = entries
-            if not baseline.measured.times_ms:
+            if not baseline.measured.samples:
                 raise RunError(f"{self.baseline.label} {'; '.join(baseline.measured.notes)}")
             own.absorb(baseline.measured)
+            # Against the baseline of the same wave: the machine may be busier in the next one.
             for entry in others:
                 entry.measured.baseline_ms = baseline.measured.median_ms
                 if self._is_of_use(entry.measured, name):
@@ -287,7 +286,9 @@ class Campaign:
         seconds = min(self._left_s, max(AT_LEAST_S, share * self._left_s))
         try:
             return keyframe_rows(self.baseline, self._scenes, self._receivers, seconds, self._tell)
-        except CaviarError as error:
+        except (
+            CaviarError
+        ) as error:  # a part of the report that is missing, and said so, is no failure of all
             label = f"{self.baseline.label}, keyframes"
             self.skipped.append(Skipped(setting=label, block="keyframes", reason=str(error)))
             return []
@@ -322,11 +323,12 @@ class Campaign:
         """The baseline, and of a wave what can be loaded in time: until then, for so many settings."""
         until, to_come = time_for
         # The baseline's process stays from wave to wave; its record starts anew, for this wave's factors.
-        entries = [self._entry(self._baseline)]
+        entries = [_Entry(self._baseline)]
         for number, setting in enumerate(wave):
             if setting == self.baseline:
                 continue
             self._tell(f"{name}: loading {setting.label}")
+            # Before it is loaded, which may take as long: a scene of it would not fit into the time anyway.
             expected, left = predicted_s(setting, costs), until - time.monotonic()
             out_of_time = left <= 0 or (expected or 0.0) > AFFORDABLE * left
             if out_of_time and setting.label not in self._whole:
@@ -340,12 +342,13 @@ class Campaign:
                 self._skip(setting, name, str(error))
                 continue
             stack.enter_context(closing(worker))
-            entries.append(self._entry(worker))
+            entries.append(_Entry(worker))
             costs.append(Cost(setting, entries[-1].cost_s))
         return entries
 
     def _by_turns(self, name: Block, entries: Sequence[_Entry], until: float) -> None:
         """Measure each as often as its share of the time allows; once at least."""
+        # Loading has taken its part of the time: what is left is shared out.
         seconds = max(0.0, until - time.monotonic())
         most = [ROUNDS * self._scenes_of(entry.measured.setting) for entry in entries]
         for entry, count in zip(entries, shares([e.cost_s for e in entries], most, seconds), strict=True):
@@ -360,6 +363,7 @@ class Campaign:
     def _turn(self, entry: _Entry, turn: int, until: float) -> None:
         measured = entry.measured
         whole = measured.setting.label in self._whole and turn < len(self._order)
+        # The first turn is always taken, so that each setting that was loaded has a line in the table.
         if turn and not whole and time.monotonic() > until:
             return
         if not turn and not whole and entry.cost_s > max(WORTH_S, until - time.monotonic()):
@@ -368,6 +372,7 @@ class Campaign:
             measured.notes.append("timed on the scene that warmed it up: another would take too long")
             entry.count = 0
             return
+        # Behind the last scene it begins again with the first: a second measurement of each, then a third.
         index = self._order[turn % self._scenes_of(measured.setting)]
         try:
             share = min(self._left_s, PATIENCE * (until - time.monotonic()))
@@ -380,17 +385,17 @@ class Campaign:
 
     def _is_of_use(self, measured: Measured, name: Block) -> bool:
         """Whether it was measured at all; adds notes for the reader of the table."""
-        if not measured.times_ms:
+        if not measured.samples:
             self._skip(measured.setting, name, "; ".join(measured.notes))
             return False
-        scenes, limit = len(measured.frames), self._scenes_of(measured.setting)
+        scenes, limit = len(measured.scenes), self._scenes_of(measured.setting)
         if scenes < len(self._scenes.instants):
             why = "" if scenes == limit else ", for want of time"
             measured.notes.append(f"{scenes} of {len(self._scenes.instants)} scenes{why}")
         if measured.setting.most_receivers is not None:
-            measured.notes.append(f"{measured.receivers[0]} receivers")
-        if measured.lost:
-            measured.notes.append(f"paths lost in {measured.lost} of {len(measured.times_ms)} measurements")
+            measured.notes.append(f"{measured.samples[0].receivers} receivers")
+        if lost := sum(sample.lost_paths for sample in measured.samples):
+            measured.notes.append(f"paths lost in {lost} of {len(measured.samples)} measurements")
         return True
 
     def _scenes_of(self, setting: Setting) -> int:
@@ -402,18 +407,6 @@ class Campaign:
     def _tell(self, text: str) -> None:
         left = self._left_s
         self._report(Progress(text=text, done=1 - left / self._seconds, left_s=left))
-
-    def _entry(self, worker: Worker) -> _Entry:
-        loaded = worker.loaded
-        return _Entry(
-            worker,
-            Measured(
-                setting=worker.setting,
-                rung=loaded.first.rung,
-                prepare_s=loaded.seconds,
-                loaded_mib=loaded.memory_mib,
-            ),
-        )
 
 
 def _no_time(expected_s: float | None, left_s: float) -> str:

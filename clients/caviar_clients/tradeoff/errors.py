@@ -1,14 +1,15 @@
-"""What a setting costs and how far off it is, as one row.
+"""Errors of a channel setting: figures of a user's channel, differences of two channels, rows of a report.
 
-What a user (a pair of devices on one carrier) gets from a channel, and how two channels differ for it.
+A user is a pair of devices on one carrier. `user_channels` computes what each user of a scene gets,
+`differences` compares that with the reference, and `error_fields` takes means over all users.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from dataclasses import dataclass, field
+from typing import Annotated, Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -21,45 +22,59 @@ from caviar_services.link.base import User, channels_of, noise_power, transmit_p
 from caviar_services.link.beam_sweep import BeamLinkSettings, sweep
 
 FLOOR_DB = -200.0
-"""[dB] What equal channels are said to differ by: float64 carries no more than −313 dB, and no text reads
-well with −∞ in it."""
+"""[dB] Difference of equal channels: float64 carries no more than −313 dB, and no text reads well with −∞."""
 
 
 def path_gain_db(a: Complex128Array) -> float:
-    """Path gain of one pair [dB]: the sum of its paths' powers, whatever their phases.
+    """Compute the path gain of a pair [dB]: the sum of its paths' powers, whatever their phases.
 
     10·log10 Σ|a_p|² (Recommendation ITU-R P.1407-8, the integral over the power delay profile). −∞ without
     a path.
+
+    Args:
+        a: Amplitudes of the paths, Shape ``[P]``.
+
+    Example:
+        >>> round(path_gain_db(np.array([0.003, 0.004j])), 2)
+        -46.02
     """
     power = float((np.abs(a) ** 2).sum())
     return 10 * float(np.log10(power)) if power > 0 else -np.inf
 
 
 def delay_spread_s(tau: Float64Array, power: Float64Array) -> float:
-    """Root mean square delay spread [s] (Recommendation ITU-R P.1407-8, second central moment).
+    """Compute the root mean square delay spread [s] (Recommendation ITU-R P.1407-8, second central moment).
 
-    S = sqrt(Σ P_p τ_p² / ΣP − (Σ P_p τ_p / ΣP)²), here taken about the mean, which loses no digits. 0 for a
-    single path.
+    S = sqrt(Σ P_p τ_p² / ΣP − (Σ P_p τ_p / ΣP)²). 0 for a single path.
+
+    Args:
+        tau: Delays of the paths [s], Shape ``[P]``.
+        power: Their powers, Shape ``[P]``.
     """
+    # About the mean: the difference of two squares of a microsecond keeps no picoseconds.
     total = power.sum()
     mean = (power * tau).sum() / total
     return float(np.sqrt((power * (tau - mean) ** 2).sum() / total))
 
 
 def angular_spread_rad(angle: Float64Array, power: Float64Array) -> float:
-    """Circular angular spread [rad] (3GPP TR 38.901, annex A.1).
+    """Compute the circular angular spread [rad] (3GPP TR 38.901, annex A.1).
 
     AS = sqrt(−2·ln |Σ exp(jφ_p)·P_p / ΣP|): it depends neither on the zero of the angle nor on where it
     wraps. Powers that cancel, as of two equal waves from opposite directions, have no bound; then the
     spread is that of the smallest resultant float64 can hold.
+
+    Args:
+        angle: Angles of the paths [rad], Shape ``[P]``.
+        power: Their powers, Shape ``[P]``.
     """
     resultant = abs((np.exp(1j * angle) * power).sum()) / power.sum()
-    # A single wave's resultant may be above 1 by rounding.
+    # The resultant of a single wave may be above 1 by rounding, and its logarithm positive.
     return float(np.sqrt(-2 * np.log(min(1.0, max(resultant, np.finfo(np.float64).tiny)))))
 
 
 def nmse(h: Complex128Array, reference: Complex128Array) -> float:
-    """Normalised squared error ‖H − H_ref‖_F² / ‖H_ref‖_F², phases included.
+    """Compute the normalised squared error ‖H − H_ref‖_F² / ‖H_ref‖_F², phases included.
 
     1 for H = 0. Its mean over channels is the NMSE as usually defined, E[‖H − H_ref‖² / ‖H_ref‖²].
     """
@@ -67,22 +82,27 @@ def nmse(h: Complex128Array, reference: Complex128Array) -> float:
 
 
 def decibel(ratio: float) -> float:
-    """Ratio of powers in dB, not below `FLOOR_DB`."""
+    """Convert a ratio of powers to dB, not below `FLOOR_DB`."""
     return max(FLOOR_DB, 10 * float(np.log10(ratio))) if ratio > 0 else FLOOR_DB
 
 
 def capacity_bps_hz(h: Complex128Array, power_over_noise: float) -> float:
-    """Capacity [bit/s/Hz] with equal power on all transmit elements and H known to the receiver alone.
+    """Compute the capacity [bit/s/Hz] with equal power on all transmit elements, H known at the receiver.
 
     C = log2 det(I + P/(N_t·N)·H·H*) (Telatar, "Capacity of multi-antenna Gaussian channels", 1999,
-    theorem 1 for a fixed H), from the singular values of H. P/N: ``power_over_noise``.
+    theorem 1 for a fixed H), from the singular values of H.
+
+    Args:
+        h: The channel, Shape ``[N_r, N_t]``.
+        power_over_noise: P/N.
     """
+    # Without H·H*: its condition is that of H squared.
     singular = np.linalg.svd(h, compute_uv=False)
     return float(np.log2(1 + power_over_noise / h.shape[1] * singular**2).sum())
 
 
 def top_k(abs_y: Float64Array, k: int) -> list[int]:
-    """Flat indices of the ``k`` greatest |y|, greatest first; of equal ones the lowest first."""
+    """Rank the ``k`` greatest |y|: flat indices, greatest first; of equal ones the lowest first."""
     return [int(i) for i in np.argsort(-abs_y.ravel(), kind="stable")[:k]]
 
 
@@ -92,10 +112,14 @@ def hit(ranked: list[int], reference: list[int], k: int) -> bool:
 
 
 def pair_loss_db(reference_abs_y: Float64Array, chosen: int) -> float:
-    """What is lost by serving a user of the reference channel with pair ``chosen`` [dB], ≥ 0.
+    """Compute the loss [dB] of serving a user of the reference channel with another pair of beams, ≥ 0.
 
     20·log10(max |y| / |y_chosen|): near 0 where pairs are about as good as each other, so that choosing
     another one does no harm.
+
+    Args:
+        reference_abs_y: |y| of all pairs of beams in the reference, Shape ``[Nt, Nr]``.
+        chosen: Flat index of the pair that is chosen.
     """
     flat = reference_abs_y.ravel()
     best, got = float(flat.max()), float(flat[chosen])
@@ -106,42 +130,57 @@ Key = tuple[int, str, str, str]
 """Frame, transmitter, receiver, carrier."""
 
 ANGLES = ("aod_zenith", "aod_azimuth", "aoa_zenith", "aoa_azimuth")
+"""Order of angular spreads."""
 
 
 @dataclass(frozen=True)
 class Noise:
-    """What the capacity takes from the link's settings; see `BeamLinkSettings`."""
+    """Settings of the link that the capacity depends on; see `BeamLinkSettings`."""
 
     figure_db: float
     temperature_k: float
 
     @classmethod
     def of(cls, scenes: Scenes) -> Noise:
-        """That of the scenario's link ``beams``, else the link's default."""
+        """Take the noise of the scenario's link ``beams``, else the link's default."""
         settings = convert_settings(BeamLinkSettings, scenes.settings_of("link", "beams"))
         return cls(settings.noise_figure_db, settings.temperature_k)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class UserChannel:
-    """One user's channel and what follows from it; no path, no spread: None."""
+    """A user's channel and the figures that follow from it.
+
+    Args:
+        los: Whether there is a line of sight.
+        path_gain_db: Path gain [dB]; −∞ without a path.
+        delay_spread_s: Delay spread [s]; None without a path.
+        angular_spread_rad: Spreads of `ANGLES` [rad], Shape ``[4]``; None without a path.
+        h: H, Shape ``[Nr, Nt]``; None without a path.
+        capacity_bps_hz: Capacity [bit/s/Hz]; 0 without a path.
+        abs_y: |y| of all pairs of beams, Shape ``[Nt, Nr]``; None without a path.
+        ranked: The five best pairs, best first; empty without a path.
+    """
 
     los: bool
-    path_gain_db: float
-    """−∞ without a path."""
-    delay_spread_s: float | None
-    angular_spread_rad: tuple[float, ...] | None
-    """In the order of `ANGLES`."""
-    h: Complex128Array | None
-    capacity_bps_hz: float
-    abs_y: Float64Array | None
-    """|y| of all pairs of beams, Shape ``[Nt, Nr]``."""
-    ranked: list[int]
-    """The five best pairs, best first; none without a path."""
+    path_gain_db: float = -np.inf
+    delay_spread_s: float | None = None
+    angular_spread_rad: Float64Array | None = None
+    h: Complex128Array | None = None
+    capacity_bps_hz: float = 0.0
+    abs_y: Float64Array | None = None
+    ranked: list[int] = field(default_factory=list)
 
 
 def user_channels(frame: int, scene: Scene, channel: Channel, noise: Noise) -> dict[Key, UserChannel]:
-    """The channels of all users of a scene."""
+    """Compute the channels of all users of a scene.
+
+    Args:
+        frame: Number of the frame, for the keys.
+        scene: Devices of the users.
+        channel: Paths and H.
+        noise: Noise of the receivers, for the capacity.
+    """
     users = users_of(scene, channel.carriers)
     looked_up = channels_of(channel, users)
     return {
@@ -156,18 +195,10 @@ def _user_channel(
     user: User, channel: Channel, los: bool, h: Complex128Array | None, noise: Noise
 ) -> UserChannel:
     if h is None:
-        return UserChannel(
-            los=los,
-            path_gain_db=-np.inf,
-            delay_spread_s=None,
-            angular_spread_rad=None,
-            h=None,
-            capacity_bps_hz=0.0,
-            abs_y=None,
-            ranked=[],
-        )
+        return UserChannel(los=los)
     paths = channel.pair(user.tx.name, user.rx.name)
     a = channel.a[channel.carriers.index(user.carrier), paths]
+    # Spreads are weighted by power, as measured ones are: weak paths far away count little.
     power = np.abs(a) ** 2
     directions = np.concatenate([channel.aod[paths], channel.aoa[paths]], axis=1)
     noise_w = noise_power(user.carrier, noise.figure_db, noise.temperature_k)
@@ -176,7 +207,7 @@ def _user_channel(
         los=los,
         path_gain_db=path_gain_db(a),
         delay_spread_s=delay_spread_s(channel.tau[paths], power),
-        angular_spread_rad=tuple(angular_spread_rad(angle, power) for angle in directions.T),
+        angular_spread_rad=np.array([angular_spread_rad(angle, power) for angle in directions.T]),
         h=h,
         capacity_bps_hz=capacity_bps_hz(h, transmit_power(user) / noise_w),
         abs_y=abs_y,
@@ -185,16 +216,16 @@ def _user_channel(
 
 
 class Difference(NamedTuple):
-    """How far a user's channel is from the reference's; None where one of them has no path."""
+    """Differences of a user's channel from the reference's; None where one of them has no path."""
 
     missed: bool
     """The reference has a path, the channel none."""
     invented: bool
-    """The other way round."""
+    """The channel has a path, the reference none."""
     los_agrees: bool
     path_gain_db: float | None
     delay_spread_s: float | None
-    angular_spread_rad: tuple[float, ...] | None
+    angular_spread_rad: Float64Array | None
     nmse: float | None
     """None where the reference has no path."""
     capacity_bps_hz: float
@@ -204,17 +235,11 @@ class Difference(NamedTuple):
 
 
 def difference(found: UserChannel, reference: UserChannel) -> Difference:
-    """Found minus reference."""
+    """Compare a user's channel with the reference's: found minus reference."""
     has, should = found.h is not None, reference.h is not None
-    spreads = None
-    if found.angular_spread_rad is not None and reference.angular_spread_rad is not None:
-        pairs = zip(found.angular_spread_rad, reference.angular_spread_rad, strict=True)
-        spreads = tuple(got - expected for got, expected in pairs)
-    delay = None
-    if found.delay_spread_s is not None and reference.delay_spread_s is not None:
-        delay = found.delay_spread_s - reference.delay_spread_s
     value, top1, top5, loss = None, None, None, None
     if reference.h is not None and reference.abs_y is not None:
+        # A channel without a path is H = 0; for one that the reference does not have there is no ratio.
         value = 1.0 if found.h is None else nmse(found.h, reference.h)
         top1, top5 = (hit(found.ranked, reference.ranked, k) for k in (1, 5))
         loss = pair_loss_db(reference.abs_y, found.ranked[0]) if found.ranked else None
@@ -223,8 +248,8 @@ def difference(found: UserChannel, reference: UserChannel) -> Difference:
         invented=has and not should,
         los_agrees=found.los == reference.los,
         path_gain_db=found.path_gain_db - reference.path_gain_db if has and should else None,
-        delay_spread_s=delay,
-        angular_spread_rad=spreads,
+        delay_spread_s=_minus(found.delay_spread_s, reference.delay_spread_s),
+        angular_spread_rad=_minus(found.angular_spread_rad, reference.angular_spread_rad),
         nmse=value,
         capacity_bps_hz=found.capacity_bps_hz - reference.capacity_bps_hz,
         top1=top1,
@@ -233,13 +258,20 @@ def difference(found: UserChannel, reference: UserChannel) -> Difference:
     )
 
 
+def _minus(found: Any, reference: Any) -> Any:
+    return None if found is None or reference is None else found - reference
+
+
 def differences(found: Mapping[Key, UserChannel], reference: Mapping[Key, UserChannel]) -> list[Difference]:
-    """Of all users that both know."""
+    """Compare all users that both know."""
     return [difference(channel, reference[key]) for key, channel in found.items() if key in reference]
 
 
 class Row(msgspec.Struct, frozen=True, kw_only=True):
-    """One setting. Errors are against the reference, over all users of all scenes that both have."""
+    """Cost and errors of a setting.
+
+    Errors are against the reference, over all users of all scenes that both have; None where there are none.
+    """
 
     setting: str
     block: str
@@ -286,35 +318,41 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def error_fields(found: Sequence[Difference]) -> dict[str, float | int | None]:
-    """The fields of a `Row` that say how far off a setting is."""
+    """Compute the fields of a `Row` that state errors, over all users.
+
+    Args:
+        found: Differences of the users; without any, all errors are None.
+    """
     gains = _values(found, lambda d: d.path_gain_db)
     delays = _values(found, lambda d: d.delay_spread_s)
+    # The mean of ratios, not the ratio of means: in that the users with the strongest channels decide alone.
     nmse = _values(found, lambda d: d.nmse)
     capacity = _values(found, lambda d: d.capacity_bps_hz)
     angles = {
-        f"{name}_spread_error_deg": _mean(
+        f"{name}_spread_error_deg": mean_or_none(
             [math.degrees(abs(d.angular_spread_rad[i])) for d in found if d.angular_spread_rad is not None]
         )
         for i, name in enumerate(ANGLES)
     }
     return {
         "users": len(found),
-        "path_gain_error_db": _mean([abs(gain) for gain in gains]),
-        "path_gain_bias_db": _mean(gains),
+        "path_gain_error_db": mean_or_none([abs(gain) for gain in gains]),
+        "path_gain_bias_db": mean_or_none(gains),
         "path_gain_error_db_p95": _percentile([abs(gain) for gain in gains], 95),
-        "delay_spread_error_ns": _mean([abs(delay) * 1e9 for delay in delays]),
+        "delay_spread_error_ns": mean_or_none([abs(delay) * 1e9 for delay in delays]),
         **angles,
-        "nmse_db": _decibel(_mean(nmse)),
+        "nmse_db": _decibel(mean_or_none(nmse)),
+        # A user without its line of sight has an NMSE of about 1 and decides the mean: hence the median.
         "nmse_db_median": _decibel(_percentile(nmse, 50)),
         "nmse_db_p95": _decibel(_percentile(nmse, 95)),
-        "capacity_error_bps_hz": _mean([abs(error) for error in capacity]),
-        "capacity_bias_bps_hz": _mean(capacity),
-        "beam_top1": _mean(_values(found, lambda d: d.top1)),
-        "beam_top5": _mean(_values(found, lambda d: d.top5)),
-        "beam_loss_db": _mean(_values(found, lambda d: d.pair_loss_db)),
-        "los_agreement": _mean(_values(found, lambda d: d.los_agrees)),
-        "missed": _mean(_values(found, lambda d: d.missed)),
-        "invented": _mean(_values(found, lambda d: d.invented)),
+        "capacity_error_bps_hz": mean_or_none([abs(error) for error in capacity]),
+        "capacity_bias_bps_hz": mean_or_none(capacity),
+        "beam_top1": mean_or_none(_values(found, lambda d: d.top1)),
+        "beam_top5": mean_or_none(_values(found, lambda d: d.top5)),
+        "beam_loss_db": mean_or_none(_values(found, lambda d: d.pair_loss_db)),
+        "los_agreement": mean_or_none(_values(found, lambda d: d.los_agrees)),
+        "missed": mean_or_none(_values(found, lambda d: d.missed)),
+        "invented": mean_or_none(_values(found, lambda d: d.invented)),
     }
 
 
@@ -322,7 +360,8 @@ def _values(found: Sequence[Difference], of: Callable[[Difference], float | None
     return [float(value) for d in found if (value := of(d)) is not None]
 
 
-def _mean(values: Sequence[float]) -> float | None:
+def mean_or_none(values: Sequence[float]) -> float | None:
+    """Return the mean of some values; None where there are none."""
     return sum(values) / len(values) if values else None
 
 

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
+from statistics import fmean
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from caviar_clients.tradeoff.errors import (
     decibel,
     differences,
     error_fields,
+    mean_or_none,
     nmse,
     user_channels,
 )
@@ -100,6 +102,7 @@ def keyframe_rows(
             traced.append(Traced(kept, sample, sample.channel))
         loaded = worker.loaded
     truth = {key: user for entry in traced for key, user in entry.sample.users.items()}
+    # Times without the first frame, which belongs to no interval: all rows are over the same frames.
     every = _Found(
         times_ms=[entry.sample.time_ms for entry in traced[1:]],
         users=dict(truth),
@@ -118,7 +121,13 @@ def keyframe_rows(
 
 
 def spaced(traced: Sequence[Traced], spacing: int, noise: Noise) -> _Found:
-    """Interpolate between every ``spacing``-th of the frames, and compare with the frames in between."""
+    """Interpolate between every few of the frames, and compare with the frames in between.
+
+    Args:
+        traced: Consecutive frames.
+        spacing: Frames from one keyframe to the next.
+        noise: Noise of the receivers, for the capacity.
+    """
     found = _Found()
     for first in range(0, len(traced) - spacing, spacing):
         last = first + spacing
@@ -128,6 +137,7 @@ def spaced(traced: Sequence[Traced], spacing: int, noise: Noise) -> _Found:
         for entry in traced[first + 1 : last]:
             got = between.at(entry.instant.t_ns / 1e9, entry.instant.scene, with_h=True)
             made.append((entry, got))
+        # As in a run: the later keyframe has to be traced before any frame of its interval.
         took_ms = (time.perf_counter() - begin) * 1e3 + traced[last].sample.time_ms
         found.times_ms += [took_ms / spacing] * spacing
         for entry, got in made:
@@ -143,9 +153,11 @@ def _note_bounds(found: _Found, truth: Channel, got: Between) -> None:
     made = {(m.carrier, got.channel.tx[m.tx], got.channel.rx[m.rx]): m for m in got.channel.h}
     for matrix in truth.h:
         mine = made.get((matrix.carrier, truth.tx[matrix.tx], truth.rx[matrix.rx]))
+        # Where the truth has no path its norm is 0, and no relative bound means anything.
         if mine is None or not matrix.h.any():
             continue
         bound = float(got.bound_db[mine.carrier, mine.tx, mine.rx])
+        # Not finite: the pair has other paths at both keyframes, and nothing is promised of those between.
         found.promised.append(bound < np.inf)
         if found.promised[-1]:
             found.within.append(decibel(nmse(mine.h, matrix.h)) <= max(bound, FLOOR_DB))
@@ -177,13 +189,9 @@ def _row(
         measurements=len(found.times_ms),
         scenes=len(found.paths),
         receivers=float(first.receivers),
-        paths=sum(found.paths) / len(found.paths),
-        with_bound=_share(found.promised),
-        within_bound=_share(found.within),
+        paths=fmean(found.paths),
+        with_bound=mean_or_none(found.promised),
+        within_bound=mean_or_none(found.within),
         note=note,
         **error_fields(differences(found.users, truth)),  # type: ignore[arg-type]  # fields of a row, by name
     )
-
-
-def _share(values: Sequence[bool]) -> float | None:
-    return sum(values) / len(values) if values else None

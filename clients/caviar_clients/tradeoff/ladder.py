@@ -1,6 +1,7 @@
-"""The settings that are compared: one line each. What a channel does not know is skipped, and said so.
+"""The settings that are compared: the ladder, the lines of the paper's tables 3 and 4, and convergence.
 
-To add a setting, add a line to `LADDER` (or to a table's columns, `TABLE_RUNGS`).
+To add a setting, add a line to `LADDER`, or to a table's columns, `TABLE_RUNGS`. A setting that the channel
+of an installation does not know is reported as not measured.
 """
 
 from __future__ import annotations
@@ -12,35 +13,45 @@ from functools import cache
 from typing import Any, Literal
 
 Block = Literal["ladder", "keyframes", "ray spacing", "arrays", "convergence", "diffuse convergence"]
-"""What a setting is measured for. Settings of a block take turns, so that noise hits all alike."""
+"""Block that a setting belongs to. Settings of a block take turns, so that noise hits all alike."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Setting:
-    """One channel model with its settings."""
+    """A channel model with its settings.
+
+    Args:
+        label: Unique name in tables and plots.
+        use: Registered channel.
+        settings: Over the scenario's, where its channel is the same implementation, or over the defaults.
+        block: Block that it is measured in.
+        column: Column of the table that it belongs to.
+        row: Row of the table that it belongs to.
+        elements: (Nt, Nr) of horizontal linear arrays in place of the scenario's; None: the scenario's.
+        scattering: Whether every material of the scenery gets `SCATTERING`, unless the scenario sets
+            coefficients itself.
+        most_scenes: Scenes at most, for a setting that takes minutes each; None: all.
+        most_receivers: Receivers at most, likewise.
+
+    Example:
+        >>> shallow = Setting(label="depth 2", use="sionna-rt", settings={"max_depth": 2})
+        >>> shallow.over({"max_depth": 5, "samples": 10})
+        {'max_depth': 2, 'samples': 10}
+    """
 
     label: str
-    """Unique; what tables and plots call it."""
     use: str
-    """Registered channel."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """In place of the scenario's, where its channel is the same implementation, or of the defaults."""
     block: Block = "ladder"
     column: str = ""
-    """Column of the table that it belongs to."""
     row: str = ""
-    """Row of the table that it belongs to."""
     elements: tuple[int, int] | None = None
-    """(Nt, Nr) of horizontal linear arrays in place of the scenario's arrays."""
     scattering: bool = False
-    """Give every material of the scenery `SCATTERING`, unless the scenario sets coefficients itself."""
     most_scenes: int | None = None
-    """Scenes at most, for what takes minutes each."""
     most_receivers: int | None = None
-    """Receivers at most, likewise."""
 
     def over(self, given: Mapping[str, Any]) -> dict[str, Any]:
-        """These settings over a scenario's; one that is None here is left out, whatever the scenario says."""
+        """Put these settings over a scenario's; one that is None here is left out, whatever that has."""
         return {key: value for key, value in {**given, **self.settings}.items() if value is not None}
 
 
@@ -48,18 +59,19 @@ SCATTERING = 0.4
 """Scattering coefficient S of Degli-Esposti et al., "Measurement and modelling of scattering from buildings",
 2007, who fitted S ≈ 0.4 to brick façades."""
 
+# How much more diffuse scattering, H of each element over so many paths, and the tracing of every pair cost,
+# about: only for the order of measurements.
 _DIFFUSE_EFFORT = 120
 _ELEMENTS_EFFORT = 15
 _PAIRS_EFFORT = 100
-"""How much dearer diffuse scattering, H of each element over so many paths, and the tracing of every pair
-are, about."""
 
 CHEAP = 2
 """Receivers of a setting that traces every pair of antenna elements."""
 
 _SIONNA = "sionna-rt"
+# Settings of `geometric` with which its gains mean the same as those of the others.
 _COMPARABLE = {"normalization": "path-loss", "nlos": "geometry"}
-"""Settings of ``geometric`` with which its gains mean the same as those of the others."""
+# Limit on the paths of a scene where they are diffuse, so that none is lost.
 _DIFFUSE_PATHS = 2_000_000
 CHOSEN_PATHS = 500
 """Diffuse paths that are chosen for a receiver, where they are chosen."""
@@ -68,6 +80,8 @@ _CHOSEN_EFFORT = 3
 _ALL = {"refraction": True, "diffraction": True}
 
 
+# What a ray-traced setting has unless it differs. All of it is given, so that none of the scenario's own
+# choices, many of which exclude each other, is measured in its place.
 _LAUNCH: Mapping[str, Any] = {
     "rung": "siso-rt",
     "candidates": "launched",
@@ -79,20 +93,22 @@ _LAUNCH: Mapping[str, Any] = {
     "scattering_paths": None,
     "follow": None,
 }
-"""What a ray-traced setting has unless it says otherwise. All of it is given, so that none of the scenario's
-own choices, many of which exclude each other, is measured in its place."""
+# Which edges diffract is the scenario's choice where any do; without diffraction these keys are off.
 _WITHOUT_DIFFRACTION: Mapping[str, Any] = {"free_edges": False, "edges_within_m": None}
-"""Which edges diffract is the scenario's choice where any do."""
 
 
 def _traced(samples: int, depth: int, **more: Any) -> dict[str, Any]:
-    """Settings of a ray-traced rung; what is not named is off."""
+    """Make settings of a ray-traced rung; what is not named is off."""
     edges = {} if more.get("diffraction") else _WITHOUT_DIFFRACTION
     return {**_LAUNCH, **edges, "samples": samples, "max_depth": depth, **more}
 
 
 def chosen_diffuse(samples: int) -> dict[str, Any]:
-    """Settings of diffuse paths chosen among the points of ``samples`` rays of their own."""
+    """Make settings of diffuse paths chosen among the points of rays of their own.
+
+    Args:
+        samples: Number of these rays.
+    """
     return {
         "scattering": True,
         "scattering_samples": samples,
@@ -142,6 +158,7 @@ LADDER: tuple[Setting, ...] = (
     ),
 )
 
+# The finest first.
 REFERENCES = ("spherical 1e6 d5 +r+d", "siso-rt 1e6 d5 +r+d", "siso-rt 1e6 d3", "free-space")
 """The default reference is the first of these that the channels of this installation know and that can be
 loaded, ``free-space`` only where there is no scenery. ``mimo-rt`` is none of them: it is affordable for few
@@ -182,17 +199,23 @@ TRUTH_SAMPLES = 3_000_000
 
 
 def samples_of(spacing_deg: float) -> int:
-    """Rays that leave an angle of ``spacing_deg`` between neighbours.
+    """Compute the number of rays that leave an angle between neighbours.
 
-    N = 4π/Δ² with Δ in radians: each ray stands for the solid angle Δ² of a square lattice. 1° gives
-    41,253 rays, 0.1° a hundred times as many.
+    N = 4π/Δ² with Δ in radians: each ray stands for the solid angle Δ² of a square lattice.
+
+    Args:
+        spacing_deg: The angle Δ [°].
+
+    Example:
+        >>> samples_of(1.0), samples_of(0.1)
+        (41253, 4125296)
     """
     return round(4 * math.pi / math.radians(spacing_deg) ** 2)
 
 
 @cache
 def spacing_settings() -> tuple[Setting, ...]:
-    """The lines of the paper's Table 3, the cheapest first: what time is short for comes last."""
+    """Make the lines of the paper's Table 3, the cheapest first: what time is short for comes last."""
     diffuse = {"scattering": True, "max_paths": _DIFFUSE_PATHS}
     rows: list[tuple[float, str, dict[str, Any]]] = [
         *((spacing, f"{spacing:g}", {}) for spacing in SPACINGS_DEG),
@@ -203,8 +226,8 @@ def spacing_settings() -> tuple[Setting, ...]:
     return tuple(sorted(made, key=_effort))
 
 
+# The rays of `mimo-rt` are those of the antenna pair: it has no launch of its own to choose from.
 _NOT_MADE = frozenset({("mimo-rt", DIFFUSE_CHOSEN)})
-"""The rays of ``mimo-rt`` are those of the antenna pair: it has no launch of its own to choose from."""
 
 
 def _spacing(rung: str, spacing_deg: float, row: str, options: Mapping[str, Any]) -> Setting:
@@ -222,13 +245,13 @@ def _spacing(rung: str, spacing_deg: float, row: str, options: Mapping[str, Any]
 
 
 def array_settings() -> tuple[Setting, ...]:
-    """The lines of the paper's Table 4, likewise."""
+    """Make the lines of the paper's Table 4, likewise."""
     made = (_arrays(rung, *elements) for elements in ELEMENTS for rung in TABLE_RUNGS)
     return tuple(sorted(made, key=_effort))
 
 
 def _effort(setting: Setting) -> float:
-    """What a scene will cost, in rays; no more than an order."""
+    """Estimate the cost of a scene, in rays; good enough for an order."""
     rays = float(setting.settings["samples"])
     if setting.scattering:
         chosen = setting.settings.get("scattering_paths") is not None
@@ -236,6 +259,7 @@ def _effort(setting: Setting) -> float:
         rays *= 1 if chosen or setting.column == "siso-rt" else _ELEMENTS_EFFORT
     if setting.column not in FEW:
         return rays
+    # Each pair of elements is traced by itself.
     pairs = math.prod(setting.elements) if setting.elements else 1
     return rays * _PAIRS_EFFORT * pairs
 
@@ -255,7 +279,12 @@ def _arrays(rung: str, nt: int, nr: int) -> Setting:
 
 
 def convergence_settings(seeds: int) -> tuple[Setting, ...]:
-    """Specular and diffuse paths over samples and seeds of the launch; the first one is the truth."""
+    """Make settings of specular and diffuse paths over samples and seeds; the first one is the truth.
+
+    Args:
+        seeds: Seeds of the launch for each number of samples.
+    """
+    # Its seed is none of the others': rays in common would make errors look smaller.
     truth = _traced(TRUTH_SAMPLES, 3, launch_seed=0)
     made = [
         Setting(label=TRUTH, use=_SIONNA, settings=truth, block="convergence", most_scenes=CONVERGENCE_SCENES)

@@ -22,13 +22,23 @@ RUNG_COLOURS = {
 }
 EQUAL_DB = -150.0
 """[dB] An NMSE below this is rounding, and not drawn."""
+# Room beside the outermost points, of the axis.
 _MARGIN = 0.12
+# Ratio of greatest to least below which each tick of a logarithmic axis has a number.
 _FEW_TICKS = 8.0
-"""Ratio of greatest to least below which each tick of a logarithmic axis has a number."""
 
 
 def draw_pareto(report: Report, file: Path) -> Path:
-    """Time of a scene against NMSE and against the error of path gain, a point for each setting."""
+    """Draw time of a scene against NMSE and against the error of path gain, a point for each setting.
+
+    Args:
+        report: The comparison.
+        file: PNG that is written.
+
+    Returns:
+        The file.
+    """
+    # The ladder alone: the lines of the paper's tables are the same settings in finer steps.
     rows = [row for row in comparable_times(report) if row.block == "ladder" and row.nmse_db is not None]
     with figure(file, 10.0, 11.0) as drawn:
         upper, lower = drawn.subplots(2, 1, sharex=True)
@@ -40,6 +50,7 @@ def draw_pareto(report: Report, file: Path) -> Path:
         lower.set_xlabel(f"time of a scene [ms]: factor to {report.baseline}, times its median")
         handles, names = upper.get_legend_handles_labels()
         drawn.legend(handles, names, loc="outside lower center", ncols=4)
+        # At the end, when limits and layout are known: places are found in pixels.
         for axes, value in ((upper, _nmse), (lower, _gain)):
             shown = _points(rows, report.reference, value)
             points = [(row.time_ms_median, error) for row, error in shown]
@@ -48,8 +59,11 @@ def draw_pareto(report: Report, file: Path) -> Path:
 
 
 def comparable_times(report: Report) -> list[Row]:
-    """Rows whose times follow from their factors: settings that were measured at different times, on a
-    machine that was not as busy at all of them, have the order of their factors."""
+    """Replace times by factors times the baseline's time.
+
+    Settings that were measured at different times, on a machine that was not as busy at all of them, then
+    have the order of their factors.
+    """
     base = next((row.time_ms_median for row in report.rows if row.setting == report.baseline), None)
     if base is None:
         return list(report.rows)
@@ -67,7 +81,7 @@ def _nmse(row: Row) -> float | None:
 def _points(
     rows: Sequence[Row], reference: str, value: Callable[[Row], float | None]
 ) -> list[tuple[Row, float]]:
-    """Rows with what is drawn of them; the reference has no error."""
+    """Select rows with the value that is drawn; the reference has no error."""
     return [(row, error) for row in rows if row.setting != reference and (error := value(row)) is not None]
 
 
@@ -78,6 +92,7 @@ def _panel(axes: Any, rows: Sequence[Row], reference: str, value: Callable[[Row]
     for row, error in points:
         colour = RUNG_COLOURS.get(row.rung, GREY)
         axes.plot(row.time_ms_median, error, "o", color=colour, markersize=8, zorder=3)
+    # Empty curves for the legend, in the order of the ladder and each rung once.
     for rung, colour in RUNG_COLOURS.items():
         if any(row.rung == rung for row, _ in points):
             axes.plot([], [], "o", color=colour, markersize=8, label=rung)
@@ -105,7 +120,8 @@ def _panel(axes: Any, rows: Sequence[Row], reference: str, value: Callable[[Row]
 
 
 def _widen(axes: Any) -> None:
-    """Room for labels beside the outermost points."""
+    """Make room for labels beside the outermost points."""
+    # More to the right, where labels stand by preference.
     left, right = axes.get_xlim()
     axes.set_xlim(left / (right / left) ** (_MARGIN / 3), right * (right / left) ** _MARGIN)
     bottom, top = axes.get_ylim()
@@ -116,7 +132,18 @@ def _widen(axes: Any) -> None:
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Corners of the staircase below which no point of (time, error) lies, from the fastest on."""
+    """Find the staircase below which no point lies.
+
+    Args:
+        points: Time and error of each setting.
+
+    Returns:
+        Its corners, from the fastest on.
+
+    Example:
+        >>> pareto_front([(2.0, 5.0), (1.0, 9.0), (3.0, 8.0)])
+        [(1.0, 9.0), (2.0, 9.0), (2.0, 5.0)]
+    """
     front = list[tuple[float, float]]()
     for time, error in sorted(points):
         if not front:
@@ -127,7 +154,15 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[tuple[float, flo
 
 
 def draw_convergence(report: Report, file: Path) -> Path:
-    """Over the samples: NMSE, and how far seeds are apart in path gain and in their best pair of beams."""
+    """Draw over the samples: NMSE, and how far seeds are apart in path gain and best pair of beams.
+
+    Args:
+        report: The comparison.
+        file: PNG that is written.
+
+    Returns:
+        The file.
+    """
     kinds = {kind: [p for p in report.convergence if p.paths == kind] for kind in ("specular", "diffuse")}
     with figure(file, 14.0, 4.8) as drawn:
         error, gain, beams = drawn.subplots(1, 3)
@@ -158,6 +193,7 @@ def _curves(error: Any, gain: Any, beams: Any, kind: str, points: Sequence[Point
     pairs = [point for point in points if point.seeds > 1]
     samples = [point.samples for point in pairs]
     between = [(p.samples, db) for p in pairs if (db := p.pair_nmse_db) is not None and db > EQUAL_DB]
+    # Rays leave along a lattice, so seeds may give the very same paths: the legend states what has no line.
     equal = "" if between else " (equal)"
     error.plot(*_columns(between), "s--", color=colour, label=f"{kind}, between seeds{equal}")
     if all(point.nmse_db for point in points):

@@ -1,4 +1,7 @@
-"""A comparison from beginning to end: its rows, and the convergence over samples."""
+"""A comparison from beginning to end: its rows, and the convergence over samples.
+
+`compare` measures a plan of blocks with a `Campaign` and makes a `Report`, which `tables` and `plot` show.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from itertools import combinations
+from statistics import fmean
 from typing import Annotated, Literal, get_args
 
 import msgspec
@@ -54,6 +58,7 @@ def points(measured: Sequence[Measured]) -> list[Point]:
 
 def _point(kind: str, samples: int, group: Sequence[Measured], truth: Mapping[Key, UserChannel]) -> Point:
     pairs = [d for one, other in combinations(group, 2) for d in differences(one.users, other.users)]
+    # Each pair of seeds as if one were the reference: how far apart two runs of a user's may be.
     between = error_fields(pairs)
     against = [error_fields(differences(entry.users, truth))["nmse_db"] for entry in group]
     return Point(
@@ -158,15 +163,18 @@ def compare(
         report=report,
     )
     with closing(campaign):
+        # All candidates in the ladder, where each is a line anyway; without it only the best one is measured.
         needed = references if "ladder" in options.parts else references[:1]
         plan = _plan(options, list(dict.fromkeys([*needed, campaign.baseline])))
         measured, interpolated = list[Measured](), list[Row]()
         for number, (block, settings) in enumerate(plan):
+            # Of the time that is left: what one block does not need, those behind it share.
             share = _WEIGHTS[block] / sum(_WEIGHTS[name] for name, _ in plan[number:])
             if block == "keyframes":
                 interpolated += campaign.keyframes(share)
             else:
                 measured += campaign.block(block, settings, share)
+    # Chosen at the end, among what could be measured: the finest may have run out of memory.
     reference = _reference(references, measured, campaign.skipped)
     receivers = [len(antennas(seen(i.scene, options.receivers, None), "rx")) for i in scenes.instants]
     return Report(
@@ -174,7 +182,7 @@ def compare(
         origin=scenes.origin,
         carriers_hz=tuple(carrier.frequency_hz for carrier in scenes.carriers),
         scenes=len(scenes.instants),
-        receivers=sum(receivers) / len(receivers),
+        receivers=fmean(receivers),
         reference=reference.setting.label,
         baseline=campaign.baseline.label,
         elapsed_s=time.monotonic() - begun,
@@ -233,7 +241,7 @@ def _is_of_a_curve(entry: Measured) -> bool:
 
 
 def _row(entry: Measured, reference: Measured) -> Row:
-    setting = entry.setting
+    setting, scenes = entry.setting, entry.scenes.values()
     # Users of other arrays have other channels.
     found = differences(entry.users, reference.users) if setting.elements is None else []
     notes = (["the reference"] if entry is reference else []) + entry.notes
@@ -242,17 +250,17 @@ def _row(entry: Measured, reference: Measured) -> Row:
         block=setting.block,
         column=setting.column,
         row=setting.row,
-        rung=entry.rung,
+        rung=entry.loaded.first.rung,
         time_ms_median=entry.median_ms,
         time_ms_p99=float(np.percentile(entry.times_ms, 99)),
         factor=entry.median_ms / entry.baseline_ms,
-        memory_mib=max(entry.memory_mib, default=None),
-        loaded_mib=entry.loaded_mib,
-        prepare_s=entry.prepare_s,
-        measurements=len(entry.times_ms),
-        scenes=len(entry.frames),
-        receivers=sum(entry.receivers) / len(entry.receivers),
-        paths=sum(entry.paths) / len(entry.paths),
+        memory_mib=max((s.memory_mib for s in entry.samples if s.memory_mib is not None), default=None),
+        loaded_mib=entry.loaded.memory_mib,
+        prepare_s=entry.loaded.seconds,
+        measurements=len(entry.samples),
+        scenes=len(scenes),
+        receivers=fmean(sample.receivers for sample in scenes),
+        paths=fmean(sample.paths for sample in scenes),
         note="; ".join(notes),
         **error_fields(found),  # type: ignore[arg-type]  # fields of a row, by name
     )

@@ -105,6 +105,7 @@ def scenes_of(path: Path, frames: int) -> Scenes:
             "a channel needs at least one carrier; add [[carriers]] with name and frequency_hz",
             key="carriers",
         )
+    # A scene without a pair has no channel: it would count as one that costs nothing.
     served = tuple(instant for instant in found.instants if pairs_of(instant.scene))
     if not served:
         raise RunError(
@@ -152,6 +153,7 @@ def is_recording(path: Path) -> bool:
 def _of_recording(path: Path, frames: int) -> Scenes:
     recording = Recording(path)
     first = recording.entry(0).episode if len(recording) else 0
+    # Of the first episode alone, as of a scenario: another one has other objects of the same names.
     kept = [frame for frame in recording.frames() if frame.episode == first]
     instants = [instant for frame in _spread(kept, frames) if (instant := _instant(frame)) is not None]
     block = [instant for frame in _middle(kept) if (instant := _instant(frame)) is not None]

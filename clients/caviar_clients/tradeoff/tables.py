@@ -24,6 +24,7 @@ from caviar_clients.tradeoff.ladder import (
 )
 from caviar_clients.tradeoff.report import Report
 
+# Factors are compared and not seconds, which are those of another machine and another ray tracer.
 PAPER_SPACING = {
     "1": (1.0, 0.7),
     "0.5": (1.0, 1.0),
@@ -245,6 +246,7 @@ def _rungs(rows: Mapping[tuple[str, str], Row]) -> list[str]:
     return [rung for rung in TABLE_RUNGS if any(column == rung for column, _ in rows)]
 
 
+# Of factors to the baseline, each measured by turns with it: times of two rows may be of different hours.
 def _relative(row: Row | None, base: Row | None) -> str:
     if row is None or base is None:
         return NOTHING
@@ -284,6 +286,7 @@ def _convergence(report: Report) -> list[str]:
     header = ["paths", "samples", "seeds", "time ms", "NMSE dB", *between]
     body = []
     for point in report.convergence:
+        # The range and not a mean: it shows whether one seed could mislead.
         values = sorted(point.nmse_db)
         span = f"{level(values[0])} … {level(values[-1])}" if values else NOTHING
         body.append(

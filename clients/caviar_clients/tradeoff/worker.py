@@ -94,6 +94,7 @@ class Rung:
         assets = scenes.assets if self._model.needs_assets else {}
         self._model.prepare(Preparation(demand={"channel": frozenset({"h"})}, assets=assets))
         self._seed = scenes.seed
+        # The first scene compiles kernels and fills caches: its time counts as loading.
         first = self.sample(scenes.instants[0])
         after = resident_mib()
         self.loaded = Loaded(
@@ -171,6 +172,7 @@ def scattering_materials(given: Mapping[str, Any], assets: Mapping[str, Path]) -
         given: The scenario's own, which stay where one of them scatters.
         assets: Files of scenery, each of whose materials gets `SCATTERING` otherwise.
     """
+    # Coefficients that the user chose are better than one value for all.
     if any(entry.get("scattering_coefficient") for entry in given.values()):
         return dict(given)
     names = {name for file in assets.values() if file.suffix == ".xml" for name in _materials(file)}
@@ -275,7 +277,7 @@ class Worker:
             target=_serve, args=(theirs, setting, scenes, receivers, products), daemon=True
         )
         self._process.start()
-        theirs.close()
+        theirs.close()  # else the end of the process would not be seen: this one would hold the pipe open
         self.loaded: Loaded = self._answer(seconds)
 
     @property
@@ -293,6 +295,7 @@ class Worker:
         Raises:
             RunError: It fails or takes too long; the process has ended then.
         """
+        # An index and not a scene: the process has had all of them since its start.
         with suppress(OSError):  # a process that died before is named by the read of its answer
             self._pipe.send(index)
         sample: Sample = self._answer(seconds)
@@ -314,6 +317,7 @@ class Worker:
             answer = None if late else self._pipe.recv()
         except (EOFError, OSError) as error:
             self.close()
+            # A process that the kernel ends for want of memory dies of SIGKILL, without a word.
             code = self._process.exitcode or 0
             cause = f"signal {signal.Signals(-code).name}" if code < 0 else f"status {code}"
             raise RunError(f"its process ended with {cause}; was there enough memory?") from error

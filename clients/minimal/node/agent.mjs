@@ -10,7 +10,7 @@ const key = (variable, what) => // from the files that a broker with keys wants
 const [publicKey, secretKey, curveServerKey] = [
   key("CAVIAR_KEY", "public"), key("CAVIAR_KEY", "secret"), key("CAVIAR_BROKER_KEY", "public")];
 const curve = curveServerKey && { curvePublicKey: publicKey, curveSecretKey: secretKey, curveServerKey };
-const broker = new Dealer({ linger: 1000, ...curve }); // [ms] at the end, so that a broker that is gone holds nobody up
+const broker = new Dealer({ linger: 1000, ...curve }); // [ms] at the end, so that a broker that is gone does not hold it up
 let who = {}, turn = { episode: -1 }, stored = new Map(), kind = ""; broker.connect(endpoint);
 const fail = (text) => { process.stderr.write(`${name}: ${text}\n`); process.exit(1); };
 

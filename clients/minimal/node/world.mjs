@@ -2,7 +2,7 @@
 //
 // Objects go round in circles, come and leave; the devices of the scenario are mounted on them; a ground and a
 // mesh are its scenery. Nothing is random and nothing is remembered from frame to frame, so that a world which
-// is killed and started again goes on as if nothing had been. Settings: objects, see OBJECTS below.
+// is killed and started again continues as if it had not been. Settings: objects, see OBJECTS below.
 import { createHash } from "node:crypto";
 import { readFileSync, readlinkSync } from "node:fs";
 import { setTimeout as sleep } from "node:timers/promises";
