@@ -22,22 +22,33 @@ MAX_ASSET = MAX_BODY
 
 
 def default_folder() -> Path:
-    """Cache of this user: ``$XDG_CACHE_HOME/caviar``, by default ``~/.cache/caviar``."""
+    """Cache of this user: ``$XDG_CACHE_HOME/caviar``, by default ``~/.cache/caviar``.
+
+    Example:
+        >>> default_folder().name
+        'caviar'
+    """
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "caviar"
 
 
 class AssetStore:
-    """Content-addressed files below ``folder``. Safe for several processes at once: a file appears
-    under its digest only when it is complete and verified.
+    """Content-addressed files below one folder.
 
-    A file that the process finds in the store is believed only after one look at its size and digest: disks
-    fill up and machines crash while a cache is written.
+    Several processes may use it at once: a file appears under its digest only when it is complete and
+    verified. A file that the process finds there is believed only after one look at its size and digest:
+    disks fill up and machines crash while a cache is written.
 
     Args:
         folder: Folder of the store; by default the cache of this user (`default_folder`).
 
     Raises:
         SetupError: The folder cannot be made.
+
+    Example:
+        >>> store = AssetStore(Path("cache"))
+        >>> wall = store.add("meshes/wall.ply", b"ply")
+        >>> store.holds(wall), store.folder_of([wall])["meshes/wall.ply"].read_bytes()
+        (True, b'ply')
     """
 
     def __init__(self, folder: Path | None = None) -> None:
@@ -53,11 +64,19 @@ class AssetStore:
             ) from error
 
     def holds(self, asset: Asset) -> bool:
-        """Whether the whole file is here, with the size and content of its description."""
+        """Whether the whole file is here, with the size and content of its description.
+
+        Args:
+            asset: Description of the file.
+        """
         return self._intact(asset.digest, asset.size)
 
     def path(self, digest: str) -> Path:
-        """Where the file with this digest is, or would be."""
+        """Where the file with this digest is, or would be.
+
+        Args:
+            digest: SHA-256 of the file.
+        """
         return self._files / digest
 
     def add(self, name: str, content: Path | bytes) -> Asset:
@@ -183,6 +202,13 @@ class IncomingAsset:
 
     Raises:
         AssetError: More is announced than a file may have.
+
+    Example:
+        >>> store = AssetStore(Path("cache"))
+        >>> wall = AssetStore(Path("elsewhere")).add("meshes/wall.ply", b"ply")
+        >>> incoming = IncomingAsset(store, wall)
+        >>> incoming.add_chunk(0, 3, b"pl"), incoming.add_chunk(2, 3, b"y"), store.holds(wall)
+        (False, True, True)
     """
 
     def __init__(self, store: AssetStore, asset: Asset) -> None:

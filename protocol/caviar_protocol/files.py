@@ -56,6 +56,11 @@ def replace_file(
 
     Raises:
         OSError: The file cannot be written; the earlier one is as it was.
+
+    Example:
+        >>> replace_file(Path("result.json"), b"{}")
+        >>> Path("result.json").read_bytes()
+        b'{}'
     """
     draft = path.with_name(f"{path.name}.{uuid4().hex}.partial" if concurrent else f"{path.name}.partial")
     try:
@@ -79,6 +84,9 @@ def replace_file(
 
 def sync_file(path: Path) -> None:
     """Have the disk hold what the operating system holds of a file or a directory.
+
+    Args:
+        path: A file, or a folder for the names in it.
 
     Raises:
         OSError: The disk refuses; the error has the path as its ``filename``.
@@ -146,6 +154,9 @@ def map_regular(path: Path) -> memoryview:
 def open_to_append(path: Path) -> FileIO:
     """Open a file of a run behind its end, to be written and read; make it and its folder where missing.
 
+    Args:
+        path: The file.
+
     Raises:
         RunError: The file cannot be written; the text names it, says why and what mends that.
     """
@@ -167,6 +178,10 @@ def open_to_append(path: Path) -> FileIO:
 def refuse_other_kinds(path: Path, remedy: str = "move it away") -> None:
     """Check that a path is a regular file, or free.
 
+    Args:
+        path: Where a file is to be written.
+        remedy: What mends that something else is there.
+
     Raises:
         OSError: It is a directory, a pipe, a socket or a device; ``strerror`` says which, and ``remedy``.
     """
@@ -187,7 +202,11 @@ def _refuse_kind(status: os.stat_result, path: Path, remedy: str) -> None:
 
 
 def file_system_of(path: Path) -> str:
-    """Describe the file system that holds a path, for an error: ``ext4 on /dev/sda1, mounted at /data``."""
+    """Describe the file system that holds a path, for an error: ``ext4 on /dev/sda1, mounted at /data``.
+
+    Args:
+        path: Any path; it need not exist.
+    """
     found, best = "its file system is unknown", ""
     try:
         lines = Path("/proc/self/mountinfo").read_text().splitlines()

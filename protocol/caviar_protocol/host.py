@@ -82,6 +82,9 @@ class SignOfLife:
     """A file that is as old as the last sign of life of this process, for the health check of a container.
 
     The environment variable ``CAVIAR_ALIVE`` names the file; without it no sign is given.
+
+    Example:
+        >>> SignOfLife().touch()  # as often as the process likes: once a second the file is touched
     """
 
     def __init__(self) -> None:
@@ -128,5 +131,9 @@ def install_command(*extras: str) -> str:
 
     Returns:
         ``/…/python -m pip install 'caviar-sim[plot]'``
+
+    Example:
+        >>> install_command("plot", "world").partition(" -m ")[2]
+        "pip install 'caviar-sim[plot,world]'"
     """
     return f"{sys.executable} -m pip install '{DISTRIBUTION}[{','.join(extras)}]'"

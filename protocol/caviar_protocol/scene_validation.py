@@ -37,7 +37,14 @@ SAME_ROTATION = 1e-6
 
 
 class SceneRules(msgspec.Struct, frozen=True, kw_only=True):
-    """What the run says about the scenes of its worlds; what is not known is not checked."""
+    """What the run says about the scenes of its worlds; what is not known is not checked.
+
+    Example:
+        >>> from caviar_protocol.recording import Recording
+        >>> scene = Recording("runs/smoke-20261122-101500")["scene"][0]
+        >>> wrong_description(scene, "world", SceneRules(prefixes={"world": ("bus.",)}))
+        "'car' has none of the prefixes that READY declared: 'bus.'"
+    """
 
     prefixes: Mapping[str, tuple[str, ...]] = {}
     """By world: what the names of its objects and fixed devices begin with."""
@@ -54,6 +61,9 @@ def numbers_are_right(scene: Scene) -> bool:
     """Whether `wrong_number` would find nothing, for a few microseconds; True is certain, False is not.
 
     A sum of squares bounds every term of it, and is no number where one of them is none.
+
+    Args:
+        scene: Of one world.
     """
     count = len(scene.names)
     if count <= FEW_OBJECTS:
@@ -103,7 +113,14 @@ def _too_fast(scene: Scene) -> BoolArray:
 
 
 def wrong_number(scene: Scene) -> str:
-    """The first object with an orientation, position, velocity or dimension that cannot be."""
+    """The first object with an orientation, position, velocity or dimension that cannot be.
+
+    Args:
+        scene: Of one world.
+
+    Returns:
+        Object, field and value, and what would be right; empty: all are possible.
+    """
     return wrong_orientation(scene) or wrong_place(scene) or wrong_dimensions(scene)
 
 
@@ -124,7 +141,14 @@ def wrong_place(scene: Scene) -> str:
 
 
 def too_fast(scene: Scene) -> str:
-    """The first object that moves, or of which a corner may move, at the speed of light or faster."""
+    """The first object that moves, or of which a corner may move, at the speed of light or faster.
+
+    Args:
+        scene: Of one world, or of all.
+
+    Returns:
+        Object, field and value, and what would be right; empty: there is none.
+    """
     with np.errstate(all="ignore"):
         fast = ~(np.linalg.norm(scene.velocity, axis=1) < MAX_SPEED)
     below = f"m/s: a finite speed below light's, {MAX_SPEED:g} m/s, is needed"
@@ -170,7 +194,16 @@ def _numbers(values: Iterable[float]) -> str:
 
 
 def wrong_description(scene: Scene, world: str, rules: SceneRules) -> str:
-    """What is wrong with names, meshes and devices of a world's scene; empty: nothing."""
+    """What is wrong with names, meshes and devices of a scene.
+
+    Args:
+        scene: Of one world.
+        world: Name of the world.
+        rules: What the run says about its scenes.
+
+    Returns:
+        The first thing that is wrong, and what would be right; empty: nothing.
+    """
     return (
         wrong_order(scene)
         or wrong_prefix(scene, world, rules)
