@@ -121,11 +121,11 @@ def both_fields(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Array, Array]]:
     seen: list[tuple[Array, Array]] = []
     replaced = path_table._diffract_anew
 
-    def keep(scene_: Any, edges: Any, met: Any, traced: Any, ends: Any, transfer: Any) -> Any:
-        before = transfer.copy()
-        found = replaced(scene_, edges, met, traced, ends, transfer)
+    def keep(scene_: Any, edges: Any, met: Any, *others: Any) -> Any:
+        before = met.transfer.copy()
+        found = replaced(scene_, edges, met, *others)
         rows = (met.types == DIFFRACTED).any(1) & (met.types != 0).all(1) & found[0]
-        seen.append((before[:, rows], transfer[:, rows]))
+        seen.append((before[:, rows], met.transfer[:, rows]))
         return found
 
     monkeypatch.setattr(path_table, "_diffract_anew", keep)

@@ -13,10 +13,10 @@ from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import AntennaArray, Carrier, Channel, ChannelOptions
 from caviar_services.antenna_arrays import element_positions
+from caviar_services.channel.arrays.channel_matrices import check_size, empty_parts, superposed
 from caviar_services.channel.assemble import Product, assemble
 from caviar_services.channel.paths import Antenna, PathTable
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
-from caviar_services.channel.wideband import check_size, empty_parts, superposed
 from caviar_services.service import Preparation, RunInfo
 
 CARRIERS = (

@@ -34,13 +34,15 @@ from caviar_services.channel.arrays.channel_matrices import (
     Located,
     Matrices,
     PlaneWaves,
+    Wideband,
+    bins_of,
     carrier_phase,
     subarray_amplitudes,
+    wideband_parts,
 )
 from caviar_services.channel.paths import Antenna, PathTable, antenna_fields, stable_ids
 from caviar_services.channel.propagation.atmosphere import amplitude_factor
 from caviar_services.channel.propagation.geometry import PathGeometry, path_geometry
-from caviar_services.channel.wideband import Wideband, bins_of, wideband_parts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,12 +98,14 @@ def assemble(
     if dropped:
         table, geometry, a, row = table.take(finite), _select(geometry, finite), a[:, finite], row[finite]
     aod, aoa = angles(geometry.departure), angles(geometry.arrival)
+    # One path alone, as in free space, needs no order.
     if len(table.pair) > 1:
         order = _order(table, geometry, aod, aoa, a)
         table, geometry, a, row = table.take(order), _select(geometry, order), a[:, order], row[order]
         aod, aoa = aod[order], aoa[order]
 
     pairs = len(transmitters) * len(receivers)
+    # Paths are sorted by pair by now.
     offsets = np.searchsorted(table.pair, np.arange(pairs + 1)).astype(np.int64)
     h: tuple[ChannelMatrix, ...] = ()
     wideband = Wideband()
@@ -118,12 +122,14 @@ def assemble(
             bins = bins_of(product.wideband, product.carriers, geometry.tau, offsets)
             responses = (response for asked in bins for response in made.responses(asked))
             wideband = wideband_parts(bins, responses, len(receivers))
+    # H is made by now; the list of paths is that of the centres of the arrays.
     if table.hidden is not None and table.hidden.any():
         shown = ~table.hidden
         table, geometry, a = table.take(shown), _select(geometry, shown), a[:, shown]
         aod, aoa = aod[shown], aoa[shown]
         offsets = np.searchsorted(table.pair, np.arange(pairs + 1)).astype(np.int64)
     frequency = np.array([carrier.frequency_hz for carrier in product.carriers])
+    # As wide as the deepest path, so that equal paths are equal bytes whatever `max_depth` is.
     depth = int((table.types != 0).sum(1).max(initial=0))
     channel = Channel(
         rung=product.rung,
@@ -172,7 +178,9 @@ def _canonical_names(table: PathTable) -> PathTable:
     used = table.types != 0
     objects = np.where(used, table.objects, -1)
     occurring = np.unique(objects[used])
+    # Only names that occur, sorted: a product does not depend on what else is in the scene.
     order = sorted(occurring.tolist(), key=table.object_names.__getitem__)
+    # The last entry stays −1, which is where the index −1 points.
     index = np.full(len(table.object_names) + 1, -1, np.int32)
     index[order] = np.arange(len(order))
     return PathTable(
@@ -234,6 +242,7 @@ def _amplitudes(
                     table.transfer[:, rows],
                     phase[:, rows],
                 )
+                # A pair of subarrays without a finite amplitude is not chosen.
                 power = np.nansum(np.abs(every) ** 2, axis=(2, 3))
                 a[:, rows] = every[np.unravel_index(np.argmax(power), power.shape)]
     return a
@@ -304,6 +313,7 @@ def outage_counts(
         dropped_pairs: Pairs of which paths were dropped, for values that are not finite.
     """
     offsets = channel.offsets
+    # The usual frame: every pair has a path on every carrier, and nothing is looked for.
     if (offsets[1:] > offsets[:-1]).all() and channel.a.all():
         return {}
     users = _users_without_path(channel)
@@ -354,6 +364,7 @@ class _Ends:
             return Cause.INSIDE
         if np.linalg.norm(end - start) < self._wavelength:
             return Cause.TOO_CLOSE
+        # A free line of sight whose path is missing was lost by the model, not by the world.
         if channel.los[t, r]:
             return Cause.NOT_FOUND
         return Cause.OUT_OF_RANGE if self._is_beside(start) or self._is_beside(end) else Cause.BLOCKED

@@ -28,12 +28,11 @@ from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Channel, ChannelOptions, Scene
 from caviar_protocol.topics.scene import Device, Panel
-from caviar_services.channel.arrays.channel_matrices import Matrices
+from caviar_services.channel.arrays.channel_matrices import Matrices, check_size, empty_parts
 from caviar_services.channel.assemble import Product, assemble, outage_counts
 from caviar_services.channel.paths import Antenna, PathTable
 from caviar_services.channel.propagation.atmosphere import Atmosphere, specific_attenuation
 from caviar_services.channel.propagation.patterns import Patterns
-from caviar_services.channel.wideband import check_size, empty_parts
 from caviar_services.pattern_files import read_pattern
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
 
@@ -225,6 +224,7 @@ class ChannelModel(Service[S]):
         )
         check_size(demand, self.run.carriers, sent, taken)  # each device once: how many there are scenes say
         self.load_patterns(preparation)
+        # Responses of megabytes would be returned to the system in each frame, and faulted in again.
         if self.wideband:
             keep_large_buffers()
         notes = (*self.load(preparation), *self._absorption_notes(), *empty_parts(demand, self.run.carriers))
@@ -257,13 +257,17 @@ class ChannelModel(Service[S]):
         scene = frame.scene()
         if scene.devices is not self._summed[0]:
             self._summed = scene.devices, _numbers_of(scene.devices)
+        # A sum is finite only where all of its terms are; where it overflows, the search below finds nothing.
         if not math.isfinite(self._summed[1] + _numbers_in(scene)):
             _refuse_not_finite(scene)
+        # The squared speeds of all objects together bound the fastest: most scenes need no more than this
+        # sum.
         if scene.angular_velocity is not None or np.vdot(scene.velocity, scene.velocity) >= SPEED_OF_LIGHT**2:
             wrong = too_fast(scene)
             if wrong:
                 raise PayloadError(f"{wrong}; is it in km/h, or of another unit of time?")
         transmitters, receivers = antennas(scene, "tx"), antennas(scene, "rx")
+        # Of mounted devices only the scene says how many there are.
         if self.wideband:
             sent, taken = (sum(end.array.size for end in ends) for ends in (transmitters, receivers))
             check_size(self.wideband, self.run.carriers, sent, taken)
@@ -417,6 +421,7 @@ class PathModel(ChannelModel[S]):
             absorption_db_per_km=self.absorption_db_per_km,
         )
         channel, dropped = assemble(product, tx, rx, found.table, found.los, found.matrices)
+        # A passive channel brings no more than was sent: above 1, far-field gains are used in the near field.
         if np.abs(channel.a).max(initial=0.0) > 1:
             _refuse_amplified(channel)
         done = time.perf_counter_ns()
@@ -433,6 +438,7 @@ class PathModel(ChannelModel[S]):
 
         They are no part of the product, which follows from its frame alone.
         """
+        # Two frames of this model in a row are compared, and nothing else: another process may have made one.
         before, self._before = self._before, (frame.episode, frame.number, channel)
         if before is None or before[:2] != (frame.episode, frame.number - 1):
             return {}

@@ -101,6 +101,7 @@ class _Decimation:
             self._push(heap, vertex)
         while heap:
             error, vertex, onto = heapq.heappop(heap)
+            # Entries of vertices that are gone stay in the heap: they are recognised when their turn comes.
             if vertex not in self._of_vertex or onto not in self._neighbours(vertex):
                 continue
             now = self._error(vertex, onto)
@@ -112,6 +113,7 @@ class _Decimation:
                 self._push(heap, onto)
                 for neighbour in self._neighbours(onto):
                     self._offer(heap, neighbour, onto)
+        # In the order of before: numbers of planes go by the order of triangles.
         faces = np.array([self._faces[i] for i in sorted(self._faces)], np.int32).reshape(-1, 3)
         return Mesh(self._mesh.vertices, faces)
 
@@ -180,6 +182,7 @@ class _Decimation:
             normal = self._normal(self._faces[faces[0]])
             if len(faces) == 2 or normal is None:
                 continue
+            # At a rim, the plane across the face keeps the rim in its course.
             across = _unit(_cross(normal, _minus(self._points[end], self._points[start])))
             if across is not None:
                 for corner in (start, end):
@@ -299,6 +302,7 @@ def detailed(
         staying = np.array([not reason for reason in reasons], np.bool_)
         if not staying.any():
             continue
+        # Passed through as it is, so that its planes stay the same to the bit.
         left = mesh if staying.all() else Mesh(mesh.vertices, mesh.faces[staying[label]])
         if settings.tolerance_m > 0:
             left = decimated(left, settings.tolerance_m)
@@ -329,6 +333,7 @@ def piece_numbers(mesh: Mesh) -> Int64Array:
     corners: Int64Array = place.reshape(-1)[mesh.faces].astype(np.int64)
     label = np.arange(len(mesh.vertices), dtype=np.int64)
     while True:
+        # Labels are handed on, and each round follows twice as many links as the last.
         lowest = label[corners].min(1)
         following = label.copy()
         np.minimum.at(following, corners, lowest[:, None])

@@ -69,6 +69,7 @@ class Antenna:
     @cached_property
     def subarrays(self) -> tuple[Antenna, ...]:
         """Its uniform parts, one for each panel and polarization, as antennas where they stand."""
+        # Most arrays are uniform: their only part is the antenna itself, and is not copied.
         if self.array.is_uniform:
             return (self,)
         return tuple(
@@ -100,6 +101,7 @@ def antenna_fields(antennas: Sequence[Antenna], which: Int64Array, directions: F
         which: Index of the antenna of each path, Shape ``[P]``.
         directions: Unit vectors from the antenna towards the path, Shape ``[P, 3]``.
     """
+    # With one base station, a mask over all paths would only copy them.
     if len(antennas) == 1:
         return antennas[0].radiated(directions)
     found: Field = np.zeros((len(which), 3))
@@ -229,6 +231,7 @@ class PathTable(Rows):
     @property
     def point_velocity(self) -> Float64Array:
         """Velocity [m/s] of what stands at each point, there, Shape ``[P, D, 3]``."""
+        # The index −1 of what is no object finds the row of zeros at the end.
         velocity: Float64Array = np.concatenate([self.object_velocity, np.zeros((1, 3))])[self.objects]
         if self.object_turning is not None:
             velocity = velocity + self.object_turning.velocity(self.objects, self.points)
@@ -258,6 +261,7 @@ def stable_ids(table: PathTable) -> UInt64Array:
     first[1:] = (ranked[1:] != ranked[:-1]) | (pair[1:] != pair[:-1])
     rank = np.empty(len(ids), np.int64)
     rank[order] = place - np.maximum.accumulate(np.where(first, place, 0))
+    # 2⁶⁴ divided by the golden ratio is the increment of SplitMix64: neighbouring ranks differ in all bits.
     return _mix(base[kind] + rank.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15))
 
 
@@ -268,6 +272,7 @@ def _kinds(table: PathTable) -> tuple[UInt64Array, Int64Array]:
         return np.array([_name_hash(())], np.uint64), np.zeros(len(table.pair), np.int64)
     faces = np.zeros_like(table.objects) if table.faces is None else table.faces
     objects = np.where(faces < 0, -1, table.objects)
+    # Paths of one kind are equal rows of integers: names are hashed once a kind, not once a path.
     discrete = np.concatenate([table.types.astype(np.int32), objects, faces], axis=1)
     kinds, kind = np.unique(discrete, axis=0, return_inverse=True)
     named = (
@@ -281,6 +286,7 @@ def _kinds(table: PathTable) -> tuple[UInt64Array, Int64Array]:
     return np.array([_name_hash(names) for names in named], np.uint64), kind.reshape(-1)
 
 
+# Kinds of paths recur from frame to frame.
 @lru_cache(maxsize=4096)
 def _name_hash(kind: tuple[tuple[int, str, int], ...]) -> int:
     text = "\0".join(f"{interaction}\0{name}\0{face}" for interaction, name, face in kind)

@@ -147,11 +147,13 @@ _Lines = Mapping[ElementTree.Element, int]
 def _parse(file: Path, called: str) -> tuple[ElementTree.Element, _Lines]:
     """The root element; document types, and with them entities, are refused before any is expanded."""
     builder, lines = ElementTree.TreeBuilder(), dict[ElementTree.Element, int]()
+    # Expat itself, because elements of ElementTree's parser do not know their lines.
     parser = expat.ParserCreate()
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         lines[builder.start(tag, attributes)] = parser.CurrentLineNumber
 
+    # A few nested entities expand to gigabytes.
     def doctype(name: str, *_: object) -> None:
         raise AssetError(
             f"{called}:{parser.CurrentLineNumber}: document type {name!r} is refused; remove "
@@ -208,6 +210,7 @@ def _shape(
     transform = element.find("transform[@name='to_world']")
     material = _material_of(where, element, materials)
     return SceneryShape(
+        # Sionna RT leaves the prefix out of the names of objects, too.
         name=(given or mesh.stem).removeprefix("mesh-"),
         file=mesh,
         to_world=np.eye(4) if transform is None else _to_world(where, transform, defaults),
@@ -221,6 +224,7 @@ def _shape(
 
 def _mesh_file(where: str, folder: Path, name: str) -> Path:
     relative = PurePosixPath(name)
+    # Other services get the meshes under these names, below a folder of their own.
     if relative.is_absolute() or ".." in relative.parts:
         raise AssetError(
             f"{where} names {name!r}; meshes travel with the description, so give a path below its folder"
@@ -271,6 +275,7 @@ def _itu_material(bsdf: ElementTree.Element) -> str:
     given = bsdf.find("string[@name='type']")
     if bsdf.get("type") == "itu-radio-material" and given is not None:
         return given.get("value", "")
+    # Blender numbers the copies of a material: itu_concrete.001.
     name = re.fullmatch(r"(?:mat-)?itu[_-](.+?)(?:\.\d+)?", bsdf.get("id", ""))
     if name is None:
         return ""
@@ -302,6 +307,7 @@ def _to_world(where: str, transform: ElementTree.Element, defaults: Mapping[str,
             ) from error
         except ValueError as error:
             raise AssetError(f"{where}: <{step.tag}> in to_world has a bad value, {error}") from error
+    # A singular transform would make a mesh a plane or a line, without an inside.
     if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix[:3, :3])) < 1e-12:
         raise AssetError(f"{where}: to_world is singular or not finite; give scales other than 0")
     return matrix
@@ -347,6 +353,7 @@ def _rotate(values: Mapping[str, str]) -> Float64Array:
 
 def _matrix(values: Mapping[str, str]) -> Float64Array:
     numbers = _numbers(values["value"], 9, 16)
+    # Row by row; nine numbers are the linear part.
     size = 3 if len(numbers) == 9 else 4
     matrix = np.eye(4)
     matrix[:size, :size] = np.reshape(numbers, (size, size))

@@ -156,9 +156,11 @@ def loft(sections: Float64Array) -> Mesh:
     for s in range(count - 1):
         for k in range(corners):
             a, b = s * corners + k, s * corners + (k + 1) % corners
+            # Both triangles of each quadrilateral between two sections.
             faces += [(a, b, b + corners), (a, b + corners, a + corners)]
     last = (count - 1) * corners
     for k in range(1, corners - 1):
+        # Fans over both ends.
         faces += [(0, k + 1, k), (last, last + k, last + k + 1)]
     return Mesh(sections.reshape(-1, 3).astype(np.float64), np.array(faces, dtype=np.int32))
 

@@ -19,7 +19,7 @@ import numpy as np
 from caviar_protocol.arrays import Complex64Array, Complex128Array, Float64Array, Int64Array
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Carrier, Interaction
-from caviar_services.channel.arrays.channel_matrices import Located
+from caviar_services.channel.arrays.channel_matrices import Bins, Located
 from caviar_services.channel.arrays.element_visibility import elements
 from caviar_services.channel.paths import Antenna, PathTable, antenna_fields
 from caviar_services.channel.propagation.atmosphere import amplitude_factor
@@ -30,7 +30,6 @@ from caviar_services.channel.sionna.candidate_visibility import Corners
 from caviar_services.channel.sionna.path_solver import Tracer
 from caviar_services.channel.sionna.path_table import path_ends, path_table
 from caviar_services.channel.sionna.scene import SionnaScene
-from caviar_services.channel.wideband import Bins
 
 
 class ElementTracer:

@@ -22,12 +22,11 @@ import numpy as np
 from caviar_protocol.arrays import Complex64Array, Complex128Array, Float64Array, Int64Array
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import AntennaArray, Carrier
-from caviar_services.channel.arrays.channel_matrices import Blocks, Located, joined
+from caviar_services.channel.arrays.channel_matrices import Bins, Blocks, Located, joined
 from caviar_services.channel.arrays.element_paths import Bend, ElementPaths, Lengths, Surfaces
 from caviar_services.channel.arrays.element_visibility import Elements, Look, Visibility, elements, visibility
 from caviar_services.channel.paths import Antenna
 from caviar_services.channel.propagation.patterns import Field, FormulaPattern, polarized_field
-from caviar_services.channel.wideband import Bins
 
 
 class ElementGains:

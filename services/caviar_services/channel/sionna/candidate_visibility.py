@@ -48,6 +48,7 @@ class Planes:
         rows = np.concatenate([table.origin, table.normal, table.low, table.high], axis=1).T
         reach = float(np.abs(rows).max(initial=0.0))
         columns = [mi.Float(column) for column in aligned_columns(rows)]
+        # In float32 what is far from the centre is known less exactly.
         self._slack = _SLACK + _RELATIVE_SLACK * reach
         self._origin, self._normal = mi.Point3f(*columns[:3]), mi.Vector3f(*columns[3:6])
         self._low, self._high = mi.Point3f(*columns[6:9]), mi.Point3f(*columns[9:12])
@@ -76,6 +77,7 @@ class Planes:
         count, receivers = len(chains), dr.width(targets)
         if not count * receivers:
             return np.zeros(0, np.int64), np.zeros(0, np.int64)
+        # Opaque: a literal would be part of the kernel, which would be compiled for each number of receivers.
         per_chain = dr.opaque(mi.UInt, receivers)
         lane = dr.arange(mi.UInt, count * receivers)
         chain, target = lane // per_chain, lane % per_chain
@@ -86,6 +88,8 @@ class Planes:
         here, possible, unsure = dr.gather(mi.Point3f, targets, target), mi.Bool(True), ~judged
         for number, image in zip(reversed(plane), reversed(images[1:]), strict=True):
             met, grazing, meets = self._met(here, image, number)
+            # The point in a plane that is met at a small angle is too uncertain: such chains go on to the
+            # exact test.
             unsure |= grazing & (number > 0)
             possible &= meets | unsure | (number == 0)
             here = dr.select(number > 0, met, here)
@@ -161,6 +165,7 @@ class Faces:
         """Know which faces are one surface now."""
         import mitsuba as mi
 
+        # The table is replaced where faces were joined or parted: mostly nothing is to be uploaded.
         if self._surface_of is not self._scene.surface_of:
             self._surface_of = self._scene.surface_of
             self._surface = mi.UInt(aligned_indices(self._surface_of))
@@ -224,6 +229,7 @@ def _looked(
     import drjit as dr
     import mitsuba as mi
 
+    # One lane alone would be another kernel to Dr.Jit.
     lanes = several(len(start))
     behind, number, *_ = look(
         positions(start[lanes]), positions(end[lanes]), dr.full(mi.Bool, True, len(lanes))
@@ -285,6 +291,7 @@ def at_corners(
     hidden, settled = np.zeros((2, len(at_centres)), np.bool_)
     if corners is not None:
         mirrors = (chains >= 0) == (np.arange(chains.shape[1]) < depth[:, None])
+        # Of chains with other interactions than reflections the corners say nothing.
         some = np.flatnonzero(mirrors.all(1))
         exist = reached(faces, planes, chains[some], receiver[some], corners.transmitter, corners.receivers)
         hidden[some] = exist.any((1, 2))
@@ -357,6 +364,7 @@ def _exists(faces: Faces, planes: Planes, number: list[Any], start: Any, end: An
 
     here = end
     images = planes.images(start, number)
+    # From the receiver back to the transmitter: each image is seen through the plane that made it.
     exists, lifted = mi.Bool(True), here
     for plane, image in zip(number[::-1], images[:0:-1], strict=True):
         origin, normal = planes.plane(plane)
@@ -371,6 +379,7 @@ def _exists(faces: Faces, planes: Planes, number: list[Any], start: Any, end: An
         lifted = dr.select(
             used, met - _OFF_SURFACE * dr.select(dr.dot(line, normal) > 0, normal, -normal), lifted
         )
+    # The first segment ends at the first plane, or at the receiver where nothing reflects.
     behind, met_plane = faces.along(start, here, exists)
     exists &= (
         dr.select(number[0] > 0, met_plane == number[0] - 1, behind > -_AT_END)

@@ -73,6 +73,7 @@ class Chains(Rows):
 
 def _chain_keys(planes: Int32Array | Int64Array, depth: Int64Array) -> UInt64Array:
     """A hash of each chain: planes are too many for a key that counts all sequences of them."""
+    # A polynomial with a prime base, modulo 2⁶⁴: planes are too many for exact numbers of sequences.
     key = depth.astype(np.uint64)
     for column in planes.T:
         key = key * np.uint64(1_000_003) + (column + 2).astype(np.uint64)
@@ -126,10 +127,12 @@ def united(parts: Sequence[Met], scene: SionnaScene) -> Met:
         return parts[0]
     launch = Launch.joined([part.launch for part in parts])
     widths = np.array([part.launch.rays for part in parts])
+    # Each part numbers its rays from 0.
     first = np.cumsum(widths) - widths
     chains = Chains.joined(
         [replace(part.chains, ray=part.chains.ray + begin) for part, begin in zip(parts, first, strict=True)]
     )
+    # Depth first, which is the order that chains of one launch have.
     signature = np.column_stack([chains.depth, _signature(launch, chains, scene)])
     _, kept, which = np.unique(signature, axis=0, return_index=True, return_inverse=True)
     rays = np.bincount(which.reshape(-1), weights=chains.rays).astype(np.int64)
@@ -159,6 +162,7 @@ def chains_of(launch: Launch, scene: SionnaScene, max_depth: int) -> Chains:
         kinds = bounce.kind.numpy()
         if d == 0:
             ray = np.flatnonzero(kinds)
+            # All rays begin in the one chain of no interaction.
             chain = np.zeros(len(ray), np.int64)
         else:
             going = kinds[ray] != 0
@@ -169,6 +173,7 @@ def chains_of(launch: Launch, scene: SionnaScene, max_depth: int) -> Chains:
         begins = _begins(launch, d, ray, chain)
         heads = np.flatnonzero(begins)
         kind, plane, token, tokens = _tokens(launch, d, ray[heads], scene)
+        # One integer for the chain before and the interaction that follows it.
         key = chain[heads] * tokens + token
         _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
         kind, plane, first = kind[first], plane[first], heads[first]
@@ -177,6 +182,7 @@ def chains_of(launch: Launch, scene: SionnaScene, max_depth: int) -> Chains:
         planes[:, d] = np.where(kind == REFLECTED, plane, -1)
         run_lengths = np.diff(np.append(heads, len(ray)))
         rays = np.bincount(inverse.reshape(-1), weights=run_lengths).astype(np.int64)
+        # Every ray of a run has the chain of its head.
         chain = inverse.reshape(-1)[np.cumsum(begins) - 1]
         specular = kind != SCATTERED
         found.append(
@@ -248,6 +254,7 @@ def _met_at(
 
 def _first_edge(scene: SionnaScene) -> int:
     """The first number of an edge: behind those of planes and kinds."""
+    # The flags of kinds are at most 8.
     return len(scene.plane_table.triangle) + 16
 
 
@@ -298,6 +305,7 @@ class Offer:
         self.planes = Planes(scene.plane_table)
         """What chains go by."""
         self._chains = met.chains
+        # Specular chains are found by the other launch; here they only lead to scattering points.
         if options.only_scattered:
             self._chains = self._chains.take(~self._chains.straight)
         self._points = points or DrawnPoints(scene.mi_scene, met.launch, met.scattered)
@@ -347,6 +355,7 @@ class Offer:
             np.concatenate([seen, np.repeat([False, True], [len(chain), len(point)])]),
             np.concatenate([np.zeros(len(direct) + len(chain)), probability]),
         )
+        # Receivers from there on fill up the kernel.
         every = every.take(every.receiver < count)
         kept = first_of_each(every.receiver, self._options.max_paths)
         return every.take(kept), self.launch, len(kept) - int(kept.sum())

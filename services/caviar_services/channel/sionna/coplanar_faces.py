@@ -55,6 +55,8 @@ class CoplanarFaces:
     def __init__(self, table: PlaneTable, first: int, sizes: Int64Array, two_sided: BoolArray) -> None:
         self._table, self._first, self._sizes, self._two_sided = table, first, sizes, two_sided
         self._begin = first + np.cumsum(sizes) - sizes
+        # Random weights: planes that differ hardly ever have the same sum. The seed is fixed, as is the
+        # order.
         rng = np.random.default_rng(0)
         self._direction = rng.standard_normal(4)
         self._direction /= np.abs(self._direction).sum()
@@ -89,6 +91,7 @@ class CoplanarFaces:
         label = self.none.label.copy()
         members = np.unique(pairs)
         while True:
+            # Labels spread along the pairs until none changes.
             least = np.minimum(label[pairs[:, 0]], label[pairs[:, 1]])
             before = label[members].copy()
             for side in (0, 1):
@@ -96,6 +99,7 @@ class CoplanarFaces:
             if (label[members] == before).all():
                 break
         groups = tuple(members[label[members] == first] for first in np.unique(label[members]))
+        # Descending: of equal labels the dictionary keeps the last, the lowest triangle.
         order = np.argsort(-triangle)
         touched = dict(zip(label[still[order]].tolist(), triangle[order].tolist(), strict=True))
         return JoinedFaces(label, groups, touched)
@@ -110,6 +114,7 @@ class CoplanarFaces:
         low = np.minimum.reduceat(np.where(flat, table.low[self._first :], np.inf), begin)
         high = np.maximum.reduceat(np.where(flat, table.high[self._first :], -np.inf), begin)
         some = np.flatnonzero(np.isfinite(low).all(1))
+        # Sorted along x, only bodies whose extents overlap there are compared.
         some = some[np.argsort(low[some, 0], kind="stable")]
         last = np.searchsorted(low[some, 0], high[some, 0] + _TOUCHING, side="right")
         place, behind = ranges(np.arange(len(some)) + 1, np.maximum(last - np.arange(len(some)) - 1, 0))

@@ -119,6 +119,7 @@ class SceneEdges:
             made = DeviceEdges(self._edges, self._rows(0), self._scene)
         elif self._on_device[0] != version:
             made = self._on_device[1]
+            # Edges of scenery stand, and stay as they were uploaded.
             made.move(self._moving, self._rows(self._moving))
         else:
             return self._on_device[1]

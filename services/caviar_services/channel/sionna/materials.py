@@ -65,6 +65,7 @@ def _dry_skin(gigahertz: float) -> Constants:
     biological tissues: III. Parametric models for the dielectric spectrum of tissues", Phys. Med. Biol. 41,
     1996, eq. 1 and table 1; the dispersions of strength 0 are left out)."""
     omega = 2 * math.pi * gigahertz * 1e9
+    # ε∞ = 4 and σ = 0.0002 S/m; of each dispersion Δε, τ and α.
     permittivity = complex(4.0, -0.0002 / (omega * EPSILON_0))
     for strength, relaxation_s, alpha in ((32.0, 7.234e-12, 0.0), (1100.0, 32.481e-9, 0.20)):
         permittivity += strength / (1 + (1j * omega * relaxation_s) ** (1 - alpha))
@@ -75,6 +76,7 @@ def _abs_plastic(gigahertz: float) -> Constants:
     """ABS, of which bumpers and housings are made: ε = 2.7 and tan δ = 0.008 at 11 GHz (B. Riddle,
     J. Baker-Jarvis and J. Krupka, "Complex permittivity measurements of common plastics over variable
     temperatures", IEEE Trans. Microw. Theory Tech. 51(3), 2003), taken as the same at other frequencies."""
+    # σ = ω ε₀ ε′ tan δ
     return 2.7, 2.7 * 0.008 * 2 * math.pi * gigahertz * 1e9 * EPSILON_0
 
 
@@ -120,10 +122,12 @@ class ObjectMaterials:
         Returns:
             The key; empty where there is none.
         """
+        # Most scenarios have no keys, and every object of every frame is asked for.
         if not self.by_key:
             return ""
         if name in self.by_key:
             return name
+        # Keys without a star are no patterns: names may have brackets, which fnmatch would interpret.
         patterns = (key for key in self.by_key if "*" in key and fnmatchcase(name, key))
         return next(patterns, cls if cls in self.by_key else "")
 
@@ -173,6 +177,7 @@ constants of the nearest end of a range; or follow the power law of that range b
 class MaterialSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What to change about a material of the scenery; what is not given stays."""
 
+    # At most 1e30: fields of constants beyond float32 are NaN, and paths by way of the surface are lost.
     relative_permittivity: Annotated[float, quantity("1", "its real part", ge=1, le=1e30)] | None = None
     conductivity_s_per_m: Annotated[float, quantity("S/m", "its conductivity", ge=0, le=1e30)] | None = None
     scattering_coefficient: (
@@ -332,6 +337,7 @@ def itu_material(
             f"{suggestion(itu_type, known)}",
             key=f"{policy.key}.{name}" if remedy else f"{policy.key}.materials.{name}",
         )
+    # Compared in float64: as float32, 60 GHz lies outside of a range that ends at 60 GHz.
     gigahertz, label = frequency_hz / 1e9, itu_type if other else f"ITU {itu_type}"
     taken = next((r for r in table if r[0] <= gigahertz <= r[1]), None)
     evaluated = gigahertz
@@ -344,6 +350,7 @@ def itu_material(
                 '"nearest" (constants of the nearest end) or "extrapolate" (power law of the nearest range)',
                 key=f"{policy.key}.outside_itu_range",
             )
+        # Of two ranges that are as near, min takes the first.
         taken = min(table, key=lambda r: abs(gigahertz - _clamped(gigahertz, r)))
         if policy.outside == "nearest":
             evaluated = _clamped(gigahertz, taken)

@@ -207,6 +207,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         notes = self.load_scene(preparation)
         frequencies = tuple(carrier.frequency_hz for carrier in self.run.carriers)
         launched, switched = contributing(self._asked, self._scene.used_surfaces(), frequencies)
+        # Objects move in the run where a world has meshes of them, or devices are mounted on them.
         meshes = any(name.startswith("objects/") for name in preparation.assets)
         moving = meshes or any(device.on for device in self.run.devices)
         enumerated = s.enumerates(moving) and launched.reflection
@@ -299,6 +300,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         Args:
             scene, transmitters, receivers: See `PathModel.paths`.
         """
+        # Another service of an embedded run may have set another variant.
         self._activate()
         _refuse_buried(scene, self.settings.without_body, self.foliage)
         if self.foliage is not None:
@@ -313,6 +315,8 @@ class SionnaChannel(PathModel[SionnaSettings]):
         table = path_table(self._scene, parts, names, velocity, antennas, traced_from)
         table = finder.in_edge_range(table, antennas)
         los = np.zeros(len(transmitters) * len(receivers), bool)
+        # Hidden paths are of other elements than the centres. Foliage dims a line of sight and does not
+        # block it.
         straight = (table.types == 0).all(1)
         los[table.pair[straight if table.hidden is None else straight & ~table.hidden]] = True
         table, too_close = with_near_pairs(table, los, *antennas, finder.wavelengths, self._scene.surfaces)

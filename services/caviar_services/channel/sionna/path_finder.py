@@ -167,7 +167,7 @@ class PathFinder:
         tracers = [self.tracer] if self._edge_range is None else [self.tracer, self._unbent]
         if not self.launches:
             tracers = []
-        # Three times: with nothing known, and with something known that has moved once and twice.
+        # What is followed begins with nothing known; the later launches go by what the earlier ones met.
         for shift, tracer in itertools.product((0.0, 0.5, 1.0), tracers):
             tracer.trace(above + shift, receivers + shift / 2, followed=followed, names=scene.names)
         if self._diffuse is not None:
@@ -210,6 +210,7 @@ class PathFinder:
         some = np.arange(depth)
         sights = np.stack(np.meshgrid(some, some), axis=-1).reshape(-1, 2).astype(np.int32)
         scenery = KnownScenery(chains[1:], sights)
+        # With all, some and none of the bodies standing.
         for parked in (0, count // 2, count):
             scene.place_bodies(objects, {number: kind for number, kind in kinds.items() if number >= parked})
             tracer.trace(above + np.array([0.0, 3.0, 4.0]), place + np.array([0.3, 0.2, 1.0]), scenery)

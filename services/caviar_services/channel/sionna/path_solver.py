@@ -201,6 +201,7 @@ class Tracer:
         corners = corners and corners.relative_to(centre)
         key = transmitter.tobytes() + (element.key if element else b"")
         self._drop_outdated()
+        # What is found for the corners of arrays is of these arrays alone, and not kept.
         last = None if corners else self._last.get(key)
         if last is None:
             if followed is None:
@@ -216,6 +217,7 @@ class Tracer:
             return traced
         self._last[key] = _Last(self._scene.version, offer, receivers, traced)
         while len(self._last) > _REMEMBERED:
+            # Dictionaries keep their order: the oldest goes.
             del self._last[next(iter(self._last))]
         return traced
 
@@ -264,6 +266,7 @@ class Tracer:
         corners: Corners | None = None,
     ) -> Traced:
         if at_once is None:
+            # A lane for each candidate of each receiver.
             at_once = max(1, lanes // max(offer.size, 1))
         parts = [
             self._batch(
@@ -326,6 +329,7 @@ class Tracer:
         from sionna.rt.utils import WedgeGeometry
 
         count, depth = len(candidates.ray), max(self._options.max_depth, 1)
+        # Sionna RT's stages fill the private fields of the buffer; so does this one.
         buffer = PathsBuffer(count, self._options.max_depth, self._options.diffraction)
         ray = mi.UInt(aligned_indices(candidates.ray))
         interactions = mi.UInt(aligned_indices(candidates.depth))
@@ -418,6 +422,7 @@ class Tracer:
         import drjit as dr
         import mitsuba as mi
 
+        # Isotropic patterns at both ends: arrays and orientations are applied afterwards.
         upright = positions(np.zeros((1, 3))), positions(np.zeros((dr.width(targets), 3)))
         geometric, carried = dr.copy(buffer.valid), mi.Bool(False)
         amplitudes: list[Any] = []

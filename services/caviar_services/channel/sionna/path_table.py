@@ -122,8 +122,10 @@ def geometry(buffer: Any) -> tuple[UInt8Array, Int64Array, Int64Array, Float64Ar
 
     depth = buffer.max_depth
     vertices = (buffer.vertices_x, buffer.vertices_y, buffer.vertices_z)
+    # One evaluation for all: each `numpy()` alone would run a kernel.
     dr.eval(vertices, buffer.interaction_types, buffer.shapes, buffer.primitives)
     return (
+        # Buffers have room for one interaction at least, also where none is traced.
         _TYPES[buffer.interaction_types.numpy()[:, :depth]],
         buffer.shapes.numpy()[:, :depth].astype(np.int64),
         buffer.primitives.numpy()[:, :depth].astype(np.int64),
@@ -235,27 +237,29 @@ def path_table(
         names, velocity: What `SionnaScene.place` returned.
         antennas, traced_from: Where they are, and where they were traced from.
     """
-    met = _Met.of(scene, parts)
-    pair, types = met.pair, met.types
+    met = Traced.joined([part for _, part in parts])
+    pair, types, traced = np.concatenate([pair for pair, _ in parts]), met.types, met.points
+    triangles = scene.triangle_numbers(met.shapes, met.primitives)
     (start, end), ends = path_ends(pair, *antennas), path_ends(pair, *traced_from)
-    traced = np.concatenate([part.points for _, part in parts])
-    corners, of_edges = scene.corners(met.triangles), None
+    corners, of_edges = scene.corners(triangles), None
     if scene.edges is not None:
         of_edges = scene.edges.ends(met.edge)
+    # Traced points are of float32 and of antennas off their surfaces; these are of the true positions.
     points = refined_points(start, traced, end, types, corners, of_edges, ends)
-    transfer = np.concatenate([part.transfer for _, part in parts], axis=1)
-    faces, joined = scene.surface_names(met.triangles, names)
+    faces, joined = scene.surface_names(triangles, names)
     kept = np.ones(len(pair), np.bool_)
     sights: Mapping[int, Sight] = {}
     if scene.edges is not None and (met.edge >= 0).any():
+        # An edge is known by its number within its object, in place of a face.
         faces = np.where(types == Interaction.DIFFRACTION, scene.edges.number[met.edge][:, None], faces)
-        kept, sights = _diffract_anew(scene, scene.edges, met, traced, ends, transfer)
+        kept, sights = _diffract_anew(scene, scene.edges, met, pair, triangles, ends)
+    # Spreading of diffracted and scattered paths is no function of their length alone.
     specular = ((types != Interaction.DIFFRACTION) & (types != Interaction.SCATTERING)).all(1)
     objects = scene.object_index(met.shapes, met.primitives)
     table = PathTable(
         pair=pair,
         transfer=spread_anew(
-            transfer,
+            met.transfer,
             specular,
             path_lengths(ends[0], traced, ends[1], types),
             path_lengths(start, points, end, types),
@@ -279,62 +283,34 @@ def path_table(
     return _with_sights(table, scene, sights, antennas, traced_from) if sights else table
 
 
-@dataclass(frozen=True, eq=False)
-class _Met:
-    """What P paths of all launches meet."""
-
-    pair: Int64Array
-    types: UInt8Array
-    shapes: Int64Array
-    primitives: Int64Array
-    triangles: Int64Array
-    """Numbers through all shapes."""
-    edge: Int64Array
-    hidden: BoolArray
-
-    @classmethod
-    def of(cls, scene: SionnaScene, parts: Sequence[tuple[Int64Array, Traced]]) -> _Met:
-        """Launch by launch."""
-        shapes = np.concatenate([part.shapes for _, part in parts])
-        primitives = np.concatenate([part.primitives for _, part in parts])
-        return cls(
-            pair=np.concatenate([pair for pair, _ in parts]),
-            types=np.concatenate([part.types for _, part in parts]),
-            shapes=shapes,
-            primitives=primitives,
-            triangles=scene.triangle_numbers(shapes, primitives),
-            edge=np.concatenate([part.edge for _, part in parts]),
-            hidden=np.concatenate([part.hidden for _, part in parts]),
-        )
-
-
 def _diffract_anew(
     scene: SionnaScene,
     edges: SceneEdges,
-    met: _Met,
-    traced: Float64Array,
+    met: Traced,
+    pair: Int64Array,
+    triangles: Int64Array,
     ends: tuple[Float64Array, Float64Array],
-    transfer: Complex128Array,
 ) -> tuple[BoolArray, Mapping[int, Sight]]:
     """Give diffracted paths the fields of their exact geometry, in place.
 
-    ``traced`` are the points of paths and ``ends`` where they run. Returns which of all paths do not run
+    ``triangles`` are what paths meet, and ``ends`` where they run. Returns which of all paths do not run
     beyond the ends of an edge, and of pairs whose line of sight passes an edge closely whether it is lit.
     """
     rows = np.flatnonzero(met.edge >= 0)
     types, edge = met.types[rows], met.edge[rows]
     bent = np.argmax(types == Interaction.DIFFRACTION, axis=1)
     of_edges = edges.ends(edge) - scene.centre
-    corners = scene.corners(met.triangles[rows]) - scene.centre
+    corners = scene.corners(triangles[rows]) - scene.centre
     start, end = (place[rows] - scene.centre for place in ends)
-    points = refined_points(start, traced[rows] - scene.centre, end, types, corners, of_edges)
+    points = refined_points(start, met.points[rows] - scene.centre, end, types, corners, of_edges)
     kept = np.ones(len(met.edge), np.bool_)
     kept[rows] = ~beyond_edges(points[np.arange(len(rows)), bent], of_edges)
+    # Behind the last interaction all points are the receiver, so that segments there have no length.
     points = np.where((types != 0)[..., None], points, end[:, None])
     path = np.concatenate([start[:, None], points, end[:, None]], axis=1)
     a, b, c = np.moveaxis(corners, -2, 0)
     faces, is_edge = edges.faces(edge)
-    chains = Chains(np.where(met.hidden, -1, met.pair), met.types, scene.surface_of[met.triangles])
+    chains = Chains(np.where(met.hidden, -1, pair), met.types, scene.surface_of[triangles])
     with np.errstate(invalid="ignore", divide="ignore"):  # such paths stay as traced
         planes = scene.surface_of[edges.triangles[edge]]
         lit, sights = waves_beside(Bends.of(path, types, faces), planes, rows, chains)
@@ -348,8 +324,9 @@ def _diffract_anew(
             scene.wavelengths,
             lit,
         )
+    # Others keep the fields of the ray tracer.
     good = is_edge & np.isfinite(fields).all((0, 2, 3))
-    transfer[:, rows[good]] = fields[:, good]
+    met.transfer[:, rows[good]] = fields[:, good]
     return kept, sights
 
 
@@ -368,6 +345,7 @@ def _with_sights(
     missing = np.array(
         sorted(sights.keys() - set(table.pair[straight].tolist()) - set(dark.tolist())), np.int64
     )
+    # Beside an edge float32 may see the line of sight on the wrong side of the shadow boundary.
     table = table.take(~(straight & np.isin(table.pair, dark)))
     start, end = path_ends(missing, *traced_from)
     free = [

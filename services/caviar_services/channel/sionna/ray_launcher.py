@@ -148,6 +148,7 @@ class Launch:
         index = mi.UInt(aligned_indices(rays))
         bounces = tuple(bounce.take(index) for bounce in self.bounces)
         wedges = None if self.wedges is None else dr.gather(type(self.wedges), self.wedges, index)
+        # Now, so that the memory of the other rays is free.
         dr.eval([getattr(bounce, field.name) for bounce in bounces for field in fields(bounce)], wedges)
         return Launch(bounces, wedges)
 
@@ -176,6 +177,7 @@ def _concatenated(parts: Sequence[Any]) -> Any:
     whole = dr.zeros(type(parts[0]), sum(dr.width(part) for part in parts))
     begin = 0
     for part in parts:
+        # Opaque, or each offset would be part of a kernel.
         dr.scatter(whole, part, dr.opaque(mi.UInt, begin) + dr.arange(mi.UInt, dr.width(part)))
         begin += dr.width(part)
     dr.eval(whole)
@@ -283,6 +285,7 @@ class Launcher:
             return Launch((), None)
         samples = self._count if rays is None else len(rays)
         lanes = samples * len(passes)
+        # Each launch, and each part of one, draws numbers of its own.
         self._sampler.seed(self._options.seed + number + self._first, lanes)
         origin = dr.repeat(source, lanes)
         direction = mi.Vector3f(self._directions)
@@ -290,12 +293,14 @@ class Launcher:
             direction = dr.gather(mi.Vector3f, self._directions, mi.UInt(aligned_indices(rays)))
         if len(passes) > 1:
             direction = dr.tile(direction, len(passes))
+        # A turn by a small angle adds the cross product with it.
         turn = mi.Vector3f(*(dr.opaque(mi.Float, angle) for angle in self._turn(number)))
         direction = dr.normalize(direction + dr.cross(turn, direction))
         active, enabled = dr.full(mi.Bool, True, lanes), dr.full(mi.UInt, passes[0], lanes)
         if len(passes) > 1:
             enabled = dr.select(dr.arange(mi.UInt, lanes) < dr.opaque(mi.UInt, samples), enabled, passes[1])
         wedges = self._no_wedges(lanes)
+        # Evaluated arrays, so that the first interaction runs the kernel of all others.
         dr.make_opaque(origin, direction, active, enabled, wedges)
         bounces = []
         for _ in range(self._options.max_depth):
@@ -323,6 +328,7 @@ class Launcher:
         import mitsuba as mi
 
         ray = mi.Ray3f(origin, direction)
+        # Coherent: lanes are in the order of the curve, so neighbours walk the tree together.
         hit = self._mi_scene.ray_intersect(ray, ray_flags=mi.RayFlags.Minimal, coherent=True, active=active)
         active &= hit.is_valid()
         sampler = self._sampler
@@ -342,6 +348,7 @@ class Launcher:
         shape = dr.reinterpret_array(mi.UInt, hit.shape)
         found = (kind, shape, hit.prim_index, hit.p, normal, sample.pdf)
         sampler.schedule_state()
+        # Evaluated after each interaction: unrolled, every depth would be a kernel of its own.
         dr.eval(found, onward.o, onward.d, active, enabled, wedges)
         bounce = Bounce(kind, shape, hit.prim_index, hit.p, normal, sample.pdf)
         return bounce, onward.o, onward.d, active, enabled, wedges
@@ -364,6 +371,7 @@ def _lattice(count: int, first: int, end: int, step: int = 1) -> Any:
     import mitsuba as mi
 
     points = -(-(end - first) // step)
+    # In float64: float32 cannot count to the 1e8 rays that a launch may have.
     number = dr.opaque(mi.Float64, first) + dr.opaque(mi.Float64, step) * dr.arange(mi.Float64, points)
     x = number / ((1.0 + math.sqrt(5.0)) / 2.0)
     return mi.Point2f(x - dr.floor(x), number / dr.opaque(mi.Float64, count - 1))

@@ -218,6 +218,7 @@ class SionnaScene(NumberedTriangles):
     def used_surfaces(self) -> UsedSurfaces:
         """What waves can meet, at rest and moving."""
         constants, slabs = self._surface_materials
+        # Bodies that stand for nothing count: which objects will come is not known.
         used = [(i, shape) for i, shape in enumerate(self._shapes) if shape.id != _NOTHING]
         return UsedSurfaces(
             materials=tuple(
@@ -237,6 +238,7 @@ class SionnaScene(NumberedTriangles):
         """Of each shape, permittivity and conductivity [S/m] on each carrier, Shape ``[2, C, S]``, and
         thickness [m] and scattering coefficient, Shape ``[2, S]``."""
         constants = []
+        # The ray tracer has the constants of one carrier at a time; here are those of all, once for the run.
         for carrier in range(len(self._carriers)):
             self.tune(carrier)
             constants.append([_constants(shape.material) for shape in self._shapes])
@@ -300,6 +302,7 @@ class SionnaScene(NumberedTriangles):
         clash = self._scenery & index.keys()
         if clash:
             raise PayloadError(f"object {min(clash)!r} has the name of a piece of scenery; rename one")
+        # Without scenery nothing else says where the world is.
         if not self.has_scenery and solid:
             self._count_from_objects(scene.position[solid])
         # A new assignment each frame: the product follows from this frame alone, also after a restart.
@@ -325,6 +328,7 @@ class SionnaScene(NumberedTriangles):
                     turning.angular_velocity[number] = scene.angular_velocity[i]
             elif body in self._standing:
                 vertices[rows] = self._middle
+        # With several shapes, only those that moved are updated: each update rebuilds the tree of a shape.
         before = self._vertices.copy() if len(self._moving) > 1 else None
         if self.move(vertices):
             params = self._scene.mi_scene_params
@@ -355,6 +359,7 @@ class SionnaScene(NumberedTriangles):
             position: [m], Shape ``[3]``.
         """
         piece = super().enclosing(position)
+        # Below the ground a ray upwards meets it once, and yet the point is inside of nothing.
         return piece if piece >= self.first_body_piece or position[2] >= self.low[2] else -1
 
     @property

@@ -96,6 +96,7 @@ def _as_in_file(mesh: Mesh, vertices: Float64Array) -> Mesh:
     """A mesh with its vertices in float64, unless the ray tracer took others than the file's."""
     same = vertices.shape == mesh.vertices.shape
     if same and len(vertices):
+        # Where the ray tracer has other vertices than the file, its own count.
         same = bool(np.abs(vertices - mesh.vertices).max() <= _SAME_VERTEX * max(np.abs(vertices).max(), 1.0))
     return Mesh(vertices, mesh.faces) if same else mesh
 
@@ -150,6 +151,7 @@ def mi_mesh(shape: Shape, centre: Float64Array) -> Any:
     faces = np.concatenate([mesh.faces + begin for mesh, begin in zip(shape.meshes, before, strict=True)])
     properties = mi.Properties()
     properties.set_id(shape.id)
+    # Else Mitsuba would smooth normals over the corners that faces share.
     properties["face_normals"] = True
     made = mi.Mesh(shape.id, int(counts.sum()), len(faces), props=properties)
     params = mi.traverse(made)
@@ -187,6 +189,7 @@ def loaded(description: Path | None) -> Any:
     gc.collect()
     try:
         with any_frequency():
+            # Unmerged: pieces keep their names, and are joined by material afterwards.
             scene = load_scene(None if description is None else str(description), merge_shapes=False)
     except (ValueError, TypeError, RuntimeError) as error:
         raise AssetError(f"{asset_name(description)}: the ray tracer cannot load it: {error}") from error
@@ -202,6 +205,7 @@ def any_frequency() -> Iterator[None]:
     """
     from sionna.rt.radio_materials import itu_material as module
 
+    # Sionna RT looks the function up in its module at each call.
     evaluate = module.itu_material
     module.itu_material = lambda name, frequency: (1.0, 0.0)
     try:

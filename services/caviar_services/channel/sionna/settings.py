@@ -246,6 +246,7 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
         if self.ray_spacing_deg is None:
             absent = _SCENERY_SAMPLES if enumerated else _SAMPLES
             return absent if self.samples is None else self.samples
+        # N = 4π/Δ²
         return round(4 * math.pi / math.radians(self.ray_spacing_deg) ** 2)
 
     def launch_options(self, seed: int) -> LaunchOptions:
@@ -280,6 +281,7 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
         by_stem["box"] = ""
         for stem in sorted(self.pool.keys() - by_stem.keys()):
             known = ", ".join(sorted(by_stem))
+            # A misspelt mesh would otherwise leave the pool at its default, to be noticed in a late frame.
             raise place.at("pool").at(stem).error(f"the run has no object mesh {stem!r}; it has: {known}")
         return {name: self.pool.get(stem, self.bodies) for stem, name in by_stem.items()}
 
@@ -328,6 +330,7 @@ def contributing(
     notes = tuple(
         f"{WARNING * (name in asked)}{name} is switched off: {reason}" for name, reason in off.items()
     )
+    # Lines of sight are left, for which no ray is launched.
     if not (left.reflection or left.refraction or left.diffraction or left.scattering):
         left = replace(left, max_depth=0)
     return left, notes
@@ -355,5 +358,6 @@ def _strongest(material: SurfaceMaterial, frequencies_hz: Sequence[float]) -> st
         float(np.abs(slab(np.cos(_INCIDENCE), constants, material.thickness_m, frequency)[1]).max())
         for constants, frequency in zip(material.constants, frequencies_hz, strict=True)
     )
+    # A level below the range of float32 says nothing.
     level = "−∞" if most < 1e-30 else f"−{-20 * np.log10(most):.0f}"
     return f"{material.name} {level} dB"

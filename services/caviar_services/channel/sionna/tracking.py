@@ -10,7 +10,7 @@ them would.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import msgspec
 import numpy as np
@@ -66,6 +66,16 @@ class _Table(Rows):
     """Number of the last launch that met it, Shape ``[K]``."""
 
 
+# Of each column, the type of its numbers in a saved state and in a table.
+_STORED: dict[str, tuple[Literal["<f8", "<i8", "<i4"], type[np.generic]]] = {
+    "depth": ("<i4", np.int64),
+    "kind": ("<i4", np.int64),
+    "triangle": ("<i4", np.int64),
+    "probability": ("<f8", np.float64),
+    "seen": ("<i8", np.int64),
+}
+
+
 class TableState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Chains in a saved state; the columns are those of a table."""
 
@@ -82,23 +92,11 @@ class TableState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         Args:
             table: The chains.
         """
-        return cls(
-            depth=Packed.of(table.depth, "<i4"),
-            kind=Packed.of(table.kind, "<i4"),
-            triangle=Packed.of(table.triangle, "<i4"),
-            probability=Packed.of(table.probability, "<f8"),
-            seen=Packed.of(table.seen, "<i8"),
-        )
+        return cls(**{name: Packed.of(getattr(table, name), kind) for name, (kind, _) in _STORED.items()})
 
     def table(self) -> _Table:
         """The table."""
-        return _Table(
-            depth=self.depth.array(np.int64),
-            kind=self.kind.array(np.int64),
-            triangle=self.triangle.array(np.int64),
-            probability=self.probability.array(np.float64),
-            seen=self.seen.array(np.int64),
-        )
+        return _Table(**{name: getattr(self, name).array(kind) for name, (_, kind) in _STORED.items()})
 
 
 class FollowedState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -116,6 +116,7 @@ class NumberedTriangles:
         # Most bodies of the pool stand for nothing: only what has moved is looked at.
         moved = changed[self._faces[self._first_moving :] - first].any(1)
         triangles = self._first_moving + np.flatnonzero(moved)
+        # Boxes of joined surfaces are around all of their planes: they are made anew.
         joined = np.array([group[0] for group in self.joined.groups], np.int64)
         self.plane_table.update(self._relative, np.union1d(self.plane_of[triangles], joined))
         self._join()
@@ -238,6 +239,7 @@ class NumberedTriangles:
         found: Counter[int] = Counter()
         for met in self.surfaces.above(position):
             found[self._left(met)] += 1
+            # One ray may slip through a gap between walls.
             if found[-1] > 1:
                 return -1
         del found[-1]
@@ -248,6 +250,7 @@ class NumberedTriangles:
         pieces = self.piece_of(met)
         is_body = pieces >= self.first_body_piece
         bodies, crossings = np.unique(pieces[is_body], return_counts=True)
+        # Bodies are closed: one that is left more often than entered is around the point.
         odd = bodies[crossings % 2 == 1]
         if len(odd):
             return int(odd[0])
@@ -280,6 +283,7 @@ class NumberedTriangles:
             shapes, primitives: See `planes`.
         """
         number = self._offsets[self._where(shapes)] + primitives
+        # The number of no shape is beyond all others and must not lead out of the table.
         clipped: Int64Array = np.clip(number, 0, len(self._faces) - 1)
         return clipped
 
@@ -298,6 +302,7 @@ class NumberedTriangles:
         Args:
             triangles: Numbers, of any Shape.
         """
+        # Shapes are held by their process-local number, triangles count in the order of shapes.
         order = np.argsort(self._offsets)
         where = order[np.searchsorted(self._offsets[order], triangles, side="right") - 1]
         return self._ids[where], triangles - self._offsets[where]
@@ -314,6 +319,7 @@ class NumberedTriangles:
         Returns:
             Numbers now; −1 where an object has left or has another mesh.
         """
+        # The usual frame: the same objects have the same bodies.
         if before == now:
             return triangles
         first = self.first_body_piece
@@ -353,6 +359,7 @@ class NumberedTriangles:
         """Number of the first triangle of each process-local shape."""
         self.offset_by_shape[ids] = np.cumsum(totals) - totals
         self._body_ids = ids[-moving:] if self._bodies else ids[:0]
+        # Sorted, so that shapes are looked up by bisection: their numbers count through the whole process.
         order = np.argsort(ids)
         self._ids, self._shape_order = ids[order], order
         self._offsets = (np.cumsum(totals) - totals)[order]
@@ -364,6 +371,7 @@ class NumberedTriangles:
         still = len(meshes) - len(self._bodies)
         of_asset = {asset: plane_numbers(mesh) for asset, mesh in unit_meshes.items()}
         numbers = plane_numbers_of(meshes[:still])
+        # A body is a point until it stands for an object, and a point has no planes.
         numbers += [of_asset[asset] for asset, _ in self._bodies]
         self._face_of = np.concatenate(numbers)
         counts = np.array([int(number.max(initial=-1)) + 1 for number in numbers], np.int64)

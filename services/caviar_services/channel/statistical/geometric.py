@@ -55,6 +55,13 @@ from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, Pose
 from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import AntennaDevice, Channel, ChannelMatrix, ChannelOptions, Scene
 from caviar_services.antenna_arrays import steering_vector
+from caviar_services.channel.arrays.channel_matrices import (
+    Bins,
+    Wideband,
+    bins_of,
+    superposed,
+    wideband_parts,
+)
 from caviar_services.channel.base import ChannelModel, Modelled
 from caviar_services.channel.propagation.atmosphere import amplitude_factor
 from caviar_services.channel.propagation.clearance import Boxes
@@ -70,7 +77,6 @@ from caviar_services.channel.statistical.waves import (
     velocity,
     with_phase,
 )
-from caviar_services.channel.wideband import Bins, Wideband, bins_of, superposed, wideband_parts
 from caviar_services.service import Frame, Preparation, RunInfo
 
 BLOCK = 256
