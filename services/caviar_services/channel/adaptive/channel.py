@@ -124,6 +124,7 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
         for rung in self._every:
             self.run.progress(f"timing rung {rung.label}", _TIMING_GRACE_S)
             timings.append([self._timed(rung, number, scene) for number, scene in enumerate(scenes)][1:])
+            # Nothing of the rehearsal may follow into the run: products depend on its frames alone.
             rung.model.reset(0, self.run.seed, 0)
         timings = timings[: len(self.rungs)]
         work = _workload(scenes[0])
@@ -143,6 +144,7 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
 
     def _room(self) -> Mapping[str, int]:
         """Objects of each mesh that every model has room for."""
+        # A scene of the rehearsal must fit every rung: some hold fewer bodies than others.
         rooms = [rung.model.room for rung in self._every if rung.model.room]
         shared = set.intersection(*map(set, rooms)) if rooms else set()
         return {asset: min(room[asset] for room in rooms) for asset in sorted(shared)}
@@ -174,6 +176,7 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
     def step(self, frame: Frame) -> StepResult:
         scene = frame.scene()
         devices = antennas(scene, "tx"), antennas(scene, "rx")
+        # What is imposed is learned before anything is stated: a replay then states the same.
         known = self.calibration.begin(frame.imposed)
         work = _workload(scene)
         predicted = self.costs.predict(work)
@@ -194,6 +197,7 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
             counts |= self._calibrate(choice.rung, made, frame, scene, devices)
             measured["calibrate"] = self.clock() - began
         stated = channel.expected_error_db
+        # Matrices that calibration alone asked for are no part of the product.
         channel = replace(channel, h=channel.h if self._with_h else ())
         return StepResult(
             products={"channel": channel},

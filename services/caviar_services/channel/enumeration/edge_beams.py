@@ -73,7 +73,7 @@ class EdgeTargets:
     def __init__(self, scene: SionnaScene, edges: SceneEdges, faces: FaceRectangles) -> None:
         import mitsuba as mi
 
-        # Parked bodies are far below the scene; their edges would be tested in vain.
+        # Bodies that no object of the frame uses are in the scene, too, but do not stand in it.
         number, piece = edges.of_bodies
         standing = np.array(scene.standing_bodies, np.int64) + scene.first_body_piece
         kept = np.isin(piece, standing)

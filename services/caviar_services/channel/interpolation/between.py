@@ -155,6 +155,8 @@ class Interpolation:
             )
         if scene is not None:
             _refuse_subarrays(scene)
+        # Where all three scenes are known, positions give lengths exactly; else Doppler shifts give the
+        # motion.
         s = (t_s - before.t_s) / self._h
         now = None if scene is None or not self._known else places(scene, self._joined)
         course = (self._by_doppler if now is None else self._by_places).at(s, now)
@@ -254,10 +256,12 @@ class Interpolation:
     ) -> Float64Array:
         """By ‖H‖ ≥ ‖Ĥ‖ − ‖H − Ĥ‖."""
         most = self._per_pair(error)
+        # Without matrices, the sum of the amplitudes stands for H of single elements.
         there = np.abs(self._per_pair(a.real) + 1j * self._per_pair(a.imag))
         if h:
             sizes = [np.linalg.norm(m.h) / np.sqrt(m.h.size) for m in h]
             there = np.array(sizes).reshape(most.shape)
+        # More missing than there is: no bound; nothing missing of nothing: exact.
         with np.errstate(divide="ignore", invalid="ignore"):
             bound = 20 * np.log10(most / (there - most))
         bound = np.where(most < there, bound, np.inf)
@@ -283,6 +287,7 @@ class Interpolation:
             carriers=like.carriers,
             tx=joined.tx,
             rx=joined.rx,
+            # A line of sight is there or not: that of the nearer keyframe.
             los=joined.los[0 if s < 0.5 else 1],
             offsets=np.searchsorted(joined.pair[order], np.arange(pairs + 1)).astype(np.int64),
             object_names=joined.object_names,
@@ -371,6 +376,7 @@ def _rows(
     first, second, pairs = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for number, (sender, receiver) in enumerate((t, r) for t in tx for r in rx):
         old, new = before.pair(sender, receiver), after.pair(sender, receiver)
+        # Ids name interactions and objects, so that a path is the same one at both keyframes.
         _, i, j = np.intersect1d(before.id[old], after.id[new], return_indices=True)
         died = np.setdiff1d(np.arange(old.stop - old.start), i)
         born = np.setdiff1d(np.arange(new.stop - new.start), j)
@@ -399,6 +405,7 @@ class _Table:
     @classmethod
     def of(cls, channel: Channel, names: Sequence[str], depth: int) -> _Table:
         more = depth - channel.interactions.shape[1]
+        # The last entry is that of −1, no object.
         index = np.array([*(names.index(name) for name in channel.object_names), -1], np.int32)
         return cls(
             channel,
@@ -413,6 +420,7 @@ def _end(tables: Sequence[_Table], rows: Int64Array) -> End:
     """What one keyframe says: ``rows`` are those of both tables, one after the other."""
     channels = [table.channel for table in tables]
     frequency = np.array([carrier.frequency_hz for carrier in channels[0].carriers])[:, None]
+    # Of a path that this keyframe lacks, ``rows`` point to the other keyframe.
     tau = np.concatenate([channel.tau for channel in channels])[rows]
     a = np.concatenate([channel.a for channel in channels], axis=1)[:, rows]
     doppler = np.concatenate([channel.doppler for channel in channels], axis=1)[:, rows]

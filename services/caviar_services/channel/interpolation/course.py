@@ -149,6 +149,7 @@ def _of(scene: Scene, joined: Joined, field: str) -> Places:
     transmitters, receivers = ends_of(scene, joined)
     tx, rx = np.divmod(joined.pair, max(len(joined.rx), 1))
     index = {name: number for number, name in enumerate(scene.names)}
+    # The last row is that of scenery, and of objects that this scene lacks.
     values = np.concatenate([getattr(scene, field), np.zeros((1, 3))])
     named = [values[index.get(name, -1)] for name in joined.object_names]
     of_objects = np.array([*named, np.zeros(3)])
@@ -170,6 +171,7 @@ def normals(corners: Float64Array, joined: Joined) -> Float64Array:
     segment = np.diff(corners, axis=1)
     length = np.linalg.norm(segment, axis=-1, keepdims=True)
     along = segment / np.where(length > 0, length, 1.0)
+    # A mirror turns a ray along its normal.
     turn = np.diff(along, axis=1)
     size = np.linalg.norm(turn, axis=-1, keepdims=True)
     mirror: BoolArray = (joined.types == Interaction.REFLECTION)[..., None]
@@ -182,6 +184,7 @@ def image_moves(moved: Places, normals: Float64Array) -> tuple[Float64Array, Flo
     A mirror with normal n that moves by o moves the image of a point that moves by x by
     x − 2n(n·x) + 2n(n·o): exact while the mirror does not turn.
     """
+    # The receiver is mirrored from its side of the path back, the transmitter from its side on.
     depth = normals.shape[1]
     to_end, to_start = moved.end, moved.start
     for d in reversed(range(depth)):
@@ -246,6 +249,7 @@ class Courses:
             _angle(joined.ends[0].departure, joined.ends[1].departure),
             _angle(joined.ends[0].arrival, joined.ends[1].arrival),
         )
+        # Slopes of the remainder: what is left of the rates behind the straight line between both images.
         moved = self._to_end[1] - self._to_end[0]
         chord = [(_unit(vector) * moved).sum(-1) / seconds for vector in self._to_end]
         self._slopes = [rate - along for rate, along in zip(self._rates(), chord, strict=True)]
@@ -329,12 +333,14 @@ class Courses:
     def _known(self, s: float, now: Places, at_ends: tuple[Places, Places]) -> Course:
         """From where ends and objects are."""
         before, after = at_ends
+        # Positions as they would be in uniform motion: only the deviation from it needs a correction.
         uniform = Places(
             *(
                 (1 - s) * getattr(before, name) + s * getattr(after, name)
                 for name in ("start", "end", "objects")
             )
         )
+        # A path of one keyframe is followed from there, one of both from the straight line between them.
         origin = np.where(self._joined.before, 0.0, 1.0)
         share = np.where(self._kept, s, origin)
         base = _between(before, after, share)
@@ -355,7 +361,7 @@ class Courses:
         correction, _ = self._hermite(s)
         most = moved.most
         length = line.length + np.where(self._kept, correction + change, 0.0)
-        bump = 4 * s * (1 - s)
+        bump = 4 * s * (1 - s)  # 0 at both keyframes, 1 in the middle
         return replace(
             line,
             length=length,

@@ -154,6 +154,7 @@ def cell_gains(
             done(number + 1, parts)
     finally:
         rt_scene.remove(_SOURCE)
+    # Each part is an estimate of its own, with as many rays.
     total /= parts
     grids = total.reshape(-1, ny, nx)
     return CellGains(element=grids[0], beams=grids[1:], rays=rays.reshape(ny, nx))
@@ -196,6 +197,7 @@ def _kernel_power(x: Any, size: int) -> Any:
     import drjit as dr
     import mitsuba as mi
 
+    # The kernel has period 1; near 0 both sines vanish and the quotient is the number of elements.
     turned, count = x - dr.round(x), dr.opaque(mi.Float, size)
     sine = dr.sin(dr.pi * turned)
     power = dr.square(dr.sin(count * dr.pi * turned) / sine) / count
@@ -291,6 +293,8 @@ def _solver(
             diff_point: Any = None, wedges_samples_cnt: Any = None, diffraction_angular_measure: Any = None,
         ) -> None:  # fmt: skip
             """What `RadioMap.add_paths` does, for every beam."""
+            # Width of the tube of a ray on the surface: of a diffracted one along the edge, else of its solid
+            # angle.
             if diffracted_paths:
                 source = dr.gather(mi.Point3f, tx_positions, tx_indices, active=active)
                 width = self._diffraction_integration_weight(wedges, source, diff_point, k_world, si)
@@ -299,6 +303,7 @@ def _solver(
                 width = solid_angle * dr.rcp(dr.abs(dr.dot(si.n, k_world)))
             cell, weight = geometry.cell(self, si, active)
             width *= weight * self._normalization_factor
+            # Rays of one launch add up in single precision; parts are added in double precision outside.
             power = dr.squared_norm(e_fields[0]) * width
             dr.scatter_add(self.power, power, cell, active)
             dr.scatter_add(self.rays, mi.UInt(1), cell, active)
@@ -308,6 +313,7 @@ def _solver(
             if not len(beams):
                 return
 
+            # One lane a ray, a loop over the beams: a lane for each beam would need the ray's field as often.
             def add(beam: Any) -> tuple[Any]:
                 gain = dr.gather(mi.Float, self._beam_gains, beam * self._samples + self._ray, active)
                 dr.scatter_add(self.power, gain * power, (beam + 1) * self._cells + cell, active)
@@ -315,6 +321,8 @@ def _solver(
 
             dr.while_loop((mi.UInt(0),), lambda beam: beam < self._beams, add, labels=("beam",))
 
+    # Sionna RT has no way to count rays otherwise: its steps are replaced, with the library's names and
+    # arguments.
     class Solver(RadioMapSolver):  # type: ignore[misc]
         """Sionna RT's solver, whose rays are counted by `Sums`."""
 

@@ -203,6 +203,7 @@ def heights(triangles: Float64Array, x: Float64Array, y: Float64Array) -> Float6
         Heights [m], Shape ``[len(y), len(x)]``; NaN where there is no triangle.
     """
     found = np.full((len(y), len(x)), -np.inf)
+    # Each triangle is looked at over the part of the grid in its bounding box alone.
     low, high = triangles[..., :2].min(axis=1), triangles[..., :2].max(axis=1)
     columns = np.searchsorted(x, [low[:, 0] - _RIM, high[:, 0] + _RIM])
     rows = np.searchsorted(y, [low[:, 1] - _RIM, high[:, 1] + _RIM])
@@ -324,6 +325,7 @@ def rays_at_once(
         return part
     needed = least_memory(nx * ny, beams)
     side = float(surface.x[1] - surface.x[0])
+    # Memory grows with the number of cells, that is with one over the square of their side; 5 % to spare.
     enough = side * np.sqrt(needed / memory) * 1.05
     with_beams = f" and {beams} beams" if beams else ""
     raise RunError(
@@ -368,7 +370,7 @@ def radio_map(
     devices = transmitters_of(scene, "the scene")
     rt, s = channel.scene, channel.settings
     shooting = Shooting(
-        samples=-(-samples // part) * part,
+        samples=-(-samples // part) * part,  # whole parts
         max_depth=s.max_depth,
         seed=channel.launch_seed % 2**31,
         los=s.los,
@@ -378,6 +380,7 @@ def radio_map(
         free_edges=s.free_edges and surface.is_level,
         scattering=s.scattering,
     )
+    # One carrier at a time: materials of the scene have those constants that it is tuned to.
     rt.place(scene, frozenset(s.without_body))
     rt.tune(carrier)
     gain, interference, chosen, rays = [], [], [], []
@@ -394,6 +397,7 @@ def radio_map(
             served, index = _served(found, beams)
             air = _transmittance(channel, carrier, surface, antenna.position)
             gain.append(served * air)
+            # The mean over a unitary codebook is the element's own gain (Parseval).
             interference.append((served if isinstance(beam, int) else found.element) * air)
             chosen.append(index)
             rays.append(found.rays)

@@ -116,6 +116,7 @@ def write_scenery(folder: Path, plates: Sequence[Plate]) -> dict[str, Path]:
     """
     meshes = folder / "scenery" / "meshes"
     meshes.mkdir(parents=True, exist_ok=True)
+    # In the order of their first plates: a later plate of the same constants is overwritten by the first one.
     skins = {_skin(plate, plates): plate for plate in reversed(plates)}
     parts = ['<scene version="2.1.0">']
     for skin, plate in reversed(skins.items()):

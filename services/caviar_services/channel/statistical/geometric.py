@@ -113,6 +113,8 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         count, k = settings.components, 10 ** (settings.k_factor_db / 10)
         self._frequencies = [carrier.frequency_hz for carrier in run.carriers]
         self._frequency = np.array(self._frequencies)[:, None]
+        # Amplitudes: all components of a blocked pair share the power, of a free one those behind the
+        # straight path.
         self._reflected = math.sqrt(1 / count)
         self._behind_straight = math.sqrt(1 / ((k + 1) * (count - 1))) if count > 1 else 0.0
         self._straight = math.sqrt(k / (k + 1)) if count > 1 else 1.0
@@ -266,6 +268,7 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         ]
         if not self._unit:
             a *= self._path_gain(waves, pairs)
+        # One array for both ends: making an array costs more than its numbers.
         both = waves.departure + waves.arrival
         aod, aoa = np.array([x for wave in both for x in angles(wave)], np.float64).reshape(2, -1, 2)
         shape = (len(transmitters), len(receivers))
@@ -369,6 +372,7 @@ class _Constant(NamedTuple):
 def _constant(
     los: tuple[bool, ...], offsets: tuple[int, ...], ids: tuple[int, ...], shape: tuple[int, int]
 ) -> _Constant:
+    # Keyed by values: a scene in which the same lines are free has the same arrays, whatever moves.
     paths = offsets[-1]
     arrays = _Constant(
         los=np.array(los, np.bool_).reshape(shape),

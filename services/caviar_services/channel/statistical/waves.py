@@ -206,6 +206,8 @@ class Draws:
         shape = (frames, settings.components)
         gain = random.normal(0.0, math.sqrt(0.5), (*shape, 2)).view(np.complex128)[..., 0]
         excess = random.exponential(settings.delay_spread_ns * 1e-9, shape)
+        # Of a free pair component 0 is the straight path, whose delay is not drawn: the others are sorted
+        # behind it.
         excess_free = excess.copy()
         excess_free[:, 1:].sort(axis=-1)
         excess.sort(axis=-1)
