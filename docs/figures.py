@@ -68,6 +68,12 @@ MEASUREMENTS: Mapping[str, Measurement] = {
         "tradeoff.md",
         {"tradeoff-keyframes": "keyframes"},
     ),
+    "stability": Measurement(
+        "caviar stability --markdown {out}/stability.md",
+        "caviar stability --markdown {out}/stability.md",
+        "stability.md",
+        {"stability": ""},
+    ),
     "stated-errors-canyon": Measurement(
         f"{_STATED} --seeds 3 --frames 30 --out {{out}}/canyon.md",
         f"{_STATED} --rungs 1e4,1e5,d1,d2 --frames 40 --out {{out}}/canyon.md",

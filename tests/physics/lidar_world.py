@@ -13,6 +13,7 @@ from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.space.coordinates import Pose, UnitQuaternion, Vector, rotation_matrix
 from caviar_protocol.topics import Lidar, LidarDevice, Scene
 from caviar_protocol.topics.scene import Device
+from caviar_services.channel.stability.lab import Thing, scene
 from caviar_services.sensors.lidar import LidarSensors, LidarSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 
@@ -31,21 +32,11 @@ class Body:
 
 def scene_of(bodies: Mapping[str, Body], *devices: Device) -> Scene:
     """The scene of these objects and devices."""
-    names = sorted(bodies)
-
-    def rows(values: Sequence[Sequence[float]], width: int) -> Float64Array:
-        return np.array(values, dtype=np.float64).reshape(len(names), width)
-
-    return Scene(
-        names=tuple(names),
-        classes=("car",) * len(names),
-        assets=tuple(bodies[name].asset for name in names),
-        position=rows([bodies[name].position for name in names], 3),
-        orientation=rows([bodies[name].orientation for name in names], 4),
-        velocity=np.zeros((len(names), 3)),
-        dimensions=rows([bodies[name].dimensions for name in names], 3),
-        devices=tuple(sorted(devices, key=lambda device: device.name)),
-    )
+    things = [
+        Thing(name, body.position, body.dimensions, body.orientation, asset=body.asset)
+        for name, body in bodies.items()
+    ]
+    return scene(devices, things)
 
 
 def prepared(

@@ -281,7 +281,10 @@ class _Split:
     @property
     def pair(self) -> list[int]:
         """Pair of devices that each pair of subarrays is of."""
-        of_t, of_r = (_owners(ranges) for ranges in (self.of_transmitter, self.of_receiver))
+        of_t, of_r = (
+            [number for number, parts in enumerate(side) for _ in parts]
+            for side in (self.of_transmitter, self.of_receiver)
+        )
         return [t * len(self.of_receiver) + r for t in of_t for r in of_r]
 
     def joined(self, blocks: list[Blocks]) -> Iterator[Blocks]:
@@ -289,10 +292,6 @@ class _Split:
         for sent in self.of_transmitter:
             for taken in self.of_receiver:
                 yield joined([[blocks[s * len(self.receive) + r] for s in sent] for r in taken])
-
-
-def _owners(ranges: Sequence[range]) -> list[int]:
-    return [number for number, parts in enumerate(ranges) for _ in parts]
 
 
 def _parts(antennas: Sequence[Antenna]) -> list[Antenna]:

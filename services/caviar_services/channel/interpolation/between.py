@@ -28,6 +28,7 @@ from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, angles
 from caviar_protocol.topics import AntennaDevice, Channel, ChannelMatrix, Scene
 from caviar_protocol.topics.channel import PLANE_WAVES
 from caviar_services.antenna_arrays import element_positions, steering_vector
+from caviar_services.channel.arrays.channel_matrices import carrier_phase
 from caviar_services.channel.interpolation.course import (
     Course,
     Courses,
@@ -183,7 +184,7 @@ class Interpolation:
         first, last = (end.gain for end in self._joined.ends)
         gain = (1 - s) * self._joined.before * first + s * self._joined.after * last
         tau = course.length / SPEED_OF_LIGHT
-        phase = carrier_phase(self._frequency[:, None], tau)
+        phase = carrier_phase(self._keyframes[0].channel.carriers, tau)
         a: Complex128Array = gain * phase / np.where(tau > 0, tau, np.inf)
         return a
 
@@ -429,7 +430,7 @@ def _end(tables: Sequence[_Table], rows: Int64Array) -> End:
         departure=unit_vectors(np.concatenate([channel.aod for channel in channels])[rows]),
         arrival=unit_vectors(np.concatenate([channel.aoa for channel in channels])[rows]),
         doppler_ratio=(doppler / frequency).mean(0),
-        gain=a * tau / carrier_phase(frequency, tau),
+        gain=a * tau / carrier_phase(channels[0].carriers, tau),
         points=np.concatenate([table.points for table in tables])[rows],
     )
 
@@ -439,11 +440,3 @@ def unit_vectors(angles: Float64Array) -> Float64Array:
     zenith, azimuth = angles[:, 0], angles[:, 1]
     sine = np.sin(zenith)
     return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.cos(zenith)], axis=-1)
-
-
-def carrier_phase(frequency: Float64Array, tau: Float64Array) -> Complex128Array:
-    """exp(−j2πfτ), Shape ``[C, K]`` for ``frequency`` of Shape ``[C, 1]``."""
-    # The whole turns of f·τ go first: they are millions, and only the rest is a phase.
-    turns = frequency * tau
-    phase: Complex128Array = np.exp(-2j * np.pi * (turns - np.round(turns)))
-    return phase

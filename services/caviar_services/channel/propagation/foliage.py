@@ -22,7 +22,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int64Array, UInt8Array, quantity
+from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt8Array, quantity
 from caviar_protocol.errors import AssetError, suggestion
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.space.scene import object_pose
@@ -408,12 +408,7 @@ class Foliage:
     def attenuated(self, table: PathTable, start: Float64Array, end: Float64Array) -> PathTable:
         """Paths with the attenuation by foliage; positions of TX and RX of each [m], Shape ``[P, 3]``."""
         factor = self.amplitude_factor(start, table.points, end, table.types)
-        return replace(table, transfer=_scaled(table.transfer, factor))
-
-
-def _scaled(transfer: Complex128Array, factor: Float64Array) -> Complex128Array:
-    scaled: Complex128Array = transfer * factor[..., None, None]
-    return scaled
+        return replace(table, transfer=table.transfer * factor[..., None, None])
 
 
 def _kind(

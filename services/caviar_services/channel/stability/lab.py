@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from caviar_protocol.arrays import Complex128Array, Float64Array
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.scenario.conversion import convert_settings
-from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Channel, Scene
+from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Channel, Interaction, Scene
 from caviar_protocol.topics.scene import Device
 from caviar_services.channel.base import ChannelModel
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
@@ -183,6 +183,13 @@ def antenna(
     )
 
 
+def ends(
+    tx: Point, rx: Point, sent: AntennaArray | None = None, taken: AntennaArray | None = None
+) -> list[AntennaDevice]:
+    """A transmitter ``t`` and a receiver ``r`` at these positions [m], with these arrays."""
+    return [antenna("t", "tx", tx, sent), antenna("r", "rx", rx, taken)]
+
+
 def scene(devices: Sequence[Device], things: Sequence[Thing] = ()) -> Scene:
     """The scene of these devices and objects."""
     things = sorted(things, key=lambda thing: thing.name)
@@ -303,9 +310,15 @@ def measure(model: Model, at: Scene, number: int = 0) -> Channel:
     return channel
 
 
+def only_reflection(channel: Channel) -> int:
+    """Row of the only path with a reflection. Raises `ValueError` where there is none, or another one."""
+    (path,) = np.flatnonzero((channel.interactions == Interaction.REFLECTION).any(1)).tolist()
+    return int(path)
+
+
 def link(model: Model, tx: Point, rx: Point, *things: Thing) -> Channel:
     """The product for two antennas ``t`` and ``r`` at these positions [m]."""
-    return measure(model, scene([antenna("t", "tx", tx), antenna("r", "rx", rx)], things))
+    return measure(model, scene(ends(tx, rx), things))
 
 
 def total(channel: Channel, carrier: int = 0) -> complex:

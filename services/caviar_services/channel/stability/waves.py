@@ -24,6 +24,7 @@ from caviar_services.channel.stability.lab import (
     Point,
     Thing,
     antenna,
+    ends,
     free_space,
     link,
     measure,
@@ -62,6 +63,7 @@ def _in_free_space(frequency: float, lab: Lab) -> Outcome:
     tx, rx = (3.7, -11.2, 24.0), (88.1, 61.9, 7.5)
     d = math.dist(tx, rx)
     expected = formulas.spherical_wave(d, frequency)
+    # One traced model for all carriers: its paths are the same, and a warm-up takes seconds.
     models = (free_space(frequency), lab.traced(FREQUENCIES))
     carrier = FREQUENCIES.index(frequency)
     got = [total(link(model, tx, rx), number) for model, number in zip(models, (0, carrier), strict=True)]
@@ -90,7 +92,8 @@ def _apart(distance: float, frequency: float, traced: bool, lab: Lab) -> Outcome
     model = lab.traced((60e9, 300e9)) if traced else free_space(frequency)
     carrier = (60e9, 300e9).index(frequency) if traced else 0
     tx = np.array([1.5, -2.25, 10.0])
-    channel = link(model, tx.tolist(), (tx + distance * np.array([0.6, 0.0, 0.8])).tolist())
+    channel = link(model, tx, (tx + distance * np.array([0.6, 0.0, 0.8])).tolist())
+    # The pair is too close where it is so for the longest wavelength of the model's carriers.
     slowest = 60e9 if traced else frequency
     if distance < formulas.C / slowest:
         return all_of(
@@ -118,6 +121,7 @@ def _phase(frequency: float, distance: float, origin: Point, lab: Lab) -> Outcom
     out = np.array(origin, np.float64)
     plate = Plate("ground", [(out + corner).tolist() for corner in square(distance)], CONDUCTOR)
     model = lab.traced(frequency, [plate])
+    # Places that are no round numbers in binary, so that rounding shows.
     tx, rx = np.array([-0.493, 0.0213, 0.1571]) * distance, np.array([0.507, -0.0137, 0.1193]) * distance
     channel = link(model, (out + tx).tolist(), (out + rx).tolist())
     flat = math.hypot(rx[0] - tx[0], rx[1] - tx[1])
@@ -144,6 +148,7 @@ def _grazing(heights: tuple[float, float], distance: float, lab: Lab) -> Outcome
     frequency = 2.8e9
     model = lab.traced(frequency, [ground(1.2 * distance)])
     got = total(link(model, (-distance / 2, 1.0, heights[0]), (distance / 2, 1.0, heights[1])))
+    # Both rays all but cancel, so the tolerance is relative to one of them.
     free = formulas.friis(formulas.over_ground(*heights, distance)[0], frequency)
     expected = two_rays(heights, distance, frequency)
     return close("of the direct ray", abs(expected) / free, abs(got) / free, absolute=2e-3)
@@ -174,8 +179,8 @@ def _reflection(
     reach = height * math.tan(math.radians(angle_deg))
     model = lab.traced(frequency, [ground(400.0, material)])
     array = AntennaArray(polarization=polarization)  # type: ignore[arg-type]
-    ends = [antenna("t", "tx", (-reach, 2, height), array), antenna("r", "rx", (reach, 2, height), array)]
-    channel = measure(model, scene(ends))
+    at = scene(ends((-reach, 2, height), (reach, 2, height), array, array))
+    channel = measure(model, at)
     reflected = channel.a[0, (channel.interactions == 1).any(1)].sum()
     length = 2 * math.hypot(reach, height)
     free = formulas.spherical_wave(length, frequency)
@@ -223,6 +228,7 @@ def _(lab: Lab) -> Outcome:
     back = (-6.0, 12 * math.tan(angle), 1.0)
     length = math.dist(tx, through)
     free = formulas.friis(length, frequency)
+    # Through and back under the same angle, over the same length.
     passed = amplitude(link(model, tx, through)) / free
     channel = link(model, tx, back)
     mirrored = abs(channel.a[0, (channel.interactions == 1).any(1)].sum()) / free
@@ -308,6 +314,7 @@ def _(lab: Lab) -> Outcome:
 
 def _boundary(image: Float64Array, lab: Lab) -> tuple[Complex128Array, Channel, float]:
     """H in 120 steps of 1 µm across the line where the wave from an image ends, and free space's |H|."""
+    # Off the boundary itself by 0.3 µm: there, either answer would be right.
     steps = (np.arange(-60, 60) + 0.3) * 1e-6
     onward = -image / np.linalg.norm(image)
     ground = 10 * onward + steps[:, None] * np.array([-onward[1], onward[0]])
@@ -343,7 +350,8 @@ def _(lab: Lab) -> Outcome:
     outcomes = []
     for angle in (5.2, 5.5, 5.8):
         rx = s_out * np.array([math.sin(angle), math.cos(angle), 0.0])
-        channel = measure(model, scene([antenna("t", "tx", tx.tolist()), antenna("r", "rx", rx.tolist())]))
+        channel = measure(model, scene(ends(tx, rx)))
+        # The edge is the z axis; the screen's other rims are far from it.
         over = (channel.interactions[:, 0] == Interaction.DIFFRACTION) & (
             np.abs(channel.points[:, 0]).max(1) < 1e-6
         )
