@@ -1,4 +1,4 @@
-"""Files that a command writes because it was asked to: results, tables, pictures."""
+"""Files that a command writes because its user asks for them: results, tables, pictures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,11 @@ _NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
 def writing(path: Path) -> Iterator[None]:
     """Make the folders to a file that the block writes.
 
-    Raises `RunError` naming the file, why it cannot be written, and what mends that.
+    Args:
+        path: The file.
+
+    Raises:
+        RunError: The block raised `OSError`; the text has file, cause and remedy.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -27,7 +31,11 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def make_folder_of(path: Path) -> None:
-    """Make the folders to a file before the work that it takes. Raises `RunError` as `writing` does."""
+    """Make the folders to a file, before the work whose result it gets.
+
+    Raises:
+        RunError: A folder cannot be made.
+    """
     with writing(path):
         pass
 
@@ -35,8 +43,13 @@ def make_folder_of(path: Path) -> None:
 def write_file(path: Path, text: str = "") -> None:
     """Write a file, and the folders to it; where that fails, the file stays as it was.
 
-    Called without text before the work, which leaves what is there: afterwards, a file that cannot be written
-    would cost the results. Raises `RunError` as `writing` does.
+    Args:
+        path: The file, a device or a pipe.
+        text: What is written. Empty: nothing is, and what is there stays; so a command tries a file before
+            its work, since one that cannot be written afterwards costs the results.
+
+    Raises:
+        RunError: The file cannot be written; the text has file, cause and remedy.
     """
     with writing(path):
         if not text:
@@ -49,10 +62,12 @@ def write_file(path: Path, text: str = "") -> None:
 
 @contextmanager
 def reserved(*paths: Path) -> Iterator[None]:
-    """Try files before the work in the block, and leave nothing behind where that fails.
+    """Try files before the work in the block, and leave nothing behind where the work fails.
 
-    What the block raises goes on; files that are still empty, and folders made for them, are removed first.
-    Raises `RunError` as `writing` does.
+    Where the block raises, files that are still empty are removed, and folders made for them.
+
+    Raises:
+        RunError: A file cannot be written.
     """
     files = [path for path in paths if not path.exists()]
     folders = {folder for path in paths for folder in path.parents if not folder.exists()}
@@ -71,12 +86,27 @@ def reserved(*paths: Path) -> Iterator[None]:
 
 
 def printable(text: str) -> str:
-    """A text without what would steer a terminal: control characters are written as Python escapes them."""
+    r"""Escape what would steer a terminal: control characters are written as Python writes them.
+
+    Example:
+        >>> print(printable("red: \x1b[31m"))
+        red: \x1b[31m
+    """
     return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
 
 
 def reason(path: Path, error: OSError, what: str = "file") -> str:
-    """Why a ``file`` or ``folder`` cannot be written, and what mends that."""
+    """Say why something cannot be written, and what mends that.
+
+    Args:
+        path: What was to be written.
+        error: What that raised.
+        what: ``file`` or ``folder``.
+
+    Example:
+        >>> reason(Path("a/b"), PermissionError(errno.EACCES, "Permission denied"))
+        'Permission denied; choose another file'
+    """
     if error.errno in _NO_SPACE:
         return f"{error.strerror}; free space there, or choose another folder"
     in_the_way = next((folder for folder in path.parents if folder.exists() and not folder.is_dir()), None)

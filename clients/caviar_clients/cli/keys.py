@@ -31,7 +31,7 @@ def new(
     directory: Directory = DEFAULT,
 ) -> None:
     """Make a key pair: NAME.key, which is secret, and NAME.pub."""
-    if role is not None:
+    if role is not None:  # all that may be refused is, before there are files
         _free(directory, name)
         _role(role)
     pair = k.Pair.new()
@@ -112,14 +112,14 @@ def token(
     tokens = k.read_tokens(directory)
     if any(other.name == name for other in tokens):
         raise SetupError(f"there is a token {name!r} already; revoke it first:  caviar keys revoke {name}")
-    text = secrets.token_urlsafe(32)
+    text = secrets.token_urlsafe(32)  # 256 bits: no password that could be guessed from its digest
     digest = hashlib.sha256(text.encode()).hexdigest()
     k.write_tokens(directory, [*tokens, k.Token(name=name, role=role, sha256=digest)])
     typer.echo(text)
 
 
 def _where_made(file: Path, directory: Path) -> Path:
-    """``file``. `SetupError` where it is not there but in the keys directory, into which `new` writes."""
+    """``file``; `SetupError` where it is not there but in the keys directory, into which `new` writes."""
     made = directory / file.name
     if not file.exists() and made != file and made.exists():
         raise SetupError(f"{file} does not exist, but {made} does; write  caviar keys authorize {made}")
@@ -133,12 +133,14 @@ def _role(role: str) -> Role:
 
 
 def _free(directory: Path, name: str) -> None:
+    """Raise `SetupError` where a name is no service's, or is authorized already."""
     k.check_name(name)
     if any(entry.name == name for entry in k.read_authorized(directory)):
         raise SetupError(f"{name!r} is authorized already; revoke it first:  caviar keys revoke {name}")
 
 
 def _add(directory: Path, entry: k.Authorization) -> None:
+    # A key with two names would let a service appear as the other one.
     entries = k.read_authorized(directory)
     for other in entries:
         if other.public == entry.public:

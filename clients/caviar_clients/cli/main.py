@@ -36,15 +36,17 @@ from caviar_protocol.host import DISTRIBUTION
 RUN, LOOK, MEASURE, OPERATE = "Run", "Look", "Measure", "Operate"
 """Groups of commands in the help."""
 
+# Commands import what they need when they run: `caviar --help` and completion in a shell load none of it.
 app = typer.Typer(
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
-    pretty_exceptions_enable=False,
+    pretty_exceptions_enable=False,  # a bug shows the traceback of Python, which reports can quote
 )
 bench = typer.Typer(no_args_is_help=True, help="Measure what the parts of a run cost on this machine.")
 app.add_typer(bench, name="bench", rich_help_panel=MEASURE)
 app.add_typer(keys, name="keys", rich_help_panel=OPERATE)
 _console = Console()
+# Warnings, errors and progress: what a command prints on standard output can be piped.
 _errors = Console(stderr=True)
 
 

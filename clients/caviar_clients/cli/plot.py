@@ -41,8 +41,10 @@ def plot_run(
     user: str | None = None,
     camera: str | None = None,
 ) -> list[Path]:
-    """Draw what a recording holds: map, |y| over time and angle of arrival, a user's delay spread, K-factor,
-    coherence and frequency response, LIDAR scan, a camera's images.
+    """Draw what a recording holds, as PNG.
+
+    Map; |y| over time and angle of arrival; a user's delay spread, K-factor, coherence and frequency
+    response; LIDAR scan; a camera's images.
 
     Args:
         run: Run directory or segment.
@@ -60,11 +62,16 @@ def plot_run(
     Raises:
         RecordingError: It is not a recording, it holds nothing to draw, or frame, user or camera are not in
             it.
-        SetupError: Matplotlib is missing; names the command that installs it.
+        SetupError: Matplotlib is not installed; the text has the command.
+        RunError: A file cannot be written.
+
+    Example:
+        >>> [file.name for file in plot_run(Path("runs/smoke-20261122-101500"), Path("pictures"))][:2]
+        ['map.png', 'beams-over-time.png']
     """
     recording = Recording(run)
     folder = out or recording.directory
-    make_folder_of(folder / "map.png")
+    make_folder_of(folder / "map.png")  # before frames are read, which takes minutes of a long run
     topics = recording.topics
     with_users = user is not None or ("link" in topics and has_users(recording))
     chosen = choose_user(recording, user or "") if "link" in topics and with_users else None
@@ -102,10 +109,17 @@ def plot_run(
 
 
 def beam_gain(array: AntennaArray, beam: int, directions: Float64Array) -> Float64Array:
-    """Amplitude of a codebook beam towards unit vectors in device axes, Shape ``[N, 3]`` to ``[N]``.
+    """Work out the amplitude of a codebook beam: ``|c_k* a(k̂)| / sqrt(N)`` times that of the element pattern.
 
-    ``|c_k* a(k̂)| / sqrt(N)`` of the beam's subarray, times the amplitude of the element pattern, which is
-    left out where it comes from a file.
+    A pattern that comes from a file is left out.
+
+    Args:
+        array: Of the device; the beam is of one of its subarrays, of N elements.
+        beam: Number k in the codebook of the array.
+        directions: Unit vectors k̂ in device axes, Shape ``[N, 3]``.
+
+    Returns:
+        Amplitudes, Shape ``[N]``.
     """
     part, own = subarray_of(array, beam)
     local = directions @ rotation_matrix(part.orientation)
@@ -121,7 +135,17 @@ def map_data(
     user: tuple[str, str, str] | None,
     footprints: Footprints | None,
 ) -> MapData | None:
-    """What a map shows of a frame; None where the frame has no scene."""
+    """Collect what a map shows of a frame.
+
+    Args:
+        recording: Has the frame.
+        frame: Which.
+        user: Transmitter, receiver and carrier of the user whose beam is drawn; None: no beam.
+        footprints: Of the scenery, as `scenery` finds them; None: none is drawn.
+
+    Returns:
+        None where the frame has no scene.
+    """
     scene = frame.scene()
     if scene is None:
         return None
@@ -153,9 +177,14 @@ def _scan(frame: RecordedFrame, file: Path) -> None:
 
 
 def camera_view(frame: RecordedFrame, camera: str | None) -> CameraView:
-    """All that one camera saw in a frame; by default the first, of the fixed ones if there are any.
+    """Collect all that one camera saw in a frame.
 
-    Raises `RecordingError` with the known names where it saw nothing.
+    Args:
+        frame: Which.
+        camera: Its name; None: the first, of those that are fixed if there are any.
+
+    Raises:
+        RecordingError: The camera saw nothing in the frame; the text has those that did.
     """
     topics: dict[str, type[Camera] | type[Depth] | type[Segmentation]] = {
         "camera": Camera,
@@ -188,13 +217,26 @@ def camera_view(frame: RecordedFrame, camera: str | None) -> CameraView:
 
 
 def choose_camera(known: Iterable[str], camera: str | None, where: str) -> str | None:
-    """The camera asked for; by default the first, of those that are fixed if there are any.
+    """Choose the camera that is shown.
 
-    None where none is asked for and none is known. Raises `RecordingError`, which begins with ``where``, for
-    a camera that is not known, with the near name and the known ones.
+    Args:
+        known: Names of cameras.
+        camera: The one asked for; None: the first, of those that are fixed if there are any.
+        where: What has no images of the camera, for the error.
+
+    Returns:
+        None where none is asked for and none is known.
+
+    Raises:
+        RecordingError: The camera is not known; the text has the near name and the known ones.
+
+    Example:
+        >>> choose_camera(["car/front", "pole"], None, "frame 0 has")
+        'pole'
     """
     names = sorted(known)
     if camera is None:
+        # A camera on an object is called after it, as in car/front.
         return min(names, key=lambda name: ("/" in name, name), default=None)
     if camera in names:
         return camera
@@ -207,7 +249,11 @@ def choose_camera(known: Iterable[str], camera: str | None, where: str) -> str |
 
 
 def scenery(recording: Recording) -> Footprints | None:
-    """Footprints of the recorded scenery and of the boxes that block a drawn channel; None without either."""
+    """Find what stands still in a recording: footprints of the scenery, and boxes that block a drawn channel.
+
+    Returns:
+        None where there is neither.
+    """
     description, boxes = find_scenery(recording.assets), _obstacles(recording)
     drawn = None
     if description is not None:
@@ -230,7 +276,7 @@ def _obstacles(recording: Recording) -> list[Box]:
 def _frame(
     recording: Recording, number: int | None, topic: str, user: tuple[str, str, str] | None
 ) -> RecordedFrame:
-    """The frame asked for, or the middle one of those with the topic in which the user sees most."""
+    """The frame asked for; else the middle one of those with the topic in which the user sees most."""
     if number is not None:
         return recording.frame(0, number)
     candidates = list(recording.frames())
@@ -272,7 +318,7 @@ def _worth(frame: RecordedFrame, user: tuple[str, str, str] | None) -> int:
 
 
 def agent_names(recording: Recording) -> str:
-    """What served the users, for the legend: the implementation where there was one agent."""
+    """Name the agents of a recorded run by their implementations, for a legend."""
     services = recording.metadata.scenario.get("services")
     specs = services.values() if isinstance(services, dict) else ()
     used = sorted({str(s.get("use")) for s in specs if isinstance(s, dict) and s.get("role") == "agent"})
@@ -280,6 +326,6 @@ def agent_names(recording: Recording) -> str:
 
 
 def moment(frame: RecordedFrame) -> str:
-    """Episode, but for the first, frame and simulated time."""
+    """Name a frame by its number and simulated time, and by its episode unless that is the first."""
     episode = f"episode {frame.episode}, " if frame.episode else ""
     return f"{episode}frame {frame.number}, t = {frame.t_ns * 1e-9:.2f} s"

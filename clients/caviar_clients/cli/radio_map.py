@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from importlib import metadata as distribution
 from pathlib import Path
@@ -13,17 +12,18 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import TimeElapsedColumn, TimeRemainingColumn
 
 from caviar_clients.cli.radio_map_inputs import Wanted, carrier_of, channel_of, noise_of, surface_of
+from caviar_clients.cli.shared import print_line, progress_bar, require_installed, require_known
 from caviar_clients.files import reserved, writing
 from caviar_clients.plots.map import RadioMapView, draw_servers, draw_values
 from caviar_clients.plots.rays import footprints
 from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.plausibility import implausible_values, in_hertz
 from caviar_clients.tradeoff.scenes import is_recording, scene_at
-from caviar_protocol.errors import RunError, SetupError, suggestion
-from caviar_protocol.host import DISTRIBUTION, has_extra, install_command
+from caviar_protocol.errors import RunError
+from caviar_protocol.host import DISTRIBUTION
 from caviar_protocol.topics import Scene
 from caviar_services.channel.radio_map.mapping import (
     BeamChoice,
@@ -60,7 +60,16 @@ ARRAYS: Mapping[str, tuple[tuple[str, ...], str, str]] = {
 
 
 def save(found: RadioMap, about: Mapping[str, Any], file: Path) -> None:
-    """Write a map; ``about`` becomes part of its metadata. Raises `RunError` where that fails."""
+    """Write a map as an archive of NumPy: the arrays of `ARRAYS`, and ``metadata`` as JSON.
+
+    Args:
+        found: The map.
+        about: Becomes part of the metadata.
+        file: ``….npz``.
+
+    Raises:
+        RunError: The file cannot be written.
+    """
     surface, coverage = found.surface, found.coverage
     centres = surface.centres
     arrays = {
@@ -88,6 +97,7 @@ def save(found: RadioMap, about: Mapping[str, Any], file: Path) -> None:
             for name, (axes, unit, meaning) in ARRAYS.items()
         },
     }
+    # A text of JSON, and no pickled object: an archive from elsewhere can be opened without running its code.
     with writing(file), file.open("wb") as stream:
         np.savez_compressed(stream, allow_pickle=False, metadata=np.array(json.dumps(metadata)), **arrays)
 
@@ -100,7 +110,7 @@ METRICS = {
 }
 """What can be drawn, and the label of its colour bar."""
 
-
+# Fewer rays in a cell leave errors of decibels, of which the user is warned.
 _FEW_RAYS = 10
 # [m]; farther away, positions in the ray tracer, which are float32, are decimetres apart.
 _FARTHEST_M = 1e6
@@ -112,21 +122,39 @@ class MapOptions:
     """What is mapped, and how finely."""
 
     metrics: tuple[str, ...] = ("gain",)
+    """Keys of `METRICS`."""
     cells: Wanted = field(default_factory=Wanted)
     frame: int = 0
+    """Instant of the first episode."""
     carrier: str | None = None
+    """None: the first."""
     beam: BeamChoice = "best"
     samples: int = 10_000_000
     """Rays of each transmitter."""
     memory_gib: float = 2.0
+    """Memory that the map may take [GiB]."""
 
 
 def options_of(metrics: Sequence[str] | None, cells: Wanted, beam: str, **others: Any) -> MapOptions:
-    """Options from the command line. Raises `RunError` for what cannot be."""
+    """Make options from those of the command line.
+
+    Args:
+        metrics: Keys of `METRICS`; None: ``gain``.
+        cells: Which cells.
+        beam: ``best``, ``wide``, or the number of a beam.
+        others: Fields of `MapOptions`.
+
+    Raises:
+        RunError: A value is none of those that an option takes.
+
+    Example:
+        >>> options_of(["rss", "rss"], Wanted(cell=2.0), "7", frame=3).metrics
+        ('rss',)
+    """
     chosen = tuple(dict.fromkeys(metrics or ("gain",)))
     for metric in chosen:
-        if metric not in METRICS:
-            raise RunError(f"--metric {metric!r} does not exist; {suggestion(metric, METRICS)}")
+        require_known("--metric", metric, METRICS)
+    # Negated comparisons, which NaN does not pass either.
     if not abs(cells.height) <= _FARTHEST_M:
         raise RunError(f"--height {cells.height:g}: write a height in metres, at most {_FARTHEST_M:,.0f}")
     if not 0 < cells.cell <= _FARTHEST_M:
@@ -157,13 +185,22 @@ def _beam(text: str) -> BeamChoice:
 def draw_radio_map(source: Path, out: Path | None, options: MapOptions, console: Console) -> list[Path]:
     """Map a scenario or a recording, and write pictures and arrays.
 
-    ``out`` is the file of the picture, by default ``radio-map.png`` in this folder, or in that of the run;
-    the arrays are beside it, in a file ``.npz``. With several metrics, their names go into those of the
-    pictures.
+    Args:
+        source: A scenario, or the directory of a run that recorded ``scene``.
+        out: File of the picture, into whose name go those of several metrics; the arrays are beside it, in a
+            file ``….npz``. None: ``radio-map.png`` in this folder, or in that of the run.
+        options: What is mapped.
+        console: Where progress, warnings and figures are shown.
 
-    Returns the files. Raises `CaviarError` for what is wrong with source or options.
+    Returns:
+        The files: a picture for each metric, and the arrays.
+
+    Raises:
+        SetupError: The ray tracer or Matplotlib is not installed.
+        ScenarioError: The scenario is wrong, or cannot be mapped.
+        RunError: An option names nothing, or a file cannot be written; nothing was computed then.
     """
-    _require_extras()
+    require_installed("a radio map", ("channel", "plot"))
     picture = out or (source if is_recording(source) and source.is_dir() else Path()) / "radio-map.png"
     if picture.suffix.lower() != ".png":
         raise RunError(f"--out {picture}: a radio map is a PNG; write a name that ends in .png")
@@ -175,7 +212,7 @@ def draw_radio_map(source: Path, out: Path | None, options: MapOptions, console:
     arrays = picture.with_suffix(".npz")
     if not is_recording(source):
         for warning in implausible_values(checked_scenario(source)):
-            console.print(f"warning: {warning}", markup=False, highlight=False, soft_wrap=True)
+            print_line(console, f"warning: {warning}")
     with reserved(*pictures.values(), arrays):
         mapped = _mapped(source, options, console)
         save(mapped.found, mapped.metadata, arrays)
@@ -183,7 +220,7 @@ def draw_radio_map(source: Path, out: Path | None, options: MapOptions, console:
         for metric, file in pictures.items():
             _draw(view, mapped.found.coverage, metric, file)
     for line in _summary(mapped):
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+        print_line(console, line)
     return [*pictures.values(), arrays]
 
 
@@ -191,7 +228,7 @@ def draw_radio_map(source: Path, out: Path | None, options: MapOptions, console:
 class _Mapped:
     found: RadioMap
     notes: tuple[str, ...]
-    """For the user: what is unusual about the cells, and what of the settings the map leaves out."""
+    """What is unusual about the cells, and what of the settings the map leaves out."""
     metadata: dict[str, Any]
     scene: Scene
     title: str
@@ -206,12 +243,14 @@ def _mapped(source: Path, options: MapOptions, console: Console) -> _Mapped:
     carrier = scenes.carriers[index]
     channel, assets = channel_of(scenes, instant.scene)
     noise_w, noise = noise_of(scenes.services, carrier)
-    with _progress(console) as bar:
+    times = (TimeElapsedColumn(), "left", TimeRemainingColumn())
+    with progress_bar(console, *times, transient=True) as bar:
         task = bar.add_task("loading the scene", total=None)
         preparation = Preparation(demand={}, assets=assets)
         channel.load_patterns(preparation)
         channel.load_scene(preparation)
         surface, about, notes = surface_of(channel, instant.scene, find_scenery(assets), options.cells)
+        # The rays of a transmitter are shot in parts that fit into the memory, and their powers are added.
         memory = int(options.memory_gib * 2**30)
         part = rays_at_once(surface, devices, options.beam, options.samples, memory)
         bar.update(task, description="shooting rays")
@@ -290,6 +329,7 @@ def _summary(mapped: _Mapped) -> Iterator[str]:
             f"warning: no ray passed through a cell, with {heights}; see whether a transmitter stands below "
             "the ground or inside of something, and whether --height and --area are where its waves go"
         )
+    # Cells at the edges of shadows have few rays in every map: a tenth of all passes without a warning.
     few = np.count_nonzero(found.rays.max(axis=0)[reached] < _FEW_RAYS) / max(int(reached.sum()), 1)
     if few > 0.1:
         yield (
@@ -302,25 +342,3 @@ def _summary(mapped: _Mapped) -> Iterator[str]:
             gain, sinr = (np.median(decibels(v[t][served])) for v in (coverage.gain, coverage.sinr))
             of = np.count_nonzero(served) / np.count_nonzero(reached)
             yield f"{name} serves {of:.1%} of these: median path gain {gain:.1f} dB, SINR {sinr:.1f} dB"
-
-
-def _require_extras() -> None:
-    missing = [extra for extra in ("channel", "plot") if not has_extra(extra)]
-    if missing:
-        raise SetupError(
-            f"a radio map needs what is not installed ({', '.join(missing)}); "
-            f"run: {install_command(*missing)}"
-        )
-
-
-@contextmanager
-def _progress(console: Console) -> Iterator[Progress]:
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console, transient=True) as bar:
-        yield bar

@@ -10,11 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
+from caviar_clients.cli.shared import require_known
 from caviar_clients.plots.rays import ground
 from caviar_clients.session.plausibility import in_hertz
 from caviar_clients.tradeoff.scenes import Scenes
 from caviar_protocol.arrays import Float64Array
-from caviar_protocol.errors import RunError, ScenarioError, suggestion
+from caviar_protocol.errors import RunError, ScenarioError
 from caviar_protocol.scenario import ServiceSpec
 from caviar_protocol.scenario.conversion import Place, convert_settings
 from caviar_protocol.scenario.schema import PATTERNS
@@ -53,20 +54,32 @@ _RELIEF = 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class Wanted:
-    """Which cells are wanted."""
+    """The cells that are wanted."""
 
     height: float = 1.5
     """[m] above the ground."""
     cell: float = 5.0
     """Side of a cell [m]."""
     surface: str = "plane"
-    """``plane``, ``ground``, or the name of a piece of scenery that the cells are draped over."""
+    """``plane``, ``ground``, or the name of a piece of scenery that the cells follow."""
     area: Area | None = None
-    """Absent: all of the scenery."""
+    """Lowest x and y, highest x and y [m]; None: all of the scenery."""
 
 
 def carrier_of(carriers: Sequence[Carrier], name: str | None) -> int:
-    """Index of the carrier that is asked for; by default the first."""
+    """Find the carrier that is mapped.
+
+    Args:
+        carriers: Of the scenario.
+        name: The one asked for; None: the first.
+
+    Returns:
+        Its index.
+
+    Raises:
+        ScenarioError: The scenario has no carrier.
+        RunError: The carrier does not exist.
+    """
     names = [carrier.name for carrier in carriers]
     if not names:
         raise ScenarioError(
@@ -74,13 +87,24 @@ def carrier_of(carriers: Sequence[Carrier], name: str | None) -> int:
         )
     if name is None:
         return 0
-    if name not in names:
-        raise RunError(f"--carrier {name!r} does not exist; {suggestion(name, names)}")
+    require_known("--carrier", name, names)
     return names.index(name)
 
 
 def channel_of(scenes: Scenes, scene: Scene) -> tuple[SionnaChannel, Mapping[str, Path]]:
-    """The ray-traced channel of the run, with its files: scenery that it stands in, patterns of antennas."""
+    """Make the ray-traced channel of a run: of an adaptive one the highest rung that traces rays.
+
+    Args:
+        scenes: The scenario or the recording.
+        scene: Has the objects.
+
+    Returns:
+        The channel, and its files by asset name: scenery, and patterns of antennas.
+
+    Raises:
+        RunError: The run has no channel that traces rays.
+        ScenarioError: The channel has foliage, which a map leaves out.
+    """
     refused = []
     for name, spec in scenes.services.items():
         if spec.role != "channel":
@@ -105,6 +129,7 @@ def channel_of(scenes: Scenes, scene: Scene) -> tuple[SionnaChannel, Mapping[str
                 )
             return cls(settings, run), scenes.assets
         if issubclass(cls, FreeSpaceChannel) and isinstance(settings, FreeSpaceSettings):
+            # Free space is a ray tracer without interactions, in a scene without objects.
             nothing = SionnaSettings(
                 atmosphere=settings.atmosphere,
                 max_depth=0,
@@ -120,7 +145,15 @@ def channel_of(scenes: Scenes, scene: Scene) -> tuple[SionnaChannel, Mapping[str
 
 
 def noise_of(services: Mapping[str, ServiceSpec], carrier: Carrier) -> tuple[float, str]:
-    """Noise power [W] of a receiver, and what it follows from: the settings of the first link."""
+    """Work out the noise power of a receiver from the settings of the first link.
+
+    Args:
+        services: Of the scenario.
+        carrier: Has the bandwidth.
+
+    Returns:
+        Noise power [W], and in words what it follows from.
+    """
     for name, spec in services.items():
         if spec.role == "link" and issubclass(load("link", spec.use), BeamLink):
             settings = convert_settings(
@@ -140,9 +173,19 @@ def noise_of(services: Mapping[str, ServiceSpec], carrier: Carrier) -> tuple[flo
 def surface_of(
     channel: SionnaChannel, scene: Scene, description: Path | None, wanted: Wanted
 ) -> tuple[MeasurementSurface, str, tuple[str, ...]]:
-    """The cells, what they are at or over, and notes for the user.
+    """Make the cells of a map.
 
-    Raises `RunError` where there is no such surface, and for more than `_MOST_CELLS` cells.
+    Args:
+        channel: Has loaded its scene.
+        scene: Has devices and objects, around which cells are where there is no scenery.
+        description: File of the scenery; None: there is none.
+        wanted: Which cells.
+
+    Returns:
+        The cells, in words what they are at or over, and notes for the user.
+
+    Raises:
+        RunError: There is no such surface, nothing of it is in the area, or there are too many cells.
     """
     area = wanted.area or _area(channel, scene)
     _check_size(area, wanted.cell)
@@ -161,8 +204,9 @@ def surface_of(
 
 
 def _check_size(area: Area, cell: float) -> None:
-    """Raise `RunError` with the cell that would do where there are too many."""
+    """Raise `RunError` with the cell that is large enough where there are too many."""
     x0, y0, x1, y1 = area
+    # As a float first, which may be infinite: the whole numbers of rows and columns may not.
     count = max(1.0, (x1 - x0) / cell) * max(1.0, (y1 - y0) / cell)
     if count < _MOST_CELLS and math.prod(cell_counts(area, cell)) <= _MOST_CELLS:
         return
@@ -199,6 +243,7 @@ def _plane(
     if level.size and np.ptp(level) > _RELIEF:
         notes.append(f"the ground rises by {np.ptp(level):.0f} m, --surface ground follows it")
     if level.size and level.max() > surface.z[0, 0]:
+        # The height of the ground under every cell is looked up only where some ground is above the cells.
         x, y = surface.centres[0, :, 0], surface.centres[:, 0, 1]
         buried = np.count_nonzero(heights(triangles, x, y) > surface.z[0, 0]) / (len(x) * len(y))
         if buried:

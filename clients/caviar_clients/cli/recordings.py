@@ -268,7 +268,11 @@ class Part(msgspec.Struct, kw_only=True):
 
 
 def rescue_run(run: Path, console: Console) -> int:
-    """Say what of a run can be read, and save it where a part of it is damaged.
+    """Say what of a run can be read, and save it beside the run where a part is damaged.
+
+    Args:
+        run: The run's directory, in which nothing is changed.
+        console: Where it is said.
 
     Returns:
         0: all is whole; 1: a part is damaged, and the rest is saved; 2: of a part nothing can be read.
@@ -324,6 +328,7 @@ def _examine_recording(run: Path) -> tuple[Recording | None, Part]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RecordingWarning)
+            # Past a gap in a segment, too: a reader of a whole run stops there.
             recording = Recording(run, past_gaps=True)
         damage = list(recording.run_digest().damage)
     except RecordingError as error:
@@ -381,13 +386,14 @@ def _examine_record(
 
 
 def _rebuilt(recording: Recording | None, journal: JournalReader | None) -> RunRecord | None:
-    """The record of a run whose recording has its scenario."""
+    """The record of a run, made from the scenario of its recording and the epochs of its journal."""
     if recording is None or journal is None:
         return None
     try:
         scenario = msgspec.convert(recording.metadata.scenario, Scenario)
     except msgspec.ValidationError:
         return None
+    # A broker that resumes the run takes the next epoch; one that was used would let late answers pass.
     epoch = max((entry.epoch for entry in JournalReader(journal.path)), default=1)
     run = recording.metadata.run
     return RunRecord(run=run, epoch=epoch, endpoint="tcp://127.0.0.1:0", scenario=scenario)
@@ -400,6 +406,7 @@ def _readable_frames(recording: Recording) -> Iterator[int]:
             products = recording.products_of(index)
         except RecordingError:
             continue
+        # Of a product that was held or absent no bytes are stored.
         stored = (p for p in products if p.provenance.status in (Status.FRESH, Status.LATE))
         if all(product.digest == product.provenance.digest for product in stored):
             yield index
@@ -418,6 +425,7 @@ def _save(
     if record is not None:
         record.save(target)
     if journal is not None:
+        # Up to the last whole entry; what a broker began to write when it died is no entry.
         with journal.path.open("rb") as source:
             RunDirectory(target).journal.write_bytes(source.read(journal.end))
     for folder in (RunDirectory(run).assets, RunDirectory(run).checkpoints):

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import MofNCompleteColumn, Progress, TaskID, TimeRemainingColumn
 
 from caviar_clients.cli.plot import agent_names, choose_camera, map_data, scenery
+from caviar_clients.cli.shared import progress_bar
 from caviar_clients.files import make_folder_of
 from caviar_clients.plots.film import GIF_FPS, WRITERS, Reel, find_ffmpeg, needed_ffmpeg
 from caviar_clients.plots.labels import common_prefix
@@ -41,6 +42,7 @@ class Film:
     file: Path
     frames: int
     fps: float
+    """Frames shown a second."""
     speed: float
     """Simulated time over playing time."""
     size: tuple[int, int]
@@ -84,12 +86,14 @@ def film_run(
     chosen = choose_user(recording, user or "") if "link" in recording.topics else None
     survey = _survey(recording, _indices(recording, frames), chosen, camera)
     make_folder_of(file)
+    # Frames pass one by one, twice: limits and scales of the first pass hold in all pictures of the second.
     moving = MovingMap(survey.plan, pixels)
     count = len(survey.indices)
     spread = sorted({round(i) for i in np.linspace(0, count - 1, min(_SAMPLES, count))})
     samples = list(_pictures(recording, survey, moving, chosen, spread)) if suffix == ".gif" else []
     samples = samples or list(_pictures(recording, survey, moving, chosen, spread[:1]))
-    with _progress(console) as bar:
+    columns = (MofNCompleteColumn(), TimeRemainingColumn())
+    with progress_bar(console or Console(quiet=True), *columns) as bar:
         task = bar.add_task("drawing", total=count)
         drawn = _counted(_pictures(recording, survey, moving, chosen, range(count)), bar, task)
         WRITERS[suffix](Reel(drawn, count, rate, samples, key_colours()), file)
@@ -106,6 +110,7 @@ def _format(
         raise SetupError(f"{file} {what}; write .mp4 or .gif")
     if suffix == ".mp4":
         needed_ffmpeg(file)
+    # A GIF that is faster is slowed down by viewers (`GIF_FPS`).
     rate = min(max(1e9 / period_ns, SLOWEST), FASTEST) if fps is None else fps
     if not 0 < rate <= (GIF_FPS if suffix == ".gif" else 240):
         raise SetupError(f"--fps is {rate:g}; write more than 0 and at most 50 for a GIF, 240 for an MP4")
@@ -116,7 +121,7 @@ def _format(
 
 
 def _indices(recording: Recording, frames: str | None) -> list[int]:
-    """Places in the recording of the frames asked for."""
+    """Places in the recording of the frames that are asked for."""
     if frames is None:
         return list(range(len(recording)))
     numbers = [entry.frame for i in range(len(recording)) if (entry := recording.entry(i)).episode == 0]
@@ -214,7 +219,7 @@ def _cut(data: UserSeries, indices: list[int]) -> UserSeries:
 def _pictures(
     recording: Recording, survey: _Survey, moving: MovingMap, user: User | None, steps: Sequence[int]
 ) -> Iterator[UInt8Array]:
-    """Of these steps of the survey; a camera that saw nothing in a frame keeps its last picture."""
+    """Pictures of some steps of the survey; a camera that saw nothing in a frame keeps its last picture."""
     last = None
     for step in steps:
         frame = RecordedFrame(recording, survey.indices[step])
@@ -229,13 +234,3 @@ def _counted(pictures: Iterator[UInt8Array], bar: Progress, task: TaskID) -> Ite
     for picture in pictures:
         yield picture
         bar.advance(task)
-
-
-def _progress(console: Console | None) -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=console or Console(quiet=True),
-    )
