@@ -328,7 +328,7 @@ def _examine_recording(run: Path) -> tuple[Recording | None, Part]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RecordingWarning)
-            # Past a gap in a segment, too: a reader of a whole run stops there.
+            # Segments behind one that is missing, too: other readers stop there.
             recording = Recording(run, past_gaps=True)
         damage = list(recording.run_digest().damage)
     except RecordingError as error:
