@@ -92,9 +92,8 @@ class Interpolation:
     phase and 1/τ is interpolated as a complex number: in magnitude and phase it would have to guess turns,
     and could not pass through zero as it does at Brewster's angle. The phase comes from the delay, see
     `course`. A path of one keyframe fades towards the other: where the instant of the change is unknown, that
-    has 2/3 of the mean
-        squared
-    error of switching in the middle, and no jump. Devices that one keyframe lacks are left out.
+    has 2/3 of the mean squared error of switching in the middle, and no jump. Devices that one keyframe lacks
+    are left out.
 
     Args:
         before: The earlier keyframe.
