@@ -28,5 +28,6 @@ def _replace(folder: Path, pages: Mapping[str, str]) -> None:
             file.unlink()
     for name, text in pages.items():
         file = folder / name
+        # Sphinx renders anew what has another time of change, whatever its content is.
         if not file.exists() or file.read_text("utf-8") != text:
             file.write_text(text, encoding="utf-8")

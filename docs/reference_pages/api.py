@@ -45,6 +45,7 @@ def _packages(top: str) -> dict[str, list[str]]:
     if spec is None or spec.submodule_search_locations is None:
         raise ModuleNotFoundError(top)
     found: dict[str, list[str]] = {top: []}
+    # Names alone: importing every module would load ray tracer and SUMO before autodoc does.
     for module in pkgutil.walk_packages(spec.submodule_search_locations, f"{top}."):
         if any(part.startswith("_") for part in module.name.split(".")):
             continue
@@ -78,6 +79,7 @@ def _summary(name: str) -> str:
 
 def hide_fields(app: Any, kind: str, name: str, member: Any, skip: bool, options: Any) -> bool | None:
     """Skip fields of structs, which `finish_docstring` tabulates, and types of fields, which SPEC.md has."""
+    # autodoc says which kind of owner a member has, and not which one.
     document = app.env.current_document
     owner: Any = sys.modules.get(document.autodoc_module or "")
     for part in (document.autodoc_class or "").split(".") if kind == "class" else ():
@@ -88,6 +90,7 @@ def hide_fields(app: Any, kind: str, name: str, member: Any, skip: bool, options
 
 def shorten_bases(app: Any, name: str, member: Any, options: Any, bases: list[Any]) -> None:
     """Show base classes without type arguments, and none that is private."""
+    # `Generic[P]` and the like have no page that a link could lead to.
     plain = [get_origin(base) or base for base in bases]
     bases[:] = [base for base in plain if not base.__name__.startswith("_")] or [object]
 

@@ -17,6 +17,7 @@ from . import markdown
 
 def pages() -> Iterator[tuple[str, str]]:
     """File name and text of each page."""
+    # The parser itself and not the text of --help: options have their types and ranges there.
     root: Any = typer.main.get_command(app)
     context = root.context_class(root, info_name="caviar")
     groups: dict[str, list[tuple[str, str]]] = {}
@@ -70,6 +71,7 @@ def _kind(parameter: Any) -> str:
     kind = next(iter(get_args(kind)), kind)  # of a list, its element
     low, high = parameter.min, parameter.max
     bounds = [f"≥ {low:g}"] if low is not None else []
+    # 2^31 is a bound of the parser, and no property of the option.
     bounds += [f"≤ {high:g}"] if high is not None and high < 2**31 else []
     return " ".join([_KINDS[kind], *bounds]) + (" …" if parameter.multiple else "")
 

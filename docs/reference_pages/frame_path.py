@@ -46,6 +46,7 @@ def traced_calls(frame: int) -> list[tuple[str, str]]:
     def note(stack: Any, event: str, _: Any) -> None:
         module = stack.f_globals.get("__name__", "")
         name = stack.f_code.co_qualname
+        # Comprehensions and methods that dataclasses generate are no functions of a file.
         ours = event == "call" and module.partition(".")[0] in PACKAGES
         if ours and not re.search("<|__create_fn__", name):
             found.setdefault((module, name))
@@ -53,6 +54,7 @@ def traced_calls(frame: int) -> list[tuple[str, str]]:
     def switch(finished: Any) -> None:
         sys.setprofile(note if finished.frame == frame - 1 else None)
 
+    # Not frame 0, in which inputs of lag 1 are always absent.
     scenario = load_scenario("smoke")
     short = replace(scenario, run=replace(scenario.run, frames=frame + 2))
     with TemporaryDirectory() as folder:

@@ -79,6 +79,7 @@ def _keys(cls: type[msgspec.Struct], inner: Structs) -> Iterator[str]:
 
 def _key(name: str, kind: str, unit: str, default: str, _: str, meaning: str) -> tuple[str, ...]:
     kind = kind.replace("](#field-types)", "](../../../protocol/SPEC.md#field-types)")
+    # Numbers of five digits and more with commas, as in prose.
     kind = re.sub(r"\b(\d{5,})(?:\.0)?\b", lambda number: f"{int(number[1]):,}", kind)
     plain = default in ("required", "left out", "all defaults")
     return f"`{name}`", kind, "" if unit == "1" else unit, default if plain else f"`{default}`", meaning
