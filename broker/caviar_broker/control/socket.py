@@ -139,6 +139,12 @@ def locked(directory: Path) -> Iterator[None]:
 def connect(directory: Path) -> socket.socket:
     """Connect to the broker that runs in a directory.
 
+    Args:
+        directory: Directory of the run.
+
+    Returns:
+        A blocking socket with a time-out of `REACH_S`.
+
     Raises:
         RunError: No broker runs there, or it does not answer within `REACH_S`.
     """

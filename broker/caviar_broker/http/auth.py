@@ -166,7 +166,12 @@ def token_of(headers: Mapping[str, str], tokens: Tokens, subprotocols: Iterable[
 
 
 def token_shown(headers: Mapping[str, str], subprotocols: Iterable[str]) -> bool:
-    """Whether a request shows a token, of whatever worth."""
+    """Whether a request shows a token, valid or not.
+
+    Example:
+        >>> token_shown({"authorization": "Bearer abc"}, []), token_shown({}, ["caviar"])
+        (True, False)
+    """
     return bool(_text(headers, subprotocols))
 
 
@@ -178,5 +183,10 @@ def _text(headers: Mapping[str, str], subprotocols: Iterable[str]) -> str:
 
 
 def subprotocol(offered: Iterable[str]) -> str | None:
-    """Choose the subprotocol of the answer: ours, if it is offered; never the one with the token."""
+    """Choose the subprotocol of the answer: ours, if it is offered; never the one with the token.
+
+    Example:
+        >>> subprotocol([f"{BEARER}abc", SUBPROTOCOL]) == SUBPROTOCOL, subprotocol(["chat"])
+        (True, None)
+    """
     return SUBPROTOCOL if SUBPROTOCOL in offered else None

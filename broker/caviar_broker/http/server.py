@@ -232,7 +232,15 @@ def http_server(app: Any, tell: Callable[[str], None], *, own_process: bool = Fa
 
 
 def listening_socket(host: str, port: int) -> socket.socket:
-    """A listening socket; what is accepted from it has its options."""
+    """Make a listening socket; what is accepted from it has its options.
+
+    Args:
+        host: Address or name of this machine.
+        port: Port; 0: any free one.
+
+    Raises:
+        RunError: The address is taken, or not this machine's.
+    """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     found = socket.socket(family, socket.SOCK_STREAM)
     found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

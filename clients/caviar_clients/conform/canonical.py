@@ -154,6 +154,10 @@ def product_digest(header: bytes, body: bytes) -> str:
     """Compute the digest of a product as SPEC.md says, section Digests.
 
     SHA-256 of the length of the header (8 bytes, little-endian), the header and the body.
+
+    Example:
+        >>> product_digest(b"\\x80", b"")[:16]
+        '7adad23172bd9288'
     """
     return hashlib.sha256(len(header).to_bytes(8, "little") + header + body).hexdigest()
 
@@ -182,7 +186,14 @@ def checked(received: Received) -> Fields:
 
 
 def not_canonical(received: Received) -> str:
-    """Say why the header of a message that `checked` let pass is not in canonical form; empty: it is."""
+    """Say why the header of a message is not in canonical form.
+
+    Args:
+        received: A message that `checked` let pass.
+
+    Returns:
+        Kind of the message, place, form found and form needed; empty where the form is canonical.
+    """
     header = received.parts[0]
     fields = unpack(header)
     message = decode_message(header)

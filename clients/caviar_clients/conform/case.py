@@ -108,7 +108,14 @@ def summary(verdicts: Sequence[Verdict]) -> str:
 
 
 def repeated(verdicts: Sequence[Verdict]) -> list[str]:
-    """Make a line for each group of cases that failed with the same words: they may have one cause."""
+    """Make a line for each group of cases that failed with the same words: they may have one cause.
+
+    Args:
+        verdicts: Verdicts of a run.
+
+    Returns:
+        A line for each group of two or more, the largest first.
+    """
     causes: dict[str, list[Verdict]] = {}
     for verdict in verdicts:
         if verdict.outcome == "fail":
@@ -122,7 +129,13 @@ def repeated(verdicts: Sequence[Verdict]) -> list[str]:
 
 
 def as_json(verdicts: Sequence[Verdict]) -> str:
-    """Write verdicts as a JSON object with ``verdicts`` and the number of each outcome."""
+    """Write verdicts as a JSON object with ``verdicts`` and the number of each outcome.
+
+    Example:
+        >>> import json
+        >>> json.loads(as_json([]))
+        {'pass': 0, 'fail': 0, 'not applicable': 0, 'verdicts': []}
+    """
     counts = Counter(verdict.outcome for verdict in verdicts)
     content: dict[str, object] = {outcome: counts[outcome] for outcome in OUTCOMES}
     content["verdicts"] = list(verdicts)

@@ -43,12 +43,22 @@ def pack(value: Any) -> bytes:
 
 
 def unpack(data: bytes) -> Any:
-    """Decode all these bytes; raises one of `BROKEN`."""
+    """Decode all these bytes; raises one of `BROKEN`.
+
+    Example:
+        >>> unpack(bytes.fromhex("81a56672616d65cd012c"))
+        {'frame': 300}
+    """
     return msgpack.unpackb(data, raw=False)
 
 
 def in_order(value: Any) -> Any:
-    """Sort the keys of all maps of a plain value as the canonical form does: by their UTF-8 bytes."""
+    """Sort the keys of all maps of a plain value as the canonical form does: by their UTF-8 bytes.
+
+    Example:
+        >>> in_order({"t_ns": 0, "frame": [{"b": 1, "a": 2}]})
+        {'frame': [{'a': 2, 'b': 1}], 't_ns': 0}
+    """
     if isinstance(value, dict):
         return {key: in_order(value[key]) for key in sorted(value, key=str.encode)}
     return [in_order(item) for item in value] if isinstance(value, list) else value

@@ -98,7 +98,15 @@ def heartbeats(kit: Kit) -> str:
 
 
 def check_beats(session: Session, since: int) -> str:
-    """Check all HEARTBEATs of a life, and that enough of them came behind the first ``since``."""
+    """Check all HEARTBEATs of a life, and that enough of them came in the time of `BEATS`.
+
+    Args:
+        session: The life.
+        since: Number of HEARTBEATs that had come when that time began.
+
+    Returns:
+        How many came, for the verdict.
+    """
     beats = session.pulse.beats
     if session.pulse.wrong:
         raise Failed("ATTACH, then only HEARTBEAT on the heartbeat connection", session.pulse.wrong[0])

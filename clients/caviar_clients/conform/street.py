@@ -126,7 +126,12 @@ def product(topic: str, source: str, frame: int, parts: frozenset[str] = frozens
 
 
 def known_parts(topic: str, hello: Fields) -> list[str]:
-    """Parts of a topic that exist in the protocol version which a client states in HELLO."""
+    """List the parts of a topic that exist in the protocol version which a client states in HELLO.
+
+    Example:
+        >>> known_parts("channel", {"version": [1, 0]}), known_parts("channel", {"version": [1, 4]})
+        (['h'], ['h', 'hf', 'taps'])
+    """
     spoken = tuple(hello["version"])
     return [
         part
@@ -141,7 +146,17 @@ def scenario_of(hello: Fields) -> str:
 
 
 def briefing(hello: Fields, directory: str = "") -> Fields:
-    """Make ``scenario`` of WELCOME for the client that said this HELLO; ``directory`` is for recorders."""
+    """Make ``scenario`` of WELCOME for a client.
+
+    Args:
+        hello: HELLO of the client.
+        directory: Folder that a recorder writes to.
+
+    Example:
+        >>> made = briefing({"role": "agent", "name": "pilot", "version": [1, 4]})
+        >>> [device["name"] for device in made["devices"]]
+        ['bs', 'rx', 'lidar', 'camera']
+    """
     plain = resolved(parse_scenario(scenario_of(hello)))
     # A world under test is itself the one that publishes the devices, whatever its name.
     world = hello["name"] if hello["role"] == "world" else WORLD

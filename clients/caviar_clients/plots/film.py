@@ -88,6 +88,10 @@ def needed_ffmpeg(file: Path) -> str:
 def write_gif(reel: Reel, file: Path) -> None:
     """Write an endless animated GIF with one palette for all pictures.
 
+    Args:
+        reel: The pictures.
+        file: GIF that is written.
+
     Raises:
         RunError: The file cannot be written; then there is none.
     """
@@ -134,6 +138,10 @@ def _cells(colours: UInt8Array) -> Int64Array:
 
 def write_mp4(reel: Reel, file: Path) -> None:
     """Write an MP4 that browsers and slides play: H.264 where ffmpeg has it, planes of 4:2:0.
+
+    Args:
+        reel: The pictures.
+        file: MP4 that is written.
 
     Raises:
         SetupError: There is no ffmpeg.

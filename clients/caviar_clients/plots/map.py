@@ -108,7 +108,15 @@ def draw_map(data: MapData, file: Path) -> None:
 
 
 def view_of(data: MapData, beam: Beam | None) -> View:
-    """Choose limits of x and y [m]: objects, devices, beam, ray points unless far off; at least 40 m."""
+    """Choose the limits of a map: objects, devices, beam, ray points unless far off; at least 40 m.
+
+    Args:
+        data: Contents of the map.
+        beam: Outline of the chosen beam; None: there is none.
+
+    Returns:
+        Limits of x and of y [m].
+    """
     devices = [device_pose(data.scene, device).position[:2] for device in data.scene.devices]
     core = np.concatenate([data.scene.position[:, :2], np.array(devices).reshape(-1, 2)])
     if beam is not None:
@@ -197,7 +205,14 @@ class Beam:
 
 
 def chosen_beam(data: MapData) -> Beam | None:
-    """Compute the outline of the beam that was chosen for the user of the map; None without one."""
+    """Compute the outline of the beam that was chosen for the user of the map.
+
+    Args:
+        data: Contents of the map; its link has the choice, its ``beam_gain`` the pattern.
+
+    Returns:
+        The outline, cut at the elevation of the user; None where no beam was chosen.
+    """
     found = _chosen(data)
     if found is None or data.beam_gain is None:
         return None
@@ -243,7 +258,13 @@ def _chosen(data: MapData) -> tuple[AntennaDevice, int, str] | None:
 
 
 def draw_objects(axes: Any, data: MapData, labels: Labels | None = None) -> None:
-    """Draw bounding boxes from above, a mark at the front, names where there is room."""
+    """Draw bounding boxes from above, a mark at the front, names where there is room.
+
+    Args:
+        axes: Axes of the map, with their limits.
+        data: Contents of the map.
+        labels: How names stand; None: as in a single picture.
+    """
     from matplotlib.collections import PolyCollection
 
     scene = data.scene

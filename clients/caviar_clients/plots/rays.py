@@ -101,7 +101,12 @@ def scale(gains: Float64Array) -> tuple[float, float]:
 
 
 def unit_vectors(angles: Float64Array) -> Float64Array:
-    """Convert (zenith, azimuth) [rad] to unit vectors, Shape ``[N, 2]`` to ``[N, 3]``."""
+    """Convert (zenith, azimuth) [rad] to unit vectors, Shape ``[N, 2]`` to ``[N, 3]``.
+
+    Example:
+        >>> unit_vectors(np.array([[np.pi / 2, 0.0]])).round(3).tolist()
+        [[1.0, 0.0, 0.0]]
+    """
     zenith, azimuth = angles[:, 0], angles[:, 1]
     sine = np.sin(zenith)
     return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.cos(zenith)], axis=-1)

@@ -195,7 +195,12 @@ _SIZES = {OPTIMUM: 54, AGENT: 24, BASELINE: 7}
 
 
 def curves(data: UserSeries, agent: str) -> list[tuple[str, Float64Array, dict[str, Any]]]:
-    """Return label, values and style of each curve."""
+    """Return label, values and style of each curve.
+
+    Args:
+        data: The user.
+        agent: Name of the agent, for the label.
+    """
     # From wide and dark to thin and dashed: curves that coincide, as those of a perfect agent, all show.
     return [
         ("optimum", data.best, {"color": OPTIMUM, "linewidth": 2.8}),

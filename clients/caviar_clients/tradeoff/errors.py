@@ -50,6 +50,10 @@ def delay_spread_s(tau: Float64Array, power: Float64Array) -> float:
     Args:
         tau: Delays of the paths [s], Shape ``[P]``.
         power: Their powers, Shape ``[P]``.
+
+    Example:
+        >>> delay_spread_s(np.array([0.0, 1e-7]), np.array([1.0, 1.0]))
+        5e-08
     """
     # About the mean: the difference of two squares of a microsecond keeps no picoseconds.
     total = power.sum()
@@ -67,6 +71,11 @@ def angular_spread_rad(angle: Float64Array, power: Float64Array) -> float:
     Args:
         angle: Angles of the paths [rad], Shape ``[P]``.
         power: Their powers, Shape ``[P]``.
+
+    Example:
+        >>> spread = angular_spread_rad(np.radians([-30.0, 30.0]), np.array([1.0, 1.0]))
+        >>> round(math.degrees(spread), 2)
+        30.73
     """
     resultant = abs((np.exp(1j * angle) * power).sum()) / power.sum()
     # The resultant of a single wave may be above 1 by rounding, and its logarithm positive.
@@ -77,12 +86,21 @@ def nmse(h: Complex128Array, reference: Complex128Array) -> float:
     """Compute the normalised squared error ‖H − H_ref‖_F² / ‖H_ref‖_F², phases included.
 
     1 for H = 0. Its mean over channels is the NMSE as usually defined, E[‖H − H_ref‖² / ‖H_ref‖²].
+
+    Example:
+        >>> round(nmse(np.array([[1.1 + 0j]]), np.array([[1.0 + 0j]])), 6)
+        0.01
     """
     return float((np.abs(h - reference) ** 2).sum() / (np.abs(reference) ** 2).sum())
 
 
 def decibel(ratio: float) -> float:
-    """Convert a ratio of powers to dB, not below `FLOOR_DB`."""
+    """Convert a ratio of powers to dB, not below `FLOOR_DB`.
+
+    Example:
+        >>> round(decibel(0.5), 2), decibel(0.0)
+        (-3.01, -200.0)
+    """
     return max(FLOOR_DB, 10 * float(np.log10(ratio))) if ratio > 0 else FLOOR_DB
 
 
@@ -95,6 +113,10 @@ def capacity_bps_hz(h: Complex128Array, power_over_noise: float) -> float:
     Args:
         h: The channel, Shape ``[N_r, N_t]``.
         power_over_noise: P/N.
+
+    Example:
+        >>> round(capacity_bps_hz(np.eye(2, dtype=complex), 10.0), 3)
+        5.17
     """
     # Without H·H*: its condition is that of H squared.
     singular = np.linalg.svd(h, compute_uv=False)
@@ -102,12 +124,22 @@ def capacity_bps_hz(h: Complex128Array, power_over_noise: float) -> float:
 
 
 def top_k(abs_y: Float64Array, k: int) -> list[int]:
-    """Rank the ``k`` greatest |y|: flat indices, greatest first; of equal ones the lowest first."""
+    """Rank the ``k`` greatest |y|: flat indices, greatest first; of equal ones the lowest first.
+
+    Example:
+        >>> top_k(np.array([[0.1, 0.9], [0.4, 0.2]]), 2)
+        [1, 2]
+    """
     return [int(i) for i in np.argsort(-abs_y.ravel(), kind="stable")[:k]]
 
 
 def hit(ranked: list[int], reference: list[int], k: int) -> bool:
-    """Whether the reference's best pair is among the first ``k`` (top-k accuracy)."""
+    """Whether the reference's best pair is among the first ``k`` (top-k accuracy).
+
+    Example:
+        >>> hit([1, 2], [2, 1], 1), hit([1, 2], [2, 1], 2)
+        (False, True)
+    """
     return reference[0] in ranked[:k]
 
 
@@ -120,6 +152,10 @@ def pair_loss_db(reference_abs_y: Float64Array, chosen: int) -> float:
     Args:
         reference_abs_y: |y| of all pairs of beams in the reference, Shape ``[Nt, Nr]``.
         chosen: Flat index of the pair that is chosen.
+
+    Example:
+        >>> round(pair_loss_db(np.array([[1.0, 0.5]]), 1), 2)
+        6.02
     """
     flat = reference_abs_y.ravel()
     best, got = float(flat.max()), float(flat[chosen])

@@ -68,12 +68,22 @@ def significant(value: float | None) -> str:
 
 
 def level(value: float | None) -> str:
-    """Write a ratio in dB to a tenth, with a minus sign where it is negative."""
+    """Write a ratio in dB to a tenth, with a minus sign where it is negative.
+
+    Example:
+        >>> level(-3.14), level(None)
+        ('−3.1', '–')
+    """
     return NOTHING if value is None else f"{value:.1f}".replace("-", "−")
 
 
 def percent(share: float | None) -> str:
-    """Write a share to a tenth of a percent."""
+    """Write a share to a tenth of a percent.
+
+    Example:
+        >>> percent(0.857)
+        '85.7 %'
+    """
     return NOTHING if share is None else f"{100 * share:.1f} %"
 
 
@@ -325,7 +335,12 @@ def _skipped(report: Report) -> list[str]:
 
 
 def by_reason(skipped: Sequence[Skipped]) -> dict[str, list[str]]:
-    """Group the labels of settings that were not measured by the reason."""
+    """Group the labels of settings that were not measured by the reason.
+
+    Example:
+        >>> by_reason([Skipped(setting=name, block="arrays", reason="no time") for name in ("a", "b")])
+        {'no time': ['a', 'b']}
+    """
     found: dict[str, list[str]] = {}
     for entry in skipped:
         found.setdefault(entry.reason, []).append(entry.setting)
