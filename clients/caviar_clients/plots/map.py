@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from caviar_clients.plots.labels import Labels, name_objects
-from caviar_clients.plots.rays import Footprints, Rays, rays, scale
+from caviar_clients.plots.rays import OUTLINE, Footprints, Rays, from_above, rays, scale
 from caviar_clients.plots.style import (
     BLACK,
     GREY,
@@ -39,9 +39,6 @@ View = tuple[tuple[float, float], tuple[float, float]]
 BeamGain = Callable[[AntennaArray, int, Float64Array], Float64Array]
 """``gain(array, beam, directions)``: amplitude of a codebook beam towards unit vectors in device
 axes, Shape ``[N, 3]`` to ``[N]``, 1 at its greatest."""
-
-OUTLINE = ((0.5, 0.5), (0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5))
-"""Corners of an object's box from above, of its length and width."""
 
 BEAM_ALPHA = 0.22
 """Opacity of the beam's area: rays and objects below it show."""
@@ -287,23 +284,6 @@ def draw_objects(axes: Any, data: MapData, labels: Labels | None = None) -> None
         if color in colors:
             legend_square(axes, label, color)
     name_objects(axes, scene, boxes, carriers, labels or Labels())
-
-
-def from_above(scene: Scene, points: Sequence[Sequence[float]]) -> Float64Array:
-    """Place points on each object of a scene.
-
-    Args:
-        scene: The scene with N objects.
-        points: x and y of each point on a box from −½ to ½.
-
-    Returns:
-        x and y in the world [m], Shape ``[N, len(points), 2]``.
-    """
-    found = np.zeros((len(scene.names), len(points), 2))
-    for i in range(len(scene.names)):
-        rotation = rotation_matrix(scene.orientation[i].tolist())[:2, :2]
-        found[i] = scene.position[i, :2] + (np.array(points) * scene.dimensions[i, :2]) @ rotation.T
-    return found
 
 
 def served_object(data: MapData) -> str:

@@ -1,4 +1,4 @@
-"""What a map draws of the world: the paths of a channel, and scenery as footprints from above."""
+"""What a map draws of the world: the paths of a channel, objects and scenery from above."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
+from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.space.ply import read_ply
 from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import Channel, Scene
@@ -123,6 +124,27 @@ def _straight(
     line = line / distance
     result: BoolArray = (leaving @ line >= _STRAIGHT) & (coming @ -line >= _STRAIGHT)
     return result
+
+
+OUTLINE = ((0.5, 0.5), (0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5))
+"""Corners of an object's box from above, of its length and width."""
+
+
+def from_above(scene: Scene, points: Sequence[Sequence[float]]) -> Float64Array:
+    """Place points on each object of a scene.
+
+    Args:
+        scene: The scene with N objects.
+        points: x and y of each point on a box from −½ to ½.
+
+    Returns:
+        x and y in the world [m], Shape ``[N, len(points), 2]``.
+    """
+    found = np.zeros((len(scene.names), len(points), 2))
+    for i in range(len(scene.names)):
+        rotation = rotation_matrix(scene.orientation[i].tolist())[:2, :2]
+        found[i] = scene.position[i, :2] + (np.array(points) * scene.dimensions[i, :2]) @ rotation.T
+    return found
 
 
 Box = tuple[Sequence[float], Sequence[float]]

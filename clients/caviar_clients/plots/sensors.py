@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from caviar_clients.plots.map import OUTLINE, from_above
+from caviar_clients.plots.rays import OUTLINE, from_above
 from caviar_clients.plots.style import BLACK, LIGHT_GREY, ORANGE, figure, legend_below
 from caviar_protocol.arrays import BoolArray, Float32Array, Float64Array, Int32Array, UInt8Array
 from caviar_protocol.space.coordinates import rotation_matrix
