@@ -2,7 +2,7 @@
 
 `Connection` carries everything that is ordered. A `HeartbeatThread` has a socket of its own (contract,
 clause 2) and watches that the broker lives. `Handshake` explains why a broker with keys does not let a
-service in.
+service in. `Termination` is the order to end, which both obey.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import logging
 import math
 import os
 import struct
+import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -25,7 +26,6 @@ from caviar_protocol.fields import MAX_BODY
 from caviar_protocol.host import SignOfLife
 from caviar_protocol.keys import BROKER_KEY_VARIABLE, KEY_VARIABLE, Credentials
 from caviar_protocol.messages import Attach, Heartbeat, HeartbeatAck, Welcome
-from caviar_services.process import Termination
 
 _log = logging.getLogger("caviar.service")
 
@@ -41,6 +41,59 @@ LINGER_MS = 500
 SILENCE_GRACE_S = 1.0
 """[s] from the broker's death, or from the end of the time in which it could be reached again, until a
 service that is still busy is ended by force."""
+
+
+class Termination:
+    """The order to end, as a flag, and as a certain end of the process.
+
+    Example:
+        >>> termination = Termination()
+        >>> termination.requested
+        False
+        >>> termination.enforce(60.0, 1, "too slow").set()  # called off
+    """
+
+    def __init__(self) -> None:
+        self.requested = False
+        self._called_off: list[threading.Event] = []
+
+    def enforce(self, grace_s: float, status: int, last_words: str) -> threading.Event:
+        """See to it that the process ends, unless it does so itself in time.
+
+        Args:
+            grace_s: Time until it is ended by force [s].
+            status: Its exit status then.
+            last_words: What it writes to standard error then.
+
+        Returns:
+            Set this event to call it off.
+        """
+        called_off = threading.Event()
+        self._called_off.append(called_off)
+
+        def end() -> None:
+            if not called_off.wait(grace_s):
+                self.end(status, last_words)
+
+        threading.Thread(target=end, name="end", daemon=True).start()
+        return called_off
+
+    def end(self, status: int, last_words: str) -> None:
+        """End the process at once.
+
+        Args:
+            status: Exit status.
+            last_words: Written to standard error.
+        """
+        sys.stderr.write(f"{last_words}\n")
+        # Not `sys.exit`: a thread that is not the main one would end alone, and a call that does not return
+        # keeps the interpreter from ending.
+        os._exit(status)
+
+    def finished(self) -> None:
+        """Everything is closed; the process ends by itself."""
+        for called_off in self._called_off:
+            called_off.set()
 
 
 class Terminated(BaseException):

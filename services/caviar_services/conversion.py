@@ -32,6 +32,7 @@ from caviar_services.service import (
 
 _log = logging.getLogger("caviar.service")
 
+# Texts of a FAULT travel to the broker and into summaries: a repr of an array in an error would fill them.
 MAX_MESSAGE = 2000
 """[characters] of a FAULT's message."""
 MAX_DETAIL = 20000
@@ -39,7 +40,19 @@ MAX_DETAIL = 20000
 
 
 def run_info(name: str, welcome: m.Welcome, progress: Progress) -> RunInfo:
-    """What WELCOME tells about the run."""
+    """Read what WELCOME says about the run.
+
+    Args:
+        name: Name of the service.
+        welcome: The message.
+        progress: Where the service reports what it does.
+
+    Example:
+        >>> times = {"heartbeat_ns": 100_000_000, "liveness_ns": 1_500_000_000}
+        >>> welcome = m.Welcome(version=m.PROTOCOL_VERSION, epoch=2, attempt=1, run="demo", seed=1, **times)
+        >>> run_info("agent", welcome, lambda phase, grace_s: None).again  # the broker was restarted
+        True
+    """
     scenario = welcome.scenario
     return RunInfo(
         name=name,
@@ -57,12 +70,22 @@ def run_info(name: str, welcome: m.Welcome, progress: Progress) -> RunInfo:
 
 
 def is_needed(service: Service[Any], order: m.Prepare) -> bool:
-    """Whether anybody wants what the service makes, or it is there for its own sake."""
+    """Whether a consumer wants what the service makes, or the service is there for its own sake.
+
+    Args:
+        service: The service.
+        order: PREPARE, with the demand for its products.
+    """
     return bool(order.demand) or service.role in ("agent", "recorder") or not service.outputs
 
 
 def content_rules(service: Service[Any], order: m.Prepare) -> ContentRules:
-    """What WELCOME and PREPARE say about the products that a service is going to get."""
+    """Collect what WELCOME and PREPARE say about the products that a service is going to get.
+
+    Args:
+        service: The service, which knows carriers and devices of the run.
+        order: PREPARE, with producers, prefixes and assets.
+    """
     run = service.run
     worlds = order.producers.get("scene", ())
     devices: dict[str, list[DeviceSpec]] = {world: [] for world in worlds}
@@ -81,7 +104,14 @@ def content_rules(service: Service[Any], order: m.Prepare) -> ContentRules:
 def granted_frame(
     service: Service[Any], reset: m.Reset, grant: m.Grant, inputs: tuple[FrameInput, ...]
 ) -> Frame:
-    """The frame that GRANT grants, in the episode that RESET began."""
+    """Make the frame that GRANT grants, in the episode that RESET began.
+
+    Args:
+        service: The service.
+        reset: RESET of the episode.
+        grant: The grant.
+        inputs: Its inputs (`frame_inputs`).
+    """
     return Frame(
         episode=grant.episode,
         number=grant.frame,
@@ -126,9 +156,23 @@ def frame_inputs(
 def encoded_done(
     identity: dict[str, int], use: str, grant: m.Grant, result: StepResult, step_ns: int
 ) -> tuple[m.Done, list[Any]]:
-    """DONE, and header and body of each product behind it; ``step_ns`` is what the step took.
+    """Make DONE, and header and body of each product behind it.
 
-    Raises `PayloadError` for a product that is not its topic's.
+    Args:
+        identity: Epoch and attempt of the service.
+        use: What the implementation is called, for the error.
+        grant: What is answered.
+        result: What the service made of the frame.
+        step_ns: What the step took [ns].
+
+    Raises:
+        PayloadError: A product is not its topic's.
+
+    Example:
+        >>> grant = m.Grant(epoch=1, attempt=1, episode=0, frame=3, t_ns=0)
+        >>> done, parts = encoded_done({"epoch": 1, "attempt": 1}, "link", grant, StepResult(), 1_000_000)
+        >>> done.frame, done.measured["step"], parts
+        (3, 1000000, [])
     """
     started = time.monotonic_ns()
     headers, parts = [], list[Any]()
@@ -154,9 +198,15 @@ def encoded_done(
 def plain_done(
     identity: dict[str, int], use: str, grant: m.Grant, result: StepResult
 ) -> tuple[m.Done, tuple[Payload, ...]]:
-    """DONE without digests, and the products as they are, for a consumer in this process.
+    """Make DONE without digests, and the products as they are, for a consumer in this process.
 
     Decisions, counts and times are left out: only a recorder gets them, and there is none.
+
+    Args:
+        identity: Epoch and attempt of the service.
+        use: What the implementation is called, for the error.
+        grant: What is answered.
+        result: What the service made of the frame.
 
     Raises:
         PayloadError: A product is not its topic's.
@@ -175,6 +225,7 @@ def plain_done(
 
 
 def _products(use: str, result: StepResult) -> list[tuple[str, Payload]]:
+    # Sorted, so that DONE and what is behind it are the same bytes whatever order a service makes them in.
     products = sorted(result.products.items()) if len(result.products) > 1 else [*result.products.items()]
     for topic, payload in products:
         if type(payload) is not PAYLOADS.get(topic) and not isinstance(payload, Encoded):
@@ -182,19 +233,22 @@ def _products(use: str, result: StepResult) -> list[tuple[str, Payload]]:
     return products
 
 
-_log = logging.getLogger("caviar.service")
-
-KEPT_BYTES = 64 << 20
-"""[B] of answers that are kept, beyond the newest two."""
-MAX_MESSAGE = 2000
-MAX_DETAIL = 20000
-"""[characters] of a FAULT's texts."""
-
-
 def fault_from(
     error: Exception, identity: Mapping[str, int], phase: str, episode: int = 0, frame: int = -1
 ) -> m.Fault:
-    """FAULT that says what an exception says, with a traceback where it is no `CaviarError`."""
+    """Make a FAULT that says what an exception says, with a traceback where it is no `CaviarError`.
+
+    Args:
+        error: The exception.
+        identity: Epoch and attempt of the service.
+        phase: What the service was doing.
+        episode: Number of the episode.
+        frame: Number of the frame; −1: none.
+
+    Example:
+        >>> fault_from(PayloadError("no scene"), {"epoch": 1, "attempt": 1}, "step", 0, 3).message
+        'no scene'
+    """
     known = isinstance(error, CaviarError)
     text = str(error) if known else f"{type(error).__name__}: {error}"
     detail = "" if known else "".join(traceback.format_exception(error))
@@ -205,7 +259,7 @@ def fault_from(
         frame=frame,
         phase=phase,
         message=_sendable(text[:MAX_MESSAGE]),
-        detail=_sendable(detail[-MAX_DETAIL:]),
+        detail=_sendable(detail[-MAX_DETAIL:]),  # the end: the line that failed is the last
         culprit=error.source if isinstance(error, ProductError) else "",
     )
 

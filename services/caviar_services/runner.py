@@ -2,36 +2,50 @@
 
 It connects, joins, passes messages between the broker and the `ServiceSession`, comes back after a lost
 connection, and stops within 2 s of SIGTERM. Every wait has a deadline: what may last as long as the run
-does is bounded by the broker's heartbeats.
+does is bounded by the broker's heartbeats. `serve` is all that a process of a service does, and `main` its
+command line.
 """
 
 from __future__ import annotations
 
+import argparse
 import logging
 import os
+import select
+import signal
+import sys
+import threading
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from caviar_protocol import messages as m
 from caviar_protocol.assets import AssetStore
 from caviar_protocol.codec import check_version
-from caviar_protocol.errors import ProtocolError, RunError
-from caviar_protocol.host import host_identity
+from caviar_protocol.errors import CaviarError, ProtocolError, RunError
+from caviar_protocol.host import host_identity, steady_memory
 from caviar_protocol.keys import Credentials
 from caviar_protocol.keys import credentials as find_credentials
+from caviar_protocol.messages import RUN_COMPLETE, STOPPED_BY
 from caviar_services.connection import (
     Connection,
     Disconnected,
     RunOver,
     Terminated,
+    Termination,
     UnansweredError,
     describe,
 )
-from caviar_services.process import TERMINATED, SignalTermination, Termination, restart_status
-from caviar_services.registry import load
+from caviar_services.registry import find_modules_in, load
 from caviar_services.service import Service
 from caviar_services.session import ServiceSession
+
+TERMINATION_GRACE_S = 1.5
+"""[s] from SIGTERM until the process is ended by force, so that it is gone within 2 s."""
+
+TERMINATED = 128 + signal.SIGTERM
+"""Exit status of a service that a signal ended."""
 
 CONNECT_TIMEOUT_S = 30.0
 """[s] until the broker has to answer HELLO, or a request for scenery."""
@@ -220,32 +234,146 @@ class Runner:
             self._termination.finished()
 
 
-def run_service(
+class SignalTermination(Termination):
+    """SIGTERM and SIGINT as such an order.
+
+    A Python signal handler does not run while the main thread is inside a compiled call, so a
+    thread of its own hears of the signal through ``set_wakeup_fd``, and ends the process when the
+    main thread has not done so in time. Against a call that holds the interpreter's lock not even
+    that helps: then the process ends as soon as the lock is free, or its parent kills it.
+
+    Args:
+        status: Exit status of a process that ends so.
+    """
+
+    def __init__(self, status: int = TERMINATED) -> None:
+        super().__init__()
+        self._status = status
+        self._read, write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        signal.set_wakeup_fd(write, warn_on_full_buffer=False)
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._handle)
+        threading.Thread(target=self._watch, name="termination", daemon=True).start()
+
+    def finished(self) -> None:
+        """Everything is closed; the process ends by itself, with a status of its own."""
+        super().finished()
+        # The interpreter puts handlers back to the default while it ends: a late SIGTERM would be the status.
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+
+    def _handle(self, *_: object) -> None:
+        self.requested = True
+
+    def _watch(self) -> None:
+        while True:
+            select.select([self._read], [], [])
+            if {signal.SIGTERM, signal.SIGINT} & set(os.read(self._read, 64)):
+                self.requested = True
+                words = "ended by SIGTERM in the middle of a call that does not return"
+                self.enforce(TERMINATION_GRACE_S, self._status, words)
+                return
+
+
+def restart_status(status: int, ended: str) -> int:
+    """Status 0 where the work is done or was called off; 1 where another run may follow.
+
+    Args:
+        status: What the runner returned.
+        ended: Why the broker ended the run; "" where it did not.
+
+    Example:
+        >>> restart_status(0, RUN_COMPLETE), restart_status(0, "world was lost"), restart_status(143, "")
+        (0, 1, 0)
+    """
+    if status == TERMINATED:
+        return 0
+    failed = bool(ended) and ended != RUN_COMPLETE and not ended.startswith(STOPPED_BY)
+    return 1 if failed else status
+
+
+def serve(
     name: str,
-    role: str,
     use: str,
-    endpoint: str,
-    connect_timeout_s: float,
-    credentials: Credentials | None = None,
+    broker: str,
+    connect_timeout_s: float = CONNECT_TIMEOUT_S,
+    key: Path | None = None,
+    broker_key: Path | None = None,
     *,
     restarted: bool = False,
+    modules: Sequence[Path] = (),
 ) -> int:
-    """Run a registered implementation as the service ``name``.
+    """Run one service in this process.
 
     Args:
         name: Name of the service in the run.
-        role: Role of the service.
-        use: Registered name of the implementation, or ``module:Class``.
-        endpoint: ZeroMQ address of the broker.
-        connect_timeout_s: Time that the broker has to answer HELLO [s].
-        credentials: For a broker with keys.
+        use: Role and implementation, ``role:name`` or ``role:module:Class``. The module is also looked for in
+            the current folder.
+        broker: ZeroMQ address of the broker.
+        connect_timeout_s: Time that the broker has to answer HELLO, or a request for scenery [s].
+        key: File with the secret key of the service; None: that of the environment, if any.
+        broker_key: File with the public key of the broker; None: that of the environment, if any.
         restarted: Whether a supervisor starts this process again whenever its status is not 0.
+        modules: Folders in which the module is looked for, too.
 
     Returns:
-        The exit status of the process.
+        The exit status of the process; what is wrong is written to standard error.
     """
-    termination = SignalTermination(0 if restarted else TERMINATED)
-    cls = load(role, use)
-    runner = Runner(name, cls, use, endpoint, connect_timeout_s, termination, credentials=credentials)
-    status = runner.run()
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(message)s")
+    role, separator, implementation = use.partition(":")
+    if not separator:
+        sys.stderr.write(f"caviar service: --use {use!r} is not ROLE:NAME, for example world:sumo\n")
+        return 2
+    if ":" in implementation:
+        for folder in (*modules, Path.cwd()):
+            find_modules_in(folder)
+    steady_memory()
+    try:
+        found = find_credentials(key, broker_key)
+        termination = SignalTermination(0 if restarted else TERMINATED)
+        cls = load(role, implementation)
+        runner = Runner(name, cls, implementation, broker, connect_timeout_s, termination, credentials=found)
+        status = runner.run()
+    except CaviarError as error:
+        sys.stderr.write(f"caviar service {name}: {error}\n")
+        return 1
     return restart_status(status, runner.ended) if restarted else status
+
+
+def main() -> int:
+    """Parse the command line and serve; the exit status."""
+    about = "One service as a process: ``python -m caviar_services NAME --use role:implementation --broker URL``."
+    parser = argparse.ArgumentParser(prog="python -m caviar_services", description=about)
+    parser.add_argument("name", help="name of the service in the run")
+    parser.add_argument("--use", required=True, metavar="ROLE:NAME", help="registered implementation")
+    parser.add_argument("--broker", required=True, metavar="URL", help="tcp://host:port of the broker")
+    parser.add_argument(
+        "--connect-timeout",
+        type=float,
+        default=CONNECT_TIMEOUT_S,
+        metavar="S",
+        help="how long to wait for the broker; it may start later than its services",
+    )
+    parser.add_argument("--key", type=Path, help="secret key of this service, NAME.key; else $CAVIAR_KEY")
+    parser.add_argument(
+        "--broker-key", type=Path, help="public key of the broker, broker.pub; else $CAVIAR_BROKER_KEY"
+    )
+    parser.add_argument(
+        "--restarted",
+        action="store_true",
+        help="this process is started again whenever its status is not 0: status 1 after a run that failed, "
+        "0 after SIGTERM",
+    )
+    parser.add_argument(
+        "--modules", type=Path, action="append", default=[], help="folder of the module of ROLE:module:Class"
+    )
+    arguments = parser.parse_args()
+    return serve(
+        arguments.name,
+        arguments.use,
+        arguments.broker,
+        arguments.connect_timeout,
+        arguments.key,
+        arguments.broker_key,
+        restarted=arguments.restarted,
+        modules=arguments.modules,
+    )

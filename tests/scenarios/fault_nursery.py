@@ -33,7 +33,7 @@ IMPORTED = (
     "stateful",
     "caviar_broker.launch",
     "caviar_clients.cli.launch",
-    "caviar_services.__main__",
+    "caviar_services.runner",
     "caviar_services.agent.baselines",
     "caviar_services.channel.statistical.free_space",
     "caviar_services.link.beam_sweep",
@@ -178,7 +178,7 @@ def _run(module: str, arguments: list[str]) -> int:
     import fault_kinds
 
     import caviar_broker.launch as broker
-    import caviar_services.__main__ as services
+    import caviar_services.runner as services
 
     sys.argv = [module, *arguments]
     if module == "caviar_broker":

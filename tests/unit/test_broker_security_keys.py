@@ -17,8 +17,7 @@ from caviar_broker.security.access import Access, answer, is_local
 from caviar_protocol import keys as k
 from caviar_protocol import messages as m
 from caviar_protocol.errors import CaviarError, RunError, SetupError
-from caviar_services.connection import Connection
-from caviar_services.process import Termination
+from caviar_services.connection import Connection, Termination
 
 REVOKED_WITHIN_S = 1.0
 

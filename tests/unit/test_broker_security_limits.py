@@ -22,8 +22,7 @@ from caviar_broker.security.tcp import TcpConnection, TcpConnections, _identity
 from caviar_protocol import messages as m
 from caviar_protocol.errors import RunError
 from caviar_protocol.scenario import Limits
-from caviar_services.connection import Connection
-from caviar_services.process import Termination
+from caviar_services.connection import Connection, Termination
 
 SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
 LIMITS = """

@@ -14,7 +14,7 @@ import pytest
 
 from caviar_clients.cli.remote import RunInProgress
 from caviar_protocol.host import VARIABLE, SignOfLife
-from caviar_services.process import TERMINATED, restart_status
+from caviar_services.runner import TERMINATED, restart_status
 
 ROOT = Path(__file__).parents[2]
 SMOKE = ROOT / "deploy" / "caviar_scenarios" / "smoke.toml"

@@ -66,7 +66,7 @@ def test_sigterm_ends_a_service_that_hangs_when_it_closes(broker: Broker) -> Non
 
 LATE = """
 import os
-from caviar_services.process import SignalTermination
+from caviar_services.runner import SignalTermination
 
 class Late:
     def __del__(self, kill=os.kill, pid=os.getpid()):

@@ -187,7 +187,7 @@ def service(
     restarted: Restarted = False,
 ) -> None:
     """Run one service and connect it to a broker."""
-    from caviar_services.__main__ import serve
+    from caviar_services.runner import serve
 
     limit = f"for at most {connect_timeout:g} s (--connect-timeout)"
     typer.echo(f"service {name}: waiting for the broker at {broker}, {limit}", err=True)

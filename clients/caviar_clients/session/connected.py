@@ -15,8 +15,7 @@ from caviar_protocol.fields import MAX_IN_FLIGHT
 from caviar_protocol.keys import Credentials
 from caviar_protocol.messages import Input
 from caviar_protocol.scenario import Scenario
-from caviar_services.connection import Terminated
-from caviar_services.process import Termination
+from caviar_services.connection import Terminated, Termination
 from caviar_services.runner import CONNECT_TIMEOUT_S, Runner
 from caviar_services.service import StepResult
 
