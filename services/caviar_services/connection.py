@@ -44,14 +44,7 @@ service that is still busy is ended by force."""
 
 
 class Termination:
-    """The order to end, as a flag, and as a certain end of the process.
-
-    Example:
-        >>> termination = Termination()
-        >>> termination.requested
-        False
-        >>> termination.enforce(60.0, 1, "too slow").set()  # called off
-    """
+    """The order to end, as a flag, and as a certain end of the process."""
 
     def __init__(self) -> None:
         self.requested = False
@@ -79,12 +72,7 @@ class Termination:
         return called_off
 
     def end(self, status: int, last_words: str) -> None:
-        """End the process at once.
-
-        Args:
-            status: Exit status.
-            last_words: Written to standard error.
-        """
+        """End the process at once. Arguments as for `enforce`."""
         sys.stderr.write(f"{last_words}\n")
         # Not `sys.exit`: a thread that is not the main one would end alone, and a call that does not return
         # keeps the interpreter from ending.
@@ -117,8 +105,16 @@ class UnansweredError(RunError):
 class Connection:
     """Sends to and receives from the broker at ``endpoint`` for the service ``name``.
 
-    Used by one thread; the heartbeat thread that `beat` starts has a socket of its own. ``credentials`` are
-    for a broker with keys.
+    Used by one thread; the heartbeat thread that `beat` starts has a socket of its own.
+
+    Args:
+        name: Name of the service.
+        endpoint: ZeroMQ address of the broker.
+        termination: The order to end, which `receive` obeys.
+        credentials: For a broker with keys.
+
+    Raises:
+        RunError: The address is none, or the keys are impossible.
     """
 
     def __init__(
@@ -147,7 +143,11 @@ class Connection:
             ) from error
 
     def beat(self, welcome: m.Welcome) -> None:
-        """Start the heartbeats."""
+        """Start the heartbeats.
+
+        Args:
+            welcome: Says how often, and how long the broker may be silent.
+        """
         self._rejoin_s = welcome.rejoin_ns / 1e9
         self._heartbeat = HeartbeatThread(
             self._context, self.endpoint, self.name, welcome, self._broker_is_gone, self._credentials
@@ -155,12 +155,25 @@ class Connection:
         self._heartbeat.start()
 
     def progress(self, phase: str, grace_s: float = 0.0) -> None:
-        """Say in the next heartbeat what is being done, and that it advances."""
+        """Say in the next heartbeat what is being done, and that it advances.
+
+        Args:
+            phase: What is being done.
+            grace_s: How long it may stay silent [s]; 0: the scenario's ``stall_s``.
+        """
         if self._heartbeat is not None:
             self._heartbeat.progress(phase, grace_s)
 
     def send(self, message: m.Message, *parts: bytes) -> None:
-        """Send a message. Raises `Disconnected` where the broker takes none any more."""
+        """Send a message.
+
+        Args:
+            message: The message.
+            parts: What travels behind it.
+
+        Raises:
+            Disconnected: The broker takes no messages any more.
+        """
         self.send_parts([encode_message(message), *parts])
 
     def send_parts(self, parts: Sequence[Any]) -> None:
@@ -174,11 +187,20 @@ class Connection:
             raise Disconnected(f"the broker at {self.endpoint} takes no messages") from error
 
     def receive(self, timeout_s: float | None = None) -> tuple[m.Message, Sequence[zmq.Frame]]:
-        """Next message and its further parts.
+        """Wait for the next message.
 
-        Raises `Terminated` after SIGTERM, `RunOver` at SHUTDOWN, `Disconnected` when the broker is silent
-        for longer than its liveness or does not know this service any more, and `UnansweredError` when
-        ``timeout_s`` is over.
+        Args:
+            timeout_s: How long to wait [s]; None: as long as the broker lives.
+
+        Returns:
+            The message and its further parts.
+
+        Raises:
+            Terminated: SIGTERM came.
+            RunOver: SHUTDOWN came.
+            Disconnected: The broker is silent for longer than its liveness, or does not know this service any
+                more.
+            UnansweredError: ``timeout_s`` is over.
         """
         until = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
@@ -257,7 +279,15 @@ class Connection:
 
 
 def describe(message: m.Message) -> str:
-    """A message for an error text: its type, and for an ERROR what it says."""
+    """Describe a message for an error text: its type, and for an ERROR or REFUSE what it says.
+
+    Args:
+        message: The message.
+
+    Example:
+        >>> describe(m.Shutdown(reason="done"))
+        'SHUTDOWN'
+    """
     text = f": {message.message}" if isinstance(message, m.Error | m.Refuse) else ""
     return f"{message_type(message)}{text}"
 
@@ -349,8 +379,14 @@ _heartbeat_log = logging.getLogger("caviar.heartbeat")
 class HeartbeatThread(threading.Thread):
     """Tells the broker that this process lives, and watches that the broker does.
 
-    ``gone`` is called in this thread when the broker has been silent for longer than the run's
-    liveness, at least two heartbeats are unanswered, and then no more.
+    Args:
+        context: Of the socket that the thread opens.
+        endpoint: ZeroMQ address of the broker.
+        name: Name of the service.
+        welcome: Says how often to beat, and how long the broker may be silent.
+        gone: Called once, in this thread, when the broker has been silent for longer than the run's liveness
+            and at least two heartbeats are unanswered.
+        credentials: For a broker with keys.
     """
 
     def __init__(

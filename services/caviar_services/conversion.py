@@ -1,33 +1,38 @@
-"""Between the messages of the protocol and what a `Service` gets and gives."""
+"""Between the messages of the protocol and what a `Service` gets and gives.
+
+From messages: what the service knows about the run, the frame with its inputs, what products are checked for.
+To messages: DONE with products, encoded or as they are, and FAULT. The newest answers are kept, for a GRANT
+that is repeated.
+"""
 
 from __future__ import annotations
 
 import logging
 import time
 import traceback
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import msgspec
 
 from caviar_protocol import messages as m
 from caviar_protocol.arrays import Payload
+from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.digest import payload_digest
 from caviar_protocol.errors import CaviarError, PayloadError, ProductError
+from caviar_protocol.fields import MAX_IN_FLIGHT
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.topics import PAYLOADS, Carrier
 from caviar_protocol.validation import ContentCheck, ContentRules
 from caviar_services.service import (
-    Encoded,
     Frame,
     FrameInput,
     Progress,
     RunInfo,
     Service,
     StepResult,
-    decoded,
-    encoded,
 )
 
 _log = logging.getLogger("caviar.service")
@@ -37,6 +42,12 @@ MAX_MESSAGE = 2000
 """[characters] of a FAULT's message."""
 MAX_DETAIL = 20000
 """[characters] of a FAULT's traceback."""
+
+
+KEPT_BYTES = 64 << 20
+"""[B] of answers that are kept, beyond the newest two."""
+
+Answer: TypeAlias = tuple[m.Done | m.Fault, Sequence[Any]]
 
 
 def run_info(name: str, welcome: m.Welcome, progress: Progress) -> RunInfo:
@@ -153,6 +164,41 @@ def frame_inputs(
     )
 
 
+class Encoded(Payload, frozen=True, kw_only=True):
+    """Stands in `StepResult.products` for a payload of which only the bytes are known.
+
+    A recorded product is sent as it was, not decoded and made again.
+    """
+
+    topic: str
+    header: bytes
+    body: bytes
+    fidelity: str = ""
+
+
+def encoded(payload: Payload) -> tuple[bytes, bytes]:
+    """Encode a product, or take the bytes of one that is encoded already.
+
+    Args:
+        payload: The product.
+
+    Returns:
+        Header and body (`caviar_protocol.codec.encode_payload`).
+    """
+    return (payload.header, payload.body) if isinstance(payload, Encoded) else encode_payload(payload)
+
+
+def decoded(payload: Payload) -> Payload:
+    """Decode a product where it is encoded, for a consumer in the same process.
+
+    Args:
+        payload: The product.
+    """
+    if isinstance(payload, Encoded):
+        return decode_payload(payload.topic, payload.header, payload.body)
+    return payload
+
+
 def encoded_done(
     identity: dict[str, int], use: str, grant: m.Grant, result: StepResult, step_ns: int
 ) -> tuple[m.Done, list[Any]]:
@@ -267,3 +313,60 @@ def fault_from(
 def _sendable(text: str) -> str:
     """The text without what UTF-8 cannot say: names of files may hold such."""
     return text.encode(errors="backslashreplace").decode()
+
+
+class Answers:
+    """The newest answers of an episode, by frame, for a GRANT that is repeated (contract, clause 7).
+
+    Example:
+        >>> answers = Answers()
+        >>> answers.put(0, (m.Done(epoch=1, attempt=1, episode=0, frame=0), ()))
+        >>> answers.is_new(0), answers.is_new(1), answers.get(1)
+        (False, True, None)
+    """
+
+    def __init__(self) -> None:
+        self._answers: OrderedDict[int, Answer] = OrderedDict()
+        self._bytes = 0
+        self._newest = -1
+
+    def clear(self, newest: int = -1) -> None:
+        """Forget all answers.
+
+        Args:
+            newest: Frame behind which the service is; −1: before the first.
+        """
+        self._answers.clear()
+        self._bytes, self._newest = 0, newest
+
+    def is_new(self, frame: int) -> bool:
+        """Whether a frame lies behind all that were answered.
+
+        Args:
+            frame: Number of the frame.
+        """
+        return frame > self._newest
+
+    def get(self, frame: int) -> Answer | None:
+        """The answer to a frame; None where it is not kept.
+
+        Args:
+            frame: Number of the frame.
+        """
+        return self._answers.get(frame)
+
+    def put(self, frame: int, answer: Answer) -> None:
+        """Keep an answer, and forget the oldest where they get too many or too large.
+
+        Args:
+            frame: Number of the frame, a new one.
+            answer: DONE or FAULT, with its parts.
+        """
+        self._answers[frame], self._newest = answer, frame
+        self._bytes += _size(answer)
+        while len(self._answers) > 2 and (len(self._answers) > MAX_IN_FLIGHT or self._bytes > KEPT_BYTES):
+            self._bytes -= _size(self._answers.popitem(last=False)[1])
+
+
+def _size(answer: Answer) -> int:
+    return sum(map(len, answer[1]))

@@ -56,7 +56,12 @@ _FOLDER = re.compile(r"llvm-(?P<version>\d+)")
 
 @dataclass(frozen=True, order=True)
 class LlvmLibrary:
-    """A libLLVM shared library."""
+    """A libLLVM shared library.
+
+    Example:
+        >>> str(LlvmLibrary((19, 1), Path("/usr/lib/libLLVM.so.19.1")))
+        'LLVM 19.1 (/usr/lib/libLLVM.so.19.1)'
+    """
 
     version: tuple[int, ...]
     """Major version first; as many parts as its file name has."""
@@ -81,6 +86,13 @@ def choose_llvm(
     Raises:
         SetupError: The explicit one does not exist or is too old, or there is none; ends with the command
             that mends it.
+
+    Example:
+        >>> choose_llvm({}, folders=(), listed=())
+        Traceback (most recent call last):
+            ...
+        caviar_protocol.errors.SetupError: no libLLVM of version 16 or newer on this machine; the ray tracer \
+compiles with it. Install one: sudo apt-get install -y libllvm19
     """
     explicit = environment.get(ENVIRONMENT, "")
     if explicit:
@@ -220,7 +232,7 @@ THREADS_VARIABLE = "CAVIAR_RAY_TRACING_THREADS"
 
 
 def cores() -> int:
-    """That this process may run on."""
+    """Number of cores that this process may run on: a container may have fewer than the machine."""
     return len(os.sched_getaffinity(0))
 
 
@@ -354,7 +366,14 @@ def _aligned(rows: Float64Array, dtype: np.dtype[Any]) -> NDArray[Any]:
 
 
 def positions(points: Float64Array) -> Any:
-    """Positions [m], Shape ``[N, 3]``, as a `mitsuba.Point3f`."""
+    """Copy positions for the ray tracer.
+
+    Args:
+        points: [m], Shape ``[N, 3]``.
+
+    Returns:
+        A `mitsuba.Point3f` of N points.
+    """
     import mitsuba as mi
 
     return mi.Point3f(*map(mi.Float, aligned_columns(points.T)))

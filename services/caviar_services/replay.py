@@ -20,7 +20,8 @@ from caviar_protocol.messages import GrantInput, Role, Status
 from caviar_protocol.recording import RecordedFrame, Recording
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.topics import PAYLOADS
-from caviar_services.service import Encoded, Frame, Preparation, Prepared, Service, StepResult
+from caviar_services.conversion import Encoded
+from caviar_services.service import Frame, Preparation, Prepared, Service, StepResult
 
 ROLES: tuple[str, ...] = get_args(Role)
 

@@ -341,8 +341,11 @@ def serve(
 
 def main() -> int:
     """Parse the command line and serve; the exit status."""
-    about = "One service as a process: ``python -m caviar_services NAME --use role:implementation --broker URL``."
-    parser = argparse.ArgumentParser(prog="python -m caviar_services", description=about)
+    parser = argparse.ArgumentParser(
+        prog="python -m caviar_services",
+        description="One service as a process: ``python -m caviar_services NAME --use role:implementation "
+        "--broker URL``.",
+    )
     parser.add_argument("name", help="name of the service in the run")
     parser.add_argument("--use", required=True, metavar="ROLE:NAME", help="registered implementation")
     parser.add_argument("--broker", required=True, metavar="URL", help="tcp://host:port of the broker")

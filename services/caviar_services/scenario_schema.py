@@ -23,7 +23,15 @@ CLASS_PLACE = r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$"
 
 
 def settings_classes() -> dict[tuple[str, str], type[msgspec.Struct]]:
-    """The ``Settings`` of each registered implementation, by role and name."""
+    """Load the ``Settings`` of each registered implementation.
+
+    Returns:
+        Class by role and name.
+
+    Example:
+        >>> settings_classes()["world", "sumo"].__name__
+        'SumoSettings'
+    """
     return {
         (role, name): load(role, name).Settings for role in get_args(Role) for name in registered_names(role)
     }

@@ -8,9 +8,7 @@ the embedded run uses the same objects without sockets.
 Life of a service: ``__init__`` → ``scenery`` (worlds) → ``prepare`` → per episode ``reset``,
 ``step`` for each frame, ``end_episode`` → ``close``. What a service with state knows after a frame
 it saves with ``checkpoint``; another process takes it over with ``restore``, behind ``reset`` of the
-same episode, and goes on with the same bytes (`state` makes bytes of a struct, and checks them).
-
-Products that are on the wire already: a recorded one is sent as it was, not decoded and made again.
+same episode, and goes on with the same bytes (`checkpoint` makes bytes of a struct, and checks them).
 """
 
 from __future__ import annotations
@@ -25,7 +23,7 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Payload
-from caviar_protocol.codec import decode_payload, encode_payload
+from caviar_protocol.codec import decode_payload
 from caviar_protocol.errors import PayloadError, ProductError, ProtocolError
 from caviar_protocol.messages import GrantInput, Input, Report, Role, Status
 from caviar_protocol.scenario import DeviceSpec
@@ -49,18 +47,34 @@ scenario's ``stall_s``. Declare one before compiling kernels or loading large sc
 
 
 def no_progress(phase: str, grace_s: float = 0.0) -> None:
-    """Report nothing: no broker watches this service."""
+    """Report nothing: no broker watches this service.
+
+    Args:
+        phase: What is being done.
+        grace_s: How long it may stay silent [s].
+    """
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunInfo:
-    """What a service knows about the run it is part of."""
+    """What a service knows about the run it is part of.
+
+    In a run the runner makes it of WELCOME; a test of a service makes its own.
+
+    Example:
+        >>> run = RunInfo(name="link", seed=7)
+        >>> run.sampling_period_ns, run.again
+        (100000000, False)
+    """
 
     name: str
     """Name of this service, unique in the run."""
     run: str = ""
+    """Identity of the run."""
     seed: int = 0
+    """Of the run; `Frame.generator` gives random numbers that depend on it."""
     sampling_period_ns: int = 100_000_000
+    """Simulated time between two frames [ns]."""
     frames: int = 1
     """Frames of an episode, unless an agent ends it earlier."""
     carriers: tuple[Carrier, ...] = ()
@@ -86,10 +100,16 @@ class RunInfo:
 
 @dataclass(frozen=True, kw_only=True)
 class Preparation:
-    """What PREPARE tells a service."""
+    """What a service learns before its first frame: which of its products are wanted, and where files are.
+
+    Example:
+        >>> preparation = Preparation(demand={"channel": frozenset({"h"})})
+        >>> "hf" in preparation.demand["channel"]  # so no response over the band is computed
+        False
+    """
 
     demand: Mapping[str, frozenset[str]]
-    """Topics of this service that someone consumes, with the parts asked for (clause 5)."""
+    """Topics of this service that are consumed, with the parts asked for (clause 5)."""
     assets: Mapping[str, Path] = field(default_factory=dict)
     """Files of scenery by name; all are in one local folder, at their names as relative paths."""
     producers: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
@@ -98,11 +118,19 @@ class Preparation:
 
 @dataclass(frozen=True, kw_only=True)
 class Prepared:
-    """What READY tells the broker, beyond the geometry digest, which the runner adds."""
+    """What a service declares once it is prepared. The runner adds the digest of the geometry for READY.
+
+    Example:
+        >>> Prepared(actuators=("beam:car.*",), notes=("model of 2026-11",)).prefixes
+        ()
+    """
 
     prefixes: tuple[str, ...] = ()
+    """Worlds: what the names of their objects and fixed devices begin with."""
     actuators: tuple[str, ...] = ()
+    """Agents: what they command, as names with ``*`` and ``?``."""
     notes: tuple[str, ...] = ()
+    """For the user: shown at the start, kept in the summary."""
     seed: int = -1
     """Agents: of the first episode; −1: the run's."""
 
@@ -116,8 +144,14 @@ class FrameInput:
         body: Body of the product as it travels.
         payload: The product as it is, of a producer in this process.
         check: Looks at what the payload says, before the service does; None: it is trusted.
+
+    Example:
+        >>> absent = GrantInput(topic="link", source="link", status=Status.ABSENT, cause="link was late")
+        >>> FrameInput(absent).present
+        False
     """
 
+    # A plain class with slots: several are made in each frame, and nothing compares them.
     __slots__ = ("_check", "_payload", "body", "header", "provenance")
 
     def __init__(
@@ -282,14 +316,21 @@ class Frame(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class StepResult(msgspec.Struct, frozen=True, kw_only=True):
-    """What a service made of a frame."""
+    """What a service made of a frame.
+
+    Example:
+        >>> StepResult(counts={"users-without-path": 2}, fidelity="ray-traced").end_episode
+        False
+    """
 
     products: Mapping[str, Payload] = {}
     """Payload by topic; a declared output that is missing here is absent."""
     fidelity: str = ""
     """Rung or quality of the products, for their provenance."""
     decisions: Mapping[str, str] = {}
+    """What was decided, by subject, for the recorder; a replay imposes it (`Frame.imposed`)."""
     counts: Mapping[str, int] = {}
+    """Events of the frame by name, which the summary of the run adds up."""
     measured: Mapping[str, int] = {}
     """Nanoseconds that named phases took."""
     end_episode: bool = False
@@ -299,7 +340,12 @@ class StepResult(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class NoSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of a service that has none."""
+    """Settings of a service that has none.
+
+    Example:
+        >>> NoSettings() == NoSettings()
+        True
+    """
 
 
 class Service(ABC, Generic[S]):
@@ -448,24 +494,3 @@ class Service(ABC, Generic[S]):
 
     def close(self) -> None:  # optional hook
         """Release what is held. Called once, also after an error."""
-
-
-class Encoded(Payload, frozen=True, kw_only=True):
-    """Stands in `StepResult.products` for a payload; only its bytes are known."""
-
-    topic: str
-    header: bytes
-    body: bytes
-    fidelity: str = ""
-
-
-def encoded(payload: Payload) -> tuple[bytes, bytes]:
-    """Header and body of a product (`caviar_protocol.codec.payloads.encode_payload`)."""
-    return (payload.header, payload.body) if isinstance(payload, Encoded) else encode_payload(payload)
-
-
-def decoded(payload: Payload) -> Payload:
-    """The product for a consumer in the same process."""
-    if isinstance(payload, Encoded):
-        return decode_payload(payload.topic, payload.header, payload.body)
-    return payload

@@ -10,7 +10,6 @@ from __future__ import annotations
 import gc
 import logging
 import time
-from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -30,6 +29,8 @@ from caviar_protocol.host import trim_memory
 from caviar_protocol.scenario.conversion import convert_settings
 from caviar_protocol.validation import ContentCheck
 from caviar_services.conversion import (
+    Answer,
+    Answers,
     content_rules,
     encoded_done,
     fault_from,
@@ -58,12 +59,9 @@ other sizes, and what they leave behind would creep up for hours. A return costs
 faults behind it: after every tenth frame that would be a twentieth of a small service's work."""
 FETCH_TIMEOUT_S = 30.0
 """[s] until the broker has to answer a request for scenery."""
-KEPT_BYTES = 64 << 20
-"""[B] of answers that are kept, beyond the newest two."""
 
 Send: TypeAlias = Callable[[m.Message, Sequence[Any]], None]
 """``send(message, parts)``: hand a message, and the parts behind it, to the broker."""
-Answer: TypeAlias = tuple[m.Done | m.Fault, Sequence[Any]]
 
 
 class ServiceSession:
@@ -458,36 +456,3 @@ _WHILE_FETCHING = frozenset({m.AssetData, m.AssetGet, m.Cancel, m.Error, m.Shutd
 
 def _ignore(_: m.Message, __: Sequence[Any], ___: float) -> None:
     """A message that asks for nothing."""
-
-
-class Answers:
-    """The newest answers of an episode, by frame, for a GRANT that is repeated (contract, clause 7)."""
-
-    def __init__(self) -> None:
-        self._answers: OrderedDict[int, Answer] = OrderedDict()
-        self._bytes = 0
-        self._newest = -1
-
-    def clear(self, newest: int = -1) -> None:
-        """Forget all answers; the service is where it was after frame ``newest``, −1: before the first."""
-        self._answers.clear()
-        self._bytes, self._newest = 0, newest
-
-    def is_new(self, frame: int) -> bool:
-        """Whether the frame lies behind all that were answered."""
-        return frame > self._newest
-
-    def get(self, frame: int) -> Answer | None:
-        """The answer to a frame; None where it is not kept."""
-        return self._answers.get(frame)
-
-    def put(self, frame: int, answer: Answer) -> None:
-        """Keep an answer, and forget the oldest where they get too many or too large."""
-        self._answers[frame], self._newest = answer, frame
-        self._bytes += _size(answer)
-        while len(self._answers) > 2 and (len(self._answers) > MAX_IN_FLIGHT or self._bytes > KEPT_BYTES):
-            self._bytes -= _size(self._answers.popitem(last=False)[1])
-
-
-def _size(answer: Answer) -> int:
-    return sum(map(len, answer[1]))

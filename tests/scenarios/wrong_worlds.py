@@ -15,7 +15,8 @@ from caviar_protocol.messages import Input, Role
 from caviar_protocol.topics import Lidar, LidarScan, Scene
 from caviar_services import conversion
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
-from caviar_services.service import Encoded, Frame, RunInfo, Service, StepResult
+from caviar_services.conversion import Encoded
+from caviar_services.service import Frame, RunInfo, Service, StepResult
 from caviar_services.world.trajectory import TrajectorySettings, TrajectoryWorld
 
 

@@ -14,10 +14,10 @@ from caviar_protocol.digest import payload_digest
 from caviar_protocol.errors import DeclarationError, RecordingError, ScenarioError
 from caviar_protocol.messages import Report, Status
 from caviar_protocol.scenario.conversion import Place
-from caviar_services.conversion import encoded_done, plain_done
+from caviar_services.conversion import Encoded, encoded_done, plain_done
 from caviar_services.registry import load
 from caviar_services.replay import Replayer, ReplaySettings, use_of
-from caviar_services.service import Encoded, Frame, FrameInput, Preparation, RunInfo, StepResult
+from caviar_services.service import Frame, FrameInput, Preparation, RunInfo, StepResult
 
 GRANT = m.Grant(epoch=1, attempt=1, episode=0, frame=0, t_ns=0)
 IDENTITY = {"epoch": 1, "attempt": 1}

@@ -33,9 +33,10 @@ from caviar_protocol.messages import Input
 from caviar_protocol.recording.reader import Imposed
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.validation import ContentCheck
+from caviar_services.conversion import Answer
 from caviar_services.registry import load
 from caviar_services.service import Service, StepResult
-from caviar_services.session import Answer, ServiceSession
+from caviar_services.session import ServiceSession
 
 S = TypeVar("S", bound=ServiceSession)
 
