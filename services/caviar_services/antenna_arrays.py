@@ -127,6 +127,7 @@ def dft_codebook(array: AntennaArray) -> Complex128Array:
     uniform: Complex128Array = np.einsum("ac,br->abcr", columns, rows).reshape(size, size)
     if array.is_uniform:
         return uniform
+    # Block by block: a beam has the elements of one panel and one polarization, the others are silent.
     codebook = np.zeros((array.size, array.size), np.complex128)
     for begin in range(0, array.size, size):
         codebook[begin : begin + size, begin : begin + size] = uniform
@@ -205,6 +206,7 @@ def _axis_cosines(size: int, beam: int, spacing: float) -> list[float]:
     """Direction cosines u within ±1 with ``spacing·u = beam/size`` modulo 1."""
     if size == 1:
         return [0.0]
+    # |u| ≤ 1 bounds the number of whole turns that the phase between two elements may have more.
     lowest = math.ceil(-spacing - beam / size)
     highest = math.floor(spacing - beam / size)
     return [(beam / size + turn) / spacing for turn in range(lowest, highest + 1)]

@@ -87,6 +87,7 @@ def saved(service: Service[Any], version: int, state: msgspec.Struct) -> bytes:
         >>> restored(agent, 1, State, saved(agent, 1, State(3)))
         State(next=3)
     """
+    # Dictionaries in the order of their keys: the order of insertion would make equal states differ.
     body = msgspec.msgpack.encode(state, order="deterministic")
     name = type(service).__qualname__
     return msgspec.msgpack.encode(
@@ -135,6 +136,8 @@ def restored(service: Service[Any], version: int, cls: type[T], state: bytes) ->
         raise RunError(f"{who}: it is no state of {name} ({error}); start the run again") from error
 
 
+# What a state may depend on. The directory and the scenario as a whole are left out: a run that is moved, or
+# gone on with under other timeouts, has the same states.
 def _circumstances(service: Service[Any]) -> bytes:
     run = service.run
     known = (run.name, run.seed, run.sampling_period_ns, run.carriers, run.devices)

@@ -97,6 +97,7 @@ def content_rules(service: Service[Any], order: m.Prepare) -> ContentRules:
         service: The service, which knows carriers and devices of the run.
         order: PREPARE, with producers, prefixes and assets.
     """
+    # A device without a world belongs to the only one; with several, the loader has asked for it.
     run = service.run
     worlds = order.producers.get("scene", ())
     devices: dict[str, list[DeviceSpec]] = {world: [] for world in worlds}
@@ -106,6 +107,7 @@ def content_rules(service: Service[Any], order: m.Prepare) -> ContentRules:
     return ContentRules(
         prefixes=order.prefixes,
         devices={world: tuple(specs) for world, specs in devices.items()},
+        # Without prefixes the service consumes no scene, and nothing is known about meshes.
         assets=frozenset(asset.name for asset in order.assets) if order.prefixes else None,
         carriers=run.carriers,
         parts=service.parts,
@@ -258,6 +260,7 @@ def plain_done(
         PayloadError: A product is not its topic's.
     """
     products = _products(use, result)
+    # Keyword by keyword: `**identity` makes a dictionary in each frame, and this loop does little else.
     done = m.Done(
         epoch=identity["epoch"],
         attempt=identity["attempt"],
@@ -364,6 +367,7 @@ class Answers:
         """
         self._answers[frame], self._newest = answer, frame
         self._bytes += _size(answer)
+        # Two are kept whatever their size.
         while len(self._answers) > 2 and (len(self._answers) > MAX_IN_FLIGHT or self._bytes > KEPT_BYTES):
             self._bytes -= _size(self._answers.popitem(last=False)[1])
 

@@ -50,6 +50,7 @@ FOLDERS: tuple[str, ...] = (
 )
 """Folders, as patterns, in which a libLLVM is looked for beside the linker's cache."""
 
+# libLLVM-19.so.1 of Debian, libLLVM.so.19.1 of LLVM itself, libLLVM.dylib of macOS, which has no version.
 _NAME = re.compile(r"libLLVM(?:-(?P<dashed>\d+(?:\.\d+)*))?\.(?:so|dylib)(?:\.(?P<dotted>\d+(?:\.\d+)*))?$")
 _FOLDER = re.compile(r"llvm-(?P<version>\d+)")
 
@@ -141,6 +142,7 @@ def activate_llvm() -> str:
 
 def _held_by_drjit() -> tuple[int, ...] | None:
     """Version of the library that Dr.Jit loaded; None if not imported, or if the environment names one."""
+    # Asked of `sys.modules`: an import would load a library, which is what is to be prevented.
     drjit = sys.modules.get("drjit")
     if drjit is None or os.environ.get(ENVIRONMENT):
         return None
@@ -192,7 +194,7 @@ def _explicit(path: Path) -> LlvmLibrary:
 
 def _library(path: Path) -> LlvmLibrary | None:
     """The library of a file name that has its version; None where it has not."""
-    real = path.resolve()
+    real = path.resolve()  # libLLVM.so is a link to the file whose name has the version
     match = _NAME.match(real.name)
     if match is None:
         return None
@@ -220,6 +222,7 @@ def _asked(path: Path) -> tuple[int, ...]:
 
 
 def _linker_cache() -> list[str]:
+    # Debian has it in /sbin, which is not in the PATH of ordinary users.
     ldconfig = shutil.which("ldconfig", path=os.environ.get("PATH", "") + ":/sbin:/usr/sbin")
     if ldconfig is None:
         return []
@@ -280,6 +283,7 @@ def limit_threads() -> None:
     """Have the ray tracer compute with as many threads as `THREADS_VARIABLE` says; imports Dr.Jit."""
     import drjit as dr
 
+    # Dr.Jit's own number stands where none is asked for: a service alone on its machine has all cores.
     threads = limited_threads()
     if threads and dr.thread_count() != threads:
         dr.set_thread_count(threads)
@@ -355,6 +359,8 @@ def several(count: int) -> Int64Array:
 
 
 def _aligned(rows: Float64Array, dtype: np.dtype[Any]) -> NDArray[Any]:
+    # One vector more than the rows take, so that the first row can begin at a multiple of 64 bytes, wherever
+    # NumPy's memory lies.
     count, size = rows.shape
     of_vector = 64 // dtype.itemsize
     stride = -(-size // of_vector) * of_vector

@@ -112,6 +112,7 @@ def load(role: str, name: str) -> type[Service[Any]]:
     if missing:
         raise DeclarationError(f"{role} {name!r} is {target}, which does not set: {missing}")
     for base in cls.__mro__[1:]:
+        # A base reads its own settings: without them it would fail in the middle of a run.
         inherited = vars(base).get("Settings", NoSettings)
         if inherited is not NoSettings and not issubclass(cls.Settings, inherited):
             raise DeclarationError(
@@ -141,7 +142,7 @@ def find_modules_in(folder: Path) -> None:
         folder: The folder.
     """
     text = str(folder.resolve())
-    if text not in sys.path:
+    if text not in sys.path:  # several services of an embedded run may name one folder
         sys.path.append(text)
 
 

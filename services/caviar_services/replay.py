@@ -76,6 +76,7 @@ class Replayer(Service[ReplaySettings]):
     def prepare(self, preparation: Preparation) -> Prepared:
         """Open the recording; `RecordingError` where it has nothing of this service."""
         recording, name = self._recording, self.run.name
+        # The first frame names each source of each topic: absent products have an entry, too.
         first = recording.entry(0).inputs if len(recording) else ()
         missing = set(self.outputs) - {item.topic for item in first if item.source == name}
         if missing:
@@ -91,6 +92,7 @@ class Replayer(Service[ReplaySettings]):
 
     def step(self, frame: Frame) -> StepResult:
         """What the service made of this frame. `RecordingError` where the frame was not recorded."""
+        # The recording ends with the last frame; the agent's extra grant behind it was not recorded.
         if frame.final:
             return StepResult(seed=self._next_seed(frame.episode))
         recorded = self._recording.frame(frame.episode, frame.number)
@@ -162,6 +164,7 @@ def _replayer(name: str) -> type[Replayer]:
     return cast(type[Replayer], type(name, (Replayer,), members))
 
 
+# `registry.load` takes classes out of modules by name; this one makes those that it is asked for.
 def __getattr__(name: str) -> Any:
     if name.startswith("__"):
         raise AttributeError(name)

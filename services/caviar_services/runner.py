@@ -59,6 +59,7 @@ ANSWER_S = 5.0
 _log = logging.getLogger("caviar.service")
 
 
+# A class of its own: of all refusals it alone may pass, once the broker has noticed the loss.
 class NameTakenError(RunError):
     """The broker has a service of this name; perhaps it has yet to learn that its connection is lost."""
 
@@ -181,6 +182,7 @@ class Runner:
             raise self._refused(message)
         if not isinstance(message, m.Welcome):
             raise ProtocolError(f"the broker answered HELLO with {describe(message)}, not with WELCOME")
+        # Before the heartbeats: a broker of another version is refused with a text, not met with nonsense.
         check_version(message.version)
         self._rejoin_s = message.rejoin_ns / 1e9
         broker.beat(message)
@@ -206,9 +208,11 @@ class Runner:
         hold_s, pause_s = self._rejoin_s, RETRY_S
         began = time.monotonic()
         _log.warning("%s; trying to come back for at most %g s (timeouts.rejoin_s)", loss, hold_s)
+        # Closed before another one is made at WELCOME: two ray tracers at once may not fit into memory.
         old, self._session = self._session, self._new_session()
         old.close()
         while True:
+            # New sockets for each attempt: what an earlier one still has in its queues is of no incarnation.
             self._broker.abandon()
             self._broker = self._connection()
             try:
@@ -219,6 +223,7 @@ class Runner:
                         f"{loss}; {self.name!r} gives up, it could not come back within {hold_s:g} s: "
                         f"{failure}; timeouts.rejoin_s of the scenario says for how long the run waits"
                     ) from failure
+                # Longer each time: all services of a run come back at once behind an outage.
                 time.sleep(pause_s)
                 pause_s = min(2 * pause_s, MAX_RETRY_S)
             else:
@@ -249,6 +254,7 @@ class SignalTermination(Termination):
     def __init__(self, status: int = TERMINATED) -> None:
         super().__init__()
         self._status = status
+        # Not blocking: Python writes a byte for each signal and must not wait for the thread that reads them.
         self._read, write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         signal.set_wakeup_fd(write, warn_on_full_buffer=False)
         for number in (signal.SIGTERM, signal.SIGINT):
@@ -287,6 +293,7 @@ def restart_status(status: int, ended: str) -> int:
     """
     if status == TERMINATED:
         return 0
+    # 1 is a supervisor's cue to start the process again, for the next attempt at the run.
     failed = bool(ended) and ended != RUN_COMPLETE and not ended.startswith(STOPPED_BY)
     return 1 if failed else status
 

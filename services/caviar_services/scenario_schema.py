@@ -51,6 +51,7 @@ def scenario_schema() -> dict[str, Any]:
     classes: list[type[msgspec.Struct]] = [Scenario, *settings.values()]
     references, definitions = msgspec.json.schema_components(classes, ref_template="#/$defs/{name}")
     by_implementation = dict(zip(settings, references[1:], strict=True))
+    # msgspec has the descriptions of structs; meanings of fields are the strings below them in the source.
     for cls in _structs(classes):
         if cls.__name__ in definitions:
             _describe(definitions[cls.__name__], cls)

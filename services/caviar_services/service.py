@@ -258,6 +258,7 @@ class Frame(msgspec.Struct, frozen=True, kw_only=True):
         Raises:
             ProductError: A payload cannot be decoded, or says what its topic does not allow.
         """
+        # By the enum's member that a module variable holds: looking it up costs more than the comparison.
         found: dict[str, P] = {}
         for item in self.inputs:
             entry = item.provenance
@@ -309,6 +310,7 @@ class Frame(msgspec.Struct, frozen=True, kw_only=True):
         Returns:
             A generator that depends on the seed, the episode, the service, the stream and the frame alone.
         """
+        # Not by drawing from one generator: a frame that is computed again, or alone, has the same numbers.
         return generator(self.seed, self.seed_episode, f"{self.service}/{stream}", self.number)
 
     def __iter__(self) -> Iterator[FrameInput]:

@@ -222,7 +222,7 @@ class ServiceSession:
 
     def leave(self, reason: str) -> None:
         """Say BYE, if the service is in the run."""
-        if self._identity:
+        if self._identity:  # the broker knows no service before WELCOME
             self._send(m.Bye(**self._identity, reason=reason), ())
 
     def close(self) -> None:
@@ -235,6 +235,7 @@ class ServiceSession:
 
     def _welcome(self, welcome: m.Welcome, _: Sequence[Any], __: float) -> None:
         self._identity = {"epoch": welcome.epoch, "attempt": welcome.attempt}
+        # A FAULT, not an exception: the broker ends the run and names the key, whatever machine this is.
         with self._reporting("settings"):
             settings = convert_settings(self.cls.Settings, welcome.settings)
             self._service = self.cls(settings, run_info(self.name, welcome, self._progress))
@@ -252,6 +253,7 @@ class ServiceSession:
             if offered:
                 self._send(m.AssetOffer(**self._identity, assets=tuple(offered)), ())
             if service.needs_assets:
+                # By content, not by name: what an earlier run fetched is not fetched again.
                 missing = [asset for asset in order.assets if not self._store.holds(asset)]
                 self._fetch_assets(_Fetch(order, missing, len(missing)), now)
             else:
@@ -266,6 +268,7 @@ class ServiceSession:
             number = fetch.count - len(fetch.missing) + 1
             self._progress(f"fetching scenery, file {number} of {fetch.count}", 0.0)
             fetch.incoming = IncomingAsset(self._store, fetch.asset)
+        # Chunk by chunk, each asked for: large scenery does not fill the queues that control messages take.
         fetch.deadline = now + self._fetch_timeout_s
         self._fetch = fetch
         self._send(m.AssetGet(digest=fetch.asset.digest, offset=fetch.incoming.offset), ())
@@ -400,7 +403,7 @@ class ServiceSession:
             return
         with self._reporting("restore", order.episode, order.frame):
             self._progress(f"restoring the state after frame {order.frame}", 0.0)
-            self._running.restore(bytes(parts[0]))
+            self._running.restore(bytes(parts[0]))  # a copy: the message's buffer is freed behind this
             if self._answers is not None:
                 self._answers.clear(order.frame)
             self._send(m.Ready(**self._identity), ())
@@ -451,6 +454,7 @@ class _Fetch:
         return self.missing[0]
 
 
+# What may come between a request for scenery and its answer; anything else is a mistake of the broker.
 _WHILE_FETCHING = frozenset({m.AssetData, m.AssetGet, m.Cancel, m.Error, m.Shutdown, m.Stale})
 
 
