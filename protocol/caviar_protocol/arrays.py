@@ -1,4 +1,4 @@
-"""Typed objects that carry arrays, and how arrays travel.
+"""Payloads with arrays: their typed fields, the checks of these, and how arrays travel.
 
 A product is two byte strings: a *header* (msgpack map of the typed fields) and a *body* (the
 arrays, one behind the other). In the header an array stands as

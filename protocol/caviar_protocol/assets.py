@@ -1,4 +1,4 @@
-"""A folder of files by the SHA-256 of their content: how scenery is kept on both sides (clause 4)."""
+"""Asset store: files of scenery by the SHA-256 of their content, on both sides (contract, clause 4)."""
 
 from __future__ import annotations
 

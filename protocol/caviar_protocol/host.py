@@ -1,4 +1,4 @@
-"""What a process asks of its machine: identity, memory, a sign of life, installed extras."""
+"""Process and machine: identity, memory of glibc, a sign of life, installed extras."""
 
 from __future__ import annotations
 

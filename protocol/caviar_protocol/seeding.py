@@ -1,4 +1,4 @@
-"""Random generators that depend on what they are for, never on when they are made."""
+"""Random generators and seeds: one for each purpose, independent of process and order (clause 19)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Writes the tables and byte examples of SPEC.md from the types and the vectors.
+"""Generator of the tables and byte examples in SPEC.md, from the types and the vectors.
 
 ``python -m caviar_protocol.spec protocol/SPEC.md`` replaces what stands between markers such as
 ``<!-- fields: Grant -->`` and ``<!-- end -->``; a test holds that nothing else would come out.

@@ -1,4 +1,4 @@
-"""Reading what a run recorded.
+"""Recordings of runs: what they consist of, and their reader.
 
 >>> from caviar_protocol.recording import Recording
 >>> recording = Recording("runs/smoke-20261122-101500")

@@ -1,4 +1,4 @@
-"""What a recording has as arrays of topics ``scene``, ``lidar``, ``camera``, ``depth`` and ``segmentation``.
+"""Arrays of the topics ``scene``, ``lidar``, ``camera``, ``depth`` and ``segmentation`` of a recording.
 
 The second axis has a row for each name: of an object in ``scene``, of a device in ``scene.devices``, of a
 sensor in the others. `caviar_protocol.recording.topics` has the topics with a row for each user.

@@ -1,4 +1,4 @@
-"""One file of a recording, read where it lies.
+"""Reader of one segment of a recording.
 
 A segment is an MCAP file with one chunk a frame. It is mapped into memory, not read: walking
 over it touches a few pages a frame, and payloads are views into the map. The framing is read

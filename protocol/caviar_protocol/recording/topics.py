@@ -1,4 +1,4 @@
-"""What a recording has as arrays of topics ``channel``, ``link`` and ``action``, and a class for each topic.
+"""Arrays of the topics ``channel``, ``link`` and ``action`` of a recording, and a class for each topic.
 
 The second axis counts users (`User`). `caviar_protocol.recording.scene` has the topics with a row for each
 object, device or sensor.

@@ -1,4 +1,4 @@
-"""Tables of a scenario file to typed objects, with errors that say what to write instead."""
+"""Conversion of scenario tables to structs, with errors that say what to write instead."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The rules of a scenario that concern several keys at once, and what follows from its keys."""
+"""Rules between several keys of a scenario, and values that follow from its keys."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""TOML: reading it from elsewhere in bounded time and memory, the line of every key, and writing it.
+"""TOML: a parser bounded in time and memory, the line of every key, and a writer.
 
 `tomllib` recurses for every level, so that a few kilobytes of brackets end in a `RecursionError`, and takes
 time quadratic in the parts of a dotted key. What no scenario needs is refused before. It does not keep line

@@ -1,4 +1,4 @@
-"""Which beam of a DFT codebook points where, for arrays of one or several panels and polarizations.
+"""Beams of DFT codebooks: which one points where, and its gain, for arrays of panels and polarizations.
 
 `Link` defines the beams by their index. An array is a set of uniform subarrays: the elements of one panel and
 one polarization. Elements and beams are both in order of the subarrays, so whatever is known of uniform

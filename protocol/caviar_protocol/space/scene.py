@@ -1,4 +1,4 @@
-"""Scenes of several worlds as one, where things are in it, and pairs of antennas (contract, clause 3).
+"""Poses in a scene, scenes of several worlds merged, and pairs of antennas (contract, clause 3).
 
 A *pair* is a transmitting and a receiving device of the scene. A device that both transmits and receives is
 no pair with itself.
