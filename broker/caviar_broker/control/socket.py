@@ -182,7 +182,7 @@ def ask(directory: Path, **request: Any) -> dict[str, Any]:
         request: Fields of the request, ``do`` and what belongs to it.
 
     Returns:
-        The answer, with ``ok`` and what was asked for: ``ask(run, do="why")["why"]["state"]``.
+        The answer, with ``ok`` and what was asked for, as ``ask(run, do="why")["why"]["state"]``.
 
     Raises:
         RequestRefusedError: The broker refuses the request.

@@ -439,7 +439,7 @@ def colour_limits(values: Float64Array) -> tuple[float, float, str]:
         values: Values of all cells with a signal [dB].
 
     Returns:
-        Both ends [dB], and at which of them values lie beyond: ``both``, ``min``, ``max`` or ``neither``.
+        Both ends [dB], and ``both``, ``min``, ``max`` or ``neither`` for the ends with values beyond them.
 
     Example:
         >>> colour_limits(np.array([-90.0, -90.0]))

@@ -35,6 +35,7 @@ from caviar_protocol.topics import Channel
 from caviar_protocol.topics.channel import PLANE_WAVES
 from caviar_services.channel.interpolation import Between, Interpolation, Keyframe
 
+# With 21 consecutive frames the widest has two intervals, so that one odd one does not decide.
 SPACINGS = (2, 5, 10)
 """Frames from one keyframe to the next."""
 

@@ -64,6 +64,7 @@ def comparable_times(report: Report) -> list[Row]:
     Settings that were measured at different times, on a machine that was not as busy at all of them, then
     have the order of their factors.
     """
+    # Without the baseline among the rows times stay as they were measured.
     base = next((row.time_ms_median for row in report.rows if row.setting == report.baseline), None)
     if base is None:
         return list(report.rows)

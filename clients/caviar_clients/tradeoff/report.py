@@ -231,6 +231,7 @@ def _reference(
     for setting in references:
         if setting.label in by_label:
             return by_label[setting.label]
+    # Each reason once: a missing library is the reason of all of them.
     labels = [setting.label for setting in references]
     reasons = dict.fromkeys(entry.reason for entry in skipped if entry.setting in labels)
     raise RunError(f"no reference can be measured, of {', '.join(labels)}: {'; '.join(reasons)}")

@@ -292,6 +292,7 @@ def _spread(entries: Sequence[T], count: int) -> list[T]:
     """Take ``count`` entries, evenly spread, the first and the last among them; all where there are fewer."""
     if len(entries) <= count:
         return list(entries)
+    # Rounding may hit an entry twice where there are few.
     return [entries[i] for i in np.unique(np.linspace(0, len(entries) - 1, count).round().astype(int))]
 
 
@@ -311,5 +312,6 @@ def _run(instants: Sequence[Instant]) -> tuple[Instant, ...]:
             runs[-1].append(instant)
         elif runs[-1]:
             runs.append([])
+    # Of several equal ones the first, so that two comparisons take the same frames.
     longest: list[Instant] = max(runs, key=lambda run: len(run))
     return tuple(longest)

@@ -159,6 +159,7 @@ def seen(scene: Scene, receivers: int | None, elements: tuple[int, int] | None) 
             if device.role == "rx" and device.name not in kept:
                 continue
             if elements is not None:
+                # As in the paper's Table 4: one row, whatever the scenario's array is.
                 columns = elements[1] if device.role == "rx" else elements[0]
                 device = replace(device, array=replace(device.array, rows=1, columns=columns))
         devices.append(device)
