@@ -12,7 +12,7 @@ from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.propagation import utd as module
 from caviar_services.channel.propagation.fresnel import Media
-from caviar_services.channel.propagation.utd import edge_fields, faces_of
+from caviar_services.channel.propagation.utd import edge_fields, wedges_of
 from caviar_services.channel.sionna import path_table
 from caviar_services.channel.stability.formulas import EPSILON_0, C, turn, unit
 from caviar_services.channel.stability.lab import (
@@ -192,7 +192,7 @@ def made_of(eta: float) -> Media:
 def over_edge(angle: float, at: float, interior: float, eta: float, along_edge: bool) -> complex:
     """Field over the edge of a wedge of high conductivity or of permittivity ``eta``, along it or across."""
     places = [leg * np.array([np.cos(a), np.sin(a), 0.0]) for leg, a in ((S_IN, at), (S_OUT, angle))]
-    faces, is_edge = faces_of(*edge_of(wedge(interior)))
+    faces, is_edge = wedges_of(*edge_of(wedge(interior)))
     assert is_edge.all()
     media = made_of(eta)
     corners = np.array([[places[0], np.zeros(3), places[1]]])
@@ -255,14 +255,14 @@ def test_behind_a_half_plane_is_sommerfelds_field() -> None:
 
 def test_what_has_no_length_or_no_width_is_no_wedge() -> None:
     ends, apexes = edge_of(wedge(1.0))
-    assert not faces_of(ends[:, :1].repeat(2, 1), apexes)[1].any()
-    assert not faces_of(ends, np.stack([apexes[:, 0], ends[:, 0]], axis=1))[1].any()
+    assert not wedges_of(ends[:, :1].repeat(2, 1), apexes)[1].any()
+    assert not wedges_of(ends, np.stack([apexes[:, 0], ends[:, 0]], axis=1))[1].any()
 
 
 def test_each_face_of_an_edge_has_its_own_material() -> None:
     """Deep in the shadow of neither face, of a wedge of a conductor and a dielectric: between the fields of
     wedges of one of these, and the same from the other side with the materials swapped."""
-    faces, _ = faces_of(*edge_of(wedge(np.pi / 2)))
+    faces, _ = wedges_of(*edge_of(wedge(np.pi / 2)))
     places = [leg * np.array([np.cos(a), np.sin(a), 0.0]) for leg, a in ((S_IN, 1.9), (S_OUT, 2.9))]
     types, normal = np.array([[DIFFRACTED]], np.uint8), np.array([[[0.0, 1, 0]]])
 
@@ -283,7 +283,7 @@ def test_faces_look_outward_from_a_wedge_that_stands_anywhere() -> None:
     rng = np.random.default_rng(2)
     for interior in (0.3, 1.2, 2.7):
         moved = wedge(interior) @ turn(*rng.uniform(-3, 3, 3)).T + rng.uniform(-1e4, 1e4, 3)
-        faces, is_edge = faces_of(*edge_of(moved))
+        faces, is_edge = wedges_of(*edge_of(moved))
         assert is_edge.all()
         assert faces.exterior[0] == pytest.approx(2 * np.pi - interior, abs=1e-9)
         middle = unit(moved[:, 2].mean(0) - moved[0, :2].mean(0))

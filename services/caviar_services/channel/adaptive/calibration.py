@@ -266,7 +266,7 @@ class ErrorBound:
         """All that is known."""
         return BoundState(learned=self.learned, last=dict(self._last), measured=self.measured)
 
-    def go_on(self, state: BoundState) -> None:
+    def restore(self, state: BoundState) -> None:
         """Continue from the state of another bound."""
         self.learn(state.learned)
         self._last, self.measured = dict(state.last), state.measured
@@ -414,10 +414,10 @@ class Calibration:
         bounds = tuple(bound.state for bound in self.bounds)
         return CalibrationState(bounds=bounds, episode=self._episode, begins=self._begins)
 
-    def go_on(self, state: CalibrationState) -> None:
+    def restore(self, state: CalibrationState) -> None:
         """Continue from the state of another calibration."""
         for bound, known in zip(self.bounds, state.bounds, strict=True):
-            bound.go_on(known)
+            bound.restore(known)
         self._episode, self._begins = state.episode, state.begins
 
 

@@ -280,9 +280,9 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
         for rung, model_state in zip(self._every, was.rungs, strict=True):
             if rung.model.checkpoints:
                 rung.model.restore(model_state)
-        self.calibration.go_on(was.errors)
-        self.costs.go_on(was.costs)
-        self._controller.go_on(was.controller)
+        self.calibration.restore(was.errors)
+        self.costs.restore(was.costs)
+        self._controller.restore(was.controller)
         self._current = was.current
 
     # --- the rest of its life ------------------------------------------------------------------------

@@ -170,7 +170,7 @@ class CostModel:
             expected=tuple(self._expected),
         )
 
-    def go_on(self, state: CostState) -> None:
+    def restore(self, state: CostState) -> None:
         """Continue from the state of another model of the same ladder.
 
         Its timings come with what it learned, which is relative to them. A difference between both machines
@@ -310,7 +310,7 @@ class Controller:
         """The rung, and for how many frames each rung would have fitted."""
         return ControllerState(current=self._current, streaks=tuple(self._streaks))
 
-    def go_on(self, state: ControllerState) -> None:
+    def restore(self, state: ControllerState) -> None:
         """Continue from the state of another controller."""
         self._current, self._streaks = state.current, list(state.streaks)
 

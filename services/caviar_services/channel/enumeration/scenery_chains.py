@@ -48,7 +48,7 @@ from caviar_services.checkpoint import Packed
 from caviar_services.ray_tracing import positions
 
 MOST_CHAINS = 20_000
-"""Sequences of which all are taken, at most."""
+"""Largest number of sequences that are enumerated."""
 
 # [m] around pyramids; more than the rim of triangles.
 _SLACK = 1e-3
@@ -62,7 +62,7 @@ class _Level:
     """Sequences of one length."""
 
     parent: Int64Array
-    """Number of the sequence of one face less that each goes on from, Shape ``[K]``."""
+    """Index of the sequence one face shorter that each continues, Shape ``[K]``."""
     face: Int64Array
     """Its last face, Shape ``[K]``."""
     planes: Int32Array
@@ -85,14 +85,20 @@ class ChainTree:
 
     @property
     def planes(self) -> Int64Array:
-        """Of the faces, in ascending order, Shape ``[U]``."""
+        """Planes of the faces, ascending, Shape ``[U]``."""
         return self._faces.plane
 
     @classmethod
     def of(cls, faces: FaceRectangles, sights: Int64Array, depth: int) -> ChainTree | None:
-        """Up to so many faces; None where there are more than `MOST_CHAINS`.
+        """All sequences of faces up to a length.
 
-        ``sights`` are planes that see one another, in both orders and sorted, Shape ``[M, 2]``.
+        Args:
+            faces: Of scenery, in ascending order of their planes.
+            sights: Pairs of planes that see one another, in both orders, sorted, Shape ``[M, 2]``.
+            depth: Faces of a sequence at most.
+
+        Returns:
+            The tree; None where there are more sequences than `MOST_CHAINS`.
         """
         seen = np.searchsorted(faces.plane, sights)
         parent, face = np.zeros(len(faces), np.int64), np.arange(len(faces))
@@ -110,12 +116,15 @@ class ChainTree:
         return cls(faces, levels)
 
     def chains(self, source: Float64Array, seen: BoolArray) -> Int32Array:
-        """Planes of the sequences that a source can light, those of fewer planes first, with the beginnings
-        of each, −1 behind the last, Shape ``[K, D]``.
+        """Sequences that a source can light.
 
         Args:
-            source: [m], Shape ``[3]``.
+            source: Position [m], Shape ``[3]``.
             seen: Faces that the source may see, Shape ``[U]``.
+
+        Returns:
+            Planes of each, −1 behind the last, Shape ``[K, D]``: shorter sequences first, with the beginnings
+            of each one among them.
         """
         faces, level = self._faces, self._levels[0]
         rows = last = np.flatnonzero(seen)
@@ -140,7 +149,7 @@ class ChainTree:
         return np.concatenate(found)
 
     def _in_front(self, image: Float64Array, last: Int64Array, target: Float64Array) -> BoolArray:
-        """Whether rectangles reach to the side of the planes of last faces that images are behind."""
+        """Whether rectangles reach to the lit side of the planes of last faces, which images are behind."""
         away = np.where(self._faces.height(image, last) > 0, -1.0, 1.0)[:, None]
         height = np.einsum("nkc,nc->nk", target, self._faces.normal[last]) - self._faces.offset[last, None]
         in_front: BoolArray = (away * height > _IN_FRONT).any(1)
@@ -180,20 +189,20 @@ _FEW = 64
 
 @dataclass(frozen=True, kw_only=True)
 class SceneryLaunch:
-    """How chains of scenery are looked for."""
+    """Launches that look for chains of scenery."""
 
     samples: int
     """Rays of a launch."""
     launches: int
-    """Each turned a little against the others."""
+    """Number of launches, each turned a little against the others."""
 
 
 @dataclass(frozen=True, eq=False)
 class KnownScenery:
-    """What is known of the scenery from the place of a transmitter."""
+    """Scenery as it is known from the place of a transmitter."""
 
     chains: Int32Array
-    """Planes that waves from there are reflected at in turn, −1 behind the last, Shape ``[K, D]``."""
+    """Planes that reflect waves from there in turn, −1 behind the last, Shape ``[K, D]``."""
     sights: Int32Array
     """Pairs of these planes that see one another, in both orders, Shape ``[M, 2]``."""
 
@@ -231,10 +240,15 @@ class SceneryChains:
         self._last: tuple[bytes, int, KnownScenery] | None = None
 
     def prepare(self, name: str, transmitter: Float64Array, progress: Callable[[int, int], None]) -> str:
-        """Launch from where the transmitter ``name`` stands [m], Shape ``[3]``, while no body is there.
+        """Find the chains from where a transmitter stands, while no body is in the scene.
 
-        ``progress`` is called before each part with its number and how many there are. Returns what was
-        found.
+        Args:
+            name: Of the transmitter.
+            transmitter: Its position in the world [m], Shape ``[3]``.
+            progress: Called before each part with its number and the count of parts.
+
+        Returns:
+            A note for the user on what was found.
         """
         if not self._scene.has_scenery:
             return "there is no scenery"
@@ -252,9 +266,13 @@ class SceneryChains:
         self._known[name] = transmitter, KnownScenery(chains, sights)
         return f"{len(chains)} chains of scenery {source}"
 
-    def of(self, name: str, transmitter: Float64Array) -> KnownScenery:
-        """Those of the transmitter ``name`` at a position in the world [m], Shape ``[3]``, in the scene as it
-        stands."""
+    def known_from(self, name: str, transmitter: Float64Array) -> KnownScenery:
+        """Chains and sights of scenery that are known from a transmitter, in the scene as it stands.
+
+        Args:
+            name: Of the transmitter.
+            transmitter: Its position in the world [m], Shape ``[3]``.
+        """
         # What one launch of many rays has found holds as long as the transmitter stands there.
         if name in self._known:
             known, scenery = self._known[name]
@@ -268,7 +286,7 @@ class SceneryChains:
         return last[2]
 
     def _now(self, place: Float64Array) -> KnownScenery:
-        """What the frame tells about the scenery from a place in the ray tracer's coordinates."""
+        """Scenery as the frame shows it from a place in the ray tracer's coordinates [m], Shape ``[3]``."""
         if not self._scene.has_scenery:
             depth = self._options.max_depth
             return KnownScenery(np.zeros((0, depth), np.int32), np.zeros((0, 2), np.int32))
@@ -297,7 +315,7 @@ class SceneryChains:
         return reduce(united, self._launcher.each(look, positions(place[None])))
 
     def _sights(self, chains: Int32Array, rays: int) -> Int32Array:
-        """Which planes of chains see one another."""
+        """Pairs of planes of chains that see one another, found with so many rays from each."""
         faces = self._faces.scenery(chains[chains >= 0].astype(np.int64))
         return visible_pairs(self._look, faces, rays, self._options.seed).astype(np.int32)
 
@@ -315,14 +333,18 @@ def launched_chains(
     transmitter: Float64Array,
     progress: Callable[[int, int], None],
 ) -> Int32Array:
-    """Planes of all chains of scenery that rays from a place go along, −1 behind the last, Shape ``[K, D]``.
-
-    Chains are sorted, those of fewer planes first, and with each chain its beginnings are there.
+    """Find the chains of scenery that rays from a place go along.
 
     Args:
-        options: Of the paths that are wanted: the depth and the seed; only reflections are looked for.
-        transmitter: In the ray tracer's coordinates [m], Shape ``[3]``.
-        progress: Called before each part with its number and how many there are.
+        scene: Without bodies.
+        options: Of the paths that are wanted: depth and seed; only reflections are looked for.
+        launch: Rays and launches.
+        transmitter: Position in the ray tracer's coordinates [m], Shape ``[3]``.
+        progress: Called before each part with its number and the count of parts.
+
+    Returns:
+        Planes of all chains, −1 behind the last, Shape ``[K, D]``: shorter ones first, with the beginnings of
+        each one among them.
     """
     reflected = only_reflected(options, launch.samples)
     source = positions(transmitter[None])
@@ -342,14 +364,14 @@ def launched_chains(
 
 
 def only_reflected(options: LaunchOptions, samples: int) -> LaunchOptions:
-    """What a launch is made with that looks for chains of reflections."""
+    """Options of a launch that looks for chains of reflections with so many rays."""
     return replace(
         options, samples=samples, reflection=True, refraction=False, diffraction=False, scattering=False
     )
 
 
 def scenery_of(launch: Launch, scene: SionnaScene, depth: int) -> Int32Array:
-    """Chains of a launch that planes of scenery alone reflect, as in `launched_chains`."""
+    """Chains of a launch that planes of scenery alone reflect, sorted as in `launched_chains`."""
     chains = chains_of(launch, scene, depth)
     some = chains.straight & ((chains.planes >= 0).sum(1) == chains.depth)
     some &= (chains.planes < scene.first_moving_plane).all(1)
@@ -367,7 +389,7 @@ _FORMAT: Literal["caviar-chains-1"] = "caviar-chains-1"
 
 
 class _ChainFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The content of a file."""
+    """Content of a file of the cache."""
 
     format: Literal["caviar-chains-1"]
     key: str
@@ -378,10 +400,18 @@ class _ChainFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
 
 class ChainCache:
-    """Files of chains below a folder, which is made when the first one is written.
+    """Cache of chains in the files of a folder.
 
     Args:
-        folder: Any; several processes may use it at once.
+        folder: Made when the first file is written; several processes may use it at once.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     cache = ChainCache(Path(folder))
+        ...     cache.save("a1", (np.array([[3, -1]], np.int32),))
+        ...     [table.tolist() for table in cache.load("a1", (2,))], cache.load("b2", (2,))
+        ([[[3, -1]]], None)
     """
 
     def __init__(self, folder: Path) -> None:
@@ -390,8 +420,15 @@ class ChainCache:
         """What could not be read or written, and why."""
 
     def load(self, key: str, widths: tuple[int, ...]) -> tuple[Int32Array, ...] | None:
-        """The tables of a key, which have rows of these widths; None where there is no file, or a damaged
-        one."""
+        """Read the tables of a key.
+
+        Args:
+            key: From `cache_key`.
+            widths: Of the rows of each table.
+
+        Returns:
+            The tables; None where there is no file, or a damaged one, which a note tells of.
+        """
         path = self._folder / key
         try:
             data = read_regular(path, "it is replaced")
@@ -415,7 +452,7 @@ class ChainCache:
         return None
 
     def save(self, key: str, tables: tuple[Int32Array, ...]) -> None:
-        """Keep the tables of a key; where that cannot be done, a note says so."""
+        """Write the tables of a key; where that fails, a note says so."""
         packed = tuple([Packed.of(table, "<i4") for table in tables])
         file = _ChainFile(format=_FORMAT, key=key, tables=packed, digest=_digest(packed))
         try:
@@ -429,7 +466,7 @@ class ChainCache:
 
 
 def cache_key(*parts: bytes) -> str:
-    """Digest of all that chains follow from."""
+    """Name of a file: the digest of everything that its chains follow from."""
     digest = hashlib.blake2b(digest_size=20)
     for part in (_FORMAT.encode(), *parts):
         # With lengths: else two parts could be divided in another place and have the same digest.

@@ -55,7 +55,7 @@ _SIGN = -1.0
 
 
 @dataclass(frozen=True, eq=False)
-class Faces(Rows):
+class Wedges(Rows):
     """Both faces of P wedges; angles are counted from the first one."""
 
     normals: Float64Array
@@ -71,16 +71,16 @@ class Faces(Rows):
         exterior: Float64Array = 2 * np.pi - np.arctan2(sine, cosine)
         return exterior
 
-    def turned(self, swap: BoolArray) -> Faces:
+    def turned(self, swap: BoolArray) -> Wedges:
         """The same wedges, with the other face first where ``swap`` is true."""
-        return Faces(
+        return Wedges(
             np.where(swap[:, None, None], self.normals[:, ::-1], self.normals),
             np.where(swap[:, None], -self.edge, self.edge),
         )
 
 
-def faces_of(ends: Float64Array, apexes: Float64Array) -> tuple[Faces, BoolArray]:
-    """Faces of wedges from points of a mesh.
+def wedges_of(ends: Float64Array, apexes: Float64Array) -> tuple[Wedges, BoolArray]:
+    """Wedges from points of a mesh.
 
     Args:
         ends: Both ends of the edges [m], Shape ``[P, 2, 3]``.
@@ -104,7 +104,7 @@ def faces_of(ends: Float64Array, apexes: Float64Array) -> tuple[Faces, BoolArray
         normals[1] = np.where(level, turned, normals[1])
         leads_in = (np.cross(normals[0], edge) * inward[0]).sum(-1, keepdims=True) >= 0
     is_edge: BoolArray = np.asarray(np.isfinite(normals).all((0, 2)))
-    return Faces(np.stack(normals, axis=1), np.where(leads_in, edge, -edge)), is_edge
+    return Wedges(np.stack(normals, axis=1), np.where(leads_in, edge, -edge)), is_edge
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,13 +119,13 @@ class Bends:
     """Unit vectors along outgoing waves, Shape ``[P, 3]``."""
     legs: tuple[Float64Array, Float64Array]
     """Lengths before and behind the edge [m], each of Shape ``[P]``."""
-    faces: Faces
+    faces: Wedges
     """First the face that waves meet more steeply."""
     swapped: BoolArray
     """Whether that is the second one of the faces as given, Shape ``[P]``."""
 
     @classmethod
-    def of(cls, corners: Float64Array, types: UInt8Array, faces: Faces) -> Bends:
+    def of(cls, corners: Float64Array, types: UInt8Array, faces: Wedges) -> Bends:
         """Those of paths; the arguments are those of `edge_fields`."""
         steps = np.diff(corners, axis=1)
         lengths = np.sqrt((steps**2).sum(-1))
@@ -178,7 +178,7 @@ def edge_fields(
     corners: Float64Array,
     types: UInt8Array,
     normals: Float64Array,
-    faces: Faces,
+    faces: Wedges,
     media: Media,
     second: Media,
     wavelengths: Sequence[float],
@@ -257,7 +257,7 @@ def _diffracted(bends: Bends, walls: tuple[Wall, Wall], lit: Int64Array) -> Comp
     return dyad
 
 
-def _angle(direction: Float64Array, faces: Faces, exterior: Float64Array) -> Float64Array:
+def _angle(direction: Float64Array, faces: Wedges, exterior: Float64Array) -> Float64Array:
     """Angles about the edge from the first face [rad], within the exterior: a direction that rounding puts
     inside of the wedge is at the nearer face."""
     normal = faces.normals[:, 0]

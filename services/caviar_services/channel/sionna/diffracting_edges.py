@@ -18,7 +18,7 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.paths import PathTable
-from caviar_services.channel.propagation.utd import Faces, faces_of
+from caviar_services.channel.propagation.utd import Wedges, wedges_of
 from caviar_services.channel.sionna.mesh_edges import MeshEdges, mesh_edges
 from caviar_services.channel.sionna.triangle_numbering import NumberedTriangles
 from caviar_services.mesh.shapes import Mesh
@@ -84,14 +84,14 @@ class SceneEdges:
         """
         return self._corners(self._edges.ends, edges)
 
-    def faces(self, edges: Int64Array) -> tuple[Faces, BoolArray]:
+    def faces(self, edges: Int64Array) -> tuple[Wedges, BoolArray]:
         """Faces of edges as they stand, and which edges have any: those of bodies that stand for nothing
         have none.
 
         Args:
             edges: Numbers, Shape ``[N]``.
         """
-        return faces_of(self.ends(edges), self._corners(self._edges.apexes, edges))
+        return wedges_of(self.ends(edges), self._corners(self._edges.apexes, edges))
 
     def outward(self, edges: Int64Array) -> Float64Array:
         """Unit vectors between the normals of both faces, Shape ``[N, 3]``; 0 at free edges and for −1.

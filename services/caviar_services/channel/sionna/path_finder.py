@@ -307,7 +307,7 @@ class PathFinder:
             self._without_edge += 1
         found: list[tuple[Traced, Float64Array | None]] = []
         if self._enumerated is not None:
-            scenery = self._scenery.of(transmitter.name, source)
+            scenery = self._scenery.known_from(transmitter.name, source)
             found.append((self._enumerated.trace(source, targets, scenery, over_edges), None))
         if self.launches:
             followed = None if self._following is None else self._following.of(transmitter.name)
