@@ -1,7 +1,7 @@
 """What a frame costs in the broker, beside a bare loop that forwards the same bytes, HELICS and mosaik.
 
     python tests/bench/bench_broker.py [--services 2 4 8 32] [--payload 100] [--frames 2000] [--curve]
-                                       [--json FILE]
+                                       [--transport tcp ipc] [--json FILE]
 
 One hub and N - 1 others, each a process of its own. In every frame the hub takes what each of the others
 made in it, and each of them takes what the hub made in the frame before. The kinds of loop take turns, round
@@ -12,7 +12,8 @@ by round, so that a machine's moods fall on all of them; ratios are medians of t
 - *helics*, *mosaik*: where they are installed (``pip install helics mosaik``);
 - *helics-lagged*: the hub too takes what was made in the frame before, which is less: nobody waits for it.
 
-With ``--curve`` the bare loop and the broker are encrypted; the others know no encryption, and are left out.
+With ``--curve`` the bare loop and the broker are encrypted; with ``--transport ipc`` both use a socket
+file, as the services of `caviar run` do. The others know neither, and are left out.
 """
 
 # ruff: noqa: T201 - a command that prints what it measured
@@ -35,7 +36,7 @@ from typing import Any
 import zmq
 
 from caviar_broker.bench.client import deliveries
-from caviar_broker.bench.run import WARM_UP
+from caviar_broker.bench.run import WARM_UP, measure
 
 HEADER = bytes(60)
 """Stands for what the broker tells with each product."""
@@ -47,28 +48,28 @@ PEERS_LEAST = 100
 """Frames of HELICS and mosaik, which take longer, at least."""
 
 PLAIN = {"helics": "helics", "helics-lagged": "helics", "mosaik": "mosaik"}
-"""Kinds that know no encryption, and what has to be installed for each."""
+"""Kinds that know TCP without encryption alone, and what has to be installed for each."""
+Seconds = Callable[[int, int, int, str], float]
+"""``kind(services, payload, frames, wire)``: seconds of a frame over ``tcp``, ``ipc`` (a socket file) or
+``curve`` (TCP with encryption)."""
 
-Seconds = Callable[[int, int, int, bool], float]
-"""``kind(services, payload, frames, curve)``: seconds that a frame takes."""
 
-
-def bare(services: int, payload: int, frames: int, curve: bool) -> float:
+def bare(services: int, payload: int, frames: int, wire: str) -> float:
     """A loop that knows nothing but the pattern, in a process of its own."""
-    command = [sys.executable, __file__, "--bare", *map(str, (services, payload, frames, int(curve)))]
+    command = [sys.executable, __file__, "--bare", *map(str, (services, payload, frames)), wire]
     done = subprocess.run(command, stdout=subprocess.PIPE, timeout=600, check=True)
     return float(done.stdout)
 
 
-def bare_loop(services: int, payload: int, frames: int, curve: bool) -> float:
+def bare_loop(services: int, payload: int, frames: int, wire: str, folder: Path) -> float:
     """The process of `bare`: seconds that a frame takes."""
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     socket = context.socket(zmq.ROUTER)
     public_key = ""
-    if curve:
+    if wire == "curve":
         public, private = zmq.curve_keypair()
         socket.curve_server, socket.curve_secretkey, public_key = True, private, public.decode()
-    socket.bind("tcp://127.0.0.1:0")
+    socket.bind(f"ipc://{folder}/bare" if wire == "ipc" else "tcp://127.0.0.1:0")
     command = [sys.executable, __file__, "--echo", str(payload), socket.getsockopt_string(zmq.LAST_ENDPOINT)]
     started = [subprocess.Popen([*command, str(number), public_key]) for number in range(services)]
     try:
@@ -142,23 +143,18 @@ def received(socket: zmq.Socket[bytes]) -> list[Any]:
     return parts
 
 
-def broker(services: int, payload: int, frames: int, curve: bool) -> float:
-    """The broker, by its own command: in a process of its own, like the bare loop."""
-    with TemporaryDirectory() as folder:
-        figures = Path(folder) / "figures.json"
-        options = {"services": services, "payload": payload, "frames": frames, "json": figures}
-        words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
-        command = [sys.executable, "-m", "caviar_clients", "bench", "broker", *words, *["--curve"] * curve]
-        subprocess.run(command, stdout=subprocess.DEVNULL, timeout=600, check=True)
-        mean: float = json.loads(figures.read_text())["us_per_frame"]["mean"]
-    return mean / 1e6
+def broker(services: int, payload: int, frames: int, wire: str) -> float:
+    """The broker of `caviar bench broker`, in a process of its own, like the bare loop."""
+    command = [sys.executable, __file__, "--broker", *map(str, (services, payload, frames)), wire]
+    done = subprocess.run(command, stdout=subprocess.PIPE, timeout=600, check=True)
+    return float(done.stdout)
 
 
 def peer(name: str, *variant: str) -> Seconds:
     """Another co-simulation, in a process of its own."""
 
-    def seconds(services: int, payload: int, frames: int, curve: bool) -> float:
-        assert not curve, f"{name} knows no encryption"
+    def seconds(services: int, payload: int, frames: int, wire: str) -> float:
+        assert wire == "tcp", f"{name} knows TCP alone"
         script = Path(__file__).with_name(f"peer_{name}.py")
         numbers = services, payload, max(PEERS_LEAST, frames // 4)
         command = [sys.executable, str(script), *map(str, numbers), *variant]
@@ -181,7 +177,7 @@ KINDS: dict[str, Seconds] = {
 }
 
 
-def report(services: int, payload: int, rows: dict[str, list[float]], curve: bool) -> list[dict[str, Any]]:
+def report(services: int, payload: int, rows: dict[str, list[float]], wire: str) -> list[dict[str, Any]]:
     """Print and return a line for each kind of loop."""
     lines = []
     delivered = deliveries("hub", services) * payload
@@ -191,7 +187,8 @@ def report(services: int, payload: int, rows: dict[str, list[float]], curve: boo
             "services": services,
             "payload": payload,
             "kind": kind,
-            "curve": curve,
+            "wire": wire,
+            "curve": wire == "curve",
             "us_per_frame": statistics.median(seconds) * 1e6,
             "bytes_per_second": delivered / statistics.median(seconds),
             "time_to_bare": statistics.median(to_bare),
@@ -200,7 +197,7 @@ def report(services: int, payload: int, rows: dict[str, list[float]], curve: boo
         lines.append(line)
         low, high = line["time_to_bare_range"]
         print(
-            f"N = {services:3} {payload:8} B {' curve' * curve} {kind:13}{line['us_per_frame']:9.0f} µs "
+            f"N = {services:3} {payload:8} B {wire:5} {kind:13}{line['us_per_frame']:9.0f} µs "
             f"a frame {line['time_to_bare']:7.2f} × bare ({low:.2f} to {high:.2f}) "
             f"{line['bytes_per_second'] / 1e6:9.3g} MB/s",
             flush=True,
@@ -213,9 +210,15 @@ def main() -> None:
     if sys.argv[1:2] == ["--echo"]:
         echo(int(sys.argv[2]), *sys.argv[3:])
         return
-    if sys.argv[1:2] == ["--bare"]:
-        services, payload, frames, curve = map(int, sys.argv[2:])
-        print(bare_loop(services, payload, frames, bool(curve)))
+    if sys.argv[1:2] in (["--bare"], ["--broker"]):
+        services, payload, frames = map(int, sys.argv[2:5])
+        wire = sys.argv[5]
+        if sys.argv[1] == "--bare":
+            with TemporaryDirectory() as folder:
+                print(bare_loop(services, payload, frames, wire, Path(folder)))
+        else:
+            measured = measure("hub", services, payload, frames, curve=wire == "curve", ipc=wire == "ipc")
+            print(measured.us_per_frame.mean / 1e6)
         return
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -226,22 +229,25 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--kinds", nargs="+", choices=list(KINDS), default=list(KINDS))
     parser.add_argument("--curve", action="store_true", help="encrypted; without helics and mosaik")
+    parser.add_argument("--transport", nargs="+", choices=["tcp", "ipc"], default=["tcp"], help="one or both")
     parser.add_argument("--json", type=Path)
-    told = parser.parse_args()
-    kinds = ["bare", *(k for k in told.kinds if k != "bare" and not (told.curve and k in PLAIN))]
+    options = parser.parse_args()
+    kinds = ["bare", *(kind for kind in options.kinds if kind != "bare")]
     for kind in [k for k in kinds if k in PLAIN and importlib.util.find_spec(PLAIN[k]) is None]:
         print(f"{kind} is left out: pip install {PLAIN[kind]}")
         kinds.remove(kind)
     lines = []
-    for payload in told.payload:
-        for services in told.services:
-            rows: dict[str, list[float]] = {kind: [] for kind in kinds}
-            for _ in range(told.rounds):
-                for kind in kinds:
-                    rows[kind].append(KINDS[kind](services, payload, told.frames, told.curve))
-            lines += report(services, payload, rows, told.curve)
-    if told.json:
-        told.json.write_text(json.dumps(lines, indent=2) + "\n")
+    for wire in ["curve"] if options.curve else options.transport:
+        able = [kind for kind in kinds if wire == "tcp" or kind not in PLAIN]
+        for payload in options.payload:
+            for services in options.services:
+                rows: dict[str, list[float]] = {kind: [] for kind in able}
+                for _ in range(options.rounds):
+                    for kind in able:
+                        rows[kind].append(KINDS[kind](services, payload, options.frames, wire))
+                lines += report(services, payload, rows, wire)
+    if options.json:
+        options.json.write_text(json.dumps(lines, indent=2) + "\n")
 
 
 if __name__ == "__main__":

@@ -77,7 +77,9 @@ class _Silent:
         """Measured by the statistics."""
 
 
-def measure(topology: Topology, services: int, payload: int, frames: int, *, curve: bool = False) -> Measured:
+def measure(
+    topology: Topology, services: int, payload: int, frames: int, *, curve: bool = False, ipc: bool = False
+) -> Measured:
     """Run ``services`` clients, each a process, with products of ``payload`` bytes.
 
     With ``curve`` each of them has a key, and what it says is encrypted, as in a run with keys.
@@ -88,6 +90,7 @@ def measure(topology: Topology, services: int, payload: int, frames: int, *, cur
         payload: Of each product [B].
         frames: That are measured, behind the warm-up.
         curve: Whether with keys.
+        ipc: Whether at a socket file, as the services of `caviar run`; else over TCP.
 
     Raises:
         RunError: The run, or one of the clients, does not come to its end.
@@ -107,7 +110,8 @@ def measure(topology: Topology, services: int, payload: int, frames: int, *, cur
     ):
         store = AssetStore(Path(folder) / "assets")
         access = _keys(Path(folder), declared) if curve else None
-        server = BrokerServer(plan, "tcp://127.0.0.1:0", journal, _Silent(), store, access=access)
+        endpoint = f"ipc://{folder}/broker" if ipc else "tcp://127.0.0.1:0"
+        server = BrokerServer(plan, endpoint, journal, _Silent(), store, access=access)
         tune_garbage_collector()
         steady_memory()
         keys = Path(folder) if curve else None
