@@ -188,12 +188,11 @@ class Payload(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
         # Payloads are made a thousand times a second: equal shapes are looked at once.
         shapes: tuple[Any, ...] = ()
         try:
-            lengths = [len(getattr(self, field)) for field in layout.listed]
-            shapes = (*layout.shapes_of(self), *lengths)
+            shapes = (*layout.shapes_of(self), *map(len, layout.listed_of(self)))
             is_known = layout.dtypes_of(self) == layout.dtypes and shapes in layout.known
         except (AttributeError, TypeError):  # no array, or no length: reported below
             is_known = False
-        if not is_known or (layout.optional and any(getattr(self, f) is not None for f in layout.optional)):
+        if not is_known or [values for values in layout.optional_of(self) if values is not None]:
             self._check_arrays()
             # A lidar has another number of hits in every frame: without a bound the set would grow for hours.
             if len(layout.known) >= KNOWN_SHAPES:
@@ -241,9 +240,9 @@ class _Layout:
     shapes_of: Callable[[Any], tuple[Any, ...]]
     dtypes: tuple[np.dtype[Any], ...]
     """As declared."""
-    listed: tuple[str, ...]
+    listed_of: Callable[[Any], tuple[Any, ...]]
     """Tuple fields whose lengths are sizes."""
-    optional: tuple[str, ...]
+    optional_of: Callable[[Any], tuple[Any, ...]]
     """Arrays that may be None."""
     known: set[tuple[Any, ...]]
     """Shapes and lengths that were seen to agree."""
@@ -256,16 +255,16 @@ def _layout(cls: type[Payload]) -> _Layout:
     optional = {f.name for f in msgspec.structs.fields(cls) if f.name in fields and not f.required}
     required = tuple(name for name in fields if name not in optional)
     return _Layout(
-        dtypes_of=_getter([f"{name}.dtype" for name in required]),
-        shapes_of=_getter([f"{name}.shape" for name in required]),
+        dtypes_of=attributes([f"{name}.dtype" for name in required]),
+        shapes_of=attributes([f"{name}.shape" for name in required]),
         dtypes=tuple(WIRE_DTYPES[fields[name].dtype] for name in required),
-        listed=tuple(field for names in cls.sizes_from.values() for field in names),
-        optional=tuple(name for name in fields if name in optional),
+        listed_of=attributes([field for names in cls.sizes_from.values() for field in names]),
+        optional_of=attributes([name for name in fields if name in optional]),
         known=set(),
     )
 
 
-def _getter(paths: Sequence[str]) -> Callable[[Any], tuple[Any, ...]]:
+def attributes(paths: Sequence[str]) -> Callable[[Any], tuple[Any, ...]]:
     """All of these attributes at once."""
     if len(paths) > 1:
         return attrgetter(*paths)

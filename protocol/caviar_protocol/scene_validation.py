@@ -74,31 +74,43 @@ def numbers_are_right(scene: Scene) -> bool:
         return False
     # The sum alone would let a squared norm of 1.5 pass beside one of 0.5.
     excess = np.vecdot(orientation, orientation) - 1.0
+    turning, dimensions = scene.angular_velocity, scene.dimensions
     return bool(
         # |n − 1| ≤ |n² − 1| for any norm n
         excess.dot(excess) <= UNIT_TOLERANCE**2
         and np.vdot(scene.position, scene.position) <= MAX_COORDINATE_M**2
-        and np.vdot(scene.velocity, scene.velocity) < MAX_SPEED**2
-        and np.vdot(scene.dimensions, scene.dimensions) <= MAX_DIMENSION_M**2
+        and np.vdot(scene.velocity, scene.velocity) < MAX_SPEED**2 / 4
+        and np.vdot(dimensions, dimensions) <= MAX_DIMENSION_M**2
         and scene.dimensions.min() > 0
-        and (scene.angular_velocity is None or not _too_fast(scene).any())
+        and (turning is None or np.vdot(turning, turning) * np.vdot(dimensions, dimensions) < MAX_SPEED**2)
     )
 
 
 def _few_numbers_are_right(scene: Scene) -> bool:
     """The same without NumPy, of which each call costs more than these sums."""
     columns = (scene.orientation, scene.position, scene.velocity, scene.dimensions)
-    for (w, x, y, z), (e, n, u), (ve, vn, vu), (a, b, c) in zip(*[v.tolist() for v in columns], strict=True):
+    rows = zip(*[v.tolist() for v in columns], _turning(scene), strict=True)
+    for (w, x, y, z), (e, n, u), (ve, vn, vu), (a, b, c), (p, q, r) in rows:
         if not (
             # |n − 1| ≤ |n² − 1| for any norm n
             abs(w * w + x * x + y * y + z * z - 1.0) <= UNIT_TOLERANCE
             and e * e + n * n + u * u <= MAX_COORDINATE_M**2
-            and ve * ve + vn * vn + vu * vu < MAX_SPEED**2
+            # |v| + |ω|·|d| / 2 bounds the speed of every point, as in `_too_fast`; half of it each is enough.
+            and ve * ve + vn * vn + vu * vu < MAX_SPEED**2 / 4
+            and (p * p + q * q + r * r) * (a * a + b * b + c * c) < MAX_SPEED**2
             and min(a, b, c) > 0.0
             and a + b + c <= MAX_DIMENSION_M
         ):
             return False
-    return scene.angular_velocity is None or not _too_fast(scene).any()
+    return True
+
+
+def _turning(scene: Scene) -> Iterable[Sequence[float]]:
+    """Angular velocities of the objects [rad/s]."""
+    if scene.angular_velocity is None:
+        return [(0.0, 0.0, 0.0)] * len(scene.names)
+    found: list[list[float]] = scene.angular_velocity.tolist()
+    return found
 
 
 def _too_fast(scene: Scene) -> BoolArray:

@@ -432,7 +432,18 @@ class ServiceSession:
         try:
             yield
         except Exception as error:
-            self._send(fault_from(error, self._identity, phase, episode, frame), ())
+            self.report(error, phase, episode, frame)
+
+    def report(self, error: Exception, phase: str, episode: int, frame: int) -> None:
+        """Send FAULT that says what an exception says.
+
+        Args:
+            error: The exception.
+            phase: What the service was doing: ``"step"``.
+            episode: In which it came.
+            frame: In which it came; −1: in none.
+        """
+        self._send(fault_from(error, self._identity, phase, episode, frame), ())
 
     def _unexpected(self, message: m.Message, why: str) -> None:
         kind = message_type(message)
