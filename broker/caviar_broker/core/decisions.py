@@ -66,7 +66,7 @@ class Decision(msgspec.Struct, frozen=True):
     """As a consumer in the same frame is granted it, and as the journal has it."""
     product: Product | None = None
     journal: int = 0
-    """Journal entry that holds a held product; 0: the one of this decision, as for one that is replayed."""
+    """Number of the journal entry in which a held product stands; 0: in this decision's own entry."""
 
     @property
     def status(self) -> Status:

@@ -145,7 +145,7 @@ class Peer:
 
 @dataclass(frozen=True, kw_only=True)
 class Snapshot:
-    """A run up to a finished frame, as a compacted journal opens with it."""
+    """State of a run after a finished frame; a compacted journal begins with it."""
 
     episode: int
     finished: int
@@ -165,7 +165,7 @@ class Snapshot:
 
 @dataclass(frozen=True, kw_only=True)
 class Resumption:
-    """A run up to a frame."""
+    """What the core needs to go on with a run that another broker left, read from its journal."""
 
     episode: int
     seed: int

@@ -1,4 +1,8 @@
-"""Which key may take part as what: the authorized file and the tokens, asked at each handshake and HELLO."""
+"""Authentication: which key or token may take part as what, asked at each handshake and HELLO.
+
+An unauthenticated peer gets no further than the handshake (ZAP status 400); one whose key is authorized for
+another name, role or topic is refused at HELLO.
+"""
 
 from __future__ import annotations
 

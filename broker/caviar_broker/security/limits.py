@@ -1,4 +1,9 @@
-"""What one peer may use of the broker, and what happens to one that takes more: it is named and cut off."""
+"""What one peer may use of the broker, and what happens to one that takes more: it is named and cut off.
+
+Bounded are the memory that messages of a peer take while they wait, the size of a message, the rate of
+messages that were not asked for, and what an unauthenticated connection, which has not said HELLO, may send.
+`PeerGuard` also answers the handshakes (ZAP) by `access`.
+"""
 
 from __future__ import annotations
 

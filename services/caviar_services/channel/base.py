@@ -108,7 +108,8 @@ class ChannelModel(Service[S]):
     outputs: ClassVar[tuple[str, ...]] = ("channel",)
     attributes_to_set: ClassVar[tuple[str, ...]] = ("rung",)
     rung: str
-    """Step of the fidelity ladder."""
+    """Step of the fidelity ladder, as in `topics.Channel.rung`. A rung of the model `adaptive` is a model of
+    such a step, with settings of its own and a label."""
 
     def __init__(self, settings: S, run: RunInfo) -> None:
         super().__init__(settings, run)

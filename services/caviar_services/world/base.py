@@ -1,6 +1,7 @@
 """What every virtual world does: names, mounted devices, scenery, and the ``scene`` payload.
 
-To add a world, subclass `World`, say in `objects_at` where things are, and register the class.
+To add a world, such as a traffic model or a game engine, subclass `World`, say in `objects_at` where things
+are, and register the class.
 """
 
 from __future__ import annotations

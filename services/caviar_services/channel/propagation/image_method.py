@@ -13,6 +13,9 @@ the coordinates. Which triangles a path meets is known exactly, so its points ca
 
 So the length of a path without scattering is that of closed form; with scattering it is that of
 the path over the point that was drawn. Amplitudes stay as traced, in float32.
+
+Enumerated chains are mirrored together with their tests of faces, in `enumeration.image_paths`; launched
+candidates are tested by Sionna RT's image method in float32 first, and come here afterwards.
 """
 
 from __future__ import annotations

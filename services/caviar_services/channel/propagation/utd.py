@@ -1,20 +1,21 @@
-"""Diffraction at edges by the uniform theory of diffraction (UTD), in float64 from the meshes' own corners.
+"""Diffraction coefficients of edges by the uniform theory of diffraction (UTD), in float64.
 
-The ray tracer's diffracted fields change by 10 dB and more with the place of a scene, for the first two
-reasons:
+Sionna RT's own diffracted fields are not used. They change by 10 dB and more with the place of a scene,
+since
 
-- Of a path with fewer interactions than the solver's depth, it counts the way from the last point to the
-  origin of coordinates, and from there to the receiver, as the length behind the edge.
-- A ray in the plane of a face is neither before nor behind it, and rounding in float32 says one or the other:
-  the wedge is then taken for its mirror image, the angle 0 for 2π, or a face for one in the shadow.
-- The terms that make up for the reflected wave where it ends have its opposite sign.
+- of a path with fewer interactions than the solver's depth, the way from the last point to the origin of
+  coordinates, and from there to the receiver, counts as the length after the edge;
+- a ray in the plane of a face is neither before nor behind it, and rounding in float32 says one or the other:
+  the wedge is then taken for its mirror image, the angle 0 for 2π, or a face for one in the shadow;
 
-Here legs are those of the path, faces those of the mesh, angles those of the exterior, and what lies in a
-plane to within `IN_PLANE` counts as lying in it. The two faces may be of different materials.
+and the terms that make up for the reflected wave where it ends have its opposite sign.
 
-The coefficient is that of the uniform theory of diffraction (R. G. Kouyoumjian and P. H. Pathak, "A
-uniform geometrical theory of diffraction for an edge in a perfectly conducting surface", Proc. IEEE 62(11),
-1974) for a wedge of reflection matrices R0 and Rn, in the ray tracer's heuristic form: exact for a conductor
+Here legs are those of the path, faces and corners those of the mesh, angles those of the exterior, and what
+lies in a plane to within `IN_PLANE` counts as lying in it. The two faces may be of different materials.
+
+The diffraction coefficient is that of the uniform theory of diffraction (R. G. Kouyoumjian and P. H. Pathak,
+"A uniform geometrical theory of diffraction for an edge in a perfectly conducting surface", Proc. IEEE
+62(11), 1974) for a wedge of reflection matrices R0 and Rn, in the ray tracer's heuristic form: exact for a conductor
 and a field along the edge, else where light and reflection end,
 
 D = R0·(D1 − D4) + Rn·(D2 − D3), Di = −exp(−jπ/4) / (2n·sqrt(2πk)·sin β0) · cot(ψi)·F(kL·ai),

@@ -4,9 +4,9 @@ Every receiver is offered all of them: so its paths depend neither on which othe
 whether a ray happened to pass near it. Most chains cannot be a path to most receivers, which the
 image method tells from the planes and the boxes around them before anything is traced.
 
-The chains of planes that the rays of a launch went along, and the points at which they were scattered.
-
-A chain is a sequence of planes that some ray went along. Chains come from the transmitter's launch alone.
+A chain is a sequence of planes that some ray of the transmitter's launch went along. Chains, and the points
+at which rays were scattered, are the candidates. Those by way of moving objects may be enumerated instead:
+`channel.enumeration`.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_services.channel.propagation.geometry import Rows, ranges
 
-# [rad]; faces that deviate less from one plane are one, as in `sionna_planes`.
+# [rad]; faces that deviate less from one plane are one, as in `planes`.
 _FLAT_ANGLE = 2e-4
 
 # Sine of the angle between two pieces of an edge below which they are one edge.

@@ -53,7 +53,7 @@ _REMEMBERED = 4
 _LANES = 8_000_000
 
 LANE_BYTES = 40
-"""Memory for each of them, or each interaction of each ray."""
+"""[B] of memory for one candidate, or for one interaction of one ray."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -137,7 +137,8 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     memory_gib: Annotated[
         float, quantity("GiB", "for rays, and element pairs, looked at or traced together", gt=0, le=1024)
     ] = 4.0
-    """Rays are launched in parts of a million at most, and of fewer where this asks for it."""
+    """Rays are launched in parts of a million at most, and of fewer where this asks for it. The candidates of
+    `siso-rt` and of enumeration that are looked at together are bounded by constants, not by this."""
     bodies: BodyCount = 32
     pool: dict[str, BodyCount] = msgspec.field(default_factory=dict)
     """Bodies of single meshes where ``bodies`` does not fit, by file name without ending: ``car = 64``;
