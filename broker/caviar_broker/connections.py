@@ -226,7 +226,7 @@ class Connections:
         self._tell(kind, text, service, "note")
 
     def _refused(self, kind: str, text: str) -> None:
-        """Show on the console that a connection which is no service's was refused: each kind once in a while."""
+        """Show on the console that a stranger's connection was refused: each kind once in a while."""
         self._tell(kind, text, "", "refused")
 
     def _stranger(self, route: bytes) -> str:

@@ -15,8 +15,8 @@ lies in a plane to within `IN_PLANE` counts as lying in it. The two faces may be
 
 The diffraction coefficient is that of the uniform theory of diffraction (R. G. Kouyoumjian and P. H. Pathak,
 "A uniform geometrical theory of diffraction for an edge in a perfectly conducting surface", Proc. IEEE
-62(11), 1974) for a wedge of reflection matrices R0 and Rn, in the ray tracer's heuristic form: exact for a conductor
-and a field along the edge, else where light and reflection end,
+62(11), 1974) for a wedge of reflection matrices R0 and Rn, in the ray tracer's heuristic form: exact for a
+conductor and a field along the edge, else where light and reflection end,
 
 D = R0·(D1 − D4) + Rn·(D2 − D3), Di = −exp(−jπ/4) / (2n·sqrt(2πk)·sin β0) · cot(ψi)·F(kL·ai),
 
