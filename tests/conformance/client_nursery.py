@@ -17,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +31,13 @@ class Nursery:
     """The process that forks; thread-safe."""
 
     def __init__(self) -> None:
+        # Without threads of NumPy's library: a fork has only the thread that forks.
         self._process = subprocess.Popen(
-            [sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            [sys.executable, __file__],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
         )
         self._numbers = itertools.count()
         self._events: dict[int, dict[str, int]] = {}
@@ -108,7 +114,8 @@ class Forked(Started):
         if self._number is None:
             return super().terminate()
         if self.nursery.status(self._number) is None:
-            os.kill(self.nursery.wait(self._number, "pid"), signal.SIGTERM)
+            with suppress(ProcessLookupError):  # it has ended, and its status is on its way
+                os.kill(self.nursery.wait(self._number, "pid"), signal.SIGTERM)
         return True
 
     def dispose(self) -> None:
@@ -116,7 +123,8 @@ class Forked(Started):
             super().dispose()
             return
         if self.nursery.status(self._number) is None:
-            os.killpg(self.nursery.wait(self._number, "pid"), signal.SIGKILL)
+            with suppress(ProcessLookupError):
+                os.killpg(self.nursery.wait(self._number, "pid"), signal.SIGKILL)
             self.nursery.wait(self._number, "status")
         self._number = None
 
@@ -149,7 +157,7 @@ def preload() -> None:
 
 def live(order: dict[str, Any]) -> None:
     """Be the client of an order, in a process group of its own; does not return."""
-    os.setsid()
+    os.setpgid(0, 0)
     log = os.open(order["log"], os.O_WRONLY | os.O_APPEND)
     null = os.open(os.devnull, os.O_RDONLY)
     for source, target in ((null, 0), (log, 1), (log, 2)):
@@ -198,6 +206,9 @@ def main() -> None:
                 pid = os.fork()
                 if pid == 0:
                     live(order)
+                # Here too, since the group may be killed as soon as its number is known.
+                with suppress(OSError):
+                    os.setpgid(pid, pid)
                 numbers[pid] = order["number"]
                 say(number=order["number"], pid=pid)
         while numbers:
