@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 import msgspec
 
 from caviar_protocol.scenario.schema import Scenario
-from caviar_protocol.spec import markdown, prose, rows, structs_in
+from caviar_protocol.spec import markdown, prose, rows, structs_below
 from caviar_services.registry import load
 from caviar_services.scenario_schema import settings_classes
 
@@ -39,7 +39,7 @@ def pages() -> Iterator[tuple[str, str]]:
     inner: Structs = {}
     for field in msgspec.structs.fields(Scenario):
         if field.name not in Scenario.not_in_file:
-            (cls,) = structs_in(field.type)
+            cls = structs_below([field.type])[0]
             title = TITLES.get(field.name, f"[{field.name}]").replace("[", "\\[")
             lines += [f"## {title}", "", markdown(prose(cls)), "", *_keys(cls, inner)]
     lines += _nested(inner)
@@ -73,8 +73,7 @@ def _keys(cls: type[msgspec.Struct], inner: Structs) -> Iterator[str]:
         yield from ("It has no settings.", "")
         return
     yield from table(("key", "type", "unit", "default", "meaning"), found)
-    for field in msgspec.structs.fields(cls):
-        inner |= {struct.__name__: struct for struct in structs_in(field.type)}
+    inner |= {struct.__name__: struct for struct in structs_below([cls]) if struct is not cls}
 
 
 def _key(name: str, kind: str, unit: str, default: str, _: str, meaning: str) -> tuple[str, ...]:

@@ -285,27 +285,32 @@ def markdown(text: str) -> str:
 @cache
 def classes() -> dict[str, type[msgspec.Struct]]:
     """Every struct that may stand on the wire, by name, those inside others too."""
-    # Breadth first, so that structs come behind those that hold them.
-    queue: list[Any] = [*get_args(messages.Message), *topics.PAYLOADS.values()]
-    found: dict[str, type[msgspec.Struct]] = {}
-    while queue:
-        cls = queue.pop(0)
-        if cls.__name__ not in found:
-            found[cls.__name__] = cls
-            for field in msgspec.structs.fields(cls):
-                queue += structs_in(field.type)
-    return found
+    return {cls.__name__: cls for cls in structs_below([messages.Message, *topics.PAYLOADS.values()])}
 
 
-def structs_in(hint: Any) -> list[type[msgspec.Struct]]:
-    """Structs that a type hint names.
+def structs_below(hints: Iterable[Any]) -> list[type[msgspec.Struct]]:
+    """Structs that type hints name, and those of their fields, however deep.
 
     Args:
-        hint: Of a field.
+        hints: Structs, or types of fields.
+
+    Returns:
+        Each once, behind those that hold it.
+
+    Example:
+        >>> [cls.__name__ for cls in structs_below([tuple[topics.ChannelMatrix, ...] | None, topics.Camera])]
+        ['Camera', 'ChannelMatrix', 'CameraImage', 'Intrinsics']
     """
-    if isinstance(hint, type) and issubclass(hint, msgspec.Struct):
-        return [hint]
-    return [cls for argument in get_args(hint) for cls in structs_in(argument)]
+    found: dict[type[msgspec.Struct], None] = {}
+    queue = list(hints)
+    while queue:
+        hint = queue.pop(0)
+        if not (isinstance(hint, type) and issubclass(hint, msgspec.Struct)):
+            queue += get_args(hint)
+        elif hint not in found:
+            found[hint] = None
+            queue += [field.type for field in msgspec.structs.fields(hint)]
+    return list(found)
 
 
 @cache

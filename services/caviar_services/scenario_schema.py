@@ -14,7 +14,7 @@ import msgspec
 
 from caviar_protocol.messages import Role
 from caviar_protocol.scenario.schema import REMOTE, Run, Scenario
-from caviar_protocol.spec import rows
+from caviar_protocol.spec import rows, structs_below
 from caviar_services.registry import load, registered_names
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
@@ -52,7 +52,7 @@ def scenario_schema() -> dict[str, Any]:
     references, definitions = msgspec.json.schema_components(classes, ref_template="#/$defs/{name}")
     by_implementation = dict(zip(settings, references[1:], strict=True))
     # msgspec has the descriptions of structs; meanings of fields are the strings below them in the source.
-    for cls in _structs(classes):
+    for cls in structs_below(classes):
         if cls.__name__ in definitions:
             _describe(definitions[cls.__name__], cls)
     for definition in definitions.values():
@@ -63,21 +63,6 @@ def scenario_schema() -> dict[str, Any]:
     del definitions["Source"]
     head: dict[str, Any] = {"$schema": DIALECT, "title": "CAVIAR scenario"}
     return {**head, **definitions.pop(Scenario.__name__), "$defs": definitions}
-
-
-def _structs(classes: list[type[msgspec.Struct]]) -> list[type[msgspec.Struct]]:
-    """These classes and those of their fields, however deep."""
-    found: list[type[msgspec.Struct]] = []
-    queue: list[Any] = list(classes)
-    while queue:
-        hint = queue.pop()
-        if isinstance(hint, type) and issubclass(hint, msgspec.Struct):
-            if hint not in found:
-                found.append(hint)
-                queue += [field.type for field in msgspec.structs.fields(hint)]
-        else:
-            queue += get_args(hint)
-    return found
 
 
 def _describe(definition: dict[str, Any], cls: type[msgspec.Struct]) -> None:
