@@ -125,7 +125,12 @@ def _of_pairs(channel: Channel, values: Float64Array) -> Float64Array:
 
 
 def in_db(ratio: Float64Array) -> Float64Array:
-    """Levels of ratios of powers [dB], limited to the range from `FLOOR_DB` to `CEILING_DB`."""
+    """Levels of ratios of powers [dB], limited to the range from `FLOOR_DB` to `CEILING_DB`.
+
+    Example:
+        >>> in_db(np.array([0.0, 0.5])).round(2).tolist()
+        [-60.0, -3.01]
+    """
     least, most = 10 ** (FLOOR_DB / 10), 10 ** (CEILING_DB / 10)
     found: Float64Array = 10 * np.log10(np.clip(ratio, least, most))
     return found
@@ -145,6 +150,15 @@ class ErrorBound:
     Args:
         declared_db: Error that the scenario expects [dB]; it takes the place of what is assumed before the
             first check.
+
+    Example:
+        >>> bound, scores = ErrorBound(), np.array([-20.0])
+        >>> bound.bounds_db(0, ["bs > car"], scores).tolist()  # nothing is known yet
+        [6.0]
+        >>> for frame in range(0, 200, 10):
+        ...     _ = bound.check(frame, ["bs > car"], scores, errors=np.array([-17.0]))
+        >>> bound.bounds_db(200, ["bs > car"], scores).tolist()
+        [-17.0]
     """
 
     def __init__(self, declared_db: float | None = None) -> None:

@@ -202,6 +202,10 @@ def summed(receive: Complex128Array, transmit: Complex128Array) -> Complex128Arr
     Args:
         receive: Of each path and receiving element, Shape ``[P, Nr]``.
         transmit: Of each path and transmitting element, Shape ``[P, Nt]``.
+
+    Example:
+        >>> summed(np.array([[1.0], [2.0]]), np.array([[1.0, 1j], [1.0, 1.0]]))
+        array([[3.+0.j, 2.+1.j]])
     """
     # In blocks: NumPy's library shares a larger product out to threads, which beside those of the ray tracer
     # wait for a processor a hundred times as long as the product takes.
@@ -354,7 +358,19 @@ def joined(rows: list[list[Blocks]]) -> Blocks:
 
 
 def carrier_phase(carriers: Sequence[Carrier], tau: Float64Array) -> Complex128Array:
-    """exp(−j2πfτ), Shape ``[C, P]``; delays [s] have the Shape ``[P]``."""
+    """Carrier phases of paths.
+
+    Args:
+        carriers: C carriers.
+        tau: Delays [s], Shape ``[P]``.
+
+    Returns:
+        exp(−j2πfτ), Shape ``[C, P]``.
+
+    Example:
+        >>> carrier_phase([Carrier(name="a", frequency_hz=1e9)], np.array([2.5e-10])).round(9)
+        array([[0.-1.j]])
+    """
     frequency = np.array([carrier.frequency_hz for carrier in carriers])
     # The whole turns of f·τ go first: they are millions, and only the rest is a phase.
     turns = frequency[:, None] * tau

@@ -435,7 +435,12 @@ def _end(tables: Sequence[_Table], rows: Int64Array) -> End:
 
 
 def unit_vectors(angles: Float64Array) -> Float64Array:
-    """Unit vectors of directions (zenith, azimuth) [rad], Shape ``[K, 2]`` to ``[K, 3]``."""
+    """Unit vectors of directions (zenith, azimuth) [rad], Shape ``[K, 2]`` to ``[K, 3]``.
+
+    Example:
+        >>> unit_vectors(np.array([[np.pi / 2, np.pi / 2]])).round(9).tolist()
+        [[0.0, 1.0, 0.0]]
+    """
     zenith, azimuth = angles[:, 0], angles[:, 1]
     sine = np.sin(zenith)
     return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.cos(zenith)], axis=-1)

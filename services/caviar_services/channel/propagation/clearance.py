@@ -50,6 +50,12 @@ class Boxes:
         """Whether each segment passes through each box; Shapes ``[Q, 3]``, ``[Q, 3]`` to ``[Q, N]``.
 
         A segment that only touches a face or an edge is not blocked. By slabs (Kay and Kajiya 1986).
+
+        Example:
+            >>> boxes = Boxes.aligned([((10, -1, 0), (12, 1, 3))])
+            >>> start, end = np.zeros((2, 3)), np.array([[20.0, 0.0, 2.0], [20.0, 0.0, 9.0]])
+            >>> boxes.block(start, end).tolist()
+            [[True], [False]]
         """
         # Shape [Q, N, 3], in the axes of each box
         origin = np.einsum("qni,nij->qnj", start[:, None] - self.centre, self.rotation)
@@ -120,7 +126,14 @@ class Surfaces:
         return position
 
     def between(self, start: Float64Array, end: Float64Array) -> bool:
-        """Whether a triangle stands on the segment between two points [m], its ends left out."""
+        """Whether a triangle stands on the segment between two points [m], its ends left out.
+
+        Example:
+            >>> wall = np.array([[[5.0, -9.0, 0.0], [5.0, 9.0, 0.0], [5.0, 0.0, 9.0]]])
+            >>> surfaces = Surfaces(wall, outside=lambda number, normal: True)
+            >>> surfaces.between(np.zeros(3), np.array([10.0, 0.0, 2.0]))
+            True
+        """
         line = end - start
         for index in self._within(np.minimum(start, end), np.maximum(start, end), 0.0).tolist():
             corners = self._triangles[index]

@@ -163,6 +163,13 @@ def lengths_inside(
 
     Returns:
         Lengths [m], Shape ``[Q, K]``.
+
+    Example:
+        >>> from caviar_services.mesh.shapes import box
+        >>> crown = MeshVolumes.of([(outward(box((0, 2), (0, 2), (0, 2))), 0)])
+        >>> start, end = np.array([[-1.0, 1.0, 1.5]]), np.array([[1.5, 1.0, 1.5]])
+        >>> lengths_inside([crown], start, end, kinds=1).tolist()
+        [[1.5]]
     """
     direction = end - start
     found = [crossed for of in volumes for crossed in of.crossings(start, direction)]

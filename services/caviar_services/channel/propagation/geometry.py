@@ -130,6 +130,14 @@ def path_geometry(
         point_velocity: Of the surface at each point [m/s], Shape ``[P, D, 3]``.
         end_velocity: See ``start_velocity``.
 
+    Example:
+        >>> row = lambda *values: np.array([values], np.float64)
+        >>> point, none = np.zeros((1, 0, 3)), np.zeros(1, np.int64)
+        >>> still, towards = row(0, 0, 0), row(-30, 0, 0)
+        >>> made = path_geometry(row(0, 0, 0), point, row(300, 0, 0), none, still, point, towards)
+        >>> made.departure.tolist(), round(float(made.doppler_ratio[0]) * 28e9)  # [Hz] at 28 GHz
+        ([[1.0, 0.0, 0.0]], 2802)
+
     Doppler shift to first order in v/c, with unit vector k_i of the segment behind corner i:
     f_D / f = Σ_i (v_i − v_{i+1})·k_i / c (a source that approaches raises the frequency).
     """

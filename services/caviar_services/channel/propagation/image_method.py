@@ -241,6 +241,11 @@ def keller_point(source: Float64Array, target: Float64Array, edges: Float64Array
     Returns:
         Points [m], Shape ``[P, 3]``, beyond an end of the edge or not; not finite where source and target are
         both on the line.
+
+    Example:
+        >>> edge = np.array([[[0.0, 0.0, 0.0], [0.0, 0.0, 9.0]]])
+        >>> keller_point(np.array([[3.0, 0.0, 1.0]]), np.array([[0.0, 6.0, 4.0]]), edge).tolist()
+        [[0.0, 0.0, 2.0]]
     """
     origin, along = edges[:, 0], edges[:, 1] - edges[:, 0]
     along = along / np.sqrt(_square(along))

@@ -159,6 +159,11 @@ def radiated_field(
         rotation: 3×3 matrix that turns the device's axes into world axes.
         directions: Unit vectors from the device outwards, in world axes, Shape ``[P, 3]``.
         pattern: Of the element; None: the one that the array names.
+
+    Example:
+        >>> field = radiated_field(AntennaArray(pattern="dipole"), np.eye(3), np.array([[1.0, 0.0, 0.0]]))
+        >>> field.round(3).tolist()  # along θ̂, which points down there
+        [[0.0, 0.0, -1.225]]
     """
     local = directions @ rotation
     field = polarized_field(pattern or _formula(array.pattern), array.polarizations[0], local)

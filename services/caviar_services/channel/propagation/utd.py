@@ -91,6 +91,12 @@ def wedges_of(ends: Float64Array, apexes: Float64Array) -> tuple[Wedges, BoolArr
     Returns:
         The wedges, and which of them are any, Shape ``[P]``: not where an edge has no length or a face no
         width.
+
+    Example:
+        >>> edge = np.array([[[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
+        >>> wedges, is_edge = wedges_of(edge, np.array([[[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]]))
+        >>> is_edge.tolist(), np.degrees(wedges.exterior).tolist()  # the corner of a house
+        ([True], [270.0])
     """
     begin, end = ends[:, 0], ends[:, 1]
     with np.errstate(invalid="ignore", divide="ignore"):  # of what is no wedge
@@ -426,6 +432,11 @@ def beyond_edges(points: Float64Array, ends: Float64Array) -> BoolArray:
     Args:
         points: Points [m], Shape ``[B, 3]``.
         ends: Both ends of the edges [m], Shape ``[B, 2, 3]``.
+
+    Example:
+        >>> edge = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 2.0]])
+        >>> beyond_edges(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 2.0]]), np.array([edge, edge])).tolist()
+        [False, True]
     """
     line = ends[:, 1] - ends[:, 0]
     along = ((points - ends[:, 0]) * line).sum(1)

@@ -201,6 +201,11 @@ def heights(triangles: Float64Array, x: Float64Array, y: Float64Array) -> Float6
 
     Returns:
         Heights [m], Shape ``[len(y), len(x)]``; NaN where there is no triangle.
+
+    Example:
+        >>> slope = np.array([[[0.0, 0.0, 0.0], [4.0, 0.0, 2.0], [0.0, 4.0, 0.0]]])
+        >>> heights(slope, np.array([1.0, 2.0]), np.array([1.0])).tolist()
+        [[0.5, 1.0]]
     """
     found = np.full((len(y), len(x)), -np.inf)
     # Each triangle is looked at over the part of the grid in its bounding box alone.
@@ -266,6 +271,10 @@ def beams_of(array: AntennaArray, beam: BeamChoice, name: str) -> range:
 
     Raises:
         RunError: The codebook has no such beam.
+
+    Example:
+        >>> beams_of(AntennaArray(rows=2, columns=4), "best", "bs")
+        range(0, 8)
     """
     if beam == "wide" or (beam == "best" and array.size == 1):
         return range(0)
@@ -287,6 +296,10 @@ def part_of(samples: int, cells: int, beams: int, memory: int) -> int:
 
     Returns:
         Rays of a part, all of one size; 0 where not even a small part fits (`least_memory`).
+
+    Example:
+        >>> part_of(samples=3_000_000, cells=10_000, beams=0, memory=2**30)
+        1000000
     """
     left = memory - cells * (_CELL_BYTES + _CELL_BEAM_BYTES * beams)
     fitting = left // (_RAY_BYTES + _RAY_BEAM_BYTES * beams)

@@ -42,7 +42,12 @@ def spherical_wave(length: float, frequency: float) -> complex:
 
 
 def doppler(closing_speed: float, frequency: float) -> float:
-    """Shift f·v/c [Hz] of a path that shortens by v [m/s], to first order in v/c."""
+    """Shift f·v/c [Hz] of a path that shortens by v [m/s], to first order in v/c.
+
+    Example:
+        >>> round(doppler(30.0, 28e9))
+        2802
+    """
     return frequency * closing_speed / C
 
 
@@ -70,6 +75,10 @@ def fresnel(cosine: float, eta: complex) -> tuple[complex, complex]:
 
     For the field across the plane of incidence and within it (ITU-R P.2040-3, eqs. 31a and 31b: the second is
     +1 at a perfect conductor).
+
+    Example:
+        >>> [round(r.real, 3) for r in fresnel(1.0, 4.0)]
+        [-0.333, 0.333]
     """
     root = cmath.sqrt(eta - (1 - cosine**2))
     return (cosine - root) / (cosine + root), (eta * cosine - root) / (eta * cosine + root)
@@ -84,7 +93,12 @@ def slab(cosine: float, eta: complex, thickness: float, frequency: float) -> tup
 
 
 def over_ground(height_tx: float, height_rx: float, distance: float) -> tuple[float, float, float]:
-    """Lengths of the direct and the reflected path over flat ground [m], and the cosine of incidence."""
+    """Lengths of the direct and the reflected path over flat ground [m], and the cosine of incidence.
+
+    Example:
+        >>> over_ground(3.0, 3.0, 8.0)
+        (8.0, 10.0, 0.6)
+    """
     direct = math.hypot(distance, height_tx - height_rx)
     bounced = math.hypot(distance, height_tx + height_rx)
     return direct, bounced, (height_tx + height_rx) / bounced
@@ -151,6 +165,10 @@ def room_images(
 
     Image (i, j, k) has |i| + |j| + |k| reflections and stands at 2⌈i/2⌉·L + (−1)^i·x on each axis (Allen and
     Berkley, 1979); there are 4n² + 2 of order n.
+
+    Example:
+        >>> len(room_images((4.0, 5.0, 3.0), np.array([1.0, 1.0, 1.0]), np.array([2.0, 3.0, 1.5]), order=2))
+        25
     """
     found = []
     span = range(-order, order + 1)

@@ -86,7 +86,12 @@ class Thing:
 
 
 def square(half: float, height: float = 0.0) -> list[tuple[float, float, float]]:
-    """Corners of a horizontal square about the origin, its normal up; half of its side and its height [m]."""
+    """Corners of a horizontal square about the origin, its normal up; half of its side and its height [m].
+
+    Example:
+        >>> square(2.0)
+        [(-2.0, -2.0, 0.0), (2.0, -2.0, 0.0), (2.0, 2.0, 0.0), (-2.0, 2.0, 0.0)]
+    """
     return [(x * half, y * half, height) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
 
 
@@ -294,7 +299,18 @@ def _prepared(model: Model, assets: Mapping[str, Path]) -> Model:
 
 
 def measure(model: Model, at: Scene, number: int = 0) -> Channel:
-    """The product of a model for a scene; what is drawn depends on the run's seed and the frame's number."""
+    """The product of a model for a scene.
+
+    Args:
+        model: Prepared.
+        at: The scene.
+        number: Of the frame, which what is drawn depends on, with the run's seed.
+
+    Example:
+        >>> channel = measure(free_space(28e9), scene(ends((0, 0, 10), (30, 40, 10))))
+        >>> round(float(channel.tau[0] * 299_792_458.0), 6)  # [m]
+        50.0
+    """
     source = FrameInput(GrantInput(topic="scene", source="world", status=Status.FRESH), payload=at)
     frame = Frame(
         episode=0,
@@ -322,7 +338,12 @@ def link(model: Model, tx: Point, rx: Point, *things: Thing) -> Channel:
 
 
 def total(channel: Channel, carrier: int = 0) -> complex:
-    """Sum of the amplitudes of the only pair: H of single elements."""
+    """Sum of the amplitudes of the only pair: H of single elements.
+
+    Example:
+        >>> round(abs(total(link(free_space(28e9), (0, 0, 10), (60, 80, 10)))), 9)
+        8.52e-06
+    """
     return complex(channel.a[carrier].sum())
 
 

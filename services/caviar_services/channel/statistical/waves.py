@@ -239,13 +239,23 @@ def velocity(scene: Scene, device: AntennaDevice) -> Vector:
 
 
 def direction(zenith: float, azimuth: float) -> Vector:
-    """Unit vector of a direction; a zenith beyond a pole comes down on its other side."""
+    """Unit vector of a direction [rad]; a zenith beyond a pole comes down on its other side.
+
+    Example:
+        >>> [round(x, 9) for x in direction(math.pi / 2, math.pi / 2)]
+        [0.0, 1.0, 0.0]
+    """
     sine = math.sin(zenith)
     return (sine * math.cos(azimuth), sine * math.sin(azimuth), math.cos(zenith))
 
 
 def angles(vector: Vector) -> tuple[float, float]:
-    """Zenith and azimuth of a vector [rad]."""
+    """Zenith and azimuth of a vector [rad].
+
+    Example:
+        >>> angles((0.0, 0.0, 2.0))
+        (0.0, 0.0)
+    """
     x, y, z = vector
     return (math.atan2(math.hypot(x, y), z), math.atan2(y, x))
 
