@@ -332,7 +332,7 @@ class Fault(_Message, frozen=True, kw_only=True, tag="FAULT"):
     """``prepare``, ``reset``, ``step``, ``encode``, …"""
     message: Text
     """One line for the user. ``KEY: …``, of a wrong key of the scenario, is shown with file and line."""
-    # Apart from the line for the user, to whom a traceback says nothing.
+    # Apart from the line for the user: a traceback is for the log.
     detail: Text = ""
     """Traceback, for the log."""
     culprit: Text = ""
